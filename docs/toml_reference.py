@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ast
 import dataclasses
+import functools
 import inspect
 import itertools
 import math
@@ -247,6 +248,7 @@ def _summary(subject: Any) -> str:
     return text.replace("``", "`").removeprefix("Return ")
 
 
+@functools.cache
 def _meanings(kind: type) -> dict[str, str]:
     """Return what is said of each field: in the string below it, or in the section Parameters or Attributes of the class."""
     said = {}

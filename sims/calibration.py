@@ -7,8 +7,8 @@ hard iron, accelerometer bias and the acceleration of the hand. It starts from t
 radian, which is what the hard iron does to it; so it starts anew from where the smoother puts that start
 (:func:`strapdown.estimation.relinearized_start`), and the result without it is reported beside.
 
-Told are, for each state, what was known before and after, whether the errors of all runs are what the covariance says, and what the plain
-filter makes of the same records. The figure shows one run's errors in the filter's own ±3σ.
+Reported are, for each state, what was known before and after, whether the errors of all runs are what the covariance says, and what the
+plain filter makes of the same records. The figure shows one run's errors in the filter's own ±3σ.
 
 Run ``python sims/calibration.py [--out FOLDER]`` (a minute).
 """

@@ -11,8 +11,8 @@ For each preset and run, a record at the gyro's natural rate with vector measure
 ``augmented``
     a linear Kalman filter, one an axis, with the sixteen states of :class:`strapdown.gyro.flicker.Shaping` beside attitude and drift.
 
-and ``control`` is the MEKF of ``own`` on the same gyro without flicker. Told is the NEES of the attitude over its three degrees of freedom,
-averaged over runs and late epochs (1 if the covariance is right), with the scatter of that mean over the runs, and the rms error.
+and ``control`` is the MEKF of ``own`` on the same gyro without flicker. Reported are the NEES of the attitude over its three degrees of
+freedom, averaged over runs and late epochs (1 if the covariance is right), the standard error of that mean, and the RMS error.
 
 Run ``python sims/flicker_in_filter.py [--out FOLDER]`` (some minutes).
 """
@@ -25,6 +25,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.stats import t
 
 from strapdown import consistency, estimation, gyro, motion, plots, quaternion
 from strapdown.gyro import datasheets, flicker
@@ -48,7 +49,7 @@ SIGMA = {
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """Of one preset: by filter, mean NEES over 3, its scatter, and rms attitude error (rad)."""
+    """Of one preset: by filter, mean NEES over 3, its standard error, and RMS attitude error (rad)."""
 
     preset: str
     anees: dict[str, float]
@@ -192,9 +193,10 @@ def draw(result, *, ax=None):
     """Draw the mean NEES of each filter by preset; return the matplotlib axes."""
     ax = plots.new_figure(size=(9.0, 4.5))[1] if ax is None else ax
     place = np.arange(len(result.outcomes))
+    student = t.ppf(0.995, result.runs - 1)
     for number, name in enumerate(FILTERS):
         value = np.array([outcome.anees[name] for outcome in result.outcomes])
-        bar = 2.58 * np.array([outcome.scatter[name] for outcome in result.outcomes])
+        bar = student * np.array([outcome.scatter[name] for outcome in result.outcomes])
         label = {"control": "control: a gyro without flicker", "own": "own: blind to flicker"}.get(name, name)
         ax.errorbar(
             place + 0.15 * (number - 2.0), value, bar, fmt="o", ms=5, capsize=3, color=style.CYCLE[number], label=label

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import base64
 import gc
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import hypothesis
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 hypothesis.settings.register_profile("fixed", derandomize=True)
 hypothesis.settings.load_profile("fixed")  # the same examples in every run
@@ -49,6 +52,35 @@ def what_is_compiled_is_not_collected() -> Iterator[None]:
 
 def pytest_sessionfinish() -> None:
     gc.freeze()  # pytest collects five times at its end, ten seconds in a process that has compiled much
+
+
+PIXEL = base64.b64decode("iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAAAAAA6fptVAAAACklEQVR42mP4DwABAQEAHLCMmQAAAABJRU5ErkJggg==")
+"""A PNG."""
+draw = Figure.savefig
+
+
+@pytest.fixture(scope="session")
+def blank() -> Callable[..., None]:
+    """Return what stands for ``Figure.savefig`` where the pixels do not matter: drawing a figure takes half a second."""
+
+    def savefig(figure: Figure, target: Any, **options: Any) -> None:
+        if hasattr(target, "write"):
+            target.write(PIXEL)
+        elif Path(target).suffix == ".png":
+            Path(target).write_bytes(PIXEL)
+        else:
+            draw(figure, target, **options)
+
+    return savefig
+
+
+@pytest.fixture(autouse=True)
+def figures_are_blank(
+    request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, blank: Callable[..., None]
+) -> None:
+    """Save blank figures in tests without the mark ``draws``; what fixtures of a whole module save is drawn."""
+    if not request.node.get_closest_marker("draws"):
+        monkeypatch.setattr(Figure, "savefig", blank)
 
 
 @pytest.fixture(scope="session")

@@ -438,7 +438,7 @@ def check_outliers(option, probability, runs, seed=11):
 @pytest.mark.parametrize("probability", [0.0, 0.05])
 @pytest.mark.parametrize("option", OPTIONS)
 def test_it_is_consistent_among_outliers(option, probability):
-    check_outliers(option, probability, 60)
+    check_outliers(option, probability, 30)
 
 
 @pytest.mark.slow
@@ -451,7 +451,7 @@ def test_it_is_consistent_among_outliers_over_many_runs(option, probability, see
 
 def test_without_a_gate_outliers_make_it_too_sure():
     nees = []
-    for run in range(60):
+    for run in range(30):
         record, belief = orbit(run, sensors=contaminated(0.05))
         nees.append(judged(multiple_model.run(record, belief, every=10), record)[1][40])
     assert np.mean(nees) / 6.0 > 2.0

@@ -7,6 +7,7 @@ import re
 import h5py
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from sims import hand_held
 from strapdown import (
@@ -200,7 +201,8 @@ def spinning(tmp_path):
     return path
 
 
-def test_states_that_the_errors_call_for(run, spinning, tmp_path):
+@pytest.mark.draws
+def test_states_that_the_errors_call_for(run, spinning, tmp_path, monkeypatch, blank):
     status, said, error = run(
         "estimate", spinning, "--out", tmp_path / "out", "--states", "--from-truth", "--every", 100, "--figures"
     )
@@ -226,6 +228,7 @@ def test_states_that_the_errors_call_for(run, spinning, tmp_path):
     )
     status, _, _ = run("check", tmp_path / "out" / "estimate.h5")
     assert status == 0
+    monkeypatch.setattr(Figure, "savefig", blank)
     status, _, _ = run("report", tmp_path / "out" / "estimate.h5")
     assert status == 0
     (tmp_path / "filter.toml").write_text(setup.to_toml(saved))
@@ -496,7 +499,9 @@ def test_a_recording_is_taken_for_that_of_a_hand(run, recording, tmp_path):
     status, said, error = run("estimate", recording, "--out", tmp_path / "out")
     assert (status, error) == (0, "")
     moved = re.search(
-        r"Motion: of a hand, ([0-9.]+) m/s, as the recording shows, with a correlation time of 0.3 s\.", said
+        r"of a hand \(log-likelihood \+ [0-9.]+ beside a vehicle\), ([0-9.]+) m/s, as the recording shows, with a correlation time "
+        r"of 0.3 s\.",
+        said,
     )
     assert moved is not None
     assert "°/s, from that second." in said

@@ -1748,6 +1748,7 @@ def test_study_says_which_filter_is_consistent(comparison):
         )
 
 
+@pytest.mark.draws
 def test_study_runs_small_and_draws(comparison, tmp_path):
     result = comparison.main(**comparison.SMALL, out=tmp_path)
     assert [path.name for path in result.figures] == ["filter_family.png"]

@@ -340,7 +340,7 @@ def test_shaping_states_are_stationary():
     shaping = flicker.shaping(10**4)
     P, p = shaping.covariance, shaping.poles
     np.testing.assert_allclose(P, p[:, None] * P * p + 1.0, rtol=1e-7)
-    frequency = (np.arange(1 << 20) + 0.5) / (1 << 21)
+    frequency = (np.arange(1 << 18) + 0.5) / (1 << 19)
     assert shaping.variance == pytest.approx(np.mean(shaping.spectrum(frequency)), rel=2e-3)
     starts = shaping.start(np.random.default_rng(1).standard_normal((20_000, 16)))
     scale = np.sqrt(np.diag(P))
@@ -628,6 +628,7 @@ def judged(outcome):
     assert outcome.rms["augmented"] <= 1.005 * outcome.rms["bound"] <= 1.03 * outcome.rms["own"]
 
 
+@pytest.mark.draws
 def test_filters_on_presets_with_flicker(tmp_path):
     result = flicker_in_filter.main(
         presets=("mpu-9250", "adis16470", "stim300"), runs=24, duration=300.0, rate=20.0, out=tmp_path
@@ -645,6 +646,7 @@ def test_filters_on_presets_at_their_natural_rates(name):
     judged(flicker_in_filter.main(presets=(name,), runs=60, duration=600.0).outcomes[0])
 
 
+@pytest.mark.draws
 def test_the_sim_finds_the_spectra_of_its_specification(tmp_path):
     result = simulate_imu.main(samples=1 << 16, out=tmp_path)
     assert (tmp_path / "simulate_imu.png").stat().st_size > 10_000

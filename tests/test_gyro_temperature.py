@@ -21,7 +21,6 @@ from strapdown.units import DEGREE_PER_HOUR, DEGREE_PER_ROOT_HOUR
 from strapdown.vectors import VectorMeasurements
 
 SLOPE = 20.0 * DEGREE_PER_HOUR  # rad/s/K
-RUNS = 40
 TOML = """
 rate_hz = 50.0
 duration_s = 300.0
@@ -212,7 +211,8 @@ def test_where_nothing_drives_the_bias_the_state_is_refused():
         error_states.GyroTemperature(slope_sigma=[1e-4, 0.0, 1e-4])
 
 
-def test_a_filter_with_the_slope_is_consistent_over_units_and_one_without_is_not():
+@pytest.mark.parametrize("runs", [12, pytest.param(40, marks=pytest.mark.slow)])
+def test_a_filter_with_the_slope_is_consistent_over_units_and_one_without_is_not(runs):
     """Each unit has its own slope, drawn from the specification; ANEES of attitude and bias at three times, two-sided."""
     scenario = scenarios.scenario_from_toml(TOML)
     flat = replace(
@@ -229,7 +229,7 @@ def test_a_filter_with_the_slope_is_consistent_over_units_and_one_without_is_not
         process_noise=noise, attitude_sigma=1e-3, bias_sigma=50.0 * DEGREE_PER_HOUR, states=states
     )
     nees = {True: [], False: []}
-    for run in range(RUNS):
+    for run in range(runs):
         record = scenarios.simulate(scenarios.drawn(scenario, 7, run), 7, run)
         start, truth = drawn_start(record, chosen).state, record.truth
         for driven_too, values in nees.items():
@@ -237,7 +237,7 @@ def test_a_filter_with_the_slope_is_consistent_over_units_and_one_without_is_not
             found = setup.run(record, used, start, every=50, full_covariance=True)
             error = consistency.errors(found.attitude, found.bias, truth.attitude[::50], truth.bias[::50])
             values.append(consistency.nees(error, found.covariance)[[20, 60, -1]])
-    low, high = chi2.ppf([0.0005, 0.9995], RUNS * 6) / (RUNS * 6)
+    low, high = chi2.ppf([0.0005, 0.9995], runs * 6) / (runs * 6)
     anees = np.mean(nees[True], axis=0) / 6.0
     assert (low < anees).all()
     assert (anees < high).all()

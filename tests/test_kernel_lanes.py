@@ -24,7 +24,6 @@ from strapdown.kernels.lane_values import (
     bits_of,
     chosen,
     everywhere,
-    fetch_ahead,
     flush_tiny,
     halves,
     lanes_of,
@@ -42,7 +41,6 @@ from strapdown.kernels.lane_values import (
     store,
     store_like,
     store_quadruples,
-    store_triples,
     total,
 )
 from strapdown.kernels.rotation import rotation_matrix
@@ -188,23 +186,6 @@ def test_triples(start, stride):
     expected = np.array([a[start + i * stride + np.arange(3)] for i in range(WIDTH)]).T
     np.testing.assert_array_equal(out.reshape(3, WIDTH), expected)
     np.testing.assert_array_equal(lane_values.load_triples(a, start, stride), expected)
-
-
-def move_triples(a, start, stride, out):
-    fetch_ahead(out, start - 4000)
-    store_triples(out, start, stride, load_triples(a, start, stride))
-
-
-@pytest.mark.parametrize("stride", [3, 4, 6, 30])
-@pytest.mark.parametrize("start", [0, 1, 6])
-def test_stored_triples_leave_what_lies_beside_them(start, stride):
-    a = RANDOM.standard_normal(start + 7 * stride + 3)
-    rows = start + stride * np.arange(WIDTH)[:, None] + np.arange(3)
-    for store_them in (kernel(move_triples), move_triples):
-        out = np.full(len(a), np.nan)
-        store_them(a, start, stride, out)
-        np.testing.assert_array_equal(out[rows], a[rows])
-        assert np.isnan(np.delete(out, rows.ravel())).all()
 
 
 @pytest.mark.parametrize("stride", [4, 5, 48])

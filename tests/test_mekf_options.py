@@ -149,7 +149,7 @@ def near(record, error=(5e-3, -5e-3, 4e-3), sigma=1e-2):
 @pytest.mark.parametrize("option", OPTIONS)
 def test_both_faces_are_one_filter(option, kind, schedule):
     given, whole = OPTIONS[option]
-    record = simulate(scenario(SCHEDULES[schedule](sensors()[kind]), duration=3.0), 5)
+    record = simulate(scenario(SCHEDULES[schedule](sensors()[kind]), duration=2.0), 5)
     if whole is not None:
         record = anisotropic(record, whole)
     result = estimation.run(record, NOISE, near(record), full_covariance=True, **given)
@@ -199,7 +199,7 @@ def consistency_of(kind, schedule, option, runs, sigma_factor=1.0):
 
 @pytest.mark.parametrize("schedule", SCHEDULES)
 @pytest.mark.parametrize("kind", sensors())
-@pytest.mark.parametrize("runs", [24, pytest.param(400, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("runs", [12, pytest.param(400, marks=pytest.mark.slow)])
 def test_every_option_is_consistent_and_a_broken_one_is_not(kind, schedule, runs):
     for option in OPTIONS:
         verdicts, (nis, low, high) = consistency_of(kind, schedule, option, runs)
@@ -207,7 +207,7 @@ def test_every_option_is_consistent_and_a_broken_one_is_not(kind, schedule, runs
             assert verdict.consistent, (option, verdict.mean, verdict.simultaneous_bounds)
         assert low < nis < high, (option, nis, low, high)
     for factor in (0.5, 3.0):
-        (broken, _), _ = consistency_of(kind, schedule, "covariance", max(runs, 40), sigma_factor=factor)
+        (broken, _), _ = consistency_of(kind, schedule, "covariance", max(runs, 24), sigma_factor=factor)
         assert not broken.consistent, (factor, broken.mean)
     for factor in (1.0 / 1.2, 1.2):
         _, (nis, low, high) = consistency_of(kind, schedule, "covariance", max(runs, 40), sigma_factor=factor)

@@ -12,7 +12,7 @@ import sys
 import time
 import weakref
 from dataclasses import fields, replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -36,6 +36,7 @@ def go(path, runs, plan=PLAN, **options):
     return campaign.run(plan, path, **{"runs": runs, "machine": "scalar", "chunk": CHUNK, "threads": 2, **options})
 
 
+@cache
 def straight(runs, chunk=CHUNK):
     return montecarlo.run_plan(PLAN, runs=runs, chunk=chunk, threads=1, machine="scalar")
 
@@ -158,7 +159,7 @@ def test_writing_takes_a_small_share_of_the_time(tmp_path, monkeypatch):
 
     monkeypatch.setattr(campaign, "_write", slow)
     begun = time.perf_counter()
-    go(tmp_path / "c.h5", 300, chunk=2)
+    go(tmp_path / "c.h5", 160, chunk=2)
     elapsed = time.perf_counter() - begun
     assert 2 <= len(written) <= 3 + elapsed / 0.5
     assert campaign.read(tmp_path / "c.h5").finished
@@ -510,7 +511,7 @@ def test_interrupted_it_keeps_what_is_finished_and_says_so(command, heeded, monk
     assert status == 130
     assert "go on with --resume" in said
     assert signal.getsignal(signal.SIGTERM) == before
-    assert campaign.read("short-montecarlo.h5").statistics.runs == 20
+    assert campaign.read("short-montecarlo.h5").statistics.runs == 2 * scalar.CHUNK
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
@@ -538,7 +539,7 @@ def test_a_signal_whose_exception_python_drops_is_heeded_after_the_chunk(command
     status, said, _ = command("short.toml", "--runs", 60, "--threads", 1, *SCALAR)
     assert status == 130
     assert "go on with --resume" in said
-    assert campaign.read("short-montecarlo.h5").statistics.runs == 10
+    assert campaign.read("short-montecarlo.h5").statistics.runs == scalar.CHUNK
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])

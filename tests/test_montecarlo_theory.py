@@ -32,7 +32,7 @@ def held_against_theory(runs, seed, machine):
 
 
 def test_mismatched_filters_fail_by_as_much_as_theory_says():
-    held_against_theory(150, 3, "scalar")
+    held_against_theory(150, 3, "lanes")
 
 
 @pytest.mark.slow

@@ -126,6 +126,7 @@ def test_a_setup_with_it_is_read_back(tmp_path):
     assert montecarlo.from_table(json.loads(json.dumps(plan.to_table()))).digest == plan.digest
 
 
+@pytest.mark.draws
 def test_the_command_studies_it(tmp_path, monkeypatch, capsys):
     own = tmp_path / "own.toml"
     own.write_text('[algorithm]\nname = "rounded"\ncoefficients = [0.5143, 0.8762, 2.0381]\n')

@@ -30,6 +30,8 @@ from strapdown.coning_study import Drift, FilterOutcome
 from strapdown.montecarlo.statistics import BINS_PER_OCTAVE
 from strapdown.plots import decimation, estimates, style
 
+pytestmark = pytest.mark.draws
+
 
 @pytest.fixture(scope="module")
 def scenario():

@@ -409,10 +409,11 @@ def test_the_mean_with_covariances_has_the_least_loss():
     np.testing.assert_allclose(P, np.linalg.inv(information.sum(axis=0)), rtol=1e-12)
 
 
+@pytest.mark.parametrize("runs", [500, pytest.param(2000, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("with_covariance", [True, False])
-def test_the_covariance_of_the_mean_is_that_of_its_error(with_covariance):
-    """Normalised squared errors of 2000 means: χ² of three degrees of freedom, or Hotelling's T² where the scatter gives the covariance."""
-    sigma, n, runs = np.array([0.02, 0.01, 0.03]), 20, 2000
+def test_the_covariance_of_the_mean_is_that_of_its_error(with_covariance, runs):
+    """Normalised squared errors of many means: χ² of three degrees of freedom, or Hotelling's T² where the scatter gives the covariance."""
+    sigma, n = np.array([0.02, 0.01, 0.03]), 20
     squares = []
     for seed in range(runs):
         true, q = scattered(n, sigma, seed)

@@ -36,6 +36,9 @@ Answer = Literal["consistent", "not consistent", "cannot tell"]
 MIN_SAMPLES = 50
 """Fewer innovations of one sensor are not judged for whiteness, normality and mean."""
 
+FEWEST_TO_AVERAGE = 20
+"""Epochs of an estimate below which its errors are judged at the end only."""
+
 RESOLUTION = 1.5
 """A filter that passes is "consistent" if a σ wrong by this factor would have been seen; else the verdict is "cannot tell"."""
 
@@ -428,21 +431,7 @@ def _of_errors(estimate: Estimate, truth: Truth, limits: list[str], beside: Sequ
         limits.append(
             "the estimate holds variances only, so errors are judged axis by axis at the end; keep whole covariances"
         )
-        squares = (e[-1] ** 2 / variance[-1])[np.isfinite(e[-1])]
-        ratio = float(np.max(squares))
-        p = min(1.0, len(squares) * min(mean_p_value(float(x), 1, 1) for x in squares))
-        worst = int(np.argmax(squares))
-        name = state_name(worst)
-        return [
-            Finding(
-                name="error at the end",
-                of=name,
-                value=math.sqrt(ratio),
-                p_value=p,
-                samples=1,
-                means=f"the {name} error at the end is {math.sqrt(ratio):.3g} σ",
-            )
-        ]
+        return [_largest_at_end(e[-1], variance[-1])]
     # Neither a filter nor a reference need have a bias.
     known = 6 if np.isfinite(e[:, 3:]).any() and np.isfinite(variance[:, 3:]).any() else 3
     e, P = e[:, :known], estimate.covariance[seen][:, :known, :known]
@@ -463,34 +452,54 @@ def _of_errors(estimate: Estimate, truth: Truth, limits: list[str], beside: Sequ
                 means=error_words(f"the {subset} error at the end", value),
             )
         )
-        if len(e) < 20:
+        if len(e) < FEWEST_TO_AVERAGE:
             continue
-        if not _averages(subset, beside):
+        if _averages(subset, beside):
+            found += _over_the_run(subset, e, P, states, limits)
+        else:
             hidden.append(subset)
-            continue
-        average = time_average(e, P, states)
-        if not average.reliable:
-            limits.append(
-                f"the {subset} error changes too slowly for this run to average over: {average.effective:.3g} effective samples"
-            )
-            continue
-        found.append(
-            Finding(
-                name="time-averaged NEES",
-                of=subset,
-                value=average.mean,
-                p_value=average.p_value,
-                samples=average.effective,
-                degrees=len(states),
-                means=error_words(f"the {subset} error over the run", average.mean),
-            )
-        )
     if hidden:
         limits.append(
             f"the {' and '.join(hidden)} errors of a filter with further error states are not averaged over one run: how slowly they "
             "change is not known"
         )
     return found
+
+
+def _largest_at_end(error: Array, variance: Array) -> Finding:
+    """Return what the largest error at the end says, of one axis; the p-value is that of the largest among so many (Bonferroni)."""
+    squares = (error**2 / variance)[np.isfinite(error)]
+    name = state_name(int(np.argmax(squares)))
+    ratio = math.sqrt(float(np.max(squares)))
+    return Finding(
+        name="error at the end",
+        of=name,
+        value=ratio,
+        p_value=min(1.0, len(squares) * min(mean_p_value(float(x), 1, 1) for x in squares)),
+        samples=1,
+        means=f"the {name} error at the end is {ratio:.3g} σ",
+    )
+
+
+def _over_the_run(subset: str, e: Array, P: Array, states: tuple[int, ...], limits: list[str]) -> list[Finding]:
+    """Return the time-averaged NEES of a subset of the states; where its error changes too slowly, none, and the reason to the limits."""
+    average = time_average(e, P, states)
+    if not average.reliable:
+        limits.append(
+            f"the {subset} error changes too slowly for this run to average over: {average.effective:.3g} effective samples"
+        )
+        return []
+    return [
+        Finding(
+            name="time-averaged NEES",
+            of=subset,
+            value=average.mean,
+            p_value=average.p_value,
+            samples=average.effective,
+            degrees=len(states),
+            means=error_words(f"the {subset} error over the run", average.mean),
+        )
+    ]
 
 
 def _averages(subset: str, beside: Sequence[str]) -> bool:

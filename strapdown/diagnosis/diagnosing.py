@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from strapdown import consistency, estimation
@@ -56,10 +58,12 @@ def diagnose(
     if not any(len(series.time) for series in record.vectors):
         raise InputError("record has no vector measurements, so there are no innovations to diagnose from")
     need_mekf(setup, "the search for causes")
-    model = Model(record=modelled_record(record, setup), noise=setup.process_noise, initial=initial)
+    modelled = modelled_record(record, setup)
+    truth = modelled.truth
+    # No hypothesis looks at the truth, which each of their many records would check anew.
+    model = Model(record=replace(modelled, truth=None), noise=setup.process_noise, initial=initial)
     every = max(1, len(model.record.increments) // 1000)
     estimate = estimation.run(model.record, model.noise, model.initial, every=every, full_covariance=True)
-    truth = model.record.truth
     kept = None if truth is None else Truth(attitude=truth.attitude[::every], bias=truth.bias[::every])
     if judgement is None:
         judgement = consistency.judge(estimate, kept, probability=probability)

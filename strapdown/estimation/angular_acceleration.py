@@ -18,7 +18,7 @@ MOST = 20000
 LASTING = 4.0
 """Weight of curvature within the window relative to noise."""
 LEAST = 100
-"""Samples needed to separate noise from motion."""
+"""Samples needed to separate noise from motion, more than the longest window."""
 UNEVEN = 0.01
 """Tolerated difference of the gyro's intervals, as a part of their mean."""
 
@@ -31,7 +31,7 @@ def turning(record: ImuRecord, time: Array) -> tuple[Array, Array]:
     better, less what noise alone would make; the order and window of the least sum are taken. σ is that of the rates' fifth differences,
     in which a smooth motion is nothing: ``σ² = E(Δ⁵)²/252``.
     """
-    from scipy.signal import savgol_coeffs, savgol_filter
+    from scipy.signal import savgol_filter
 
     dt = np.diff(record.time)
     mean = float(dt.mean())
@@ -46,34 +46,29 @@ def turning(record: ImuRecord, time: Array) -> tuple[Array, Array]:
             f"a lever arm needs {LEAST} gyro samples or more, to tell noise from motion; the record has {len(dt)}"
         )
     rates = record.rates
-    windows = [window for window in WINDOWS if window <= len(dt)]
     white = np.mean(np.diff(rates, 5, axis=0) ** 2, axis=0) / 252.0
 
     def weights(order: int, window: int) -> Array:
-        padded = np.zeros(windows[-1])
-        half = (windows[-1] - window) // 2
-        padded[half : half + window] = savgol_coeffs(window, order, deriv=1, delta=mean, use="dot")
-        return padded
+        return _slope_weights(order, window) / mean
 
-    @functools.cache
-    def slope(order: int, window: int, samples: int) -> Array:
-        return np.asarray(savgol_filter(rates[:samples], window, order, deriv=1, delta=mean, axis=0))
+    def slope(order: int, window: int) -> Array:
+        return np.asarray(savgol_filter(rates, window, order, deriv=1, delta=mean, axis=0))
 
-    tried = [(order, window) for order in ORDERS for window in windows if window >= order + 2]
+    sample = np.ascontiguousarray(rates[:MOST].T)
+    tried = [(order, window) for order in ORDERS for window in WINDOWS if window >= order + 2]
     noises, bends = [], []
     for order, window in tried:
-        half = _half(order, window)
-        apart = float(np.sum((weights(order, window) - weights(order, half)) ** 2))
-        bent = np.mean((slope(order, window, MOST) - slope(order, half, MOST)) ** 2, axis=0) - white * apart
+        apart = weights(order, window) - weights(order, _half(order, window))
+        inside = apart[(len(apart) - window) // 2 :][:window]
+        bent = np.array([np.mean(np.correlate(axis, inside) ** 2) for axis in sample]) - white * float(apart @ apart)
         noises.append(white * float(np.sum(weights(order, window) ** 2)))
         bends.append(np.maximum(bent, 0.0))
     best = int(np.argmin(np.sum(np.array(noises) + LASTING * np.array(bends), axis=1)))
     order, window = tried[best]
-    acceleration = slope(order, window, len(dt))
+    acceleration = slope(order, window)
     h, sharper = weights(order, window), weights(order, _half(order, window))
-    lost = _lost(
-        acceleration, slope(order, _half(order, window), len(dt)), white * float(h @ h), white * float(h @ sharper)
-    )
+    sharp = slope(order, _half(order, window))
+    lost = _lost(acceleration, sharp, white * float(h @ h), white * float(h @ sharper))
     acceleration = acceleration * lost
     smooth = np.asarray(savgol_filter(rates, ORDERS[0] + 2, ORDERS[0], axis=0))
     # A sample is the mean over its interval, f + f″ dt²/24.
@@ -98,6 +93,14 @@ def turning(record: ImuRecord, time: Array) -> tuple[Array, Array]:
     alike = lags[np.abs(np.subtract.outer(np.arange(4), np.arange(4)))]
     left = np.einsum("mi,ij,mj->m", nodes, alike, nodes)
     return np.concatenate(found, axis=1), noises[best] * left[:, None] + bends[best]
+
+
+@functools.cache
+def _slope_weights(order: int, window: int) -> Array:
+    """Return the weights of a slope a sample, in the middle of the longest window."""
+    from scipy.signal import savgol_coeffs
+
+    return np.pad(savgol_coeffs(window, order, deriv=1, use="dot"), (WINDOWS[-1] - window) // 2)
 
 
 def _half(order: int, window: int) -> int:

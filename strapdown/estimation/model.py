@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -133,10 +134,54 @@ def assemble(blocks: tuple[ErrorStates, ...], kinds: Mapping[str, str]) -> Model
     scales, forces = (_stack(blocks, name, (3, 3)).reshape(-1, 9) for name in ("gyro_scale", "gyro_force"))
     gyro = np.concatenate([_stack(blocks, "gyro_offset", (3,)), scales + forces], axis=1)
     force_f = _force(blocks, np.any(scales != 0.0, axis=1) & np.any(forces != 0.0, axis=1))
-    sensors = np.zeros((len(kinds), len(decay), 15))
-    carried, levered = np.zeros((2, len(kinds), len(decay)), bool)
+    seen = _on_sensors(blocks, kinds, len(decay))
+    feed = _feeds(blocks)
+    fed = np.append(False, feed != 0.0)[: len(feed)]
+    linked = (feed != 0.0) | fed
+    moves = (decay > 0.0) | (density > 0.0) | linked | seen.bound
+    order = np.argsort(~moves, kind="stable")
+    gyro_use = _uses(gyro[:, :3], scales) + FORCE * np.any(forces != 0.0, axis=1)
+    if np.any(linked & (gyro_use != 0)):
+        raise InputError(
+            f"block state {int(np.argmax(linked & (gyro_use != 0)))} belongs to a chain and enters the gyro; give it a feed of 0, or no "
+            "effect on the gyro"
+        )
+    chains = np.stack([feed, np.where(fed, density, 0.0), seen.stride], axis=1)
+    quickened = np.where(linked, MAX_DECAY / MAX_CHAIN_DECAY, np.where(gyro_use & OFFSET, 5.0, 1.0))
+    fastest = float(np.max(decay * quickened, initial=0.0))
+    return Model(
+        order=order,
+        decay=decay[order],
+        density=np.where(fed, 0.0, density)[order],
+        chains=chains[order] if np.any(linked | seen.bound) else np.empty((0, 3)),
+        changing=int(np.sum(moves)),
+        limit=MAX_DECAY / fastest if fastest > 0.0 else np.inf,
+        gyro=np.ascontiguousarray(gyro[order]),
+        gyro_use=gyro_use[order],
+        sensors=np.ascontiguousarray(seen.sensors[:, order]),
+        sensor_use=np.ascontiguousarray(seen.use[:, order]),
+        force_f=force_f,
+        varying=seen.varying,
+    )
+
+
+class _Seen(NamedTuple):
+    """What the sensors see of the states: effects and their use as in :class:`Model`, in the order from outside."""
+
+    sensors: Array
+    use: np.ndarray
+    stride: Array
+    """The last column of a model's chains."""
+    bound: np.ndarray
+    """Which states are carried (m,), bool."""
+    varying: frozenset[str]
+
+
+def _on_sensors(blocks: Sequence[ErrorStates], kinds: Mapping[str, str], states: int) -> _Seen:
+    sensors = np.zeros((len(kinds), states, 15))
+    carried, levered = np.zeros((2, len(kinds), states), bool)
+    stride, bound = np.zeros(states), np.zeros(states, bool)
     varying = set()
-    stride, bound = np.zeros(len(decay)), np.zeros(len(decay), bool)
     names = list(kinds)
     first = 0
     for block in blocks:
@@ -160,37 +205,10 @@ def assemble(blocks: tuple[ErrorStates, ...], kinds: Mapping[str, str]) -> Model
             if effect.varying and kinds[sensor] in ("direction", "heading"):
                 varying.add(sensor)
         first += block.size
-    feed = _feeds(blocks)
-    fed = np.append(False, feed != 0.0)[: len(feed)]
-    linked = (feed != 0.0) | fed
-    moves = (decay > 0.0) | (density > 0.0) | linked | bound
-    order = np.argsort(~moves, kind="stable")
-    gyro_use = _uses(gyro[:, :3], scales) + FORCE * np.any(forces != 0.0, axis=1)
-    sensor_use = _uses(sensors[..., :3], sensors[..., 6:], sensors[..., 3:6])
-    sensor_use += (LEVER - OFFSET) * (levered & (sensor_use & OFFSET > 0))
-    sensor_use += CARRIED * (carried & (sensor_use & FIXED > 0))
-    if np.any(linked & (gyro_use != 0)):
-        raise InputError(
-            f"block state {int(np.argmax(linked & (gyro_use != 0)))} belongs to a chain and enters the gyro; give it a feed of 0, or no "
-            "effect on the gyro"
-        )
-    chains = np.stack([feed, np.where(fed, density, 0.0), stride], axis=1)
-    quickened = np.where(linked, MAX_DECAY / MAX_CHAIN_DECAY, np.where(gyro_use & OFFSET, 5.0, 1.0))
-    fastest = float(np.max(decay * quickened, initial=0.0))
-    return Model(
-        order=order,
-        decay=decay[order],
-        density=np.where(fed, 0.0, density)[order],
-        chains=chains[order] if np.any(linked | bound) else np.empty((0, 3)),
-        changing=int(np.sum(moves)),
-        limit=MAX_DECAY / fastest if fastest > 0.0 else np.inf,
-        gyro=np.ascontiguousarray(gyro[order]),
-        gyro_use=gyro_use[order],
-        sensors=np.ascontiguousarray(sensors[:, order]),
-        sensor_use=np.ascontiguousarray(sensor_use[:, order]),
-        force_f=force_f,
-        varying=frozenset(varying),
-    )
+    use = _uses(sensors[..., :3], sensors[..., 6:], sensors[..., 3:6])
+    use += (LEVER - OFFSET) * (levered & (use & OFFSET > 0))
+    use += CARRIED * (carried & (use & FIXED > 0))
+    return _Seen(sensors, use, stride, bound, frozenset(varying))
 
 
 @functools.cache

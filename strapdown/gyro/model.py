@@ -287,28 +287,53 @@ def simulate(
     exact = np.ascontiguousarray(array("true_increments", true_increments, (len(stamps) - 1, 3)))
     n = len(exact)
     key = generator.integers(0, 2**64, size=2, dtype=np.uint64)
-    has_flicker = bool(np.any(np.asarray(spec.bias_instability) > 0.0))
-    low_passed = np.isfinite(spec.bandwidth)
-    if has_flicker or low_passed:
+    low_passed = bool(np.isfinite(spec.bandwidth))
+    if np.any(np.asarray(spec.bias_instability) > 0.0) or low_passed:
         _need_uniform(stamps)
     streams = _streams(key)
     initial = np.empty((3, 64))
     for axis in range(3):
         compiled(noise.fill_normals)(streams[axis, _INITIAL], np.empty((2, 32), np.uint64), initial[axis])
-    shaping = flicker.shaping(n)
-    tau = spec.markov_correlation_time
-    q = _axes(spec.markov_noise)
-    instability = _axes(spec.bias_instability)
-    white = _axes(spec.angle_random_walk)
-    states = shaping.start(initial[:, : flicker.STATES])
     increments, bias = np.empty((n, 3)), np.empty((n + 1, 3))
     words, normals = np.empty((2, gyro_errors.BLOCK // 2), np.uint64), np.zeros((4, gyro_errors.BLOCK))
+    compiled(gyro_errors.drift_and_noise)(
+        read_only(stamps),
+        read_only(exact),
+        *_errors(spec, initial, n, low_passed),
+        gyro_errors.Draws(streams, words, normals),
+        increments,
+        bias,
+    )
+    _add_environment(spec, stamps, specific_force, temperature, increments, bias)
+    if low_passed:
+        white = _axes(spec.angle_random_walk)
+        increments = _low_pass(
+            spec, increments, (stamps[-1] - stamps[0]) / n, white, initial, streams[:, _LOW_PASS:], words, normals
+        )
+    rounded = [np.any(np.asarray(value) > 0.0) for value in (spec.quantization, spec.rate_resolution)]
+    if np.isfinite(spec.range) or any(rounded):
+        step = _axes(spec.quantization_step)
+        carried = step * (generator.random(3) - 0.5)
+        compiled(gyro_errors.digitize)(
+            stamps, np.full(3, spec.range), step, _axes(spec.rate_resolution), carried, increments
+        )
+    return GyroOutput(increments=increments, bias=bias, edges=stamps)
+
+
+def _errors(
+    spec: GyroSpec, initial: Array, samples: int, low_passed: bool
+) -> tuple[gyro_errors.Errors, gyro_errors.Drift]:
+    """Return the errors of a gyro and what its drift starts from, of normals (3, 64); a low-pass adds the white noise itself."""
+    shaping = flicker.shaping(samples)
+    tau = spec.markov_correlation_time
+    q, instability = _axes(spec.markov_noise), _axes(spec.bias_instability)
+    states = shaping.start(initial[:, : flicker.STATES])
     errors = gyro_errors.Errors(
         matrix=np.eye(3) + spec.error_matrix,
         asymmetry=read_only(spec.asymmetry),
         constant=spec.turn_on_bias + _axes(spec.turn_on_bias_sigma) * initial[:, -1],
         ramp=_axes(spec.rate_ramp),
-        white=_axes(0.0) if low_passed else white,
+        white=_axes(0.0 if low_passed else spec.angle_random_walk),
         walk=_axes(spec.rate_random_walk),
         markov=q,
         correlation_time=np.full(3, tau),
@@ -316,49 +341,38 @@ def simulate(
         poles=np.ascontiguousarray(shaping.poles),
         gains=np.ascontiguousarray(shaping.gains),
     )
-    state = gyro_errors.Drift(
+    return errors, gyro_errors.Drift(
         flicker_states=states,
         flicker_before=instability * (states @ shaping.gains),
         walk=np.zeros(3),
         markov=q * np.sqrt(0.5 * tau) * initial[:, -2] if np.isfinite(tau) else np.zeros(3),
     )
-    compiled(gyro_errors.drift_and_noise)(
-        read_only(stamps),
-        read_only(exact),
-        errors,
-        state,
-        gyro_errors.Draws(streams, words, normals),
-        increments,
-        bias,
-    )
+
+
+def _add_environment(
+    spec: GyroSpec,
+    edges: Array,
+    specific_force: ArrayLike | None,
+    temperature: ArrayLike | None,
+    increments: Array,
+    bias: Array,
+) -> None:
+    """Add what specific force and temperature make of increments and bias, in place."""
+    dt = np.diff(edges)[:, None]
     if np.any(spec.g_sensitivity != 0.0):
         if specific_force is None:
             raise InputError("the specification has a g_sensitivity; pass specific_force (n, 3) in m/s²")
-        increments += array("specific_force", specific_force, (n, 3)) @ spec.g_sensitivity.T * np.diff(stamps)[:, None]
+        force = array("specific_force", specific_force, (len(increments), 3))
+        increments += force @ spec.g_sensitivity.T * dt
     if spec.temperature is not None:
         if temperature is None:
             raise InputError(
                 "the gyro has a bias over temperature, and there is no temperature; add the table [temperature] to the scenario "
                 "(temperature (n + 1,), °C, in Python)"
             )
-        drift = spec.temperature.bias(array("temperature", temperature, (n + 1,)))
+        drift = spec.temperature.bias(array("temperature", temperature, (len(edges),)))
         bias += drift
-        increments += 0.5 * (drift[1:] + drift[:-1]) * np.diff(stamps)[:, None]
-    if low_passed:
-        increments = _low_pass(
-            spec, increments, (stamps[-1] - stamps[0]) / n, white, initial, streams[:, _LOW_PASS:], words, normals
-        )
-    if (
-        np.isfinite(spec.range)
-        or np.any(np.asarray(spec.quantization) > 0.0)
-        or np.any(np.asarray(spec.rate_resolution) > 0.0)
-    ):
-        step = _axes(spec.quantization_step)
-        carried = step * (generator.random(3) - 0.5)
-        compiled(gyro_errors.digitize)(
-            stamps, np.full(3, spec.range), step, _axes(spec.rate_resolution), carried, increments
-        )
-    return GyroOutput(increments=increments, bias=bias, edges=stamps)
+        increments += 0.5 * (drift[1:] + drift[:-1]) * dt
 
 
 def _axes(value: Axes) -> Array:

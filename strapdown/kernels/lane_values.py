@@ -49,13 +49,6 @@ def store_quadruples(array, start, stride, q):
         array[row : row + 4] = [q[0][i], q[1][i], q[2][i], q[3][i]]
 
 
-def store_triples(array, start, stride, v):
-    """Write the three components of eight 3-vectors, the i-th to ``array[start + i stride]``."""
-    for i in range(WIDTH):
-        row = start + i * stride
-        array[row : row + 3] = [v[0][i], v[1][i], v[2][i]]
-
-
 def lanes_of(pattern):
     """Return zero in as many lanes as ``pattern``, a tuple of floats, has entries, and of their type."""
     return np.zeros(len(pattern), np.asarray(pattern).dtype)
@@ -69,10 +62,6 @@ def load_like(array, start, like):
 def element(array, place):
     """Return ``array[place]``; a place outside the array is one of the memory before or behind it, where other arrays stand."""
     return np.lib.stride_tricks.as_strided(array, (2,), (int(place) * array.itemsize,))[1]
-
-
-def fetch_ahead(array, place):
-    """Have the line of the cache that holds ``array[place]`` fetched, which may lie outside the array; nothing else."""
 
 
 def store_like(array, start, value):

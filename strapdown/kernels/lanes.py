@@ -21,6 +21,7 @@ from numba.core.typeconv import Conversion
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.extending import intrinsic, lower_builtin, lower_cast, models, register_model
 
+from strapdown.kernels.compiler import DATA
 from strapdown.kernels.lane_values import WIDTH
 
 _ELEMENTS = {
@@ -176,7 +177,7 @@ def _length(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
 
 
 def _pointer(context: Any, builder: Any, array_type: Any, array: Any, index: Any, vector: ir.VectorType) -> Any:
-    data = context.make_array(array_type)(context, builder, array).data
+    data = builder.extract_value(array, DATA)
     return builder.bitcast(builder.gep(data, [index]), vector.as_pointer())
 
 
@@ -302,22 +303,6 @@ def store_quadruples(typingctx: Any, array: Any, start: Any, stride: Any, q: Any
     return types.void(array, types.intp, types.intp, _tuple_of(array.dtype, 4)), lower
 
 
-@intrinsic  # type: ignore[untyped-decorator]
-def store_triples(typingctx: Any, array: Any, start: Any, stride: Any, v: Any) -> Any:
-    """Lower :func:`lane_values.store_triples`: a pair and a single, so that nothing beside them is written."""
-
-    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        data, first, step, packed = arguments
-        x, y, z = cgutils.unpack_tuple(builder, packed)
-        for i, row in enumerate(_rows_of(builder, [x, y, z, z])):
-            for places in ([0, 1], [2]):
-                part = _picked(builder, row, row, places)
-                _write(context, builder, array, data, _row(builder, first, step, i, places[0]), part)
-        return context.get_dummy_value()
-
-    return types.void(array, types.intp, types.intp, _tuple_of(array.dtype, 3)), lower
-
-
 def _converted(builder: Any, value: Any, source: Any, target: Any) -> Any:
     """Return floats (lanes or scalar) in another precision."""
     if source == target:
@@ -415,7 +400,7 @@ def element(typingctx: Any, array: Any, place: Any) -> Any:
     """Lower :func:`lane_values.element`."""
 
     def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        data = context.make_array(array)(context, builder, arguments[0]).data
+        data = builder.extract_value(arguments[0], DATA)
         return builder.load(builder.gep(data, [arguments[1]]))
 
     return array.dtype(array, types.intp), lower
@@ -432,21 +417,6 @@ def store_like(typingctx: Any, array: Any, start: Any, value: Any) -> Any:
         return context.get_dummy_value()
 
     return types.void(array, types.intp, value), lower
-
-
-@intrinsic  # type: ignore[untyped-decorator]
-def fetch_ahead(typingctx: Any, array: Any, place: Any) -> Any:
-    """Lower :func:`lane_values.fetch_ahead`."""
-
-    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        data = context.make_array(array)(context, builder, arguments[0]).data
-        pointer = builder.bitcast(builder.gep(data, [arguments[1]]), ir.IntType(8).as_pointer())
-        flags = [ir.Constant(_INDEX, flag) for flag in (0, 3, 1)]  # to read, to keep, data
-        function = ir.FunctionType(ir.VoidType(), [pointer.type, _INDEX, _INDEX, _INDEX])
-        builder.call(cgutils.get_or_insert_function(builder.module, function, "llvm.prefetch.p0"), [pointer, *flags])
-        return context.get_dummy_value()
-
-    return types.void(array, types.intp), lower
 
 
 @intrinsic  # type: ignore[untyped-decorator]
@@ -610,13 +580,11 @@ INTRINSICS = {
         load_quadruples,
         store,
         store_quadruples,
-        store_triples,
         lanes_of,
         flush_tiny,
         restore_mode,
         load_like,
         element,
-        fetch_ahead,
         store_like,
         narrowed,
         total,

@@ -17,24 +17,19 @@ textbook's own would be rounding times the condition number. The covariance foll
 from __future__ import annotations
 
 from strapdown.kernels.algebra import (
-    add,
     add_matrices,
     add_to_diagonal,
-    combine,
     divided,
     factored,
     full,
-    matrix_times_vector,
     multiply,
     multiply_add,
     scale,
-    subtract,
     times_transpose_upper,
     times_transpose_upper_add,
     transpose,
 )
 from strapdown.kernels.filter_step import process_noise, transition
-from strapdown.kernels.rotation import inverse_right_jacobian, logarithm, moved, quaternion_multiply, turned
 
 
 def minus_product(S, A, B):
@@ -125,34 +120,3 @@ def left_noise(N, q11, q12, q22):
         multiply_add(n_tt, q12, scale_matrix(q22, n_tb)),
         times_transpose_upper_add(n_bt, transpose(q12), scale_upper(q22, n_bb)),
     )
-
-
-def smooth(q, b, A, B, C, delta_theta, dt, angle_variance, rate_variance, next_q, next_b, next_A, next_B, next_C):
-    """Return the smoothed state at the start of a segment: one step as a whole, what :mod:`strapdown.kernels.smoother_loop` does in parts.
-
-    (q, b, A, B, C) is the filtered state there, ``delta_theta`` and ``dt`` the increment from it, and (next_q, …) the *smoothed* state at
-    the end of the segment. Each covariance lives in the tangent space at its own attitude.
-    """
-    phi = combine(1.0, delta_theta, -dt, b)
-    q11, q12, q22 = step_noise(phi, dt, angle_variance, rate_variance)
-    N = kept_share(A, B, C, q11, q12, q22)
-    g_tt, g_tb, g_bt, g_bb = gain(N, phi, dt)
-    d_tt, d_tb, d_bb = left_noise(N, q11, q12, q22)
-    p = turned(q, phi)
-    a = logarithm(quaternion_multiply((p[0], -p[1], -p[2], -p[3]), next_q))
-    d = subtract(next_b, b)
-    J = inverse_right_jacobian(a)
-    theta = add(matrix_times_vector(g_tt, a), matrix_times_vector(g_tb, d))
-    bias = add(matrix_times_vector(g_bt, a), matrix_times_vector(g_bb, d))
-    g_tt = multiply(g_tt, J)
-    g_bt = multiply(g_bt, J)
-    bt = transpose(next_B)
-    y_tt = multiply_add(g_tt, full(next_A), multiply(g_tb, bt))
-    y_tb = multiply_add(g_tt, next_B, multiply(g_tb, full(next_C)))
-    y_bt = multiply_add(g_bt, full(next_A), multiply(g_bb, bt))
-    y_bb = multiply_add(g_bt, next_B, multiply(g_bb, full(next_C)))
-    A = times_transpose_upper_add(y_tt, g_tt, times_transpose_upper_add(y_tb, g_tb, d_tt))
-    B = multiply_add(y_tt, transpose(g_bt), multiply_add(y_tb, transpose(g_bb), d_tb))
-    C = times_transpose_upper_add(y_bt, g_bt, times_transpose_upper_add(y_bb, g_bb, d_bb))
-    q, J = moved(q, theta)
-    return q, add(b, bias), times_transpose_upper(multiply(J, full(A)), J), multiply(J, B), C

@@ -239,14 +239,14 @@ def run(
         )
     chosen = choose(plan, machine)
     with locked(target):
-        stored = _stored(target) if resume and target.exists() else None
-        if stored is None:
+        held = _stored(target) if resume and target.exists() else None
+        if held is None:
             size = machine_named(chosen.machine).CHUNK if chunk is None else count("chunk", chunk)
             state, before = _Progress(None, {}, size), 0.0
         else:
-            held, state = stored
-            size, before = held.chunk, held.seconds
-            _need_same(target, held, plan, chosen.machine, size if chunk is None else count("chunk", chunk), runs)
+            stored, state = held
+            size, before = stored.chunk, stored.seconds
+            _need_same(target, stored, plan, chosen.machine, size if chunk is None else count("chunk", chunk), runs)
         begun = time.perf_counter()
 
         def campaign() -> Campaign:
@@ -261,26 +261,41 @@ def run(
                 seconds=before + time.perf_counter() - begun,
             )
 
-        missing = state.missing(runs)
-        if progress is not None and (done := runs - sum(n for _, n in missing)):
-            progress(done)
-        hands = in_threads(threads) if workers is None else workers
-        due, unwritten = 0.0, True  # the first time in any case, so that a file that cannot be written is found at once
-        _write(target, campaign(), state, table)
-        try:
-            for place, (part,) in hands(Work(plans=(plan,), machine=chosen.machine), missing):
-                state.take(missing[place][0], part)
-                unwritten = True
-                if progress is not None:
-                    progress(missing[place][1])
-                if (now := time.perf_counter()) >= due:
-                    _write(target, campaign(), state, table)
-                    unwritten = False
-                    due = time.perf_counter() + (time.perf_counter() - now) * (1.0 / SHARE - 1.0)
-        finally:
-            if unwritten:
-                _write(target, campaign(), state, table)
+        def write() -> None:
+            _write(target, campaign(), state, table)
+
+        work = Work(plans=(plan,), machine=chosen.machine)
+        _compute(work, state, runs, in_threads(threads) if workers is None else workers, write, progress)
         return campaign()
+
+
+def _compute(
+    work: Work,
+    state: _Progress,
+    runs: int,
+    hands: Workers,
+    write: Callable[[], None],
+    progress: Callable[[int], None] | None,
+) -> None:
+    """Compute the chunks that are missing; write at once, then at intervals, and whatever ends the work."""
+    missing = state.missing(runs)
+    if progress is not None and (done := runs - sum(n for _, n in missing)):
+        progress(done)
+    write()  # so that a file that cannot be written is found before anything is computed
+    due, unwritten = 0.0, False
+    try:
+        for place, (part,) in hands(work, missing):
+            state.take(missing[place][0], part)
+            unwritten = True
+            if progress is not None:
+                progress(missing[place][1])
+            if (now := time.perf_counter()) >= due:
+                write()
+                unwritten = False
+                due = time.perf_counter() + (time.perf_counter() - now) * (1.0 / SHARE - 1.0)
+    finally:
+        if unwritten:
+            write()
 
 
 def _need_same(target: Path, held: Campaign, plan: Plan, machine: str, chunk: int, runs: int) -> None:

@@ -19,6 +19,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from itertools import accumulate
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -539,9 +540,11 @@ class Faults:
         if self.correlated_sigma > 0.0 and len(time):
             drive = self.correlated_sigma * generator.standard_normal(white.shape)
             decay = np.exp(-np.diff(time) / self.correlation_time)
-            correlated[0] = drive[0]
-            for k, (phi, share) in enumerate(zip(decay, np.sqrt(1.0 - decay**2), strict=True)):
-                correlated[k + 1] = phi * correlated[k] + share * drive[k + 1]
+            steps = np.sqrt(1.0 - decay**2)[:, None] * drive[1:]
+            for axis in range(3):  # in Python's own numbers: ten times as fast as in arrays of three
+                pairs = zip(decay.tolist(), steps[:, axis].tolist(), strict=True)
+                start = float(drive[0, axis])
+                correlated[:, axis] = list(accumulate(pairs, lambda now, k: k[0] * now + k[1], initial=start))
         return white, correlated
 
     def heard(self, series: VectorMeasurements, generator: np.random.Generator) -> VectorMeasurements:
