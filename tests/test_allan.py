@@ -632,7 +632,7 @@ def test_intervals_average_over_the_terms_that_may_be_there():
 @pytest.mark.parametrize(("samples", "noise"), [(4096, {"N": 1.0}), (16384, {"N": 1.0, "B": 1.5, "K": 0.15})])
 @pytest.mark.slow
 def test_intervals_cover_where_other_terms_are_absent(samples, noise):
-    """Three axes alike, all terms fitted, 200 records: of the terms that are there 95 ± 2 %, and neither end fails throughout."""
+    """Three axes alike, all terms fitted, 200 records: 95 % of the terms that are there, a little more where the others are absent."""
     fits = [
         allan.fit_noise(np.stack([simulate([seed, k, 16], samples, 1.0, **noise) for k in range(3)], axis=1), 1.0)
         for seed in range(200)
@@ -645,9 +645,9 @@ def test_intervals_cover_where_other_terms_are_absent(samples, noise):
             assert low <= 0.02
             assert high == 0.0
             continue
-        assert 0.93 <= 1.0 - low - high <= 0.97, symbol
-        assert low >= 0.008
-        assert 0.012 <= high <= 0.045
+        assert 0.93 <= 1.0 - low - high <= 0.98, symbol
+        assert 0.005 <= low <= 0.04
+        assert 0.005 <= high <= 0.04
 
 
 def test_fit_is_the_restricted_maximum():
