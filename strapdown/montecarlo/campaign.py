@@ -249,8 +249,8 @@ def run(
             _need_same(target, stored, plan, chosen.machine, size if chunk is None else count("chunk", chunk), runs)
         begun = time.perf_counter()
 
-        def campaign() -> Campaign:
-            return Campaign(
+        def write() -> Campaign:
+            now = Campaign(
                 plan=plan,
                 machine=chosen.machine,
                 reason=chosen.reason,
@@ -260,13 +260,11 @@ def run(
                 arithmetic=arithmetic(),
                 seconds=before + time.perf_counter() - begun,
             )
-
-        def write() -> None:
-            _write(target, campaign(), state, table)
+            _write(target, now, state, table)
+            return now
 
         work = Work(plans=(plan,), machine=chosen.machine)
-        _compute(work, state, runs, in_threads(threads) if workers is None else workers, write, progress)
-        return campaign()
+        return _compute(work, state, runs, in_threads(threads) if workers is None else workers, write, progress)
 
 
 def _compute(
@@ -274,14 +272,14 @@ def _compute(
     state: _Progress,
     runs: int,
     hands: Workers,
-    write: Callable[[], None],
+    write: Callable[[], Campaign],
     progress: Callable[[int], None] | None,
-) -> None:
-    """Compute the chunks that are missing; write at once, then at intervals, and whatever ends the work."""
+) -> Campaign:
+    """Compute the chunks that are missing; write at once, then at intervals, and whatever ends the work; return what was written last."""
     missing = state.missing(runs)
     if progress is not None and (done := runs - sum(n for _, n in missing)):
         progress(done)
-    write()  # so that a file that cannot be written is found before anything is computed
+    written = write()  # so that a file that cannot be written is found before anything is computed
     due, unwritten = 0.0, False
     try:
         for place, (part,) in hands(work, missing):
@@ -290,12 +288,12 @@ def _compute(
             if progress is not None:
                 progress(missing[place][1])
             if (now := time.perf_counter()) >= due:
-                write()
-                unwritten = False
+                written, unwritten = write(), False
                 due = time.perf_counter() + (time.perf_counter() - now) * (1.0 / SHARE - 1.0)
     finally:
         if unwritten:
-            write()
+            written = write()
+    return written
 
 
 def _need_same(target: Path, held: Campaign, plan: Plan, machine: str, chunk: int, runs: int) -> None:
