@@ -74,9 +74,6 @@ CALLED = (
 )
 """Not inlined: their work is far more than a call."""
 
-BORROWS_ARRAYS = True
-"""See :mod:`strapdown.kernels.machine`."""
-
 MISS, GAIN, STEP, AXES = 0, 1, 2, 3
 """Lines of n states: P h less the gain times the noise, P h, the correction, and from the last on three of the three axes."""
 OWN, KEPT = 0, 1
