@@ -249,8 +249,10 @@ def run(
             _need_same(target, stored, plan, chosen.machine, size if chunk is None else count("chunk", chunk), runs)
         begun = time.perf_counter()
 
-        def campaign() -> Campaign:
-            return Campaign(
+        written: list[Campaign] = []
+
+        def write() -> None:
+            now = Campaign(
                 plan=plan,
                 machine=chosen.machine,
                 reason=chosen.reason,
@@ -260,13 +262,12 @@ def run(
                 arithmetic=arithmetic(),
                 seconds=before + time.perf_counter() - begun,
             )
-
-        def write() -> None:
-            _write(target, campaign(), state, table)
+            _write(target, now, state, table)
+            written[:] = [now]
 
         work = Work(plans=(plan,), machine=chosen.machine)
         _compute(work, state, runs, in_threads(threads) if workers is None else workers, write, progress)
-        return campaign()
+        return written[0]
 
 
 def _compute(
