@@ -11,8 +11,8 @@ by itself; compensated, every filter's samples are shifted by ``--latency``.
 - *NIS*: normalised innovation squared per degree of freedom, accelerometer and magnetometer. That of the magnetometer is far below 1: its
   disturbance, which lasts for seconds and at rest for good, is modelled as white at the level of its slow part.
 - *left out*: the error on each recording with the numbers (:data:`CANDIDATES`) that are best on all the others.
-- *modified*: recordings with a clipped gyro, dropouts, uneven stamps, no magnetometer, no rest at the start, and with hard iron that is
-  found or not: error, σ and coverage.
+- *modified*: recordings with a clipped gyro, dropouts, uneven or repeated stamps, no magnetometer, no rest at the start, and with hard
+  iron that is found or not: error, σ and coverage.
 
 Without recordings the unit is simulated: at rest for two seconds, then turned and moved about on smooth paths that are not the filter's own
 model. Run ``python sims/hand_held.py [--latency MS] [--out FOLDER] [RECORDING...]``, recordings being files of the BROAD data set.
@@ -45,6 +45,7 @@ from strapdown.motion import Harmonic, HarmonicRates
 from strapdown.plots import style
 from strapdown.randomness import generator
 from strapdown.recordings import Recording, hard_iron
+from strapdown.recordings.recording import with_gyro
 from strapdown.units import DEGREE
 
 QUIET = replace(ahrs.MOTIONS["any"], rest_bias_sigma=HAND_HELD.rest_bias_sigma)
@@ -233,7 +234,17 @@ def modified(recording: Recording, seed: int = 1) -> dict[str, Recording]:
         "no rest": _rows(recording, np.arange(n)[begin : moving[-1]]),
         "4 % of hard iron": ironed,
         "4 % of hard iron, not looked for": ironed,
+        "repeated stamps": _stamped_again(recording, np.unique(random.integers(1, n, n // 300))),
     }
+
+
+def _stamped_again(recording: Recording, rows: np.ndarray) -> Recording:
+    """Return the recording as a reader makes it of a file in which these rows have the stamps of the rows before."""
+    time = recording.time.copy()
+    time[rows] = recording.time[rows - 1]
+    names = ("specific_force", "magnetic_field", "true_attitude", "movement")
+    columns = {name: getattr(recording, name) for name in names}
+    return with_gyro(source=recording.source, time=time, rate=recording.rate, **columns)
 
 
 def _rows(recording: Recording, rows: np.ndarray) -> Recording:

@@ -7,13 +7,14 @@ A unit quaternion ``q_fb`` takes body vectors to the fixed frame, ``v_f = q_fb �
 from __future__ import annotations
 
 import contextlib
+import functools
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from strapdown.checks import Array, InputError, array, unit_quaternions
+from strapdown.checks import Array, InputError, array, lengths, unit_quaternions
 from strapdown.checks import covariance as checked
 
 if TYPE_CHECKING:
@@ -159,12 +160,12 @@ def normalize(q: ArrayLike) -> Array:
     """
     value = array("q", q, (..., 4))
     value = value / _scale(value)
-    return np.asarray(value / np.linalg.norm(value, axis=-1, keepdims=True))
+    return np.asarray(value / lengths(value)[..., None])
 
 
 def _scale(value: Array) -> Array:
     """Return powers of two (..., 1) near the largest entry, over which squares neither overflow nor vanish and no bit is lost."""
-    largest = np.max(np.abs(value), axis=-1, keepdims=True)
+    largest = functools.reduce(np.maximum, np.moveaxis(np.abs(value), -1, 0))[..., None]
     zero = largest[..., 0] == 0.0
     if np.any(zero):
         place = [int(i) for i in np.argwhere(zero)[0]] if zero.ndim else []
@@ -194,11 +195,13 @@ def rotate(q: ArrayLike, v: ArrayLike) -> Array:
     """
     value = unit_quaternions("q", q)
     vector = array("v", v, (..., 3))
-    w, u = value[..., :1], value[..., 1:]
+    w, x, y, z = np.moveaxis(value, -1, 0)
+    vx, vy, vz = np.moveaxis(vector, -1, 0)
     # v + 2 w (u × v) + 2 u × (u × v): no matrix, no loss for small angles
     with _together(q=value, v=vector):
-        t = 2.0 * np.cross(u, vector)
-        return np.asarray(vector + w * t + np.cross(u, t))
+        tx, ty, tz = 2.0 * (y * vz - z * vy), 2.0 * (z * vx - x * vz), 2.0 * (x * vy - y * vx)
+        turned = (vx + w * tx + (y * tz - z * ty), vy + w * ty + (z * tx - x * tz), vz + w * tz + (x * ty - y * tx))
+        return np.stack(turned, axis=-1)
 
 
 def exp(rotation_vector: ArrayLike) -> Array:
@@ -228,11 +231,11 @@ def exp(rotation_vector: ArrayLike) -> Array:
     longest = float(np.max(np.abs(phi), initial=0.0))
     if longest > LONGEST:
         raise InputError(f"rotation_vector holds {longest:g} rad, more than {LONGEST:g} rad; check the unit")
-    half = 0.5 * np.linalg.norm(phi, axis=-1, keepdims=True)
+    half = 0.5 * lengths(phi)
     # sin x / x needs no series: the quotient is accurate for every x but zero.
     safe = np.where(half > 0.0, half, 1.0)
-    sinc = np.where(half > 0.0, np.sin(safe) / safe, 1.0)
-    return np.concatenate([np.cos(half), 0.5 * sinc * phi], axis=-1)
+    half_sinc = 0.5 * np.where(half > 0.0, np.sin(safe) / safe, 1.0)
+    return np.stack([np.cos(half), *(half_sinc * one for one in np.moveaxis(phi, -1, 0))], axis=-1)
 
 
 def log(q: ArrayLike) -> Array:
@@ -255,15 +258,15 @@ def log(q: ArrayLike) -> Array:
     [0.0, 0.0, 3.141593]
     """
     value = unit_quaternions("q", q)
-    w, u = value[..., :1], value[..., 1:]
+    w, u = value[..., 0], value[..., 1:]
     # Scaled by its largest entry, so that the squares of a 1e-200 rad rotation do not underflow.
-    largest = np.max(np.abs(u), axis=-1, keepdims=True)
+    largest = functools.reduce(np.maximum, np.moveaxis(np.abs(u), -1, 0))
     scale = np.where(largest > 0.0, largest, 1.0)
-    norm = scale * np.linalg.norm(u / scale, axis=-1, keepdims=True)
+    norm = scale * lengths(u / scale[..., None])
     sign = np.where(w < 0.0, -1.0, 1.0)
     safe = np.where(norm > 0.0, norm, 1.0)
     factor = np.where(norm > 0.0, 2.0 * np.arctan2(norm, np.abs(w)) / safe, 2.0)
-    return np.asarray(sign * factor * u)
+    return np.asarray((sign * factor)[..., None] * u)
 
 
 def to_matrix(q: ArrayLike) -> Array:

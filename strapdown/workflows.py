@@ -34,7 +34,7 @@ from strapdown import (
 )
 from strapdown import setup as setups
 from strapdown.allan import gaps as allan_gaps
-from strapdown.checks import Array, InputError, count, instance, one_of
+from strapdown.checks import Array, InputError, count, instance
 from strapdown.consistency import Judgement
 from strapdown.covariance import Analysis, Consider
 from strapdown.estimation.gating import Gate, Robust
@@ -320,8 +320,9 @@ def estimate(
         Refuse measurements beyond this quantile of χ² (0.999), and recover from a lost attitude.
     robust : Robust or {"huber", "student"}, optional
         Weigh measurements by the size of their innovations.
-    motion : {"hand", "any"}, optional
-        Recording: model of the motion; default ``"hand"``, of bounded velocity, with states for the gyro's scale factors.
+    motion : {"auto", "hand", "vehicle", "any"}, optional
+        Recording: model of the motion, with states for the gyro's scale factors. ``"hand"``: of bounded velocity; ``"vehicle"``: of
+        acceleration that lasts for seconds; default ``"auto"``: the likelier of them. ``"any"``: white noise, without such states.
     latency : float, optional
         Recording: delay of the gyro's samples, s; default half a sample interval.
     calibration : UnitCalibration, optional
@@ -355,7 +356,7 @@ def estimate(
         _refuse("a record", setup=setup, initial=initial, states=states or None)
         for words in ahrs.doctor.at_rest(source):
             warnings.warn(f"{source.source}: {words}", stacklevel=2)
-        parameters = _recording_parameters(motion, noise)
+        parameters = _recording_parameters(source, motion, noise)
         if isinstance(noise, GyroSpec) and noise.temperature is not None:
             source, parameters = ahrs.without_temperature(source, parameters, noise.temperature, walks=smooth)
         found = ahrs.estimate(
@@ -419,8 +420,10 @@ def _specification(noise: GyroSpec | NoiseFit) -> GyroSpec:
     return noise
 
 
-def _recording_parameters(motion: str | None, noise: GyroSpec | NoiseFit | ProcessNoise | None) -> ahrs.AhrsParameters:
-    parameters = ahrs.MOTIONS[one_of("motion", motion or "hand", ahrs.MOTIONS)]
+def _recording_parameters(
+    source: Recording, motion: str | None, noise: GyroSpec | NoiseFit | ProcessNoise | None
+) -> ahrs.AhrsParameters:
+    parameters = ahrs.MOTIONS[ahrs.motions.chosen(source, motion or "auto")[0]]
     if noise is None:
         return parameters
     if isinstance(noise, ProcessNoise):
@@ -742,7 +745,8 @@ def tune(
     setup : FilterSetup, optional
         The filter to start from. Default: matched to the first record, or that of recordings.
     free : sequence of str, optional
-        Parameters to tune: ``"gyro.arw"``, ``"gyro.rrw"``, ``"SENSOR.sigma"``, …; default the gyro's two and every sensor's σ.
+        Parameters to tune: ``"gyro.arw"``, ``"gyro.rrw"``, ``"SENSOR.sigma"``, …; default the gyro's two and every sensor's σ. Of
+        recordings, but for ``truth`` or ``rmse``: ``"filter.scale"`` alone.
     priors : mapping of str to Prior, optional
         What is known of a parameter before, by its name.
     starts : int, default 4
@@ -793,6 +797,10 @@ def tune(
             setup = setup or tuning.recording_setup()
             cases.append(tuning.recording_case(one))
     assert setup is not None
+    if any(isinstance(one, Recording) for one in given) and not (objective.get("truth") or objective.get("rmse")):
+        free, objective["spacing"] = tuning.by_innovations(
+            free, objective.get("spacing", 0.0), gate=objective.get("gate"), priors=priors
+        )
     workers = count("threads", threads if threads is not None else os.cpu_count() or 1)
     return tuning.tune(cases, setup, free, priors=priors, starts=starts, seed=seed, threads=workers, **objective).tuning
 

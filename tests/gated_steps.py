@@ -44,7 +44,6 @@ from strapdown.kernels.iterated_update import (
     UNKNOWN,
     UNKNOWN_TILT,
 )
-from strapdown.kernels.rotation import rotation_matrix
 from strapdown.records import Event
 from strapdown.vectors import KINDS
 
@@ -493,11 +492,10 @@ class GatedStepFilter(StepFilter):
 
     def _rows_at(self, measurement: Any, model: Any, attitude: Array, others: Array) -> Rows:
         """Return a measurement's rows at an attitude (4,) and (b, c) (3 + m,), by the kernels' own function."""
-        H, y, basis = np.empty((3, 3 + len(others))), np.empty(3), np.empty((3, 3))
-        q = tuple(attitude.tolist())
+        rows = H, y, basis = np.empty((3, 3 + len(others))), np.empty(3), np.empty((3, 3))
         given = KIND_CODES[measurement.kind], measurement.z, measurement.frame, measurement.length
         effects = 0, model.sensors, model.sensor_use, NO_LEVER
-        d = error_state_step.fill_rows(q, rotation_matrix(q), others, *given, *effects, H, y, basis)
+        d = error_state_step.fill_rows(tuple(attitude.tolist()), others, *given, *effects, rows)
         angle, arc = arc_of(measurement, y, basis)
         return Rows(y[:d].copy(), H[:d].copy(), (basis @ measurement.noise @ basis.T)[:d, :d], angle, arc)
 

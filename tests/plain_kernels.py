@@ -9,6 +9,7 @@ from typing import Any
 
 import numba
 
+from strapdown.kernels.compiler import KernelCompiler
 from strapdown.kernels.machine import helper
 
 KERNELS = "strapdown.kernels"
@@ -18,7 +19,8 @@ KERNELS = "strapdown.kernels"
 def called(function: FunctionType, parts: tuple[ModuleType, ...] = ()) -> Callable[..., Any]:
     """Return a compiled function that calls a kernel's helper: helpers themselves have no wrapper for calls from Python."""
     made = helper(function, parts)
-    return numba.njit(lambda *arguments: made(*arguments))  # noqa: PLW0108 (the lambda is what gets the wrapper)
+    wrapped = numba.njit(pipeline_class=KernelCompiler, _nrt=False)
+    return wrapped(lambda *arguments: made(*arguments))  # noqa: PLW0108 (the lambda is what gets the wrapper)
 
 
 def plain(function: FunctionType, *parts: ModuleType) -> FunctionType:

@@ -11,9 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from sims import hand_held
 from strapdown import ahrs, quaternion, setup
-from strapdown.ahrs import AhrsParameters, estimating
+from strapdown.ahrs import AhrsParameters, estimating, motions
 from strapdown.checks import InputError
 from strapdown.consistency import reference_errors
+from strapdown.estimation.error_states import BoundedVelocity
 from strapdown.recordings import Recording, hard_iron, read, sensor_delays
 from strapdown.records import (
     Estimate,
@@ -333,9 +334,9 @@ def test_bad_parameters_are_refused(name, value):
 # ---------------------------------------------------------------------------------------------------- the bias at the start
 
 
-def quiet_second(rate, noise=1e-3, turn=(0.0, 0.0, 0.0), field=True) -> Recording:
-    """A second of constant rate ``turn`` of the body, °/s, that the gyro measures as ``rate``, °/s, and two of its noise."""
-    time = np.arange(round(3.0 * RATE)) / RATE
+def quiet_second(rate, noise=1e-3, turn=(0.0, 0.0, 0.0), field=True, length=3.0) -> Recording:
+    """Three seconds, or ``length``, of constant rate ``turn`` of the body, °/s, that the gyro measures as ``rate``, °/s."""
+    time = np.arange(round(length * RATE)) / RATE
     attitude = START * Rotation.from_rotvec(np.outer(time, np.array(turn) * DEGREE))
     random = np.random.default_rng(5)
     seen = {
@@ -383,6 +384,75 @@ def test_without_it_the_bias_starts_at_zero():
     state = ahrs.start(quiet_second((0.3, 0.2, 0.1)), slice(0, round(RATE)), AhrsParameters())
     np.testing.assert_array_equal(state.bias, np.zeros(3))
     assert np.sqrt(state.covariance[5, 5]) == pytest.approx(0.5 * DEGREE)
+
+
+# ---------------------------------------------------------------------------------------------------- what moves it
+
+
+def driven(duration: float = 60.0) -> Recording:
+    """A car that sets off after two seconds and turns left and right at 8 m/s, on a road that shakes it."""
+    time = np.arange(round(duration * RATE)) / RATE
+    t = np.maximum(time - 2.0, 0.0)
+    yaw, speed = 1.2 * (1.0 - np.cos(0.25 * t)), 8.0 * t**2 / (9.0 + t**2)
+    velocity = speed[:, None] * np.stack([np.cos(yaw), np.sin(yaw), 0.0 * yaw], axis=1)
+    random = np.random.default_rng(9)
+    attitude = Rotation.from_rotvec(yaw[:, None] * [0.0, 0.0, 1.0])
+    shaken = np.where(time > 2.0, 0.5, 0.02)[:, None] * random.standard_normal((len(time), 3))
+    return Recording(
+        source="driven",
+        time=time,
+        rate=0.3 * np.sin(0.25 * t)[:, None] * [0.0, 0.0, 1.0] + 2e-3 * random.standard_normal((len(time), 3)),
+        specific_force=attitude.inv().apply(np.gradient(velocity, time, axis=0) + np.array([0.0, 0.0, 9.81])) + shaken,
+        magnetic_field=attitude.inv().apply([0.0, 20.0, -43.0]) + 0.3 * random.standard_normal((len(time), 3)),
+        true_attitude=np.roll(attitude.as_quat(), 1, axis=-1),
+    )
+
+
+def test_acceleration_that_lasts_is_a_vehicles_and_does_not_pass_for_tilt():
+    """A filter that bounds the velocity takes the curves for tilt; that of a vehicle does not, and is chosen."""
+    car = driven()
+    name, odds = motions.chosen(car)
+    assert (name, odds > 500.0) == ("vehicle", True)
+    own, hand = (worst(ahrs.estimate(car, ahrs.MOTIONS[one]), after=10.0)["inclination"] for one in ("vehicle", "hand"))
+    assert own < 3.5 < 3.0 * own < hand
+
+
+@pytest.mark.parametrize("run", range(3))
+def test_a_hand_is_a_hand_however_it_was_recorded(run):
+    """Clipped, with dropouts, without a magnetometer or rest, with a bias that nothing shows, and at rest alone."""
+    plain = hand_held.simulated(5, run, 60.0)
+    limit = 0.5 * np.abs(plain.rate).max()
+    faulty = {
+        "too short": hand_held._rows(plain, np.arange(len(plain.time)) < 2.0 * hand_held.RATE),
+        "clipped at half": dataclasses.replace(plain, rate=np.clip(plain.rate, -limit, limit)),
+        "bias without rest": recording(60.0, bias=(1.5 * DEGREE, 0.0, 0.0), noise=1.0).since(1000),
+        "at rest": quiet_second((0.0, 0.0, 0.0), length=60.0),
+    }
+    for words, one in {"plain": plain, **faulty, **hand_held.modified(plain)}.items():
+        assert motions.chosen(one)[0] == "hand", words
+    assert motions.chosen(plain)[1] > 30.0
+    assert motions.chosen(plain, "any") == ("any", np.inf)
+
+
+@pytest.mark.parametrize("name", ["hand", "vehicle"])
+def test_the_change_of_mean_acceleration_is_that_of_the_bounded_velocity(name):
+    """``(v(2T) − 2 v(T) + v(0))/T`` by the transition of the process over T and its stationary covariance."""
+    own = dataclasses.replace(ahrs.MOTIONS[name], velocity_sigma=1.7)
+    block = BoundedVelocity(
+        sensor="accelerometer",
+        velocity_sigma=1.7,
+        velocity_time=own.velocity_time,
+        acceleration_time=own.acceleration_time,
+    )
+    first = block.units.index("m/s")
+    P, T = block.covariance, motions.SPAN
+    at = [(block.transition(t) @ P)[first, first] for t in (0.0, T, 2.0 * T)]
+    assert motions._change(own) == pytest.approx((6.0 * at[0] - 8.0 * at[1] + 2.0 * at[2]) / T**2, rel=1e-9)
+
+
+def test_all_trials_of_broad_are_of_a_hand(broad):
+    assert min(motions.chosen(read(file))[1] for file in broad.glob("*.hdf5")) > 100.0
+    assert {motions.chosen(read(file))[0] for file in broad.glob("*.hdf5")} == {"hand"}
 
 
 # ---------------------------------------------------------------------------------------------------- latency

@@ -413,7 +413,6 @@ def rows_at(face, sensor, kind, reference, z):
     frame = (*z, 0.0, 0.0, 0.0, 0.0, 0.0) if attitude else tuple(triad(reference).ravel())
     count = error_state_step.fill_rows(
         tuple(face.attitude),
-        tuple(quaternion.to_matrix(face.attitude).ravel()),
         np.array([*face.bias, *face.values]),
         KIND_CODES[kind],
         (0.0, 0.0, 0.0) if attitude else tuple(z / length),
@@ -423,9 +422,7 @@ def rows_at(face, sensor, kind, reference, z):
         model.sensors,
         model.sensor_use,
         (0.0,) * 9,
-        H,
-        y,
-        basis,
+        (H, y, basis),
     )
     return H[:count], y[:count]
 

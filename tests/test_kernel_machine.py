@@ -313,10 +313,45 @@ def test_formulas_are_traced_and_what_decides_or_repeats_is_compiled():
     for a in (2.25, -0.5):
         assert plain_kernels.called(module.everything)(a, 3, here) == module.everything(a, 3, there)
         np.testing.assert_array_equal(here, there)
-    for name in ("product", "formula"):
+    for name in ("product", "formula", "part"):
         assert not machine.helper(getattr(module, name), ()).formula.plain.signatures
-    for name in ("branch", "loop", "part", "power"):
+    for name in ("branch", "loop", "power"):
         assert len(machine.helper(getattr(module, name), ()).formula.plain.signatures) == 1
+
+
+ARRAYS = """
+def longer(row):
+    return len(row), row.shape[0]
+
+def inner(a, i, j):
+    later, column = a[1, i:], a[:, i]
+    return a[1, i, j] + 10.0 * a[i, j, 0] + len(later) + 100.0 * later[1, j] + 1000.0 * column[1, j]
+
+def elements(a, flags, words, rows, thin):
+    words[0] = 7
+    flags[words[1]] = True
+    a[words[1], 0, 2] += inner(a, 1, 2)
+    a[0, 1] = 0.5
+    return longer(a[1, 2]), longer(thin), thin[1], a.shape, rows[1, 0], flags[0], flags[1], words[0], len(a)
+
+def behind(row):
+    return row[-1]
+"""
+
+
+def test_elements_rows_and_shapes_of_arrays_are_what_they_are_in_plain_python():
+    module = module_of("arrays", ARRAYS)
+    results = []
+    for function in (module.elements, plain_kernels.called(module.elements)):
+        a = np.arange(24.0).reshape(2, 3, 4)
+        flags, words = np.zeros(2, bool), np.array([0, 1], np.int32)
+        rows = machine.read_only(np.arange(6, dtype=np.float32).reshape(3, 2))
+        results.append(
+            (function(a, flags, words, rows, np.arange(12.0)[::3]), a.tolist(), flags.tolist(), words.tolist())
+        )
+    assert results[0] == results[1]
+    with pytest.raises(Exception, match="counts from the front"):
+        plain_kernels.called(module.behind)(np.zeros(3))
 
 
 # ---------------------------------------------------------------------------------------------------- what it runs on

@@ -511,7 +511,7 @@ def test_interrupted_it_keeps_what_is_finished_and_says_so(command, heeded, monk
     assert status == 130
     assert "go on with --resume" in said
     assert signal.getsignal(signal.SIGTERM) == before
-    assert campaign.read("short-montecarlo.h5").statistics.runs == 20
+    assert campaign.read("short-montecarlo.h5").statistics.runs == 2 * scalar.CHUNK
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
@@ -539,7 +539,7 @@ def test_a_signal_whose_exception_python_drops_is_heeded_after_the_chunk(command
     status, said, _ = command("short.toml", "--runs", 60, "--threads", 1, *SCALAR)
     assert status == 130
     assert "go on with --resume" in said
-    assert campaign.read("short-montecarlo.h5").statistics.runs == 10
+    assert campaign.read("short-montecarlo.h5").statistics.runs == scalar.CHUNK
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])

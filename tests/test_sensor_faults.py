@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from strapdown import ahrs, quaternion
 from strapdown.recordings import Recording, sensor_faults
+from strapdown.recordings.recording import sampled
 from strapdown.units import DEGREE
 
 RATE = 200.0
@@ -54,6 +55,15 @@ def test_samples_at_the_limit_are_recognised():
     clipped = np.clip(plain, -5.0, 5.0)
     np.testing.assert_array_equal(sensor_faults.clipped_samples(clipped, 1.0), np.abs(plain) >= 5.0)
     assert not sensor_faults.clipped_samples(plain, 1.0).any()
+    one_side = np.minimum(plain, 5.0)
+    np.testing.assert_array_equal(sensor_faults.clipped_samples(one_side, 1.0), plain >= 5.0)
+
+
+def test_rows_of_nan_or_of_zeros_are_no_samples():
+    rows = np.array(
+        [[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [2.0, 0.0, 0.0], [0.0, 0.0, 0.0], [1.0, np.nan, 1.0], [1.0, -1.0, 0.0]]
+    )
+    np.testing.assert_array_equal(sampled(rows), [True, True, True, False, False, True])
 
 
 def test_quantised_rest_and_held_samples_are_not_clipped():

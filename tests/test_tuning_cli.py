@@ -8,6 +8,8 @@ import json
 import numpy as np
 import pytest
 
+import strapdown as sd
+from sims import hand_held
 from strapdown import gyro, motion, scenarios, setup, tuning, vectors
 from strapdown.checks import InputError
 from strapdown.estimation.gating import Gate
@@ -206,3 +208,21 @@ def test_columns_and_topic_are_read_as_estimate_reads_them(run, tmp_path, option
     assert {"--columns": "no column 's(dps)'", "--topic": "topic"}[option] in complaint
     _, _, complaint = run("tune", path, option, good)
     assert {"--columns": "no accelerometer", "--topic": "topic"}[option] in complaint
+
+
+@pytest.mark.parametrize("options", [("--free", "gyro.arw"), ("--gate",), ("--prior", "bmi088")])
+def test_of_a_recording_without_its_errors_only_the_scale_is_tuned(run, tmp_path, options):
+    """Its disturbances last: the likelier filter is as a rule worse."""
+    path = tmp_path / "walk.csv"
+    one = hand_held.simulated(3, 0, 8.0)
+    columns = np.column_stack([one.time, one.rate, one.specific_force, one.magnetic_field])
+    header = "time,gx [rad/s],gy,gz,ax [m/s2],ay,az,mx,my,mz"
+    np.savetxt(path, columns, delimiter=",", header=header, comments="")
+    status, _, complaint = run("tune", path, "--out", tmp_path / "filter.toml", *options)
+    assert status == 2
+    assert "more than the innovations of a recording show" in complaint
+    assert not (tmp_path / "filter.toml").exists()
+    with pytest.raises(InputError, match="more than the innovations"):
+        sd.tune(one, free=["gyro.arw"], threads=1)
+    found = sd.tune(one, starts=1, threads=1)
+    assert [parameter.name for parameter in found.parameters] == ["filter.scale"]

@@ -27,7 +27,7 @@ import numpy as np
 
 from strapdown import coning, quaternion
 from strapdown.ahrs.starting import quiet_span
-from strapdown.checks import Array, InputError
+from strapdown.checks import Array, InputError, lengths
 from strapdown.recordings.recording import Recording, increments
 from strapdown.units import DEGREE, STANDARD_GRAVITY
 
@@ -335,7 +335,7 @@ def _dip(recording: Recording, quiet: slice, up: Array) -> float | None:
 def _force_unit(recording: Recording) -> tuple[tuple[str, ...], list[str]]:
     if recording.specific_force is None:
         return (), []
-    strength = float(np.nanmedian(np.linalg.norm(recording.specific_force, axis=1)))
+    strength = float(np.nanmedian(lengths(recording.specific_force)))
     if not strength > 0.0:
         return (), ["the accelerometer reads zero throughout"]
     distances = {words: abs(math.log(strength * factor / STANDARD_GRAVITY)) for words, factor in FORCE_UNITS.items()}
@@ -346,7 +346,7 @@ def _force_unit(recording: Recording) -> tuple[tuple[str, ...], list[str]]:
 
 
 def _too_fast(recording: Recording) -> list[str]:
-    speed = np.linalg.norm(recording.rate, axis=1)
+    speed = lengths(recording.rate)
     k = int(np.argmax(speed))
     if speed[k] <= FASTEST:
         return []
@@ -400,12 +400,10 @@ def _means(recording: Recording, attitude: Array, vectors: Array, strength: floa
     step = max(1, round(MIN_INTERVAL / float(np.median(np.diff(recording.time)))))
     rows = slice(None, None, step)
     time, v, q = recording.time[rows], vectors[rows] / strength, attitude[rows]
-    seen = np.isfinite(v).all(axis=1) & np.isfinite(q).all(axis=1)
+    seen = np.isfinite(lengths(v)) & np.isfinite(lengths(q))
     window = np.floor((time - time[0]) / SPAN).astype(int)
     number = int(window[-1]) + 1
-    turning = np.bincount(window, np.linalg.norm(recording.rate[rows], axis=1), number) / np.bincount(
-        window, minlength=number
-    ).clip(1)
+    turning = np.bincount(window, lengths(recording.rate[rows]), number) / np.bincount(window, minlength=number).clip(1)
     counts = np.bincount(window[seen], minlength=number)
     full = np.flatnonzero(counts >= 0.5 * max(1.0, SPAN / float(np.median(np.diff(time)))))
     chosen = np.sort(full[np.argsort(-turning[full])][:WINDOWS])
@@ -419,7 +417,7 @@ def _means(recording: Recording, attitude: Array, vectors: Array, strength: floa
 
 
 def _strength(vectors: Array) -> float:
-    return float(np.nanmedian(np.linalg.norm(vectors, axis=1)))
+    return float(np.nanmedian(lengths(vectors)))
 
 
 # ------------------------------------------------------------------------------------------------------------------ with a reference
@@ -431,7 +429,7 @@ REFERENCE_SPAN = 0.1
 def _with_reference(recording: Recording) -> Iterator[Candidate]:
     assert recording.true_attitude is not None
     known = np.isfinite(recording.true_attitude).all(axis=1)
-    known &= np.linalg.norm(np.nan_to_num(recording.true_attitude), axis=1) > 0.0
+    known &= lengths(np.nan_to_num(recording.true_attitude)) > 0.0
     first, last, turn = _turns(recording, known)
     if len(first) < 10:
         return
@@ -471,14 +469,15 @@ def _turns(recording: Recording, known: np.ndarray) -> tuple[np.ndarray, np.ndar
     first = np.arange(0, len(recording.time) - step, max(1, step // 2))
     first = first[known[first] & known[first + step]]
     turn = total[first + step] - total[first]
-    chosen = np.sort(np.argsort(-np.linalg.norm(turn, axis=1))[:2000])
+    chosen = np.sort(np.argsort(-lengths(turn))[:2000])
     return first[chosen], first[chosen] + step, turn[chosen]
 
 
 def _sensor_means(recording: Recording, attitude: Array, vectors: Array | None) -> _Means | None:
-    if vectors is None or not _strength(vectors) > 0.0:
+    strength = 0.0 if vectors is None else _strength(vectors)
+    if vectors is None or not strength > 0.0:
         return None
-    means = _means(recording, attitude, vectors, _strength(vectors))
+    means = _means(recording, attitude, vectors, strength)
     return means if len(means.product) else None
 
 

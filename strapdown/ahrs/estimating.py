@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,11 +15,13 @@ from strapdown.ahrs.preparing import Prepared, prepare
 from strapdown.ahrs.starting import quiet_span
 from strapdown.checks import Array, InputError
 from strapdown.estimation.gating import Gate, Robust
+from strapdown.estimation.memory import side_by_side
 from strapdown.estimation.temperature import joined
 from strapdown.kernels import recording_steps
 from strapdown.kernels.machine import compiled, read_only
 from strapdown.recordings import Recording, sensor_delays, sensor_faults, unit_calibration
 from strapdown.recordings.hard_iron import low_pass
+from strapdown.recordings.recording import sampled
 from strapdown.recordings.sensor_delays import Delays
 from strapdown.recordings.sensor_faults import Faults
 from strapdown.recordings.unit_calibration import UnitCalibration
@@ -127,12 +130,13 @@ def estimate(
         if parameters.gyro_scale_sigma > 0.0:
             parameters = replace(parameters, gyro_scale_sigma=calibration.sigma)
     quiet = slice(0, span.stop - span.start)
-    delays = sensor_delays.find(used, latency, field_delay, causal=not smooth)
-    prepared = prepare(used, quiet, parameters, delays.field, causal=not smooth)
+    turned = sensor_delays.gyro_attitude(used)
+    delays = sensor_delays.find(used, latency, field_delay, causal=not smooth, turned=turned)
+    prepared = prepare(used, quiet, parameters, delays.field, causal=not smooth, turned=turned)
     parameters = parameters.matched(prepared.acceleration)
     filtered = _run(prepared, parameters, faults.turn_variance, gate, robust, smooth)
     found = _at_stamps(filtered, used, prepared, parameters, delays, faults.turn_variance, smooth, full_covariance)
-    scale = found.error_states.get("gyro scale")
+    scale = filtered.error_states.get("gyro scale")
     return AhrsEstimate(
         recording=used,
         estimate=found,
@@ -202,11 +206,14 @@ def _at_stamps(
 ) -> Estimate:
     """Return the estimate at the recording's stamps: carried on by the gyro from the step before each, and over the delay of the gyro."""
     edge, turned = prepared.edge, prepared.turned
-    row = np.searchsorted(edge, np.arange(len(used.time)), side="right") - 1
-    bias = filtered.bias.take(row, axis=0)
+    row = np.repeat(np.arange(len(edge)), np.diff(edge, append=len(used.time)))
+    n = len(row)
+    attitude, bias, variance = side_by_side(*(((n, width), float) for width in (4, 3, 6)))
+    (own,) = side_by_side(((n, 3, 3), float))
+    filtered.bias.take(row, axis=0, out=bias, mode="clip")  # any other mode copies to a buffer first
     late = np.broadcast_to(delays.gyro, used.time.shape)
     ahead = -sensor_delays.turn_over(used, -late) if smooth else used.rate * late[:, None]
-    ahead = ahead - bias * (used.time - used.time[edge][row] + late)[:, None]
+    ahead -= bias * (used.time - filtered.time.take(row) + late)[:, None]
     step = quaternion.multiply(filtered.attitude, quaternion.conjugate(turned[edge]))
     assert filtered.covariance is not None
     R = quaternion.to_matrix(filtered.attitude)
@@ -216,11 +223,10 @@ def _at_stamps(
     scale[:, :2] = np.sqrt(OWN_SHARE + ACCELERATION_SHARE * np.sqrt(level))[:, None]
     fixed *= scale[:, :, None] * scale[:, None, :]
     iron = 0.0 if prepared.dip is None else (parameters.iron_sigma / np.cos(prepared.dip)) ** 2
-    attitude, own = np.empty((len(row), 4)), np.empty((len(row), 3, 3))
     compiled(recording_steps.carry_to_stamps)(
         row, step, fixed, turned, ahead, read_only(used.rate), delays.sigma**2, iron, attitude, own
     )
-    variance = filtered.variance.take(row, axis=0)
+    filtered.variance.take(row, axis=0, out=variance, mode="clip")
     variance[:, :3] = np.einsum("kii->ki", own)
     P = None
     if full_covariance:
@@ -240,21 +246,32 @@ def _at_stamps(
         covariance=P,
         innovations=_innovations(filtered, level),
         skipped={
-            name: int(np.sum(~(np.isfinite(samples).all(axis=1) & samples.any(axis=1))))
+            name: len(samples) - int(np.count_nonzero(sampled(samples)))
             for name, samples in sensors.items()
             if samples is not None
         },
         events=filtered.events,
-        error_states={
-            name: ErrorStateEstimate(
-                components=block.components,
-                units=block.units,
-                values=block.values.take(row, axis=0),
-                variance=block.variance.take(row, axis=0),
-            )
-            for name, block in filtered.error_states.items()
-        },
+        error_states=_OfRows(filtered.error_states, row),
     )
+
+
+class _OfRows(Mapping[str, ErrorStateEstimate]):
+    """Error states at some of the rows ``row`` (n,), each gathered when it is asked for."""
+
+    def __init__(self, states: Mapping[str, ErrorStateEstimate], row: np.ndarray) -> None:
+        self.states, self.row = states, row
+
+    def __getitem__(self, name: str) -> ErrorStateEstimate:
+        block = self.states[name]
+        return replace(
+            block, values=block.values.take(self.row, axis=0), variance=block.variance.take(self.row, axis=0)
+        )
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.states)
+
+    def __len__(self) -> int:
+        return len(self.states)
 
 
 def _level(filtered: Estimate, uncertain: np.ndarray) -> Array:

@@ -154,5 +154,9 @@ HAND_HELD = AhrsParameters(
 )
 """A unit in the hand: its velocity is bounded, by as much as the recording shows, and of its gyro, whose turns are large, scale factors
 and misalignments are states."""
-MOTIONS = {"hand": HAND_HELD, "any": AhrsParameters()}
+VEHICLE = replace(
+    HAND_HELD, specific_force_noise=0.15, field_disturbance=0.1, velocity_time=10.0, acceleration_time=2.0
+)
+"""A unit in a car, a boat or an aircraft: its acceleration lasts for seconds and would pass for tilt, and iron is near."""
+MOTIONS = {"hand": HAND_HELD, "vehicle": VEHICLE, "any": AhrsParameters()}
 """The model by what moves the unit."""

@@ -7,14 +7,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from strapdown import coning, estimation, quaternion
+from strapdown import estimation, quaternion
 from strapdown.ahrs import headings, starting
 from strapdown.ahrs.parameters import AhrsParameters
 from strapdown.checks import Array
 from strapdown.gyro.temperature import BiasOverTemperature
 from strapdown.kernels import recording_steps
 from strapdown.kernels.machine import compiled, read_only
-from strapdown.recordings import Recording, gyro_temperature, increments, sensor_delays
+from strapdown.recordings import Recording, gyro_temperature, sensor_delays
 from strapdown.records import ImuRecord
 from strapdown.vectors import VectorMeasurements
 
@@ -48,6 +48,7 @@ def prepare(
     field_delay: Array | float = 0.0,
     *,
     causal: bool = True,
+    turned: Array | None = None,
 ) -> Prepared:
     """Return the record that the filter runs on, and its start.
 
@@ -62,15 +63,18 @@ def prepare(
         Delay of the magnetometer's samples beside the gyro's, s: each is turned forward by the gyro.
     causal : bool
         Find hard iron from the samples up to each step alone; otherwise from all of them, for the start too.
+    turned : ndarray (n, 4), optional
+        Attitude by the gyro alone at the samples, if it is at hand.
     """
     initial = starting.start(recording, quiet, parameters)  # first, for it refuses a sensor without samples
-    turned = coning.integrate(increments(recording), coning.ALGORITHMS["one-sample"])
-    edge = _edges(recording.time, parameters.step)
+    if turned is None:
+        turned = sensor_delays.gyro_attitude(recording)
+    edge = edges(recording.time, parameters.step)
     time = recording.time[edge]
     at_edge = turned[edge]
     interval = float(np.median(np.diff(recording.time)))
     assert recording.specific_force is not None
-    force, number = _averages(recording.specific_force, turned, edge)
+    force, number = averages(recording.specific_force, turned, edge)
     shown = number > 0
     gravity = starting.norm(starting.mean_at_first(recording, recording.specific_force, quiet, "accelerometer")[0])
     vectors = [
@@ -87,7 +91,7 @@ def prepare(
     if recording.magnetic_field is not None:
         back = quaternion.exp(-sensor_delays.turn_over(recording, field_delay)) if np.any(field_delay) else None
         frame = turned if back is None else quaternion.multiply(turned, back)
-        field, number = _averages(recording.magnetic_field, frame, edge)
+        field, number = averages(recording.magnetic_field, frame, edge)
         samples = headings.FieldSteps(
             field=field,
             frame=frame[(edge[:-1] + edge[1:] + 1) // 2],
@@ -106,7 +110,7 @@ def prepare(
     known = recording.temperature is not None and bool(np.isfinite(recording.temperature).all())
     temperature = recording.temperature[edge] if known and recording.temperature is not None else None
     record = ImuRecord(time=time, increments=turn, vectors=tuple(vectors), temperature=temperature)
-    return Prepared(record, initial, edge, turned, dip, iron, _liveliest(force, shown, parameters.step))
+    return Prepared(record, initial, edge, turned, dip, iron, liveliest(force, shown, parameters.step))
 
 
 def without_temperature(
@@ -123,20 +127,21 @@ def without_temperature(
     return used, replace(parameters, rate_random_walk=float(np.hypot(parameters.rate_random_walk, walk)))
 
 
-def _edges(time: Array, step: float) -> np.ndarray:
+def edges(time: Array, step: float) -> np.ndarray:
     """Return the samples at which steps end (k + 1,): the first, the last before each multiple of ``step``, s, and the last of all."""
     bins = np.floor((time - time[0]) / step + 1e-6)
-    return np.unique(np.concatenate([[0], np.flatnonzero(np.diff(bins)), [len(time) - 1]]))
+    inner = np.flatnonzero(bins[1:] != bins[:-1])
+    return np.concatenate([[0], inner[inner > 0], [len(time) - 1]])
 
 
-def _averages(samples: Array, frame: Array, edge: Array) -> tuple[Array, Array]:
+def averages(samples: Array, frame: Array, edge: Array) -> tuple[Array, Array]:
     """Return the mean of each step's samples in the axes that ``frame`` (n, 4) turns them to (k, 3), and their number; 0 where none."""
     total, number = np.empty((len(edge) - 1, 3)), np.empty(len(edge) - 1)
     compiled(recording_steps.average_samples)(read_only(samples), read_only(frame), edge, total, number)
     return total / np.maximum(number, 1.0)[:, None], number
 
 
-def _liveliest(force: Array, shown: np.ndarray, step: float) -> float:
+def liveliest(force: Array, shown: np.ndarray, step: float) -> float:
     """Return the largest RMS deviation, each component, of the specific force (k, 3) from its mean over spans of :data:`LIVELY_SPAN`.
 
     In the frame that the gyro keeps gravity is constant, so what varies is acceleration, or at the level of the sensor's noise nothing.

@@ -6,7 +6,7 @@ import numpy as np
 
 from strapdown import coning, estimation, quaternion
 from strapdown.ahrs.parameters import AhrsParameters
-from strapdown.checks import Array, InputError
+from strapdown.checks import Array, InputError, lengths
 from strapdown.recordings import Recording
 from strapdown.vectors import wahba
 
@@ -34,9 +34,11 @@ def quiet_span(recording: Recording) -> slice:
             "interval; if its stamps are in ms or us, say so (--time-unit, or units={'time': 'ms'})"
         )
     blocks = len(recording.time) // length
-    rate = recording.rate[: blocks * length].reshape(blocks, length, 3)
+    axes = recording.rate[: blocks * length].T.reshape(3, blocks, length)
+    mean = axes.mean(axis=2)
+    varying = axes - mean[:, :, None]
     # The mean counts beside the spread, so that a steady turn is not taken for rest; half of it may be bias.
-    restless = np.linalg.norm(rate.std(axis=1), axis=1) + 0.5 * np.linalg.norm(rate.mean(axis=1), axis=1)
+    restless = np.sqrt(np.einsum("abk,abk->b", varying, varying) / length) + 0.5 * lengths(mean.T)
     first = int(np.argmax(restless <= 2.0 * restless.min()))
     return slice(first * length, (first + 1) * length)
 

@@ -259,7 +259,7 @@ def fit_noise(
             raise InputError(
                 f"values, axis {axis}, holds no noise (it is constant or a straight line); pass a recorded sensor"
             )
-        fit = fit_axis(whole, random_terms, "rate_ramp" in chosen, level)
+        fit = fit_axis(whole, "rate_ramp" in chosen)
         fits.append(fit)
         found = []
         for part, bins, place in zip(parts, each, places, strict=True):

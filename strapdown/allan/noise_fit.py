@@ -1,4 +1,4 @@
-"""Noise coefficients of a record at rest, by maximum likelihood on its cosine transform, with profile-likelihood intervals.
+"""Noise coefficients of a record at rest, by maximum likelihood on its cosine transform, with model-averaged profile-likelihood intervals.
 
 Quantisation Q, angle random walk N, bias instability B, rate random walk K and rate ramp R, as in :mod:`strapdown.allan.deviation`.
 
@@ -14,9 +14,10 @@ follows the motion, no coefficient describes it, and ``NoiseFit.misfit_probabili
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -52,8 +53,17 @@ UNITS = {
 """Unit at the rim and its factor to SI, for each term."""
 
 
+TERM_COST = 1.5
+"""Log-likelihood by which a coefficient must raise that of a combination of terms to raise its weight (Akaike's: 1).
+
+Measured in 30 s of white noise and random walk alike on three axes: at a cost of 1 the interval of the largest axis covers 97.9 % (too
+wide), at 1.5 96.6 %. Beside flicker that the record hardly shows, one axis's interval of the random walk covers 94 % at 1, 88 % at 1.5 and
+86 % at 2.
+"""
+
+
 SUPPORT_PROBABILITY = 1e-3
-"""A term is supported if its likelihood ratio would occur by chance, in a record without it, with less than this probability."""
+"""A term is supported if a record without it would show as much of it by chance with less than this probability."""
 
 
 MISFIT_PROBABILITY = 1e-3
@@ -72,7 +82,7 @@ class NoiseFit(Listed):
     terms : tuple of str
         Terms fitted, a subset of :data:`TERMS`; they index the last axis below.
     estimate : ndarray (axes, terms)
-        Coefficients; NaN where the record does not support the term.
+        Coefficients, averaged over the combinations of terms; NaN where the record does not support the term.
     lower, upper : ndarray (axes, terms)
         Two-sided interval of confidence ``level``. Where the term is not supported ``lower`` is 0 and ``upper`` the upper end of
         that interval (for the ramp: a bound on its size), so that the pair covers the truth at least as often as ``level`` whether
@@ -80,7 +90,7 @@ class NoiseFit(Listed):
     supported : ndarray of bool (axes, terms)
         Whether the record supports the term.
     covariance : ndarray (axes, terms, terms)
-        Covariance of the estimates, from the Fisher information; NaN for unsupported terms.
+        Covariance of the estimates, from the Fisher information of all terms at their most likely values; NaN for unsupported terms.
     misfit_probability : ndarray (axes,)
         Probability that a record of the fitted noises departs as far from them, by the most significant of three tests: its
         spectrum, its largest sample and its noise by segments, the last two after whitening. Near zero the record contains
@@ -171,9 +181,19 @@ def fit_noise(
     The squared DCT-II coefficients of the record, j = 1 … n − 1 at frequency j/(2 n dt), are modelled as independent χ² of one
     degree of freedom around ``Σ θ_i V_i(j)``, θ = (Q², N², B², K²) ≥ 0, V the exact expectation for each noise on a finite record;
     a rate ramp is a mean. Coefficients are pooled in bins of 5 % in frequency. θ maximises the likelihood restricted for the ramp
-    (REML); intervals are those where twice the log-likelihood, maximised over all other terms, falls by the χ² quantile. Terms
-    without support stay in the model at their most likely value while the others are judged, so that their uncertainty widens the
-    other intervals.
+    (REML).
+
+    Which terms the sensor has is not known, and where one is absent, at the bound θ = 0 of the model, twice the fall of the
+    likelihood of the *other* terms is no χ²: with all terms in the model their upper ends would be too low and their lower ends
+    fail too seldom (Self & Liang 1987). Nor may a term be left out because the record does not show it, for what it adds would be
+    attributed to the others. So the intervals are averaged over all combinations of terms, ``Σ_m w_m Φ(r_m(θ)) = (1 ± level)/2``, r_m
+    being the signed root of twice the fall of the likelihood in combination m, maximised over its other terms (Fletcher & Turek
+    2012), with the weights ``w_m ∝ exp(log L_m − TERM_COST · coefficients)``. The axes are units of one kind: L is the likelihood of
+    all axes, each with its own coefficients. For a term count the combinations with it.
+
+    References: Self & Liang, "Asymptotic properties of maximum likelihood estimators and likelihood ratio tests under
+    nonstandard conditions", J. Am. Stat. Assoc. 82, 1987; Fletcher & Turek, "Model-averaged profile likelihood intervals", J.
+    Agric. Biol. Environ. Stat. 17, 2012.
     """
     record, dt, scale = averaged(values, sample_interval, kind)
     level = confidence(level)
@@ -203,7 +223,7 @@ def fit_noise(
             dt=dt,
             last=last,
         )
-        fits.append(fit_axis(bins, random_terms, "rate_ramp" in chosen, level))
+        fits.append(fit_axis(bins, "rate_ramp" in chosen))
         misfits.append(misfit_of(coefficient, bins, fits[-1].best, random_terms, starts, last, dt))
     return of_axes(chosen, fits, misfits, level=level, samples=samples, sample_interval=dt)
 
@@ -315,13 +335,11 @@ class Optimum(NamedTuple):
 
 
 class AxisFit(NamedTuple):
-    """Fit of one axis."""
+    """Likelihood of one axis: the most likely coefficients of each combination of terms, and of all; a slope that is fixed, or None."""
 
-    estimate: Array
-    lower: Array
-    upper: Array
-    supported: NDArray[np.bool_]
-    covariance: Array
+    bins: Bins
+    slope: float | None
+    combinations: dict[tuple[bool, ...], Optimum]
     best: Optimum
 
 
@@ -340,15 +358,15 @@ def _loss(bins: Bins, theta: Array, slope: float | None, restricted: bool) -> Op
 
 
 def _maximise(
-    bins: Bins, start: Array, *, held: int | None = None, slope: float | None = None, restricted: bool = True
+    bins: Bins, start: Array, free: NDArray[np.bool_], *, slope: float | None = None, restricted: bool = True
 ) -> Optimum:
     """Return the most likely theta ≥ 0 by Fisher scoring, each step a non-negative least-squares problem, with step halving.
 
-    ``held`` keeps that component at its value in ``start``.
+    Components that are not ``free`` keep their values in ``start``.
     """
     from scipy.optimize import nnls
 
-    free = np.array([i != held for i in range(len(start))])
+    held = np.where(free, 0.0, start)
     point = _loss(bins, start, slope, restricted)
     if not free.any():
         return point
@@ -358,7 +376,7 @@ def _maximise(
         if slope is None and restricted:
             power = power + bins.ramp / np.sum(bins.ramp / variance)
         weight = np.sqrt(bins.number) / variance
-        residual = power / bins.number - (start[held] * bins.basis[held] if held is not None else 0.0)
+        residual = power / bins.number - held @ bins.basis
         design = (bins.basis[free] * weight).T
         norm = np.linalg.norm(design, axis=0)
         target = start.copy()
@@ -396,53 +414,86 @@ def _standard_errors(information: Array) -> Array:
     return np.asarray(np.sqrt(np.maximum(np.diag(inverse), 0.0)) * scale)
 
 
-def fit_axis(bins: Bins, random_terms: tuple[str, ...], with_ramp: bool, level: float) -> AxisFit:
-    """Fit the coefficients of one axis, with profile-likelihood intervals."""
-    from scipy.stats import chi2
+def fit_axis(bins: Bins, with_ramp: bool) -> AxisFit:
+    """Return the most likely coefficients of each combination of terms on one axis."""
+    slope, guess = None if with_ramp else -bins.first_slope, _first_guess(bins)
+    combinations = {
+        chosen: _maximise(bins, np.where(chosen, guess, 0.0), np.array(chosen), slope=slope)
+        for chosen in itertools.product((False, True), repeat=len(guess))
+        if any(chosen)
+    }
+    return AxisFit(bins, slope, combinations, min(combinations.values(), key=lambda one: one.loss))
 
-    fixed_slope = None if with_ramp else -bins.first_slope
-    best = _maximise(bins, _first_guess(bins), slope=fixed_slope)
-    two_sided = 0.5 * float(chi2.ppf(level, 1))
-    support = 0.5 * float(chi2.ppf(1.0 - 2.0 * SUPPORT_PROBABILITY, 1))
-    information = _information(bins, best.variance)
-    errors = _standard_errors(information)
-    count = len(random_terms)
-    estimate, lower, upper = np.full(count, np.nan), np.zeros(count), np.empty(count)
-    supported = np.zeros(count, dtype=bool)
-    for i in range(count):
 
-        def fall(value: float, i: int = i) -> float:
-            start = best.theta.copy()
-            start[i] = value
-            if not np.any(start > 0.0):
-                start = errors.copy()
-                start[i] = value
-            return _maximise(bins, start, held=i, slope=fixed_slope).loss - best.loss
+def _weights(fits: Sequence[AxisFit], i: int) -> dict[tuple[bool, ...], float]:
+    """Return the weights of the combinations with term i, of sum 1."""
+    cost = {
+        chosen: sum(fit.combinations[chosen].loss + TERM_COST * sum(chosen) for fit in fits)
+        for chosen in fits[0].combinations
+        if chosen[i]
+    }
+    least = min(cost.values())
+    total = sum(math.exp(least - value) for value in cost.values())
+    return {chosen: math.exp(least - value) / total for chosen, value in cost.items()}
 
-        supported[i] = best.theta[i] > 0.0 and (count == 1 or fall(0.0) > support)
-        if supported[i]:
-            estimate[i] = math.sqrt(best.theta[i])
-            lower[i] = math.sqrt(_crossing(fall, best.theta[i], -best.theta[i], two_sided))
-        upper[i] = math.sqrt(_crossing(fall, best.theta[i], 2.0 * errors[i], two_sided))
-    covariance = np.full((count, count), np.nan)
-    used = np.flatnonzero(best.theta > 0.0)
-    shrink = 1.0 / np.sqrt(np.diag(information)[used])
-    inverse = np.linalg.pinv(information[np.ix_(used, used)] * np.outer(shrink, shrink)) * np.outer(shrink, shrink)
-    slope_of_root = 0.5 / np.sqrt(best.theta[used])  # d√θ/dθ
-    covariance[np.ix_(used, used)] = inverse * np.outer(slope_of_root, slope_of_root)
+
+def _interval(
+    fit: AxisFit, i: int, weights: Mapping[tuple[bool, ...], float], level: float
+) -> tuple[float, float, float]:
+    """Return estimate, lower and upper of a term's coefficient on one axis; not supported: NaN, 0 and the upper end."""
+    from scipy.optimize import brentq
+    from scipy.special import ndtr, ndtri
+
+    tail = 0.5 - 0.5 * level
+    heavy = {chosen: weight for chosen, weight in weights.items() if weight > min(0.05 * tail, SUPPORT_PROBABILITY)}
+    total = sum(heavy.values())
+
+    @functools.cache
+    def below(size: float) -> float:
+        """Return the averaged probability that the coefficient is less."""
+        return float(sum(w / total * ndtr(_signed_root(fit, np.array(c), i, size**2)) for c, w in heavy.items()))
+
+    def crossing(probability: float, low: float, high: float) -> float:
+        # The normal score is nearly a straight line, which the solver likes.
+        score = lambda size: ndtri(min(max(below(size), 1e-15), 1.0 - 1e-15)) - ndtri(probability)  # noqa: E731
+        return float(brentq(score, low, high, xtol=1e-5 * high))
+
+    sizes = {chosen: math.sqrt(fit.combinations[chosen].theta[i]) for chosen in heavy}
+    top, zero = max(sizes.values()), below(0.0)
+    high = top if top > 0.0 else math.sqrt(_first_guess(fit.bins)[i])
+    while below(high) < 1.0 - tail:
+        high *= 1.5
+    upper = crossing(1.0 - tail, top if below(top) < 1.0 - tail else 0.0, high)
+    if zero >= SUPPORT_PROBABILITY:
+        return math.nan, 0.0, upper
+    estimate = sum(heavy[chosen] / total * size for chosen, size in sizes.items())
+    return estimate, crossing(tail, 0.0, top) if zero < tail else 0.0, upper
+
+
+def _signed_root(fit: AxisFit, chosen: NDArray[np.bool_], i: int, value: float) -> float:
+    """Return the root of twice the fall of log likelihood from the most likely coefficients of some terms to ``value`` of θ_i, signed."""
+    best = fit.combinations[tuple(chosen.tolist())]
+    start, free = best.theta.copy(), chosen.copy()
+    start[i], free[i] = value, False
+    if not np.any(start > 0.0):
+        start = np.where(free, _first_guess(fit.bins), start)
+    fall = _maximise(fit.bins, start, free, slope=fit.slope).loss - best.loss
+    return math.copysign(math.sqrt(2.0 * max(0.0, fall)), value - best.theta[i])
+
+
+def _covariance(fit: AxisFit, estimate: Array) -> Array:
+    """Return the covariance of the coefficients of one axis from the Fisher information; NaN where there is no estimate."""
+    supported = ~np.isnan(estimate)
+    size = np.where(supported, estimate, np.sqrt(fit.best.theta))
+    used = np.flatnonzero(size > 0.0)
+    information = _information(fit.bins, fit.best.variance)[np.ix_(used, used)]
+    shrink = 1.0 / np.sqrt(np.diag(information))
+    inverse = np.linalg.pinv(information * np.outer(shrink, shrink)) * np.outer(shrink, shrink)
+    covariance = np.full((len(estimate), len(estimate)), np.nan)
+    covariance[np.ix_(used, used)] = inverse * np.outer(0.5 / size[used], 0.5 / size[used])  # d√θ/dθ
     covariance[~supported, :] = np.nan
     covariance[:, ~supported] = np.nan
-    if with_ramp:
-        ramp = _fit_ramp(bins, best, two_sided, support)
-        estimate, lower, upper = np.append(estimate, ramp[0]), np.append(lower, ramp[1]), np.append(upper, ramp[2])
-        supported = np.append(supported, not math.isnan(ramp[0]))
-        wide = np.full((count + 1, count + 1), np.nan)
-        wide[:count, :count] = covariance
-        if supported[-1]:
-            wide[-1, :-1] = wide[:-1, -1] = np.where(supported[:-1], 0.0, np.nan)
-            wide[-1, -1] = 1.0 / np.sum(bins.ramp / best.variance)
-        covariance = wide
-    return AxisFit(estimate, lower, upper, supported, covariance, best)
+    return covariance
 
 
 def of_axes(
@@ -454,14 +505,30 @@ def of_axes(
     samples: int,
     sample_interval: float,
 ) -> NoiseFit:
-    """Return the fits of single axes as one; a misfit is its probability and what was seen."""
+    """Return the fits of single axes as one, with intervals; a misfit is its probability and what was seen."""
+    count = len(fits[0].best.theta)
+    estimate, lower, upper = np.empty((3, len(fits), len(terms)))
+    covariance = np.full((len(fits), len(terms), len(terms)), np.nan)
+    for i in range(count):
+        weights = _weights(fits, i)
+        for axis, fit in enumerate(fits):
+            estimate[axis, i], lower[axis, i], upper[axis, i] = _interval(fit, i, weights, level)
+    for axis, fit in enumerate(fits):
+        covariance[axis, :count, :count] = _covariance(fit, estimate[axis, :count])
+        if len(terms) > count:
+            estimate[axis, -1], lower[axis, -1], upper[axis, -1] = _fit_ramp(fit, level)
+            if not math.isnan(estimate[axis, -1]):
+                covariance[axis, -1, :-1] = covariance[axis, :-1, -1] = np.where(
+                    np.isnan(estimate[axis, :-1]), np.nan, 0.0
+                )
+                covariance[axis, -1, -1] = 1.0 / np.sum(fit.bins.ramp / fit.best.variance)
     return NoiseFit(
         terms=terms,
-        estimate=np.stack([f.estimate for f in fits]),
-        lower=np.stack([f.lower for f in fits]),
-        upper=np.stack([f.upper for f in fits]),
-        supported=np.stack([f.supported for f in fits]),
-        covariance=np.stack([f.covariance for f in fits]),
+        estimate=estimate,
+        lower=lower,
+        upper=upper,
+        supported=~np.isnan(estimate),
+        covariance=covariance,
         misfit_probability=np.array([probability for probability, _ in misfits]),
         misfit=tuple(what for _, what in misfits),
         level=level,
@@ -470,34 +537,30 @@ def of_axes(
     )
 
 
-def _crossing(fall: Callable[[float], float], centre: float, step: float, level: float) -> float:
-    """Return where ``fall`` reaches ``level``, seen from ``centre`` in the direction of ``step`` (downwards: between 0 and centre)."""
-    from scipy.optimize import brentq
-
-    if step < 0.0:
-        if fall(0.0) <= level:
-            return 0.0
-        return float(brentq(lambda v: fall(v) - level, 0.0, centre, xtol=1e-5 * centre))
-    near, far = centre, centre + step
-    while fall(far) < level:
-        near, far = far, centre + 2.0 * (far - centre)
-    return float(brentq(lambda v: fall(v) - level, near, far, xtol=1e-5 * (far - near)))
-
-
-def _fit_ramp(bins: Bins, best: Optimum, two_sided: float, support: float) -> tuple[float, float, float]:
+def _fit_ramp(fit: AxisFit, level: float) -> tuple[float, float, float]:
     """Return estimate, lower and upper of the ramp; unsupported: NaN, 0 and a bound on its size.
 
     The ramp's own interval profiles the unrestricted likelihood: how far K may go to explain the trend is part of it.
     """
-    top = _maximise(bins, best.theta, restricted=False)
+    from scipy.optimize import brentq
+    from scipy.stats import chi2
+
+    bins, free = fit.bins, np.ones(len(fit.best.theta), dtype=bool)
+    top = _maximise(bins, fit.best.theta, free, restricted=False)
+    drop = 0.5 * float(chi2.ppf(level, 1))
 
     def fall(slope: float) -> float:
-        return _maximise(bins, top.theta, slope=slope).loss - top.loss
+        return _maximise(bins, top.theta, free, slope=slope).loss - top.loss
+
+    def crossing(step: float) -> float:
+        near, far = top.slope, top.slope + step
+        while fall(far) < drop:
+            near, far = far, top.slope + 2.0 * (far - top.slope)
+        return float(brentq(lambda v: fall(v) - drop, near, far, xtol=1e-5 * abs(far - near))) + bins.first_slope
 
     error = 1.0 / math.sqrt(float(np.sum(bins.ramp / top.variance)))
-    low = -_crossing(lambda v: fall(-v), -top.slope, 2.0 * error, two_sided) + bins.first_slope
-    high = _crossing(fall, top.slope, 2.0 * error, two_sided) + bins.first_slope
-    if fall(-bins.first_slope) > support:
+    low, high = crossing(-2.0 * error), crossing(2.0 * error)
+    if fall(-bins.first_slope) > 0.5 * float(chi2.ppf(1.0 - 2.0 * SUPPORT_PROBABILITY, 1)):
         return top.slope + bins.first_slope, low, high
     return math.nan, 0.0, max(abs(low), abs(high))
 

@@ -142,8 +142,8 @@ class _Recorded:
     motion: Annotated[
         str | None,
         typer.Option(
-            help="What moves the unit: hand (default), of bounded velocity, with states for the gyro's scale; or any, whose acceleration "
-            "is white noise, without such states."
+            help="What moves the unit: hand, of bounded velocity; vehicle, whose acceleration lasts for seconds; auto (default), the "
+            "likelier of both; or any, whose acceleration is white noise, without states for the gyro's scale."
         ),
     ] = None
     latency: Annotated[
@@ -524,11 +524,11 @@ def _estimate_recording(
     from strapdown.recordings import unit_calibration
     from strapdown.units import DEGREE, DEGREE_PER_HOUR_PER_ROOT_HOUR, DEGREE_PER_ROOT_HOUR
 
-    motion = one_of("--motion", options.motion or "hand", ahrs.MOTIONS)
+    motion = one_of("--motion", options.motion or "auto", ("auto", *ahrs.MOTIONS))
     late = None if options.latency is None else 1e-3 * non_negative("--latency", options.latency, unit="ms")
     robustness = shared.robustness
     carried = None if options.calibration is None else unit_calibration.read(options.calibration)
-    source, parameters = _read_recording(recording, layout, ahrs.MOTIONS[motion], shared, options.temperature)
+    source, parameters, motion, odds = _read_recording(recording, layout, motion, shared, options.temperature)
     with progress_bar("smoothing" if shared.smooth else "filtering"):
         result = ahrs.estimate(
             source,
@@ -545,7 +545,7 @@ def _estimate_recording(
     errors = None if used.true_attitude is None else reference_errors(result.estimate.attitude, used.true_attitude)
     rms = None if errors is None else {name: value / DEGREE for name, value in errors.rms(used.movement).items()}
     paths = _write_recording(result, parameters, replace(parameters.setup, **robustness), motion, shared.smooth, out)
-    _say_recording(result, parameters, motion)
+    _say_recording(result, parameters, motion, odds)
     if shared.gyro is not None:
         arw, rrw = parameters.angle_random_walk, parameters.rate_random_walk
         console.print(
@@ -564,9 +564,12 @@ def _estimate_recording(
 
 
 def _read_recording(
-    recording: Path, layout: dict[str, Any], parameters: AhrsParameters, shared: _Shared, temperature: Path | None
-) -> tuple[Recording, AhrsParameters]:
-    """Return the recording, its bias over temperature subtracted, and the filter's parameters with the noise of the gyro given."""
+    recording: Path, layout: dict[str, Any], motion: str, shared: _Shared, temperature: Path | None
+) -> tuple[Recording, AhrsParameters, str, float]:
+    """Return the recording, its bias over temperature subtracted, the filter's parameters with the noise of the gyro given, and the motion.
+
+    With the motion comes its log-likelihood beyond that of the other, infinite where it was given.
+    """
     from strapdown import ahrs, recordings
     from strapdown.gyro import read_spec
     from strapdown.gyro import temperature as thermal
@@ -575,6 +578,8 @@ def _read_recording(
     with progress_bar("reading"):
         source = recordings.read(recording, **layout)
     doubt(source, recording)
+    motion, odds = ahrs.motions.chosen(source, motion, name="--motion")
+    parameters = ahrs.MOTIONS[motion]
     if shared.gyro is not None:
         from strapdown import workflows  # which imports much more
 
@@ -583,7 +588,7 @@ def _read_recording(
     if warm is not None:
         walks = shared.smooth or shared.observability
         source, parameters = ahrs.without_temperature(source, parameters, warm, walks=walks)
-    return source, parameters
+    return source, parameters, motion, odds
 
 
 def _fixed_frame(used: Recording) -> str:
@@ -630,7 +635,7 @@ def _write_recording(
     return paths
 
 
-def _say_recording(result: AhrsEstimate, parameters: AhrsParameters, motion: str) -> None:
+def _say_recording(result: AhrsEstimate, parameters: AhrsParameters, motion: str, odds: float) -> None:
     """Print what was read, how the filter started, and what of the samples is not as it should be."""
     from strapdown import recordings
 
@@ -642,7 +647,7 @@ def _say_recording(result: AhrsEstimate, parameters: AhrsParameters, motion: str
     for remark in used.remarks:
         console.print(remark)
     console.print(f"Fixed frame: {_fixed_frame(used)}.")
-    console.print(_model(motion, parameters, result))
+    console.print(_model(motion, odds, parameters, result))
     for sentence in (*result.delays.words, *(f"{one}." for one in result.faults.words)):
         console.print(sentence)
     if result.hard_iron.any():
@@ -678,7 +683,7 @@ def _rested(parameters: AhrsParameters, result: AhrsEstimate) -> bool:
     return bool(result.initial.covariance[3, 3] <= (0.5 * parameters.bias_sigma) ** 2)
 
 
-def _model(moved_by: str, parameters: AhrsParameters, result: AhrsEstimate) -> str:
+def _model(moved_by: str, odds: float, parameters: AhrsParameters, result: AhrsEstimate) -> str:
     """Return in words the model of a recording's motion, and the bias that the filter started from."""
     import numpy as np
 
@@ -688,8 +693,14 @@ def _model(moved_by: str, parameters: AhrsParameters, result: AhrsEstimate) -> s
         return "Motion: any, its acceleration modelled as white noise."
     bias, sigma = result.initial.bias / DEGREE, np.sqrt(result.initial.covariance[3, 3]) / DEGREE
     shown = ", as the recording shows," if parameters.velocity_from_record else ""
+    likelier = (
+        f" (log-likelihood + {odds:.3g} beside a {'hand' if moved_by == 'vehicle' else 'vehicle'})"
+        if odds < np.inf
+        else ""
+    )
     words = (
-        f"Motion: of a hand, {parameters.velocity_sigma:.2g} m/s{shown} with a correlation time of {parameters.velocity_time:g} s. "
+        f"Motion: of a {moved_by}{likelier}, {parameters.velocity_sigma:.2g} m/s{shown} with a correlation time of "
+        f"{parameters.velocity_time:g} s. "
         f"Gyro bias at the start: {', '.join(f'{value:.3g}' for value in bias)} °/s, σ {sigma:.2g} °/s"
     )
     if not _rested(parameters, result):

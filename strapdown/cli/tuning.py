@@ -57,7 +57,7 @@ class _Filter:
         typer.Option(
             help="Parameters to tune, with commas: gyro.arw, gyro.rrw, SENSOR.sigma, initial.attitude, initial.bias, "
             "gate.probability (as --gate); SENSOR.sigma.x, .y, .z (about one body axis); or filter.scale alone. If not given the "
-            "gyro's two and every sensor's."
+            "gyro's two and every sensor's; of a recording without --truth or --rmse filter.scale, and no other."
         ),
     ] = None
     filter_file: Annotated[
@@ -247,6 +247,7 @@ def tune(
     """Tune the filter by maximum likelihood, with an interval for each parameter."""
     import os
 
+    from strapdown import recordings, tuning
     from strapdown.checks import count
 
     workers = count("threads", search.threads if search.threads is not None else os.cpu_count() or 1)
@@ -260,6 +261,9 @@ def tune(
     count("seed", search.seed, least=0)
     _check_files(records, start.filter_file, output)
     cases, before, gyros = _cases(records, chosen, start, layout)
+    if not (goal.truth or goal.rmse or all(recordings.is_record(path) for path in records)):
+        names, spacing = tuning.by_innovations(start.names, goal.spacing, gate=goal.gate, prior=start.prior)
+        start, goal = replace(start, free=",".join(names)), replace(goal, spacing=spacing)
     if algorithm is not None:
         before = replace(before, integration=algorithm)
     if (before.gate or before.robust) and not (goal.truth or goal.gate):

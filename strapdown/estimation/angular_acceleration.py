@@ -54,13 +54,12 @@ def turning(record: ImuRecord, time: Array) -> tuple[Array, Array]:
     def slope(order: int, window: int) -> Array:
         return np.asarray(savgol_filter(rates, window, order, deriv=1, delta=mean, axis=0))
 
-    sample = np.ascontiguousarray(rates[:MOST].T)
+    products = [_products(axis - axis.mean()) for axis in rates[:MOST].T]
     tried = [(order, window) for order in ORDERS for window in WINDOWS if window >= order + 2]
     noises, bends = [], []
     for order, window in tried:
         apart = weights(order, window) - weights(order, _half(order, window))
-        inside = apart[(len(apart) - window) // 2 :][:window]
-        bent = np.array([np.mean(np.correlate(axis, inside) ** 2) for axis in sample]) - white * float(apart @ apart)
+        bent = np.array([apart @ found @ apart for found in products]) - white * float(apart @ apart)
         noises.append(white * float(np.sum(weights(order, window) ** 2)))
         bends.append(np.maximum(bent, 0.0))
     best = int(np.argmin(np.sum(np.array(noises) + LASTING * np.array(bends), axis=1)))
@@ -93,6 +92,18 @@ def turning(record: ImuRecord, time: Array) -> tuple[Array, Array]:
     alike = lags[np.abs(np.subtract.outer(np.arange(4), np.arange(4)))]
     left = np.einsum("mi,ij,mj->m", nodes, alike, nodes)
     return np.concatenate(found, axis=1), noises[best] * left[:, None] + bends[best]
+
+
+def _products(series: Array) -> Array:
+    """Return the mean products of the samples of a window, over all positions of the longest window in a series."""
+    width = WINDOWS[-1]
+    n = len(series) - width + 1
+    products = np.zeros((width, width))
+    products[0] = np.einsum("n,nj->j", series[:n], np.lib.stride_tricks.sliding_window_view(series, width))
+    for i in range(1, width):  # one sample leaves each sum, one joins it
+        gone, new = series[i - 1 : width - 1], series[n + i - 1 :]
+        products[i, i:] = products[i - 1, i - 1 : -1] + new[0] * new - gone[0] * gone
+    return np.asarray(np.triu(products) + np.triu(products, 1).T) / n
 
 
 @functools.cache

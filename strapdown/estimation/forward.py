@@ -663,7 +663,7 @@ def factor_body(problem: Problem, units: Mapping[str, float], *, together: bool 
         x=x,
         F=F,
         length=lengths(problem.record, problem.events, model, units),
-        turning=_turns(problem.record, problem.events, model),
+        turning=turns(problem.record, problem.events, model),
         scratch=scratch(model),
         together=together and not len(model.chains),
         sharpness=np.inf,
@@ -745,13 +745,18 @@ def restart_in_factor(judge: Judge) -> root_form.Restart:
 
 def _with_whole_bias(estimate: Estimate, model: Model, out: root_form.Outputs, *, full: bool) -> Estimate:
     """Return an estimate that reports the whole bias."""
-    offsets = model.gyro[:, :3] * (model.gyro_use & OFFSET > 0)[:, None]
     return replace(
         estimate,
-        whole_bias=out.x[:, :3] + out.x[:, 3:] @ offsets,
+        whole_bias=whole_bias(model, out.x),
         whole_bias_variance=out.whole_variance,
         whole_bias_covariance=out.whole_covariance if full else None,
     )
+
+
+def whole_bias(model: Model, x: Array) -> Array:
+    """Return the gyro's whole bias (rows, 3) of the kernels' bias and error states (rows, 3 + m)."""
+    offsets = model.gyro[:, :3] * (model.gyro_use & OFFSET > 0)[:, None]
+    return np.asarray(x[:, :3] + x[:, 3:] @ offsets)
 
 
 def outside(body: root_form.Body, model: Model, i: int) -> tuple[Array, Array, Array, Array]:
@@ -882,7 +887,7 @@ def _singular_triangle(P: Array) -> Array:
     return np.asarray(np.linalg.qr(root[:, ::-1], mode="r"))[::-1, ::-1].copy()
 
 
-def _turns(record: ImuRecord, events: Schedule, model: Model) -> Array:
+def turns(record: ImuRecord, events: Schedule, model: Model) -> Array:
     """Return rate, angular acceleration and the variances of the latter's axes at the events (events, 9); none without a lever arm."""
     if not model.levers.any():
         return np.empty((0, 9))

@@ -492,12 +492,11 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
     def _rows(self, measurement: _Measurement, sensor: str) -> tuple[Array, Array, Array]:
         """Return residual (d,), H (d, n) and noise (d, d) of a measurement, by the kernels' own function."""
         model, others = self._sensor_model(sensor, measurement.kind), np.concatenate([self.bias, self.values])
-        H, y, basis = np.empty((3, len(self.x))), np.empty(3), np.empty((3, 3))
-        q = tuple(self.attitude.tolist())
+        rows = error_state_step.Rows(H=np.empty((3, len(self.x))), y=np.empty(3), basis=np.empty((3, 3)))
         given = KIND_CODES[measurement.kind], measurement.z, measurement.frame, measurement.length
         effects = 0, model.sensors, model.sensor_use, NO_LEVER
-        d = error_state_step.fill_rows(q, rotation_matrix(q), others, *given, *effects, H, y, basis)
-        return y[:d], H[:d], (basis @ measurement.noise @ basis.T)[:d, :d]
+        d = error_state_step.fill_rows(tuple(self.attitude.tolist()), others, *given, *effects, rows)
+        return rows.y[:d], rows.H[:d], (rows.basis @ measurement.noise @ rows.basis.T)[:d, :d]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -17,11 +17,13 @@ import functools
 import hashlib
 import io
 import json
+import multiprocessing
 import os
 import re
 import stat
 import subprocess
 import sys
+import threading
 import tomllib
 import warnings
 from collections.abc import Iterator
@@ -309,16 +311,42 @@ def _need_readable(path: Name) -> None:
 @functools.lru_cache(maxsize=64)
 def _fault_of_child(path: str, *identity: int) -> str:
     seconds = 2 + identity[1] // 20_000_000
+    # A fork has imported everything already. Beside other threads a lock that one of them holds would be locked in it for ever.
+    alone = sys.platform == "linux" and threading.active_count() == 1
+    status = _status_of_fork(path, seconds) if alone else _status_of_process(path, seconds)
+    if status is None or status in (-9, -24):  # SIGKILL and SIGXCPU, which the limits of :func:`probe` send
+        return "does not come to an end"
+    return "crashes on it" if status < 0 else ""
+
+
+def _status_of_fork(path: str, seconds: int) -> int | None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # of idle threads of libraries, such as OpenBLAS's
+        child = multiprocessing.get_context("fork").Process(target=_silent_probe, args=(path, seconds))
+        child.start()
+    child.join(30 * seconds)
+    if child.exitcode is None:
+        child.kill()
+    return child.exitcode
+
+
+def _silent_probe(path: str, seconds: int) -> None:
+    null = os.open(os.devnull, os.O_WRONLY)
+    for stream in (1, 2):
+        os.dup2(null, stream)
+    with contextlib.suppress(Exception):
+        probe(path, seconds)
+
+
+def _status_of_process(path: str, seconds: int) -> int | None:
     # Python itself may be frozen into a program, or the child lack h5py: then it ends with a status of its own, and the file is read here.
     child = "import sys; sys.path[:0] = [sys.argv[1]]; from strapdown.files import reading; reading.probe(sys.argv[2], int(sys.argv[3]))"
     command = [sys.executable, "-c", child, str(Path(__file__).parents[2]), path, str(seconds)]
     try:
         done = subprocess.run(command, capture_output=True, stdin=subprocess.DEVNULL, timeout=30 * seconds, check=False)
     except subprocess.TimeoutExpired:
-        return "does not come to an end"
-    if done.returncode in (-9, -24):  # SIGKILL and SIGXCPU, which the limits of :func:`probe` send
-        return "does not come to an end"
-    return "crashes on it" if done.returncode < 0 else ""
+        return None
+    return done.returncode
 
 
 def probe(path: str, seconds: int) -> None:

@@ -59,9 +59,6 @@ from strapdown.kernels.rotation import quaternion_multiply, rotation_matrix
 from strapdown.kernels.state import SIZE, keep_state, load_state, store_state
 from strapdown.kernels.walk import SQUARED_RANGE, step_within, turn_squared
 
-BORROWS_ARRAYS = True
-"""See :mod:`strapdown.kernels.machine`."""
-
 CALLED = ("least_share",)
 
 

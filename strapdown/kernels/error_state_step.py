@@ -19,6 +19,9 @@ All but the square roots is plain arithmetic, so that the same functions serve t
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
+
+import numpy as np
 
 from strapdown.kernels.algebra import (
     add,
@@ -458,15 +461,28 @@ def offset_of(sensors, sensor_use, s, k, W):
     return a
 
 
-def fill_rows(q, R, x, kind, z, frame, length, s, sensors, sensor_use, W, H, y, basis):
-    """Write the rows of one measurement, ``y = H δx + noise``, and return how many: 2 direction, 3 vector, 1 heading, 3 attitude.
+class Rows(NamedTuple):
+    """The rows of one measurement, ``y = H δx + noise``, of n states."""
+
+    H: np.ndarray
+    """(3, n or more)"""
+    y: np.ndarray
+    """(3,)"""
+    basis: np.ndarray
+    """(3, 3), the body axes that the rows measure along; of a direction that its states make longer or shorter, over that length: so its
+    noise is, too."""
+
+
+def fill_rows(q, x, kind, z, frame, length, s, sensors, sensor_use, W, rows):
+    """Write the rows of one measurement, and return how many: 2 direction, 3 vector, 1 heading, 3 attitude.
 
     ``frame`` is the row of the schedule's frames as a 9-tuple, ``z`` the measured vector and ``length`` what it was divided by, or of a
     direction or heading the strength of what is measured. ``W`` is the :func:`turning_matrix` of the instant, for lever arms.
-    ``sensor_use`` may be all zero: then the rows are those of the plain filter. ``basis`` (3, 3) gets the body axes that the rows
-    measure along; of a direction that its states make longer or shorter, over that length: so its noise is, too.
+    ``sensor_use`` may be all zero: then the rows are those of the plain filter.
     """
+    H, y, basis = rows
     states = len(x) - 3
+    R = rotation_matrix(q)
     for i in range(3):
         for j in range(H.shape[1]):
             H[i, j] = 0.0
@@ -541,7 +557,7 @@ def fill_rows(q, R, x, kind, z, frame, length, s, sensors, sensor_use, W, H, y, 
         return 1
     u = transpose_times_vector(R, (frame[0], frame[1], frame[2]))
     v = transpose_times_vector(R, (frame[3], frame[4], frame[5]))
-    rows = 2 if kind == DIRECTION else 3
+    number = 2 if kind == DIRECTION else 3
     third = transpose_times_vector(R, r)
     if not coupled:
         put_row(basis, 0, u)
@@ -550,18 +566,18 @@ def fill_rows(q, R, x, kind, z, frame, length, s, sensors, sensor_use, W, H, y, 
         put_row(H, 0, scale(-1.0, v))
         put_row(H, 1, u)
         y[0], y[1] = dot(u, z), dot(v, z)
-        if rows == 3:
+        if number == 3:
             y[2] = dot(third, z) - 1.0
-        return rows
+        return number
     turnable = transpose_times_vector(R, add(r, fixed))
     seen = add(turnable, transpose_times_vector(R, carried))
     m = add(matrix_times_vector(M, seen), offset)
     shrink = 1.0
-    if rows == 2:
+    if number == 2:
         shrink = 1.0 / math.sqrt(dot(m, m))
         u, v = across(scale(shrink, m))
-    residual = z if rows == 2 else subtract(z, m)
-    for i in range(rows):
+    residual = z if number == 2 else subtract(z, m)
+    for i in range(number):
         t = u if i == 0 else (v if i == 1 else third)
         y[i] = dot(t, residual)
         put_row(basis, i, scale(shrink, t))
@@ -578,7 +594,7 @@ def fill_rows(q, R, x, kind, z, frame, length, s, sensors, sensor_use, W, H, y, 
                 if use & SCALE:
                     e = add(e, matrix_times_vector(matrix_at(sensors, s, k), seen))
                 H[i, 6 + k] = shrink * dot(t, e)
-    return rows
+    return number
 
 
 def arm_noise(x, s, sensors, sensor_use, length, variance, C):

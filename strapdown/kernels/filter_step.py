@@ -177,11 +177,12 @@ def reset(q, A, B, correction):
     )
 
 
-def rows_at_once(b, A, B, C, pa1, pa2, h1, e1, h2, y2, s1, s12, s22):
-    """Update with two rows of covariance (s1, s12, s22), the second freed of the first: the divisions do not wait for each other.
+def rows_at_once(b, A, B, C, pa1, pa2, h1, e1, h2, y2, S):
+    """Update with two rows of covariance S (s1, s12, s22), the second freed of the first: the divisions do not wait for each other.
 
     Returns the correction, b, A, B, C, the second row's innovation freed of the first with its variance, and the NIS.
     """
+    s1, s12, s22 = S
     determinant = s1 * s22 - s12 * s12
     inverse1 = 1.0 / s1
     inverse = 1.0 / determinant
@@ -231,9 +232,9 @@ def update_direction_and_judge(q, b, A, B, C, R, u, v, z, variance):
     s22 = dot(h2, pa2) + variance
     together = s1 + s22 < SHORT_FORM * variance
     if everywhere(together):
-        correction, b, A, B, C, e2, s2, nis = rows_at_once(b, A, B, C, pa1, pa2, h1, e1, h2, y2, s1, s12, s22)
+        correction, b, A, B, C, e2, s2, nis = rows_at_once(b, A, B, C, pa1, pa2, h1, e1, h2, y2, (s1, s12, s22))
     elif anywhere(together):
-        at_once = rows_at_once(b, A, B, C, pa1, pa2, h1, e1, h2, y2, s1, s12, s22)
+        at_once = rows_at_once(b, A, B, C, pa1, pa2, h1, e1, h2, y2, (s1, s12, s22))
         one_by_one = row_after_row(b, A, B, C, h1, e1, h2, y2, variance)
         correction = chosen_triple(together, at_once[0], one_by_one[0])
         b = chosen_triple(together, at_once[1], one_by_one[1])

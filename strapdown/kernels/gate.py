@@ -55,10 +55,6 @@ from strapdown.kernels.measurement import (
 from strapdown.kernels.rotation import moved, quaternion_multiply, rotation_matrix
 from strapdown.kernels.walk import SQUARED_RANGE, step_within, turn_squared
 
-BORROWS_ARRAYS = True
-"""See :mod:`strapdown.kernels.machine`."""
-
-
 OPEN = (
     "load",
     "save",

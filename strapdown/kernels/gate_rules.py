@@ -14,9 +14,6 @@ import math
 
 from strapdown.kernels.iterated_update import ACCEPTED, REFUSED
 
-BORROWS_ARRAYS = True
-"""See :mod:`strapdown.kernels.machine`."""
-
 WIDE_PASSES = 20
 """Maximum number of linearisations of one update, of a candidate and of a filter that has recovered."""
 WIDENING = 3.0

@@ -40,6 +40,13 @@ def markov_step(dt, correlation_time):
     return math.exp(-2.0 * u), step, mean, dt * dt * dt * bridge_remainder(u)
 
 
+def gauss_markov(decay, steps, values):
+    """Fill values (n + 1, 3) from the first row on: x ← φ x + w of decays φ (n,) and steps w (n, 3)."""
+    for k in range(len(decay)):
+        for i in range(3):
+            values[k + 1, i] = decay[k] * values[k, i] + steps[k, i]
+
+
 def flicker_block(poles, gains, states, scale, normals, out):
     """Fill out (m,) with flicker of 16 states, which go on: x ← p x + w, out = scale g · x."""
     a = poles

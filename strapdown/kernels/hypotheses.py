@@ -58,9 +58,6 @@ from strapdown.kernels.series import second, sinc
 from strapdown.kernels.state import load_state, store_state
 from strapdown.kernels.walk import SQUARED_RANGE, step_within, turn_squared
 
-BORROWS_ARRAYS = True
-"""See :mod:`strapdown.kernels.machine`."""
-
 CALLED = ("updated", "moment_match", "normalized_weights")
 
 PASSES = 5

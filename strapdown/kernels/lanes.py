@@ -21,6 +21,7 @@ from numba.core.typeconv import Conversion
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.extending import intrinsic, lower_builtin, lower_cast, models, register_model
 
+from strapdown.kernels.compiler import DATA
 from strapdown.kernels.lane_values import WIDTH
 
 _ELEMENTS = {
@@ -176,7 +177,7 @@ def _length(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
 
 
 def _pointer(context: Any, builder: Any, array_type: Any, array: Any, index: Any, vector: ir.VectorType) -> Any:
-    data = context.make_array(array_type)(context, builder, array).data
+    data = builder.extract_value(array, DATA)
     return builder.bitcast(builder.gep(data, [index]), vector.as_pointer())
 
 
@@ -399,7 +400,7 @@ def element(typingctx: Any, array: Any, place: Any) -> Any:
     """Lower :func:`lane_values.element`."""
 
     def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        data = context.make_array(array)(context, builder, arguments[0]).data
+        data = builder.extract_value(arguments[0], DATA)
         return builder.load(builder.gep(data, [arguments[1]]))
 
     return array.dtype(array, types.intp), lower

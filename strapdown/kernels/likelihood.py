@@ -33,9 +33,6 @@ from strapdown.kernels.series import LARGEST_ANGLE
 from strapdown.kernels.state import load_lanes, store_lanes
 from strapdown.kernels.walk import MAX_TURN, SQUARED_RANGE
 
-BORROWS_ARRAYS = True
-"""See :mod:`strapdown.kernels.machine`."""
-
 HALF_RANGE = 0.25 * SQUARED_RANGE
 """The square of half the turn that the polynomials bear."""
 FOUND = 12 * WIDTH

@@ -15,9 +15,6 @@ from strapdown.kernels.lane_values import WIDTH, load, spread, store
 from strapdown.kernels.likelihood import FOUND, WORK, measured_rows, part_at, row_at, variance_of
 from strapdown.kernels.measurement import KIND, VECTOR, frame_row, value_of
 
-BORROWS_ARRAYS = True
-"""See :mod:`strapdown.kernels.machine`."""
-
 
 def add_deviance(room, place, e, s):
     """Add e²/s in lanes to the work space at ``place``, and multiply what stands behind it by s."""

@@ -83,12 +83,11 @@ def _twin(function: FunctionType, parts: tuple[ModuleType, ...]) -> FunctionType
     return twin
 
 
-def _options(function: FunctionType) -> dict[str, Any]:
+def _options() -> dict[str, Any]:
     # Only 'contract' (fused multiply-add): full fastmath silently breaks isnan and isfinite.
-    # A module that says BORROWS_ARRAYS neither makes nor returns arrays, and has them not counted: in a hot loop that costs more than
-    # the arithmetic.
-    counted = not function.__globals__.get("BORROWS_ARRAYS", False)
-    return {"fastmath": {"contract"}, "error_model": "numpy", "nogil": True, "_nrt": counted}
+    # Kernels neither make nor return arrays, and so do not count references to them: counting costs more than the arithmetic of a hot
+    # loop, and a third of all instructions to compile.
+    return {"fastmath": {"contract"}, "error_model": "numpy", "nogil": True, "_nrt": False}
 
 
 def _without_literals(dispatcher: Any) -> Any:
@@ -119,7 +118,7 @@ def helper(function: FunctionType, parts: tuple[ModuleType, ...] = ()) -> Any:
         return INTRINSICS[function.__name__]
     called = function.__name__ in function.__globals__.get("CALLED", ())
     # Nothing calls it from Python or C: without those two wrappers it compiles in two thirds of the time.
-    options = {"forceinline": not called, "no_cpython_wrapper": True, "no_cfunc_wrapper": True, **_options(function)}
+    options = {"forceinline": not called, "no_cpython_wrapper": True, "no_cfunc_wrapper": True, **_options()}
     twin = _twin(function, parts)
     plain = _without_literals(numba.njit(pipeline_class=HelperCompiler, **options)(twin))
     return traced(twin, plain, called=called)
@@ -144,7 +143,7 @@ def compiled(function: Callable[..., Any], *parts: ModuleType) -> Any:
 
     if not _is_kernel(function):
         raise TypeError(f"{function!r} does not live in {PACKAGE}; move it there before compiling it")
-    options = {"pipeline_class": KernelCompiler, **_options(function)}  # type: ignore[arg-type]
+    options = {"pipeline_class": KernelCompiler, "no_cfunc_wrapper": True, **_options()}
     dispatcher = numba.njit(**options)(_twin(function, parts))  # type: ignore[arg-type]
     with contextlib.suppress(RuntimeError):  # no writable place for a cache: compile in every process
         dispatcher._cache = KernelCache(dispatcher.py_func)

@@ -21,9 +21,6 @@ from strapdown.kernels.algebra import (
 from strapdown.kernels.lane_values import chosen, element
 from strapdown.kernels.rotation import logarithm, quaternion_multiply
 
-BORROWS_ARRAYS = True
-"""See :mod:`strapdown.kernels.machine`."""
-
 DIRECTION = 0
 """Kind: a unit direction, two degrees of freedom."""
 VECTOR = 1

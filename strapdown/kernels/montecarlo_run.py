@@ -39,9 +39,6 @@ from strapdown.kernels.measurement import ATTITUDE, HEADING, VECTOR, heading_row
 from strapdown.kernels.noise import next_word, single_normals, stream_state
 from strapdown.kernels.rotation import exponential, quaternion_multiply, rotation_matrix, unit
 
-BORROWS_ARRAYS = True
-"""See :mod:`strapdown.kernels.machine`."""
-
 GYRO, FLICKER, MARKOV, TURN_ON, START, DISPERSIONS, SENSORS = range(7)
 """Sources of noise: streams of a run. Two a sensor follow, from SENSORS on: its white noise, and its faults."""
 

@@ -22,9 +22,6 @@ from strapdown.kernels.lane_values import (
 from strapdown.kernels.montecarlo_run import KEPT
 from strapdown.kernels.rotation import quaternion_multiply
 
-BORROWS_ARRAYS = True
-"""See :mod:`strapdown.kernels.machine`."""
-
 SUMS = 6 + 21 + 21 + 3 + 6
 """Numbers summed at an epoch: e, e eᵀ and P (upper triangles in blocks θθ, θb, bb), the NEES of state, attitude, bias, and the product of
 each NEES over the runs, whose logarithm is the sum of logarithms: a number from 1 to 2, and the powers of two that it lacks."""

@@ -28,6 +28,7 @@ from strapdown.kernels.algebra import (
 from strapdown.kernels.chains import chain_start, chain_step, step_chains
 from strapdown.kernels.error_state_step import (
     OFFSET,
+    Rows,
     arm_noise,
     carry,
     decorrelate,
@@ -64,16 +65,12 @@ from strapdown.kernels.measurement import (
     value_of,
     vector_at,
 )
-from strapdown.kernels.rotation import far_turn, quaternion_multiply, right_jacobian, rotation_matrix, turned, unit
+from strapdown.kernels.rotation import far_turn, quaternion_multiply, right_jacobian, turned, unit
 from strapdown.kernels.triangle import covariances, dot_rows, take_row, triangularise, variances, whole_bias
 from strapdown.kernels.walk import step_within, turn_squared
 
 CALLED = ("store_segment", "age_chains", "aged_chain")
-"""Not inlined. Only functions of few arrays are: each array of a NamedTuple is handed over as seven numbers."""
-
-BORROWS_ARRAYS = True
-"""See :mod:`strapdown.kernels.machine`."""
-
+"""Not inlined. Only functions of few arrays are: each array of a NamedTuple is handed over by itself."""
 
 SHORT = 0.2
 """Of λ dt of a state in a chain: its series is exact."""
@@ -391,24 +388,8 @@ def seen_rows(form, e, q, x, kind, z, frame, sensor):
     if len(t) > 0:
         turn = (t[e, 0] - x[0], t[e, 1] - x[1], t[e, 2] - x[2])
         W = turning_matrix(turn, (t[e, 3], t[e, 4], t[e, 5]))
-    R = rotation_matrix(q)
-    length = form.length[e]
-    return fill_rows(
-        q,
-        R,
-        x,
-        kind,
-        z,
-        frame,
-        length,
-        sensor,
-        model.sensors,
-        model.sensor_use,
-        W,
-        scratch.rows[0],
-        scratch.threes[0],
-        scratch.threes[2:],
-    )
+    rows = Rows(scratch.rows[0], scratch.threes[0], scratch.threes[2:])
+    return fill_rows(q, x, kind, z, frame, form.length[e], sensor, model.sensors, model.sensor_use, W, rows)
 
 
 def keep(state, row, e, body, out):

@@ -36,9 +36,6 @@ from strapdown.kernels.triangle import covariances, padded, triangularise, varia
 
 CALLED = ("load_segment",)
 
-BORROWS_ARRAYS = True
-"""See :mod:`strapdown.kernels.machine`."""
-
 
 class Passes(NamedTuple):
     """Backward passes: pass p goes from the filtered state at edge ``last[p]`` down and writes edges ``upto[p]`` to ``first[p]``."""

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 from strapdown.kernels.lane_values import WIDTH, load, store
 
-BORROWS_ARRAYS = True
-"""See :mod:`strapdown.kernels.machine`."""
-
 SIZE = 28
 
 

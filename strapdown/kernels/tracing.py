@@ -62,8 +62,6 @@ class Trace:
         """Return what a function that numba knows makes of symbols and numbers."""
         given = tuple(map(type_of, arguments))
         kind, signature = self.signature(function, given)
-        if isinstance(signature.return_type, types.Array):
-            raise NotAFormula  # a part of an array may have to be counted
         if self.builder is None:
             return symbols(signature.return_type)
         key = (function, given)

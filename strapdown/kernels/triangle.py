@@ -19,9 +19,6 @@ from strapdown.kernels.lane_values import WIDTH, anywhere, load, spread, store, 
 CALLED = ("triangularise", "take_row", "dot_rows", "variances", "covariances", "whole_bias")
 """Not inlined where other kernels use them: their work is far more than a call, and each copy would be compiled anew."""
 
-BORROWS_ARRAYS = True
-"""See :mod:`strapdown.kernels.machine`."""
-
 _UNIT = np.repeat([0.0, 1.0, 0.0], [WIDTH, 1, WIDTH])
 
 

@@ -12,9 +12,6 @@ from strapdown.kernels.algebra import combine, dot, scale
 from strapdown.kernels.measurement import vector_at
 from strapdown.kernels.series import LARGEST_ANGLE
 
-BORROWS_ARRAYS = True
-"""See :mod:`strapdown.kernels.machine`."""
-
 OPEN = ("begin", "keep", "is_small", "longest_step", "predict", "stopped", "update", "finish")
 
 

@@ -1,4 +1,8 @@
-"""The scalar machine: any scenario, any filter, one run after the other through the simulator and the compiled filter."""
+"""The scalar machine: any scenario and any filter; each run goes through the simulator, and one after the other through the filter.
+
+Filters with error states run eight at once (:func:`strapdown.setup.run_together`). A run's bits depend neither on the runs beside it nor on
+whether it is one of a campaign or a replay.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +39,7 @@ from strapdown.scenarios import Scenario, drawn, simulate
 from strapdown.setup import FilterSetup
 
 NAME = "scalar"
-CHUNK = 10
+CHUNK = 8
 
 _TINY = float(np.finfo(np.float64).tiny)
 _OFF_DIAGONAL = ~np.eye(3, dtype=bool)
@@ -138,9 +142,8 @@ def replay(plan: Plan, run: int) -> Replay:
     number = count("run", run, least=0)
     record = record_of(plan, number)
     initial = start(record, plan.setup, plan.seed, number, plan.dispersions)
-    return Replay(
-        record=record, initial=initial, estimate=setup.run(record, plan.setup, initial, every=1, full_covariance=True)
-    )
+    (estimate,) = _estimates(plan, [record], [initial], every=1)
+    return Replay(record=record, initial=initial, estimate=estimate)
 
 
 def run_chunk(plan: Plan, first_run: int, runs: int) -> Statistics:
@@ -150,13 +153,33 @@ def run_chunk(plan: Plan, first_run: int, runs: int) -> Statistics:
 
 def run_chunks(plans: Sequence[Plan], first_run: int, runs: int) -> tuple[Statistics, ...]:
     """Return the statistics of several plans that differ in the filter alone; each run is simulated once and given to all filters."""
-    one = plans[0]
+    one, end = plans[0], first_run + runs
     sums = [Sums(plan, runs) for plan in plans]
-    for run in range(first_run, first_run + runs):
-        record = record_of(one, run)
+    at_once = max(_at_once(plan) for plan in plans)
+    for first in range(first_run, end, at_once):
+        numbers = range(first, min(first + at_once, end))
+        records = [record_of(one, run) for run in numbers]
         for part in sums:
-            part.add(run, record)
+            part.add(numbers, records)
     return tuple(part.statistics for part in sums)
+
+
+def _at_once(plan: Plan) -> int:
+    """Return how many runs are filtered at once: more than one where all have the same times."""
+    spec = plan.scenario.gyro
+    losses = [getattr(getattr(one, "faults", None), "drop_probability", 0.0) for one in plan.scenario.sensors]
+    differ = any((spec.sampling_jitter, spec.timestamp_error, spec.drop_probability, *losses))
+    return 1 if differ else setup.runs_at_once(plan.setup)
+
+
+def _estimates(
+    plan: Plan, records: Sequence[ImuRecord], initials: Sequence[estimation.State], every: int
+) -> list[Estimate]:
+    """Filter runs of a plan, and keep every ``every``-th state with its covariance."""
+    if _at_once(plan) > 1:
+        return setup.run_together(records, plan.setup, initials, every)
+    pairs = zip(records, initials, strict=True)
+    return [setup.run(record, plan.setup, initial, every=every, full_covariance=True) for record, initial in pairs]
 
 
 class Sums:
@@ -178,15 +201,22 @@ class Sums:
         self.scores: list[tuple[int, float]] = []
         self.examples: list[tuple[int, Array, Array]] = []
 
-    def add(self, run: int, record: ImuRecord) -> None:
-        """Filter one run and add what comes of it."""
+    def add(self, runs: Sequence[int], records: Sequence[ImuRecord]) -> None:
+        """Filter runs and add what comes of them."""
         plan = self.plan
-        initial = start(record, plan.setup, plan.seed, run, plan.dispersions)
+        initials = [
+            start(record, plan.setup, plan.seed, run, plan.dispersions)
+            for run, record in zip(runs, records, strict=True)
+        ]
         # A record that has lost samples has its epochs at no fixed step, so all steps are kept and the epochs picked; and so where a filter
         # of one's own chooses its times.
-        regular = len(record.increments) == plan.samples and not isinstance(plan.setup.estimator, Own)
-        every = plan.every if regular else 1
-        estimate = setup.run(record, plan.setup, initial, every=every, full_covariance=True)
+        regular = [len(one.increments) == plan.samples and not isinstance(plan.setup.estimator, Own) for one in records]
+        estimates = _estimates(plan, records, initials, plan.every if all(regular) else 1)
+        for run, record, estimate, fixed in zip(runs, records, estimates, regular, strict=True):
+            self._add(run, record, estimate, regular=fixed)
+
+    def _add(self, run: int, record: ImuRecord, estimate: Estimate, *, regular: bool) -> None:
+        """Add the estimate of one run."""
         assert record.truth is not None
         assert estimate.covariance is not None
         rows = slice(None) if regular else _at_epochs(estimate.time, self.time)

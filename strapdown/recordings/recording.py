@@ -103,7 +103,7 @@ class Recording(Listed):
             value = getattr(self, name)
             if value is not None:
                 value = array(f"{self.source}: {name}", value, (n, width), allow_nan=True)
-                if name != "true_attitude" and not np.any(value[~np.isnan(value)]) and not np.isnan(value).all():
+                if name != "true_attitude" and not np.any(np.abs(value) > 0.0) and not np.isnan(value).all():
                     raise InputError(
                         f"{self.source}: {name} is 0 in every row, as where there is no such sensor; leave its columns out"
                     )
@@ -237,6 +237,12 @@ def increments(recording: Recording) -> Array:
     higher polynomials.
     """
     return np.asarray(0.5 * (recording.rate[1:] + recording.rate[:-1]) * np.diff(recording.time)[:, None])
+
+
+def sampled(samples: Array) -> np.ndarray:
+    """Return which rows (n, 3) of a sensor are samples (n,): neither NaN nor 0 throughout."""
+    x, y, z = samples.T
+    return np.asarray(~np.isnan(x + y + z) & ((x != 0.0) | (y != 0.0) | (z != 0.0)))
 
 
 def gaps(time: ArrayLike) -> list[tuple[float, float]]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from strapdown import coning, quaternion
 from strapdown.checks import Array, InputError, non_negative
-from strapdown.recordings.recording import Recording, increments
+from strapdown.recordings.recording import Recording, increments, sampled
 
 FIELD_SPAN = 0.2
 """Span over which the change of the field, turned back by the gyro, shows the magnetometer's delay, s."""
@@ -72,14 +72,19 @@ class Delays:
 
 
 def find(
-    recording: Recording, latency: float | None = None, field: float | None = None, *, causal: bool = False
+    recording: Recording,
+    latency: float | None = None,
+    field: float | None = None,
+    *,
+    causal: bool = False,
+    turned: Array | None = None,
 ) -> Delays:
     """Return the delays of a recording's sensors.
 
     ``latency`` is the delay of gyro and accelerometer where it is known, s; by default half a sample interval, as of samples that are means
     over the interval before their stamp, or as much as the magnetometer is ahead of the gyro, for no sensor shows what is to come.
     ``field`` is the delay of the magnetometer behind the gyro where it is known, s. ``causal``: each sample's delay from the samples before
-    it, found anew whenever the recording has become twice as long.
+    it, found anew whenever the recording has become twice as long. ``turned`` (n, 4): attitude by the gyro alone, if it is at hand.
     """
     length = recording.time[-1] - recording.time[0]
     if latency is not None and non_negative("latency", latency, unit="s") >= length:
@@ -87,7 +92,7 @@ def find(
     found = np.full(len(recording.time), field or 0.0)
     sigma = GIVEN_SIGMA if field is not None else np.inf
     if field is None and recording.magnetic_field is not None:
-        evidence = _evidence(recording)
+        evidence = _evidence(recording, gyro_attitude(recording) if turned is None else turned)
         spans = [1.0] if causal else [length]
         while spans[-1] < length:
             spans.append(2.0 * spans[-1])
@@ -115,10 +120,19 @@ def magnetometer_delay(recording: Recording) -> tuple[float, float]:
     ``−τ ṁ``, ``ṁ = −w × m``, and how that changes over :data:`FIELD_SPAN` is fitted by least squares without the outliers. A field that
     turns with the body (hard iron) is in quadrature to it in a swing: it does not pass for a delay, but a strong one hides some.
     """
-    return (0.0, np.inf) if recording.magnetic_field is None else _fitted(*_evidence(recording)[1:])
+    return (
+        (0.0, np.inf)
+        if recording.magnetic_field is None
+        else _fitted(*_evidence(recording, gyro_attitude(recording))[1:])
+    )
 
 
-def _evidence(recording: Recording) -> tuple[Array, Array, Array, Array]:
+def gyro_attitude(recording: Recording) -> Array:
+    """Return the attitude (n, 4) by the gyro alone at every sample, from the identity at the first one."""
+    return coning.integrate(increments(recording), coning.ALGORITHMS["one-sample"])
+
+
+def _evidence(recording: Recording, turned: Array) -> tuple[Array, Array, Array, Array]:
     """Return times (m,), s, of pairs of field samples, and what :func:`_fitted` needs of their changes and of those by a unit delay."""
     time, none = recording.time, (np.empty(0),) * 4
     assert recording.magnetic_field is not None
@@ -126,30 +140,30 @@ def _evidence(recording: Recording) -> tuple[Array, Array, Array, Array]:
     if len(time) < 10 * lag:
         return none
     stride = max(1, lag // PAIRS_IN_SPAN)
-    at = np.arange(0, len(time), stride)
     lag = max(1, lag // stride)
-    attitude = coning.integrate(increments(recording), coning.ALGORITHMS["one-sample"])[at]
-    field = recording.magnetic_field[at]
-    known = np.asarray(np.isfinite(field).all(axis=1) & field.any(axis=1))
+    attitude, rate, field = (each[::stride] for each in (turned, recording.rate, recording.magnetic_field))
+    known = sampled(field)
     field = np.where(known[:, None], field, 0.0)
     still = quaternion.rotate(attitude, field)
-    late = quaternion.rotate(attitude, np.cross(recording.rate[at], field))
+    (x, y, z), (fx, fy, fz) = rate.T, field.T
+    late = quaternion.rotate(attitude, np.stack([y * fz - z * fy, z * fx - x * fz, x * fy - y * fx], axis=1))
     pairs = known[lag:] & known[:-lag]
     change, wanted = (still[lag:] - still[:-lag])[pairs], (late[lag:] - late[:-lag])[pairs]
     products = (np.einsum("ki,ki->k", a, b) for a, b in ((change, wanted), (wanted, wanted), (change, change)))
-    return time[at][lag:][pairs], *products
+    return time[::stride][lag:][pairs], *products
 
 
 def _fitted(across: Array, along: Array, total: Array) -> tuple[float, float]:
     """Return the delay, s, and its σ, by which w makes up c, without the farthest; c·w, w·w and c·c of each pair (m,) are given."""
-    kept = np.full(len(total), True)
+    kept, low, high = np.full(len(total), True), (len(total) - 1) // 2, len(total) // 2
     for _ in range(4):
         information = float(np.sum(along[kept]))
         if information == 0.0:
             return 0.0, np.inf
         delay = float(np.sum(across[kept])) / information
         left = total - 2.0 * delay * across + delay**2 * along
-        middle = float(np.median(left))
+        ordered = np.partition(left, (low, high))
+        middle = 0.5 * float(ordered[low] + ordered[high])
         kept = left <= 2.5**2 * middle
     # Of a normal residual with three components the median length is 1.54 σ; the pairs of one span overlap and are not independent.
     return delay, float(np.sqrt(max(middle, 0.0) * PAIRS_IN_SPAN / information)) / 1.54
@@ -163,10 +177,10 @@ def turn_over(recording: Recording, delay: Array | float) -> Array:
     """
     time = recording.time
     late = np.broadcast_to(np.asarray(delay, np.float64), time.shape)
-    sums = np.vstack([np.zeros(3), np.cumsum(increments(recording), axis=0)])
+    sums = np.zeros((len(time), 3))
+    np.cumsum(increments(recording), axis=0, out=sums[1:])
     then = time - late
     before = np.stack([np.interp(then, time, one) for one in sums.T], axis=1)
-    outside = then - np.clip(then, time[0], time[-1])
-    before += np.where(outside < 0.0, outside, 0.0)[:, None] * recording.rate[0]
-    before += np.where(outside > 0.0, outside, 0.0)[:, None] * recording.rate[-1]
-    return np.asarray(sums - before)
+    for outside, end in ((then < time[0], 0), (then > time[-1], -1)):
+        before[outside] += (then[outside] - time[end])[:, None] * recording.rate[end]
+    return np.subtract(sums, before, out=before)

@@ -93,7 +93,9 @@ def find(recording: Recording) -> Faults:
             f"{len(long)} intervals between stamps are longer than {LONG_INTERVAL:g} usual ones, up to {steps.max():.3g} s: σ grows over "
             "each by what the rate changes in as long a time"
         )
-    return Faults(recording=replace(recording, **changes), turn_variance=variance, words=tuple(words))
+    if changes:
+        recording = replace(recording, **changes)
+    return Faults(recording=recording, turn_variance=variance, words=tuple(words))
 
 
 def truncation_step(rate: Array) -> float | None:
@@ -106,11 +108,11 @@ def truncation_step(rate: Array) -> float | None:
     if step is None:
         return None
     crossing = np.zeros(rate.shape, bool)
+    above, below = rate > CROSSING_STEPS * step, rate < -CROSSING_STEPS * step
     reach = 2
     while reach <= SLOWEST_CROSSING and 2 * reach < len(rate):
-        before, after = rate[: -2 * reach], rate[2 * reach :]
-        beyond = np.minimum(np.abs(before), np.abs(after)) > CROSSING_STEPS * step
-        crossing[reach:-reach] |= beyond & (before * after < 0.0)
+        before, after = slice(-2 * reach), slice(2 * reach, None)
+        crossing[reach:-reach] |= (above[before] & below[after]) | (below[before] & above[after])
         reach *= 2
     bins = np.abs(rate[crossing]) / step
     number = np.bincount(np.rint(bins[bins < BINS + 0.5]).astype(int), minlength=1)
@@ -123,7 +125,10 @@ def truncation_step(rate: Array) -> float | None:
 
 def _quantisation(rate: Array) -> float | None:
     """Return the step that nearly all the slow ones among the rates (n, 3) are multiples of, zero included; None where there is none."""
-    slow, number = np.unique(np.round(np.abs(rate[np.abs(rate) < SLOW_RATE]), 7), return_counts=True)
+    sizes = np.abs(rate)
+    counted = np.bincount(np.rint(1e7 * sizes[sizes < SLOW_RATE]).astype(np.intp))
+    values = np.flatnonzero(counted)
+    slow, number = values / 1e7, counted[values]
     frequent = slow[number >= 3]
     if len(frequent) < BINS or frequent[0] != 0.0:
         return None
@@ -142,14 +147,17 @@ def untruncated(rate: Array, step: float) -> Array:
 def clipped_samples(samples: Array, least: float) -> np.ndarray:
     """Return which of the samples (n, 3) are at their sensor's limit: those that repeat the extreme of their axis, beyond ``least``."""
     found = np.zeros(samples.shape, bool)
-    for k, axis in enumerate(samples.T):
-        same = np.append(False, axis[1:] == axis[:-1])
+    for k, axis in enumerate(samples.T.copy()):
         extremes = [axis == end for end in (np.nanmax(axis, initial=-np.inf), np.nanmin(axis, initial=np.inf))]
+        repeated = [np.count_nonzero(at) >= MIN_CLIPPED and abs(axis[np.argmax(at)]) >= least for at in extremes]
+        if not any(repeated):
+            continue
+        same = np.append(False, axis[1:] == axis[:-1])
         between = ~(extremes[0] | extremes[1])
         if not between.any() or np.mean(same[between]) > MAX_REPEATS:
             continue
-        for at in extremes:
-            if np.sum(at) >= MIN_CLIPPED and np.any(at & same) and abs(axis[np.argmax(at)]) >= least:
+        for at, candidate in zip(extremes, repeated, strict=True):
+            if candidate and np.any(at & same):
                 found[:, k] |= at
     return found
 
@@ -161,7 +169,10 @@ def restored(time: Array, rate: Array) -> tuple[Array, Array, np.ndarray]:
     run is uncertain by :data:`RESTORED_ERROR` of itself; its variance is spread evenly over the intervals of the run.
     """
     clipped = clipped_samples(rate, MIN_CLIPPED_RATE)
-    result, variance = rate.copy(), np.zeros(len(time) - 1)
+    variance = np.zeros(len(time) - 1)
+    if not clipped.any():
+        return rate, variance, clipped
+    result = rate.copy()
     for k in np.flatnonzero(clipped.any(axis=0)):
         edges = np.flatnonzero(np.diff(np.concatenate([[0], clipped[:, k].astype(int), [0]])))
         for first, stop in edges.reshape(-1, 2):

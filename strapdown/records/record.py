@@ -652,8 +652,11 @@ def result_file(path: str | os.PathLike[str], kind: str, attributes: Mapping[str
 
 
 def put(group: Any, name: str, value: Array, unit: str, meaning: str = "") -> None:
-    """Write an array with its unit, and its meaning where the name does not state it, as attributes; compressed unless it is small."""
-    large = value.size > 256
+    """Write an array with its unit, and its meaning where the name does not state it, as attributes; compressed unless it is small.
+
+    Nor are covariances: they are most of a file, and compressing them would take a fifth of a warm `strapdown estimate` to save a third.
+    """
+    large = value.size > 256 and value.ndim < 3
     dataset = group.create_dataset(
         name, data=value, **({"compression": "gzip", "compression_opts": 1, "shuffle": True} if large else {})
     )

@@ -22,6 +22,7 @@ from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.states import ProcessNoise, State
 from strapdown.files import reading, tables
 from strapdown.gyro import GyroSpec
+from strapdown.kernels.lane_values import WIDTH
 from strapdown.records import Estimate, ImuRecord, compress
 from strapdown.results import ByValue
 from strapdown.scenarios import Scenario, simulate
@@ -462,6 +463,25 @@ def run(record: ImuRecord, setup: FilterSetup, initial: State, **options: Any) -
     if setup.states is not None:
         return optional.run(modelled_record(record, setup), setup.process_noise, initial, setup.states, **chosen)
     return estimation.run(modelled_record(record, setup), setup.process_noise, initial, **chosen)
+
+
+def runs_at_once(setup: FilterSetup) -> int:
+    """Return how many records :func:`run_together` filters at once: 1 for a filter that it is not for."""
+    judged = setup.gate is not None or setup.robust is not None
+    return WIDTH if setup.estimator == MEKF and setup.states is not None and not judged else 1
+
+
+def run_together(
+    records: Sequence[ImuRecord], setup: FilterSetup, initials: Sequence[State], every: int
+) -> list[Estimate]:
+    """Run the filter of a setup over several records, and keep every ``every``-th state with its covariance.
+
+    The filter is one that :func:`runs_at_once` allows. A record's estimate has the same bits whatever the records beside it, and agrees
+    with that of :func:`run` to rounding.
+    """
+    assert setup.states is not None
+    modelled = [modelled_record(record, setup) for record in records]
+    return optional.run_together(modelled, setup.process_noise, initials, setup.states, every)
 
 
 def _run_other(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from strapdown import units
 from strapdown.checks import Array, InputError, array, known_keys, non_negative, one_of, positive
-from strapdown.estimation import forward
+from strapdown.estimation import forward, together
 from strapdown.estimation import model as modelling
 from strapdown.estimation.error_states import (
     BoundedVelocity,
@@ -421,19 +421,39 @@ def run(
 
     An ``initial`` without values has the whole bias. Options are those of :func:`strapdown.estimation.run`.
     """
-    error_states = states.blocks({series.sensor: series.kind for series in record.vectors})
-    state = initial if len(initial.values) else initial_state(initial, error_states)
-    problem = forward.prepared(record, process_noise, state, error_states, driven=True)
+    problem = prepared(record, process_noise, initial, states)
     options = forward.Options(
         every=every, full_covariance=full_covariance, gate=gate, robust=robust, whole_bias=True, together=True
     )
     found = forward.filtered(problem, options).estimate
+    return _reported(forward.watched(found, monitor, gate), states)
+
+
+def run_together(
+    records: Sequence[ImuRecord], process_noise: ProcessNoise, initials: Sequence[State], states: States, every: int
+) -> list[Estimate]:
+    """Run the filter over several records, eight at once where it can (:mod:`strapdown.estimation.together`), with full covariance."""
+    problems = [prepared(one, process_noise, start, states) for one, start in zip(records, initials, strict=True)]
+    options = forward.Options(every=every, full_covariance=True, whole_bias=True, together=True)
+    found = together.run(problems, every, lambda problem: forward.filtered(problem, options).estimate)
+    return [_reported(one, states) for one in found]
+
+
+def prepared(record: ImuRecord, process_noise: ProcessNoise, initial: State, states: States) -> forward.Problem:
+    """Return a record prepared for the filter with these states."""
+    error_states = states.blocks({series.sensor: series.kind for series in record.vectors})
+    state = initial if len(initial.values) else initial_state(initial, error_states)
+    return forward.prepared(record, process_noise, state, error_states, driven=True)
+
+
+def _reported(found: Estimate, states: States) -> Estimate:
+    """Return an estimate whose bias is the whole one, what is too quick for a state in its variance."""
     assert found.whole_bias is not None
     assert found.whole_bias_variance is not None
     fast = np.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0]) * states.gyro_fast_bias_sigma**2
     covariance = found.whole_bias_covariance
     return replace(
-        forward.watched(found, monitor, gate),
+        found,
         bias=found.whole_bias,
         variance=found.whole_bias_variance + fast,
         covariance=None if covariance is None else covariance + np.diag(fast),

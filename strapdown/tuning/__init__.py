@@ -51,6 +51,7 @@ from strapdown.tuning.planning import plan
 from strapdown.tuning.planning import simulated_again as simulated_again
 from strapdown.tuning.procedure import GATED as GATED
 from strapdown.tuning.procedure import tune
+from strapdown.tuning.starting import by_innovations as by_innovations
 from strapdown.tuning.starting import one_gyro as one_gyro
 from strapdown.tuning.starting import record_case, recording_case
 from strapdown.tuning.starting import recording_setup as recording_setup

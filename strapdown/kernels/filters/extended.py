@@ -42,9 +42,6 @@ from strapdown.kernels.rotation import moved, quaternion_multiply, rotation_matr
 from strapdown.kernels.state import load_state, store_state
 from strapdown.kernels.walk import SQUARED_RANGE, step_within, turn_squared
 
-BORROWS_ARRAYS = True
-"""See :mod:`strapdown.kernels.machine`."""
-
 OPEN = ("from_body_side", "to_body_side", "propagated", "error_rows", "row_update", "closed")
 
 

@@ -1,0 +1,810 @@
+"""The filter with error states over several runs at once, a run a lane: the covariance form of :mod:`strapdown.kernels.root_form`.
+
+All runs have their gyro edges and measurements at the same times, of the same sensors, noise and references; what differs is lanes. Models,
+formulas and their names are those of :mod:`strapdown.kernels.error_state_step`, without chains, and without offsets in fixed axes. Of the
+covariance P, held whole, the upper triangle is used.
+
+A run whose covariance might lose digits, or that leaves the range of the polynomials, is marked as lost, and is left to the factor. No lane
+depends on its neighbours. Lanes in memory lie one after the other, so place p of a flat array begins at ``p · len(like)``.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from strapdown.kernels.algebra import (
+    add,
+    add_matrices,
+    combine,
+    cross,
+    dot,
+    full,
+    matrix_times_vector,
+    multiply,
+    scale,
+    skew_polynomial,
+    square_root,
+    subtract,
+    symmetric_minus_outer,
+    symmetric_times_vector,
+    times_transpose_upper_add,
+    transpose,
+    transpose_times_vector,
+)
+from strapdown.kernels.error_state_step import (
+    FACTORIALS,
+    FORCE,
+    LEVER,
+    OFFSET,
+    SCALE,
+    THREE_NODES,
+    THREE_WEIGHTS,
+    gyro_matrix_times,
+    inverse,
+    matrix_at,
+    offset_of,
+    turning_matrix,
+)
+from strapdown.kernels.filter_step import SHORT_FORM, process_noise, reset, transition
+from strapdown.kernels.lane_angles import arctangent, rotation_vector
+from strapdown.kernels.lane_values import anywhere, chosen, lanes_of, load_like, store_like
+from strapdown.kernels.measurement import ATTITUDE, DIRECTION, HEADING, VERTICAL, frame_at, six_at
+from strapdown.kernels.montecarlo_run import store_four, store_triple, triple
+from strapdown.kernels.rotation import exponential, quaternion_multiply, right_jacobian, rotation_matrix, turned
+from strapdown.kernels.walk import SQUARED_RANGE
+
+CALLED = (
+    "step",
+    "follow",
+    "fill_table",
+    "at_node",
+    "absorb",
+    "product",
+    "minus_outer",
+    "take_row",
+    "attitude_rows",
+    "heading_rows",
+    "vector_rows",
+    "decorrelate",
+    "least_share",
+    "keep",
+)
+"""Not inlined: their work is far more than a call."""
+
+BORROWS_ARRAYS = True
+"""See :mod:`strapdown.kernels.machine`."""
+
+MISS, GAIN, STEP, AXES = 0, 1, 2, 3
+"""Lines of n states: P h less the gain times the noise, P h, the correction, and from the last on three of the three axes."""
+OWN, KEPT = 0, 1
+"""Lines of n numbers, the same in all lanes: noise of a state by itself, and what is left of it, in the steps since P's."""
+LEFT, MEAN, OF_NOISE, TIME, SERIES = 0, 1, 10, 11, 10
+"""Columns of a state's table: e^{−λu}, ``∫₀ᵘ e^{−λs} ds``, ``∫₀ᵘ e^{−2λs} ds``, u; between them ``Σ (−λu)ⁱ/(i + k)!`` in column k."""
+SAME = 1e-9
+"""Part of a step within which another one has the same table."""
+MAX_SHARPNESS = 1e9
+"""Largest ratio of an innovation's variance to the measurement's at which P keeps digits enough."""
+MIN_SHARE = 1e-6
+"""Smallest part of a state's variance, given the states before it, at which P keeps digits enough."""
+CHECK = 1024
+"""Intervals from one look at the digits to the next."""
+
+
+class Events(NamedTuple):
+    """Measurements in order of time (m,), the same in all runs."""
+
+    time: np.ndarray
+    place: np.ndarray
+    """Row of the innovations."""
+    sensor: np.ndarray
+    kind: np.ndarray
+    frame: np.ndarray
+    """Right-handed frames about the references (m, 9)."""
+    noise: np.ndarray
+    """Upper triangles of the covariances in body axes (m, 6)."""
+    length: np.ndarray
+    """What the effects are divided by."""
+
+
+class Runs(NamedTuple):
+    """What differs from run to run; the last axis is the lanes."""
+
+    increments: np.ndarray
+    """(n, 3, W), rad."""
+    value: np.ndarray
+    """Measured vectors, or attitudes (m, 4, W)."""
+    turning: np.ndarray
+    """Rate, angular acceleration and the latter's variances (m, 9, W), or (0, 9, W) without lever arms."""
+
+
+class Work(NamedTuple):
+    """The filter's state, and work space of n states in all; the last axis is the lanes."""
+
+    attitude: np.ndarray
+    """(4, W)"""
+    x: np.ndarray
+    """Bias and error states (n − 3, W)."""
+    P: np.ndarray
+    """(2, n, n, W): the filter's, and what it is at an edge between two measurements."""
+    top: np.ndarray
+    """What each state makes of the attitude over the steps since P's (n, 3, W)."""
+    cross: np.ndarray
+    """Covariance of the noise of those steps: attitude with each state (n, 3, W)."""
+    rows: np.ndarray
+    """H of a measurement (3, n, W)."""
+    lines: np.ndarray
+    """(6, n, W): :data:`MISS` to :data:`AXES`."""
+    alone: np.ndarray
+    """(2, n): :data:`OWN` and :data:`KEPT`."""
+    table: np.ndarray
+    """What a step makes of each state, and last the step that it is of (m + 1, 4, 12)."""
+    lost: np.ndarray
+    """1 where the run is lost (W,)."""
+    written: np.ndarray
+    """What is to be handed out (2 n + 22, W)."""
+
+
+class Outputs(NamedTuple):
+    """What is written of each of the first runs, as many as there is room for."""
+
+    kept: np.ndarray
+    """q (4), x (n − 3), variances (n) and the covariance of attitude and whole bias (21) at the kept edges (runs, rows, 2 n + 22)."""
+    innovation: np.ndarray
+    """e₁, s₁, e₂, s₂, e₃, s₃ by place (runs, m, 6)."""
+
+
+def place_of(n, i, j):
+    """Return the place of P's entry (i, j)."""
+    return n * min(i, j) + max(i, j)
+
+
+def seen(work, like, place):
+    """Return a lane value of P by its place."""
+    return load_like(work.P, place * len(like), like)
+
+
+def one_of(array, place, like):
+    """Return a lane value by its place."""
+    return load_like(array, place * len(like), like)
+
+
+def put(array, place, like, value):
+    """Write a lane value to its place."""
+    store_like(array, place * len(like), value)
+
+
+def identity(like):
+    """Return the identity matrix in lanes."""
+    one = like + 1.0
+    return (one, like, like, like, one, like, like, like, one)
+
+
+def error_matrix(gyro, k):
+    """Return the matrix of a state of the gyro."""
+    return (
+        gyro[k, 3],
+        gyro[k, 4],
+        gyro[k, 5],
+        gyro[k, 6],
+        gyro[k, 7],
+        gyro[k, 8],
+        gyro[k, 9],
+        gyro[k, 10],
+        gyro[k, 11],
+    )
+
+
+def four(array, place, like):
+    """Return four neighbouring places."""
+    return (
+        one_of(array, place, like),
+        one_of(array, place + 1, like),
+        one_of(array, place + 2, like),
+        one_of(array, place + 3, like),
+    )
+
+
+def spread_six(like, array, e):
+    """Return row e of an array in all lanes."""
+    a = six_at(array, e)
+    return (like + a[0], like + a[1], like + a[2], like + a[3], like + a[4], like + a[5])
+
+
+def scaled(c, A):
+    """Return c A of a 9-tuple."""
+    return (c * A[0], c * A[1], c * A[2], c * A[3], c * A[4], c * A[5], c * A[6], c * A[7], c * A[8])
+
+
+def mark(work, like, good):
+    """Mark the runs as lost in which a condition does not hold: of what is no number none does."""
+    lost = one_of(work.lost, 0, like)
+    put(work.lost, 0, like, chosen(good, lost, like + 1.0))
+
+
+# ------------------------------------------------------------------------------------------------------------------------ prediction
+
+
+def step(model, work, like, q, turn, noise, dt, part):
+    """Propagate attitude and ``x`` over an increment, and add the step to those since P's; return q, Φ_θθ and Q_θθ of all of them."""
+    gyro, gyro_use, decay, density = model.gyro, model.gyro_use, model.decay, model.density
+    x, table = work.x, work.table
+    if abs(dt - table[len(decay), 0, 0]) > SAME * dt:
+        fill_table(table, decay, dt)
+    r = combine(1.0, part, -dt, triple(x, 0, like))
+    force = (like, like, like)
+    if dot(model.force_f, model.force_f) > 0.0:
+        force = transpose_times_vector(rotation_matrix(turned(q, scale(0.5, r))), model.force_f)
+    D = identity(like)
+    coupled = False
+    for k in range(len(decay)):
+        use = gyro_use[k]
+        if use != 0:
+            c = one_of(x, 3 + k, like)
+            if use & OFFSET:
+                r = combine(1.0, r, -table[k, 3, MEAN] * c, (gyro[k, 0], gyro[k, 1], gyro[k, 2]))
+            if use & FORCE:
+                r = combine(1.0, r, -dt * c, gyro_matrix_times(gyro, k, force))
+            if use & SCALE:
+                coupled = True
+                D = add_matrices(D, scaled(c, error_matrix(gyro, k)))
+    if coupled:
+        D = inverse(D)
+        r = matrix_times_vector(D, r)
+    mark(work, like, dot(r, r) <= SQUARED_RANGE)
+    phi11, phi12 = transition(r, dt)
+    q11, q12, q22 = process_noise(r, dt, model.angle_variance, model.rate_variance)
+    if coupled:
+        phi12 = multiply(phi12, D)
+    rate = scale(1.0 / dt, r)
+    noise = times_transpose_upper_add(multiply(phi11, full(noise)), phi11, q11)
+    for i in range(3):
+        column = (phi12[i], phi12[3 + i], phi12[6 + i])
+        noise = follow(work, like, 3 + i, phi11, column, (q12[i], q12[3 + i], q12[6 + i]), q22, 1.0, noise)
+    E = E0 = E1 = E2 = D
+    held = -1.0
+    for k in range(len(decay)):
+        use, kept, own = gyro_use[k], table[k, 3, LEFT], density[k] * table[k, 3, OF_NOISE]
+        put(x, 3 + k, like, kept * one_of(x, 3 + k, like))
+        if use == 0:
+            work.alone[OWN, 6 + k] = kept * kept * work.alone[OWN, 6 + k] + own
+            work.alone[KEPT, 6 + k] *= kept
+        else:
+            e = (gyro[k, 0], gyro[k, 1], gyro[k, 2])
+            w = (like, like, like)
+            if use & SCALE:
+                w = add(w, gyro_matrix_times(gyro, k, rate))
+            if use & FORCE:
+                w = add(w, gyro_matrix_times(gyro, k, force))
+            column = matrix_times_vector(phi12, w)
+            share = (like, like, like)
+            if use & OFFSET:
+                if decay[k] != held:
+                    held = decay[k]
+                    E0, E1 = at_node(table, k, 0, rate, D, coupled), at_node(table, k, 1, rate, D, coupled)
+                    E2, E = at_node(table, k, 2, rate, D, coupled), at_node(table, k, 3, rate, D, coupled)
+                column = subtract(column, matrix_times_vector(E, e))
+                if density[k] > 0.0:
+                    noise, share = driven(table, k, 0, density[k], E0, e, noise, share)
+                    noise, share = driven(table, k, 1, density[k], E1, e, noise, share)
+                    noise, share = driven(table, k, 2, density[k], E2, e, noise, share)
+            noise = follow(work, like, 6 + k, phi11, column, share, own, kept, noise)
+    return turned(q, r), multiply(phi11, turn), noise
+
+
+def fill_table(table, decay, dt):
+    """Write what a step of dt makes of each state by itself: rows of the nodes of its noise, and of its end."""
+    table[len(decay), 0, 0] = dt
+    for k in range(len(decay)):
+        same = k > 0 and decay[k] == decay[k - 1]
+        for i in range(12 if same else 0):
+            for r in range(4):
+                table[k, r, i] = table[k - 1, r, i]
+        for i in range(0 if same else 4):
+            u = dt * (1.0 - THREE_NODES[i]) if i < 3 else dt
+            z = -decay[k] * u
+            phi = FACTORIALS[0]
+            for j in range(1, 15):
+                phi = FACTORIALS[j] + z * phi
+                if 16 - j < SERIES:
+                    table[k, i, 16 - j] = phi
+            table[k, i, TIME] = u
+            table[k, i, MEAN] = u * (1.0 + z * phi)
+            table[k, i, LEFT] = math.exp(z)
+        if not same:
+            table[k, 3, OF_NOISE] = -0.5 * math.expm1(-2.0 * decay[k] * dt) / decay[k] if decay[k] > 0.0 else dt
+
+
+def at_node(table, k, i, rate, D, coupled):
+    """Return :func:`strapdown.kernels.error_state_step.response` up to a node of state k's noise, times (I + M)⁻¹.
+
+    Of each series four terms: to 1e-10 in the range of a step.
+    """
+    f = table[k, i]
+    u = f[TIME]
+    y = -u * u * dot(rate, rate)
+    linear = f[2] + y * (f[4] + y * (f[6] + y * f[8]))
+    quadratic = f[3] + y * (f[5] + y * (f[7] + y * f[9]))
+    E = skew_polynomial(f[MEAN], -u * u * linear, u * u * u * quadratic, rate)
+    return multiply(E, D) if coupled else E
+
+
+def driven(table, k, i, density, E, e, noise, share):
+    """Add what state k's white noise makes at Gauss's node i: of Q_θθ, and of Q with the attitude."""
+    weight = THREE_WEIGHTS[i] * density * table[k, 3, TIME]
+    t = matrix_times_vector(E, e)
+    return symmetric_minus_outer(noise, scale(-weight, t), t), combine(1.0, share, -weight * table[k, i, LEFT], t)
+
+
+def follow(work, like, i, phi11, column, share, own, kept, noise):
+    """Let a step follow those since P's, as to state i; return Q_θθ with what they have of it. As ``error_state_step.follow``."""
+    alone = work.alone
+    u = matrix_times_vector(phi11, triple(work.cross, 3 * i, like))
+    v = combine(1.0, u, alone[OWN, i], column)
+    top = matrix_times_vector(phi11, triple(work.top, 3 * i, like))
+    store_triple(work.top, 3 * i, like, combine(1.0, top, alone[KEPT, i], column))
+    store_triple(work.cross, 3 * i, like, combine(kept, v, 1.0, share))
+    alone[OWN, i] = kept * kept * alone[OWN, i] + own
+    alone[KEPT, i] *= kept
+    return (
+        noise[0] + (column[0] * u[0] + v[0] * column[0]),
+        noise[1] + (column[0] * u[1] + v[0] * column[1]),
+        noise[2] + (column[0] * u[2] + v[0] * column[2]),
+        noise[3] + (column[1] * u[1] + v[1] * column[1]),
+        noise[4] + (column[1] * u[2] + v[1] * column[2]),
+        noise[5] + (column[2] * u[2] + v[2] * column[2]),
+    )
+
+
+def start_steps(work, like):
+    """Forget the steps since P's."""
+    for i in range(work.alone.shape[1]):
+        store_triple(work.top, 3 * i, like, (like, like, like))
+        store_triple(work.cross, 3 * i, like, (like, like, like))
+        work.alone[OWN, i] = 0.0
+        work.alone[KEPT, i] = 1.0
+
+
+def absorb(model, work, like, base, turn, noise):
+    """Take the P that begins at place ``base`` over the steps since: ``Φ P Φᵀ + Q``."""
+    n, last = work.alone.shape[1], 6 + model.changing
+    kept = work.alone[KEPT]
+    for j in range(n):
+        t = matrix_times_vector(
+            turn,
+            (
+                seen(work, like, base + place_of(n, 0, j)),
+                seen(work, like, base + place_of(n, 1, j)),
+                seen(work, like, base + place_of(n, 2, j)),
+            ),
+        )
+        for i in range(3, n):
+            if i < 6 or model.gyro_use[i - 6] != 0:
+                t = combine(1.0, t, seen(work, like, base + place_of(n, i, j)), triple(work.top, 3 * i, like))
+        for a in range(3):
+            put(work.lines, n * (AXES + a) + j, like, t[a])
+    A = (axes_at(work, like, n, 0), axes_at(work, like, n, 1), axes_at(work, like, n, 2))
+    T = (A[0][0], A[1][0], A[2][0], A[0][1], A[1][1], A[2][1], A[0][2], A[1][2], A[2][2])
+    S = times_transpose_upper_add(T, turn, noise)
+    for i in range(3, n):
+        t = axes_at(work, like, n, i)
+        if i < 6 or model.gyro_use[i - 6] != 0:
+            S = symmetric_minus_outer(S, scale(-1.0, t), triple(work.top, 3 * i, like))
+        t = combine(kept[i], t, 1.0, triple(work.cross, 3 * i, like))
+        for a in range(3):
+            put(work.P, base + n * a + i, like, t[a])
+    put_attitude(work, like, base, n, S)
+    for i in range(3, last):
+        for j in range(max(i, 6), last):
+            here = base + n * i + j
+            put(work.P, here, like, kept[i] * kept[j] * seen(work, like, here))
+        for j in range(last, n if i >= 6 else 0):
+            here = base + n * i + j
+            put(work.P, here, like, kept[i] * seen(work, like, here))
+        here = base + n * i + i
+        put(work.P, here, like, seen(work, like, here) + work.alone[OWN, i])
+
+
+def axes_at(work, like, n, i):
+    """Return what the three lines of axes hold of state i."""
+    return (
+        one_of(work.lines, n * AXES + i, like),
+        one_of(work.lines, n * (AXES + 1) + i, like),
+        one_of(work.lines, n * (AXES + 2) + i, like),
+    )
+
+
+def attitude_of(work, like, n):
+    """Return the covariance of the attitude (6-tuple)."""
+    a, b = triple(work.P, 0, like), triple(work.P, n, like)
+    return (a[0], a[1], a[2], b[1], b[2], seen(work, like, 2 * n + 2))
+
+
+def put_attitude(work, like, base, n, S):
+    """Write the covariance of the attitude."""
+    store_triple(work.P, base, like, (S[0], S[1], S[2]))
+    put(work.P, base + n + 1, like, S[3])
+    put(work.P, base + n + 2, like, S[4])
+    put(work.P, base + 2 * n + 2, like, S[5])
+
+
+# ----------------------------------------------------------------------------------------------------------------------- measurements
+
+
+def product(work, like, use, r, line):
+    """Write P h of a row of H, of a sensor whose states are marked in ``use``, to a line."""
+    n = work.alone.shape[1]
+    for j in range(n):
+        put(work.lines, n * line + j, like, like)
+    for i in range(n):
+        if i < 3 or (i >= 6 and use[i - 6] != 0):
+            h = one_of(work.rows, n * r + i, like)
+            for j in range(n):
+                p = one_of(work.lines, n * line + j, like) + h * seen(work, like, place_of(n, i, j))
+                put(work.lines, n * line + j, like, p)
+
+
+def against(work, like, use, r, line):
+    """Return the scalar product of a row of H and a line."""
+    n = work.alone.shape[1]
+    p = like
+    for i in range(n):
+        if i < 3 or (i >= 6 and use[i - 6] != 0):
+            p = p + one_of(work.rows, n * r + i, like) * one_of(work.lines, n * line + i, like)
+    return p
+
+
+def minus_outer(work, like, left, right, factor):
+    """Subtract the product of two lines, times a factor, from P."""
+    n = work.alone.shape[1]
+    for i in range(n):
+        a = factor * one_of(work.lines, n * left + i, like)
+        for j in range(i, n):
+            here = n * i + j
+            put(work.P, here, like, seen(work, like, here) - a * one_of(work.lines, n * right + j, like))
+
+
+def take_row(work, like, use, r, y, variance):
+    """Update P and the correction with row r of H, which measures y with noise of ``variance``; return its innovation and their variance.
+
+    Joseph's form, as :func:`strapdown.kernels.filter_step.update_row`.
+    """
+    n = work.alone.shape[1]
+    product(work, like, use, r, GAIN)
+    s = against(work, like, use, r, GAIN) + variance
+    inverted = 1.0 / s
+    error = y - against(work, like, use, r, STEP)
+    gain = error * inverted
+    for i in range(n):
+        here = n * STEP + i
+        put(work.lines, here, like, one_of(work.lines, here, like) + gain * one_of(work.lines, n * GAIN + i, like))
+    minus_outer(work, like, GAIN, GAIN, inverted)
+    precise = s > SHORT_FORM * variance
+    if anywhere(precise):
+        product(work, like, use, r, MISS)
+        for i in range(n):
+            here = n * MISS + i
+            missed = one_of(work.lines, here, like) - (variance * inverted) * one_of(work.lines, n * GAIN + i, like)
+            put(work.lines, here, like, chosen(precise, missed, like))
+        minus_outer(work, like, MISS, GAIN, inverted)
+    mark(work, like, s >= variance)
+    mark(work, like, s <= MAX_SHARPNESS * variance)
+    return error, s
+
+
+def sensed(work, model, like, s, length, W):
+    """Return the offset, body axes, and I + M of what a sensor measures, and whether any state is about it."""
+    use = model.sensor_use
+    offset = (like, like, like)
+    M = identity(like)
+    coupled = False
+    for k in range(use.shape[1]):
+        if use[s, k] != 0:
+            coupled = True
+            c = one_of(work.x, 3 + k, like)
+            if use[s, k] & (OFFSET | LEVER):
+                offset = combine(1.0, offset, c / length, offset_of(model.sensors, use, s, k, W))
+            if use[s, k] & SCALE:
+                M = add_matrices(M, scaled(c, matrix_at(model.sensors, s, k)))
+    return offset, M, coupled
+
+
+def put_row(work, like, n, r, h):
+    """Write the attitude's part of a row of H."""
+    store_triple(work.rows, n * r, like, h)
+
+
+def attitude_rows(model, work, like, q, measured, s):
+    """Write H of a measured attitude; return y (3)."""
+    n, use = work.alone.shape[1], model.sensor_use
+    offset, _, _ = sensed(work, model, like, s, 1.0, identity(like))
+    mark(work, like, dot(offset, offset) <= SQUARED_RANGE)
+    predicted = turned(q, offset)
+    E = transpose(rotation_matrix(exponential(offset)))
+    J = right_jacobian(offset)
+    for r in range(3):
+        put_row(work, like, n, r, (E[3 * r], E[3 * r + 1], E[3 * r + 2]))
+    for k in range(use.shape[1]):
+        if use[s, k] != 0:
+            t = matrix_times_vector(J, (model.sensors[s, k, 0], model.sensors[s, k, 1], model.sensors[s, k, 2]))
+            for r in range(3):
+                put(work.rows, n * r + 6 + k, like, t[r])
+    return rotation_vector(quaternion_multiply((predicted[0], -predicted[1], -predicted[2], -predicted[3]), measured))
+
+
+def heading_rows(model, work, like, q, z, reference, length, s):
+    """Write H of the heading of a vector; return y."""
+    n, use = work.alone.shape[1], model.sensor_use
+    R = rotation_matrix(q)
+    offset, M, coupled = sensed(work, model, like, s, length, identity(like))
+    D = inverse(M)
+    m = matrix_times_vector(R, matrix_times_vector(D, subtract(z, offset)))
+    level = m[0] * m[0] + m[1] * m[1]
+    mark(work, like, level > VERTICAL)  # a vertical vector shows no heading
+    y = arctangent(m[0] * reference[1] - m[1] * reference[0], m[0] * reference[0] + m[1] * reference[1])
+    if coupled:
+        # Derivatives where the heading is what is expected: see error_state_step.fill_rows.
+        stretch = square_root(level / (reference[0] * reference[0] + reference[1] * reference[1]))
+        m = (stretch * reference[0], stretch * reference[1], m[2])
+    clean = transpose_times_vector(R, m)
+    g = (-m[1] / level, m[0] / level, like)
+    put_row(work, like, n, 0, transpose_times_vector(R, cross(m, g)))
+    for k in range(use.shape[1]):
+        if use[s, k] != 0:
+            e = scale(1.0 / length, offset_of(model.sensors, use, s, k, D))
+            w = add((like, like, like), e)
+            if use[s, k] & SCALE:
+                w = add(w, matrix_times_vector(matrix_at(model.sensors, s, k), clean))
+            put(work.rows, 6 + k, like, -dot(g, matrix_times_vector(R, matrix_times_vector(D, w))))
+    return y
+
+
+def across(d, like):
+    """Return unit vectors t1, t2 with t1 × t2 = d of a unit vector d, as ``error_state_step.across`` in each lane."""
+    one = like + 1.0
+    x, y, z = chosen(d[0] < 0.0, -d[0], d[0]), chosen(d[1] < 0.0, -d[1], d[1]), chosen(d[2] < 0.0, -d[2], d[2])
+    second = chosen(y < x, chosen(y <= z, one, like), like)
+    third = chosen(z < x, one - second, like)
+    t = cross((one - second - third, second, third), d)
+    t = scale(1.0 / square_root(dot(t, t)), t)
+    return t, cross(d, t)
+
+
+def vector_rows(model, work, like, q, z, frame, length, s, W, rows):
+    """Write H of a direction (two rows) or a whole vector (three); return y (3) and the rows' axes."""
+    n, use = work.alone.shape[1], model.sensor_use
+    R = rotation_matrix(q)
+    offset, M, coupled = sensed(work, model, like, s, length, W)
+    u = transpose_times_vector(R, (frame[0], frame[1], frame[2]))
+    v = transpose_times_vector(R, (frame[3], frame[4], frame[5]))
+    third = transpose_times_vector(R, (frame[6], frame[7], frame[8]))
+    m = add(matrix_times_vector(M, third), offset)
+    shrink = like + 1.0
+    residual = subtract(z, m)
+    if rows == 2:
+        residual = z
+        if coupled:
+            shrink = 1.0 / square_root(dot(m, m))
+            u, v = across(scale(shrink, m), like)
+    y = (dot(u, residual), dot(v, residual), dot(third, residual))
+    u, v, w = scale(shrink, u), scale(shrink, v), scale(shrink, third)
+    # ∂m/∂δθ = (I + M) [R_fbᵀ r], and t · (A × δθ) = (t × A) · δθ
+    put_row(work, like, n, 0, cross(transpose_times_vector(M, u), third))
+    put_row(work, like, n, 1, cross(transpose_times_vector(M, v), third))
+    put_row(work, like, n, 2, cross(transpose_times_vector(M, w), third))
+    for k in range(use.shape[1]):
+        if use[s, k] != 0:
+            e = add((like, like, like), scale(1.0 / length, offset_of(model.sensors, use, s, k, W)))
+            if use[s, k] & SCALE:
+                e = add(e, matrix_times_vector(matrix_at(model.sensors, s, k), third))
+            put(work.rows, 6 + k, like, dot(u, e))
+            put(work.rows, n + 6 + k, like, dot(v, e))
+            put(work.rows, 2 * n + 6 + k, like, dot(w, e))
+    return y, u, v, w
+
+
+def decorrelate(work, like, use, rows, y, T, C):
+    """Make the rows independent, as ``error_state_step.decorrelate``; return y and the variances (3)."""
+    t0, t1, t2 = T
+    c0, c1 = symmetric_times_vector(C, t0), symmetric_times_vector(C, t1)
+    d0 = dot(t0, c0)
+    l10, l20 = dot(t1, c0) / d0, dot(t2, c0) / d0
+    d1 = dot(t1, c1) - l10 * l10 * d0
+    l21 = (dot(t2, c1) - l20 * l10 * d0) / d1
+    d2 = dot(t2, symmetric_times_vector(C, t2)) - l20 * l20 * d0 - l21 * l21 * d1
+    n = work.alone.shape[1]
+    for i in range(n if rows > 1 else 0):
+        if i < 3 or (i >= 6 and use[i - 6] != 0):
+            h0 = one_of(work.rows, i, like)
+            h1 = one_of(work.rows, n + i, like) - l10 * h0
+            put(work.rows, n + i, like, h1)
+            if rows > 2:
+                put(work.rows, 2 * n + i, like, one_of(work.rows, 2 * n + i, like) - l20 * h0 - l21 * h1)
+    y1 = y[1] - l10 * y[0]
+    return (y[0], y1, y[2] - l20 * y[0] - l21 * y1), (d0, d1, d2)
+
+
+def arm_noise(model, work, like, s, length, variance, C):
+    """Return C and what the noise of the angular acceleration adds to it, as ``error_state_step.arm_noise``."""
+    r = (like, like, like)
+    for k in range(model.sensor_use.shape[1]):
+        if model.sensor_use[s, k] & LEVER:
+            c = one_of(work.x, 3 + k, like) / length
+            r = combine(1.0, r, c, (model.sensors[s, k, 0], model.sensors[s, k, 1], model.sensors[s, k, 2]))
+    return (
+        C[0] + r[2] * r[2] * variance[1] + r[1] * r[1] * variance[2],
+        C[1] - r[0] * r[1] * variance[2],
+        C[2] - r[0] * r[2] * variance[1],
+        C[3] + r[2] * r[2] * variance[0] + r[0] * r[0] * variance[2],
+        C[4] - r[1] * r[2] * variance[0],
+        C[5] + r[1] * r[1] * variance[0] + r[0] * r[0] * variance[1],
+    )
+
+
+def update(model, work, like, q, e, events, runs, out):
+    """Update with measurement e; return q."""
+    n = work.alone.shape[1]
+    s, kind, length = events.sensor[e], events.kind[e], events.length[e]
+    use = model.sensor_use[s]
+    value = four(runs.value, 4 * e, like)
+    z = (value[0], value[1], value[2])
+    frame, C = frame_at(events.frame, e), spread_six(like, events.noise, e)
+    one = like + 1.0
+    T = ((one, like, like), (like, one, like), (like, like, one))
+    rows = 3
+    if kind == ATTITUDE:
+        y = attitude_rows(model, work, like, q, value, s)
+    elif kind == HEADING:
+        rows = 1
+        error = heading_rows(model, work, like, q, z, (frame[6], frame[7], frame[8]), length, s)
+        y = (error, like, like)
+    else:
+        rows = 2 if kind == DIRECTION else 3
+        W = identity(like)
+        if len(runs.turning) > 0:
+            turn = subtract(triple(runs.turning, 9 * e, like), triple(work.x, 0, like))
+            W = turning_matrix(turn, triple(runs.turning, 9 * e + 3, like))
+            C = arm_noise(model, work, like, s, length, triple(runs.turning, 9 * e + 6, like), C)
+        y, t0, t1, t2 = vector_rows(model, work, like, q, z, frame, length, s, W, rows)
+        T = (t0, t1, t2)
+    y, variance = decorrelate(work, like, use, rows, y, T, C)
+    for i in range(n):
+        put(work.lines, n * STEP + i, like, like)
+    for r in range(rows):
+        error, s2 = take_row(work, like, use, r, y[r], variance[r])
+        put(work.written, 2 * r, like, error)
+        put(work.written, 2 * r + 1, like, s2)
+    hand_out(work, like, out.innovation, events.place[e], 2 * rows)
+    q, A, G = reset(q, attitude_of(work, like, n), identity(like), triple(work.lines, n * STEP, like))
+    put_attitude(work, like, 0, n, A)
+    for i in range(3, n):
+        put(work.x, i - 3, like, one_of(work.x, i - 3, like) + one_of(work.lines, n * STEP + i, like))
+        p = (seen(work, like, i), seen(work, like, n + i), seen(work, like, 2 * n + i))
+        p = matrix_times_vector(G, p)
+        for a in range(3):
+            put(work.P, n * a + i, like, p[a])
+    return q
+
+
+# ------------------------------------------------------------------------------------------------------------------------------ the run
+
+
+def hand_out(work, like, out, row, count):
+    """Write the first numbers of ``work.written`` to a row of each run that there is room for."""
+    for i in range(count):
+        for lane in range(out.shape[0]):
+            out[lane, row, i] = work.written[i, lane]
+
+
+def keep(model, work, like, base, q, row, out):
+    """Write a row of the outputs, the covariance from the P that begins at place ``base``."""
+    n, written = work.alone.shape[1], work.written
+    store_four(written, 0, like, q)
+    for i in range(n - 3):
+        put(written, 4 + i, like, one_of(work.x, i, like))
+    for i in range(n):
+        put(written, n + 1 + i, like, seen(work, like, base + n * i + i))
+    # Covariances of each state with attitude and whole bias, b + Σ c e, and of those among themselves.
+    reported = work.lines.shape[0]
+    for a in range(reported):
+        for j in range(n):
+            t = seen(work, like, base + place_of(n, a, j))
+            for k in range(n - 6 if a >= 3 else 0):
+                if model.gyro_use[k] & OFFSET:
+                    t = t + model.gyro[k, a - 3] * seen(work, like, base + place_of(n, 6 + k, j))
+            put(work.lines, n * a + j, like, t)
+    here = 2 * n + 1
+    for a in range(reported):
+        for b in range(a, reported):
+            t = one_of(work.lines, n * b + a, like)
+            for k in range(n - 6 if a >= 3 else 0):
+                if model.gyro_use[k] & OFFSET:
+                    t = t + model.gyro[k, a - 3] * one_of(work.lines, n * b + 6 + k, like)
+            put(written, here, like, t)
+            here += 1
+    hand_out(work, like, out, row, here)
+
+
+def least_share(work, like):
+    """Return the smallest part of a state's variance that the states before it leave, by elimination in the second P."""
+    n = work.alone.shape[1]
+    base = n * n
+    least = like + 1.0
+    for i in range(n):
+        for j in range(i, n):
+            t = seen(work, like, n * i + j)
+            for r in range(i):
+                up, right = seen(work, like, base + n * r + i), seen(work, like, base + n * r + j)
+                t = t - up * right / seen(work, like, base + n * r + r)
+            put(work.P, base + n * i + j, like, t)
+        share = seen(work, like, base + n * i + i) / seen(work, like, n * i + i)
+        least = chosen(share >= least, least, share)
+    return least
+
+
+def advance(pattern, edges, every, model, events, runs, work, out):
+    """Filter ``len(pattern)`` runs from the state in ``work``; a row is kept at every ``every``-th edge.
+
+    Parameters
+    ----------
+    pattern : tuple of floats, one a run
+    edges : array (n + 1,)
+    every : int
+    model : strapdown.kernels.root_form.Model
+    events : Events
+    runs : Runs
+    work : Work
+    out : Outputs
+    """
+    like = lanes_of(pattern)
+    n = work.alone.shape[1]
+    unmoved = identity(like)
+    still = (like, like, like, like, like, like)
+    turn, noise = unmoved, still
+    q = four(work.attitude, 0, like)
+    start_steps(work, like)
+    count, e, row, countdown = len(events.time), 0, 0, 0
+    behind = False
+    now = edges[0]
+    whole = 1.0
+    for k in range(-1, len(edges) - 1):
+        end = edges[k + 1]
+        if k >= 0:
+            whole = end - edges[k]
+        while True:
+            due = e < count and events.time[e] <= end
+            stop = events.time[e] if due else end
+            dt = stop - now
+            if dt > 0.0:
+                if dt > model.limit:
+                    dt = model.limit
+                    stop = now + dt
+                    due = False
+                part = scale(dt / whole, triple(runs.increments, 3 * k, like))
+                q, turn, noise = step(model, work, like, q, turn, noise, dt, part)
+                behind = True
+                now = stop
+            if due:
+                if behind:
+                    absorb(model, work, like, 0, turn, noise)
+                    start_steps(work, like)
+                    turn, noise, behind = unmoved, still, False
+                q = update(model, work, like, q, e, events, runs, out)
+                e += 1
+            if now >= end and (e == count or events.time[e] > end):
+                break
+        if countdown == 0:
+            countdown = every
+            base = 0
+            if behind:
+                base = n * n
+                for i in range(n * n):
+                    put(work.P, base + i, like, seen(work, like, i))
+                absorb(model, work, like, base, turn, noise)
+            keep(model, work, like, base, q, row, out.kept)
+            row += 1
+        countdown -= 1
+        if (k + 1) % CHECK == 0 or k == len(edges) - 2:
+            mark(work, like, least_share(work, like) >= MIN_SHARE)
