@@ -204,10 +204,12 @@ def test_few_campaigns_of_a_right_filter_are_called_wrong():
     assert found.count("consistent") >= 18  # and 160 runs suffice
 
 
-@pytest.mark.parametrize("plan", [satellite(100.0), coloured(50.0)], ids=["flicker and scale", "coloured tracker"])
-def test_few_runs_of_a_filter_with_states_are_called_wrong(plan):
+@pytest.mark.parametrize(
+    ("plan", "seconds"), [(satellite, 100.0), (coloured, 50.0)], ids=["flicker and scale", "coloured tracker"]
+)
+def test_few_runs_of_a_filter_with_states_are_called_wrong(plan, seconds):
     """More than two of thirty have a probability of 0.003 at the nominal 1 %, and of 0.96 at 20 %."""
-    assert verdicts_of_runs(plan, 30).count("not consistent") <= 2
+    assert verdicts_of_runs(plan(seconds), 30).count("not consistent") <= 2
 
 
 @pytest.mark.slow
