@@ -6,6 +6,7 @@ import io
 import json
 import sys
 import time
+import types
 
 import pytest
 from rich.console import Console
@@ -119,3 +120,25 @@ def test_json_on_standard_output_is_all_that_is_there(run, tmp_path):
     assert "Drift about the third axis" in other
     assert not (tmp_path / "-").exists()
     assert "Drift about the third axis" in run("coning-budget", "--psd", "lines.csv", "--rate", 100)[1]
+
+
+def test_a_fault_ends_the_compiling():
+    class Function:
+        def __init__(self, calls):
+            self.py_func = types.FunctionType(compile("", "kernel", "exec"), dict(enumerate(calls)))
+            self.py_func.__module__ = "strapdown.kernels.none"
+
+    called = Function(())
+    kernel = Function((called,))
+    compiling = progress._Compiling()
+    compiling.started(kernel)
+    assert compiling.current == "compiling, once: 0 of 2 functions"
+    compiling.started(called)
+    compiling.finished(called)
+    assert compiling.current == "compiling, once: 1 of 2 functions"
+    compiling.finished(kernel)
+    assert compiling.current == ""
+    later = Function((Function(()),))
+    compiling.started(later)
+    compiling.finished(later)  # by a fault, before what it calls
+    assert compiling.current == ""

@@ -440,6 +440,7 @@ def test_an_estimate_prints_what_is_known_at_the_end():
     assert "1.000000, 0.000000" in str(estimate)
 
 
+@pytest.mark.draws
 def test_results_print_as_short_tables():
     record = sd.simulate(scenario(30.0))
     estimate = sd.estimate(record)

@@ -128,6 +128,8 @@ class _Compiling:
         self._listening = False
         self._known: set[Any] = set()
         self._left: set[Any] = set()
+        self._begun = 0
+        """Functions begun and not ended: one calls the next."""
 
     def listen(self) -> None:
         """Listen as soon as numba is there."""
@@ -151,11 +153,15 @@ class _Compiling:
         """Count a function that is being compiled, and all that it calls."""
         self._left |= _called(dispatcher) - self._known
         self._known |= self._left
+        self._begun += 1
         self._say()
 
     def finished(self, dispatcher: Any) -> None:
         """Count a function as compiled."""
         self._left.discard(dispatcher)
+        self._begun -= 1
+        if self._begun == 0:  # what is left was not needed, or a fault ended the compiling
+            self._left.clear()
         self._say()
 
     def _say(self) -> None:
