@@ -18,11 +18,8 @@ from targets import Target, targets
 from strapdown.checks import InputError
 from strapdown.files.reading import BLOCK, SEAL
 
-DEFAULT = 3_000
-SLOW = 20_000
-"""With --slow."""
+DEFAULT = 20_000
 CPU_SECONDS = 60.0
-"""For 20,000 files."""
 HANG_SECONDS = 20.0
 """Of the clock, for a machine with much else to do; the processor's time has its own bound."""
 
@@ -75,8 +72,7 @@ def cpu_seconds() -> float:
 
 
 def test_damaged_files_are_read_right_or_refused_by_name(tmp_path, request):
-    option = request.config.getoption
-    number = option("--attack-files") or (SLOW if option("--slow") else DEFAULT)
+    number = request.config.getoption("--attack-files") or DEFAULT
     chance = random.Random(request.config.getoption("--attack-seed"))
     known = targets(tmp_path)
     for target in known:
@@ -116,7 +112,7 @@ def test_damaged_files_are_read_right_or_refused_by_name(tmp_path, request):
         ]
         Path(log).write_text("\n".join(lines) + "\n")
     assert not faults, "\n".join(f"{count} {what}" for what, count in faults.most_common(40))
-    assert spent < CPU_SECONDS * number / SLOW
+    assert spent < CPU_SECONDS * number / DEFAULT
     kinds = {target.name for target in known}
     for outcome in ("read", "refused"):  # or the damage is no damage, or nothing else than damage
         seen = {name.split()[0] for name in outcomes if name.endswith(outcome)}
