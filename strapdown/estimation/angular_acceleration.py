@@ -13,6 +13,7 @@ ORDERS = (3, 5, 7)
 """Degrees of the polynomial fitted to the rate over a window; its slope at the middle is the acceleration (Savitzky & Golay 1964)."""
 WINDOWS = (5, 7, 9, 11, 13, 17, 21, 25, 31, 37, 45, 53, 61)
 """Windows tried, samples."""
+_REACH = WINDOWS[-1] // 2
 MOST = 20000
 """Samples by which order and window are chosen."""
 LASTING = 4.0
@@ -49,17 +50,19 @@ def turning(record: ImuRecord, time: Array) -> tuple[Array, Array]:
     white = np.mean(np.diff(rates, 5, axis=0) ** 2, axis=0) / 252.0
 
     def weights(order: int, window: int) -> Array:
-        return _slope_weights(order, window) / mean
+        return np.asarray(_slopes(order, window)[_REACH, : WINDOWS[-1]]) / mean
 
     def slope(order: int, window: int) -> Array:
         return np.asarray(savgol_filter(rates, window, order, deriv=1, delta=mean, axis=0))
 
-    products = [_products(axis - axis.mean()) for axis in rates[:MOST].T]
+    bending = np.diff(rates[:MOST], 2, axis=0).T
+    products = [_products(axis) for axis in bending]
     tried = [(order, window) for order in ORDERS for window in WINDOWS if window >= order + 2]
     noises, bends = [], []
     for order, window in tried:
-        apart = weights(order, window) - weights(order, _half(order, window))
-        bent = np.array([apart @ found @ apart for found in products]) - white * float(apart @ apart)
+        apart = (_slopes(order, window) - _slopes(order, _half(order, window))) / mean
+        bent = np.array([_mean_square(apart, *each) for each in zip(bending, products, strict=True)])
+        bent -= white * float(apart[_REACH] @ apart[_REACH])
         noises.append(white * float(np.sum(weights(order, window) ** 2)))
         bends.append(np.maximum(bent, 0.0))
     best = int(np.argmin(np.sum(np.array(noises) + LASTING * np.array(bends), axis=1)))
@@ -95,23 +98,38 @@ def turning(record: ImuRecord, time: Array) -> tuple[Array, Array]:
 
 
 def _products(series: Array) -> Array:
-    """Return the mean products of the samples of a window, over all positions of the longest window in a series."""
-    width = WINDOWS[-1]
+    """Return the sums of products of the second differences in a window, over all positions of the longest window in a series."""
+    width = WINDOWS[-1] - 2
     n = len(series) - width + 1
     products = np.zeros((width, width))
     products[0] = np.einsum("n,nj->j", series[:n], np.lib.stride_tricks.sliding_window_view(series, width))
-    for i in range(1, width):  # one sample leaves each sum, one joins it
+    for i in range(1, width):  # one leaves each sum, one joins it
         gone, new = series[i - 1 : width - 1], series[n + i - 1 :]
         products[i, i:] = products[i - 1, i - 1 : -1] + new[0] * new - gone[0] * gone
-    return np.asarray(np.triu(products) + np.triu(products, 1).T) / n
+    return np.asarray(np.triu(products) + np.triu(products, 1).T)
+
+
+def _mean_square(weights: Array, series: Array, products: Array) -> float:
+    """Return the mean square of what weights of samples, as :func:`_slopes` has them, make of a series of second differences.
+
+    What two slopes differ by is nothing of a straight line, so summed twice the weights are those of the differences, in which the rate
+    itself, of which little is left, costs no digits. ``products`` are the series' own.
+    """
+    summed = np.cumsum(np.cumsum(weights, axis=1), axis=1)[:, :-2]
+    inside, width = summed[_REACH], summed.shape[1]
+    begin, end = summed[:_REACH] @ series[:width], summed[_REACH + 1 :] @ series[-width:]
+    return float(inside @ products @ inside + begin @ begin + end @ end) / (len(series) + 2)
 
 
 @functools.cache
-def _slope_weights(order: int, window: int) -> Array:
-    """Return the weights of a slope a sample, in the middle of the longest window."""
-    from scipy.signal import savgol_coeffs
+def _slopes(order: int, window: int) -> Array:
+    """Return the weights of slopes: at the first samples of a series, in the middle of the longest window, and at the last ones."""
+    from scipy.signal import savgol_filter
 
-    return np.pad(savgol_coeffs(window, order, deriv=1, use="dot"), (WINDOWS[-1] - window) // 2)
+    width = WINDOWS[-1]
+    every = savgol_filter(np.eye(2 * width), window, order, deriv=1, axis=0)
+    middle = every[width : width + 1, width - _REACH : width + _REACH + 1]
+    return np.concatenate([every[:_REACH, :width], middle, every[-_REACH:, -width:]])
 
 
 def _half(order: int, window: int) -> int:
