@@ -35,7 +35,7 @@ PATTERN = (0.0,) * WIDTH
 """One run a lane."""
 
 
-def takes(problem: Problem) -> bool:
+def supports(problem: Problem) -> bool:
     """Return whether a record can be filtered beside others: its model has no chains, no offset in fixed axes and no temperature."""
     model = problem.model
     return (
@@ -55,7 +55,7 @@ def run(problems: Sequence[Problem], every: int, alone: Callable[[Problem], Esti
     every : int
         Keep the state at every ``every``-th edge, the first included.
     alone : callable
-        Filters a record that this function does not take, or whose covariance lost its digits on the way.
+        Filters a record that :func:`supports` refuses, or whose covariance lost its digits on the way.
 
     Returns
     -------
@@ -64,7 +64,7 @@ def run(problems: Sequence[Problem], every: int, alone: Callable[[Problem], Esti
     """
     groups: list[list[int]] = []
     for i, problem in enumerate(problems):
-        if takes(problem):
+        if supports(problem):
             mine = next((group for group in groups if _alike(problems[group[0]], problem)), None)
             if mine is None:
                 groups.append([i])
