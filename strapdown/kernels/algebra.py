@@ -111,6 +111,11 @@ def full(S):
     return (S[0], S[1], S[2], S[1], S[3], S[4], S[2], S[4], S[5])
 
 
+def scale_matrix(s, A):
+    """Return s A of a scalar and a 9-tuple."""
+    return (s * A[0], s * A[1], s * A[2], s * A[3], s * A[4], s * A[5], s * A[6], s * A[7], s * A[8])
+
+
 def add_matrices(A, B):
     """Return A + B of two 9-tuples."""
     return (

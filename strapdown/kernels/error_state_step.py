@@ -32,6 +32,7 @@ from strapdown.kernels.algebra import (
     matrix_times_vector,
     multiply,
     scale,
+    scale_matrix,
     skew_polynomial,
     subtract,
     symmetric_minus_outer,
@@ -131,6 +132,21 @@ def longest_step(dt, theta, limit):
     return min(longest, limit)
 
 
+def error_matrix(gyro, k):
+    """Return the matrix T of a state of the gyro."""
+    return (
+        gyro[k, 3],
+        gyro[k, 4],
+        gyro[k, 5],
+        gyro[k, 6],
+        gyro[k, 7],
+        gyro[k, 8],
+        gyro[k, 9],
+        gyro[k, 10],
+        gyro[k, 11],
+    )
+
+
 def gyro_matrix_times(gyro, k, v):
     """Return T v of a state's matrix T."""
     return (
@@ -184,21 +200,7 @@ def move(q, x, dt, part, decay, gyro, gyro_use, force_f, top, factor):
             r = combine(1.0, r, -dt * x[3 + k], gyro_matrix_times(gyro, k, force))
         if gyro_use[k] & SCALE:
             scaled = True
-            c = x[3 + k]
-            M = add_matrices(
-                M,
-                (
-                    c * gyro[k, 3],
-                    c * gyro[k, 4],
-                    c * gyro[k, 5],
-                    c * gyro[k, 6],
-                    c * gyro[k, 7],
-                    c * gyro[k, 8],
-                    c * gyro[k, 9],
-                    c * gyro[k, 10],
-                    c * gyro[k, 11],
-                ),
-            )
+            M = add_matrices(M, scale_matrix(x[3 + k], error_matrix(gyro, k)))
     D = inverse(M) if scaled else IDENTITY
     phi = matrix_times_vector(D, r) if scaled else r
     phi11, phi12 = transition(phi, dt)
@@ -507,11 +509,7 @@ def fill_rows(q, x, kind, z, frame, length, s, sensors, sensor_use, W, rows):
                 else:
                     fixed = combine(1.0, fixed, c / length, d)
             if use & SCALE:
-                U = matrix_at(sensors, s, k)
-                M = add_matrices(
-                    M,
-                    (c * U[0], c * U[1], c * U[2], c * U[3], c * U[4], c * U[5], c * U[6], c * U[7], c * U[8]),
-                )
+                M = add_matrices(M, scale_matrix(c, matrix_at(sensors, s, k)))
     if kind == ATTITUDE:
         # The offset is a rotation vector between the sensor's axes and the body's.
         predicted, J = moved(q, offset)
@@ -597,12 +595,8 @@ def fill_rows(q, x, kind, z, frame, length, s, sensors, sensor_use, W, rows):
     return number
 
 
-def arm_noise(x, s, sensors, sensor_use, length, variance, C):
-    """Return C and what the gyro's angular acceleration, of these variances about the axes, adds to it: ``[r] diag(variance) [r]ᵀ``."""
-    r = (0.0, 0.0, 0.0)
-    for k in range(len(x) - 3):
-        if sensor_use[s, k] & LEVER:
-            r = combine(1.0, r, x[3 + k] / length, (sensors[s, k, 0], sensors[s, k, 1], sensors[s, k, 2]))
+def lever_noise(r, variance, C):
+    """Return ``C + [r] diag(variance) [r]ᵀ`` (6-tuple)."""
     return (
         C[0] + r[2] * r[2] * variance[1] + r[1] * r[1] * variance[2],
         C[1] - r[0] * r[1] * variance[2],
@@ -611,6 +605,15 @@ def arm_noise(x, s, sensors, sensor_use, length, variance, C):
         C[4] - r[1] * r[2] * variance[0],
         C[5] + r[1] * r[1] * variance[0] + r[0] * r[0] * variance[1],
     )
+
+
+def arm_noise(x, s, sensors, sensor_use, length, variance, C):
+    """Return C and what the gyro's angular acceleration, of these variances about the axes, adds to it: ``[r] diag(variance) [r]ᵀ``."""
+    r = (0.0, 0.0, 0.0)
+    for k in range(len(x) - 3):
+        if sensor_use[s, k] & LEVER:
+            r = combine(1.0, r, x[3 + k] / length, (sensors[s, k, 0], sensors[s, k, 1], sensors[s, k, 2]))
+    return lever_noise(r, variance, C)
 
 
 def decorrelate(H, y, rows, basis, C, spread):

@@ -25,6 +25,7 @@ from strapdown.kernels.algebra import (
     matrix_times_vector,
     multiply,
     scale,
+    scale_matrix,
     skew_polynomial,
     square_root,
     subtract,
@@ -42,8 +43,10 @@ from strapdown.kernels.error_state_step import (
     SCALE,
     THREE_NODES,
     THREE_WEIGHTS,
+    error_matrix,
     gyro_matrix_times,
     inverse,
+    lever_noise,
     matrix_at,
     offset_of,
     turning_matrix,
@@ -179,21 +182,6 @@ def identity(like):
     return (one, like, like, like, one, like, like, like, one)
 
 
-def error_matrix(gyro, k):
-    """Return the matrix of a state of the gyro."""
-    return (
-        gyro[k, 3],
-        gyro[k, 4],
-        gyro[k, 5],
-        gyro[k, 6],
-        gyro[k, 7],
-        gyro[k, 8],
-        gyro[k, 9],
-        gyro[k, 10],
-        gyro[k, 11],
-    )
-
-
 def four(array, place, like):
     """Return four neighbouring places."""
     return (
@@ -208,11 +196,6 @@ def spread_six(like, array, e):
     """Return row e of an array in all lanes."""
     a = six_at(array, e)
     return (like + a[0], like + a[1], like + a[2], like + a[3], like + a[4], like + a[5])
-
-
-def scaled(c, A):
-    """Return c A of a 9-tuple."""
-    return (c * A[0], c * A[1], c * A[2], c * A[3], c * A[4], c * A[5], c * A[6], c * A[7], c * A[8])
 
 
 def mark(work, like, good):
@@ -246,7 +229,7 @@ def step(model, work, like, q, turn, noise, dt, part):
                 r = combine(1.0, r, -dt * c, gyro_matrix_times(gyro, k, force))
             if use & SCALE:
                 coupled = True
-                D = add_matrices(D, scaled(c, error_matrix(gyro, k)))
+                D = add_matrices(D, scale_matrix(c, error_matrix(gyro, k)))
     if coupled:
         D = inverse(D)
         r = matrix_times_vector(D, r)
@@ -504,7 +487,7 @@ def sensed(work, model, like, s, length, W):
             if use[s, k] & (OFFSET | LEVER):
                 offset = combine(1.0, offset, c / length, offset_of(model.sensors, use, s, k, W))
             if use[s, k] & SCALE:
-                M = add_matrices(M, scaled(c, matrix_at(model.sensors, s, k)))
+                M = add_matrices(M, scale_matrix(c, matrix_at(model.sensors, s, k)))
     return offset, M, coupled
 
 
@@ -630,14 +613,7 @@ def arm_noise(model, work, like, s, length, variance, C):
         if model.sensor_use[s, k] & LEVER:
             c = one_of(work.x, 3 + k, like) / length
             r = combine(1.0, r, c, (model.sensors[s, k, 0], model.sensors[s, k, 1], model.sensors[s, k, 2]))
-    return (
-        C[0] + r[2] * r[2] * variance[1] + r[1] * r[1] * variance[2],
-        C[1] - r[0] * r[1] * variance[2],
-        C[2] - r[0] * r[2] * variance[1],
-        C[3] + r[2] * r[2] * variance[0] + r[0] * r[0] * variance[2],
-        C[4] - r[1] * r[2] * variance[0],
-        C[5] + r[1] * r[1] * variance[0] + r[0] * r[0] * variance[1],
-    )
+    return lever_noise(r, variance, C)
 
 
 def update(model, work, like, q, e, events, runs, out):

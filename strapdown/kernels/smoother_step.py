@@ -25,6 +25,7 @@ from strapdown.kernels.algebra import (
     multiply,
     multiply_add,
     scale,
+    scale_matrix,
     times_transpose_upper,
     times_transpose_upper_add,
     transpose,
@@ -57,11 +58,6 @@ def minus_times_transpose_upper(S, A, B):
         ((S[4] - A[3] * B[6]) - A[4] * B[7]) - A[5] * B[8],
         ((S[5] - A[6] * B[6]) - A[7] * B[7]) - A[8] * B[8],
     )
-
-
-def scale_matrix(s, A):
-    """Return s A of a scalar and a 9-tuple."""
-    return (s * A[0], s * A[1], s * A[2], s * A[3], s * A[4], s * A[5], s * A[6], s * A[7], s * A[8])
 
 
 def noise_share(A, B, C, q11, q12, q22):
