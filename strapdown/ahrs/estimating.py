@@ -12,8 +12,8 @@ import numpy as np
 from strapdown import estimation, quaternion
 from strapdown.ahrs.parameters import HAND_HELD, AhrsParameters
 from strapdown.ahrs.preparing import Prepared, prepare
-from strapdown.ahrs.starting import quiet_span
-from strapdown.checks import Array, InputError
+from strapdown.ahrs.starting import need_accelerometer, quiet_span
+from strapdown.checks import Array
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.memory import side_by_side
 from strapdown.estimation.temperature import joined
@@ -119,8 +119,7 @@ def estimate(
     InputError
         If there is no accelerometer, a sensor has no valid sample in the quiet second, or the recording is too short.
     """
-    if recording.specific_force is None:
-        raise InputError(f"{recording.source} has no accelerometer, which shows the vertical; add columns ax, ay, az")
+    need_accelerometer(recording)
     span = quiet_span(recording)
     faults = sensor_faults.find(recording.since(span.start))
     used = faults.recording

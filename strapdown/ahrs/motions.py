@@ -13,7 +13,7 @@ import numpy as np
 from strapdown import coning
 from strapdown.ahrs import preparing, starting
 from strapdown.ahrs.parameters import HAND_HELD, MOTIONS, AhrsParameters
-from strapdown.checks import InputError, lengths, one_of
+from strapdown.checks import lengths, one_of
 from strapdown.recordings import Recording, increments, sensor_faults
 from strapdown.units import STANDARD_GRAVITY
 
@@ -60,8 +60,7 @@ def likelihoods(recording: Recording) -> dict[str, float]:
     >>> max(found, key=found.get)  # doctest: +SKIP
     'hand'
     """
-    if recording.specific_force is None:
-        raise InputError(f"{recording.source} has no accelerometer, which shows the vertical; add columns ax, ay, az")
+    starting.need_accelerometer(recording)
     span = starting.quiet_span(recording)
     faults = sensor_faults.find(recording.since(span.start))
     used, force = faults.recording, faults.recording.specific_force

@@ -14,6 +14,12 @@ QUIET_SPAN = 1.0
 """Length of the quiet span that the filter starts from, s."""
 
 
+def need_accelerometer(recording: Recording) -> None:
+    """Refuse a recording that does not show the vertical."""
+    if recording.specific_force is None:
+        raise InputError(f"{recording.source} has no accelerometer, which shows the vertical; add columns ax, ay, az")
+
+
 def quiet_span(recording: Recording) -> slice:
     """Return the samples of the first quiet second: the first whose rate is no more than twice as restless as in the quietest.
 

@@ -61,7 +61,7 @@ def turning(record: ImuRecord, time: Array) -> tuple[Array, Array]:
     noises, bends = [], []
     for order, window in tried:
         apart = (_slopes(order, window) - _slopes(order, _half(order, window))) / mean
-        bent = np.array([_mean_square(apart, *each) for each in zip(bending, products, strict=True)])
+        bent = _mean_squares(apart, bending, products)
         bent -= white * float(apart[_REACH] @ apart[_REACH])
         noises.append(white * float(np.sum(weights(order, window) ** 2)))
         bends.append(np.maximum(bent, 0.0))
@@ -109,16 +109,19 @@ def _products(series: Array) -> Array:
     return np.asarray(np.triu(products) + np.triu(products, 1).T)
 
 
-def _mean_square(weights: Array, series: Array, products: Array) -> float:
-    """Return the mean square of what weights of samples, as :func:`_slopes` has them, make of a series of second differences.
+def _mean_squares(weights: Array, bending: Array, products: list[Array]) -> Array:
+    """Return the mean squares (3,) of what weights of samples, as :func:`_slopes` has them, make of axes of second differences (3, n).
 
     What two slopes differ by is nothing of a straight line, so summed twice the weights are those of the differences, in which the rate
-    itself, of which little is left, costs no digits. ``products`` are the series' own.
+    itself, of which little is left, costs no digits. ``products`` are those of each axis.
     """
     summed = np.cumsum(np.cumsum(weights, axis=1), axis=1)[:, :-2]
     inside, width = summed[_REACH], summed.shape[1]
-    begin, end = summed[:_REACH] @ series[:width], summed[_REACH + 1 :] @ series[-width:]
-    return float(inside @ products @ inside + begin @ begin + end @ end) / (len(series) + 2)
+    found = np.empty(len(bending))
+    for i, series in enumerate(bending):
+        begin, end = summed[:_REACH] @ series[:width], summed[_REACH + 1 :] @ series[-width:]
+        found[i] = inside @ products[i] @ inside + begin @ begin + end @ end
+    return np.asarray(found / (bending.shape[1] + 2))
 
 
 @functools.cache

@@ -9,6 +9,7 @@ import numpy as np
 
 from strapdown import ahrs, estimation, quaternion, setup
 from strapdown.ahrs import AhrsParameters
+from strapdown.ahrs.starting import need_accelerometer
 from strapdown.checks import InputError
 from strapdown.gyro import GyroSpec
 from strapdown.randomness import generator
@@ -46,8 +47,7 @@ def recording_case(recording: Recording, parameters: AhrsParameters | None = Non
     InputError
         If there is no accelerometer, or the recording is too short.
     """
-    if recording.specific_force is None:
-        raise InputError(f"{recording.source} has no accelerometer, which shows the vertical; add columns ax, ay, az")
+    need_accelerometer(recording)
     span = ahrs.quiet_span(recording)
     used = recording.since(span.start)
     prepared = ahrs.prepare(used, slice(0, span.stop - span.start), parameters or ahrs.MOTIONS["any"])
