@@ -111,6 +111,7 @@ KERNELS: dict[str, tuple[Callable, tuple[int, ...], Callable]] = {
     "multiply_add": (algebra.multiply_add, (M, M, M), lambda A, B, C: flat(matrix(A) @ matrix(B) + matrix(C))),
     "transpose": (algebra.transpose, (M,), lambda A: flat(swapped(matrix(A)))),
     "full": (algebra.full, (U,), lambda s: flat(symmetric(s))),
+    "scale_matrix": (algebra.scale_matrix, (S, M), lambda s, A: flat(scalar(scalar(s)) * matrix(A))),
     "add_matrices": (algebra.add_matrices, (M, M), lambda A, B: flat(matrix(A) + matrix(B))),
     "combine_matrices": (
         algebra.combine_matrices,
