@@ -356,11 +356,12 @@ def estimate(
         _refuse("a record", setup=setup, initial=initial, states=states or None)
         for words in ahrs.doctor.at_rest(source):
             warnings.warn(f"{source.source}: {words}", stacklevel=2)
-        parameters = _recording_parameters(source, motion, noise)
+        begun: Recording | ahrs.Begun = ahrs.begin(source)
+        parameters = _recording_parameters(begun, motion, noise)
         if isinstance(noise, GyroSpec) and noise.temperature is not None:
-            source, parameters = ahrs.without_temperature(source, parameters, noise.temperature, walks=smooth)
+            begun, parameters = ahrs.without_temperature(source, parameters, noise.temperature, walks=smooth)
         found = ahrs.estimate(
-            source,
+            begun,
             parameters,
             latency=latency,
             calibration=calibration,
@@ -421,7 +422,7 @@ def _specification(noise: GyroSpec | NoiseFit) -> GyroSpec:
 
 
 def _recording_parameters(
-    source: Recording, motion: str | None, noise: GyroSpec | NoiseFit | ProcessNoise | None
+    source: Recording | ahrs.Begun, motion: str | None, noise: GyroSpec | NoiseFit | ProcessNoise | None
 ) -> ahrs.AhrsParameters:
     parameters = ahrs.MOTIONS[ahrs.motions.chosen(source, motion or "auto")[0]]
     if noise is None:

@@ -27,7 +27,7 @@ from strapdown.cli.terminal import (
 )
 
 if TYPE_CHECKING:
-    from strapdown.ahrs import AhrsEstimate, AhrsParameters
+    from strapdown.ahrs import AhrsEstimate, AhrsParameters, Begun
     from strapdown.estimation.states import State
     from strapdown.recordings import Recording
     from strapdown.recordings.recordfiles import RecordFile
@@ -528,14 +528,14 @@ def _estimate_recording(
     late = None if options.latency is None else 1e-3 * non_negative("--latency", options.latency, unit="ms")
     robustness = shared.robustness
     carried = None if options.calibration is None else unit_calibration.read(options.calibration)
-    source, parameters, motion, odds = _read_recording(recording, layout, motion, shared, options.temperature)
+    begun, parameters, motion, odds = _read_recording(recording, layout, motion, shared, options.temperature)
     with progress_bar("smoothing" if shared.smooth else "filtering"):
         result = ahrs.estimate(
-            source,
+            begun,
             parameters,
             latency=late,
             calibration=carried,
-            full_covariance=source.true_attitude is not None
+            full_covariance=begun.recording.true_attitude is not None
             if shared.full_covariance is None
             else shared.full_covariance,
             smooth=shared.smooth,
@@ -556,7 +556,7 @@ def _estimate_recording(
         paths.append(_observability(out, used.source, result.record, parameters.setup, result.initial))
     if rms is not None:
         paths.append(_rms(out, used.source, rms))
-    paths += _export(exports, result.estimate, source)
+    paths += _export(exports, result.estimate, begun.recording)
     if output.drawn_as is not None:
         frame = _fixed_frame(used)
         paths += _drawn(out, output.drawn_as, result.estimate, used.source, used=used, errors=errors, fixed_frame=frame)
@@ -565,7 +565,7 @@ def _estimate_recording(
 
 def _read_recording(
     recording: Path, layout: dict[str, Any], motion: str, shared: _Shared, temperature: Path | None
-) -> tuple[Recording, AhrsParameters, str, float]:
+) -> tuple[Begun, AhrsParameters, str, float]:
     """Return the recording, its bias over temperature subtracted, the filter's parameters with the noise of the gyro given, and the motion.
 
     With the motion comes its log-likelihood beyond that of the other, infinite where it was given.
@@ -578,7 +578,8 @@ def _read_recording(
     with progress_bar("reading"):
         source = recordings.read(recording, **layout)
     doubt(source, recording)
-    motion, odds = ahrs.motions.chosen(source, motion, name="--motion")
+    begun = ahrs.begin(source)
+    motion, odds = ahrs.motions.chosen(begun, motion, name="--motion")
     parameters = ahrs.MOTIONS[motion]
     if shared.gyro is not None:
         from strapdown import workflows  # which imports much more
@@ -588,7 +589,8 @@ def _read_recording(
     if warm is not None:
         walks = shared.smooth or shared.observability
         source, parameters = ahrs.without_temperature(source, parameters, warm, walks=walks)
-    return source, parameters, motion, odds
+        begun = ahrs.begin(source)
+    return begun, parameters, motion, odds
 
 
 def _fixed_frame(used: Recording) -> str:
