@@ -19,7 +19,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -41,10 +41,12 @@ from strapdown.checks import (
 )
 from strapdown.kernels import gyro_errors
 from strapdown.kernels.machine import compiled
-from strapdown.motion import Motion
-from strapdown.motion.orbit import CircularOrbit
 from strapdown.results import ByValue
 from strapdown.units import STANDARD_GRAVITY
+
+if TYPE_CHECKING:
+    from strapdown.motion import Motion
+    from strapdown.motion.orbit import CircularOrbit
 
 Kind = Literal["direction", "heading", "vector", "attitude"]
 KINDS: dict[str, int] = {"direction": 2, "heading": 1, "vector": 3, "attitude": 3}
@@ -680,6 +682,8 @@ class HorizonSensor(ByValue):
 
     def __post_init__(self) -> None:
         """Check every field."""
+        from strapdown.motion.orbit import CircularOrbit  # all motions come with it, and recordings need none
+
         _check_sampling(self.name, self.sigma, "rad", self.rate, self.phase)
         instance(f"{self.name}: orbit", self.orbit, CircularOrbit, "give an orbit.CircularOrbit")
 
