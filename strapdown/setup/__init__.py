@@ -554,7 +554,8 @@ def observability(record: ImuRecord, setup: FilterSetup, initial: State) -> Obse
     if setup.states is None:
         return estimation.observability(modelled, setup.process_noise, initial)
     blocks = setup.states.blocks({series.sensor: series.kind for series in modelled.vectors})
-    return estimation.observability(modelled, setup.process_noise, optional.initial_state(initial, blocks), blocks)
+    start = optional.initial_state(initial, blocks, setup.states.gyro_fast_bias_sigma)
+    return estimation.observability(modelled, setup.process_noise, start, blocks)
 
 
 def initial_state(

@@ -34,6 +34,9 @@ from strapdown.vectors import GRAVITY_F, KINDS
 Entries = float | tuple[float, ...] | tuple[tuple[float, ...], ...]
 """A standard deviation: one for all axes or entries, or one each; 0: no state."""
 
+_BIAS = np.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])
+"""Which of attitude and bias is the bias."""
+
 
 def _entries(name: str, value: Any, shape: tuple[int, ...], unit: str) -> Entries:
     """Return a number, or nested tuples of an array of this shape; none is negative."""
@@ -388,13 +391,15 @@ def _spread(diagonal: Entries, off_diagonal: Entries) -> tuple[Array, Array]:
     return on, off
 
 
-def initial_state(initial: State, error_states: tuple[ErrorStates, ...]) -> State:
+def initial_state(initial: State, error_states: tuple[ErrorStates, ...], fast_bias_sigma: float = 0.0) -> State:
     """Return the state to start from where ``initial`` has the *whole* bias, the error states' part of it included.
 
     Its error is what ``initial`` says, whatever the parts are: of the bias ``b = β − Σ c e`` the covariance follows, so that a drift that
-    is large beside a well-known bias is known only together with it.
+    is large beside a well-known bias is known only together with it. The part too fast for a state, of σ ``fast_bias_sigma``, is in the
+    initial bias as well and lasts no longer than a sample: the states know the rest of the bias that much worse.
     """
-    plain = modelling.with_error_states(initial, error_states)
+    fast = np.diag(_BIAS * fast_bias_sigma**2)
+    plain = modelling.with_error_states(replace(initial, covariance=initial.covariance + fast), error_states)
     turn = np.eye(len(plain.covariance))
     first = 6
     for one in error_states:
@@ -426,7 +431,7 @@ def run(
         every=every, full_covariance=full_covariance, gate=gate, robust=robust, whole_bias=True, together=True
     )
     found = forward.filtered(problem, options).estimate
-    return _reported(forward.watched(found, monitor, gate), states)
+    return _reported(forward.watched(found, monitor, gate), states, initial)
 
 
 def run_together(
@@ -436,27 +441,29 @@ def run_together(
     problems = [prepared(one, process_noise, start, states) for one, start in zip(records, initials, strict=True)]
     options = forward.Options(every=every, full_covariance=True, whole_bias=True, together=True)
     found = together.run(problems, every, lambda problem: forward.filtered(problem, options).estimate)
-    return [_reported(one, states) for one in found]
+    return [_reported(one, states, start) for one, start in zip(found, initials, strict=True)]
 
 
 def prepared(record: ImuRecord, process_noise: ProcessNoise, initial: State, states: States) -> forward.Problem:
     """Return a record prepared for the filter with these states."""
     error_states = states.blocks({series.sensor: series.kind for series in record.vectors})
-    state = initial if len(initial.values) else initial_state(initial, error_states)
+    state = initial if len(initial.values) else initial_state(initial, error_states, states.gyro_fast_bias_sigma)
     return forward.prepared(record, process_noise, state, error_states, driven=True)
 
 
-def _reported(found: Estimate, states: States) -> Estimate:
-    """Return an estimate whose bias is the whole one, what is too quick for a state in its variance."""
+def _reported(found: Estimate, states: States, initial: State) -> Estimate:
+    """Return an estimate whose bias is the whole one, the part too fast for a state in its variance."""
     assert found.whole_bias is not None
     assert found.whole_bias_variance is not None
-    fast = np.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0]) * states.gyro_fast_bias_sigma**2
+    fast = np.outer(np.ones(len(found.time)), _BIAS * states.gyro_fast_bias_sigma**2)
+    if not len(initial.values):
+        fast[0] *= -1.0  # the initial bias has this part, so its error has not
     covariance = found.whole_bias_covariance
     return replace(
         found,
         bias=found.whole_bias,
         variance=found.whole_bias_variance + fast,
-        covariance=None if covariance is None else covariance + np.diag(fast),
+        covariance=None if covariance is None else covariance + fast[:, :, None] * np.eye(6),
     )
 
 
