@@ -282,6 +282,26 @@ def test_the_whole_bias_is_that_of_all_states():
     assert begin.covariance[3, 6] == pytest.approx(-4e-6)
 
 
+def test_the_smoother_reports_the_whole_bias_too():
+    """At the last edge it is the filter; there the kernels sum the parts."""
+    record = simulated(markov_noise=1e-3, markov_correlation_time=8.0)
+    states = States(
+        gyro_scale_sigma=1e-3, gyro_drift_sigma=(2e-3, 1e-3), gyro_drift_time=(8.0, 1.5), gyro_fast_bias_sigma=1e-4
+    )
+    given = chosen(states)
+    filtered = run(record, given, full_covariance=True)
+    smoothed = setup.smooth(record, given, begun(record), full_covariance=True)
+    np.testing.assert_allclose(smoothed.bias[-1], filtered.bias[-1], rtol=1e-9)
+    np.testing.assert_allclose(smoothed.covariance[-1], filtered.covariance[-1], rtol=1e-9, atol=1e-18)
+    np.testing.assert_allclose(smoothed.variance, np.einsum("kii->ki", smoothed.covariance), rtol=1e-12)
+    middle = len(record.time) // 2
+    assert np.all(smoothed.variance[middle] < filtered.variance[middle])
+    diagonals = setup.smooth(record, given, begun(record))
+    assert diagonals.covariance is None
+    assert diagonals.whole_covariance is None
+    np.testing.assert_array_equal(diagonals.variance, smoothed.variance)
+
+
 # ------------------------------------------------------------------------------------------------------------- the gyro and force
 
 

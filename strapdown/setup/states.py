@@ -10,7 +10,7 @@ import numpy as np
 
 from strapdown import units
 from strapdown.checks import Array, InputError, array, known_keys, non_negative, one_of, positive
-from strapdown.estimation import forward, together
+from strapdown.estimation import forward, smoothing, together
 from strapdown.estimation import model as modelling
 from strapdown.estimation.error_states import (
     BoundedVelocity,
@@ -401,13 +401,15 @@ def initial_state(initial: State, error_states: tuple[ErrorStates, ...], fast_bi
     fast = np.diag(_BIAS * fast_bias_sigma**2)
     plain = modelling.with_error_states(replace(initial, covariance=initial.covariance + fast), error_states)
     turn = np.eye(len(plain.covariance))
-    first = 6
-    for one in error_states:
-        turn[3:6, first : first + one.size] = -np.asarray(one.gyro_offset).T
-        first += one.size
+    turn[3:6, 6:] = -_offsets(error_states)
     sigma = np.sqrt(np.diag(plain.covariance))
     root = (turn @ (sigma[:, None] * np.linalg.cholesky(plain.covariance / np.outer(sigma, sigma)))).T
     return replace(plain, covariance=root.T @ root, factor=root)
+
+
+def _offsets(error_states: tuple[ErrorStates, ...]) -> Array:
+    """Return what a unit of each error state adds to the gyro's bias (3, m)."""
+    return np.concatenate([np.empty((3, 0)), *(np.asarray(one.gyro_offset).T for one in error_states)], axis=1)
 
 
 def run(
@@ -442,6 +444,41 @@ def run_together(
     options = forward.Options(every=every, full_covariance=True, whole_bias=True, together=True)
     found = together.run(problems, every, lambda problem: forward.filtered(problem, options).estimate)
     return [_reported(one, states, start) for one, start in zip(found, initials, strict=True)]
+
+
+def smooth(
+    record: ImuRecord,
+    process_noise: ProcessNoise,
+    initial: State,
+    states: States,
+    *,
+    full_covariance: bool = False,
+    error_state_covariance: bool = True,
+    **options: Any,
+) -> Estimate:
+    """Run the smoother with these states; with drifts among them its estimate is of the whole gyro bias.
+
+    An ``initial`` without values has the whole bias. Options are those of :func:`strapdown.estimation.smooth`. In the first second the
+    variance of the whole bias is an upper bound: the part too fast for a state is taken for independent of the initial error.
+    """
+    blocks = states.blocks({series.sensor: series.kind for series in record.vectors})
+    kept: dict[str, Any] = {"full_covariance": full_covariance, "error_state_covariance": error_state_covariance}
+    if not states.gyro_drift_sigma:
+        return smoothing.smooth(record, process_noise, initial, blocks, **kept, **options)
+    state = initial if len(initial.values) else initial_state(initial, blocks, states.gyro_fast_bias_sigma)
+    found = smoothing.smooth(record, process_noise, state, blocks, full_covariance=True, **options)
+    assert found.whole_covariance is not None
+    offsets = _offsets(blocks)
+    sums = np.eye(6, 6 + offsets.shape[1])
+    sums[3:, 6:] = offsets
+    covariance = sums @ found.whole_covariance @ sums.T + np.diag(_BIAS * states.gyro_fast_bias_sigma**2)
+    return replace(
+        found,
+        bias=found.bias + np.concatenate([one.values for one in found.error_states.values()], axis=1) @ offsets.T,
+        variance=np.einsum("kii->ki", covariance).copy(),
+        covariance=covariance if full_covariance else None,
+        whole_covariance=found.whole_covariance if full_covariance and error_state_covariance else None,
+    )
 
 
 def prepared(record: ImuRecord, process_noise: ProcessNoise, initial: State, states: States) -> forward.Problem:
