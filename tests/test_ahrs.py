@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 import strapdown
 from sims import hand_held
-from strapdown import ahrs, quaternion, setup
+from strapdown import ahrs, estimation, quaternion, setup
 from strapdown.ahrs import AhrsParameters, estimating, motions
 from strapdown.checks import InputError
 from strapdown.consistency import reference_errors
@@ -657,6 +657,28 @@ def test_between_two_steps_the_attitudes_covariance_is_turned_with_the_unit(smoo
     np.testing.assert_array_equal(estimate.bias, estimate.bias[begin][step])
     without = ahrs.estimate(late(), latency=0.0025, smooth=smooth).estimate
     np.testing.assert_array_equal(without.variance, estimate.variance)
+
+
+def test_the_level_of_the_acceleration_scales_the_tilt_alone():
+    """The filter's covariance in fixed axes, its first two rows and columns by one factor."""
+    unit = dataclasses.replace(ahrs.HAND_HELD, iron_sigma=0.0)
+    found = ahrs.estimate(recording(noise=1.0), unit, latency=0.0, full_covariance=True)
+    own = found.parameters.setup
+    blocks = own.states.blocks({one.sensor: one.kind for one in found.record.vectors})
+    plain = estimation.run(found.record, own.process_noise, found.initial, blocks, full_covariance=True)
+    rows = np.searchsorted(found.recording.time, plain.time)
+    rate = found.recording.rate[rows]
+    P = found.estimate.covariance[rows, :3, :3] - found.delays.sigma**2 * rate[:, :, None] * rate[:, None, :]
+    R, own_R = quaternion.to_matrix(found.estimate.attitude[rows]), quaternion.to_matrix(plain.attitude)
+    scaled = R @ P @ R.transpose(0, 2, 1)
+    ratio = scaled / (own_R @ plain.covariance[:, :3, :3] @ own_R.transpose(0, 2, 1))
+    tilt = np.sqrt(ratio[:, 0, 0])
+    assert tilt.min() < 0.9
+    np.testing.assert_allclose(ratio[:, 1, 1], tilt**2, rtol=1e-6)
+    np.testing.assert_allclose(ratio[:, 2, 2], 1.0, rtol=1e-6)
+    correlated = np.abs(scaled[:, 0, 2]) > 1e-3 * np.sqrt(scaled[:, 0, 0] * scaled[:, 2, 2])
+    assert correlated.mean() > 0.5
+    np.testing.assert_allclose(ratio[correlated, 0, 2], tilt[correlated], rtol=1e-6)
 
 
 def test_a_start_without_rest_is_as_uncertain_as_it_is_wrong():
