@@ -594,6 +594,25 @@ def test_a_latency_that_is_given_is_made_good():
     np.testing.assert_array_equal(compensated.estimate.time, delayed.time)
 
 
+def test_the_gyros_bias_is_taken_off_the_way_to_a_stamp_and_over_the_delay():
+    bias = np.array([5.0, -4.0, 3.0]) * DEGREE
+    plain = recording(12.0, bias=tuple(bias))
+    found, late_by = (ahrs.estimate(plain, latency=one) for one in (0.0, 0.02))
+    used, q = found.recording, found.estimate.attitude
+    seen = found.estimate.bias
+    assert np.abs(seen - bias).max() < 0.2 * DEGREE
+    # from each step's stamp on, a sample at a time, by SciPy
+    turn = 0.5 * (used.rate[1:] + used.rate[:-1]) - seen[:-1]
+    by_gyro = Rotation.from_rotvec(turn * np.diff(used.time)[:, None])
+    step = np.searchsorted(found.record.time, used.time, side="right") - 1
+    same = step[1:] == step[:-1]
+    moved = quaternion.log(quaternion.multiply(quaternion.conjugate(q[:-1]), q[1:]))
+    assert same.mean() > 0.8
+    np.testing.assert_allclose(moved[same], by_gyro.as_rotvec()[same], atol=4e-5)  # without the bias 4e-4
+    ahead = quaternion.log(quaternion.multiply(quaternion.conjugate(q), late_by.estimate.attitude))
+    np.testing.assert_allclose(ahead, 0.02 * (used.rate - seen), atol=1e-4)  # without the bias 2e-3
+
+
 @pytest.mark.parametrize(
     ("value", "words"), [(-1e-3, "latency is -0.001 s"), (np.nan, "latency is"), (60.0, "lasts 30 s")]
 )
