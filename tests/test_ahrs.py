@@ -597,7 +597,7 @@ def test_a_latency_that_is_given_is_made_good():
 def test_the_gyros_bias_is_taken_off_the_way_to_a_stamp_and_over_the_delay():
     bias = np.array([5.0, -4.0, 3.0]) * DEGREE
     plain = recording(12.0, bias=tuple(bias))
-    found, late_by = (ahrs.estimate(plain, latency=one) for one in (0.0, 0.02))
+    found, late_by, far = (ahrs.estimate(plain, latency=one) for one in (0.0, 0.02, 0.5))
     used, q = found.recording, found.estimate.attitude
     seen = found.estimate.bias
     assert np.abs(seen - bias).max() < 0.2 * DEGREE
@@ -611,6 +611,9 @@ def test_the_gyros_bias_is_taken_off_the_way_to_a_stamp_and_over_the_delay():
     np.testing.assert_allclose(moved[same], by_gyro.as_rotvec()[same], atol=4e-5)  # without the bias 4e-4
     ahead = quaternion.log(quaternion.multiply(quaternion.conjugate(q), late_by.estimate.attitude))
     np.testing.assert_allclose(ahead, 0.02 * (used.rate - seen), atol=1e-4)  # without the bias 2e-3
+    ahead = quaternion.log(quaternion.multiply(quaternion.conjugate(q), far.estimate.attitude))
+    assert np.linalg.norm(ahead, axis=1).max() > 0.6
+    np.testing.assert_allclose(ahead, 0.5 * (used.rate - seen), atol=3e-3)
 
 
 @pytest.mark.parametrize(
@@ -698,6 +701,11 @@ def test_the_level_of_the_acceleration_scales_the_tilt_alone():
     correlated = np.abs(scaled[:, 0, 2]) > 1e-3 * np.sqrt(scaled[:, 0, 0] * scaled[:, 2, 2])
     assert correlated.mean() > 0.5
     np.testing.assert_allclose(ratio[correlated, 0, 2], tilt[correlated], rtol=1e-6)
+    beside, with_bias = found.estimate.covariance[rows], own_R @ plain.covariance[:, :3, 3:]
+    with_bias[:, :2] *= tilt[:, None, None]
+    np.testing.assert_allclose(R @ beside[:, :3, 3:], with_bias, atol=1e-6 * np.abs(with_bias).max())
+    np.testing.assert_array_equal(beside[:, 3:, :3], beside[:, :3, 3:].transpose(0, 2, 1))
+    np.testing.assert_array_equal(beside[:, 3:, 3:], plain.covariance[:, 3:, 3:])
 
 
 def test_a_start_without_rest_is_as_uncertain_as_it_is_wrong():

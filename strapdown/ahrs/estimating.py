@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from strapdown import estimation, quaternion
+from strapdown import estimation
 from strapdown.ahrs.parameters import HAND_HELD, AhrsParameters
 from strapdown.ahrs.preparing import Prepared, prepare
 from strapdown.ahrs.starting import Begun, begin
@@ -205,7 +205,7 @@ def _at_stamps(
     """Return the estimate at the recording's stamps: carried on by the gyro from the step before each, and over the delay of the gyro."""
     edge, n = prepared.edge, len(used.time)
     attitude, bias, variance = side_by_side(*(((n, width), float) for width in (4, 3, 6)))
-    (own,) = side_by_side(((n if full_covariance else 0, 3, 3), float))
+    (P,) = side_by_side(((n if full_covariance else 0, 6, 6), float))
     late = np.broadcast_to(delays.gyro, used.time.shape)
     ahead = -sensor_delays.turn_over(used, -late) if smooth else used.rate * late[:, None]
     level = _level(filtered, _over_steps(turn_variance, edge) > 0.0)
@@ -218,24 +218,16 @@ def _at_stamps(
         recording_steps.Stamps(*map(read_only, (used.time, used.rate, prepared.turned, late, ahead))),
         delays.sigma**2,
         iron,
-        recording_steps.Carried(attitude, bias, variance, own),
+        recording_steps.Carried(attitude, bias, variance, P),
     )
     row = functools.partial(np.repeat, np.arange(len(edge)), np.diff(edge, append=n))
-    P = None
-    if full_covariance:
-        scale = np.stack([tilt, tilt, np.ones_like(tilt)], axis=1)
-        fixed = scale[:, :, None] * (quaternion.to_matrix(filtered.attitude) @ filtered.covariance[:, :3, 3:])
-        P = filtered.covariance.take(row(), axis=0)
-        P[:, :3, :3] = own
-        P[:, :3, 3:] = quaternion.to_matrix(attitude).transpose(0, 2, 1) @ fixed[row()]
-        P[:, 3:, :3] = P[:, :3, 3:].transpose(0, 2, 1)
     sensors = {"accelerometer": used.specific_force, "magnetometer": used.magnetic_field}
     return Estimate(
         time=used.time,
         attitude=attitude,
         bias=bias,
         variance=variance,
-        covariance=P,
+        covariance=P if full_covariance else None,
         innovations=_innovations(filtered, level),
         skipped={
             name: len(samples) - int(np.count_nonzero(sampled(samples)))

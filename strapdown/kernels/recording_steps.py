@@ -123,7 +123,7 @@ class Carried(NamedTuple):
     variance: np.ndarray
     """(n, 6)"""
     covariance: np.ndarray
-    """Of the attitude (n, 3, 3), or (0, 3, 3)."""
+    """(n, 6, 6), or (0, 6, 6)."""
 
 
 def carry_to_stamps(steps, stamps, timing, iron, out):
@@ -144,6 +144,20 @@ def carry_to_stamps(steps, stamps, timing, iron, out):
         xx, xy, xz, yy, yz, zz = times_transpose_upper(multiply(R, full(body)), R)
         s = steps.tilt[k]
         fixed = full((s * s * xx, s * s * xy, s * xz, s * s * yy, s * yz, zz))
+        across = (
+            P[k, 0, 3],
+            P[k, 0, 4],
+            P[k, 0, 5],
+            P[k, 1, 3],
+            P[k, 1, 4],
+            P[k, 1, 5],
+            P[k, 2, 3],
+            P[k, 2, 4],
+            P[k, 2, 5],
+        )
+        across = multiply(R, across)
+        a, b = scale(s, across[:3]), scale(s, across[3:6])
+        across = (a[0], a[1], a[2], b[0], b[1], b[2], across[6], across[7], across[8])
         for n in range(first, last):
             late = stamps.time[n] - stamps.time[first] + stamps.late[n]
             v = combine(1.0, (stamps.ahead[n, 0], stamps.ahead[n, 1], stamps.ahead[n, 2]), -late, bias)
@@ -160,9 +174,13 @@ def carry_to_stamps(steps, stamps, timing, iron, out):
             for i in range(3, 6):
                 out.variance[n, i] = steps.variance[k, i]
             if n < len(out.covariance):
+                mixed = multiply(transpose(R), across)
                 for i in range(3):
                     for j in range(3):
                         out.covariance[n, i, j] = own[3 * i + j]
+                        out.covariance[n, i, 3 + j] = mixed[3 * i + j]
+                        out.covariance[n, 3 + j, i] = mixed[3 * i + j]
+                        out.covariance[n, 3 + i, 3 + j] = P[k, 3 + i, 3 + j]
 
 
 def low_pass(values, share, result):
