@@ -584,7 +584,7 @@ def advance(pattern, numbers, keys, gyro, start, events, every, draws, out, deta
             if due:
                 q, b, A, B, C = update(q, b, A, B, C, e, events, draws, out, detail, like)
                 e += 1
-            elif now >= end:
+            if now >= end and (e == count or events.time[e] > end):
                 break
         i = min(k + 1, steps - 1)
         whole = edges[i + 1] - edges[i]
