@@ -15,7 +15,7 @@ import hashlib
 import platform
 from collections.abc import Callable
 from pathlib import Path
-from types import FunctionType, ModuleType
+from types import CodeType, FunctionType, ModuleType
 from typing import Any
 
 import numpy as np
@@ -37,9 +37,15 @@ def _is_kernel(value: object) -> bool:
     return isinstance(value, FunctionType) and (value.__module__ or "").startswith(PACKAGE)
 
 
+def _names(code: CodeType) -> tuple[str, ...]:
+    """Return the names that a function's code asks for, and those of generator expressions in it."""
+    inner = (_names(one) for one in code.co_consts if isinstance(one, CodeType))
+    return sum(inner, code.co_names)
+
+
 def _kernels_named(function: FunctionType) -> dict[str, FunctionType]:
     """Return the kernel functions that a function names, by name."""
-    named = {name: function.__globals__.get(name) for name in function.__code__.co_names}
+    named = {name: function.__globals__.get(name) for name in _names(function.__code__)}
     return {name: value for name, value in named.items() if isinstance(value, FunctionType) and _is_kernel(value)}
 
 
@@ -69,7 +75,7 @@ def _defined(function: FunctionType, parts: tuple[ModuleType, ...]) -> FunctionT
 def _twin(function: FunctionType, parts: tuple[ModuleType, ...]) -> FunctionType:
     """Return a copy of ``function`` whose kernel globals are the compiled helpers."""
     bound: dict[str, Any] = {"__name__": function.__module__}
-    for name in function.__code__.co_names:
+    for name in _names(function.__code__):
         if name in function.__globals__:
             value = function.__globals__[name]
             if isinstance(value, ModuleType) and value.__name__.startswith(PACKAGE):
