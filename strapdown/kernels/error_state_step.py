@@ -134,26 +134,12 @@ def longest_step(dt, theta, limit):
 
 def error_matrix(gyro, k):
     """Return the matrix T of a state of the gyro."""
-    return (
-        gyro[k, 3],
-        gyro[k, 4],
-        gyro[k, 5],
-        gyro[k, 6],
-        gyro[k, 7],
-        gyro[k, 8],
-        gyro[k, 9],
-        gyro[k, 10],
-        gyro[k, 11],
-    )
+    return tuple(gyro[k, i] for i in range(3, 12))
 
 
 def gyro_matrix_times(gyro, k, v):
     """Return T v of a state's matrix T."""
-    return (
-        gyro[k, 3] * v[0] + gyro[k, 4] * v[1] + gyro[k, 5] * v[2],
-        gyro[k, 6] * v[0] + gyro[k, 7] * v[1] + gyro[k, 8] * v[2],
-        gyro[k, 9] * v[0] + gyro[k, 10] * v[1] + gyro[k, 11] * v[2],
-    )
+    return matrix_times_vector(error_matrix(gyro, k), v)
 
 
 def turning_matrix(rate, acceleration):
@@ -424,17 +410,7 @@ def turn_columns(chains, A, F, end):
 
 def matrix_at(array, s, k):
     """Return the 3×3 matrix that ends row (s, k) of an array (…, …, 15)."""
-    return (
-        array[s, k, 6],
-        array[s, k, 7],
-        array[s, k, 8],
-        array[s, k, 9],
-        array[s, k, 10],
-        array[s, k, 11],
-        array[s, k, 12],
-        array[s, k, 13],
-        array[s, k, 14],
-    )
+    return tuple(array[s, k, i] for i in range(6, 15))
 
 
 def across(d):

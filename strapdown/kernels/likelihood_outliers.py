@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 
-from strapdown.kernels.algebra import add, dot, scale, subtract
+from strapdown.kernels.algebra import add, dot, full, scale, subtract
 from strapdown.kernels.filter_step import reset, update_row
 from strapdown.kernels.lane_values import WIDTH, load, spread, store
 from strapdown.kernels.likelihood import FOUND, WORK, measured_rows, part_at, row_at, variance_of
@@ -45,43 +45,21 @@ def updated(b, A, B, C, number, measured, place, sensor, z, factor, room, found)
 
 def between(w, x, y):
     """Return x + w (y − x) of two tuples of three."""
-    return (x[0] + w * (y[0] - x[0]), x[1] + w * (y[1] - x[1]), x[2] + w * (y[2] - x[2]))
+    return tuple(a + w * (b - a) for a, b in zip(x, y, strict=True))
+
+
+def between_matrix(w, S, T, x, y, u, v):
+    """Return the cross-covariance of a mixture, (1 − w) of S and w of T, of attitude (means x, y) and bias (means u, v)."""
+    d, g = scale(w * (1.0 - w), subtract(y, x)), subtract(v, u)
+    M = between(w, S, T)
+    return tuple(M[3 * i + j] + d[i] * g[j] for i in range(3) for j in range(3))
 
 
 def between_symmetric(w, S, T, x, y):
     """Return the covariance of a mixture, (1 − w) of (S, mean x) and w of (T, mean y), as upper triangle."""
     d = subtract(y, x)
-    v = scale(w * (1.0 - w), d)
-    s0, s1, s2 = between(w, (S[0], S[1], S[2]), (T[0], T[1], T[2]))
-    s3, s4, s5 = between(w, (S[3], S[4], S[5]), (T[3], T[4], T[5]))
-    return (
-        s0 + v[0] * d[0],
-        s1 + v[0] * d[1],
-        s2 + v[0] * d[2],
-        s3 + v[1] * d[1],
-        s4 + v[1] * d[2],
-        s5 + v[2] * d[2],
-    )
-
-
-def between_matrix(w, S, T, x, y, u, v):
-    """Return the cross-covariance of a mixture, of attitude (means x, y) and bias (means u, v)."""
-    d = scale(w * (1.0 - w), subtract(y, x))
-    g = subtract(v, u)
-    a = between(w, (S[0], S[1], S[2]), (T[0], T[1], T[2]))
-    b = between(w, (S[3], S[4], S[5]), (T[3], T[4], T[5]))
-    c = between(w, (S[6], S[7], S[8]), (T[6], T[7], T[8]))
-    return (
-        a[0] + d[0] * g[0],
-        a[1] + d[0] * g[1],
-        a[2] + d[0] * g[2],
-        b[0] + d[1] * g[0],
-        b[1] + d[1] * g[1],
-        b[2] + d[1] * g[2],
-        c[0] + d[2] * g[0],
-        c[1] + d[2] * g[1],
-        c[2] + d[2] * g[2],
-    )
+    v, M = scale(w * (1.0 - w), d), full(between(w, S, T))
+    return tuple(M[3 * i + j] + v[i] * d[j] for i in range(3) for j in range(i, 3))
 
 
 def update(state, e, now, measured, body, out):
