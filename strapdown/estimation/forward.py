@@ -639,7 +639,6 @@ def scratch(model: Model) -> root_form.Scratch:
     return root_form.Scratch(
         rows=np.zeros((3, 3, width)),
         lines=np.zeros((root_form.LINES, width)),
-        threes=np.empty((5, 3)),
         steps=np.zeros((2, 2, 6 + m, 4)),
         links=np.empty((len(model.chains), LINKS)),
         six=np.empty((6, 6)),

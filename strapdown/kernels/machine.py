@@ -5,6 +5,7 @@ compiled twins together, so that the source needs no decorator and stays plain P
 
 A kernel may leave functions open: it names them in ``OPEN`` of its module, where they stand without a body, or are those of one of the
 modules that define them. :func:`compiled` takes the modules that do; so :func:`strapdown.kernels.walk.walk` is the loop of every filter.
+Those in ``REPLACEABLE`` are its own where no other defines them.
 """
 
 from __future__ import annotations
@@ -58,8 +59,8 @@ def _depends_on_parts(function: FunctionType) -> bool:
 
 def _open(one: FunctionType | ModuleType) -> tuple[str, ...]:
     """Return the names that a module, or that of a function, leaves open."""
-    names: tuple[str, ...] = (one.__globals__ if isinstance(one, FunctionType) else vars(one)).get("OPEN", ())
-    return names
+    names = one.__globals__ if isinstance(one, FunctionType) else vars(one)
+    return (*names.get("OPEN", ()), *names.get("REPLACEABLE", ()))
 
 
 def _defined(name: str, value: FunctionType, function: FunctionType, parts: tuple[ModuleType, ...]) -> FunctionType:
@@ -70,6 +71,8 @@ def _defined(name: str, value: FunctionType, function: FunctionType, parts: tupl
         found = getattr(module, name, None)
         if isinstance(found, FunctionType) and name not in _open(module):
             return found
+    if name in function.__globals__.get("REPLACEABLE", ()):
+        return value
     names = ", ".join(module.__name__ for module in parts) or "nothing"
     raise TypeError(f"{function.__module__} leaves {name} open, and {names} does not define it")
 
