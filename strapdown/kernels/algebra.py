@@ -87,12 +87,12 @@ def scale_matrix(s, A):
 
 
 def add_matrices(A, B):
-    """Return A + B of two 9-tuples."""
+    """Return A + B of two matrices, both whole or both symmetric."""
     return tuple(a + b for a, b in zip(A, B, strict=True))
 
 
 def combine_matrices(s, A, t, B):
-    """Return s A + t B of scalars and 9-tuples."""
+    """Return s A + t B of scalars and matrices, both whole or both symmetric."""
     return tuple(s * a + t * b for a, b in zip(A, B, strict=True))
 
 
@@ -178,3 +178,13 @@ def solved(F, v):
 def divided(X, F):
     """Return X S⁻¹ of a matrix X, from the factors of S."""
     return solved(F, X[:3]) + solved(F, X[3:6]) + solved(F, X[6:])
+
+
+def congruent(M, S):
+    """Return the symmetric M S Mᵀ."""
+    return times_transpose_upper(multiply(M, full(S)), M)
+
+
+def plus_square(S, v):
+    """Return S + v vᵀ of a symmetric matrix."""
+    return symmetric_minus_outer(S, scale(-1.0, v), v)

@@ -17,6 +17,7 @@ from strapdown.kernels.algebra import (
     add_matrices,
     add_to_diagonal,
     combine,
+    congruent,
     dot,
     full,
     minus_outer,
@@ -26,7 +27,6 @@ from strapdown.kernels.algebra import (
     skew_polynomial,
     symmetric_minus_outer,
     symmetric_times_vector,
-    times_transpose_upper,
     times_transpose_upper_add,
     transpose,
     transpose_times_vector,
@@ -147,7 +147,7 @@ def reset(q, A, B, correction):
         G = chosen_parts(large, J, G)
     return (
         moved,
-        times_transpose_upper(multiply(G, full(A)), G),
+        congruent(G, A),
         multiply(G, B),
     )
 

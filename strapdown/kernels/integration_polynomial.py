@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from strapdown.kernels.algebra import add, combine, cross, dot, square_root
 from strapdown.kernels.integration import large_exponential, pair_correction
-from strapdown.kernels.rotation import quaternion_multiply, renormalized
+from strapdown.kernels.rotation import quaternion_multiply, renormalized, unit
+from strapdown.kernels.state import store_row
 
 NEGLIGIBLE = 2.0**-56
 """rad; powers of the rate that together turn less are left out, and the series ends when all terms to come turn less."""
@@ -160,11 +161,7 @@ def polynomial_steps(increments, samples, previous, fits, correction, rates, ser
             q = quaternion_multiply(q, step)
         if smooth:
             q = quaternion_multiply(q, large_exponential(pair_correction(increments, start, correction)))
-        q = renormalized(q)
-        steps[k, 0] = q[0]
-        steps[k, 1] = q[1]
-        steps[k, 2] = q[2]
-        steps[k, 3] = q[3]
+        store_row(steps, k, renormalized(q))
 
 
 def magnus_4(b0, b1):
@@ -192,12 +189,6 @@ def commutator_free_4(b0, b1):
     )
 
 
-def normalized(q):
-    """Return q / |q|."""
-    s = 1.0 / square_root(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
-    return (s * q[0], s * q[1], s * q[2], s * q[3])
-
-
 def runge_kutta_4(start, middle, end):
     """Return the classical Runge–Kutta step of equation (17), normalised; the arguments are T × rate at 0, T/2, T."""
     k1 = (0.0, 0.5 * start[0], 0.5 * start[1], 0.5 * start[2])
@@ -205,7 +196,7 @@ def runge_kutta_4(start, middle, end):
     k3 = quaternion_times_vector((0.5 + 0.25 * k2[0], 0.25 * k2[1], 0.25 * k2[2], 0.25 * k2[3]), middle)
     k4 = quaternion_times_vector((0.5 + 0.5 * k3[0], 0.5 * k3[1], 0.5 * k3[2], 0.5 * k3[3]), end)
     s = 1.0 / 6.0
-    return normalized(
+    return unit(
         (
             1.0 + s * (k1[0] + 2.0 * (k2[0] + k3[0]) + k4[0]),
             s * (k1[1] + 2.0 * (k2[1] + k3[1]) + k4[1]),
@@ -252,8 +243,4 @@ def scheme_steps(increments, weights, scheme, steps):
             q = runge_kutta_4(a, b, c)
         else:
             q = euler(a)
-        q = renormalized(q)
-        steps[k, 0] = q[0]
-        steps[k, 1] = q[1]
-        steps[k, 2] = q[2]
-        steps[k, 3] = q[3]
+        store_row(steps, k, renormalized(q))

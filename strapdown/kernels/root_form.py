@@ -15,13 +15,14 @@ from typing import NamedTuple
 import numpy as np
 
 from strapdown.kernels.algebra import (
+    add,
     combine,
+    congruent,
     cross,
     dot,
-    full,
     matrix_times_vector,
     multiply,
-    times_transpose_upper,
+    plus_square,
     transpose,
     transpose_times_vector,
 )
@@ -463,16 +464,10 @@ def store_prediction(form, i, q, k, part, dt, out):
 def attitude_covariance(form, i, q):
     """Return the covariance of the attitude (6-tuple)."""
     F = form.F[i]
-    s00 = s01 = s02 = s11 = s12 = s22 = 0.0
+    S = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     for j in range(form.x.shape[1] + 3):
-        a, b, c = F[j, 0], F[j, 1], F[j, 2]
-        s00 += a * a
-        s01 += a * b
-        s02 += a * c
-        s11 += b * b
-        s12 += b * c
-        s22 += c * c
-    return (s00, s01, s02, s11, s12, s22)
+        S = plus_square(S, vector_at(F, j))
+    return S
 
 
 def start_update(form, i):
@@ -496,23 +491,19 @@ def linearised(form, i, e, now_q, q, M, z, frame, noise, kind, sensor, prior):
     rows, y, axes, _ = seen_rows(form, e, now_q, now_x, kind, z, frame, sensor)
     far, along = seen_from_afar(kind, z, rows, y, axes)
     y, spread = independent(form, e, now_x, sensor, rows, y, axes, noise, arm_variance(form, e))
-    p0 = p1 = p2 = 0.0
-    for j in range(size, H.shape[1]):
-        for r in range(3):
-            prior_H[r, j] = 0.0
-    for j in range(size):
-        for r in range(3):
-            prior_H[r, j] = H[r, j]
-        p0 += H[0, j] * scratch.lines[PRIOR][j]
-        p1 += H[1, j] * scratch.lines[PRIOR][j]
-        p2 += H[2, j] * scratch.lines[PRIOR][j]
+    p = (0.0, 0.0, 0.0)
+    for j in range(H.shape[1]):
+        column = (H[0, j], H[1, j], H[2, j])
+        prior_H[0, j], prior_H[1, j], prior_H[2, j] = column
+        if j < size:
+            p = combine(1.0, p, scratch.lines[PRIOR][j], column)
     for r in range(3):
         prior_H[r, 0], prior_H[r, 1], prior_H[r, 2] = transpose_times_vector(M, vector_at(H, r))
     if len(model.chains) > 0:
         turn_columns(model.chains, transpose(fixed_turn(q, now_q)), prior_H, 3)
     two, three = rows > 1, rows > 2
     variance = (spread[0], spread[1] if two else 1.0, spread[2] if three else 1.0)
-    return rows, (y[0], y[1] if two else 0.0, y[2] if three else 0.0), (p0, p1, p2), variance, far, along
+    return rows, (y[0], y[1] if two else 0.0, y[2] if three else 0.0), p, variance, far, along
 
 
 def seen_from_afar(kind, z, rows, y, axes):
@@ -538,16 +529,10 @@ def innovation_covariance(form, i, q, rows):
     for r in range(3):
         for j in range(size):
             seen[r, j] = dot_rows(F, j, H, r) if r < rows else 0.0
-    s00 = s01 = s02 = s11 = s12 = s22 = 0.0
+    S = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     for j in range(size):
-        a, b, c = seen[0, j], seen[1, j], seen[2, j]
-        s00 += a * a
-        s01 += a * b
-        s02 += a * c
-        s11 += b * b
-        s12 += b * c
-        s22 += c * c
-    return (s00, s01, s02, s11, s12, s22)
+        S = plus_square(S, (seen[0, j], seen[1, j], seen[2, j]))
+    return S
 
 
 def step_of(form, i, state, rows, u, M, prior, q, now_q):
@@ -674,12 +659,11 @@ def start_candidate(form, memory, now, attitude_sigma, restart):
 
 def bias_variances(F, size):
     """Return the variances of the bias (3,) of a factor's covariance."""
-    x = y = z = 0.0
+    variances = (0.0, 0.0, 0.0)
     for j in range(size):
-        x += F[j, 3] * F[j, 3]
-        y += F[j, 4] * F[j, 4]
-        z += F[j, 5] * F[j, 5]
-    return (x, y, z)
+        b = (F[j, 3], F[j, 4], F[j, 5])
+        variances = add(variances, (b[0] * b[0], b[1] * b[1], b[2] * b[2]))
+    return variances
 
 
 def aged_chain(decay, chains, first, k, age):
@@ -716,7 +700,7 @@ def aged_chain(decay, chains, first, k, age):
     phi = (own0, near1, far2, 0.0, own1, near2, 0.0, 0.0, own2)
     Q = (q00, q01, q02, q11, q12, q22)
     for _ in range(doublings):
-        more = times_transpose_upper(multiply(phi, full(Q)), phi)
+        more = congruent(phi, Q)
         Q = (Q[0] + more[0], Q[1] + more[1], Q[2] + more[2], Q[3] + more[3], Q[4] + more[4], Q[5] + more[5])
         phi = multiply(phi, phi)
     return phi, Q

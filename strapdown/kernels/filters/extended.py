@@ -14,15 +14,14 @@ import numpy as np
 
 from strapdown.kernels.algebra import (
     combine,
+    congruent,
     dot,
-    full,
     matrix_times_vector,
     minus_outer,
     multiply,
     scale,
     symmetric_minus_outer,
     symmetric_times_vector,
-    times_transpose_upper,
     transpose,
     transpose_times_vector,
 )
@@ -171,11 +170,6 @@ def finish(state, row, e, body):
 def negated(v):
     """Return −v."""
     return (-v[0], -v[1], -v[2])
-
-
-def congruent(M, S):
-    """Return the symmetric M S Mᵀ."""
-    return times_transpose_upper(multiply(M, full(S)), M)
 
 
 def turned_in_fixed_axes(q, phi):
