@@ -236,7 +236,7 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
     # ---------------------------------------------------------------------------------------------------------------- updates
 
     def update(self, *arguments: Any, **options: Any) -> None:
-        """Refuse filterpy's own update by any ``Hx``: it would leave the correction in ``x``, outside ``attitude`` and ``bias``.
+        """Refuse filterpy's own updates by any ``Hx``: they would leave the correction in ``x``, outside ``attitude`` and ``bias``.
 
         Parameters
         ----------
@@ -249,26 +249,11 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
             Always; use :meth:`update_direction`, :meth:`update_vector`, :meth:`update_heading` or :meth:`update_attitude`.
         """
         raise InputError(
-            "update() by HJacobian and Hx knows no attitude, and would leave its correction in x; use update_direction, update_vector, "
+            "an update by HJacobian and Hx knows no attitude, and would leave its correction in x; use update_direction, update_vector, "
             "update_heading or update_attitude"
         )
 
-    def predict_update(self, *arguments: Any, **options: Any) -> None:
-        """Refuse filterpy's own step, as :meth:`update` does.
-
-        Parameters
-        ----------
-        *arguments, **options
-            Ignored.
-
-        Raises
-        ------
-        InputError
-            Always.
-        """
-        raise InputError(
-            "predict_update() would update by Hx, which knows no attitude; use predict, then update_direction or another"
-        )
+    predict_update = update
 
     def update_direction(
         self,
