@@ -264,11 +264,6 @@ def keep(state, row, e, body, out):
     return q, b, A, B, C, span, kept
 
 
-def stopped(state):
-    """Go on to the end."""
-    return False
-
-
 def finish(state, row, e, body):
     """Leave the end states."""
     q, b, A, B, C, _, _ = state

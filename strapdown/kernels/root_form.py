@@ -391,11 +391,6 @@ def keep(state, row, e, body, out):
     return state
 
 
-def stopped(state):
-    """Go on to the end."""
-    return False
-
-
 def finish(state, row, e, body):
     """Leave the end state and return the number of segments."""
     q, segments, behind = state

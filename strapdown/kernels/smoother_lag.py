@@ -38,6 +38,7 @@ from strapdown.kernels.smoother_loop import (
     MOVED,
     NOISE,
     ROW,
+    SIX,
     TURN,
     move_states,
     prepare_gains,
@@ -64,7 +65,6 @@ PREPARED = RESULT + GROUP
 PREPARED_ROW = GROUP + WIDTH
 _NOT_NEGATIVE = 2**62 - 1
 _LANE = WIDTH - 1
-SIX = (0, 1, 2, 3, 4, 5)
 _LARGEST_SQUARE = LARGEST_ANGLE * LARGEST_ANGLE
 
 

@@ -98,6 +98,7 @@ _NOTHING = 1e-30
 _LARGEST_SQUARE = LARGEST_ANGLE * LARGEST_ANGLE
 _NOT_NEGATIVE = 2**62 - 1
 _LANE = WIDTH - 1
+SIX = (0, 1, 2, 3, 4, 5)
 # An index and one of these: the same index, and the compiler sees that it is not negative, which it otherwise tests at each number read.
 
 
@@ -329,21 +330,9 @@ def carry_covariance(work, group, i):
     g += 18
     columns = load_columns(work, f, g)
     # Rows of P_s (G J)ᵀ, of which P_s is read from its upper triangle.
-    z = (
-        times_columns(work, (p, p + 1, p + 2, p + 3, p + 4, p + 5), columns),
-        times_columns(work, (p + 1, p + 9, p + 10, p + 11, p + 12, p + 13), columns),
-        times_columns(work, (p + 2, p + 10, p + 18, p + 19, p + 20, p + 21), columns),
-        times_columns(work, (p + 3, p + 11, p + 19, p + 27, p + 28, p + 29), columns),
-        times_columns(work, (p + 4, p + 12, p + 20, p + 28, p + 36, p + 37), columns),
-        times_columns(work, (p + 5, p + 13, p + 21, p + 29, p + 37, p + 45), columns),
-    )
-    p -= COVARIANCE_ROW
-    store(work, p, row_times(work, f, g, z, load(work, d)))
-    store(work, p + 8, row_times(work, f + 1, g + 1, z, load(work, d + 5)))
-    store(work, p + 16, row_times(work, f + 2, g + 2, z, load(work, d + 9)))
-    store(work, p + 24, row_times(work, f + 3, g + 3, z, load(work, d + 12)))
-    store(work, p + 32, row_times(work, f + 4, g + 4, z, load(work, d + 14)))
-    store(work, p + 40, row_times(work, f + 5, g + 5, z, load(work, d + 15)))
+    z = tuple(times_columns(work, tuple(p + 8 * min(r, c) + max(r, c) for c in SIX), columns) for r in SIX)
+    for r, begin in enumerate((0, 5, 9, 12, 14, 15)):
+        store(work, p - COVARIANCE_ROW + 8 * r, row_times(work, f + r, g + r, z, load(work, d + begin)))
 
 
 def move_states(work, group, errors, whole):

@@ -151,11 +151,6 @@ def keep(state, row, e, body, out):
     return state
 
 
-def stopped(state):
-    """Go on to the end."""
-    return False
-
-
 def finish(state, row, e, body):
     """Leave the end state, body side."""
     q, b, A, B, C = state
