@@ -87,7 +87,7 @@ def scale_matrix(s, A):
 
 
 def add_matrices(A, B):
-    """Return A + B of two matrices, both whole or both symmetric."""
+    """Return A + B of two tuples of any length."""
     return tuple(a + b for a, b in zip(A, B, strict=True))
 
 

@@ -23,6 +23,7 @@ import math
 from strapdown.kernels.algebra import (
     add_matrices,
     combine,
+    cross,
     dot,
     matrix_times_vector,
     multiply,
@@ -75,21 +76,10 @@ THREE_WEIGHTS = (5.0 / 18.0, 8.0 / 18.0, 5.0 / 18.0)
 
 def inverse(A):
     """Return the inverse of a 3×3 matrix."""
-    c0 = A[4] * A[8] - A[5] * A[7]
-    c1 = A[5] * A[6] - A[3] * A[8]
-    c2 = A[3] * A[7] - A[4] * A[6]
-    d = 1.0 / (A[0] * c0 + A[1] * c1 + A[2] * c2)
-    return (
-        d * c0,
-        d * (A[2] * A[7] - A[1] * A[8]),
-        d * (A[1] * A[5] - A[2] * A[4]),
-        d * c1,
-        d * (A[0] * A[8] - A[2] * A[6]),
-        d * (A[2] * A[3] - A[0] * A[5]),
-        d * c2,
-        d * (A[1] * A[6] - A[0] * A[7]),
-        d * (A[0] * A[4] - A[1] * A[3]),
-    )
+    a, b, c = A[:3], A[3:6], A[6:]
+    x, y, z = cross(b, c), cross(c, a), cross(a, b)
+    d = 1.0 / dot(a, x)
+    return tuple(d * v[i] for i in range(3) for v in (x, y, z))
 
 
 def response(rate, u, decay):

@@ -23,6 +23,7 @@ from strapdown.kernels.lane_values import (
     spread,
     store_quadruples,
 )
+from strapdown.kernels.measurement import vector_at
 from strapdown.kernels.rotation import exponential, quaternion_multiply, renormalized
 from strapdown.kernels.series import LARGEST_ANGLE
 from strapdown.kernels.state import load_quaternion, store_several
@@ -234,33 +235,18 @@ def pair_vectors(increments, samples, previous, tables, vectors):
     for k in range(len(vectors)):
         first = k * samples
         start = min(max(first - previous, 0), latest)
-        x, y, z = pair_correction(increments, start, tables[first - start])
+        phi = pair_correction(increments, start, tables[first - start])
         for i in range(first, first + samples):
-            x += increments[i, 0]
-            y += increments[i, 1]
-            z += increments[i, 2]
-        vectors[k, 0] = x
-        vectors[k, 1] = y
-        vectors[k, 2] = z
+            phi = add(phi, vector_at(increments, i))
+        vectors[k, 0], vectors[k, 1], vectors[k, 2] = phi
 
 
 def pair_correction(increments, first, pairs):
     """Return Σ_{i<j} K_ij Δθ_i × Δθ_j over the window that starts at row ``first``."""
-    x = 0.0
-    y = 0.0
-    z = 0.0
+    total = (0.0, 0.0, 0.0)
     for j in range(1, len(pairs)):
-        a = 0.0
-        b = 0.0
-        c = 0.0
+        before = (0.0, 0.0, 0.0)
         for i in range(j):
-            s = pairs[i, j]
-            a += s * increments[first + i, 0]
-            b += s * increments[first + i, 1]
-            c += s * increments[first + i, 2]
-        last = first + j
-        part = cross((a, b, c), (increments[last, 0], increments[last, 1], increments[last, 2]))
-        x += part[0]
-        y += part[1]
-        z += part[2]
-    return (x, y, z)
+            before = combine(1.0, before, pairs[i, j], vector_at(increments, first + i))
+        total = add(total, cross(before, vector_at(increments, first + j)))
+    return total

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from strapdown.kernels.algebra import add, combine, cross, dot, square_root
 from strapdown.kernels.integration import large_exponential, pair_correction
+from strapdown.kernels.measurement import vector_at
 from strapdown.kernels.rotation import quaternion_multiply, renormalized, unit
 from strapdown.kernels.state import store_row
 
@@ -43,18 +44,13 @@ def fitted_rates(increments, first, fit, rates):
     this power and all higher ones.
     """
     window = len(fit)
-    for m in range(window):
-        rates[0, m] = 0.0
-        rates[1, m] = 0.0
-        rates[2, m] = 0.0
-    for j in range(window):
-        x = increments[first + j, 0]
-        y = increments[first + j, 1]
-        z = increments[first + j, 2]
+    for axis in range(3):
         for m in range(window):
-            rates[0, m] += fit[j, m] * x
-            rates[1, m] += fit[j, m] * y
-            rates[2, m] += fit[j, m] * z
+            rates[axis, m] = 0.0
+        for j in range(window):
+            x = increments[first + j, axis]
+            for m in range(window):
+                rates[axis, m] += fit[j, m] * x
     return sized(rates, window)
 
 
@@ -156,7 +152,7 @@ def polynomial_steps(increments, samples, previous, fits, correction, rates, ser
             bound, kept = fitted_rates(increments, start, fits[i - start], rates)
             step, ended = interval_quaternion(rates, kept, series)
             if bound > LARGEST_RATE or not ended:
-                step = large_exponential((increments[i, 0], increments[i, 1], increments[i, 2]))
+                step = large_exponential(vector_at(increments, i))
                 smooth = False
             q = quaternion_multiply(q, step)
         if smooth:
@@ -214,15 +210,10 @@ def euler(increment):
 
 def weighted(increments, first, weights, row):
     """Return Σ_j weights[row, j] Δθ_j over the window that starts at row ``first``."""
-    x = 0.0
-    y = 0.0
-    z = 0.0
+    total = (0.0, 0.0, 0.0)
     for j in range(weights.shape[1]):
-        s = weights[row, j]
-        x += s * increments[first + j, 0]
-        y += s * increments[first + j, 1]
-        z += s * increments[first + j, 2]
-    return (x, y, z)
+        total = combine(1.0, total, weights[row, j], vector_at(increments, first + j))
+    return total
 
 
 def scheme_steps(increments, weights, scheme, steps):

@@ -325,14 +325,13 @@ def follow(work, like, i, phi11, column, share, own, kept, noise):
     store_several(work.cross, 3 * i, like, combine(kept, v, 1.0, share))
     alone[OWN, i] = kept * kept * alone[OWN, i] + own
     alone[KEPT, i] *= kept
-    return (
-        noise[0] + (column[0] * u[0] + v[0] * column[0]),
-        noise[1] + (column[0] * u[1] + v[0] * column[1]),
-        noise[2] + (column[0] * u[2] + v[0] * column[2]),
-        noise[3] + (column[1] * u[1] + v[1] * column[1]),
-        noise[4] + (column[1] * u[2] + v[1] * column[2]),
-        noise[5] + (column[2] * u[2] + v[2] * column[2]),
-    )
+    return crossed(noise, column, u, v)
+
+
+def crossed(S, a, u, v):
+    """Return S + a uᵀ + v aᵀ, known to be symmetric."""
+    T = full(S)
+    return tuple(T[3 * i + j] + (a[i] * u[j] + v[i] * a[j]) for i in range(3) for j in range(i, 3))
 
 
 def start_steps(work, like):
@@ -386,11 +385,7 @@ def absorb(model, work, like, base, turn, noise):
 
 def axes_at(work, like, n, i):
     """Return what the three lines of axes hold of state i."""
-    return (
-        one_of(work.lines, n * AXES + i, like),
-        one_of(work.lines, n * (AXES + 1) + i, like),
-        one_of(work.lines, n * (AXES + 2) + i, like),
-    )
+    return tuple(one_of(work.lines, n * (AXES + a) + i, like) for a in range(3))
 
 
 def attitude_of(work, like, n):

@@ -39,7 +39,9 @@ HALF_RANGE = 0.25 * SQUARED_RANGE
 FOUND = 12 * WIDTH
 """Place in the work space of innovations and variances; before it the rows of a measurement."""
 WORK = 18 * WIDTH
-ROOM = 22 * WIDTH
+WIDE = 21 * WIDTH
+"""Innovations and variances with those of an outlier."""
+ROOM = 27 * WIDTH
 """Size of the work space."""
 
 
@@ -211,21 +213,14 @@ def update(state, e, now, measured, body, out):
     z = value_of(measured, place, sensor)
     factor = load(body.factors, WIDTH * sensor)
     number = measured_rows(q, z, kind, frame_row(measured, place, sensor), measured.triads, room)
-    correction = (spread(0.0), spread(0.0), spread(0.0))
-    for r in range(number):
-        h, y = row_at(room, r)
-        innovation = y - dot(h, correction)
-        variance = variance_of(measured, place, sensor, kind, z, r) * factor
-        turn, b, A, B, C, s = update_row(b, A, B, C, h, innovation, variance)
-        correction = add(correction, turn)
-        store(room, FOUND + 2 * WIDTH * r, innovation)
-        store(room, FOUND + 2 * WIDTH * r + WIDTH, s)
+    correction, b, A, B, C = updated(b, A, B, C, number, measured, place, sensor, z, factor, room, FOUND)
     q, A, B = reset(q, A, B, correction)
     if kind == VECTOR:
-        store(room, FOUND + 4 * WIDTH, load(room, 8 * WIDTH))
-        store(room, FOUND + 5 * WIDTH, variance_of(measured, place, sensor, kind, z, 2) * factor)
         number = 3
-    add_likelihood(room, number, span, out)
+    for i in range(WIDTH):
+        deviance, product = deviance_of(room, FOUND, number, i)
+        out.minus_log[WIDTH * span + i] += 0.5 * (math.log(product) + deviance)
+        out.squares[WIDTH * span + i] += deviance
     if len(out.innovations) > 0:
         start = 6 * WIDTH * e
         for i in range(2 * WIDTH * number):
@@ -235,18 +230,35 @@ def update(state, e, now, measured, body, out):
     return q, b, A, B, C, span, kept
 
 
-def add_likelihood(room, number, span, out):
-    """Add a measurement's deviance and log determinant to the sums of its part."""
-    for i in range(WIDTH):
-        product = 1.0
-        deviance = 0.0
-        for r in range(number):
-            e = room[FOUND + 2 * WIDTH * r + i]
-            s = room[FOUND + 2 * WIDTH * r + WIDTH + i]
-            deviance += e * e / s
-            product *= s
-        out.minus_log[WIDTH * span + i] += 0.5 * (math.log(product) + deviance)
-        out.squares[WIDTH * span + i] += deviance
+def updated(b, A, B, C, number, measured, place, sensor, z, factor, room, found):
+    """Update with all variances of a measurement times ``factor``; return the attitude correction, b, A, B, C.
+
+    Innovations and their variances go to the work space at ``found``, in lanes; a vector's length has the third.
+    """
+    kind = measured.series[sensor, KIND]
+    correction = (spread(0.0), spread(0.0), spread(0.0))
+    for r in range(number):
+        h, y = row_at(room, r)
+        innovation = y - dot(h, correction)
+        variance = variance_of(measured, place, sensor, kind, z, r) * factor
+        turn, b, A, B, C, s = update_row(b, A, B, C, h, innovation, variance)
+        correction = add(correction, turn)
+        store_several(room, found + 2 * WIDTH * r, (innovation, s))
+    if kind == VECTOR:
+        variance = variance_of(measured, place, sensor, kind, z, 2) * factor
+        store_several(room, found + 4 * WIDTH, (load(room, 8 * WIDTH), variance))
+    return correction, b, A, B, C
+
+
+def deviance_of(room, found, number, i):
+    """Return the NIS of a measurement in lane i and the determinant of its innovations' covariance."""
+    deviance, product = 0.0, 1.0
+    for r in range(number):
+        e = room[found + 2 * WIDTH * r + i]
+        s = room[found + 2 * WIDTH * r + WIDTH + i]
+        deviance += e * e / s
+        product *= s
+    return deviance, product
 
 
 def row_at(room, r):
