@@ -44,13 +44,14 @@ def fitted_rates(increments, first, fit, rates):
     this power and all higher ones.
     """
     window = len(fit)
-    for axis in range(3):
+    for m in range(window):
+        rates[0, m], rates[1, m], rates[2, m] = 0.0, 0.0, 0.0
+    for j in range(window):
+        x, y, z = vector_at(increments, first + j)
         for m in range(window):
-            rates[axis, m] = 0.0
-        for j in range(window):
-            x = increments[first + j, axis]
-            for m in range(window):
-                rates[axis, m] += fit[j, m] * x
+            rates[0, m] += fit[j, m] * x
+            rates[1, m] += fit[j, m] * y
+            rates[2, m] += fit[j, m] * z
     return sized(rates, window)
 
 
