@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import signal
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import typer
 
+from strapdown.checks import InputError, count
 from strapdown.cli.filters import default_words, filter_of_scenario, own_filter
 from strapdown.cli.terminal import (
     Tables,
@@ -29,6 +32,7 @@ from strapdown.cli.terminal import (
     writable,
     written,
 )
+from strapdown.files import write_json
 
 if TYPE_CHECKING:
     from types import FrameType
@@ -134,8 +138,6 @@ def montecarlo(
     output: _Output,
 ) -> None:
     """Run a scenario many times through a filter and judge the filter: exit status 0 consistent, 1 not, 2 cannot tell (or bad input)."""
-    from strapdown.checks import InputError
-    from strapdown.files import write_json
     from strapdown.montecarlo import summary
 
     source = Path(scenario)
@@ -165,7 +167,6 @@ def montecarlo(
 
 def _planned(source: Path, scenario: str, model: _Model, machine: str) -> tuple[Campaign | None, Plan]:
     """Return the campaign that a file holds, if it is one's, and the plan."""
-    from strapdown.checks import InputError
     from strapdown.montecarlo import campaign as campaigns
 
     if source.suffix.lower() not in _CAMPAIGN_SUFFIXES:
@@ -182,8 +183,6 @@ def _planned(source: Path, scenario: str, model: _Model, machine: str) -> tuple[
 
 def _check_files(target: Path, *, replaced: bool) -> None:
     """Refuse a file that cannot be written, or a report beside it that is another's; ``replaced``: what is there may be."""
-    from strapdown.checks import InputError
-
     writable("out", target, suffixes=_CAMPAIGN_SUFFIXES)
     beside = target.with_suffix(".json")
     if beside.exists() and not target.exists() and not replaced:
@@ -194,7 +193,6 @@ def _check_files(target: Path, *, replaced: bool) -> None:
 def _computed(plan: Plan, target: Path, name: str, computing: _Computing, output: _Output) -> Campaign:
     """Compute the runs, in threads or on Dask, and write them to the file as they are finished."""
     from strapdown import montecarlo as engine
-    from strapdown.checks import InputError, count
     from strapdown.montecarlo import campaign as campaigns
 
     runs = computing.runs
@@ -268,7 +266,6 @@ def asked_to_stop() -> Iterator[Callable[[], None]]:
 def _plan(scenario: str, model: _Model) -> Plan:
     from strapdown import montecarlo as engine
     from strapdown import workflows
-    from strapdown.checks import InputError
     from strapdown.gyro import read_spec
     from strapdown.setup import matched
 
@@ -301,8 +298,6 @@ def _plan(scenario: str, model: _Model) -> Plan:
 
 def _with_filter(held: Campaign, own: Own, source: Path) -> Campaign:
     """Return a campaign with its filter's code, which its file does not hold."""
-    from strapdown.checks import InputError
-
     if held.plan.setup.estimator != own:
         raise InputError(
             f"{own.name} as its file stands is not the filter of {source}, {held.plan.setup.estimator_name}; take the file as it was, or "
@@ -339,7 +334,6 @@ def _judged(campaign: Campaign) -> Judgement:
 
 def _print_result(campaign: Campaign) -> int:
     """Show the statistics and the verdict; return the exit status."""
-    from strapdown.checks import InputError
     from strapdown.cli.judgement import status_of
     from strapdown.montecarlo import summary
     from strapdown.montecarlo.verdicts import bound_of
@@ -442,9 +436,6 @@ def _replayed(target: Path, run: int) -> list[Path]:
 
 
 def _replay(plan: Plan, run: int, machine: str, target: Path) -> None:
-    import json
-
-    import numpy as np
 
     from strapdown import consistency, setup
     from strapdown import montecarlo as engine

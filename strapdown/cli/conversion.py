@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from strapdown.checks import InputError
 from strapdown.cli.reading import RECORDING_HELP, Layout
 from strapdown.cli.terminal import command, console, writable, written
 
@@ -39,7 +40,6 @@ def convert(
 ) -> None:
     """Convert a recording, a simulated record or an estimate: IN is recognised by its content, OUT written by its ending."""
     from strapdown import recordings
-    from strapdown.checks import InputError
     from strapdown.records import read_estimate
 
     options = layout.options(source)

@@ -7,8 +7,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import typer
 
+from strapdown.checks import InputError, count, non_negative, one_of
 from strapdown.cli.filters import ChosenStates, filter_for
 from strapdown.cli.reading import RECORDING_HELP, Layout
 from strapdown.cli.terminal import (
@@ -25,6 +27,8 @@ from strapdown.cli.terminal import (
     writable,
     written,
 )
+from strapdown.files import reading, usable_folder, write_json
+from strapdown.units import DEGREE, DEGREE_PER_HOUR, DEGREE_PER_HOUR_PER_ROOT_HOUR, DEGREE_PER_ROOT_HOUR
 
 if TYPE_CHECKING:
     from strapdown.ahrs import AhrsEstimate, AhrsParameters
@@ -218,7 +222,6 @@ def estimate(
     The accelerometer gives the vertical and the magnetometer the heading; where the recording holds its specification, as one of `strapdown
     simulate` does, the filter is matched to that.
     """
-    from strapdown.files import usable_folder
     from strapdown.recordings import is_record
     from strapdown.records import read_attributes
 
@@ -240,8 +243,6 @@ def estimate(
 
 def _check_kind(recording: Path, options: list[str], specified: bool) -> None:
     """Refuse options that need a specification where there is none, and the other way round."""
-    from strapdown.checks import InputError
-
     if options and specified:
         raise InputError(
             f"{options[0]} goes with a recording without a specification; {recording} holds one, of `strapdown simulate`"
@@ -258,7 +259,6 @@ def _exports(output: _Output, recording: Path, *, changed: bool) -> Exports:
     ``changed``: the samples are read in other axes than those of the file.
     """
     from strapdown import recordings
-    from strapdown.checks import InputError, one_of
     from strapdown.records import outputs
 
     frame = None if output.frame is None else one_of("--frame", output.frame.upper(), outputs.FRAMES)
@@ -291,8 +291,6 @@ def _export(exports: Exports, estimate: Estimate, recording: Recording | None) -
 def _estimate_specified(path: Path, shared: _Shared, options: _Specified, output: _Output, exports: Exports) -> None:
     """Run the filter over a recording that holds its specification, report and write its estimate."""
     from strapdown import workflows
-    from strapdown.checks import InputError, count
-    from strapdown.files import reading
     from strapdown.recordings.recordfiles import read_record_file
 
     every = count("every", options.every)
@@ -338,7 +336,6 @@ def _write_specified(
 ) -> list[Path]:
     """Write the estimate and what is known of it, and print its errors; return the files."""
     from strapdown import setup
-    from strapdown.files import write_json
     from strapdown.records import write_estimate
 
     result, truth = run.estimate, run.truth
@@ -364,8 +361,6 @@ def _write_specified(
 
 
 def _say_nis(result: Estimate, path: Path) -> None:
-    import numpy as np
-
     seen = {s: i for s, i in result.innovations.items() if np.sum(i.used)}
     if seen:
         each = ", ".join(f"{np.mean(i.nis[i.used]) / i.innovation.shape[1]:.3g} {s}" for s, i in seen.items())
@@ -375,7 +370,6 @@ def _say_nis(result: Estimate, path: Path) -> None:
 def _observability(out: Path, source: str, record: ImuRecord, chosen: FilterSetup, initial: State) -> Path:
     """Print and write how observable each state is; return the file."""
     from strapdown import setup
-    from strapdown.files import write_json
 
     with progress_bar("observability"):
         shown = setup.observability(record, chosen, initial)
@@ -451,10 +445,7 @@ def _print_states(result: Any, record: ImuRecord) -> dict[str, Any]:
 
 def _start(record: ImuRecord, chosen: FilterSetup, attitude: str | None, from_truth: bool) -> Start | None:
     """Return the start that the options give; None: from the first measurements."""
-    import numpy as np
-
     from strapdown import setup
-    from strapdown.checks import InputError
     from strapdown.setup.for_record import Start, drawn_start
 
     if attitude is not None and from_truth:
@@ -494,10 +485,7 @@ def _print_result(result: Estimate) -> None:
 
 def _errors(result: Estimate, truth: Any) -> dict[str, float]:
     """Return errors and consistency over the second half, degrees and degrees an hour."""
-    import numpy as np
-
     from strapdown import consistency
-    from strapdown.units import DEGREE, DEGREE_PER_HOUR
 
     half = slice(len(result.time) // 2, None)
     error = consistency.errors(result.attitude[half], result.bias[half], truth.attitude[half], truth.bias[half])
@@ -519,10 +507,8 @@ def _estimate_recording(
 ) -> None:
     """Run the filter over a recording: accelerometer as the vertical, magnetometer as the heading."""
     from strapdown import ahrs
-    from strapdown.checks import non_negative, one_of
     from strapdown.consistency import reference_errors
     from strapdown.recordings import unit_calibration
-    from strapdown.units import DEGREE, DEGREE_PER_HOUR_PER_ROOT_HOUR, DEGREE_PER_ROOT_HOUR
 
     motion = one_of("--motion", options.motion or "auto", ("auto", *ahrs.MOTIONS))
     late = None if options.latency is None else 1e-3 * non_negative("--latency", options.latency, unit="ms")
@@ -604,7 +590,6 @@ def _write_recording(
 ) -> list[Path]:
     """Write the estimate, its states and the calibration; return the files."""
     from strapdown import setup
-    from strapdown.files import write_json
     from strapdown.recordings import unit_calibration
     from strapdown.records import write_estimate
 
@@ -667,8 +652,6 @@ def _say_recording(result: AhrsEstimate, parameters: AhrsParameters, motion: str
 
 def _rms(out: Path, source: str, rms: dict[str, float]) -> Path:
     """Print and write the RMS errors against the reference, degrees; return the file."""
-    from strapdown.files import write_json
-
     write_json(out / "errors.json", {"source": source, **{f"{name}_rmse_deg": value for name, value in rms.items()}})
     rows = table("RMS error over the movement phase, degrees", *rms, left=0)
     rows.add_row(*(f"{value:.2f}" for value in rms.values()))
@@ -685,10 +668,6 @@ def _rested(parameters: AhrsParameters, result: AhrsEstimate) -> bool:
 
 def _model(moved_by: str, odds: float, parameters: AhrsParameters, result: AhrsEstimate) -> str:
     """Return in words the model of a recording's motion, and the bias that the filter started from."""
-    import numpy as np
-
-    from strapdown.units import DEGREE
-
     if moved_by == "any":
         return "Motion: any, its acceleration modelled as white noise."
     bias, sigma = result.initial.bias / DEGREE, np.sqrt(result.initial.covariance[3, 3]) / DEGREE

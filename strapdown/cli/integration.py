@@ -6,8 +6,10 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import typer
 
+from strapdown.checks import InputError
 from strapdown.cli.reading import RECORDING_HELP, Layout
 from strapdown.cli.terminal import (
     Tables,
@@ -24,6 +26,8 @@ from strapdown.cli.terminal import (
     writable,
     written,
 )
+from strapdown.files import reading
+from strapdown.units import DEGREE, DEGREE_PER_HOUR
 
 if TYPE_CHECKING:
     from strapdown.recordings import Recording
@@ -78,10 +82,7 @@ def integrate(
     out: Annotated[Path, typer.Option(help="HDF5 file for the attitude.")] = Path("attitude.h5"),
 ) -> None:
     """Integrate a gyro recording to attitude, starting at the true attitude if the file holds it, else at the identity."""
-    import numpy as np
-
     from strapdown import coning, quaternion, recordings, records, workflows
-    from strapdown.files import reading
     from strapdown.recordings import recordfiles
 
     writable("out", out, suffixes=(".h5", ".hdf5"), sources=(recording,))
@@ -140,8 +141,6 @@ def coning_budget(
 ) -> None:
     """Predict the drift that an angular vibration spectrum leaves, for each algorithm and sample rate."""
     from strapdown import coning
-    from strapdown.checks import InputError
-    from strapdown.units import DEGREE, DEGREE_PER_HOUR
 
     json_target(json, psd)
     tables_folder(tables)

@@ -7,9 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import typer
 from rich.text import Text
 
+from strapdown.checks import InputError
 from strapdown.cli.filters import no_state_words
 from strapdown.cli.reading import RECORDING_HELP, Layout
 from strapdown.cli.terminal import (
@@ -25,6 +27,7 @@ from strapdown.cli.terminal import (
     writable,
     written,
 )
+from strapdown.files import reading
 
 if TYPE_CHECKING:
     from strapdown.consistency import Judgement
@@ -97,7 +100,6 @@ def check(
     With --record the verdict takes the statistics and the causes that were looked for together. With --truth the estimate may be of any
     filter; clocks and frames are compared first. An estimate from elsewhere without a truth is judged by its innovations, if it has any.
     """
-    from strapdown.checks import InputError
     from strapdown.consistency.bounds import tail
 
     json_target(json, result, record, filter_file, foreign.truth)
@@ -135,7 +137,6 @@ def check(
 def _judged_own(result: Path, probability: float, *, with_record: bool) -> tuple[Judgement, dict[str, Any]]:
     """Judge a result of this package; return the verdict and what the JSON says of it."""
     from strapdown import consistency, records
-    from strapdown.checks import InputError
     from strapdown.report import findings
 
     attributes = records.read_attributes(result)
@@ -175,15 +176,12 @@ def status_of(judgement: Judgement) -> int:
 
 def _is_own(path: Path) -> bool:
     """Return whether a file is, or should be by its name, a result of this package; one that is missing is reported as such."""
-    from strapdown.files import reading
-
     return not path.exists() or path.suffix.lower() in (".h5", ".hdf5") or (path.is_file() and reading.is_hdf5(path))
 
 
 def _judged_foreign(result: Path, options: _Foreign, probability: float) -> tuple[Judgement, dict[str, Any]]:
     """Judge an estimate from elsewhere; return the verdict and what the JSON says of it."""
     from strapdown import consistency
-    from strapdown.checks import InputError
     from strapdown.consistency import foreign
     from strapdown.recordings.attitudes import read_attitudes
     from strapdown.records import write_estimate
@@ -271,8 +269,6 @@ def _diagnosed(
     result: Path, record: Path, filter_file: Path | None, judgement: Judgement
 ) -> tuple[dict[str, Any], Diagnosis | None]:
     """Show the causes that a record gives evidence of; return them as plain values, and with the verdict by all evidence, if any."""
-    import numpy as np
-
     from strapdown import diagnosis, estimation, records
     from strapdown.recordings import recordfiles
     from strapdown.setup.for_record import unmodelled_errors
@@ -313,7 +309,6 @@ def _diagnosed(
 def _filter_of(result: Path, filter_file: Path | None) -> FilterSetup:
     """Return the setup that an estimate was made with, as a file gives it or as the estimate itself does."""
     from strapdown import records, setup
-    from strapdown.checks import InputError
 
     if filter_file is not None:
         return setup.read_setup(filter_file)
@@ -325,10 +320,6 @@ def _filter_of(result: Path, filter_file: Path | None) -> FilterSetup:
 
 def _need_same(result: Path, estimate: Estimate, path: Path, record: ImuRecord) -> None:
     """Refuse a record that an estimate was not made from."""
-    import numpy as np
-
-    from strapdown.checks import InputError
-
     unknown = sorted(set(estimate.innovations) - {series.sensor for series in record.vectors})
     if unknown or not np.isin(estimate.time, record.time).all():
         what = f"has no sensor {unknown[0]!r}" if unknown else "has other stamps"

@@ -6,8 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import typer
 
+from strapdown.checks import InputError, finite, non_negative
 from strapdown.cli.filters import filter_of_scenario
 from strapdown.cli.terminal import (
     FigureFormat,
@@ -24,6 +26,8 @@ from strapdown.cli.terminal import (
     writable,
     written,
 )
+from strapdown.files import usable_folder, write_json
+from strapdown.units import ARCSECOND, DEGREE, DEGREE_PER_HOUR, STANDARD_GRAVITY
 
 if TYPE_CHECKING:
     from strapdown.covariance import Consider
@@ -31,8 +35,6 @@ if TYPE_CHECKING:
 
 def _named(option: str, values: list[str] | None) -> dict[str, float]:
     """Return the numbers of options NAME=VALUE."""
-    from strapdown.checks import InputError, finite
-
     found = {}
     for text in values or []:
         name, equals, number = text.rpartition("=")
@@ -50,7 +52,6 @@ def _named(option: str, values: list[str] | None) -> dict[str, float]:
 
 def _in_own_units(biases: dict[str, float], sensors: Any) -> dict[str, float]:
     """Return sensor biases in the unit of each sensor's σ, of numbers in nT, m/s² or arcsec."""
-    from strapdown.units import ARCSECOND
     from strapdown.vectors import Accelerometer, Magnetometer
 
     sizes = {sensor.name: {Magnetometer: 1e-9, Accelerometer: 1.0}.get(type(sensor), ARCSECOND) for sensor in sensors}
@@ -86,8 +87,6 @@ class _Errors:
 
     def check(self) -> None:
         """Refuse negative σ, in the unit that they were given in."""
-        from strapdown.checks import non_negative
-
         units = {"scale_factor": "ppm", "misalignment": "mrad", "g_sensitivity": "°/h/g"}
         for name, unit in (units | {"attitude_sigma": "degrees", "bias_sigma": "°/h"}).items():
             non_negative("--" + name.replace("_", "-"), getattr(self, name) or 0.0, unit=unit)
@@ -95,7 +94,6 @@ class _Errors:
     def considered(self, sensors: Any) -> Consider:
         """Return the errors in SI, for a scenario's sensors."""
         from strapdown.covariance import Consider
-        from strapdown.units import ARCSECOND, DEGREE_PER_HOUR, STANDARD_GRAVITY
 
         return Consider(
             scale_factor=1e-6 * self.scale_factor,
@@ -126,9 +124,7 @@ def covariance(
     """Predict a filter's errors and their budget by source, in one pass without noise."""
     from strapdown import covariance as analysis
     from strapdown import plots, setup
-    from strapdown.files import usable_folder, write_json
     from strapdown.plots.style import save_as
-    from strapdown.units import DEGREE, DEGREE_PER_HOUR
 
     errors.check()
     chosen = scenario_named(scenario)
@@ -160,11 +156,9 @@ def covariance(
 
 
 def _print_result(name: str, found: Any, integration: str, *, matched: bool) -> None:
-    import numpy as np
 
     from strapdown.covariance import LARGEST_LINEAR
     from strapdown.plots.style import angle_unit, rate_unit
-    from strapdown.units import DEGREE
 
     rms, sigma = found.rms[-1], found.filter_sigma[-1]
     unit, size = angle_unit(np.concatenate([rms[:3], sigma[:3]]))
@@ -216,10 +210,6 @@ def _print_result(name: str, found: Any, integration: str, *, matched: bool) -> 
 
 def _summary(name: str, found: Any) -> dict[str, Any]:
     """Return the analysis for JSON, units in the key names."""
-    import numpy as np
-
-    from strapdown.units import ARCSECOND, DEGREE_PER_HOUR
-
     units = np.array([ARCSECOND] * 3 + [DEGREE_PER_HOUR] * 3)
 
     def parts(values: Any) -> dict[str, Any]:

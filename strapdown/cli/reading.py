@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
+from strapdown.checks import InputError, one_of
 from strapdown.cli.terminal import given
 
 RECORDING_HELP = (
@@ -51,7 +52,6 @@ class Samples:
     def options(self, path: Path) -> dict[str, Any]:
         """Return the options of :func:`strapdown.recordings.read` that are given; a simulated record takes none of them."""
         from strapdown import recordings
-        from strapdown.checks import InputError
 
         if recordings.is_record(path):
             for option in given(self):
@@ -89,7 +89,6 @@ class Layout(Samples):
     def options(self, path: Path) -> dict[str, Any]:
         """Return the options of :func:`strapdown.recordings.read` that are given; a simulated record takes none of them."""
         from strapdown import recordings
-        from strapdown.checks import one_of
 
         found = super().options(path)
         if self.axes:
@@ -102,7 +101,6 @@ class Layout(Samples):
 def _axes(texts: Sequence[str]) -> str | dict[str, str]:
     """Return the axes of the whole unit, or those of sensors by name."""
     from strapdown import recordings
-    from strapdown.checks import InputError, one_of
 
     single = {}
     for text in texts:

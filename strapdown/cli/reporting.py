@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from strapdown.cli.terminal import command, console, progress_bar, writable, written
+from strapdown.files.reading import existing_file
 
 
 @command
@@ -24,7 +25,6 @@ def report(
 ) -> None:
     """Write a self-contained HTML page about a result: verdict in words, numbers, figures, how to reproduce it; the statistics as JSON."""
     from strapdown import report as reports
-    from strapdown.files.reading import existing_file
 
     existing_file(result)
     page = result.with_suffix(".html") if out is None else out

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import typer
 
+from strapdown.checks import InputError, count, one_of, positive
 from strapdown.cli.reading import RECORDING_HELP, Samples
 from strapdown.cli.terminal import (
     FigureFormat,
@@ -25,6 +28,7 @@ from strapdown.cli.terminal import (
     writable,
     written,
 )
+from strapdown.files import usable_folder, write_json, written_beside
 
 if TYPE_CHECKING:
     from strapdown import allan as identification
@@ -140,8 +144,6 @@ class _Exports:
 
     def check(self, sensors: list[str]) -> None:
         """Refuse files that need another sensor, and a factor that is none."""
-        from strapdown.checks import InputError, positive
-
         if (self.kalibr or self.px4) and not {"gyro", "accelerometer"} <= set(sensors):
             raise InputError("--kalibr and --px4 need both: --sensor gyro --sensor accelerometer")
         positive("--factor", self.factor)
@@ -149,7 +151,6 @@ class _Exports:
     def write(self, fits: dict[str, identification.NoiseFit], out: Path, source: str, topic: str | None) -> None:
         """Write the files that are asked for."""
         from strapdown.allan import parameters
-        from strapdown.files import written_beside
 
         made = {
             "imu.yaml": lambda: parameters.to_kalibr(fits, factor=self.factor, topic=topic or "/imu0", source=source),
@@ -191,8 +192,6 @@ def allan(
 ) -> None:
     """Identify a sensor's noise from a recording at rest: Allan deviation, fitted coefficients, specification as TOML."""
     from strapdown.allan import parameters as noise_parameters
-    from strapdown.checks import count, one_of
-    from strapdown.files import usable_folder
 
     chosen = list(dict.fromkeys(sensor or ["gyro"]))
     for one in chosen:
@@ -226,14 +225,10 @@ def _identify(
     recording: Path, sensor: str, layout: dict[str, Any], options: _Identification, output: _Output
 ) -> identification.NoiseFit:
     """Identify one sensor, print and write what was found."""
-    import numpy as np
-
     from strapdown import allan as identification
     from strapdown import plots, recordings
     from strapdown.allan import gaps as allan_gaps
     from strapdown.allan import parameters as noise_parameters
-    from strapdown.checks import InputError
-    from strapdown.files import written_beside
     from strapdown.plots.style import save_as
 
     out, (specification, numbers, figure_name, _) = output.out, _names(sensor, output.form)
@@ -314,10 +309,6 @@ def _show_coefficients(rows: list[dict[str, Any]]) -> None:
 
 def _plausible(recording: Path, sensor: str, source: GyroSamples) -> None:
     """Refuse samples that no sensor gives, from which squares would leave the range of doubles."""
-    import numpy as np
-
-    from strapdown.checks import InputError
-
     if source.values.shape[1] not in (1, 3):
         raise InputError(
             f"{recording.name} has {source.values.shape[1]} columns; a {sensor} has three axes, or pass one column, (n,) or (n, 1)"
@@ -334,12 +325,9 @@ def _plausible(recording: Path, sensor: str, source: GyroSamples) -> None:
 
 def _regressed(recording: Path, sensor: str, source: GyroSamples, order: int, out: Path, paths: list[Path]) -> Any:
     """Return the samples without their dependence on temperature, which is printed and written."""
-    import numpy as np
     import tomli_w
 
     from strapdown.allan import temperature as allan_temperature
-    from strapdown.checks import InputError
-    from strapdown.files import written_beside
     from strapdown.gyro.temperature import STEM, BiasOverTemperature, to_table
 
     if source.temperature is None:
@@ -383,10 +371,6 @@ def _write_numbers(
     sensor: str,
 ) -> None:
     """Write coefficients and deviation as JSON, which has no word for NaN."""
-    import math
-
-    from strapdown.files import write_json
-
     number = lambda value: None if isinstance(value, float) and not math.isfinite(value) else value  # noqa: E731
     unit = {"gyro": "rad_per_s", "accelerometer": "m_per_s2", "magnetometer": "t"}[sensor]
     write_json(

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from strapdown.checks import InputError, positive
 from strapdown.cli.terminal import (
     FigureFormat,
     Format,
@@ -24,6 +25,8 @@ from strapdown.cli.terminal import (
     writable,
     written,
 )
+from strapdown.files import usable_folder, write_json
+from strapdown.units import DEGREE
 
 if TYPE_CHECKING:
     from strapdown.coning import Algorithm
@@ -95,8 +98,6 @@ class _Scenario:
     def parameters(self, own: tuple[Algorithm, ...]) -> ConingParameters:
         """Return the parameters of the study, ``own`` algorithms compared too; what no algorithm follows is refused."""
         from strapdown import coning_study
-        from strapdown.checks import InputError, positive
-        from strapdown.units import DEGREE
 
         if positive("--angle", self.angle, unit="degrees") >= 90.0:  # in the unit that it was given in
             raise InputError(f"--angle is {self.angle:g} degrees; a cone's half-angle is below a right angle")
@@ -127,7 +128,6 @@ def coning(
     """Study coning: the drift of each integration algorithm, and what a filter makes of it."""
     from strapdown import coning_study, plots
     from strapdown.coning import read_algorithms
-    from strapdown.files import usable_folder, write_json
 
     own = tuple(one for path in algorithm or () for one in read_algorithms(path))
     parameters = motion.parameters(own)

@@ -18,7 +18,9 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from strapdown.checks import InputError
 from strapdown.cli.progress import errors, progress_bar, rate_text
+from strapdown.files import json_text, output_file, usable_folder, write_json
 
 if TYPE_CHECKING:
     from strapdown.recordings import Recording
@@ -162,8 +164,6 @@ def tables_written(folder: Path | None, study: str, *results: Any) -> list[Path]
 
 def tables_folder(folder: Path | None) -> None:
     """Refuse a folder of ``--tables`` that cannot be written to, before anything is computed."""
-    from strapdown.files import usable_folder
-
     if folder is not None:
         usable_folder("--tables", folder)
 
@@ -179,7 +179,6 @@ def scenario_named(name: str) -> Scenario:
     Refused are numbers beyond :data:`LARGEST_NUMBER`, a duration shorter than one gyro sample, and more measurements of a sensor than
     :data:`MAX_MEASUREMENTS`: each would end deep inside, as an infinity or for want of memory.
     """
-    from strapdown.checks import InputError
     from strapdown.scenarios import load_scenario, scenario_to_table
 
     chosen = load_scenario(name)
@@ -220,9 +219,6 @@ def writable(
     A folder of that name stands in the way, the folder that they go to may not be written or lies below a file, the suffix is none of
     ``suffixes`` (where given), or a target is one of the ``sources`` that are read.
     """
-    from strapdown.checks import InputError
-    from strapdown.files import output_file
-
     for target in targets:
         if target.is_dir():
             raise InputError(
@@ -234,8 +230,6 @@ def writable(
 
 def need_own(target: Path, command: str, own: Callable[[Path], bool]) -> None:
     """Refuse to replace a file that the command did not write, of which there may be no other copy; its own it may make again."""
-    from strapdown.checks import InputError
-
     try:
         replaceable = not target.exists() or own(target)
     except InputError:
@@ -272,8 +266,6 @@ def json_target(json: Path | None, *sources: Path | None) -> None:
 
 def put_json(json: Path | None, content: Any) -> None:
     """Write JSON where it was asked for."""
-    from strapdown.files import json_text, write_json
-
     if json == STANDARD_OUTPUT:
         sys.stdout.write(json_text(content))
     elif json is not None:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
+import numpy as np
 import typer
 
+from strapdown.checks import InputError, count, one_of
 from strapdown.cli.reading import Layout
 from strapdown.cli.terminal import (
     FigureFormat,
@@ -26,6 +29,8 @@ from strapdown.cli.terminal import (
     writable,
     written,
 )
+from strapdown.files import write_json, written_beside
+from strapdown.units import DEGREE
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -92,7 +97,6 @@ class _Filter:
     def algorithm(self) -> Any:
         """Integration algorithm, if one is named."""
         from strapdown import coning
-        from strapdown.checks import one_of
 
         name = self.integration
         return None if name is None else coning.ALGORITHMS[one_of("integration", name, coning.ALGORITHMS)]
@@ -176,7 +180,6 @@ class _Objective:
     def split(self, cases: Sequence[Case]) -> tuple[tuple[Case, ...], tuple[Case, ...]]:
         """Return the data to tune on and those held out."""
         from strapdown import tuning
-        from strapdown.checks import one_of
 
         if self.holdout is None:
             return tuple(cases), ()
@@ -245,10 +248,7 @@ def tune(
     output: _Output,
 ) -> None:
     """Tune the filter by maximum likelihood, with an interval for each parameter."""
-    import os
-
     from strapdown import recordings, tuning
-    from strapdown.checks import count
 
     workers = count("threads", search.threads if search.threads is not None else os.cpu_count() or 1)
     algorithm = start.algorithm
@@ -323,8 +323,6 @@ def _tuned(
 
 
 def _refusal(words: str) -> Exception:
-    from strapdown.checks import InputError
-
     return InputError(words)
 
 
@@ -390,7 +388,6 @@ def _cases(
 ) -> tuple[list[Case], FilterSetup, dict[str, GyroSpec]]:
     """Return the records to tune on, the filter to start from, and the gyros of the records that hold theirs."""
     from strapdown import recordings, tuning
-    from strapdown.checks import InputError
     from strapdown.cli.filters import filter_for, need_angles
     from strapdown.recordings import recordfiles
 
@@ -489,8 +486,6 @@ def _print_gate(found: TunedGate) -> None:
 
 def _anees(one: Performance) -> str:
     """Return the ANEES as a table shows it: of attitude and bias, or where only the attitude is known of that."""
-    import numpy as np
-
     if math.isfinite(one.anees):
         return _figure(one.anees)
     return f"{_figure(float(np.nanmean(one.nees[0].mean)))} (attitude)" if one.nees else "-"
@@ -498,7 +493,6 @@ def _anees(one: Performance) -> str:
 
 def _print_comparison(comparison: Comparison, *, truth: bool) -> None:
     from strapdown.report import tunings
-    from strapdown.units import DEGREE
 
     listing = table(
         "On the data held out", "filter", "log likelihood", "NIS", "99 % bounds", "ANEES", "attitude RMS, °", "verdict"
@@ -530,7 +524,6 @@ def _print_comparison(comparison: Comparison, *, truth: bool) -> None:
 
 def _write(found: _Found, records: Sequence[ImuRecord], paths: Sequence[Path], of: str, output: _Output) -> None:
     from strapdown import tuning
-    from strapdown.files import write_json, written_beside
     from strapdown.plots import tuning as drawing
     from strapdown.plots.style import save_as
     from strapdown.report import tunings
@@ -558,8 +551,6 @@ def _write(found: _Found, records: Sequence[ImuRecord], paths: Sequence[Path], o
 
 
 def _report(found: _Found, units: Sequence[Unit], paths: Sequence[Path], of: str) -> dict[str, Any]:
-    import numpy as np
-
     number = lambda value: None if isinstance(value, float) and not math.isfinite(value) else value  # noqa: E731
     result, gate, comparison = found.result, found.gate, found.comparison
     content: dict[str, Any] = {
@@ -611,7 +602,6 @@ def _plan(
     threads: int,
 ) -> None:
     from strapdown import scenarios, setup, tuning
-    from strapdown.checks import InputError
     from strapdown.recordings import recordfiles
 
     if len(records) != 1:
@@ -642,8 +632,6 @@ def _plan(
 
 
 def _numbers(text: str) -> list[float]:
-    from strapdown.checks import InputError
-
     try:
         return [float(part) for part in text.split(",")]
     except ValueError:
