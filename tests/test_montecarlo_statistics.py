@@ -620,7 +620,7 @@ def test_lost_samples_and_jitter_go_through_too():
 def test_what_the_motion_is_remembered_to_say_is_what_it_says():
     remembered = scalar._Remembered(SCENARIO.motion)
     for times in (np.linspace(0.0, 1.0, 7), np.linspace(0.0, 1.0, 8), 0.25, np.linspace(0.0, 1.0, 7)):
-        for what in ("attitude", "body_rate", "fixed_rate", "body_angular_acceleration"):
+        for what in ("attitude", "body_rate", "body_angular_acceleration"):
             assert np.array_equal(getattr(remembered, what)(times), getattr(SCENARIO.motion, what)(times))
     assert np.array_equal(remembered.increments([0.0, 0.1]), SCENARIO.motion.increments([0.0, 0.1]))
     for k in range(100):

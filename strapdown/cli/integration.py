@@ -150,24 +150,23 @@ def coning_budget(
         raise InputError(
             f"{psd} holds an amplitude of {largest / DEGREE:.4g}°; that of a vibration is below 90°: check the unit"
         )
-    chosen = {"algorithms": tuple(algorithm)} if algorithm else {}
-    budget = coning.ConingBudget(lines=lines, sample_rates=tuple(rate), **chosen)
+    rows: list[dict[str, Any]] = [
+        {
+            "algorithm": name,
+            "sample_rate_hz": r,
+            "drift_deg_per_hour": coning.vibration_drift(lines, name, r) / DEGREE_PER_HOUR,
+        }
+        for name in algorithm or coning.drift.BUDGETED
+        for r in rate
+    ]
     listing = table(
         f"Drift about the third axis left by {len(lines)} vibration lines, °/h",
         "algorithm",
         *(f"{r:g} Hz" for r in rate),
     )
-    for name in budget.algorithms:
-        listing.add_row(name, *(f"{budget.drift(name, r) / DEGREE_PER_HOUR:.4g}" for r in rate))
+    for k in range(0, len(rows), len(rate)):
+        listing.add_row(rows[k]["algorithm"], *(f"{row['drift_deg_per_hour']:.4g}" for row in rows[k : k + len(rate)]))
     show(listing)
-    rows = [
-        {
-            "algorithm": row["algorithm"],
-            "sample_rate_hz": row["sample_rate"],
-            "drift_deg_per_hour": float(row["drift"]) / DEGREE_PER_HOUR,
-        }
-        for row in budget.rows()
-    ]
     paths = tables_written(tables, "coning budget", rows)
     if json is not None:
         put_json(json, {"lines": len(lines), "budget": rows})

@@ -45,8 +45,6 @@ if TYPE_CHECKING:
 
 FIGURES = ("likelihood", "heldout")
 """Figures that are drawn beside the filter, by the ends of their names."""
-PRIOR_FACTOR = 3.0
-"""One standard deviation of a prior, where none is given."""
 MAX_EXAMINED = 4
 """Records that are looked at for what the tuned filter leaves unexplained."""
 WORSE = 1.05
@@ -69,9 +67,6 @@ class _Filter:
         Path | None,
         typer.Option("--filter", help="TOML with a table named filter; by default one that matches the records."),
     ] = None
-    integration: Annotated[
-        str | None, typer.Option(help="Integration algorithm (`strapdown algorithms`); the filter's if not given.")
-    ] = None
     states: Annotated[
         bool,
         typer.Option(
@@ -84,22 +79,11 @@ class _Filter:
         str | None,
         typer.Option(help="Weak prior of the gyro's noise: TOML of `strapdown allan`, or the name of a preset."),
     ] = None
-    prior_factor: Annotated[float, typer.Option(help="One standard deviation of the prior is a factor of this.")] = (
-        PRIOR_FACTOR
-    )
 
     @property
     def names(self) -> list[str] | None:
         """Parameters named, if any are."""
         return None if self.free is None else [name.strip() for name in self.free.split(",") if name.strip()]
-
-    @property
-    def algorithm(self) -> Any:
-        """Integration algorithm, if one is named."""
-        from strapdown import coning
-
-        name = self.integration
-        return None if name is None else coning.ALGORITHMS[one_of("integration", name, coning.ALGORITHMS)]
 
     def setup(self, *, plan: bool) -> FilterSetup | None:
         """Return the filter of the file, if there is one; states that it or a plan cannot have are refused."""
@@ -107,9 +91,9 @@ class _Filter:
 
         chosen = None if self.filter_file is None else read_setup(self.filter_file)
         if self.states and chosen is not None:
-            raise _refusal("--filter holds the filter's states itself, in [filter.states]; leave --states out")
+            raise InputError("--filter holds the filter's states itself, in [filter.states]; leave --states out")
         if plan and (self.states or (chosen is not None and chosen.states is not None)):
-            raise _refusal(
+            raise InputError(
                 "--plan knows no optional states; leave --states away, and [filter.states] out of the filter"
             )
         return chosen
@@ -119,7 +103,7 @@ class _Filter:
         from strapdown import tuning
 
         if self.names == []:
-            raise _refusal(f"--free is {self.free!r} and names no parameter; name some, or leave it out")
+            raise InputError(f"--free is {self.free!r} and names no parameter; name some, or leave it out")
         wanted = [name for name in self.names or [] if name not in tuning.GATED]
         wanted = wanted or list(tuning.default_names([case.record for case in cases]))
         if self.filter_file is None or any(name.startswith(("gyro.", "filter.")) for name in wanted):
@@ -132,11 +116,9 @@ class _Filter:
         from strapdown.gyro import datasheets, read_spec
 
         if self.prior is None:
-            if self.prior_factor != PRIOR_FACTOR:
-                raise _refusal("--prior-factor goes with --prior, the noise that it is about")
             return {}
         spec = read_spec(self.prior) if Path(self.prior).suffix == ".toml" else datasheets.preset(self.prior).spec
-        found = tuning.priors_from_gyro(spec, record, factor=self.prior_factor)
+        found = tuning.priors_from_gyro(spec, record)
         return {name: prior for name, prior in found.items() if name in names}
 
 
@@ -236,8 +218,8 @@ def tune(
     records: Annotated[
         list[Path],
         typer.Argument(
-            help="Records (HDF5 of `strapdown simulate`) or recordings (BROAD HDF5, CSV), all of one unit; with --plan one record, or the "
-            "name or TOML file of a scenario."
+            help="Records (HDF5 of `strapdown simulate`) or recordings (BROAD HDF5, CSV), all of one unit; with --plan the name or "
+            "TOML file of a scenario."
         ),
     ],
     start: _Filter,
@@ -251,21 +233,18 @@ def tune(
     from strapdown import recordings, tuning
 
     workers = count("threads", search.threads if search.threads is not None else os.cpu_count() or 1)
-    algorithm = start.algorithm
     chosen = start.setup(plan=planning.plan)
     if planning.plan:
-        _plan(records, chosen, algorithm, start.names, planning.length, workers)
+        _plan(records, chosen, start.names, planning.length, workers)
         return
     if planning.length is not None:
-        raise _refusal("--length is for --plan; the records' own length is taken")
+        raise InputError("--length is for --plan; the records' own length is taken")
     count("seed", search.seed, least=0)
     _check_files(records, start.filter_file, output)
     cases, before, gyros = _cases(records, chosen, start, layout)
     if not (goal.truth or goal.rmse or all(recordings.is_record(path) for path in records)):
         names, spacing = tuning.by_innovations(start.names, goal.spacing, gate=goal.gate, prior=start.prior)
         start, goal = replace(start, free=",".join(names)), replace(goal, spacing=spacing)
-    if algorithm is not None:
-        before = replace(before, integration=algorithm)
     if (before.gate or before.robust) and not (goal.truth or goal.gate):
         console.print(
             "The filter's gate and weights are not applied: what passes a gate is the likelier the narrower it is. --gate models outliers, "
@@ -322,17 +301,13 @@ def _tuned(
     return _Found(result, objective, gate, comparison, examined, worst)
 
 
-def _refusal(words: str) -> Exception:
-    return InputError(words)
-
-
 def _check_files(records: Sequence[Path], filter_file: Path | None, output: _Output) -> None:
     """Refuse a record that is given twice, and files that cannot be written or are not this command's."""
     from strapdown.report import tunings
 
     for k, path in enumerate(records):
         if path.exists() and any(path.samefile(other) for other in records[:k] if other.exists()):
-            raise _refusal(f"{path} is given twice; a record counts once")
+            raise InputError(f"{path} is given twice; a record counts once")
     sources, out = (*records, filter_file), output.out
     report = out.with_suffix(".json")
     writable("out", out, suffixes=(".toml",), sources=sources)
@@ -594,40 +569,21 @@ def _report(found: _Found, units: Sequence[Unit], paths: Sequence[Path], of: str
 
 
 def _plan(
-    records: Sequence[Path],
-    chosen: FilterSetup | None,
-    algorithm: Any,
-    names: list[str] | None,
-    length: str | None,
-    threads: int,
+    sources: Sequence[Path], chosen: FilterSetup | None, names: list[str] | None, length: str | None, threads: int
 ) -> None:
     from strapdown import scenarios, setup, tuning
-    from strapdown.recordings import recordfiles
 
-    if len(records) != 1:
-        raise InputError(f"--plan takes one record or scenario; {len(records)} are given")
-    source: Any
-    path = records[0]
-    if recordfiles.is_record(path):
-        file = recordfiles.read_record_file(path)
-        source, example = file.record, file.record
-        if chosen is None and file.gyro is None:
-            raise InputError(
-                f"{path} does not hold its gyro's specification; give the filter to plan with, --filter filter.toml"
-            )
-        modelled = chosen or setup.matched_to_record(file.gyro, file.record)  # type: ignore[arg-type]
-        whole = float(file.record.time[-1] - file.record.time[0])
-    else:
-        source = scenarios.load_scenario(path)
-        modelled = chosen or setup.matched(source)
-        example = scenarios.simulate(source)
-        whole = source.duration
-    if algorithm is not None:
-        modelled = replace(modelled, integration=algorithm)
-    lengths = [whole] if length is None else _numbers(length)
+    if len(sources) != 1:
+        raise InputError(f"--plan takes one scenario; {len(sources)} are given")
+    lengths = None if length is None else _numbers(length)
+    scenario = scenarios.load_scenario(sources[0])
+    modelled = chosen or setup.matched(scenario)
+    example = scenarios.simulate(scenario)
     wanted = names or list(tuning.default_names([example]))
     with progress_bar("simulated records", 4) as advance:
-        found = tuning.plan(source, modelled, wanted, lengths=lengths, threads=threads, progress=advance)
+        found = tuning.plan(
+            scenario, modelled, wanted, lengths=lengths or [scenario.duration], threads=threads, progress=advance
+        )
     _print_plan(found, [example])
 
 

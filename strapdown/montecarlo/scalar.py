@@ -7,6 +7,7 @@ whether it is one of a campaign or a replay.
 from __future__ import annotations
 
 import contextlib
+import functools
 import hashlib
 import weakref
 from collections import OrderedDict
@@ -118,20 +119,10 @@ class _Remembered:
                     self._known.popitem(last=False)
         return answer
 
-    def attitude(self, time: ArrayLike) -> Array:
-        return self._answer("attitude", time)
-
-    def body_rate(self, time: ArrayLike) -> Array:
-        return self._answer("body_rate", time)
-
-    def fixed_rate(self, time: ArrayLike) -> Array:
-        return self._answer("fixed_rate", time)
-
-    def body_angular_acceleration(self, time: ArrayLike) -> Array:
-        return self._answer("body_angular_acceleration", time)
-
-    def increments(self, edges: ArrayLike) -> Array:
-        return self._answer("increments", edges)
+    attitude = functools.partialmethod(_answer, "attitude")
+    body_rate = functools.partialmethod(_answer, "body_rate")
+    body_angular_acceleration = functools.partialmethod(_answer, "body_angular_acceleration")
+    increments = functools.partialmethod(_answer, "increments")
 
 
 _SCENARIOS: weakref.WeakKeyDictionary[Plan, Scenario] = weakref.WeakKeyDictionary()
