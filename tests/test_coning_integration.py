@@ -36,7 +36,7 @@ SECONDS = 12.0
 
 def integrated_rates(rates, interval, algorithm, first=quaternion.IDENTITY):
     """Attitude from rate samples, by the quadrature that the algorithm is made for; eight points for one made for increments."""
-    points = ALGORITHMS[algorithm].rate_points or 8
+    points = coning.named(algorithm).rate_points or 8
     return coning.integrate(coning.increments_from_rates(rates, interval, points), algorithm, first)
 
 

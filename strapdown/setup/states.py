@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 
@@ -309,23 +309,9 @@ class States(ByValue):
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the declared states, as :func:`chosen` accepts them."""
-        gyro = (
-            ("gyro.scale", _any(self.gyro_scale_sigma)),
-            ("gyro.misalignment", _any(self.gyro_misalignment_sigma)),
-            ("gyro.force", _any(self.gyro_force_sigma) or _any(self.gyro_cross_force_sigma)),
-            ("gyro.temperature", _any(self.gyro_temperature_sigma)),
-            ("gyro.drift", bool(self.gyro_drift_sigma)),
-        )
-        found = [name for name, there in gyro if there]
+        found = [f"gyro.{part}" for part, fields in _GYRO_PARTS.items() if _declared(self, fields)]
         for sensor, one in self.sensors.items():
-            parts = (
-                ("mounting", _any(one.mounting_sigma)),
-                ("bias", _any(one.bias_sigma)),
-                ("lever", _any(one.lever_arm_sigma)),
-                ("correlated", one.correlated_sigma > 0.0),
-                ("velocity", one.velocity_time > 0.0),
-            )
-            found += [f"{sensor}.{part}" for part, there in parts if there]
+            found += [f"{sensor}.{part}" for part, fields in _SENSOR_PARTS.items() if _declared(one, fields)]
         return tuple(found)
 
     def chosen(self, names: tuple[str, ...]) -> States:
@@ -350,33 +336,42 @@ class States(ByValue):
             if not self.names:
                 raise InputError(f"states: {name!r} is asked for, and there is none to choose from")
             one_of("states: name", name, self.names)
-        kept = replace(
-            self,
-            gyro_scale_sigma=self.gyro_scale_sigma if "gyro.scale" in names else 0.0,
-            gyro_misalignment_sigma=self.gyro_misalignment_sigma if "gyro.misalignment" in names else 0.0,
-            gyro_force_sigma=self.gyro_force_sigma if "gyro.force" in names else 0.0,
-            gyro_cross_force_sigma=self.gyro_cross_force_sigma if "gyro.force" in names else 0.0,
-            gyro_temperature_sigma=self.gyro_temperature_sigma if "gyro.temperature" in names else 0.0,
-            gyro_drift_sigma=self.gyro_drift_sigma if "gyro.drift" in names else (),
-            gyro_drift_time=self.gyro_drift_time if "gyro.drift" in names else (),
-            gyro_fast_bias_sigma=self.gyro_fast_bias_sigma if "gyro.drift" in names else 0.0,
-        )
-        sensors = {}
-        for sensor, one in self.sensors.items():
-            correlated = f"{sensor}.correlated" in names
-            part = replace(
-                one,
-                mounting_sigma=one.mounting_sigma if f"{sensor}.mounting" in names else 0.0,
-                bias_sigma=one.bias_sigma if f"{sensor}.bias" in names else 0.0,
-                lever_arm_sigma=one.lever_arm_sigma if f"{sensor}.lever" in names else 0.0,
-                correlated_sigma=one.correlated_sigma if correlated else 0.0,
-                correlation_time=one.correlation_time if correlated else 0.0,
-            )
-            if f"{sensor}.velocity" not in names:
-                part = replace(part, **dict.fromkeys(VELOCITY, 0.0))  # type: ignore[arg-type]
-            if part.blocks(sensor, "direction", 1.0):
-                sensors[sensor] = part
-        return replace(kept, sensors=sensors)
+        sensors = {sensor: _kept(one, sensor, _SENSOR_PARTS, names) for sensor, one in self.sensors.items()}
+        used = {sensor: one for sensor, one in sensors.items() if one.blocks(sensor, "direction", 1.0)}
+        return replace(_kept(self, "gyro", _GYRO_PARTS, names), sensors=used)
+
+
+_GYRO_PARTS = {
+    "scale": ("gyro_scale_sigma",),
+    "misalignment": ("gyro_misalignment_sigma",),
+    "force": ("gyro_force_sigma", "gyro_cross_force_sigma"),
+    "temperature": ("gyro_temperature_sigma",),
+    "drift": ("gyro_drift_sigma",),
+}
+"""Fields that declare each state of the gyro, by its name."""
+_SENSOR_PARTS = {
+    "mounting": ("mounting_sigma",),
+    "bias": ("bias_sigma",),
+    "lever": ("lever_arm_sigma",),
+    "correlated": ("correlated_sigma",),
+    "velocity": tuple(VELOCITY),
+}
+"""The same of a sensor."""
+_BESIDE = {"gyro_drift_sigma": ("gyro_drift_time", "gyro_fast_bias_sigma"), "correlated_sigma": ("correlation_time",)}
+"""Fields that go with another and declare no state by themselves."""
+Part = TypeVar("Part", States, SensorStates)
+
+
+def _declared(states: States | SensorStates, fields: tuple[str, ...]) -> bool:
+    return any(_any(getattr(states, field)) for field in fields)
+
+
+def _kept(states: Part, owner: str, parts: Mapping[str, tuple[str, ...]], names: tuple[str, ...]) -> Part:
+    """Return the states of an owner, the gyro or a sensor, whose names are given."""
+    none = type(states)()
+    dropped = [field for part, fields in parts.items() if f"{owner}.{part}" not in names for field in fields]
+    dropped += [beside for field in dropped for beside in _BESIDE.get(field, ())]
+    return replace(states, **{field: getattr(none, field) for field in dropped})
 
 
 def _spread(diagonal: Entries, off_diagonal: Entries) -> tuple[Array, Array]:
