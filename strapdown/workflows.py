@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import functools
 import os
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -33,7 +32,6 @@ from strapdown import (
     units,
 )
 from strapdown import setup as setups
-from strapdown.allan import gaps as allan_gaps
 from strapdown.checks import Array, InputError, count, instance
 from strapdown.consistency import Judgement
 from strapdown.covariance import Analysis, Consider
@@ -810,19 +808,19 @@ def tune(
 
 def _samples(
     source: Recording | ImuRecord | GyroSamples | ArrayLike, sample_interval: float | None, sensor: str, kind: str
-) -> tuple[ArrayLike, float, str, bool]:
-    """Return samples, their interval, their kind and whether some are missing."""
+) -> tuple[ArrayLike, float, str]:
+    """Return samples, NaN where missing, their interval and their kind."""
     if isinstance(source, (Recording, ImuRecord)):
         source = recordings.samples_of(source, sensor, gaps=True)
     if isinstance(source, recordings.GyroSamples):
         if sample_interval is not None:
             raise InputError("sample_interval goes with an array; a recording has its own: leave it out")
-        return source.values, source.sample_interval, source.kind, bool(np.isnan(source.values).any())
+        return source.values, source.sample_interval, source.kind
     if sample_interval is None:
         raise InputError(
             "sample_interval is missing; an array does not know the time between its samples: give it in s"
         )
-    return source, sample_interval, kind, False
+    return source, sample_interval, kind
 
 
 def allan_deviation(
@@ -838,7 +836,7 @@ def allan_deviation(
     Parameters
     ----------
     source : Recording, ImuRecord, GyroSamples or array_like (n,) or (n, axes)
-        A recording may have gaps (:mod:`strapdown.allan.gaps`).
+        Missing samples are NaN (:mod:`strapdown.allan.gaps`).
     sample_interval : float, optional
         Of an array: time between its samples, s.
     sensor : {"gyro", "accelerometer", "magnetometer"}
@@ -867,9 +865,7 @@ def allan_deviation(
     >>> round(float(found.deviation[0, 0]), 2)  # σ √(dt/τ)
     0.1
     """
-    values, interval, what, gaps = _samples(source, sample_interval, sensor, kind)
-    if gaps:
-        return allan_gaps.allan_deviation(values, interval, **options)
+    values, interval, what = _samples(source, sample_interval, sensor, kind)
     return allan.allan_deviation(values, interval, kind=what, **options)
 
 
@@ -912,6 +908,5 @@ def fit_noise(
     >>> noise = sd.fit_noise(sd.read("rest.csv", units={"gyro": "deg/s"}))  # doctest: +SKIP
     >>> estimate = sd.estimate(record, noise=noise)  # doctest: +SKIP
     """
-    values, interval, what, gaps = _samples(source, sample_interval, sensor, kind)
-    fit: Callable[..., NoiseFit] = allan_gaps.fit_noise if gaps else functools.partial(allan.fit_noise, kind=what)
-    return dataclasses.replace(fit(values, interval, **options), sensor=sensor)
+    values, interval, what = _samples(source, sample_interval, sensor, kind)
+    return dataclasses.replace(allan.fit_noise(values, interval, kind=what, **options), sensor=sensor)

@@ -188,6 +188,12 @@ def allan_deviation(
     record, dt, scale = averaged(values, sample_interval, kind)
     checks.one_of("estimator", estimator, ESTIMATORS)
     level = confidence(level)
+    if np.isnan(record).any():
+        if estimator != "overlapping":
+            raise InputError(f"values has gaps (NaN), with which estimator {estimator!r} does not go; leave it out")
+        from strapdown.allan import gaps
+
+        return gaps.allan_deviation(scale * record, dt, taus=taus, level=level)
     samples = record.shape[0]
     multiples = _multiples(taus, samples, dt, _order(estimator))
     deviation = np.empty((record.shape[1], len(multiples)))
@@ -427,10 +433,10 @@ def confidence(level: float) -> float:
 
 
 def averaged(values: ArrayLike, sample_interval: float, kind: str) -> tuple[Array, float, float]:
-    """Return the record (n, axes), its sample interval, and the factor that makes rates of its values."""
+    """Return the record (n, axes), NaN where a sample is missing, its sample interval, and the factor that makes rates of its values."""
     dt = checks.positive("sample_interval", sample_interval, unit="s")
     checks.one_of("kind", kind, ("rate", "increments"))
-    record = checks.array("values", values, ("n",) if np.ndim(values) == 1 else ("n", "axes"))
+    record = checks.array("values", values, ("n",) if np.ndim(values) == 1 else ("n", "axes"), allow_nan=True)
     if record.ndim == 1:
         record = record[:, None]
     if not 1 <= record.shape[1] <= 3:

@@ -28,14 +28,15 @@ from strapdown import checks, units
 from strapdown.allan.deviation import TERMS, AllanDeviation, averaged, confidence, model_deviation
 from strapdown.allan.spectrum import (
     Bins,
+    Segment,
     bin_slices,
     bin_starts,
     binned,
     cosine_transform,
     expected_power,
-    last_coefficient,
     mean_power,
     ramp_coefficients,
+    segment,
 )
 from strapdown.checks import Array, InputError
 from strapdown.results import Listed, Listing, figure
@@ -69,6 +70,9 @@ SUPPORT_PROBABILITY = 1e-3
 MISFIT_PROBABILITY = 1e-3
 """Value of ``NoiseFit.misfit_probability`` below which the record contains more than the noises."""
 
+
+SHORTEST = 64
+"""Samples of the shortest segment without a gap that a fit uses."""
 
 _STRETCHES = 64
 
@@ -153,7 +157,8 @@ def fit_noise(
     Parameters
     ----------
     values : array_like (n,) or (n, axes)
-        Averaged-rate samples, rad/s, or angle increments, rad; at least 64 samples, at most three axes.
+        Averaged-rate samples, rad/s, or angle increments, rad, at most three axes. Missing ones, NaN, must not depend on the values
+        lost; the segments between them of at least 64 samples are used, which ``samples`` of the result counts.
     sample_interval : float
         Sample interval, s.
     kind : {"rate", "increments"}, default "rate"
@@ -181,7 +186,8 @@ def fit_noise(
     The squared DCT-II coefficients of the record, j = 1 … n − 1 at frequency j/(2 n dt), are modelled as independent χ² of one
     degree of freedom around ``Σ θ_i V_i(j)``, θ = (Q², N², B², K²) ≥ 0, V the exact expectation for each noise on a finite record;
     a rate ramp is a mean. Coefficients are pooled in bins of 5 % in frequency. θ maximises the likelihood restricted for the ramp
-    (REML).
+    (REML). In a record with gaps the likelihood is that within each segment: the differences between the means of segments are not used,
+    so that many short ones contain little information on a random walk. ``misfit_probability`` is that of the worst, times their number.
 
     Which terms the sensor has is not known, and where one is absent, at the bound θ = 0 of the model, twice the fall of the
     likelihood of the *other* terms is no χ²: with all terms in the model their upper ends would be too low and their lower ends
@@ -199,33 +205,40 @@ def fit_noise(
     level = confidence(level)
     chosen = tuple(checks.one_of("terms: term", term, TERMS) for term in terms)
     chosen = tuple(term for term in TERMS if term in chosen)
-    if not set(chosen) - {"rate_ramp"}:
-        raise InputError("terms names no random noise; add one of quantization, angle_random_walk, …")
-    samples = record.shape[0]
-    if samples < 64:
-        raise InputError(f"values has {samples} samples; at least 64 are needed to separate the noises")
-    last = last_coefficient(samples, dt, highest_frequency)
-    if highest_frequency is not None and last < 32:
-        raise InputError(f"highest_frequency is {highest_frequency:g} Hz: only {last} coefficients lie below; raise it")
-    starts = bin_starts(last)
     random_terms = tuple(term for term in chosen if term != "rate_ramp")
-    basis = np.stack([mean_power(term, samples, dt, starts, last) for term in random_terms])
+    if not random_terms:
+        raise InputError("terms names no random noise; add one of quantization, angle_random_walk, …")
+    places = without_gaps(np.asarray(~np.isnan(record).any(axis=1)))
+    if not places:
+        raise InputError(
+            f"values has {len(record)} samples; at least {SHORTEST} are needed to separate the noises, in a row without a gap"
+        )
+    segments = [segment(place, dt, random_terms, highest_frequency) for place in places]
+    lasts = [one.last for one in segments]
+    if highest_frequency is not None and (sum(lasts) < 32 or min(lasts) < 1):
+        raise InputError(
+            f"highest_frequency is {highest_frequency:g} Hz: only {sum(lasts)} coefficients lie below; raise it"
+        )
     fits, misfits = [], []
     for axis in range(record.shape[1]):
         rate = record[:, axis]
-        coefficient = cosine_transform(rate, scale)
-        bins = binned(
-            coefficient,
-            basis,
-            starts,
-            axis=axis,
-            largest=scale * float(max(np.max(rate), -np.min(rate))),
-            dt=dt,
-            last=last,
-        )
-        fits.append(fit_axis(bins, "rate_ramp" in chosen))
-        misfits.append(misfit_of(coefficient, bins, fits[-1].best, random_terms, starts, last, dt))
-    return of_axes(chosen, fits, misfits, level=level, samples=samples, sample_interval=dt)
+        coefficients = [cosine_transform(rate[place], scale) for place in places]
+        each, whole = binned(coefficients, segments, dt)
+        largest = scale * float(max(np.nanmax(rate), -np.nanmin(rate)))
+        if not np.any(whole.square > (1e-13 * largest) ** 2 * whole.number):
+            raise InputError(
+                f"values, axis {axis}, holds no noise (it is constant or a straight line); pass a recorded sensor"
+            )
+        fits.append(fit_axis(whole, "rate_ramp" in chosen))
+        misfits.append(_worst_misfit(coefficients, each, fits[-1].best, random_terms, segments, dt))
+    samples = sum(place.stop - place.start for place in places)
+    return _of_axes(chosen, fits, misfits, level=level, samples=samples, sample_interval=dt)
+
+
+def without_gaps(known: NDArray[np.bool_]) -> list[slice]:
+    """Return the segments of samples between gaps, without those of fewer than :data:`SHORTEST`."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], known, [False]]).astype(np.int8)))
+    return [slice(int(a), int(b)) for a, b in edges.reshape(-1, 2) if b - a >= SHORTEST]
 
 
 def expected_errors(parameters: Mapping[str, float], samples: int, sample_interval: float) -> dict[str, float]:
@@ -496,7 +509,7 @@ def _covariance(fit: AxisFit, estimate: Array) -> Array:
     return covariance
 
 
-def of_axes(
+def _of_axes(
     terms: tuple[str, ...],
     fits: Sequence[AxisFit],
     misfits: Sequence[tuple[float, str]],
@@ -568,22 +581,35 @@ def _fit_ramp(fit: AxisFit, level: float) -> tuple[float, float, float]:
 # Misfit
 
 
-def misfit_of(
-    coefficient: Array,
-    bins: Bins,
+def _worst_misfit(
+    coefficients: Sequence[Array],
+    each: Sequence[Bins],
     best: Optimum,
     random_terms: tuple[str, ...],
-    starts: NDArray[np.int64],
-    last: int,
+    segments: Sequence[Segment],
     dt: float,
+) -> tuple[float, str]:
+    """Return the least probability of :func:`_misfit_of` over the segments, times their number, and its description."""
+    found = []
+    for coefficient, bins, one in zip(coefficients, each, segments, strict=True):
+        own = best._replace(variance=best.theta @ bins.basis)
+        probability, what = _misfit_of(coefficient, bins, own, random_terms, one, dt)
+        where = "" if len(segments) == 1 else f"in the segment from {one.place.start * dt:.6g} s "
+        found.append((probability, where + what))
+    probability, what = min(found, key=lambda one: one[0])
+    return min(1.0, len(found) * probability), what
+
+
+def _misfit_of(
+    coefficient: Array, bins: Bins, best: Optimum, random_terms: tuple[str, ...], one: Segment, dt: float
 ) -> tuple[float, str]:
     """Return the probability of a departure from the fit this large, and its description; overwrites ``coefficient``.
 
     Divided by their fitted sizes and transformed back, the coefficients are a white series of unit variance. A turn or a step of the
     bias, whose spectrum may pass for a random walk's, stands out in it. Of three tests the smallest probability is multiplied by three.
     """
-    samples = len(coefficient)
-    for s in bin_slices(starts, last):
+    samples, last = len(coefficient), one.last
+    for s in bin_slices(one.starts, last):
         j = np.arange(s.start, s.stop)
         variance = np.zeros(len(j))
         for term, theta in zip(random_terms, best.theta, strict=True):

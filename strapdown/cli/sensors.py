@@ -227,7 +227,6 @@ def _identify(
     """Identify one sensor, print and write what was found."""
     from strapdown import allan as identification
     from strapdown import plots, recordings
-    from strapdown.allan import gaps as allan_gaps
     from strapdown.allan import parameters as noise_parameters
     from strapdown.plots.style import save_as
 
@@ -243,7 +242,13 @@ def _identify(
         if options.temperature is not None:
             values = _regressed(recording, sensor, source, options.temperature, out, paths)
         with progress_bar("fit, deviation, figure", 3) as advance:
-            fit, deviation = _fitted(values, source, options, gaps=gaps)
+            fit = identification.fit_noise(
+                values, source.sample_interval, kind=source.kind, highest_frequency=options.highest_frequency
+            )
+            estimator = "robust" if options.robust else "overlapping"
+            deviation = identification.allan_deviation(
+                values, source.sample_interval, kind=source.kind, estimator=estimator
+            )
             advance(2)
             figure = plots.allan_overview(deviation, fit, identification.curves_by_axis(fit, deviation), sensor=sensor)
             advance(1)
@@ -255,8 +260,9 @@ def _identify(
     for remark in source.remarks:
         console.print(remark)
     if gaps:
+        shortest = identification.noise_fit.SHORTEST
         console.print(
-            f"With gaps: the fit uses {fit.samples} samples in stretches of {allan_gaps.SHORTEST} or more, the deviation all there are."
+            f"With gaps: the fit uses {fit.samples} samples in stretches of {shortest} or more, the deviation all there are."
         )
     rows = noise_parameters.table(fit, sensor)
     _show_coefficients(rows)
@@ -278,22 +284,6 @@ def _identify(
         )
         console.print(f"warning: {_DISTRUST}, nor {specification}.", highlight=False)
     return fit
-
-
-def _fitted(
-    values: Any, source: GyroSamples, options: _Identification, *, gaps: bool
-) -> tuple[identification.NoiseFit, identification.AllanDeviation]:
-    """Return the noise coefficients and the Allan deviation of samples, which may have gaps."""
-    from strapdown import allan as identification
-    from strapdown.allan import gaps as allan_gaps
-
-    interval, highest = source.sample_interval, options.highest_frequency
-    if gaps:
-        fit = allan_gaps.fit_noise(values, interval, highest_frequency=highest)
-        return fit, allan_gaps.allan_deviation(values, interval)
-    fit = identification.fit_noise(values, interval, kind=source.kind, highest_frequency=highest)
-    estimator = "robust" if options.robust else "overlapping"
-    return fit, identification.allan_deviation(values, interval, kind=source.kind, estimator=estimator)
 
 
 def _show_coefficients(rows: list[dict[str, Any]]) -> None:
