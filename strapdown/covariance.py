@@ -151,12 +151,7 @@ class Analysis(Listed):
     beyond_linear: tuple[str, ...]
 
     def listing(self) -> Listing:
-        """Return the error budget at the last epoch, as a table.
-
-        Returns
-        -------
-        Listing
-        """
+        """Return the error budget at the last epoch, as a table."""
         rows = [
             (name, kind, figure(attitude / ARCSECOND), figure(bias / DEGREE_PER_HOUR))
             for name, kind, attitude, bias in self.budget()
@@ -806,10 +801,7 @@ def _check_considered(scenario: Scenario, consider: Consider) -> None:
 def _propagated(
     path: _Path, edges: Array, random: _Random, columns: list[_Column], fixed: int, sensors: int
 ) -> covariance_loop.Outputs:
-    """Propagate the covariance of each random source and each error without noise through the filter's gains.
-
-    ``fixed``: number of the columns, the first of them, that are fixed errors.
-    """
+    """Propagate the covariance of each random source and each error without noise through the filter's gains."""
     rows, coloured = path.rows, random.coloured
     with_rate = [k for k, column in enumerate(columns) if column.rate is not None]
     place = np.full(len(columns), -1)

@@ -96,11 +96,6 @@ def simulate(scenario: Scenario | str | os.PathLike[str], *, seed: int | None = 
     ImuRecord
         Its ``truth`` is known, and its ``origin`` is the scenario, which :func:`estimate` matches its filter to.
 
-    Raises
-    ------
-    InputError
-        If there is no such scenario, or its file has an unknown key or a value out of range.
-
     Examples
     --------
     >>> import strapdown as sd
@@ -193,11 +188,6 @@ def write(
         and :func:`strapdown.recordings.writers` lists those of recordings and estimates.
     **options
         Of the format (:func:`strapdown.recordings.write`): ``sequence`` and ``frame`` of an estimate as a table.
-
-    Raises
-    ------
-    InputError
-        If the ending names no format that holds such content.
 
     Examples
     --------
@@ -496,11 +486,6 @@ def integrate(
     AttitudeHistory
         ``time`` (k + 1,), s, and ``attitude`` (k + 1, 4), q_fb, at the edges of the algorithm's steps; samples left over are dropped.
 
-    Raises
-    ------
-    InputError
-        If there is no such algorithm, or fewer samples than one of its steps needs.
-
     Examples
     --------
     >>> import strapdown as sd
@@ -550,11 +535,6 @@ def check(
     -------
     Judgement
         ``verdict`` is "consistent", "not consistent" or "cannot tell"; ``findings`` are the statistics.
-
-    Raises
-    ------
-    InputError
-        If the truth is not that of the estimate's epochs, or a Monte Carlo has no finished run.
 
     Examples
     --------
@@ -666,11 +646,6 @@ def monte_carlo(
     Statistics
         For :func:`check`; the same to the bit for any number of threads.
 
-    Raises
-    ------
-    InputError
-        If there is no such scenario, or no machine computes it with this filter.
-
     Examples
     --------
     >>> import strapdown as sd
@@ -706,11 +681,6 @@ def covariance_analysis(
     -------
     Analysis
         σ of attitude (rad, body axes) and bias (rad/s) over time, actual and by the filter's own covariance, and the error budget.
-
-    Raises
-    ------
-    InputError
-        As :func:`strapdown.covariance.analyse`.
 
     Examples
     --------
@@ -760,11 +730,6 @@ def tune(
     -------
     Tuning
         ``setup`` is the tuned filter, for :func:`estimate` and :func:`monte_carlo`.
-
-    Raises
-    ------
-    InputError
-        If a parameter is unknown, or the options exclude each other.
 
     Examples
     --------
@@ -851,11 +816,6 @@ def allan_deviation(
     AllanDeviation
         Deviation at each averaging time and axis, in the unit of the samples (increments: that unit per s), and its confidence band.
 
-    Raises
-    ------
-    InputError
-        If samples are not finite, too few, or at uneven intervals.
-
     Examples
     --------
     >>> import numpy as np
@@ -896,11 +856,6 @@ def fit_noise(
     -------
     NoiseFit
         For ``noise`` of :func:`estimate`.
-
-    Raises
-    ------
-    InputError
-        If samples are not finite, too few, or at uneven intervals.
 
     Examples
     --------

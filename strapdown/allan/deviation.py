@@ -165,12 +165,6 @@ def allan_deviation(
     AllanDeviation
         The deviation of each axis.
 
-    Raises
-    ------
-    InputError
-        If samples are not finite, a τ is outside [sample interval, half the record] (modified and Hadamard: a third), or ``kind``
-        or ``estimator`` is unknown.
-
     Notes
     -----
     The overlapping estimator equals ``allantools.oadev``, the modified one ``allantools.mdev`` and the Hadamard one
@@ -405,10 +399,7 @@ def flicker_variance(multiples: ArrayLike) -> Array:
 
 
 def model_deviation(parameters: Mapping[str, float], taus: ArrayLike, sample_interval: float) -> dict[str, Array]:
-    """Return the Allan deviation (t,), rad/s, of each noise term and of their sum, ``"total"``, at ``taus``, s.
-
-    ``parameters`` are coefficients, SI, by name in :data:`TERMS`; absent ones are zero.
-    """
+    """Return the Allan deviation (t,), rad/s, of each noise term and of their sum, ``"total"``, at ``taus``, s."""
     checks.known_keys("parameters", parameters, TERMS)
     tau = checks.array("taus", taus, ("t",))
     dt = checks.positive("sample_interval", sample_interval, unit="s")

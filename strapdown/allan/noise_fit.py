@@ -176,11 +176,6 @@ def fit_noise(
     NoiseFit
         Coefficients, SI, of each axis.
 
-    Raises
-    ------
-    InputError
-        If samples are not finite, the record has no noise or is too short, or a term is unknown.
-
     Notes
     -----
     The squared DCT-II coefficients of the record, j = 1 … n − 1 at frequency j/(2 n dt), are modelled as independent χ² of one
@@ -299,10 +294,7 @@ def to_gyro_parameters(fit: NoiseFit) -> dict[str, float | tuple[float, ...]]:
 
 
 def upper_bounds(fit: NoiseFit) -> dict[str, float | tuple[float, ...]]:
-    """Return the upper ends, SI, by term, one or one an axis, of the intervals of the terms that some axis does not support.
-
-    The record cannot exclude coefficients up to these; a filter that must not be overconfident may use them.
-    """
+    """Return the upper ends, SI, by term, one or one an axis, of the intervals of the terms that some axis does not support."""
     return _by_name(fit, fit.upper, np.asarray(~fit.supported.all(axis=0)))
 
 
@@ -373,10 +365,7 @@ def _loss(bins: Bins, theta: Array, slope: float | None, restricted: bool) -> Op
 def _maximise(
     bins: Bins, start: Array, free: NDArray[np.bool_], *, slope: float | None = None, restricted: bool = True
 ) -> Optimum:
-    """Return the most likely theta ≥ 0 by Fisher scoring, each step a non-negative least-squares problem, with step halving.
-
-    Components that are not ``free`` keep their values in ``start``.
-    """
+    """Return the most likely theta ≥ 0 by Fisher scoring, each step a non-negative least-squares problem, with step halving."""
     from scipy.optimize import nnls
 
     held = np.where(free, 0.0, start)
@@ -551,10 +540,7 @@ def _of_axes(
 
 
 def _fit_ramp(fit: AxisFit, level: float) -> tuple[float, float, float]:
-    """Return estimate, lower and upper of the ramp; unsupported: NaN, 0 and a bound on its size.
-
-    The ramp's own interval profiles the unrestricted likelihood: how far K may go to explain the trend is part of it.
-    """
+    """Return estimate, lower and upper of the ramp; unsupported: NaN, 0 and a bound on its size."""
     from scipy.optimize import brentq
     from scipy.stats import chi2
 

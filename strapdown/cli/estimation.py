@@ -254,10 +254,7 @@ def _check_kind(recording: Path, options: list[str], specified: bool) -> None:
 
 
 def _exports(output: _Output, recording: Path, *, changed: bool) -> Exports:
-    """Return the further files of an estimate; what cannot be written is refused.
-
-    ``changed``: the samples are read in other axes than those of the file.
-    """
+    """Return the further files of an estimate; what cannot be written is refused."""
     from strapdown import recordings
     from strapdown.records import outputs
 

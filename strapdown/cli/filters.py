@@ -32,10 +32,7 @@ def filter_for(
     *,
     smooth: bool = False,
 ) -> tuple[FilterSetup, list[str]]:
-    """Return the filter, and what to say of it: of a file, or matched to the gyro's specification and the record's sensors.
-
-    A filter that is to be smoothed is not given gyro drifts unless ``states`` names them.
-    """
+    """Return the filter, and what to say of it: of a file, or matched to the gyro's specification and the record's sensors."""
     from strapdown import setup
     from strapdown.gyro import read_spec
     from strapdown.setup.for_record import matched_setup, unmodelled_errors

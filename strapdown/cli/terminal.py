@@ -133,10 +133,7 @@ def counted(number: int, what: str) -> str:
 
 
 def table(title: str, *columns: str, left: int = 1) -> Table:
-    """Print the title and return an empty table, its first ``left`` columns text and the others numbers.
-
-    The title stands outside because one longer than its table would wrap inside it.
-    """
+    """Print the title and return an empty table, its first ``left`` columns text and the others numbers."""
     console.print(Text(title, style="bold"))
     result = Table(box=box.SIMPLE_HEAD, header_style="", pad_edge=False, padding=(0, 1, 0, 0))
     for k, column in enumerate(columns):
@@ -174,11 +171,7 @@ def verdict(good: bool) -> Text:
 
 
 def scenario_named(name: str) -> Scenario:
-    """Return the scenario of a name or a TOML file whose numbers can be computed with, not only read.
-
-    Refused are numbers beyond :data:`LARGEST_NUMBER`, a duration shorter than one gyro sample, and more measurements of a sensor than
-    :data:`MAX_MEASUREMENTS`: each would end deep inside, as an infinity or for want of memory.
-    """
+    """Return the scenario of a name or a TOML file whose numbers can be computed with, not only read."""
     from strapdown.scenarios import load_scenario, scenario_to_table
 
     chosen = load_scenario(name)
@@ -214,11 +207,7 @@ def _numbers(place: str, content: Any) -> Iterator[tuple[str, float]]:
 def writable(
     option: str, *targets: Path, suffixes: tuple[str, ...] = (), sources: tuple[Path | str | None, ...] = ()
 ) -> None:
-    """Refuse files that a command is going to write but cannot, before it computes what goes into them.
-
-    A folder of that name stands in the way, the folder that they go to may not be written or lies below a file, the suffix is none of
-    ``suffixes`` (where given), or a target is one of the ``sources`` that are read.
-    """
+    """Refuse files that a command is going to write but cannot, before it computes what goes into them."""
     for target in targets:
         if target.is_dir():
             raise InputError(

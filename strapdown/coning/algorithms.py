@@ -179,11 +179,6 @@ class Algorithm:
         Algorithm
             The algorithm, its orders and drift constant derived.
 
-        Raises
-        ------
-        InputError
-            If the coefficients leave no increment in the step or are not numbers.
-
         Examples
         --------
         >>> own = Algorithm.from_coefficients("ignagni-3", ["9/20", "27/20"])
@@ -240,11 +235,6 @@ class Algorithm:
         Algorithm
             The algorithm, its orders and drift constant derived.
 
-        Raises
-        ------
-        InputError
-            If a product is not one of two different increments of the window.
-
         Examples
         --------
         >>> own = Algorithm.from_products("miller-3", 3, [(1, 3, "9/20"), (1, 2, "27/40"), (2, 3, "27/40")])
@@ -292,11 +282,6 @@ class Algorithm:
         -------
         Algorithm
             The algorithm.
-
-        Raises
-        ------
-        InputError
-            If a key is unknown or missing, or a value is not what it must be.
         """
         checks.known_keys(
             place, table, ("name", "samples", "previous", "following", "coefficients", "products", "source")
@@ -340,11 +325,6 @@ class Algorithm:
         -------
         Algorithm
             The algorithm.
-
-        Raises
-        ------
-        InputError
-            If the file does not hold exactly one valid table.
         """
         found = read_algorithms(path)
         if len(found) > 1:
@@ -482,11 +462,6 @@ def read_algorithms(path: str | os.PathLike[str]) -> tuple[Algorithm, ...]:
     -------
     tuple of Algorithm
         The algorithms.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, is not TOML, has no such table, or a table is not one of an algorithm.
     """
     with reading.from_file(path):
         content = reading.toml(path)
@@ -722,10 +697,7 @@ def named(algorithm: str | Algorithm) -> Algorithm:
 
 
 def algorithm_rows() -> list[dict[str, str | int | float]]:
-    """Return the printed table of the catalogue, one row an algorithm.
-
-    The drift constant is C of the leading drift −C β² ω λ^(drift order) under small coning, λ = ω × sample interval.
-    """
+    """Return the printed table of the catalogue, one row an algorithm."""
     return [
         {
             "name": a.name,

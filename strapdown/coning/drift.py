@@ -116,10 +116,7 @@ _COLUMNS = ("frequency_hz", "angle_deg", "angle_across_deg", "phase_deg")
 
 
 def read_vibration(path: str | os.PathLike[str]) -> tuple[VibrationLine, ...]:
-    """Read vibration lines from CSV with the columns ``frequency_hz, angle_deg[, angle_across_deg][, phase_deg]``.
-
-    Without the optional columns the second axis has the amplitude of the first and lags it by 90°: coning.
-    """
+    """Read vibration lines from CSV with the columns ``frequency_hz, angle_deg[, angle_across_deg][, phase_deg]``."""
     file = Path(path)
     with reading.from_file(file):
         return _vibration(file, reading.text(file).splitlines())

@@ -66,11 +66,6 @@ def integrate(
     -------
     ndarray (n // N + 1, 4)
         Unit quaternions q_fb, first the initial attitude.
-
-    Raises
-    ------
-    InputError
-        If the algorithm or frame is unknown, or an input has the wrong shape or is not finite.
     """
     table = named(algorithm)
     checks.one_of("frame", frame, ("body", "fixed"))
@@ -123,11 +118,6 @@ def increments_from_rates(rates: ArrayLike, sample_interval: float, points: int 
     ndarray (n, 3)
         Increments, rad. For an oscillation they are too small by a relative error of order λ^points. Near the ends the samples used
         lie to one side.
-
-    Raises
-    ------
-    InputError
-        If ``points`` is odd or there are fewer than two samples.
 
     Examples
     --------

@@ -182,12 +182,7 @@ class Judgement(Listed):
         return tuple(one.of for one in self.power if not one.of.startswith(_INNOVATIONS))
 
     def listing(self) -> Listing:
-        """Return the verdict and each statistic with its bounds, as a table.
-
-        Returns
-        -------
-        Listing
-        """
+        """Return the verdict and each statistic with its bounds, as a table."""
         rows = [
             (
                 one.name,
@@ -269,11 +264,6 @@ def judge(
     Judgement
         Its ``power`` says for each state how wrong a σ the tests would have shown. An error state has no truth here, and is not
         tested.
-
-    Raises
-    ------
-    InputError
-        If the truth has other epochs than the estimate, or the probability is not between 0 and 1.
 
     References
     ----------

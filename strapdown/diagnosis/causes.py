@@ -81,12 +81,7 @@ class Diagnosis(Listed):
     probability: float
 
     def listing(self) -> Listing:
-        """Return the causes considered, the likeliest first, as a table.
-
-        Returns
-        -------
-        Listing
-        """
+        """Return the causes considered, the likeliest first, as a table."""
         rows = [
             (one.name, one.of, figure(one.gain), figure(one.log_p), "significant" if one in self.causes else "")
             for one in self.considered[:8]

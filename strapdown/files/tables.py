@@ -166,10 +166,7 @@ Kind = TypeVar("Kind")
 
 
 def read(path: str | os.PathLike[str], name: str, remedy: str, make: Callable[[Mapping[str, Any], str], Kind]) -> Kind:
-    """Return what ``make`` makes of the table ``[name]`` of a TOML file; ``remedy`` says what to do where there is none.
-
-    ``make`` is called with the table and what it is called in errors.
-    """
+    """Return what ``make`` makes of the table ``[name]`` of a TOML file; ``remedy`` says what to do where there is none."""
     with reading.from_file(path):
         table = reading.toml(path).get(name)
         if not isinstance(table, dict):

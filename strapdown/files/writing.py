@@ -22,10 +22,7 @@ from strapdown.files.reading import BLOCK, SEAL
 
 @contextlib.contextmanager
 def written_beside(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Yield a temporary path in the same folder; on success it replaces ``path``, on any error it is removed.
-
-    Missing parent folders are made. The suffix is kept, so that writers which look at it (matplotlib) are content.
-    """
+    """Yield a temporary path in the same folder; on success it replaces ``path``, on any error it is removed."""
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(prefix=f".{target.stem}-", suffix=target.suffix, dir=target.parent)
@@ -127,10 +124,7 @@ def set_attributes(node: Any, values: Mapping[str, Any]) -> None:
 
 
 def usable_folder(name: str, folder: str | os.PathLike[str]) -> None:
-    """Refuse a folder that results cannot go to, before they are computed: one below a file, or that may not be written.
-
-    Nothing is made; the folder appears with the first file written.
-    """
+    """Refuse a folder that results cannot go to, before they are computed: one below a file, or that may not be written."""
     place = Path(folder).absolute()
     while not place.exists():
         place = place.parent

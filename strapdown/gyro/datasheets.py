@@ -52,10 +52,7 @@ def _registry() -> Any:
 
 
 def parse(name: str, text: str, wanted: str, example: str = "") -> float:
-    """Return a quantity given as text, in the unit ``wanted``; another dimension is refused.
-
-    Understands pint's syntax, ``sqrt(…)``, √ and °; ``h`` is the hour, ``g`` standard gravity and ``Hz`` 1/s.
-    """
+    """Return a quantity given as text, in the unit ``wanted``; another dimension is refused."""
     registry = _registry()
     if not isinstance(text, str):
         raise InputError(f"{name} is {text!r}; give it as text with its unit, such as {example!r}")
@@ -98,11 +95,6 @@ def from_datasheet(**quantities: str) -> GyroSpec:
     -------
     GyroSpec
         The specification, SI.
-
-    Raises
-    ------
-    InputError
-        If a quantity is unknown, is not text with a unit, or has another dimension.
 
     Notes
     -----
@@ -294,11 +286,6 @@ def preset(name: str) -> Preset:
     -------
     Preset
         The preset.
-
-    Raises
-    ------
-    InputError
-        If the name is unknown; the message names the nearest known one.
 
     Examples
     --------

@@ -271,11 +271,6 @@ def simulate(
     GyroOutput
         Measured increments and true bias.
 
-    Raises
-    ------
-    InputError
-        If shapes do not fit, the edges are not uniform where they must be, or a required input is missing.
-
     Notes
     -----
     Over an interval dt the bias walks by σ_u √dt n₁; its integral, given both ends, is ½ (b_k + b_{k+1}) dt plus a Gaussian of
@@ -471,10 +466,7 @@ def low_pass_step(natural: float, damping: float, dt: float) -> tuple[Array, Arr
 
 
 def sampling(spec: GyroSpec, edges: ArrayLike, generator: np.random.Generator) -> tuple[Array, Array]:
-    """Return the true sampling instants (n + 1,) and the reported stamps (n + 1,), s, for nominal edges.
-
-    Jitter and stamp error are independent and normal, cut off at two fifths of the shortest interval so that the order stays.
-    """
+    """Return the true sampling instants (n + 1,) and the reported stamps (n + 1,), s, for nominal edges."""
     nominal = increasing("edges", edges, least=2)
     most = 0.4 * float(np.diff(nominal).min())
     draws = generator.standard_normal((2, len(nominal)))
@@ -665,10 +657,7 @@ def to_table(spec: GyroSpec) -> dict[str, Any]:
 
 
 def from_table(table: Mapping[str, Any], place: str = "gyro", base: GyroSpec | None = None) -> GyroSpec:
-    """Return the specification in a table with units in the key names, changes of ``base`` if given.
-
-    An unknown key is refused with the nearest known one.
-    """
+    """Return the specification in a table with units in the key names, changes of ``base`` if given."""
     known_keys(place, table, [*tables.keys(FORM), "temperature", *(["preset"] if base else [])])
     own = {key: value for key, value in table.items() if key != "temperature"}
     values = tables.decode(own, FORM, place)
@@ -689,10 +678,5 @@ def read_spec(path: str | os.PathLike[str]) -> GyroSpec:
     -------
     GyroSpec
         The specification.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, is not TOML, has no such table, or has an unknown key.
     """
     return tables.read(path, "gyro", "`strapdown allan` writes one", from_table)

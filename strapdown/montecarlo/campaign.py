@@ -435,11 +435,6 @@ def read(path: str | os.PathLike[str]) -> Campaign:
     -------
     Campaign
         With the statistics of the runs finished so far.
-
-    Raises
-    ------
-    InputError
-        If the file does not exist, is truncated, is of another kind, or was written by a newer version.
     """
     return _stored(Path(path))[0]
 

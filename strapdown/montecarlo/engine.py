@@ -116,11 +116,6 @@ def replay(plan: Plan, run: int, *, machine: str = "auto") -> Replay:
     -------
     Replay
         Record, initial state and estimate.
-
-    Raises
-    ------
-    InputError
-        If the number is negative, or the machine cannot compute the plan.
     """
     found = machine_named(choose(plan, machine).machine).replay(plan, count("run", run, least=0))
     spec = scalar.dispersed(plan.scenario.gyro, plan.dispersions, plan.seed, run)
@@ -206,10 +201,7 @@ class Window:
 
 
 def in_threads(threads: int | None = None) -> Workers:
-    """Return workers that are threads of this process; default one a core.
-
-    They are daemons: Ctrl-C does not wait for the chunks that are running.
-    """
+    """Return workers that are threads of this process; default one a core."""
     number = os.cpu_count() or 1 if threads is None else count("threads", threads)
 
     def work_through(work: Work, chunks: Chunks) -> Iterator[tuple[int, Parts]]:
@@ -293,11 +285,6 @@ def run_plan(
     -------
     Statistics
         Sums over all the runs, merged in the order of the chunks.
-
-    Raises
-    ------
-    InputError
-        If no machine computes the plan, or a number is out of range.
     """
     chosen = choose(plan, machine).machine
     size = machine_named(chosen).CHUNK if chunk is None else count("chunk", chunk)
@@ -352,11 +339,6 @@ def run(
     -------
     list of Statistics
         One a setup.
-
-    Raises
-    ------
-    InputError
-        If no machine computes a setup, or a number is out of range.
     """
     count("runs", runs)
     plans = tuple(

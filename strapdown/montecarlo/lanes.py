@@ -292,10 +292,7 @@ def _nominal(sensor: Any, scenario: Scenario, seed: int) -> VectorMeasurements:
 
 
 def _exact(sensor: Any, scenario: Scenario, series: VectorMeasurements) -> tuple[Array, Array, Array]:
-    """Return the values of a sensor without noise (m, 4), its true σ (m, 3), and the scale of its noise (m,), as the filter takes them.
-
-    Vectors are taken over the length of their references, an attitude as a quaternion.
-    """
+    """Return the values of a sensor without noise (m, 4), its true σ (m, 3), and the scale of its noise (m,), as the filter takes them."""
     silent = replace(sensor.faults, outlier_probability=0.0, correlated_sigma=0.0)
     changes: dict[str, Any] = {"faults": silent}
     if isinstance(sensor, AttitudeSensor):
@@ -513,10 +510,7 @@ def _example(kept: Array, truth: Array) -> tuple[Array, Array]:
 
 
 def replay(plan: Plan, run: int, *, width: int = 1) -> Replay:
-    """Return one run in full detail, bitwise what it is among the others.
-
-    The record is at the filter's steps: an increment is what the coning algorithm makes of its gyro samples.
-    """
+    """Return one run in full detail, bitwise what it is among the others."""
     number = count("run", run, least=0)
     group = _Group(plan, width, every=1, detail=True)
     group.advance(number)

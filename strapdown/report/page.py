@@ -122,10 +122,7 @@ def _image(draw: Callable[[], Figure], theme: str) -> tuple[str, bool]:
 
 
 def chart(one: Chart) -> str:
-    """Return the place of an interactive chart with its data.
-
-    A long series is reduced to the extremes of each column of time, a band to its widest in each column.
-    """
+    """Return the place of an interactive chart with its data."""
     lines = [series.value for series in one.series if not series.band]
     columns = CHART_POINTS // (2 * len(lines))
     rows = np.unique(np.concatenate([extreme_rows(one.time, value, columns) for value in lines]))

@@ -41,11 +41,7 @@ class Table:
 
 
 def write(tables: Sequence[Table], folder: str | os.PathLike[str]) -> list[Path]:
-    r"""Write tables to a folder, made if missing, as ``NAME.csv`` and ``NAME.tex``; return the files.
-
-    The CSV has the keys as its header and numbers that read back to the bit; the LaTeX is a ``tabular`` with four digits, to input into a
-    document that loads ``booktabs``.
-    """
+    r"""Write tables to a folder, made if missing, as ``NAME.csv`` and ``NAME.tex``; return the files."""
     written = []
     for table in tables:
         for suffix, content in (("csv", to_csv(table)), ("tex", to_latex(table))):
@@ -260,10 +256,7 @@ def of_tuning(content: Mapping[str, Any]) -> list[Table]:
 
 
 def of_allan(rows: Sequence[Mapping[str, Any]], sensor: str) -> list[Table]:
-    """Return the noise coefficients of a sensor, of the rows of :func:`strapdown.allan.parameters.table`, as ``SENSOR-noise``.
-
-    The estimate is empty for a term that the record does not show; its upper end bounds what the record could hide.
-    """
+    """Return the noise coefficients of a sensor, of the rows of :func:`strapdown.allan.parameters.table`, as ``SENSOR-noise``."""
     shown = [
         {
             **row,

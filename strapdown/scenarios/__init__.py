@@ -439,11 +439,6 @@ def load_scenario(name_or_path: str | os.PathLike[str]) -> Scenario:
     Scenario
         In SI units and radians, whatever the units of the keys.
 
-    Raises
-    ------
-    InputError
-        If there is neither, or the file is no TOML, lacks a key, or has an unknown one (the nearest known one is named).
-
     Examples
     --------
     >>> from strapdown import scenarios

@@ -367,10 +367,7 @@ def _need_white(noise: Mapping[str, float]) -> None:
 
 
 def measurement_density(record: ImuRecord) -> float:
-    """Return the variance of a measurement about an axis times the interval between measurements, rad² s, over all sensors and axes.
-
-    A direction measures two axes of three, a heading one; infinite where there is no measurement.
-    """
+    """Return the variance of a measurement about an axis times the interval between measurements, rad² s, over all sensors and axes."""
     information = sum(_information(series) for series in record.vectors)
     length = float(record.time[-1] - record.time[0])
     return length / information if information > 0.0 else float("inf")
@@ -451,11 +448,6 @@ def run(record: ImuRecord, setup: FilterSetup, initial: State, **options: Any) -
     -------
     Estimate
         With ``error_states`` where the setup has any.
-
-    Raises
-    ------
-    InputError
-        If the setup has a σ or a state for a sensor that the record does not have, or an argument is out of range.
     """
     if setup.estimator != MEKF:
         return _run_other(modelled_record(record, setup), setup, initial, **options)
@@ -575,11 +567,6 @@ def initial_state(
     -------
     State
         Attitude and bias with independent errors of these σ.
-
-    Raises
-    ------
-    InputError
-        If a shape is wrong, or the quaternion is not of unit length.
     """
     return estimation.initial_state(
         attitude, bias=bias, attitude_sigma=setup.attitude_sigma, bias_sigma=setup.bias_sigma
@@ -672,10 +659,7 @@ def from_table(table: Mapping[str, Any], place: str = "filter") -> FilterSetup:
 
 
 def need_angles(setup: FilterSetup, kinds: Mapping[str, str], place: str) -> None:
-    """Raise an error for a σ beyond half a turn of a sensor that measures angles: it must have been meant in another unit than rad.
-
-    ``kinds`` are those of the sensors by their names; whole vectors ("vector") may have any σ. ``place`` is what is named in the error.
-    """
+    """Raise an error for a σ beyond half a turn of a sensor that measures angles: it must have been meant in another unit than rad."""
     for name, sigma in setup.sigma.items():
         largest = float(np.max(sigma))
         if kinds.get(name, "vector") != "vector" and largest > np.pi:
@@ -722,10 +706,5 @@ def read_setup(path: str | os.PathLike[str]) -> FilterSetup:
     -------
     FilterSetup
         Setup of the table, in SI units and radians.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, is no TOML, or has no such table or an unknown key.
     """
     return tables.read(path, "filter", "`strapdown tune` writes one", from_table)

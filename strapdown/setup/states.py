@@ -155,11 +155,6 @@ class SensorStates:
         -------
         tuple of ErrorStates
             One block for each error of the sensor with a σ above zero.
-
-        Raises
-        ------
-        InputError
-            If a state does not go with this kind of measurement.
         """
         one_of(f"{sensor}: kind", kind, KINDS)
         found: list[ErrorStates] = []
@@ -294,11 +289,6 @@ class States(ByValue):
         -------
         tuple of ErrorStates
             Blocks of the gyro, then those of the sensors in the order of ``sensors``.
-
-        Raises
-        ------
-        InputError
-            If a sensor is unknown, or a state does not go with its kind of measurement.
         """
         found = list(self.gyro_blocks())
         for name, one in self.sensors.items():
@@ -326,11 +316,6 @@ class States(ByValue):
         -------
         States
             The same σ for these names, and 0 for all others.
-
-        Raises
-        ------
-        InputError
-            If a name is unknown.
         """
         for name in names:
             if not self.names:
@@ -412,10 +397,7 @@ def run(
     robust: Robust | None = None,
     monitor: Monitor | None = None,
 ) -> Estimate:
-    """Run the filter with these states; its estimate is of the attitude and the whole gyro bias, drifts included, and of the error states.
-
-    An ``initial`` without values has the whole bias. Options are those of :func:`strapdown.estimation.run`.
-    """
+    """Run the filter with these states; it estimates the attitude, the whole gyro bias, drifts included, and the error states."""
     problem = prepared(record, process_noise, initial, states)
     options = forward.Options(
         every=every, full_covariance=full_covariance, gate=gate, robust=robust, whole_bias=True, together=True

@@ -75,11 +75,6 @@ def plan(
     -------
     Plan
         Least standard error of the logarithm of each parameter, by record length: 0.1 is 10 %.
-
-    Raises
-    ------
-    InputError
-        If a length is not above zero, or a name is unknown.
     """
     instance("scenario", scenario, Scenario, "give a Scenario")
     wanted = np.sort(np.asarray(lengths, float))

@@ -134,10 +134,7 @@ class Unmodelled:
 
 
 def unmodelled(case: Case, chosen: FilterSetup, *, probability: float = 0.99) -> Unmodelled:
-    """Return what the part of a record that a filter was tuned on says against the tuned filter.
-
-    The filter is run some twenty times; where the innovations are not of the right shape some hundred times more, for their causes.
-    """
+    """Return what the part of a record that a filter was tuned on says against the tuned filter."""
     tail(probability)
     judgement = performance([case], chosen).judgements[0]
     record = seen(case)
@@ -178,10 +175,7 @@ def accepted(record: ImuRecord, estimate: Estimate) -> ImuRecord:
 
 
 def scale_factor(record: ImuRecord, noise: ProcessNoise, initial: estimation.State) -> ScaleFactor:
-    """Return the scale factor of the gyro that explains most beside a filter of this noise, or of less walk of the bias.
-
-    ``record`` as the filter processes it (:func:`strapdown.setup.modelled_record`).
-    """
+    """Return the scale factor of the gyro that explains most beside a filter of this noise, or of less walk of the bias."""
     rate_angle = turns(record, noise, initial)
     levels = LEVELS if noise.rate_random_walk > 0.0 else LEVELS[:1]
     tuned = run(Model(record=record, noise=noise, initial=initial))

@@ -333,10 +333,7 @@ def _missing(value: Array) -> np.ndarray:
 
 
 def _of_known(name: str, value: Array, missing: np.ndarray, stand_in: Array | Callable[[Array], ArrayLike]) -> Array:
-    """Return a property of each sample (m, ...), NaN of a missing sample (m,) replaced by ``stand_in``.
-
-    ``stand_in`` is an array of the same length, or a function of the known entries.
-    """
+    """Return a property of each sample (m, ...), NaN of a missing sample (m,) replaced by ``stand_in``."""
     if not np.isnan(np.sum(value)):
         return value
     lost = np.isnan(value.reshape(len(value), -1)).any(axis=1)
