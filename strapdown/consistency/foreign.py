@@ -453,7 +453,7 @@ def _rates(series: _Series) -> tuple[Array, Array]:
 
 
 def coarse_offset(own_time: Array, own_speed: Array, true_time: Array, true_speed: Array) -> float:
-    """Return the offset, s, to be added to the first times, at which two series of angular speeds correlate best; 0 if nothing stands out."""
+    """Return the offset, s, to be added to the first times, at which two series of angular speeds agree best; 0 if nothing stands out."""
     step = max(float(np.median(np.diff(own_time))), float(np.median(np.diff(true_time))))
     apart = own_time[-1] < true_time[0] or true_time[-1] < own_time[0]
     base = true_time[0] - own_time[0] if apart else 0.0
