@@ -16,7 +16,7 @@ import typer
 from strapdown.checks import InputError, count
 from strapdown.cli.filters import default_words, filter_of_scenario, own_filter
 from strapdown.cli.terminal import (
-    Tables,
+    TABLES,
     command,
     console,
     counted,
@@ -50,81 +50,62 @@ _CAMPAIGN_SUFFIXES = (".h5", ".hdf5")
 class _Model:
     """Filter and errors; a file of a campaign has its own."""
 
-    filter_file: Annotated[
-        Path | None,
-        typer.Option(
-            "--filter",
-            help="TOML with a table named filter, as `strapdown tune` writes it; or FILE.py:NAME, a filter of your own in a Python file, "
-            "which is executed. Default: the filter that matches the scenario.",
-        ),
-    ] = None
-    gyro: Annotated[
-        Path | None,
-        typer.Option(
-            help="TOML with a table named gyro, a data sheet's: the filter is matched to it, not to the scenario's gyro."
-        ),
-    ] = None
-    dispersions: Annotated[
-        Path | None,
-        typer.Option(
-            help="TOML with a table named dispersions: initial errors and gyro parameters that differ from run to run."
-        ),
-    ] = None
-    seed: Annotated[int | None, typer.Option(help="Seed; the scenario's own if not given.")] = None
-    float32: Annotated[bool, typer.Option("--float32", help="Compute in single precision; with lanes only.")] = False
-    states: Annotated[
-        bool | None,
-        typer.Option(
-            "--states/--no-states",
-            help="With or without a state for each error that the scenario specifies. Default: with them, where there are such errors and "
-            "no filter, --float32 or lanes are asked for.",
-        ),
-    ] = None
+    filter_file: Path | None = typer.Option(
+        None,
+        "--filter",
+        help="TOML with a table named filter, as `strapdown tune` writes it; or FILE.py:NAME, a filter of your own in a Python file, "
+        "which is executed. Default: the filter that matches the scenario.",
+    )
+    gyro: Path | None = typer.Option(
+        None,
+        help="TOML with a table named gyro, a data sheet's: the filter is matched to it, not to the scenario's gyro.",
+    )
+    dispersions: Path | None = typer.Option(
+        None,
+        help="TOML with a table named dispersions: initial errors and gyro parameters that differ from run to run.",
+    )
+    seed: int | None = typer.Option(None, help="Seed; the scenario's own if not given.")
+    float32: bool = typer.Option(False, "--float32", help="Compute in single precision; with lanes only.")
+    states: bool | None = typer.Option(
+        None,
+        "--states/--no-states",
+        help="With or without a state for each error that the scenario specifies. Default: with them, where there are such errors and "
+        "no filter, --float32 or lanes are asked for.",
+    )
 
 
 @dataclass(frozen=True)
 class _Computing:
     """Runs and what computes them."""
 
-    runs: Annotated[int | None, typer.Option(help="Number of runs; 1000, or that of the file resumed.")] = None
-    threads: Annotated[int | None, typer.Option(help="Threads; one a core if not given.")] = None
-    machine: Annotated[
-        str,
-        typer.Option(
-            help="lanes: eight runs at once in vector registers; scalar: any scenario and filter; auto: lanes where they can."
-        ),
-    ] = "auto"
-    chunk: Annotated[int | None, typer.Option(help="Runs between merges and writes; the machine's if not given.")] = (
-        None
+    runs: int | None = typer.Option(None, help="Number of runs; 1000, or that of the file resumed.")
+    threads: int | None = typer.Option(None, help="Threads; one a core if not given.")
+    machine: str = typer.Option(
+        "auto",
+        help="lanes: eight runs at once in vector registers; scalar: any scenario and filter; auto: lanes where they can.",
     )
-    workers: Annotated[int | None, typer.Option(help="Number of processes to use instead of threads (needs Dask).")] = (
-        None
+    chunk: int | None = typer.Option(None, help="Runs between merges and writes; the machine's if not given.")
+    workers: int | None = typer.Option(None, help="Number of processes to use instead of threads (needs Dask).")
+    cluster: str | None = typer.Option(
+        None,
+        help="Compute on the Dask scheduler at this address, tcp://HOST:8786, or tls:// with Dask's certificates configured. Scheduler "
+        "and workers can run any code here (they send pickles): name only one that you trust as you trust your own account.",
     )
-    cluster: Annotated[
-        str | None,
-        typer.Option(
-            help="Compute on the Dask scheduler at this address, tcp://HOST:8786, or tls:// with Dask's certificates configured. Scheduler "
-            "and workers can run any code here (they send pickles): name only one that you trust as you trust your own account."
-        ),
-    ] = None
 
 
 @dataclass(frozen=True)
 class _Output:
     """Output."""
 
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            help="HDF5 file; NAME-montecarlo.h5 after the name, or the TOML file, of the scenario if not given."
-        ),
-    ] = None
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with the file, if it exists.")] = False
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Begin anew although the file exists.")] = False
-    replay: Annotated[
-        int | None, typer.Option(help="Compute this one run again and write it in full detail: record and estimate.")
-    ] = None
-    tables: Tables = None
+    out: Path | None = typer.Option(
+        None, help="HDF5 file; NAME-montecarlo.h5 after the name, or the TOML file, of the scenario if not given."
+    )
+    resume: bool = typer.Option(False, "--resume", help="Go on with the file, if it exists.")
+    overwrite: bool = typer.Option(False, "--overwrite", help="Begin anew although the file exists.")
+    replay: int | None = typer.Option(
+        None, help="Compute this one run again and write it in full detail: record and estimate."
+    )
+    tables: Path | None = TABLES
 
 
 @command

@@ -33,10 +33,10 @@ def convert(
         ),
     ],
     layout: Layout,
-    reference: Annotated[
-        Path | None, typer.Option(help="TUM trajectory whose attitudes become the recording's reference.")
-    ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace OUT if it is there.")] = False,
+    reference: Path | None = typer.Option(
+        None, help="TUM trajectory whose attitudes become the recording's reference."
+    ),
+    force: bool = typer.Option(False, "--force", help="Replace OUT if it is there."),
 ) -> None:
     """Convert a recording, a simulated record or an estimate: IN is recognised by its content, OUT written by its ending."""
     from strapdown import recordings

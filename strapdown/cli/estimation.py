@@ -61,35 +61,27 @@ ABOUT_IT = ("estimate.html", "estimate.report.json")
 class _Shared:
     """Filter."""
 
-    gyro: Annotated[
-        Path | None,
-        typer.Option(
-            help="TOML with a table named gyro, as `strapdown allan` writes it: the gyro noise of the filter."
-        ),
-    ] = None
-    gate: Annotated[
-        float | None,
-        typer.Option(help="Refuse measurements beyond this quantile (0.999) of chi-squared, and recover."),
-    ] = None
-    robust: Annotated[
-        str | None, typer.Option(help="Weigh measurements by the size of their innovations: huber or student.")
-    ] = None
-    full_covariance: Annotated[
-        bool | None,
-        typer.Option(
-            "--full-covariance/--variances",
-            help="Write whole 6 x 6 covariances, or only their diagonals; whole ones by default where there is a specification or a "
-            "reference attitude.",
-        ),
-    ] = None
-    observability: Annotated[
-        bool,
-        typer.Option("--observability", help="Report how observable each state is, optional ones included."),
-    ] = False
-    smooth: Annotated[
-        bool,
-        typer.Option("--smooth", help="Use the samples after each time too, by the fixed-interval smoother."),
-    ] = False
+    gyro: Path | None = typer.Option(
+        None, help="TOML with a table named gyro, as `strapdown allan` writes it: the gyro noise of the filter."
+    )
+    gate: float | None = typer.Option(
+        None, help="Refuse measurements beyond this quantile (0.999) of chi-squared, and recover."
+    )
+    robust: str | None = typer.Option(
+        None, help="Weigh measurements by the size of their innovations: huber or student."
+    )
+    full_covariance: bool | None = typer.Option(
+        None,
+        "--full-covariance/--variances",
+        help="Write whole 6 x 6 covariances, or only their diagonals; whole ones by default where there is a specification or a "
+        "reference attitude.",
+    )
+    observability: bool = typer.Option(
+        False, "--observability", help="Report how observable each state is, optional ones included."
+    )
+    smooth: bool = typer.Option(
+        False, "--smooth", help="Use the samples after each time too, by the fixed-interval smoother."
+    )
 
     @property
     def robustness(self) -> dict[str, Any]:
@@ -105,33 +97,27 @@ class _Shared:
 class _Specified:
     """With a specification, as in recordings of `strapdown simulate`."""
 
-    filter_file: Annotated[
-        Path | None,
-        typer.Option(
-            "--filter",
-            help="TOML with a table named filter, as `strapdown tune` writes it; by default one that matches.",
-        ),
-    ] = None
-    states: Annotated[
-        bool | None,
-        typer.Option(
-            "--states/--no-states",
-            help="With or without a state for each error in it (scale, misalignment, drift, hard iron, …). By default with them, where "
-            "there are such errors.",
-        ),
-    ] = None
-    state: Annotated[
-        list[str] | None,
-        typer.Option(help="Only this one of those states, such as gyro.scale or SENSOR.bias; may be repeated."),
-    ] = None
-    attitude: Annotated[
-        str | None,
-        typer.Option(help="Initial attitude body to fixed, w,x,y,z; by default from the first measurements."),
-    ] = None
-    from_truth: Annotated[
-        bool, typer.Option("--from-truth", help="With a truth: start there, off by errors drawn from the filter's σ.")
-    ] = False
-    every: Annotated[int, typer.Option(help="Store every n-th filter step.")] = 1
+    filter_file: Path | None = typer.Option(
+        None,
+        "--filter",
+        help="TOML with a table named filter, as `strapdown tune` writes it; by default one that matches.",
+    )
+    states: bool | None = typer.Option(
+        None,
+        "--states/--no-states",
+        help="With or without a state for each error in it (scale, misalignment, drift, hard iron, …). By default with them, where "
+        "there are such errors.",
+    )
+    state: list[str] | None = typer.Option(
+        None, help="Only this one of those states, such as gyro.scale or SENSOR.bias; may be repeated."
+    )
+    attitude: str | None = typer.Option(
+        None, help="Initial attitude body to fixed, w,x,y,z; by default from the first measurements."
+    )
+    from_truth: bool = typer.Option(
+        False, "--from-truth", help="With a truth: start there, off by errors drawn from the filter's σ."
+    )
+    every: int = typer.Option(1, help="Store every n-th filter step.")
 
     @property
     def chosen_states(self) -> ChosenStates:
@@ -143,59 +129,43 @@ class _Specified:
 class _Recorded:
     """Without a specification."""
 
-    motion: Annotated[
-        str | None,
-        typer.Option(
-            help="What moves the unit: hand, of bounded velocity; vehicle, whose acceleration lasts for seconds; auto (default), the "
-            "likelier of both; or any, whose acceleration is white noise, without states for the gyro's scale."
-        ),
-    ] = None
-    latency: Annotated[
-        float | None,
-        typer.Option(
-            help="Delay of the gyro's samples, ms, that of its low-pass; 0: point samples. By default half a sample interval."
-        ),
-    ] = None
-    calibration: Annotated[
-        Path | None,
-        typer.Option(help="calibration.toml of an earlier recording of the same unit; a new one is written."),
-    ] = None
-    temperature: Annotated[
-        Path | None,
-        typer.Option(
-            help="gyro-temperature.toml of `strapdown allan --temperature`, the gyro's bias over temperature, subtracted first; the "
-            "error of its slope is estimated (with --smooth and --observability it becomes a random walk)."
-        ),
-    ] = None
+    motion: str | None = typer.Option(
+        None,
+        help="What moves the unit: hand, of bounded velocity; vehicle, whose acceleration lasts for seconds; auto (default), the "
+        "likelier of both; or any, whose acceleration is white noise, without states for the gyro's scale.",
+    )
+    latency: float | None = typer.Option(
+        None,
+        help="Delay of the gyro's samples, ms, that of its low-pass; 0: point samples. By default half a sample interval.",
+    )
+    calibration: Path | None = typer.Option(
+        None, help="calibration.toml of an earlier recording of the same unit; a new one is written."
+    )
+    temperature: Path | None = typer.Option(
+        None,
+        help="gyro-temperature.toml of `strapdown allan --temperature`, the gyro's bias over temperature, subtracted first; the "
+        "error of its slope is estimated (with --smooth and --observability it becomes a random walk).",
+    )
 
 
 @dataclass(frozen=True, eq=False)
 class _Output:
     """Output."""
 
-    out: Annotated[Path, typer.Option(help="Folder for estimate.h5, errors.json and the figures.")] = Path(
-        "estimate-results"
+    out: Path = typer.Option(Path("estimate-results"), help="Folder for estimate.h5, errors.json and the figures.")
+    to: list[Path] | None = typer.Option(
+        None,
+        help="Write the estimate to this file too, in the format of its ending: .csv, .tsv, .parquet, .tum, .h5, .rrd (Rerun), and of "
+        "a recording .bag, .mcap or .db3 with orientation and covariance filled in; may be repeated.",
     )
-    to: Annotated[
-        list[Path] | None,
-        typer.Option(
-            help="Write the estimate to this file too, in the format of its ending: .csv, .tsv, .parquet, .tum, .h5, .rrd (Rerun), and of "
-            "a recording .bag, .mcap or .db3 with orientation and covariance filled in; may be repeated."
-        ),
-    ] = None
-    euler: Annotated[
-        str | None, typer.Option(help="With --to a table: Euler angles of this sequence, ZYX if not given.")
-    ] = None
-    frame: Annotated[
-        str | None,
-        typer.Option(
-            help="With --to: fixed frame of the output, enu (if not given) or ned; body axes stay as they are."
-        ),
-    ] = None
-    figures: Annotated[
-        bool, typer.Option("--figures", help="Draw the estimate, its states and errors; --format does too.")
-    ] = False
-    form: Annotated[FigureFormat | None, FORMAT] = None
+    euler: str | None = typer.Option(None, help="With --to a table: Euler angles of this sequence, ZYX if not given.")
+    frame: str | None = typer.Option(
+        None, help="With --to: fixed frame of the output, enu (if not given) or ned; body axes stay as they are."
+    )
+    figures: bool = typer.Option(
+        False, "--figures", help="Draw the estimate, its states and errors; --format does too."
+    )
+    form: FigureFormat | None = typer.Option(None, "--format", help=FORMAT.help)
 
     @property
     def drawn_as(self) -> FigureFormat | None:

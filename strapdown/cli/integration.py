@@ -12,7 +12,7 @@ import typer
 from strapdown.checks import InputError
 from strapdown.cli.reading import RECORDING_HELP, Layout
 from strapdown.cli.terminal import (
-    Tables,
+    TABLES,
     command,
     console,
     json_target,
@@ -36,8 +36,8 @@ if TYPE_CHECKING:
 
 @command
 def algorithms(
-    time: Annotated[bool, typer.Option(help="Measure the time a sample takes on this machine (a few seconds).")] = True,
-    tables: Tables = None,
+    time: bool = typer.Option(True, help="Measure the time a sample takes on this machine (a few seconds)."),
+    tables: Path | None = TABLES,
 ) -> None:
     """List the integration algorithms: samples, orders, drift constant, what they need, time a sample."""
     from strapdown import coning
@@ -78,8 +78,8 @@ def algorithms(
 def integrate(
     recording: Annotated[Path, typer.Argument(help=f"Simulated record (HDF5). {RECORDING_HELP}.")],
     layout: Layout,
-    algorithm: Annotated[str, typer.Option(help="Name of the algorithm; see `strapdown algorithms`.")] = "four-sample",
-    out: Annotated[Path, typer.Option(help="HDF5 file for the attitude.")] = Path("attitude.h5"),
+    algorithm: str = typer.Option("four-sample", help="Name of the algorithm; see `strapdown algorithms`."),
+    out: Path = typer.Option(Path("attitude.h5"), help="HDF5 file for the attitude."),
 ) -> None:
     """Integrate a gyro recording to attitude, starting at the true attitude if the file holds it, else at the identity."""
     from strapdown import coning, quaternion, recordings, records, workflows
@@ -133,11 +133,9 @@ def coning_budget(
         Path, typer.Option(help="CSV of vibration lines: frequency_hz, angle_deg[, angle_across_deg, phase_deg].")
     ],
     rate: Annotated[list[float], typer.Option(help="Gyro samples a second, Hz; may be given several times.")],
-    algorithm: Annotated[list[str] | None, typer.Option(help="Algorithm; may be given several times.")] = None,
-    json: Annotated[
-        Path | None, typer.Option(help="Write the table as JSON too, to this file; - for standard output.")
-    ] = None,
-    tables: Tables = None,
+    algorithm: list[str] | None = typer.Option(None, help="Algorithm; may be given several times."),
+    json: Path | None = typer.Option(None, help="Write the table as JSON too, to this file; - for standard output."),
+    tables: Path | None = TABLES,
 ) -> None:
     """Predict the drift that an angular vibration spectrum leaves, for each algorithm and sample rate."""
     from strapdown import coning

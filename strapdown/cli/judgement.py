@@ -44,30 +44,23 @@ CONSISTENT, NOT, CANNOT_TELL = 0, 1, 2
 class _Foreign:
     """With a truth: an estimate of any filter."""
 
-    truth: Annotated[
-        Path | None,
-        typer.Option(
-            help="Reference attitudes, of any clock and frames: a simulated record, TUM, EuRoC, CSV, ROS bag. What differs is printed."
-        ),
-    ] = None
-    error_frame: Annotated[
-        str,
-        typer.Option(
-            help="How the covariance is meant, body, fixed or euler (roll, pitch, yaw); find takes what the errors fit."
-        ),
-    ] = "find"
-    align: Annotated[
-        str,
-        typer.Option(
-            help="What is estimated and removed: any of time,fixed,body (frames), or none; auto: a clock's offset, and rotations beyond 5°."
-        ),
-    ] = "auto"
-    aligned: Annotated[
-        Path | None,
-        typer.Option(help="HDF5 file for the estimate as it was judged, which `strapdown report` reads."),
-    ] = None
-    topic: Annotated[str | None, typer.Option(help="Topic of the estimate, where a bag holds several.")] = None
-    truth_topic: Annotated[str | None, typer.Option(help="Topic of the truth, where a bag holds several.")] = None
+    truth: Path | None = typer.Option(
+        None,
+        help="Reference attitudes, of any clock and frames: a simulated record, TUM, EuRoC, CSV, ROS bag. What differs is printed.",
+    )
+    error_frame: str = typer.Option(
+        "find",
+        help="How the covariance is meant, body, fixed or euler (roll, pitch, yaw); find takes what the errors fit.",
+    )
+    align: str = typer.Option(
+        "auto",
+        help="What is estimated and removed: any of time,fixed,body (frames), or none; auto: a clock's offset, and rotations beyond 5°.",
+    )
+    aligned: Path | None = typer.Option(
+        None, help="HDF5 file for the estimate as it was judged, which `strapdown report` reads."
+    )
+    topic: str | None = typer.Option(None, help="Topic of the estimate, where a bag holds several.")
+    truth_topic: str | None = typer.Option(None, help="Topic of the truth, where a bag holds several.")
 
 
 @command
@@ -80,20 +73,18 @@ def check(
         ),
     ],
     foreign: _Foreign,
-    probability: Annotated[
-        float, typer.Option(help="Probability that a right filter passes all tests together, at least.")
-    ] = 0.99,
-    record: Annotated[
-        Path | None, typer.Option(help="Record that an estimate was made from: with it, likely causes are named.")
-    ] = None,
-    filter_file: Annotated[
-        Path | None,
-        typer.Option(
-            "--filter",
-            help="TOML with the table named filter that the estimate was made with; by default that in the estimate.",
-        ),
-    ] = None,
-    json: Annotated[Path | None, typer.Option("--json", help="File for all statistics; - for standard output.")] = None,
+    probability: float = typer.Option(
+        0.99, help="Probability that a right filter passes all tests together, at least."
+    ),
+    record: Path | None = typer.Option(
+        None, help="Record that an estimate was made from: with it, likely causes are named."
+    ),
+    filter_file: Path | None = typer.Option(
+        None,
+        "--filter",
+        help="TOML with the table named filter that the estimate was made with; by default that in the estimate.",
+    ),
+    json: Path | None = typer.Option(None, "--json", help="File for all statistics; - for standard output."),
 ) -> None:
     """Judge whether a filter is consistent: exit status 0 consistent, 1 not, 2 cannot tell (or bad input).
 
@@ -339,9 +330,9 @@ def _not_of_the_search(chosen: FilterSetup, estimate: Estimate) -> str:
 def doctor(
     recording: Annotated[Path, typer.Argument(help=f"{RECORDING_HELP}.")],
     layout: Layout,
-    json: Annotated[
-        Path | None, typer.Option("--json", help="File for the explanations and their scores; - for standard output.")
-    ] = None,
+    json: Path | None = typer.Option(
+        None, "--json", help="File for the explanations and their scores; - for standard output."
+    ),
 ) -> None:
     """Find the conventions that a recording follows, by trying the others: exit status 0 as declared, 1 wrong, 2 cannot tell."""
     from strapdown import recordings

@@ -12,9 +12,9 @@ import typer
 from strapdown.checks import InputError, finite, non_negative
 from strapdown.cli.filters import filter_of_scenario
 from strapdown.cli.terminal import (
+    FORMAT,
+    TABLES,
     FigureFormat,
-    Format,
-    Tables,
     command,
     console,
     progress_bar,
@@ -62,28 +62,24 @@ def _in_own_units(biases: dict[str, float], sensors: Any) -> dict[str, float]:
 class _Errors:
     """Errors besides those that the filter models."""
 
-    scale_factor: Annotated[float, typer.Option(help="Consider gyro scale factors of this 1σ, ppm.")] = 0.0
-    misalignment: Annotated[float, typer.Option(help="Consider gyro misalignments of this 1σ, mrad.")] = 0.0
-    g_sensitivity: Annotated[float, typer.Option(help="Consider gyro g-sensitivities of this 1σ, °/h/g.")] = 0.0
-    sensor_bias: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="Consider a sensor's bias of this 1σ on each axis, NAME=VALUE: nT, m/s², or arcsec. Repeatable."
-        ),
-    ] = None
-    mounting: Annotated[
-        list[str] | None,
-        typer.Option(help="Consider a sensor turned on the body by this 1σ about each axis, NAME=ARCSEC. Repeatable."),
-    ] = None
-    time_offset: Annotated[
-        list[str] | None, typer.Option(help="Consider a sensor that measures late by this 1σ, NAME=MS. Repeatable.")
-    ] = None
-    attitude_sigma: Annotated[
-        float | None, typer.Option(help="Actual 1σ of the initial attitude, each axis, degrees; else the filter's.")
-    ] = None
-    bias_sigma: Annotated[
-        float | None, typer.Option(help="Actual 1σ of the initial bias, each axis, °/h; else the filter's.")
-    ] = None
+    scale_factor: float = typer.Option(0.0, help="Consider gyro scale factors of this 1σ, ppm.")
+    misalignment: float = typer.Option(0.0, help="Consider gyro misalignments of this 1σ, mrad.")
+    g_sensitivity: float = typer.Option(0.0, help="Consider gyro g-sensitivities of this 1σ, °/h/g.")
+    sensor_bias: list[str] | None = typer.Option(
+        None, help="Consider a sensor's bias of this 1σ on each axis, NAME=VALUE: nT, m/s², or arcsec. Repeatable."
+    )
+    mounting: list[str] | None = typer.Option(
+        None, help="Consider a sensor turned on the body by this 1σ about each axis, NAME=ARCSEC. Repeatable."
+    )
+    time_offset: list[str] | None = typer.Option(
+        None, help="Consider a sensor that measures late by this 1σ, NAME=MS. Repeatable."
+    )
+    attitude_sigma: float | None = typer.Option(
+        None, help="Actual 1σ of the initial attitude, each axis, degrees; else the filter's."
+    )
+    bias_sigma: float | None = typer.Option(
+        None, help="Actual 1σ of the initial bias, each axis, °/h; else the filter's."
+    )
 
     def check(self) -> None:
         """Refuse negative σ, in the unit that they were given in."""
@@ -109,17 +105,15 @@ class _Errors:
 def covariance(
     scenario: Annotated[str, typer.Argument(help="Name of a built-in scenario, or a TOML file.")],
     errors: _Errors,
-    filter_file: Annotated[
-        Path | None,
-        typer.Option(
-            "--filter",
-            help="TOML with a table named filter, as `strapdown tune` writes it; without it the filter that matches the scenario.",
-        ),
-    ] = None,
-    epochs: Annotated[int, typer.Option(help="Epochs over the scenario's time.")] = 100,
-    out: Annotated[Path, typer.Option(help="Folder for covariance.json and the figure.")] = Path("covariance-results"),
-    form: Format = FigureFormat.png,
-    tables: Tables = None,
+    filter_file: Path | None = typer.Option(
+        None,
+        "--filter",
+        help="TOML with a table named filter, as `strapdown tune` writes it; without it the filter that matches the scenario.",
+    ),
+    epochs: int = typer.Option(100, help="Epochs over the scenario's time."),
+    out: Path = typer.Option(Path("covariance-results"), help="Folder for covariance.json and the figure."),
+    form: FigureFormat = FORMAT,
+    tables: Path | None = TABLES,
 ) -> None:
     """Predict a filter's errors and their budget by source, in one pass without noise."""
     from strapdown import covariance as analysis

@@ -13,9 +13,9 @@ import typer
 from strapdown.checks import InputError, count, one_of, positive
 from strapdown.cli.reading import RECORDING_HELP, Samples
 from strapdown.cli.terminal import (
+    FORMAT,
+    TABLES,
     FigureFormat,
-    Format,
-    Tables,
     command,
     console,
     need_own,
@@ -52,17 +52,12 @@ def scenarios() -> None:
 @command
 def simulate(
     scenario: Annotated[str, typer.Argument(help="Name of a built-in scenario, or a TOML file.")],
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            help="HDF5 file, or CSV by its suffix; by default .h5 after the name, or the TOML file, of the scenario."
-        ),
-    ] = None,
-    seed: Annotated[int | None, typer.Option(help="Seed; the scenario's own if not given.")] = None,
-    run: Annotated[int, typer.Option(help="Number of the run of this seed.")] = 0,
-    show: Annotated[
-        bool, typer.Option(help="Print the scenario as TOML, to start a file of one's own, and stop.")
-    ] = False,
+    out: Path | None = typer.Option(
+        None, help="HDF5 file, or CSV by its suffix; by default .h5 after the name, or the TOML file, of the scenario."
+    ),
+    seed: int | None = typer.Option(None, help="Seed; the scenario's own if not given."),
+    run: int = typer.Option(0, help="Number of the run of this seed."),
+    show: bool = typer.Option(False, help="Print the scenario as TOML, to start a file of one's own, and stop."),
 ) -> None:
     """Simulate a scenario: a record with its truth."""
     from strapdown import scenarios as catalogue
@@ -108,33 +103,28 @@ def simulate(
 class _Identification:
     """Identification."""
 
-    rate: Annotated[float | None, typer.Option(help="Samples a second, Hz; for NPY.")] = None
-    highest_frequency: Annotated[
-        float | None,
-        typer.Option(help="Hz; the fit leaves out what lies above: a low-pass filter's shape, vibration."),
-    ] = None
-    robust: Annotated[
-        bool, typer.Option(help="Deviation by medians, which outliers hardly change; the fit is not affected.")
-    ] = False
-    temperature: Annotated[
-        int | None,
-        typer.Option(
-            metavar="ORDER",
-            help="Regress the bias on the recorded temperature, by a polynomial of this order, and identify the noise of what is left.",
-        ),
-    ] = None
+    rate: float | None = typer.Option(None, help="Samples a second, Hz; for NPY.")
+    highest_frequency: float | None = typer.Option(
+        None, help="Hz; the fit leaves out what lies above: a low-pass filter's shape, vibration."
+    )
+    robust: bool = typer.Option(
+        False, help="Deviation by medians, which outliers hardly change; the fit is not affected."
+    )
+    temperature: int | None = typer.Option(
+        None,
+        metavar="ORDER",
+        help="Regress the bias on the recorded temperature, by a polynomial of this order, and identify the noise of what is left.",
+    )
 
 
 @dataclass(frozen=True, eq=False)
 class _Exports:
     """Files for other programs."""
 
-    kalibr: Annotated[bool, typer.Option("--kalibr", help="Write imu.yaml too; needs gyro and accelerometer.")] = False
-    factor: Annotated[float, typer.Option(help="Factor on the noise in imu.yaml; 5 to 10 are usual.")] = 1.0
-    px4: Annotated[bool, typer.Option("--px4", help="Write px4.params of EKF2 too; needs gyro and accelerometer.")] = (
-        False
-    )
-    matlab: Annotated[bool, typer.Option("--matlab", help="Write imu_sensor.m, for imuSensor, too.")] = False
+    kalibr: bool = typer.Option(False, "--kalibr", help="Write imu.yaml too; needs gyro and accelerometer.")
+    factor: float = typer.Option(1.0, help="Factor on the noise in imu.yaml; 5 to 10 are usual.")
+    px4: bool = typer.Option(False, "--px4", help="Write px4.params of EKF2 too; needs gyro and accelerometer.")
+    matlab: bool = typer.Option(False, "--matlab", help="Write imu_sensor.m, for imuSensor, too.")
 
     @property
     def files(self) -> list[str]:
@@ -170,9 +160,9 @@ class _Exports:
 class _Output:
     """Output."""
 
-    out: Annotated[Path, typer.Option(help="Folder for gyro.toml, allan.json and the figure.")] = Path("allan-results")
-    form: Format = FigureFormat.png
-    tables: Tables = None
+    out: Path = typer.Option(Path("allan-results"), help="Folder for gyro.toml, allan.json and the figure.")
+    form: FigureFormat = FORMAT
+    tables: Path | None = TABLES
 
 
 @command
@@ -185,10 +175,9 @@ def allan(
     options: _Identification,
     exports: _Exports,
     output: _Output,
-    sensor: Annotated[
-        list[str] | None,
-        typer.Option(help="gyro (if not given), accelerometer or magnetometer; may be repeated."),
-    ] = None,
+    sensor: list[str] | None = typer.Option(
+        None, help="gyro (if not given), accelerometer or magnetometer; may be repeated."
+    ),
 ) -> None:
     """Identify a sensor's noise from a recording at rest: Allan deviation, fitted coefficients, specification as TOML."""
     from strapdown.allan import parameters as noise_parameters

@@ -10,7 +10,7 @@ import inspect
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+from typing import TYPE_CHECKING, Any, get_type_hints
 
 import typer
 from rich import box
@@ -86,26 +86,25 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
 
 
 def _options(group: Any) -> list[inspect.Parameter]:
-    """Return the fields of a group as parameters; the first line of its docstring is their heading in --help."""
-    hints = get_type_hints(group, include_extras=True)
+    """Return the fields of a group as parameters, their options the defaults; the first line of its docstring is the heading in --help."""
+    hints = get_type_hints(group)
     found = []
     for field in dataclasses.fields(group):
-        option = copy.copy(hints[field.name].__metadata__[0])
+        option: Any = copy.copy(field.default)
         option.rich_help_panel = group.__doc__.partition("\n")[0].rstrip(".")
-        annotation: Any = Annotated[hints[field.name].__origin__, option]
         kind = inspect.Parameter.KEYWORD_ONLY
-        found.append(inspect.Parameter(field.name, kind, default=field.default, annotation=annotation))
+        found.append(inspect.Parameter(field.name, kind, default=option, annotation=hints[field.name]))
     return found
 
 
 def given(group: Any) -> list[str]:
     """Return the options of a group that were given, as on the command line."""
-    hints = get_type_hints(type(group), include_extras=True)
     flags = []
     for field in dataclasses.fields(group):
-        if getattr(group, field.name) not in (field.default, []):
-            flag = hints[field.name].__metadata__[0].default
-            flags.append(flag.partition("/")[0] if isinstance(flag, str) else "--" + field.name.replace("_", "-"))
+        option: Any = field.default
+        if getattr(group, field.name) not in (option.default, []):
+            flag = option.param_decls[0] if option.param_decls else "--" + field.name.replace("_", "-")
+            flags.append(flag.partition("/")[0])
     return flags
 
 
@@ -117,13 +116,11 @@ class FigureFormat(enum.StrEnum):
     svg = "svg"
 
 
-FORMAT: Any = typer.Option("--format", help="Format of the figures.")
-Format = Annotated[FigureFormat, FORMAT]
+FORMAT: Any = typer.Option(FigureFormat.png, "--format", help="Format of the figures.")
 """Option of every command that draws."""
-Tables = Annotated[
-    Path | None,
-    typer.Option("--tables", help="Folder to write the tables to as well, as CSV with every digit and as LaTeX."),
-]
+TABLES: Any = typer.Option(
+    None, "--tables", help="Folder to write the tables to as well, as CSV with every digit and as LaTeX."
+)
 """Option of every command that prints the tables of a study."""
 
 

@@ -14,9 +14,9 @@ import typer
 from strapdown.checks import InputError, count, one_of
 from strapdown.cli.reading import Layout
 from strapdown.cli.terminal import (
+    FORMAT,
+    TABLES,
     FigureFormat,
-    Format,
-    Tables,
     command,
     console,
     doubt,
@@ -55,30 +55,24 @@ WORSE = 1.05
 class _Filter:
     """Filter to start from."""
 
-    free: Annotated[
-        str | None,
-        typer.Option(
-            help="Parameters to tune, with commas: gyro.arw, gyro.rrw, SENSOR.sigma, initial.attitude, initial.bias, "
-            "gate.probability (as --gate); SENSOR.sigma.x, .y, .z (about one body axis); or filter.scale alone. If not given the "
-            "gyro's two and every sensor's; of a recording without --truth or --rmse filter.scale, and no other."
-        ),
-    ] = None
-    filter_file: Annotated[
-        Path | None,
-        typer.Option("--filter", help="TOML with a table named filter; by default one that matches the records."),
-    ] = None
-    states: Annotated[
-        bool,
-        typer.Option(
-            "--states",
-            help="Give the filter the optional states that the record's specified errors call for; --free may name their sizes too, such "
-            "as gyro.scale_sigma, SENSOR.correlated_sigma, SENSOR.correlation_time.",
-        ),
-    ] = False
-    prior: Annotated[
-        str | None,
-        typer.Option(help="Weak prior of the gyro's noise: TOML of `strapdown allan`, or the name of a preset."),
-    ] = None
+    free: str | None = typer.Option(
+        None,
+        help="Parameters to tune, with commas: gyro.arw, gyro.rrw, SENSOR.sigma, initial.attitude, initial.bias, "
+        "gate.probability (as --gate); SENSOR.sigma.x, .y, .z (about one body axis); or filter.scale alone. If not given the "
+        "gyro's two and every sensor's; of a recording without --truth or --rmse filter.scale, and no other.",
+    )
+    filter_file: Path | None = typer.Option(
+        None, "--filter", help="TOML with a table named filter; by default one that matches the records."
+    )
+    states: bool = typer.Option(
+        False,
+        "--states",
+        help="Give the filter the optional states that the record's specified errors call for; --free may name their sizes too, such "
+        "as gyro.scale_sigma, SENSOR.correlated_sigma, SENSOR.correlation_time.",
+    )
+    prior: str | None = typer.Option(
+        None, help="Weak prior of the gyro's noise: TOML of `strapdown allan`, or the name of a preset."
+    )
 
     @property
     def names(self) -> list[str] | None:
@@ -126,32 +120,22 @@ class _Filter:
 class _Objective:
     """Objective, by default the likelihood of all innovations."""
 
-    truth: Annotated[bool, typer.Option("--truth", help="Tune by the errors against the truth and their σ.")] = False
-    rmse: Annotated[
-        bool,
-        typer.Option(
-            "--rmse", help="Tune by the RMS attitude error against the truth; then all σ alike by innovations."
-        ),
-    ] = False
-    gate: Annotated[
-        bool,
-        typer.Option(
-            "--gate",
-            help="Model outliers too, their share and scale, and set the filter's gate where an outlier is the likelier explanation.",
-        ),
-    ] = False
-    spacing: Annotated[
-        float,
-        typer.Option(
-            help="Use a sensor's samples this many seconds apart, with the weight of all: for disturbances that last."
-        ),
-    ] = 0.0
-    holdout: Annotated[
-        float | None, typer.Option(help="Share of the data held out, to judge the filter before and after on.")
-    ] = None
-    holdout_by: Annotated[str, typer.Option(help="Hold out the end of each record (time), or whole ones (record).")] = (
-        "time"
+    truth: bool = typer.Option(False, "--truth", help="Tune by the errors against the truth and their σ.")
+    rmse: bool = typer.Option(
+        False, "--rmse", help="Tune by the RMS attitude error against the truth; then all σ alike by innovations."
     )
+    gate: bool = typer.Option(
+        False,
+        "--gate",
+        help="Model outliers too, their share and scale, and set the filter's gate where an outlier is the likelier explanation.",
+    )
+    spacing: float = typer.Option(
+        0.0, help="Use a sensor's samples this many seconds apart, with the weight of all: for disturbances that last."
+    )
+    holdout: float | None = typer.Option(
+        None, help="Share of the data held out, to judge the filter before and after on."
+    )
+    holdout_by: str = typer.Option("time", help="Hold out the end of each record (time), or whole ones (record).")
 
     @property
     def name(self) -> str:
@@ -172,33 +156,31 @@ class _Objective:
 class _Search:
     """Search."""
 
-    starts: Annotated[int, typer.Option(help="Searches: one from the filter, the others from random starts.")] = 4
-    factor: Annotated[float, typer.Option(help="Random starts are off by up to this factor, either way.")] = 30.0
-    seed: Annotated[int, typer.Option(help="Of the random starts.")] = 0
-    threads: Annotated[int | None, typer.Option(help="Threads; one a core if not given.")] = None
+    starts: int = typer.Option(4, help="Searches: one from the filter, the others from random starts.")
+    factor: float = typer.Option(30.0, help="Random starts are off by up to this factor, either way.")
+    seed: int = typer.Option(0, help="Of the random starts.")
+    threads: int | None = typer.Option(None, help="Threads; one a core if not given.")
 
 
 @dataclass(frozen=True)
 class _Planning:
     """Plan, before there are records."""
 
-    plan: Annotated[bool, typer.Option("--plan", help="Predict how well records will determine each parameter.")] = (
-        False
+    plan: bool = typer.Option(False, "--plan", help="Predict how well records will determine each parameter.")
+    length: str | None = typer.Option(
+        None, help="Lengths of a record, s, with commas; that of the scenario if not given."
     )
-    length: Annotated[
-        str | None, typer.Option(help="Lengths of a record, s, with commas; that of the scenario if not given.")
-    ] = None
 
 
 @dataclass(frozen=True)
 class _Output:
     """Output."""
 
-    out: Annotated[
-        Path, typer.Option("--out", "-o", help="TOML for --filter of other commands; JSON and figures go beside it.")
-    ] = Path("filter.toml")
-    form: Format = FigureFormat.png
-    tables: Tables = None
+    out: Path = typer.Option(
+        Path("filter.toml"), "--out", "-o", help="TOML for --filter of other commands; JSON and figures go beside it."
+    )
+    form: FigureFormat = FORMAT
+    tables: Path | None = TABLES
 
 
 class _Found(NamedTuple):
