@@ -303,7 +303,7 @@ def estimate(
         Record: initial state (:func:`initial_state`) at the first edge. Default: from the first measurements.
     states : bool or sequence of str, optional
         Record: with an error state for each error that the scenario specifies (scale factor, misalignment, hard iron, …), or for those
-        named alone; False: without any. Default: with them where there are such errors (smoother: without drifts).
+        named alone; False: without any. Default: with them where there are such errors.
     gate : Gate or float, optional
         Refuse measurements beyond this quantile of χ² (0.999), and recover from a lost attitude.
     robust : Robust or {"huber", "student"}, optional
@@ -360,7 +360,7 @@ def estimate(
         return found.estimate
     instance("source", source, ImuRecord, SOURCE)
     _refuse("a recording", motion=motion, latency=latency, calibration=calibration)
-    chosen = _record_setup(source, noise, setup, initial, states, smooth=smooth)
+    chosen = _record_setup(source, noise, setup, initial, states)
     changed = {name: value for name, value in (("gate", gate), ("robust", robust)) if value is not None}
     chosen = dataclasses.replace(chosen, **changed)  # type: ignore[arg-type]
     start = None if initial is None else for_record.Start(initial, "Started from the state given.")
@@ -434,8 +434,6 @@ def _record_setup(
     setup: FilterSetup | None,
     initial: State | None,
     states: bool | Sequence[str] | None,
-    *,
-    smooth: bool,
 ) -> FilterSetup:
     if setup is not None:
         instance("setup", setup, FilterSetup, "give a FilterSetup, as setup.matched or tune returns it")
@@ -443,7 +441,7 @@ def _record_setup(
         return setup
     if not isinstance(noise, ProcessNoise):
         spec = None if noise is None else _specification(noise)
-        return for_record.matched_setup(record, spec, states=states, smooth=smooth)
+        return for_record.matched_setup(record, spec, states=states)
     if initial is None:
         raise InputError(
             "noise is a ProcessNoise, which says nothing of the initial gyro bias; give initial= too, or a GyroSpec as noise"

@@ -266,9 +266,7 @@ def _estimate_specified(path: Path, shared: _Shared, options: _Specified, output
     if shared.gyro is not None and options.filter_file is not None:
         raise InputError("--gyro and --filter both give the filter's gyro noise; give one of them")
     held = read_record_file(path)
-    chosen, remarks = filter_for(
-        path, held, shared.gyro, options.filter_file, options.chosen_states, smooth=shared.smooth
-    )
+    chosen, remarks = filter_for(path, held, shared.gyro, options.filter_file, options.chosen_states)
     chosen = replace(chosen, **shared.robustness)
     with reading.from_file(path):
         record = held.with_origin(str(path))

@@ -29,8 +29,6 @@ def filter_for(
     gyro: Path | None,
     filter_file: Path | None,
     states: ChosenStates,
-    *,
-    smooth: bool = False,
 ) -> tuple[FilterSetup, list[str]]:
     """Return the filter, and what to say of it: of a file, or matched to the gyro's specification and the record's sensors."""
     from strapdown import setup
@@ -50,7 +48,7 @@ def filter_for(
     spec = None if gyro is None else read_spec(gyro)
     if spec is None and held.gyro is None:
         raise InputError(f"{path} does not hold the gyro's specification; give --gyro or --filter, a TOML file")
-    chosen = matched_setup(record, spec, states=True if states == () else states, smooth=smooth)
+    chosen = matched_setup(record, spec, states=True if states == () else states)
     missing = unmodelled_errors(record, chosen)
     if states is False or (states is None and chosen.states is None):
         return chosen, no_state_words(missing, chosen)

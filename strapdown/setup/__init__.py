@@ -16,7 +16,6 @@ import numpy as np
 from strapdown import coning, estimation, gyro, quaternion, units, vectors
 from strapdown.checks import Array, InputError, known_keys, one_of, positive
 from strapdown.estimation import Observability, filters
-from strapdown.estimation.error_states import ErrorStates
 from strapdown.estimation.filters.own import Own, OwnFilter, as_own
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.states import ProcessNoise, State
@@ -516,27 +515,23 @@ def smooth(record: ImuRecord, setup: FilterSetup, initial: State, **options: Any
     Raises
     ------
     InputError
-        If the forward pass would need more memory than :data:`MAX_MEMORY`, or a gyro drift is among the states.
+        If it would need more memory than :data:`MAX_MEMORY`.
     """
     need_mekf(setup, "the smoother")
     chosen = {"gate": setup.gate, "robust": setup.robust, **options}
     modelled = modelled_record(record, setup)
-    blocks: tuple[ErrorStates, ...] = ()
-    if setup.states is not None:
-        if setup.states.gyro_drift_sigma:
-            raise InputError(
-                "the smoother does not estimate a gyro drift as part of the whole bias; leave gyro.drift out, or do not smooth"
-            )
-        blocks = setup.states.blocks({series.sensor: series.kind for series in modelled.vectors})
-    n = 6 + sum(block.size for block in blocks)
+    states = setup.states or States()
+    n = 6 + sum(one.size for one in states.blocks({series.sensor: series.kind for series in modelled.vectors}))
     segments = len(modelled.increments) + sum(len(series.time) for series in modelled.vectors)
     need = 8 * (n * (n + 1) // 2 + n + 5) * segments
+    if states.gyro_drift_sigma:
+        need += 8 * n * n * len(modelled.time)
     if need > MAX_MEMORY:
         raise InputError(
             f"smoothing {len(modelled.increments)} samples with {n} states takes {need / 1e9:.3g} GB, more than {MAX_MEMORY / 1e9:g}; "
             "cut the record, or do not smooth"
         )
-    return estimation.smooth(modelled, setup.process_noise, initial, blocks, **chosen)
+    return optional.smooth(modelled, setup.process_noise, initial, states, **chosen)
 
 
 def observability(record: ImuRecord, setup: FilterSetup, initial: State) -> Observability:
@@ -546,7 +541,8 @@ def observability(record: ImuRecord, setup: FilterSetup, initial: State) -> Obse
     if setup.states is None:
         return estimation.observability(modelled, setup.process_noise, initial)
     blocks = setup.states.blocks({series.sensor: series.kind for series in modelled.vectors})
-    return estimation.observability(modelled, setup.process_noise, optional.initial_state(initial, blocks), blocks)
+    start = optional.initial_state(initial, blocks, setup.states.gyro_fast_bias_sigma)
+    return estimation.observability(modelled, setup.process_noise, start, blocks)
 
 
 def initial_state(
