@@ -15,13 +15,14 @@ Gates, robust updates and everything else that depends on the data are not part 
 from __future__ import annotations
 
 import dataclasses
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from strapdown import coning, gyro, kinematics, quaternion, vectors
+from strapdown import coning, gyro, kinematics, quaternion, scenarios, vectors
 from strapdown.checks import Array, InputError, count, known_keys, non_negative
 from strapdown.estimation.states import covariance_matrices
 from strapdown.gyro import GyroSpec, flicker
@@ -694,7 +695,7 @@ def _considered_columns(scenario: Scenario, consider: Consider, path: _Path) -> 
 
 
 def analyse(
-    scenario: Scenario,
+    scenario: Scenario | str | os.PathLike[str],
     setup: FilterSetup | None = None,
     *,
     consider: Consider | None = None,
@@ -706,8 +707,8 @@ def analyse(
 
     Parameters
     ----------
-    scenario : Scenario
-        Motion, gyro, sensors and duration.
+    scenario : Scenario, str or path
+        As of :func:`strapdown.scenarios.simulate`.
     setup : FilterSetup, optional
         The filter. Default: matched to the scenario (:func:`strapdown.setup.matched`).
     consider : Consider, optional
@@ -734,10 +735,11 @@ def analyse(
 
     Examples
     --------
-    >>> from strapdown import covariance, scenarios
-    >>> found = covariance.analyse(scenarios.load_scenario("two-stars"))  # doctest: +SKIP
+    >>> import strapdown as sd
+    >>> found = sd.covariance_analysis("two-stars")  # doctest: +SKIP
     >>> print(found)  # doctest: +SKIP
     """
+    scenario = scenarios.chosen(scenario)
     setup = matched(scenario) if setup is None else setup
     consider = Consider() if consider is None else consider
     _check_considered(scenario, consider)

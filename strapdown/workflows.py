@@ -23,7 +23,6 @@ from strapdown import (
     allan,
     coning,
     consistency,
-    covariance,
     gyro,
     quaternion,
     recordings,
@@ -34,14 +33,14 @@ from strapdown import (
 from strapdown import setup as setups
 from strapdown.checks import Array, InputError, count, instance
 from strapdown.consistency import Judgement
-from strapdown.covariance import Analysis, Consider
+from strapdown.covariance import analyse as covariance_analysis
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.states import ProcessNoise, State
 from strapdown.files import written_beside
 from strapdown.gyro import GyroSpec
 from strapdown.recordings import Recording, recordfiles
 from strapdown.records import Estimate, ImuRecord, Origin, Truth
-from strapdown.scenarios import Scenario
+from strapdown.scenarios import Scenario, simulate
 from strapdown.setup import FilterSetup, for_record
 
 if TYPE_CHECKING:
@@ -76,41 +75,7 @@ SAME_STAMP = 1e-9
 """Largest difference of two stamps of one epoch, s."""
 
 
-# --------------------------------------------------------------------------------------------------------- simulate, read, write
-
-
-def simulate(scenario: Scenario | str | os.PathLike[str], *, seed: int | None = None, run: int = 0) -> ImuRecord:
-    """Simulate a scenario: gyro increments and vector measurements, with the true attitude and gyro bias.
-
-    Parameters
-    ----------
-    scenario : Scenario, str or path
-        A scenario, the name of a built-in one (``strapdown.scenarios.SCENARIOS``), or the path of its TOML file.
-    seed : int, optional
-        Of the random numbers; default the scenario's own.
-    run : int, default 0
-        Number of the run; runs of one seed are independent.
-
-    Returns
-    -------
-    ImuRecord
-        Its ``truth`` is known, and its ``origin`` is the scenario, which :func:`estimate` matches its filter to.
-
-    Examples
-    --------
-    >>> import strapdown as sd
-    >>> record = sd.simulate("two-stars", seed=1)
-    >>> len(record.increments), [one.sensor for one in record.vectors]
-    (30000, ['star 1', 'star 2'])
-    """
-    return scenarios.simulate(_scenario(scenario), seed, run)
-
-
-def _scenario(given: Scenario | str | os.PathLike[str]) -> Scenario:
-    instance(
-        "scenario", given, (Scenario, str, os.PathLike), "give a Scenario, a built-in name, or the path of a TOML file"
-    )
-    return given if isinstance(given, Scenario) else scenarios.load_scenario(given)
+# ------------------------------------------------------------------------------------------------------------------ read, write
 
 
 def read(path: Any, **options: Any) -> ImuRecord | Recording | Estimate | Campaign:
@@ -651,41 +616,8 @@ def monte_carlo(
     """
     from strapdown import montecarlo
 
-    chosen = plan(_scenario(scenario), setup=setup, seed=seed, states=states, dispersions=dispersions)
+    chosen = plan(scenarios.chosen(scenario), setup=setup, seed=seed, states=states, dispersions=dispersions)
     return montecarlo.run_plan(chosen, runs=runs, threads=threads, progress=progress)
-
-
-def covariance_analysis(
-    scenario: Scenario | str | os.PathLike[str],
-    setup: FilterSetup | None = None,
-    *,
-    consider: Consider | None = None,
-    epochs: int = 100,
-) -> Analysis:
-    """Predict the errors of a filter on a scenario without noise samples: σ and error budget by source.
-
-    Parameters
-    ----------
-    scenario : Scenario, str or path
-        As of :func:`simulate`.
-    setup : FilterSetup, optional
-        The filter; default: matched to the scenario.
-    consider : Consider, optional
-        Errors besides those of the scenario.
-    epochs : int, default 100
-        Intervals between the epochs of the result.
-
-    Returns
-    -------
-    Analysis
-        σ of attitude (rad, body axes) and bias (rad/s) over time, actual and by the filter's own covariance, and the error budget.
-
-    Examples
-    --------
-    >>> import strapdown as sd
-    >>> budget = sd.covariance_analysis("two-stars")  # doctest: +SKIP
-    """
-    return covariance.analyse(_scenario(scenario), setup, consider=consider, epochs=epochs)
 
 
 # ----------------------------------------------------------------------------------------------------------------------- tune

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from strapdown import gyro, motion, vectors
-from strapdown.checks import Array, InputError, array, count, finite, known_keys, one_of, positive
+from strapdown.checks import Array, InputError, array, count, finite, instance, known_keys, one_of, positive
 from strapdown.files import reading, tables
 from strapdown.files.tables import Form
 from strapdown.gyro import GyroSpec
@@ -175,7 +175,15 @@ class Scenario:
         return np.arange(round(self.duration * self.rate) + 1) / self.rate
 
 
-def simulate(scenario: Scenario, seed: int | None = None, run: int = 0) -> ImuRecord:
+def chosen(given: Scenario | str | os.PathLike[str]) -> Scenario:
+    """Return a scenario, given itself, by a built-in name, or by the path of its TOML file."""
+    instance(
+        "scenario", given, (Scenario, str, os.PathLike), "give a Scenario, a built-in name, or the path of a TOML file"
+    )
+    return given if isinstance(given, Scenario) else load_scenario(given)
+
+
+def simulate(scenario: Scenario | str | os.PathLike[str], seed: int | None = None, run: int = 0) -> ImuRecord:
     """Simulate one run of a scenario: gyro increments, vector measurements and the truth.
 
     Each sensor draws from a random stream of its own (seed, run, name), so adding one changes nothing of the others. With sampling jitter
@@ -184,25 +192,26 @@ def simulate(scenario: Scenario, seed: int | None = None, run: int = 0) -> ImuRe
 
     Parameters
     ----------
-    scenario : Scenario
-        Motion, gyro and sensors.
+    scenario : Scenario, str or path
+        A scenario, the name of a built-in one (:data:`SCENARIOS`), or the path of its TOML file.
     seed : int, optional
-        Default: the scenario's own.
+        Of the random numbers; default the scenario's own.
     run : int, default 0
-        Runs of one seed are independent.
+        Number of the run; runs of one seed are independent.
 
     Returns
     -------
     ImuRecord
-        With ``truth`` and ``origin``.
+        Its ``truth`` is known, and its ``origin`` is the scenario, which :func:`strapdown.estimate` matches its filter to.
 
     Examples
     --------
-    >>> from strapdown import scenarios
-    >>> record = scenarios.simulate(scenarios.load_scenario("two-stars"))
-    >>> record.increments.shape, record.truth.attitude.shape
-    ((30000, 3), (30001, 4))
+    >>> import strapdown as sd
+    >>> record = sd.simulate("two-stars", seed=1)
+    >>> record.truth.attitude.shape, [one.sensor for one in record.vectors]
+    ((30001, 4), ['star 1', 'star 2'])
     """
+    scenario = chosen(scenario)
     seed = scenario.seed if seed is None else seed
     spec, nominal = scenario.gyro, scenario.edges
     edges, stamps = gyro.sampling(spec, nominal, generator(seed, run, "gyro sampling"))
