@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -28,7 +27,7 @@ from strapdown.cli.terminal import (
     writable,
     written,
 )
-from strapdown.files import usable_folder, write_json, written_beside
+from strapdown.files import plain, usable_folder, write_json, written_beside
 
 if TYPE_CHECKING:
     from strapdown import allan as identification
@@ -350,22 +349,19 @@ def _write_numbers(
     sensor: str,
 ) -> None:
     """Write coefficients and deviation as JSON, which has no word for NaN."""
-    number = lambda value: None if isinstance(value, float) and not math.isfinite(value) else value  # noqa: E731
     unit = {"gyro": "rad_per_s", "accelerometer": "m_per_s2", "magnetometer": "t"}[sensor]
-    write_json(
-        path,
-        {
-            "source": source,
-            "sample_interval_s": fit.sample_interval,
-            "level": fit.level,
-            "coefficients": [{key: number(value) for key, value in row.items()} for row in rows],
-            "misfit_probability": [float(p) for p in fit.misfit_probability],
-            "misfit": list(fit.misfit),
-            "estimator": deviation.estimator,
-            "tau_s": [float(tau) for tau in deviation.taus],
-            f"deviation_{unit}": [[number(float(x)) for x in axis] for axis in deviation.deviation],
-        },
-    )
+    table = {
+        "source": source,
+        "sample_interval_s": fit.sample_interval,
+        "level": fit.level,
+        "coefficients": rows,
+        "misfit_probability": fit.misfit_probability,
+        "misfit": fit.misfit,
+        "estimator": deviation.estimator,
+        "tau_s": deviation.taus,
+        f"deviation_{unit}": deviation.deviation,
+    }
+    write_json(path, plain(table))
 
 
 _LARGEST_RATE = 1e12

@@ -29,7 +29,7 @@ from strapdown.cli.terminal import (
     writable,
     written,
 )
-from strapdown.files import write_json, written_beside
+from strapdown.files import plain, write_json, written_beside
 from strapdown.units import DEGREE
 
 if TYPE_CHECKING:
@@ -508,13 +508,12 @@ def _write(found: _Found, records: Sequence[ImuRecord], paths: Sequence[Path], o
 
 
 def _report(found: _Found, units: Sequence[Unit], paths: Sequence[Path], of: str) -> dict[str, Any]:
-    number = lambda value: None if isinstance(value, float) and not math.isfinite(value) else value  # noqa: E731
     result, gate, comparison = found.result, found.gate, found.comparison
     content: dict[str, Any] = {
         "records": [path.name for path in paths],
         "parameters": [
             {
-                **{key: number(value) for key, value in vars(one).items()},
+                **vars(one),
                 "note": _note(one, unit),
                 "unit": unit.name,
                 "si_per_unit": unit.factor,
@@ -529,9 +528,9 @@ def _report(found: _Found, units: Sequence[Unit], paths: Sequence[Path], of: str
     }
     if gate is not None:
         content["gate"] = {
-            "probability": number(gate.probability),
-            "lower": number(gate.lower),
-            "upper": number(gate.upper),
+            "probability": gate.probability,
+            "lower": gate.lower,
+            "upper": gate.upper,
             "thresholds": gate.thresholds,
         }
     if comparison is not None:
@@ -539,15 +538,15 @@ def _report(found: _Found, units: Sequence[Unit], paths: Sequence[Path], of: str
             name: {
                 "log_likelihood_per_innovation": one.log_likelihood,
                 "nis_per_degree": one.nis,
-                "nis_bounds": list(one.nis_bounds),
-                "anees_per_state": number(one.anees),
-                "attitude_rms_rad": number(one.attitude_rms),
-                "nees_per_state": {course.of: number(float(np.nanmean(course.mean))) for course in one.nees},
+                "nis_bounds": one.nis_bounds,
+                "anees_per_state": one.anees,
+                "attitude_rms_rad": one.attitude_rms,
+                "nees_per_state": {course.of: np.nanmean(course.mean) for course in one.nees},
                 "judgements": [judgement.summary() for judgement in one.judgements],
             }
             for name, one in (("before", comparison.before), ("after", comparison.after))
         }
-    return content
+    return plain(content)  # type: ignore[no-any-return]
 
 
 def _plan(

@@ -28,6 +28,7 @@ from strapdown.consistency.whiteness import (
     ljung_box,
     mean_innovation_p_value,
 )
+from strapdown.files import plain
 from strapdown.records import Estimate, Truth
 from strapdown.results import Listed, Listing, figure
 
@@ -214,22 +215,16 @@ class Judgement(Listed):
         dict
             Verdict, reason, probability, findings, limits, power and unmodelled errors by these names.
         """
-        plain = lambda x: None if isinstance(x, float) and not math.isfinite(x) else x  # noqa: E731
-        return {
+        table = {
             "verdict": self.verdict,
             "reason": self.reason,
             "probability": self.probability,
-            "findings": [
-                {
-                    **{name: plain(value) for name, value in vars(one).items()},
-                    "means": one.means if one.rejected else "",
-                }
-                for one in self.findings
-            ],
-            "limits": list(self.limits),
-            "power": [{"of": one.of, "factor": plain(one.factor)} for one in self.power],
-            "unmodelled": list(self.unmodelled),
+            "findings": [{**vars(one), "means": one.means if one.rejected else ""} for one in self.findings],
+            "limits": self.limits,
+            "power": [{"of": one.of, "factor": one.factor} for one in self.power],
+            "unmodelled": self.unmodelled,
         }
+        return plain(table)  # type: ignore[no-any-return]
 
 
 def judge(

@@ -8,6 +8,7 @@ from typing import Any
 
 from strapdown.checks import Array
 from strapdown.consistency import Finding, Judgement
+from strapdown.files import plain
 from strapdown.results import Listed, Listing, figure
 
 LIKELIER = math.log(20.0)
@@ -125,24 +126,9 @@ class Diagnosis(Listed):
             All hypotheses with their figures and whether they are significant, the probability, and the verdict as of
             :meth:`strapdown.consistency.Judgement.summary`.
         """
-        number = lambda x: float(x) if math.isfinite(x) else None  # noqa: E731
-
-        def row(cause: Cause) -> dict[str, Any]:
-            return {
-                "name": cause.name,
-                "of": cause.of,
-                "estimate": [number(x) for x in cause.estimate],
-                "standard_error": [number(x) for x in cause.standard_error],
-                "unit": cause.unit,
-                "gain": number(cause.gain),
-                "log_p": number(cause.log_p),
-                "words": cause.words,
-                "significant": cause in self.causes,
-                "alternative": cause in self.alternatives,
-            }
-
-        return {
-            "probability": self.probability,
-            "causes": [row(cause) for cause in self.considered],
-            "judgement": self.judgement.summary(),
-        }
+        causes = [
+            {**vars(one), "significant": one in self.causes, "alternative": one in self.alternatives}
+            for one in self.considered
+        ]
+        table = {"probability": self.probability, "causes": causes, "judgement": self.judgement.summary()}
+        return plain(table)  # type: ignore[no-any-return]

@@ -7,6 +7,7 @@ import datetime
 import hashlib
 import io
 import json
+import math
 import os
 import platform
 import tempfile
@@ -145,6 +146,17 @@ def output_file(
         if target.exists() and Path(source).exists() and target.samefile(source):
             raise InputError(f"{name} is {target}, the very file that is read; choose another name")
     usable_folder(name, target.parent)
+
+
+def plain(value: Any) -> Any:
+    """Return a value as JSON holds it: arrays as lists, numbers that are not finite as null."""
+    if isinstance(value, (np.ndarray, np.generic)):
+        value = value.tolist()
+    if isinstance(value, Mapping):
+        return {key: plain(one) for key, one in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(one) for one in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def json_text(content: Any) -> str:

@@ -27,6 +27,7 @@ from strapdown.diagnosis import Cause
 from strapdown.diagnosis.likelihood import Model, log_p, run
 from strapdown.diagnosis.turning import PLAUSIBLE, turns
 from strapdown.estimation.states import ProcessNoise
+from strapdown.files import plain
 from strapdown.records import Estimate, ImuRecord, cut
 from strapdown.setup import FilterSetup
 from strapdown.tuning.fitting import Tuning
@@ -122,12 +123,7 @@ class Unmodelled:
             "suspected": self.suspected,
             "words": list(self.words),
             "moves_with_the_rate": self.moves_with_the_rate,
-            "scale_factor": {
-                "value": [float(x) for x in self.scale_factor.value],
-                "standard_error": [float(x) for x in self.scale_factor.standard_error],
-                "gain": self.scale_factor.gain,
-                "p_value": self.scale_factor.p_value,
-            },
+            "scale_factor": plain(vars(self.scale_factor)),
             "causes": [cause.words for cause in self.causes],
             "judgement": self.judgement.summary(),
         }
