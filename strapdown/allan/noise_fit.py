@@ -19,7 +19,7 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -43,15 +43,42 @@ from strapdown.results import Listed, Listing, figure
 
 SYMBOLS = dict(zip(TERMS, "QNBKR", strict=True))
 
-
-UNITS = {
-    "quantization": ("arcsec", units.ARCSECOND),
-    "angle_random_walk": ("°/√h", units.DEGREE_PER_ROOT_HOUR),
-    "bias_instability": ("°/h", units.DEGREE_PER_HOUR),
-    "rate_random_walk": ("°/h/√h", units.DEGREE_PER_HOUR_PER_ROOT_HOUR),
-    "rate_ramp": ("°/h/h", units.DEGREE_PER_HOUR / 3600.0),
+SENSORS = ("gyro", "accelerometer", "magnetometer")
+_MICRO_G = 1e-6 * units.STANDARD_GRAVITY
+UNITS: Mapping[str, Mapping[str, tuple[str, float]]] = {
+    "gyro": {
+        "quantization": ("arcsec", units.ARCSECOND),
+        "angle_random_walk": ("°/√h", units.DEGREE_PER_ROOT_HOUR),
+        "bias_instability": ("°/h", units.DEGREE_PER_HOUR),
+        "rate_random_walk": ("°/h/√h", units.DEGREE_PER_HOUR_PER_ROOT_HOUR),
+        "rate_ramp": ("°/h/h", units.DEGREE_PER_HOUR / 3600.0),
+    },
+    "accelerometer": {
+        "quantization": ("mm/s", 1e-3),
+        "angle_random_walk": ("µg/√Hz", _MICRO_G),
+        "bias_instability": ("µg", _MICRO_G),
+        "rate_random_walk": ("µg/√h", _MICRO_G / 60.0),
+        "rate_ramp": ("µg/h", _MICRO_G / 3600.0),
+    },
+    "magnetometer": {
+        "quantization": ("nT s", 1e-9),
+        "angle_random_walk": ("nT/√Hz", 1e-9),
+        "bias_instability": ("nT", 1e-9),
+        "rate_random_walk": ("nT/√h", 1e-9 / 60.0),
+        "rate_ramp": ("nT/h", 1e-9 / 3600.0),
+    },
 }
-"""Unit at the rim and its factor to SI, for each term."""
+"""Unit at the rim and its factor to SI, for each term of each sensor."""
+NAMES: Mapping[str, Mapping[str, str]] = {
+    "gyro": {},
+    "accelerometer": {
+        "angle_random_walk": "velocity_random_walk",
+        "rate_random_walk": "acceleration_random_walk",
+        "rate_ramp": "acceleration_ramp",
+    },
+    "magnetometer": {"angle_random_walk": "white_noise", "rate_random_walk": "random_walk", "rate_ramp": "ramp"},
+}
+"""Name of a term by sensor, where it differs from that of a gyro."""
 
 
 TERM_COST = 1.5
@@ -124,23 +151,24 @@ class NoiseFit(Listed):
     sample_interval: float
     sensor: str = "gyro"
 
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What of an axis is no such noise, a sentence each."""
+        return tuple(
+            f"axis {'xyz'[axis]} holds more than such noises: {what} (probability {max(probability, 1e-99):.0e})"
+            for axis, (probability, what) in enumerate(zip(self.misfit_probability, self.misfit, strict=True))
+            if probability < MISFIT_PROBABILITY
+        )
+
     def listing(self) -> Listing:
         """Return the coefficients with their intervals, as a table."""
         rows = []
         for row in table(self):
-            axis, term, seen = int(str(row["axis"])), str(row["term"]), bool(row["supported"])
-            factor = 1.0 if self.sensor == "gyro" else UNITS[term][1]
-            unit = str(row["unit"]) if self.sensor == "gyro" else "SI"
-            estimate, lower, upper = (float(row[end]) * factor for end in ("estimate", "lower", "upper"))  # type: ignore[arg-type]
-            first = (figure(estimate), figure(lower)) if seen else ("not seen", "")
-            rows.append(("xyz"[axis], f"{term} ({row['symbol']})", unit, *first, figure(upper)))
-        notes = [
-            f"axis {'xyz'[axis]} holds more than such noises: {what} (probability {max(probability, 1e-99):.0e})"
-            for axis, (probability, what) in enumerate(zip(self.misfit_probability, self.misfit, strict=True))
-            if probability < MISFIT_PROBABILITY
-        ]
+            seen = (figure(row["estimate"]), figure(row["lower"])) if row["supported"] else ("not seen", "")
+            what = f"{row['term']} ({row['symbol']})"
+            rows.append(("xyz"[row["axis"]], what, row["unit"], *seen, figure(row["upper"])))
         title = f"Noise of the {self.sensor}, {self.samples} samples of {self.sample_interval:.6g} s, {100.0 * self.level:g} % intervals"
-        return Listing(title, ("axis", "term", "unit", "estimate", "from", "to"), rows, notes, left=3)
+        return Listing(title, ("axis", "term", "unit", "estimate", "from", "to"), rows, self.warnings, left=3)
 
 
 def fit_noise(
@@ -306,24 +334,20 @@ def _by_name(fit: NoiseFit, values: Array, wanted: NDArray[np.bool_]) -> dict[st
     }
 
 
-def table(fit: NoiseFit) -> list[dict[str, object]]:
+def name(sensor: str, term: str) -> str:
+    """Return the name of a term for a sensor."""
+    return NAMES[checks.one_of("sensor", sensor, SENSORS)].get(term, term)
+
+
+def table(fit: NoiseFit) -> list[dict[str, Any]]:
     """Return one row per axis and term for printing, in the units of :data:`UNITS`: estimate, lower and upper (NaN: no such value)."""
-    rows: list[dict[str, object]] = []
+    rows = []
     for axis, i in np.ndindex(*fit.estimate.shape):
         term = fit.terms[i]
-        unit, factor = UNITS[term]
-        rows.append(
-            {
-                "axis": axis,
-                "term": term,
-                "symbol": SYMBOLS[term],
-                "estimate": float(fit.estimate[axis, i] / factor),
-                "lower": float(fit.lower[axis, i] / factor),
-                "upper": float(fit.upper[axis, i] / factor),
-                "unit": unit,
-                "supported": bool(fit.supported[axis, i]),
-            }
-        )
+        unit, factor = UNITS[fit.sensor][term]
+        ends = {end: float(getattr(fit, end)[axis, i] / factor) for end in ("estimate", "lower", "upper")}
+        known = {"unit": unit, "supported": bool(fit.supported[axis, i])}
+        rows.append({"axis": axis, "term": name(fit.sensor, term), "symbol": SYMBOLS[term], **ends, **known})
     return rows
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -23,6 +22,7 @@ from strapdown.cli.terminal import (
     progress_bar,
     put_json,
     show,
+    show_listing,
     table,
     writable,
     written,
@@ -233,23 +233,8 @@ def _show_explanations(found: Checked) -> None:
 
 
 def _show_statistics(judgement: Judgement) -> None:
-    rows = table(
-        "Statistics of the filter against what they are of a right one",
-        "statistic",
-        "of",
-        "value",
-        f"{100.0 * judgement.probability:g} % bounds",
-        "p-value",
-        "samples",
-        "",
-        left=2,
-    )
-    for one in judgement.findings:
-        bounds = f"{one.low:.4g} to {one.high:.4g}" if math.isfinite(one.low) else ""
-        mark = Text("FAIL", style="red") if one.rejected else Text("pass", style="green")
-        rows.add_row(one.name, one.label, f"{one.value:.4g}", bounds, f"{one.p_value:.2g}", f"{one.samples:.4g}", mark)
     if judgement.findings:
-        show(rows)
+        show_listing(judgement.listing(), "Statistics of the filter against what they are of a right one")
         console.print(
             "Each p-value is that of its statistic alone; bounds, pass and FAIL take all together "
             f"(a right filter fails with at most {100.0 * (1.0 - judgement.probability):.2g} %). NIS and NEES are per degree of freedom."
@@ -283,11 +268,7 @@ def _diagnosed(
         found = diagnosis.diagnose(
             accepted(held.record, estimate), chosen, initial, probability=judgement.probability, judgement=judgement
         )
-    rows = table("Causes by what they would explain", "cause", "of", "gain", "ln p", "", left=2)
-    for cause in found.considered[:8]:
-        mark = Text("likely", style="red") if cause in found.causes else Text("no")
-        rows.add_row(cause.name, cause.of, f"{cause.gain:.4g}", f"{cause.log_p:.4g}", mark)
-    show(rows)
+    show_listing(found.listing(), "Causes by what they would explain")
     content = {**found.summary(), "without_a_state": list(missing)}
     own = _not_of_the_search(chosen, estimate)
     if own:

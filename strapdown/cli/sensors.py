@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -21,6 +21,7 @@ from strapdown.cli.terminal import (
     progress_bar,
     scenario_named,
     show,
+    show_listing,
     table,
     tables_folder,
     tables_written,
@@ -179,11 +180,11 @@ def allan(
     ),
 ) -> None:
     """Identify a sensor's noise from a recording at rest: Allan deviation, fitted coefficients, specification as TOML."""
-    from strapdown.allan import parameters as noise_parameters
+    from strapdown.allan.noise_fit import SENSORS
 
     chosen = list(dict.fromkeys(sensor or ["gyro"]))
     for one in chosen:
-        one_of("--sensor", one, noise_parameters.SENSORS)
+        one_of("--sensor", one, SENSORS)
     exports.check(chosen)
     if options.temperature is not None:
         count("--temperature", options.temperature)
@@ -215,7 +216,6 @@ def _identify(
     """Identify one sensor, print and write what was found."""
     from strapdown import allan as identification
     from strapdown import plots, recordings
-    from strapdown.allan import parameters as noise_parameters
     from strapdown.plots.style import save_as
 
     out, (specification, numbers, figure_name, _) = output.out, _names(sensor, output.form)
@@ -233,12 +233,13 @@ def _identify(
             fit = identification.fit_noise(
                 values, source.sample_interval, kind=source.kind, highest_frequency=options.highest_frequency
             )
+            fit = replace(fit, sensor=sensor)
             estimator = "robust" if options.robust else "overlapping"
             deviation = identification.allan_deviation(
                 values, source.sample_interval, kind=source.kind, estimator=estimator
             )
             advance(2)
-            figure = plots.allan_overview(deviation, fit, identification.curves_by_axis(fit, deviation), sensor=sensor)
+            figure = plots.allan_overview(deviation, fit)
             advance(1)
     except InputError as error:
         raise InputError(f"{recording.name}: {error}") from None
@@ -252,37 +253,22 @@ def _identify(
         console.print(
             f"With gaps: the fit uses {fit.samples} samples in stretches of {shortest} or more, the deviation all there are."
         )
-    rows = noise_parameters.table(fit, sensor)
-    _show_coefficients(rows)
-    warnings = [
-        f"axis {'xyz'[axis]} holds more than such noises: {what} (probability {max(probability, 1e-99):.0e})"
-        for axis, (probability, what) in enumerate(zip(fit.misfit_probability, fit.misfit, strict=True))
-        if probability < identification.MISFIT_PROBABILITY
-    ]
+    rows = identification.table(fit)
+    show_listing(fit.listing(), f"Noise coefficients with {100.0 * fit.level:g} % intervals")
+    console.print("Of a term not seen in this record, the last column bounds what it could hide.")
     with written_beside(out / specification) as temporary:
-        temporary.write_text(_specification(fit, f"{recording.name}, {length}", warnings, sensor), encoding="utf-8")
-    _write_numbers(out / numbers, recording.name, fit, deviation, rows, sensor)
+        temporary.write_text(_specification(fit, f"{recording.name}, {length}"), encoding="utf-8")
+    _write_numbers(out / numbers, recording.name, fit, deviation, rows)
     paths += save_as({out / figure_name: figure}, output.form)
     written(out / specification, out / numbers, *paths, *tables_written(output.tables, "allan", rows, sensor))
-    for warning in warnings:
+    for warning in fit.warnings:
         console.print(f"warning: {warning}", highlight=False)
-    if warnings:
+    if fit.warnings:
         console.print(
             f"Cut the recording to where the {sensor} rests, or leave a filter's band out by --highest-frequency."
         )
         console.print(f"warning: {_DISTRUST}, nor {specification}.", highlight=False)
     return fit
-
-
-def _show_coefficients(rows: list[dict[str, Any]]) -> None:
-    listing = table("Noise coefficients with 95 % intervals", "axis", "term", "unit", "estimate", "from", "to", left=3)
-    for row in rows:
-        estimate = f"{row['estimate']:.4g}" if row["supported"] else "not seen"
-        lower = f"{row['lower']:.4g}" if row["supported"] else ""
-        term = f"{row['term']} ({row['symbol']})"
-        listing.add_row("xyz"[int(row["axis"])], term, str(row["unit"]), estimate, lower, f"{row['upper']:.4g}")
-    show(listing)
-    console.print("Of a term not seen in this record, the last column bounds what it could hide.")
 
 
 def _plausible(recording: Path, sensor: str, source: GyroSamples) -> None:
@@ -345,11 +331,10 @@ def _write_numbers(
     source: str,
     fit: identification.NoiseFit,
     deviation: identification.AllanDeviation,
-    rows: list[dict[str, object]],
-    sensor: str,
+    rows: list[dict[str, Any]],
 ) -> None:
-    """Write coefficients and deviation as JSON, which has no word for NaN."""
-    unit = {"gyro": "rad_per_s", "accelerometer": "m_per_s2", "magnetometer": "t"}[sensor]
+    """Write coefficients and deviation as JSON."""
+    unit = {"gyro": "rad_per_s", "accelerometer": "m_per_s2", "magnetometer": "t"}[fit.sensor]
     table = {
         "source": source,
         "sample_interval_s": fit.sample_interval,
@@ -369,18 +354,19 @@ _LARGEST_RATE = 1e12
 _DISTRUST = "do not trust these intervals"
 
 
-def _specification(fit: identification.NoiseFit, source: str, warnings: list[str], sensor: str) -> str:
+def _specification(fit: identification.NoiseFit, source: str) -> str:
     """Return the text of gyro.toml, or of another sensor's: the terms seen, and as comments bounds of the others, and warnings."""
     import tomli_w
 
     from strapdown import allan as identification
     from strapdown.allan import parameters as noise_parameters
 
+    sensor = fit.sensor
     lines = [f"{sensor.capitalize()} noise by `strapdown allan` from {source}."]
-    lines += [f"WARNING: {warning}." for warning in warnings]
-    if warnings:
+    lines += [f"WARNING: {warning}." for warning in fit.warnings]
+    if fit.warnings:
         lines.append(f"WARNING: {_DISTRUST}, nor this file.")
-    text = _commented(lines) + "\n" + tomli_w.dumps(noise_parameters.to_toml(fit, sensor))
+    text = _commented(lines) + "\n" + tomli_w.dumps(noise_parameters.to_toml(fit))
     partly, wholly = [], []
     for term, bound in identification.upper_bounds(fit).items():
         key, factor = noise_parameters.key(sensor, term)

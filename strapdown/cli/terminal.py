@@ -24,6 +24,7 @@ from strapdown.files import json_text, output_file, usable_folder, write_json
 
 if TYPE_CHECKING:
     from strapdown.recordings import Recording
+    from strapdown.results import Listing
     from strapdown.scenarios import Scenario
 
 __all__ = [
@@ -41,6 +42,7 @@ __all__ = [
     "rate_text",
     "scenario_named",
     "show",
+    "show_listing",
     "table",
     "verdict",
     "writable",
@@ -145,6 +147,15 @@ def show(rows: Table) -> None:
         console.print(rows, crop=False)
     finally:
         console.width = width
+
+
+def show_listing(listing: Listing, title: str) -> None:
+    """Show the table of a result under another title, without its notes."""
+    rows = table(title, *listing.columns, left=listing.left)
+    styles = {"pass": "green", "FAIL": "red", "likely": "red"}
+    for row in listing.rows:
+        rows.add_row(*(Text(cell, style=styles.get(cell, "")) for cell in row))
+    show(rows)
 
 
 def tables_written(folder: Path | None, study: str, *results: Any) -> list[Path]:

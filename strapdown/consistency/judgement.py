@@ -191,11 +191,12 @@ class Judgement(Listed):
                 figure(one.value),
                 f"{figure(one.low)} to {figure(one.high)}" if math.isfinite(one.low) else "",
                 figure(one.p_value, 2),
+                figure(one.samples),
                 "FAIL" if one.rejected else "pass",
             )
             for one in self.findings
         ]
-        columns = ("statistic", "of", "value", f"{100.0 * self.probability:g} % bounds", "p-value", "")
+        columns = ("statistic", "of", "value", f"{100.0 * self.probability:g} % bounds", "p-value", "samples", "")
         return Listing(
             f"{self.verdict}: {self.reason}", columns, rows, [f"Note: {one}." for one in self.limits], left=2
         )

@@ -84,11 +84,11 @@ class Diagnosis(Listed):
     def listing(self) -> Listing:
         """Return the causes considered, the likeliest first, as a table."""
         rows = [
-            (one.name, one.of, figure(one.gain), figure(one.log_p), "significant" if one in self.causes else "")
+            (one.name, one.of, figure(one.gain), figure(one.log_p), "likely" if one in self.causes else "no")
             for one in self.considered[:8]
         ]
         notes = self.words.splitlines()
-        return Listing("Causes by log-likelihood gained", ("cause", "of", "gain", "ln p", ""), rows, notes, left=2)
+        return Listing("Causes by what they would explain", ("cause", "of", "gain", "ln p", ""), rows, notes, left=2)
 
     @property
     def alternatives(self) -> tuple[Cause, ...]:

@@ -256,7 +256,7 @@ def of_tuning(content: Mapping[str, Any]) -> list[Table]:
 
 
 def of_allan(rows: Sequence[Mapping[str, Any]], sensor: str) -> list[Table]:
-    """Return the noise coefficients of a sensor, of the rows of :func:`strapdown.allan.parameters.table`, as ``SENSOR-noise``."""
+    """Return the noise coefficients of a sensor, of the rows of :func:`strapdown.allan.table`, as ``SENSOR-noise``."""
     shown = [
         {
             **row,
