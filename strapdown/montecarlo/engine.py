@@ -12,7 +12,7 @@ from typing import Any, Protocol
 
 from strapdown.checks import InputError, count, one_of
 from strapdown.montecarlo import scalar
-from strapdown.montecarlo.plan import Dispersions, Plan
+from strapdown.montecarlo.plan import Plan
 from strapdown.montecarlo.statistics import Replay, Statistics, merge
 from strapdown.records import Origin
 from strapdown.scenarios import Scenario
@@ -298,13 +298,11 @@ def run(
     *,
     runs: int,
     seed: int,
-    epochs: int = 100,
-    nis_bins: int = 100,
-    dispersions: Dispersions | None = None,
     chunk: int | None = None,
     threads: int | None = None,
     machine: str = "scalar",
     progress: Callable[[int], None] | None = None,
+    **options: Any,
 ) -> list[Statistics]:
     """Run several filter setups on the same simulated runs and return the statistics of each.
 
@@ -320,20 +318,14 @@ def run(
         Number of independent runs.
     seed : int
         Seed of all random streams.
-    epochs : int, default 100
-        Intervals between the epochs of the statistics.
-    nis_bins : int, default 100
-        Spans of time of the NIS.
-    dispersions : Dispersions, optional
-        Initial errors and gyro parameters that differ from run to run.
-    chunk : int, optional
-        Runs between merges; default the machine's.
-    threads : int, optional
-        Default: one a core.
+    chunk, threads : int, optional
+        As of :func:`run_plan`.
     machine : {"scalar", "auto", "lanes"}
         "auto": the lanes if they support every setup.
     progress : callable, optional
-        Called with the number of runs just finished.
+        As of :func:`run_plan`.
+    **options
+        Other fields of :class:`Plan`, such as ``epochs``.
 
     Returns
     -------
@@ -341,17 +333,7 @@ def run(
         One a setup.
     """
     count("runs", runs)
-    plans = tuple(
-        Plan(
-            scenario=scenario,
-            setup=one,
-            seed=seed,
-            epochs=epochs,
-            nis_bins=nis_bins,
-            dispersions=dispersions or Dispersions(),
-        )
-        for one in setups
-    )
+    plans = tuple(Plan(scenario=scenario, setup=one, seed=seed, **options) for one in setups)
     names = {choose(plan, machine).machine for plan in plans}
     work = Work(plans=plans, machine=names.pop() if len(names) == 1 else scalar.NAME)
     size = machine_named(work.machine).CHUNK if chunk is None else count("chunk", chunk)

@@ -150,13 +150,7 @@ def _prepared(plan: Plan) -> _Prepared:
 
 def _quiet(spec: GyroSpec) -> GyroSpec:
     """Return the gyro without what differs from run to run."""
-    none = (
-        "angle_random_walk",
-        "rate_random_walk",
-        "bias_instability",
-        "markov_noise",
-        "turn_on_bias_sigma",
-    )
+    none = ("angle_random_walk", "rate_random_walk", "bias_instability", "markov_noise", "turn_on_bias_sigma")
     silent: dict[str, Any] = dict.fromkeys(none, 0.0)
     return replace(spec, **silent, range=np.inf)
 
@@ -177,7 +171,9 @@ def _prepare(plan: Plan) -> _Prepared:
     )
     steps = quiet if algorithm.name == "one-sample" else compress(quiet, algorithm)
     n = algorithm.samples
-    series = tuple(_nominal(sensor, scenario, plan.seed) for sensor in scenario.sensors)
+    # Of some run: times, kinds, references and nominal σ are those of all runs.
+    ends = scenario.motion, scenario.edges[0], scenario.edges[-1]
+    series = tuple(one.observe(*ends, generator(plan.seed, 0, one.name)) for one in scenario.sensors)
     record = replace(steps, vectors=series)
     modelled = setup.modelled_record(replace(quiet, vectors=series), plan.setup)
     events = schedule(modelled.vectors, float(record.time[0]), float(record.time[-1]))
@@ -283,12 +279,6 @@ def _gyro_terms(plan: Plan, dt: float, steps: int) -> tuple[Any, ...]:
         factor if flickers else np.empty((0, flicker.STATES)),
         dispersion,
     )
-
-
-def _nominal(sensor: Any, scenario: Scenario, seed: int) -> VectorMeasurements:
-    """Return the series of a sensor in some run: its times, kind, references and nominal σ are those of all runs."""
-    series = sensor.observe(scenario.motion, scenario.edges[0], scenario.edges[-1], generator(seed, 0, sensor.name))
-    return series  # type: ignore[no-any-return]
 
 
 def _exact(sensor: Any, scenario: Scenario, series: VectorMeasurements) -> tuple[Array, Array, Array]:
