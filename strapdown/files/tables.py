@@ -26,6 +26,8 @@ Form = Mapping[str, Choice]
 PLAIN: Choice = (("", 1.0),)
 TEXT: Choice = (("", 0.0),)
 """Words and names; what has this choice holds no number."""
+FLAG: Choice = (("", 2.0),)
+"""What is true or false."""
 RATIO: Choice = (("ratio", 1.0),)
 PPM: Choice = (("ppm", 1e-6), ("ratio", 1.0))
 SECONDS: Choice = (("s", 1.0),)
@@ -75,7 +77,7 @@ def _same(a: Any, b: Any) -> bool:
 
 def _entry(name: str, content: Any, choice: Choice) -> dict[str, Any]:
     if isinstance(content, str | bool | int):
-        return {name if choice in (PLAIN, TEXT) else f"{name}_{choice[0][0]}": content}
+        return {name if choice in (PLAIN, TEXT, FLAG) else f"{name}_{choice[0][0]}": content}
     for suffix, factor in choice:
         exact = _exact_quotient(np.asarray(content, np.float64), factor)
         if exact is not None:
@@ -110,6 +112,10 @@ def _number(content: Any, factor: float, choice: Choice, place: str) -> Any:
     if choice == TEXT:
         if not isinstance(content, str):
             raise InputError(f"{place} is {content!r}; it must be a text in quotes")
+        return content
+    if choice == FLAG:
+        if not isinstance(content, bool):
+            raise InputError(f"{place} is {content!r}; it must be true or false")
         return content
     if choice == PLAIN and isinstance(content, str):
         return content

@@ -509,7 +509,7 @@ SENSOR_FORM: tables.Form = {
     "correlated_sigma": tables.PLAIN,
     "correlation_time": tables.SECONDS,
     "frame": tables.PLAIN,
-    "varying": tables.PLAIN,
+    "varying": tables.FLAG,
     "lever_arm_sigma": tables.METRES,
     "velocity_time": tables.SECONDS,
     "velocity_sigma": _SPEED,
@@ -539,25 +539,6 @@ def from_table(table: Mapping[str, Any], place: str = "states") -> States:
         where = f"{place}: sensors: {name}"
         if not isinstance(content, Mapping):
             raise InputError(f"{where} is {content!r}; it must be a table, [{place}.sensors.{name}]")
-        by_sensor[name] = _placed(where, SensorStates, _plain(where, content), SENSOR_FORM)
+        by_sensor[name] = tables.build(SensorStates, content, SENSOR_FORM, where)
     own = {key: value for key, value in table.items() if key != "sensors"}
-    return _placed(place, States, own, FORM, sensors=by_sensor)  # type: ignore[no-any-return]
-
-
-def _plain(place: str, content: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a table whose bool goes through as one; tables take bools for slips."""
-    known_keys(place, content, tables.keys(SENSOR_FORM))
-    if "varying" in content and not isinstance(content["varying"], bool):
-        raise InputError(f"{place}: varying is {content['varying']!r}; it must be true or false")
-    return dict(content)
-
-
-def _placed(place: str, kind: Any, table: dict[str, Any], form: tables.Form, **more: Any) -> Any:
-    """Build from a table; what is refused names the place."""
-    if "varying" in table:
-        more["varying"] = table.pop("varying")
-    try:
-        return tables.build(kind, table, form, place, **more)
-    except InputError as error:
-        text = str(error)
-        raise InputError(text if text.startswith(place) else f"{place}: {text}") from None
+    return tables.build(States, own, FORM, place, sensors=by_sensor)  # type: ignore[no-any-return]
