@@ -162,7 +162,7 @@ def test_coverage_counts_errors_inside_one_two_three_sigma_their_ends_too():
     error = z[:, None] * np.sqrt(np.diagonal(P[0]))
     sums._add_errors(0, error, P)
     inside = np.array([[1, 1, 1], [1, 1, 1], [1, 1, 1], [0, 1, 1], [0, 1, 1], [0, 0, 1], [0, 0, 0]])
-    assert np.array_equal(sums.coverage, np.repeat(inside[:, None, :], 6, axis=1))
+    assert np.array_equal(sums.sums.coverage, np.repeat(inside[:, None, :], 6, axis=1))
 
 
 def test_merging_parts_is_the_whole():
