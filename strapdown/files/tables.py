@@ -53,21 +53,15 @@ def keys(form: Form) -> dict[str, tuple[str, float]]:
 
 
 def encode(value: Any, form: Form) -> dict[str, Any]:
-    """Return a dataclass as a table; fields at their default are left out."""
+    """Return a dataclass as a table; fields at their default, and None, are left out."""
     table: dict[str, Any] = {}
     for field in dataclasses.fields(value):
-        if field.name not in form:
-            continue
-        content = getattr(value, field.name)
-        if field.default is not dataclasses.MISSING:
-            default = field.default
-        elif field.default_factory is not dataclasses.MISSING:
+        content, default = getattr(value, field.name), field.default
+        if field.default_factory is not dataclasses.MISSING:
             default = field.default_factory()
-        else:
-            default = None
-        if default is not None and _same(content, default):
-            continue
-        table.update(_entry(field.name, content, form[field.name]))
+        known = default is not dataclasses.MISSING and default is not None
+        if field.name in form and content is not None and not (known and _same(content, default)):
+            table.update(_entry(field.name, content, form[field.name]))
     return table
 
 

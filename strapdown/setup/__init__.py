@@ -600,8 +600,7 @@ def to_table(setup: FilterSetup) -> dict[str, Any]:
     if setup.sigma:
         table["sigma"] = {name: list(s) if isinstance(s, tuple) else s for name, s in setup.sigma.items()}
     if setup.gate is not None:
-        known = {name: choice for name, choice in _GATE_FORM.items() if getattr(setup.gate, name) is not None}
-        table["gate"] = tables.encode(setup.gate, known)
+        table["gate"] = tables.encode(setup.gate, _GATE_FORM)
         if setup.gate.recovery is None:
             table["gate"]["recovery"] = NEVER
     if setup.robust is not None:
@@ -628,13 +627,10 @@ def from_table(table: Mapping[str, Any], place: str = "filter") -> FilterSetup:
         sigma = _part(table, "sigma", place)
         parts["sigma"] = {name: _sigma(f"{place}: sigma: {name}", value) for name, value in sigma.items()}
     if "gate" in table:
-        content = dict(_part(table, "gate", place))
-        if content.get("recovery") == NEVER:
-            parts["gate"] = tables.build(
-                Gate, {k: v for k, v in content.items() if k != "recovery"}, _GATE_FORM, f"{place}: gate", recovery=None
-            )
-        else:
-            parts["gate"] = tables.build(Gate, content, _GATE_FORM, f"{place}: gate")
+        content = _part(table, "gate", place)
+        never = {name: None for name in ("recovery",) if content.get(name) == NEVER}
+        given = {key: value for key, value in content.items() if key not in never}
+        parts["gate"] = tables.build(Gate, given, _GATE_FORM, f"{place}: gate", **never)
     if "robust" in table:
         parts["robust"] = tables.build(Robust, _part(table, "robust", place), _ROBUST_FORM, f"{place}: robust")
     if "states" in table:
