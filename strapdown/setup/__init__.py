@@ -291,45 +291,41 @@ def unmodelled_errors(
     >>> setup.unmodelled_errors(GyroSpec(angle_random_walk=1e-5, scale_factor=(1e-4, 0.0, 0.0)))
     ("the gyro's scale factor of 100 ppm",)
     """
-    found = []
-    known = set() if states is None else set(states.names)
-    largest = {
-        name: float(np.max(np.abs(getattr(spec, name)))) for name in ("scale_factor", "asymmetry", "misalignment")
-    }
-    words = {"scale_factor": ("scale factor", 1e-6, "ppm"), "asymmetry": ("asymmetry", 1e-6, "ppm")}
-    words["misalignment"] = ("misalignment", 1e-3, "mrad")
-    covering = {"scale_factor": "gyro.scale", "misalignment": "gyro.misalignment"}
-    for name, (what, size, unit) in words.items():
-        if largest[name] > 0.0 and covering.get(name) not in known:
-            found.append(f"the gyro's {what} of {largest[name] / size:.3g} {unit}")
-    if np.any(np.asarray(spec.bias_instability) > 0.0) and "gyro.drift" not in known:
-        instability = float(np.max(spec.bias_instability)) / units.DEGREE_PER_HOUR
-        found.append(f"the gyro's flicker of {instability:.3g} °/h, covered in the attitude but not in the bias")
-    felt = np.any(np.asarray(spec.g_sensitivity) != 0.0) and np.any(np.asarray(gravity_f) != 0.0)
-    if felt and "gyro.force" not in known:
-        found.append("the gyro's sensitivity to acceleration")
-    if spec.temperature is not None and "gyro.temperature" not in known:
-        found.append("the gyro's bias over temperature")
-    if float(np.max(spec.quantization)) > 0.0 or float(np.max(spec.rate_resolution)) > 0.0:
-        found.append("the gyro's quantisation")
+    scale, asymmetry, misalignment, flicker = (
+        float(np.max(np.abs(getattr(spec, name))))
+        for name in ("scale_factor", "asymmetry", "misalignment", "bias_instability")
+    )
+    found: list[tuple[Any, str, str]] = [
+        (scale, "gyro.scale", f"the gyro's scale factor of {scale / 1e-6:.3g} ppm"),
+        (asymmetry, "", f"the gyro's asymmetry of {asymmetry / 1e-6:.3g} ppm"),
+        (misalignment, "gyro.misalignment", f"the gyro's misalignment of {misalignment / 1e-3:.3g} mrad"),
+        (
+            flicker,
+            "gyro.drift",
+            f"the gyro's flicker of {flicker / units.DEGREE_PER_HOUR:.3g} °/h, covered in the attitude but not in the bias",
+        ),
+        (np.any(gravity_f) * spec.g_sensitivity, "gyro.force", "the gyro's sensitivity to acceleration"),
+        (spec.temperature is not None, "gyro.temperature", "the gyro's bias over temperature"),
+        (np.max(spec.quantization) + np.max(spec.rate_resolution), "", "the gyro's quantisation"),
+    ]
     for sensor in sensors:
-        if np.any(np.asarray(getattr(sensor, "hard_iron", 0.0)) != 0.0) and f"{sensor.name}.bias" not in known:
-            found.append(f"the hard iron of the {sensor.name}")
-        if np.any(np.asarray(getattr(sensor, "soft_iron", 0.0)) != 0.0):
-            found.append(f"the soft iron of the {sensor.name}")
-        if np.any(np.asarray(getattr(sensor, "bias", 0.0)) != 0.0) and f"{sensor.name}.bias" not in known:
-            found.append(f"the bias of the {sensor.name}")
-        if np.any(np.asarray(getattr(sensor, "lever_arm_b", 0.0)) != 0.0) and f"{sensor.name}.lever" not in known:
-            found.append(f"the accelerations that the {sensor.name} feels at its lever arm")
-        if getattr(sensor, "acceleration_f", None) is not None and f"{sensor.name}.velocity" not in known:
-            found.append(f"the acceleration of the point that the {sensor.name} is at")
-        faults = getattr(sensor, "faults", None)
-        correlated = faults is not None and getattr(faults, "correlated_sigma", 0.0) > 0.0
-        if correlated and f"{sensor.name}.correlated" not in known:
-            found.append(f"the correlated noise of the {sensor.name}")
-        if faults is not None and getattr(faults, "outlier_probability", 0.0) > 0.0:
-            found.append(f"the outliers of the {sensor.name}")
-    return tuple(found)
+        name, faults = sensor.name, getattr(sensor, "faults", vectors.Faults())
+        accelerated = getattr(sensor, "acceleration_f", None) is not None
+        found += [
+            (getattr(sensor, "hard_iron", 0.0), f"{name}.bias", f"the hard iron of the {name}"),
+            (getattr(sensor, "soft_iron", 0.0), "", f"the soft iron of the {name}"),
+            (getattr(sensor, "bias", 0.0), f"{name}.bias", f"the bias of the {name}"),
+            (
+                getattr(sensor, "lever_arm_b", 0.0),
+                f"{name}.lever",
+                f"the accelerations that the {name} feels at its lever arm",
+            ),
+            (accelerated, f"{name}.velocity", f"the acceleration of the point that the {name} is at"),
+            (faults.correlated_sigma, f"{name}.correlated", f"the correlated noise of the {name}"),
+            (faults.outlier_probability, "", f"the outliers of the {name}"),
+        ]
+    known = () if states is None else states.names
+    return tuple(words for size, state, words in found if np.any(size) and state not in known)
 
 
 def _linear_sigma(record: ImuRecord) -> float:
