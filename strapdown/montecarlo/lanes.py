@@ -439,11 +439,7 @@ def run_chunk(plan: Plan, first_run: int, runs: int, *, width: int | None = None
                 valid,
                 group.prepared.truth,
                 *bins,
-                finite,
-                sums.reshape(-1),
-                coverage,
-                histogram,
-                scratch,
+                montecarlo_statistics.Sums(finite, sums.reshape(-1), coverage, histogram, scratch),
                 score,
             )
             scores[place : place + GROUP] = score
