@@ -775,11 +775,9 @@ def fit_noise(
     source : Recording, ImuRecord, GyroSamples or array_like (n,) or (n, axes)
         Samples at rest; a recording may have gaps.
     sample_interval : float, optional
-        Of an array: time between its samples, s.
-    sensor : {"gyro", "accelerometer", "magnetometer"}
-        Of a recording.
-    kind : {"rate", "increments"}
-        Of an array: averaged samples, or their integrals over each interval.
+        Of an array, s.
+    sensor, kind : str
+        As of :func:`allan_deviation`.
     **options
         ``highest_frequency``, ``terms``, ``level`` of :func:`strapdown.allan.fit_noise`.
 

@@ -200,12 +200,8 @@ def run(
         Start anew although the file exists.
     chunk : int, optional
         Runs between merges; default the file's, or the machine's.
-    machine : {"auto", "lanes", "scalar"}
-        "auto": the lanes if they support every term of the plan.
-    threads : int, optional
-        Default: one a core.
-    workers : Workers, optional
-        What computes the chunks instead of threads (:func:`strapdown.montecarlo.cluster.on_dask`).
+    machine, threads, workers : optional
+        As of :func:`strapdown.montecarlo.run_plan`.
     progress : callable, optional
         Called with the number of runs just finished, first with those that the file held.
 

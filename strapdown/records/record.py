@@ -194,17 +194,8 @@ def compress(record: ImuRecord, algorithm: str | coning.Algorithm) -> ImuRecord:
     kept = len(record.increments) // n * n
     if kept == 0:
         raise InputError(f"record has {len(record.increments)} intervals; {table.name} needs at least {n}")
-    every = slice(0, kept + 1, n)
-    truth = (
-        None if record.truth is None else Truth(attitude=record.truth.attitude[every], bias=record.truth.bias[every])
-    )
-    return dataclasses.replace(
-        record,
-        time=record.time[every],
-        increments=coning.rotation_vectors(record.increments[:kept], table, edges=record.time[: kept + 1]),
-        truth=truth,
-        temperature=None if record.temperature is None else record.temperature[every],
-    )
+    increments = coning.rotation_vectors(record.increments[:kept], table, edges=record.time[: kept + 1])
+    return _at_edges(record, slice(0, kept + 1, n), increments, record.vectors)
 
 
 def cut(record: ImuRecord, first: int, last: int) -> ImuRecord:
@@ -233,17 +224,19 @@ def cut(record: ImuRecord, first: int, last: int) -> ImuRecord:
         if first == 0:
             inside |= series.time == t0
         vectors.append(series.taken(inside))
-    edges = slice(first, last + 1)
-    truth = (
-        None if record.truth is None else Truth(attitude=record.truth.attitude[edges], bias=record.truth.bias[edges])
-    )
+    return _at_edges(record, slice(first, last + 1), record.increments[first:last], vectors)
+
+
+def _at_edges(record: ImuRecord, edges: slice, increments: Array, vectors: Iterable[VectorMeasurements]) -> ImuRecord:
+    """Return the record at some of its edges, with the increments between them."""
+    truth, temperature = record.truth, record.temperature
     return dataclasses.replace(
         record,
         time=record.time[edges],
-        increments=record.increments[first:last],
+        increments=increments,
         vectors=tuple(vectors),
-        truth=truth,
-        temperature=None if record.temperature is None else record.temperature[edges],
+        truth=None if truth is None else Truth(attitude=truth.attitude[edges], bias=truth.bias[edges]),
+        temperature=None if temperature is None else temperature[edges],
     )
 
 

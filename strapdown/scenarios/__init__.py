@@ -578,7 +578,7 @@ def scenario_to_toml(scenario: Scenario) -> str:
 
 @functools.cache
 def builtin_rows() -> tuple[dict[str, object], ...]:
-    """Return one row a built-in scenario for printing: name, description, duration s, rate Hz, motion, gyro, sensors."""
+    """Return one row a built-in scenario for printing: name, description, duration s, rate Hz, gyro."""
     rows = []
     for name in SCENARIOS:
         table = reading.toml(_BUILTIN / f"{name}.toml")
@@ -588,9 +588,7 @@ def builtin_rows() -> tuple[dict[str, object], ...]:
                 "description": table["description"],
                 "duration_s": table["duration_s"],
                 "rate_hz": table["rate_hz"],
-                "motion": table["motion"]["type"],
                 "gyro": table["gyro"].get("preset", "own figures"),
-                "sensors": ", ".join(sensor["name"] for sensor in table.get("sensors", [])),
             }
         )
     return tuple(rows)

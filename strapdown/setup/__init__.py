@@ -494,12 +494,8 @@ def smooth(record: ImuRecord, setup: FilterSetup, initial: State, **options: Any
 
     Parameters
     ----------
-    record : ImuRecord
-        At the gyro's rate.
-    setup : FilterSetup
-        Filter whose noise, σ, error states, gate and integration algorithm are applied.
-    initial : State
-        State at the first edge.
+    record, setup, initial : ImuRecord, FilterSetup, State
+        As of :func:`run`.
     **options
         Of :func:`strapdown.estimation.smooth`.
 
