@@ -50,6 +50,10 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         items[:] = [item for item in items if not item.get_closest_marker("slow")]
 
 
+def pytest_collection_finish() -> None:
+    gc.freeze()  # the modules stay
+
+
 @pytest.fixture(scope="module", autouse=True)
 def what_is_compiled_is_not_collected() -> Iterator[None]:
     """Leave what a module has compiled out of garbage collection: in a process that has compiled much, each one takes seconds."""
