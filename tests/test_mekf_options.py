@@ -207,10 +207,10 @@ def test_every_option_is_consistent_and_a_broken_one_is_not(kind, schedule, runs
             assert verdict.consistent, (option, verdict.mean, verdict.simultaneous_bounds)
         assert low < nis < high, (option, nis, low, high)
     for factor in (0.5, 3.0):
-        (broken, _), _ = consistency_of(kind, schedule, "covariance", max(runs, 24), sigma_factor=factor)
+        (broken, _), _ = consistency_of(kind, schedule, "covariance", max(runs, 40), sigma_factor=factor)
         assert not broken.consistent, (factor, broken.mean)
     for factor in (1.0 / 1.2, 1.2):
-        _, (nis, low, high) = consistency_of(kind, schedule, "covariance", max(runs, 24), sigma_factor=factor)
+        _, (nis, low, high) = consistency_of(kind, schedule, "covariance", max(runs, 40), sigma_factor=factor)
         assert not 0.85 * low < nis < 1.15 * high, (factor, nis)
 
 
