@@ -104,7 +104,7 @@ def main(*, duration: float = 1800.0, rate: float = 100.0, wrong: float = 30.0, 
             {
                 "optimiser": name,
                 "seconds": used,
-                "passes": number,
+                "passes": int(number),  # COBYLA counts in an int64
                 "short_of_best": float(objective.minus_log(point)[0] - best.after),
             }
         )

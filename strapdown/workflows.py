@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import functools
 import os
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -24,7 +23,6 @@ from strapdown import (
     allan,
     coning,
     consistency,
-    covariance,
     gyro,
     quaternion,
     recordings,
@@ -33,17 +31,16 @@ from strapdown import (
     units,
 )
 from strapdown import setup as setups
-from strapdown.allan import gaps as allan_gaps
 from strapdown.checks import Array, InputError, count, instance
 from strapdown.consistency import Judgement
-from strapdown.covariance import Analysis, Consider
+from strapdown.covariance import analyse as covariance_analysis
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.states import ProcessNoise, State
 from strapdown.files import written_beside
 from strapdown.gyro import GyroSpec
 from strapdown.recordings import Recording, recordfiles
 from strapdown.records import Estimate, ImuRecord, Origin, Truth
-from strapdown.scenarios import Scenario
+from strapdown.scenarios import Scenario, simulate
 from strapdown.setup import FilterSetup, for_record
 
 if TYPE_CHECKING:
@@ -78,46 +75,7 @@ SAME_STAMP = 1e-9
 """Largest difference of two stamps of one epoch, s."""
 
 
-# --------------------------------------------------------------------------------------------------------- simulate, read, write
-
-
-def simulate(scenario: Scenario | str | os.PathLike[str], *, seed: int | None = None, run: int = 0) -> ImuRecord:
-    """Simulate a scenario: gyro increments and vector measurements, with the true attitude and gyro bias.
-
-    Parameters
-    ----------
-    scenario : Scenario, str or path
-        A scenario, the name of a built-in one (``strapdown.scenarios.SCENARIOS``), or the path of its TOML file.
-    seed : int, optional
-        Of the random numbers; default the scenario's own.
-    run : int, default 0
-        Number of the run; runs of one seed are independent.
-
-    Returns
-    -------
-    ImuRecord
-        Its ``truth`` is known, and its ``origin`` is the scenario, which :func:`estimate` matches its filter to.
-
-    Raises
-    ------
-    InputError
-        If there is no such scenario, or its file has an unknown key or a value out of range.
-
-    Examples
-    --------
-    >>> import strapdown as sd
-    >>> record = sd.simulate("two-stars", seed=1)
-    >>> len(record.increments), [one.sensor for one in record.vectors]
-    (30000, ['star 1', 'star 2'])
-    """
-    return scenarios.simulate(_scenario(scenario), seed, run)
-
-
-def _scenario(given: Scenario | str | os.PathLike[str]) -> Scenario:
-    instance(
-        "scenario", given, (Scenario, str, os.PathLike), "give a Scenario, a built-in name, or the path of a TOML file"
-    )
-    return given if isinstance(given, Scenario) else scenarios.load_scenario(given)
+# ------------------------------------------------------------------------------------------------------------------ read, write
 
 
 def read(path: Any, **options: Any) -> ImuRecord | Recording | Estimate | Campaign:
@@ -195,11 +153,6 @@ def write(
         and :func:`strapdown.recordings.writers` lists those of recordings and estimates.
     **options
         Of the format (:func:`strapdown.recordings.write`): ``sequence`` and ``frame`` of an estimate as a table.
-
-    Raises
-    ------
-    InputError
-        If the ending names no format that holds such content.
 
     Examples
     --------
@@ -315,7 +268,7 @@ def estimate(
         Record: initial state (:func:`initial_state`) at the first edge. Default: from the first measurements.
     states : bool or sequence of str, optional
         Record: with an error state for each error that the scenario specifies (scale factor, misalignment, hard iron, …), or for those
-        named alone; False: without any. Default: with them where there are such errors (smoother: without drifts).
+        named alone; False: without any. Default: with them where there are such errors.
     gate : Gate or float, optional
         Refuse measurements beyond this quantile of χ² (0.999), and recover from a lost attitude.
     robust : Robust or {"huber", "student"}, optional
@@ -372,7 +325,7 @@ def estimate(
         return found.estimate
     instance("source", source, ImuRecord, SOURCE)
     _refuse("a recording", motion=motion, latency=latency, calibration=calibration)
-    chosen = _record_setup(source, noise, setup, initial, states, smooth=smooth)
+    chosen = _record_setup(source, noise, setup, initial, states)
     changed = {name: value for name, value in (("gate", gate), ("robust", robust)) if value is not None}
     chosen = dataclasses.replace(chosen, **changed)  # type: ignore[arg-type]
     start = None if initial is None else for_record.Start(initial, "Started from the state given.")
@@ -446,8 +399,6 @@ def _record_setup(
     setup: FilterSetup | None,
     initial: State | None,
     states: bool | Sequence[str] | None,
-    *,
-    smooth: bool,
 ) -> FilterSetup:
     if setup is not None:
         instance("setup", setup, FilterSetup, "give a FilterSetup, as setup.matched or tune returns it")
@@ -455,7 +406,7 @@ def _record_setup(
         return setup
     if not isinstance(noise, ProcessNoise):
         spec = None if noise is None else _specification(noise)
-        return for_record.matched_setup(record, spec, states=states, smooth=smooth)
+        return for_record.matched_setup(record, spec, states=states)
     if initial is None:
         raise InputError(
             "noise is a ProcessNoise, which says nothing of the initial gyro bias; give initial= too, or a GyroSpec as noise"
@@ -497,11 +448,6 @@ def integrate(
     -------
     AttitudeHistory
         ``time`` (k + 1,), s, and ``attitude`` (k + 1, 4), q_fb, at the edges of the algorithm's steps; samples left over are dropped.
-
-    Raises
-    ------
-    InputError
-        If there is no such algorithm, or fewer samples than one of its steps needs.
 
     Examples
     --------
@@ -552,11 +498,6 @@ def check(
     -------
     Judgement
         ``verdict`` is "consistent", "not consistent" or "cannot tell"; ``findings`` are the statistics.
-
-    Raises
-    ------
-    InputError
-        If the truth is not that of the estimate's epochs, or a Monte Carlo has no finished run.
 
     Examples
     --------
@@ -668,11 +609,6 @@ def monte_carlo(
     Statistics
         For :func:`check`; the same to the bit for any number of threads.
 
-    Raises
-    ------
-    InputError
-        If there is no such scenario, or no machine computes it with this filter.
-
     Examples
     --------
     >>> import strapdown as sd
@@ -680,46 +616,8 @@ def monte_carlo(
     """
     from strapdown import montecarlo
 
-    chosen = plan(_scenario(scenario), setup=setup, seed=seed, states=states, dispersions=dispersions)
+    chosen = plan(scenarios.chosen(scenario), setup=setup, seed=seed, states=states, dispersions=dispersions)
     return montecarlo.run_plan(chosen, runs=runs, threads=threads, progress=progress)
-
-
-def covariance_analysis(
-    scenario: Scenario | str | os.PathLike[str],
-    setup: FilterSetup | None = None,
-    *,
-    consider: Consider | None = None,
-    epochs: int = 100,
-) -> Analysis:
-    """Predict the errors of a filter on a scenario without noise samples: σ and error budget by source.
-
-    Parameters
-    ----------
-    scenario : Scenario, str or path
-        As of :func:`simulate`.
-    setup : FilterSetup, optional
-        The filter; default: matched to the scenario.
-    consider : Consider, optional
-        Errors besides those of the scenario.
-    epochs : int, default 100
-        Intervals between the epochs of the result.
-
-    Returns
-    -------
-    Analysis
-        σ of attitude (rad, body axes) and bias (rad/s) over time, actual and by the filter's own covariance, and the error budget.
-
-    Raises
-    ------
-    InputError
-        As :func:`strapdown.covariance.analyse`.
-
-    Examples
-    --------
-    >>> import strapdown as sd
-    >>> budget = sd.covariance_analysis("two-stars")  # doctest: +SKIP
-    """
-    return covariance.analyse(_scenario(scenario), setup, consider=consider, epochs=epochs)
 
 
 # ----------------------------------------------------------------------------------------------------------------------- tune
@@ -763,11 +661,6 @@ def tune(
     Tuning
         ``setup`` is the tuned filter, for :func:`estimate` and :func:`monte_carlo`.
 
-    Raises
-    ------
-    InputError
-        If a parameter is unknown, or the options exclude each other.
-
     Examples
     --------
     >>> import strapdown as sd
@@ -810,19 +703,19 @@ def tune(
 
 def _samples(
     source: Recording | ImuRecord | GyroSamples | ArrayLike, sample_interval: float | None, sensor: str, kind: str
-) -> tuple[ArrayLike, float, str, bool]:
-    """Return samples, their interval, their kind and whether some are missing."""
+) -> tuple[ArrayLike, float, str]:
+    """Return samples, NaN where missing, their interval and their kind."""
     if isinstance(source, (Recording, ImuRecord)):
         source = recordings.samples_of(source, sensor, gaps=True)
     if isinstance(source, recordings.GyroSamples):
         if sample_interval is not None:
             raise InputError("sample_interval goes with an array; a recording has its own: leave it out")
-        return source.values, source.sample_interval, source.kind, bool(np.isnan(source.values).any())
+        return source.values, source.sample_interval, source.kind
     if sample_interval is None:
         raise InputError(
             "sample_interval is missing; an array does not know the time between its samples: give it in s"
         )
-    return source, sample_interval, kind, False
+    return source, sample_interval, kind
 
 
 def allan_deviation(
@@ -838,7 +731,7 @@ def allan_deviation(
     Parameters
     ----------
     source : Recording, ImuRecord, GyroSamples or array_like (n,) or (n, axes)
-        A recording may have gaps (:mod:`strapdown.allan.gaps`).
+        Missing samples are NaN (:mod:`strapdown.allan.gaps`).
     sample_interval : float, optional
         Of an array: time between its samples, s.
     sensor : {"gyro", "accelerometer", "magnetometer"}
@@ -853,11 +746,6 @@ def allan_deviation(
     AllanDeviation
         Deviation at each averaging time and axis, in the unit of the samples (increments: that unit per s), and its confidence band.
 
-    Raises
-    ------
-    InputError
-        If samples are not finite, too few, or at uneven intervals.
-
     Examples
     --------
     >>> import numpy as np
@@ -867,9 +755,7 @@ def allan_deviation(
     >>> round(float(found.deviation[0, 0]), 2)  # σ √(dt/τ)
     0.1
     """
-    values, interval, what, gaps = _samples(source, sample_interval, sensor, kind)
-    if gaps:
-        return allan_gaps.allan_deviation(values, interval, **options)
+    values, interval, what = _samples(source, sample_interval, sensor, kind)
     return allan.allan_deviation(values, interval, kind=what, **options)
 
 
@@ -901,17 +787,11 @@ def fit_noise(
     NoiseFit
         For ``noise`` of :func:`estimate`.
 
-    Raises
-    ------
-    InputError
-        If samples are not finite, too few, or at uneven intervals.
-
     Examples
     --------
     >>> import strapdown as sd
     >>> noise = sd.fit_noise(sd.read("rest.csv", units={"gyro": "deg/s"}))  # doctest: +SKIP
     >>> estimate = sd.estimate(record, noise=noise)  # doctest: +SKIP
     """
-    values, interval, what, gaps = _samples(source, sample_interval, sensor, kind)
-    fit: Callable[..., NoiseFit] = allan_gaps.fit_noise if gaps else functools.partial(allan.fit_noise, kind=what)
-    return dataclasses.replace(fit(values, interval, **options), sensor=sensor)
+    values, interval, what = _samples(source, sample_interval, sensor, kind)
+    return dataclasses.replace(allan.fit_noise(values, interval, kind=what, **options), sensor=sensor)

@@ -29,7 +29,7 @@ from strapdown.estimation.model import turning_matrix
 from strapdown.estimation.schedule import KIND_CODES
 from strapdown.estimation.states import GateMemory, State, check_arguments, restart_bias_variance
 from strapdown.estimation.step_filter import NO_LEVER, StepFilter
-from strapdown.kernels import error_state_step, gate_rules, iterated_update
+from strapdown.kernels import error_state_step, gate_rules, iterated_update, sensor_rows
 from strapdown.kernels.algebra import cross, dot
 from strapdown.kernels.gate_rules import WIDE_PASSES
 from strapdown.kernels.iterated_update import (
@@ -492,10 +492,12 @@ class GatedStepFilter(StepFilter):
 
     def _rows_at(self, measurement: Any, model: Any, attitude: Array, others: Array) -> Rows:
         """Return a measurement's rows at an attitude (4,) and (b, c) (3 + m,), by the kernels' own function."""
-        rows = H, y, basis = np.empty((3, 3 + len(others))), np.empty(3), np.empty((3, 3))
-        given = KIND_CODES[measurement.kind], measurement.z, measurement.frame, measurement.length
+        H = np.zeros((3, 3 + len(others)))
+        value = measurement.frame[:4] if measurement.kind == "attitude" else (*measurement.z, 0.0)
+        given = KIND_CODES[measurement.kind], value, measurement.frame, measurement.length
         effects = 0, model.sensors, model.sensor_use, NO_LEVER
-        d = error_state_step.fill_rows(tuple(attitude.tolist()), others, *given, *effects, rows)
+        d, y, axes, _ = sensor_rows.fill_rows(tuple(attitude.tolist()), others, H, *given, *effects, 0.0)
+        y, basis = np.array(y), np.array(axes)
         angle, arc = arc_of(measurement, y, basis)
         return Rows(y[:d].copy(), H[:d].copy(), (basis @ measurement.noise @ basis.T)[:d, :d], angle, arc)
 

@@ -10,7 +10,7 @@ from typing import Any
 import numba
 
 from strapdown.kernels.compiler import KernelCompiler
-from strapdown.kernels.machine import helper
+from strapdown.kernels.machine import _defined, _names, helper
 
 KERNELS = "strapdown.kernels"
 
@@ -27,24 +27,14 @@ def plain(function: FunctionType, *parts: ModuleType) -> FunctionType:
     """Return what :func:`strapdown.kernels.machine.compiled` would compile: the source, its open functions bound to ``parts``."""
     made: dict[FunctionType, FunctionType] = {}
 
-    def definition(one: FunctionType) -> FunctionType:
-        if one.__name__ not in one.__globals__.get("OPEN", ()):
-            return one
-        for part in parts:
-            found = getattr(part, one.__name__, None)
-            if isinstance(found, FunctionType) and one.__name__ not in found.__globals__.get("OPEN", ()):
-                return found
-        raise TypeError(f"nothing defines {one.__name__}")
-
     def bound(one: FunctionType) -> FunctionType:
-        one = definition(one)
         if one not in made:
             names = dict(one.__globals__)
             made[one] = FunctionType(one.__code__, names, one.__name__, one.__defaults__)
-            for name in one.__code__.co_names:
+            for name in _names(one.__code__):
                 value = names.get(name)
                 if isinstance(value, FunctionType) and value.__module__.startswith(KERNELS):
-                    names[name] = bound(value)
+                    names[name] = bound(_defined(name, value, one, parts))
         return made[one]
 
     return bound(function) if parts else function

@@ -21,7 +21,7 @@ from strapdown.estimation.observability import state_names, without_errors
 from strapdown.estimation.schedule import KIND_CODES
 from strapdown.estimation.states import ProcessNoise
 from strapdown.estimation.step_filter import StepFilter
-from strapdown.kernels import error_state_step, triangle
+from strapdown.kernels import sensor_rows, triangle
 from strapdown.kernels.machine import compiled
 from strapdown.records import ImuRecord
 from strapdown.vectors import VectorMeasurements, triad
@@ -406,25 +406,26 @@ def test_rows_are_the_derivative_of_what_sensors_give(option):
 
 def rows_at(face, sensor, kind, reference, z):
     """Return H and y that the kernel makes of a measurement at the face's estimate."""
-    H, y, basis = np.empty((3, len(face.x))), np.empty(3), np.empty((3, 3))
+    H = np.zeros((3, len(face.x)))
     model = face._model(sensor, kind)
     length = np.linalg.norm(reference) if kind == "vector" else 1.0
     attitude = kind == "attitude"
     frame = (*z, 0.0, 0.0, 0.0, 0.0, 0.0) if attitude else tuple(triad(reference).ravel())
-    count = error_state_step.fill_rows(
+    count, y, _, _ = sensor_rows.fill_rows(
         tuple(face.attitude),
         np.array([*face.bias, *face.values]),
+        H,
         KIND_CODES[kind],
-        (0.0, 0.0, 0.0) if attitude else tuple(z / length),
+        tuple(z) if attitude else (*(z / length), 0.0),
         frame,
         length,
         0,
         model.sensors,
         model.sensor_use,
         (0.0,) * 9,
-        (H, y, basis),
+        0.0,
     )
-    return H[:count], y[:count]
+    return H[:count], np.array(y[:count])
 
 
 # ------------------------------------------------------------------------------------------------- square root: sharp, diffuse, long

@@ -131,7 +131,7 @@ def test_states_go_through_their_file_to_the_last_bit(tmp_path):
 def test_bad_tables_are_refused_with_their_place(table, words):
     with pytest.raises(InputError, match=words) as caught:
         optional.from_table(table, "f.toml: filter: states")
-    assert str(caught.value).startswith("f.toml: filter: states")
+    assert "f.toml: filter: states" in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -261,23 +261,45 @@ def test_the_whole_bias_is_that_of_all_states():
     initial = begun(record)
     reported = optional.run(record, NOISE, initial, states, every=50, full_covariance=True)
     blocks = states.blocks({"mag": "vector", "acc": "vector"})
-    begin = optional.initial_state(initial, blocks)
+    begin = optional.initial_state(initial, blocks, states.gyro_fast_bias_sigma)
     whole = estimation.run(record, NOISE, begin, blocks, every=50, full_covariance=True)
     sum_of = np.zeros((6, 12))
     sum_of[:6, :6] = np.eye(6)
     sum_of[3:, 6:9] = sum_of[3:, 9:] = np.eye(3)
     expected = sum_of @ whole.whole_covariance @ sum_of.T
-    expected[:, [3, 4, 5], [3, 4, 5]] += 1e-8
+    expected[1:, [3, 4, 5], [3, 4, 5]] += 1e-8
+    expected[0] = initial.covariance
     np.testing.assert_allclose(reported.covariance, expected, rtol=1e-9, atol=1e-18)
     np.testing.assert_allclose(reported.variance, np.einsum("kii->ki", expected), rtol=1e-11)
     np.testing.assert_allclose(
         reported.bias, whole.bias + sum(one.values for one in whole.error_states.values()), rtol=0, atol=1e-15
     )
-    # The start is what it says of the whole bias, whatever the parts are.
+    # The initial bias is the sum of all parts, and of one too fast for a state that does not last.
     at_start = sum_of @ begin.covariance @ sum_of.T
-    np.testing.assert_allclose(at_start, initial.covariance, rtol=1e-9, atol=1e-18)
+    fast = 1e-8 * np.diag([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])
+    np.testing.assert_allclose(at_start, initial.covariance + fast, rtol=1e-9, atol=1e-18)
     np.testing.assert_allclose(begin.covariance[6:, 6:], np.diag(np.repeat([2e-3, 1e-3], 3) ** 2), rtol=1e-12)
     assert begin.covariance[3, 6] == pytest.approx(-4e-6)
+
+
+def test_the_smoother_reports_the_whole_bias_too():
+    """At the last edge it is the filter; there the kernels sum the parts."""
+    record = simulated(markov_noise=1e-3, markov_correlation_time=8.0)
+    states = States(
+        gyro_scale_sigma=1e-3, gyro_drift_sigma=(2e-3, 1e-3), gyro_drift_time=(8.0, 1.5), gyro_fast_bias_sigma=1e-4
+    )
+    given = chosen(states)
+    filtered = run(record, given, full_covariance=True)
+    smoothed = setup.smooth(record, given, begun(record), full_covariance=True)
+    np.testing.assert_allclose(smoothed.bias[-1], filtered.bias[-1], rtol=1e-9)
+    np.testing.assert_allclose(smoothed.covariance[-1], filtered.covariance[-1], rtol=1e-9, atol=1e-18)
+    np.testing.assert_allclose(smoothed.variance, np.einsum("kii->ki", smoothed.covariance), rtol=1e-12)
+    middle = len(record.time) // 2
+    assert np.all(smoothed.variance[middle] < filtered.variance[middle])
+    diagonals = setup.smooth(record, given, begun(record))
+    assert diagonals.covariance is None
+    assert diagonals.whole_covariance is None
+    np.testing.assert_array_equal(diagonals.variance, smoothed.variance)
 
 
 # ------------------------------------------------------------------------------------------------------------- the gyro and force

@@ -166,6 +166,15 @@ def satellite(duration=300.0):
     return montecarlo.Plan(scenario=scenario, setup=chosen, epochs=50, individuals=True)
 
 
+def test_the_bias_is_consistent_from_the_first_second():
+    """A filter that takes the initial bias for that of its states has a NEES of 1.24: the fast part of flicker is not in them."""
+    runs = montecarlo.run_plan(satellite(5.0), runs=300, threads=1)
+    bias = runs.anees[:, runs.subsets.index("bias")]
+    low, high = consistency.mean_bounds(3, 300, 0.999)
+    assert low < bias[0] < high
+    assert low < bias[np.searchsorted(runs.time, 1.0)] < high
+
+
 def coloured(correlation_time):
     """A tracker whose noise is half coloured, with states for that."""
     base = satellite(100.0).scenario

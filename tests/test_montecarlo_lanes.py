@@ -274,6 +274,19 @@ def test_coning_algorithms_and_substeps():
     np.testing.assert_allclose(estimate.attitude, replay.estimate.attitude, atol=1e-12)
 
 
+def test_a_measurement_at_the_end_of_a_cut_step_is_in_the_row_there():
+    """Steps of two halves, whose sum rounds to the edge or not, and a measurement at each edge."""
+    rate = [0.0, 0.0, 100.0 / 3.0]  # two thirds of a radian a sample
+    spun = replace(SCENARIO, motion=motion.ConstantRate(rate=rate), sensors=(replace(UP, rate=50.0),))
+    replay = lanes.replay(replace(PLAN, scenario=spun), 0)
+    time, half = replay.record.time, 0.5 * np.diff(replay.record.time)
+    middle = time[:-1] + half
+    assert np.any((time[1:] - middle > half) & (middle + half == time[1:]))  # cut, and yet at the edge
+    estimate = setup.run(replay.record, SETUP, replay.initial)
+    np.testing.assert_allclose(estimate.variance, replay.estimate.variance, rtol=1e-9)
+    np.testing.assert_allclose(estimate.attitude, replay.estimate.attitude, atol=1e-12)
+
+
 # ----------------------------------------------------------------------------------------------------- single precision
 
 

@@ -12,7 +12,7 @@ from strapdown.checks import InputError
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.gyro import GyroSpec
 from strapdown.randomness import generator
-from strapdown.setup import FilterSetup, states
+from strapdown.setup import FilterSetup
 
 SETUP = FilterSetup(
     process_noise=estimation.ProcessNoise(angle_random_walk=1.234567e-5, rate_random_walk=3.3e-8),
@@ -278,9 +278,6 @@ def test_what_cannot_be_smoothed_is_refused(monkeypatch):
     record = scenarios.simulate(chosen, 3)
     filter_setup = setup.matched(chosen)
     start = setup.initial_state(filter_setup, record.truth.attitude[0])
-    drifting = states.States(gyro_drift_sigma=(1e-5,), gyro_drift_time=(10.0,))
-    with pytest.raises(InputError, match="does not estimate a gyro drift"):
-        setup.smooth(record, dataclasses.replace(filter_setup, states=drifting), start)
     monkeypatch.setattr(setup, "MAX_MEMORY", 1e5)
     with pytest.raises(InputError, match=r"with 6 states takes .* GB, more than 0.0001; cut the record"):
         setup.smooth(record, filter_setup, start)

@@ -16,7 +16,7 @@ from strapdown.ahrs.starting import need_accelerometer, quiet_span
 from strapdown.checks import Array
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.memory import side_by_side
-from strapdown.estimation.temperature import joined
+from strapdown.estimation.schedule import joined
 from strapdown.kernels import recording_steps
 from strapdown.kernels.machine import compiled, read_only
 from strapdown.recordings import Recording, sensor_delays, sensor_faults, unit_calibration

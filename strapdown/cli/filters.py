@@ -5,6 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+import numpy as np
+
+from strapdown.checks import InputError
+from strapdown.files import reading
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
@@ -24,16 +29,9 @@ def filter_for(
     gyro: Path | None,
     filter_file: Path | None,
     states: ChosenStates,
-    *,
-    smooth: bool = False,
 ) -> tuple[FilterSetup, list[str]]:
-    """Return the filter, and what to say of it: of a file, or matched to the gyro's specification and the record's sensors.
-
-    A filter that is to be smoothed is not given gyro drifts unless ``states`` names them.
-    """
+    """Return the filter, and what to say of it: of a file, or matched to the gyro's specification and the record's sensors."""
     from strapdown import setup
-    from strapdown.checks import InputError
-    from strapdown.files import reading
     from strapdown.gyro import read_spec
     from strapdown.setup.for_record import matched_setup, unmodelled_errors
 
@@ -50,7 +48,7 @@ def filter_for(
     spec = None if gyro is None else read_spec(gyro)
     if spec is None and held.gyro is None:
         raise InputError(f"{path} does not hold the gyro's specification; give --gyro or --filter, a TOML file")
-    chosen = matched_setup(record, spec, states=True if states == () else states, smooth=smooth)
+    chosen = matched_setup(record, spec, states=True if states == () else states)
     missing = unmodelled_errors(record, chosen)
     if states is False or (states is None and chosen.states is None):
         return chosen, no_state_words(missing, chosen)
@@ -78,8 +76,6 @@ def default_words(names: Sequence[str]) -> str:
 
 def need_angles(filter_file: Path, chosen: FilterSetup, held: RecordFile) -> None:
     """Refuse σ of the record's sensors that cannot be in rad, but where the record's own are as wide."""
-    import numpy as np
-
     from strapdown import setup
 
     fine = {one.sensor: one.kind for one in held.record.vectors if len(one.time) and np.max(one.sigma) <= np.pi}

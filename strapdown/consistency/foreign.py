@@ -453,10 +453,7 @@ def _rates(series: _Series) -> tuple[Array, Array]:
 
 
 def coarse_offset(own_time: Array, own_speed: Array, true_time: Array, true_speed: Array) -> float:
-    """Return the offset, s, to be added to the first times, at which two series of angular speeds correlate best; 0 if nothing stands out.
-
-    Speeds are the same in all frames.
-    """
+    """Return the offset, s, to be added to the first times, at which two series of angular speeds agree best; 0 if nothing stands out."""
     step = max(float(np.median(np.diff(own_time))), float(np.median(np.diff(true_time))))
     apart = own_time[-1] < true_time[0] or true_time[-1] < own_time[0]
     base = true_time[0] - own_time[0] if apart else 0.0
@@ -633,10 +630,7 @@ def _in_truth_axes(P: Array, own: _Series, truth: Truth, alignment: Alignment) -
 def explanations(
     error: Array, readings: Mapping[str, Array], chosen: str, truth: Truth, time: Array, attitude: Array
 ) -> tuple[Explanation, ...]:
-    """Return what would explain the attitude errors (m, 3) better than the covariance alone, the likeliest first.
-
-    Constant rotations and an offset in time are fitted by weighted least squares, and what they gain is held against χ²; a scale of σ too.
-    """
+    """Return what would explain the attitude errors (m, 3) better than the covariance alone, the likeliest first."""
     from scipy.special import chdtrc
 
     P = readings[chosen][:, :3, :3]

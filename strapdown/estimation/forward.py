@@ -20,7 +20,7 @@ from strapdown.estimation.error_states import ErrorStates
 from strapdown.estimation.gating import LOCK_OUT, Gate, Monitor, Robust
 from strapdown.estimation.memory import side_by_side
 from strapdown.estimation.model import Model
-from strapdown.estimation.schedule import Schedule, innovations_by_sensor, schedule, skipped_too
+from strapdown.estimation.schedule import Schedule, innovations_by_sensor, joined, schedule, skipped_too
 from strapdown.estimation.states import (
     Candidate,
     GateMemory,
@@ -181,7 +181,7 @@ def run(
     options = Options(
         every=count("every", every), full_covariance=full_covariance, gate=gate, robust=robust, together=every > 1
     )
-    return watched(_passed(record, process_noise, initial, error_states, options, monitor).estimate, monitor, gate)
+    return _passed(record, process_noise, initial, error_states, options, monitor).estimate
 
 
 def run_part(
@@ -218,7 +218,7 @@ def run_part(
         robust=robust,
     )
     passed = _passed(record, process_noise, initial, error_states, options, monitor)
-    return watched(passed.estimate, monitor, gate), passed.end
+    return passed.estimate, passed.end
 
 
 def _passed(
@@ -239,7 +239,7 @@ def _passed(
             f"the filter diverged before {end:g} s: its attitude is no number; the errors of the start or of the measurements are many "
             "times their sigmas"
         )
-    return passed
+    return replace(passed, estimate=watched(passed.estimate, monitor, options.gate))
 
 
 def prepared(
@@ -289,7 +289,7 @@ def filtered(problem: Problem, options: Options) -> Passed:
         parts.append(temperature.at_edges(passed.estimate, slopes, off[:: options.every]))
         state, before = passed.end, mean
     end = temperature.shifted(state, slopes, float(T[-1]) - before)
-    estimate = temperature.joined(parts)
+    estimate = joined(parts)
     skipped = skipped_too(problem.events, estimate.innovations)
     return Passed(estimate=replace(estimate, skipped=skipped), make_end=lambda: end, segments=np.empty((0, 0)))
 
@@ -314,7 +314,7 @@ def watched(estimate: Estimate, monitor: Monitor | None, gate: Gate | None) -> E
         nis = np.where(np.concatenate([one.used for one in parts]), nis, gate.thresholds[degrees - 1])
     order = np.argsort(time, kind="stable")
     events = [*estimate.events, *monitor.watch(time[order], nis[order], degrees[order])]
-    return replace(estimate, events=_in_order(events))
+    return replace(estimate, events=in_order(events))
 
 
 def gaps(time: Array, factor: float = GAP_FACTOR) -> list[Event]:
@@ -329,7 +329,8 @@ def gaps(time: Array, factor: float = GAP_FACTOR) -> list[Event]:
     ]
 
 
-def _in_order(events: Sequence[Event]) -> tuple[Event, ...]:
+def in_order(events: Sequence[Event]) -> tuple[Event, ...]:
+    """Return events in order of time."""
     return tuple(sorted(events, key=lambda event: event.start))
 
 
@@ -346,19 +347,10 @@ def _block_outputs(problem: Problem, options: Options, *, judged: bool) -> covar
     """Return room for what a run writes."""
     rows = len(problem.record.increments) // options.every + 1
     shapes = (rows, 4), (rows, 3), (rows, 6), (rows if options.full_covariance else 0, 21)
-    written = side_by_side(
-        *((shape, float) for shape in (*shapes, _innovations(problem.events, judged=judged))),
-    )
-    (segments,) = side_by_side(((options.segments + 1 if options.segments else 0, 32), float))
-    attitude, bias, variance, covariance, innovation = written
-    return covariance_form.Outputs(
-        attitude=attitude,
-        bias=bias,
-        variance=variance,
-        covariance=covariance,
-        innovation=innovation,
-        segments=segments,
-    )
+    innovations = _innovations(problem.events, judged=judged)
+    written = side_by_side(*((shape, float) for shape in (*shapes, innovations)))
+    segments = side_by_side(((options.segments + 1 if options.segments else 0, 32), float))
+    return covariance_form.Outputs(*written, *segments)
 
 
 def _block_body(problem: Problem, options: Options, states: Array) -> covariance_form.Body:
@@ -453,7 +445,7 @@ def _block_result(
         covariance=covariance_matrices(out.covariance) if options.full_covariance else None,
         innovations=innovations,
         skipped=skipped_too(problem.events, innovations),
-        events=_in_order([*gaps(problem.record.time), *events]),
+        events=in_order([*gaps(problem.record.time), *events]),
     )
     return Passed(
         estimate=estimate,
@@ -537,13 +529,8 @@ class Judge:
         """Return what the gate remembers at the end; None without a gate."""
         if self.gate is None:
             return None
-        first = self.start()
-        return replace(
-            first,
-            candidate=candidate,
-            counts=self.memory,
-            counters=dict(zip(self.problem.events.sensors, self.counters, strict=True)),
-        )
+        counters = dict(zip(self.problem.events.sensors, self.counters, strict=True))
+        return replace(self.start(), candidate=candidate, counts=self.memory, counters=counters)
 
     def start(self) -> GateMemory:
         """Return what a gate knows of a candidate's start, as of the start of the first part of the record."""
@@ -617,20 +604,8 @@ def restart_states(state: State, error_states: tuple[ErrorStates, ...]) -> tuple
 
 def model_arrays(model: Model, variances: tuple[float, float]) -> root_form.Model:
     """Return noise and error states as the kernels take them."""
-    return root_form.Model(
-        angle_variance=variances[0],
-        rate_variance=variances[1],
-        decay=model.decay,
-        density=model.density,
-        changing=model.changing,
-        limit=model.limit,
-        gyro=model.gyro,
-        gyro_use=model.gyro_use,
-        sensors=model.sensors,
-        sensor_use=model.sensor_use,
-        force_f=tuple(model.force_f.tolist()),
-        chains=model.chains,
-    )
+    same = {name: getattr(model, name) for name in root_form.Model._fields[2:]}
+    return root_form.Model(*variances, **{**same, "force_f": tuple(model.force_f.tolist())})
 
 
 def scratch(model: Model) -> root_form.Scratch:
@@ -639,7 +614,6 @@ def scratch(model: Model) -> root_form.Scratch:
     return root_form.Scratch(
         rows=np.zeros((3, 3, width)),
         lines=np.zeros((root_form.LINES, width)),
-        threes=np.empty((5, 3)),
         steps=np.zeros((2, 2, 6 + m, 4)),
         links=np.empty((len(model.chains), LINKS)),
         six=np.empty((6, 6)),
@@ -717,10 +691,15 @@ def _in_factor(problem: Problem, options: Options) -> Passed:
         ),
         innovations=innovations,
         skipped=skipped_too(events, innovations),
-        events=_in_order([*gaps(record.time), *happened]),
+        events=in_order([*gaps(record.time), *happened]),
     )
     if options.whole_bias:
-        estimate = _with_whole_bias(estimate, model, out, full=options.full_covariance)
+        estimate = replace(
+            estimate,
+            whole_bias=whole_bias(model, out.x),
+            whole_bias_variance=out.whole_variance,
+            whole_bias_covariance=out.whole_covariance if options.full_covariance else None,
+        )
     candidate = candidate_in_factor(body, model) if judge.memory[gate_rules.CANDIDATE] else None
     memory = judge.remembered(candidate)
     return Passed(
@@ -740,16 +719,6 @@ def restart_in_factor(judge: Judge) -> root_form.Restart:
         root=modelling.lower_root(first.covariance[np.ix_(model.order, model.order)]),
         time=first.start,
         fresh=np.empty((3 * model.states + 6, padded(3 + model.states))),
-    )
-
-
-def _with_whole_bias(estimate: Estimate, model: Model, out: root_form.Outputs, *, full: bool) -> Estimate:
-    """Return an estimate that reports the whole bias."""
-    return replace(
-        estimate,
-        whole_bias=whole_bias(model, out.x),
-        whole_bias_variance=out.whole_variance,
-        whole_bias_covariance=out.whole_covariance if full else None,
     )
 
 

@@ -451,7 +451,7 @@ def _order(one: _Measured) -> tuple[float, int]:
     return one[0], one[1]
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class _Sensor:
     """A sensor as it was declared."""
 
@@ -459,13 +459,15 @@ class _Sensor:
     kind: str
     place: int
     reference_f: Array
+    covariance: Array
+    sigma: float
     row: _Row
 
     @staticmethod
     def of(series: VectorMeasurements, place: int) -> _Sensor:
-        reference = series.references_f[0]
-        row = _row(series.kind, reference, series.covariances[0], not series.anisotropic, float(series.sigma[0]))
-        return _Sensor(name=series.sensor, kind=series.kind, place=place, reference_f=reference, row=row)
+        reference, noise, sigma = series.references_f[0], series.covariances[0], float(series.sigma[0])
+        row = _row(series.kind, reference, noise, not series.anisotropic, sigma)
+        return _Sensor(series.sensor, series.kind, place, reference, noise, sigma, row)
 
     def changed(self, sigma: float | None, reference: ArrayLike | None) -> _Row:
         """Return the row of a measurement whose σ or reference is another one."""
@@ -477,14 +479,10 @@ class _Sensor:
             r = np.array(given if self.kind == "vector" else _unit(given))
             if self.kind == "heading":
                 need_level(f"{self.name}: reference_f", r)
-        if sigma is not None:
-            s = positive(f"{self.name}: sigma", sigma)
-            return _row(self.kind, r, s**2 * np.eye(3), self.row.isotropic, s)
-        old = self.row
-        length = float(np.linalg.norm(r)) if self.kind == "vector" else 1.0
-        share = old.length / length
-        noise = tuple(share**2 * c for c in old.noise)
-        return old._replace(frame=_frame(r), length=length, sigma=share * old.sigma, noise=noise)
+        if sigma is None:
+            return _row(self.kind, r, self.covariance, self.row.isotropic, self.sigma)
+        s = positive(f"{self.name}: sigma", sigma)
+        return _row(self.kind, r, s**2 * np.eye(3), self.row.isotropic, s)
 
     def measured(self, time: float, value: Any, row: _Row) -> _Measured | None:
         """Return a measurement; None if it is missing, or of a direction without length."""

@@ -20,9 +20,9 @@ from numpy.typing import ArrayLike
 
 from strapdown import estimation, quaternion, records, vectors
 from strapdown.checks import Array, InputError, array, count, finite, positive
-from strapdown.estimation.forward import after, gaps, gate_options
+from strapdown.estimation.forward import after, gaps, gate_options, in_order
 from strapdown.estimation.gating import Gate, Monitor, Robust
-from strapdown.estimation.schedule import Schedule, schedule
+from strapdown.estimation.schedule import Schedule, innovations_by_sensor, joined, schedule
 from strapdown.estimation.states import (
     ProcessNoise,
     State,
@@ -35,7 +35,7 @@ from strapdown.kernels import gate_rules, measurement
 from strapdown.kernels import hypotheses as hypotheses_kernel
 from strapdown.kernels.machine import compiled, read_only
 from strapdown.kernels.walk import walk
-from strapdown.records import Estimate, Event, ImuRecord, Innovations
+from strapdown.records import Estimate, Event, ImuRecord
 from strapdown.units import DEGREE, DEGREE_PER_HOUR
 from strapdown.vectors import VectorMeasurements
 
@@ -189,8 +189,8 @@ def run(
     after = estimation.run(
         rest, process_noise, one, every=every, full_covariance=True, gate=gate, robust=robust, monitor=monitor
     )
-    whole = _joined([(-np.inf, found.estimate), (found.became_one, after)], gaps(record.time))
-    return replace(found, estimate=replace(whole, skipped=found.estimate.skipped))
+    own = tuple(event for event in after.events if event.kind != "gap")  # those of the whole record are there already
+    return replace(found, estimate=joined([found.estimate, replace(after, events=own)]))
 
 
 def _from_where_one(record: ImuRecord, found: BankEstimate) -> tuple[ImuRecord, State]:
@@ -271,7 +271,7 @@ def _until_one(record: ImuRecord, process_noise: ProcessNoise, options: _Options
         sensor: events.skipped[sensor] + int(np.sum(events.sensor[:first] == i))
         for i, sensor in enumerate(events.sensors)
     }
-    estimate = replace(found.estimate, skipped=skipped, events=_in_order(own_events))
+    estimate = replace(found.estimate, skipped=skipped, events=in_order(own_events))
     one = found.at >= 0
     return BankEstimate(
         estimate=estimate,
@@ -332,7 +332,8 @@ def _walked(
         edges, increments, after(events.measurements, first + 1), 1, body, out
     )
     used += first + 1
-    taken = np.arange(first + 1, used + recovery if at == hypotheses_kernel.LOST else used)
+    processed = np.zeros(len(events.time), bool)
+    processed[events.row[first + 1 : used + recovery if at == hypotheses_kernel.LOST else used]] = True
     P = covariance_matrices(out.covariance[:rows])
     estimate = Estimate(
         time=record.time[kept[:rows]],
@@ -340,7 +341,7 @@ def _walked(
         bias=out.bias[:rows],
         variance=np.ascontiguousarray(np.diagonal(P, axis1=1, axis2=2)),
         covariance=P,
-        innovations=_innovations(events, taken, out.innovation, out.share if options.doubted else None),
+        innovations=innovations_by_sensor(events, out.innovation, out.share if options.doubted else None, processed),
     )
     return _Walked(estimate, kept, angles, out.weights[:rows], weight, at, used)
 
@@ -413,64 +414,6 @@ def _isotropic(series: VectorMeasurements) -> VectorMeasurements:
         axes = np.repeat(largest[:, None], 3, axis=1)
         return replace(series, sigma=largest, sigma_axes=axes, covariance=None)
     return replace(series, sigma=largest, sigma_axes=None, covariance=None)
-
-
-def _innovations(events: Schedule, taken: np.ndarray, rows: Array, weight: Array | None) -> dict[str, Innovations]:
-    """Return the innovations e₁, s₁, e₂, s₂, … of the events taken, by sensor, as many as each has degrees of freedom."""
-    result = {}
-    for i, (sensor, kind) in enumerate(zip(events.sensors, events.kinds, strict=True)):
-        mine = taken[events.sensor[taken] == i]
-        place = events.row[mine]
-        filled = rows[place, : 2 * vectors.KINDS[kind]]
-        result[sensor] = Innovations(
-            time=events.time[mine],
-            innovation=filled[:, 0::2],
-            variance=filled[:, 1::2],
-            weight=None if weight is None else weight[place],
-        )
-    return result
-
-
-def _joined(parts: list[tuple[float, Estimate]], gap_events: list[Event]) -> Estimate:
-    """Return estimates of one record as one, each from its time until the next one's, their events with the ``gap_events``."""
-    bounds = [*np.maximum.accumulate([since for since, _ in parts]).tolist(), np.inf]
-    rows = [
-        (one.time >= since) & (one.time < until)
-        for (_, one), since, until in zip(parts, bounds[:-1], bounds[1:], strict=True)
-    ]
-
-    def of_rows(name: str) -> Array:
-        return np.concatenate([getattr(one, name)[kept] for (_, one), kept in zip(parts, rows, strict=True)])
-
-    innovations = {}
-    for sensor in parts[0][1].innovations:
-        series = [one.innovations[sensor] for _, one in parts]
-        # A measurement at a bound belongs to the estimate before it, a row to the one after it.
-        mine = [
-            (one.time > since) & (one.time <= until)
-            for one, since, until in zip(series, bounds[:-1], bounds[1:], strict=True)
-        ]
-        weights = [one.weight[kept] for one, kept in zip(series, mine, strict=True) if one.weight is not None]
-        innovations[sensor] = Innovations(
-            time=np.concatenate([one.time[kept] for one, kept in zip(series, mine, strict=True)]),
-            innovation=np.concatenate([one.innovation[kept] for one, kept in zip(series, mine, strict=True)]),
-            variance=np.concatenate([one.variance[kept] for one, kept in zip(series, mine, strict=True)]),
-            weight=np.concatenate(weights) if len(weights) == len(parts) else None,
-        )
-    events = [event for _, one in parts for event in one.events if event.kind != "gap"]
-    return Estimate(
-        time=of_rows("time"),
-        attitude=of_rows("attitude"),
-        bias=of_rows("bias"),
-        variance=of_rows("variance"),
-        covariance=of_rows("covariance") if all(one.covariance is not None for _, one in parts) else None,
-        innovations=innovations,
-        events=_in_order([*events, *gap_events]),
-    )
-
-
-def _in_order(events: list[Event]) -> tuple[Event, ...]:
-    return tuple(sorted(events, key=lambda event: event.start))
 
 
 def _reason(record: ImuRecord, events: Schedule, weight: Array, estimate: Estimate) -> str:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from strapdown.checks import Array, InputError
 from strapdown.estimation.memory import side_by_side
 from strapdown.kernels import measurement
 from strapdown.kernels.machine import compiled, read_only
-from strapdown.records import Innovations
+from strapdown.records import Estimate, Innovations
 from strapdown.vectors import KINDS, VectorMeasurements, triad
 
 KIND_CODES = {
@@ -270,30 +271,25 @@ def _need_noise(series: VectorMeasurements) -> None:
             )
 
 
-def innovations_by_sensor(events: Schedule, rows: Array, weight: Array | None = None) -> dict[str, Innovations]:
+def innovations_by_sensor(
+    events: Schedule, rows: Array, weight: Array | None = None, processed: Array | None = None
+) -> dict[str, Innovations]:
     """Return what a kernel wrote of each measurement by place, e₁, s₁, e₂, s₂, …, by sensor, as many as it has degrees of freedom.
 
-    A heading whose row is NaN was that of a vertical vector, which shows none, and is left out (:func:`skipped_too`).
+    Left out are those not ``processed`` (by place, bool; default: all are), and headings whose row is NaN, of a vertical vector, which
+    shows none (:func:`skipped_too`).
     """
     result = {}
     for i, (sensor, kind) in enumerate(zip(events.sensors, events.kinds, strict=True)):
         mine = slice(events.bounds[i], events.bounds[i + 1])
-        filled = rows[mine, : 2 * KINDS[kind]]
-        one = Innovations(
-            time=events.series_time[i],
-            innovation=filled[:, 0::2],
-            variance=filled[:, 1::2],
-            weight=None if weight is None else weight[mine],
-        )
-        if kind == "heading" and np.isnan(np.sum(one.innovation)):
-            shown = ~np.isnan(one.innovation[:, 0])
-            one = Innovations(
-                time=one.time[shown],
-                innovation=one.innovation[shown],
-                variance=one.variance[shown],
-                weight=None if one.weight is None else one.weight[shown],
-            )
-        result[sensor] = one
+        e, s = rows[mine, 0 : 2 * KINDS[kind] : 2], rows[mine, 1 : 2 * KINDS[kind] : 2]
+        time, share = events.series_time[i], None if weight is None else weight[mine]
+        shown = None if processed is None else processed[mine]
+        if kind == "heading" and np.isnan(np.sum(e)):
+            shown = ~np.isnan(e[:, 0]) if shown is None else shown & ~np.isnan(e[:, 0])
+        if shown is not None:
+            time, e, s, share = time[shown], e[shown], s[shown], None if share is None else share[shown]
+        result[sensor] = Innovations(time=time, innovation=e, variance=s, weight=share)
     return result
 
 
@@ -304,3 +300,44 @@ def skipped_too(events: Schedule, innovations: Mapping[str, Innovations]) -> dic
         sensor: events.skipped[sensor] + int(number) - len(innovations[sensor].time)
         for sensor, number in zip(events.sensors, numbers, strict=True)
     }
+
+
+def joined(parts: Sequence[Estimate]) -> Estimate:
+    """Return the estimates of successive parts of a record as one; at an edge between two stands the first part's."""
+    if len(parts) == 1:
+        return parts[0]
+
+    def rows(*values: Array | None) -> Any:
+        return (
+            None if values[0] is None else np.concatenate([v[k > 0 :] for k, v in enumerate(values) if v is not None])
+        )
+
+    names = ["time", "attitude", "bias", "variance", "covariance"]
+    names += ["whole_covariance", "whole_bias", "whole_bias_variance", "whole_bias_covariance"]
+    innovations = {}
+    for sensor in dict.fromkeys(name for part in parts for name in part.innovations):
+        own = [part.innovations[sensor] for part in parts if sensor in part.innovations]
+        weights = [one.weight for one in own if one.weight is not None]
+        innovations[sensor] = Innovations(
+            time=np.concatenate([one.time for one in own]),
+            innovation=np.concatenate([one.innovation for one in own]),
+            variance=np.concatenate([one.variance for one in own]),
+            weight=np.concatenate(weights) if len(weights) == len(own) else None,
+        )
+    blocks = {
+        name: replace(
+            block,
+            values=rows(*(part.error_states[name].values for part in parts)),
+            variance=rows(*(part.error_states[name].variance for part in parts)),
+        )
+        for name, block in parts[0].error_states.items()
+    }
+    # A lock-out that goes on is reported by each part, by the last as a whole.
+    events = {(event.kind, event.sensor, event.start): event for part in parts for event in part.events}
+    return replace(
+        parts[0],
+        innovations=innovations,
+        events=tuple(events.values()),
+        error_states=blocks,
+        **{name: rows(*(getattr(part, name) for part in parts)) for name in names},
+    )

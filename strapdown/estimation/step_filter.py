@@ -29,10 +29,11 @@ from strapdown.checks import (
 )
 from strapdown.estimation import model as modelling
 from strapdown.estimation.error_states import ErrorStates
+from strapdown.estimation.forward import model_arrays
 from strapdown.estimation.schedule import KIND_CODES
 from strapdown.estimation.states import ProcessNoise, State, check_arguments
 from strapdown.estimation.temperature import need_none
-from strapdown.kernels import chains, error_state_step
+from strapdown.kernels import chains, error_state_step, sensor_rows
 from strapdown.kernels.measurement import has_heading
 from strapdown.kernels.rotation import rotation_matrix
 from strapdown.records import LARGEST_TURN
@@ -213,18 +214,17 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
 
     def _sub_step(self, part: Array, dt: float) -> None:
         """Propagate over an increment at constant rate, by the kernels' own functions."""
-        model, m, n = self._motion, len(self.values), len(self.x)
+        white = self.process_noise.angle_random_walk**2, self.process_noise.rate_random_walk**2
+        model, m, n = model_arrays(self._motion, white), len(self.values), len(self.x)
         q, phi, x = tuple(self.attitude.tolist()), tuple(part.tolist()), np.concatenate([self.bias, self.values])
-        gyro, force = (model.gyro, model.gyro_use), tuple(model.force_f.tolist())
         top, factor = np.zeros((n, 4)), np.empty(m)
-        attitude, _, rate, D = error_state_step.move(q, x, dt, phi, model.decay, *gyro, force, top, factor)
+        attitude, _, rate, D = error_state_step.move(q, x, dt, phi, model, top, factor)
         # Rows 0 to n become Φᵀ, the rows after them N with Q = Nᵀ N.
-        rows = np.zeros((n + model.noise_rows, n))
+        rows = np.zeros((n + self._motion.noise_rows, n))
         rows[:n] = np.eye(n)
         error_state_step.carry(rows, n, 0, top, factor, m)
-        white = self.process_noise.angle_random_walk**2, self.process_noise.rate_random_walk**2
         noise = np.zeros((n, 4))
-        error_state_step.step_noise(noise, dt, rate, D, *white, model.decay, model.density, *gyro)
+        error_state_step.step_noise(noise, dt, rate, D, model)
         row = error_state_step.fill_noise(rows, n, noise, n)
         links = np.empty((len(model.chains), chains.LINKS))
         chains.step_chains(rows, n, row, x, dt, model.decay, model.chains, links)
@@ -236,7 +236,7 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
     # ---------------------------------------------------------------------------------------------------------------- updates
 
     def update(self, *arguments: Any, **options: Any) -> None:
-        """Refuse filterpy's own update by any ``Hx``: it would leave the correction in ``x``, outside ``attitude`` and ``bias``.
+        """Refuse filterpy's own updates by any ``Hx``: they would leave the correction in ``x``, outside ``attitude`` and ``bias``.
 
         Parameters
         ----------
@@ -249,26 +249,11 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
             Always; use :meth:`update_direction`, :meth:`update_vector`, :meth:`update_heading` or :meth:`update_attitude`.
         """
         raise InputError(
-            "update() by HJacobian and Hx knows no attitude, and would leave its correction in x; use update_direction, update_vector, "
+            "an update by HJacobian and Hx knows no attitude, and would leave its correction in x; use update_direction, update_vector, "
             "update_heading or update_attitude"
         )
 
-    def predict_update(self, *arguments: Any, **options: Any) -> None:
-        """Refuse filterpy's own step, as :meth:`update` does.
-
-        Parameters
-        ----------
-        *arguments, **options
-            Ignored.
-
-        Raises
-        ------
-        InputError
-            Always.
-        """
-        raise InputError(
-            "predict_update() would update by Hx, which knows no attitude; use predict, then update_direction or another"
-        )
+    predict_update = update
 
     def update_direction(
         self,
@@ -492,16 +477,18 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
     def _rows(self, measurement: _Measurement, sensor: str) -> tuple[Array, Array, Array]:
         """Return residual (d,), H (d, n) and noise (d, d) of a measurement, by the kernels' own function."""
         model, others = self._sensor_model(sensor, measurement.kind), np.concatenate([self.bias, self.values])
-        rows = error_state_step.Rows(H=np.empty((3, len(self.x))), y=np.empty(3), basis=np.empty((3, 3)))
-        given = KIND_CODES[measurement.kind], measurement.z, measurement.frame, measurement.length
+        H = np.zeros((3, len(self.x)))
+        value = measurement.frame[:4] if measurement.kind == "attitude" else (*measurement.z, 0.0)
+        given = KIND_CODES[measurement.kind], value, measurement.frame, measurement.length
         effects = 0, model.sensors, model.sensor_use, NO_LEVER
-        d = error_state_step.fill_rows(tuple(self.attitude.tolist()), others, *given, *effects, rows)
-        return rows.y[:d], rows.H[:d], (rows.basis @ measurement.noise @ rows.basis.T)[:d, :d]
+        d, y, axes, _ = sensor_rows.fill_rows(tuple(self.attitude.tolist()), others, H, *given, *effects, 0.0)
+        T = np.array(axes)
+        return np.array(y[:d]), H[:d], (T @ measurement.noise @ T.T)[:d, :d]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Measurement:
-    """A measurement as the kernels take it (:func:`strapdown.kernels.error_state_step.fill_rows`)."""
+    """A measurement as the kernels take it (:func:`strapdown.kernels.sensor_rows.fill_rows`)."""
 
     kind: str
     z: tuple[float, ...]

@@ -17,7 +17,7 @@ import numpy as np
 from strapdown.checks import Array, InputError
 from strapdown.estimation.error_states import ErrorStates, GyroTemperature
 from strapdown.estimation.states import State
-from strapdown.records import Estimate, ImuRecord, Innovations
+from strapdown.records import Estimate, ImuRecord
 
 LEVELS = 200
 """Stretches over the range of temperature, at the least."""
@@ -100,44 +100,3 @@ def at_edges(estimate: Estimate, own: slice, off: Array) -> Estimate:
     change = values * off[:, None]
     whole = None if estimate.whole_bias is None else estimate.whole_bias + change
     return replace(estimate, bias=estimate.bias + change, whole_bias=whole)
-
-
-def joined(parts: Sequence[Estimate]) -> Estimate:
-    """Return the estimates of successive parts of a record as one; at an edge between two stands the first part's."""
-    if len(parts) == 1:
-        return parts[0]
-
-    def rows(*values: Array | None) -> Any:
-        return (
-            None if values[0] is None else np.concatenate([v[k > 0 :] for k, v in enumerate(values) if v is not None])
-        )
-
-    names = ["time", "attitude", "bias", "variance", "covariance"]
-    names += ["whole_covariance", "whole_bias", "whole_bias_variance", "whole_bias_covariance"]
-    innovations = {}
-    for sensor in dict.fromkeys(name for part in parts for name in part.innovations):
-        own = [part.innovations[sensor] for part in parts if sensor in part.innovations]
-        weights = [one.weight for one in own if one.weight is not None]
-        innovations[sensor] = Innovations(
-            time=np.concatenate([one.time for one in own]),
-            innovation=np.concatenate([one.innovation for one in own]),
-            variance=np.concatenate([one.variance for one in own]),
-            weight=np.concatenate(weights) if len(weights) == len(own) else None,
-        )
-    blocks = {
-        name: replace(
-            block,
-            values=rows(*(part.error_states[name].values for part in parts)),
-            variance=rows(*(part.error_states[name].variance for part in parts)),
-        )
-        for name, block in parts[0].error_states.items()
-    }
-    # A lock-out that goes on is reported by each part, by the last as a whole.
-    events = {(event.kind, event.sensor, event.start): event for part in parts for event in part.events}
-    return replace(
-        parts[0],
-        innovations=innovations,
-        events=tuple(events.values()),
-        error_states=blocks,
-        **{name: rows(*(getattr(part, name) for part in parts)) for name in names},
-    )

@@ -162,7 +162,7 @@ def _filtered(problems: Sequence[Problem], every: int) -> list[Estimate | None]:
         turning=_in_lanes(levers),
     )
     out = lane_states.Outputs(kept=np.empty((runs, rows, 2 * n + 22)), innovation=np.empty((runs, measurements, 6)))
-    compiled(lane_states.advance)(
+    compiled(lane_states.advance, lane_states)(
         PATTERN, edges, every, model_arrays(model, first.variances), _common(first), taken, work, out
     )
     estimates = [

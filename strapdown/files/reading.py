@@ -62,10 +62,7 @@ class NoDigestWarning(UserWarning):
 
 @contextlib.contextmanager
 def from_file(path: Name) -> Iterator[None]:
-    """Raise any exception within as an InputError that names the file.
-
-    The content of the file is the input of the code within, so any exception is the file's fault; the original is chained to the error.
-    """
+    """Raise any exception within as an InputError that names the file."""
     try:
         yield
     except InputError as error:

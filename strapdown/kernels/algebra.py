@@ -46,58 +46,28 @@ def combine(s, a, t, b):
 
 def matrix_times_vector(A, v):
     """Return A v."""
-    return (
-        A[0] * v[0] + A[1] * v[1] + A[2] * v[2],
-        A[3] * v[0] + A[4] * v[1] + A[5] * v[2],
-        A[6] * v[0] + A[7] * v[1] + A[8] * v[2],
-    )
+    return tuple(A[i] * v[0] + A[i + 1] * v[1] + A[i + 2] * v[2] for i in (0, 3, 6))
 
 
 def transpose_times_vector(A, v):
     """Return Aᵀ v."""
-    return (
-        A[0] * v[0] + A[3] * v[1] + A[6] * v[2],
-        A[1] * v[0] + A[4] * v[1] + A[7] * v[2],
-        A[2] * v[0] + A[5] * v[1] + A[8] * v[2],
-    )
+    return tuple(A[i] * v[0] + A[i + 3] * v[1] + A[i + 6] * v[2] for i in range(3))
 
 
 def symmetric_times_vector(S, v):
     """Return S v of a symmetric matrix."""
-    return (
-        S[0] * v[0] + S[1] * v[1] + S[2] * v[2],
-        S[1] * v[0] + S[3] * v[1] + S[4] * v[2],
-        S[2] * v[0] + S[4] * v[1] + S[5] * v[2],
-    )
+    return matrix_times_vector(full(S), v)
 
 
 def multiply(A, B):
     """Return A B."""
-    return (
-        A[0] * B[0] + A[1] * B[3] + A[2] * B[6],
-        A[0] * B[1] + A[1] * B[4] + A[2] * B[7],
-        A[0] * B[2] + A[1] * B[5] + A[2] * B[8],
-        A[3] * B[0] + A[4] * B[3] + A[5] * B[6],
-        A[3] * B[1] + A[4] * B[4] + A[5] * B[7],
-        A[3] * B[2] + A[4] * B[5] + A[5] * B[8],
-        A[6] * B[0] + A[7] * B[3] + A[8] * B[6],
-        A[6] * B[1] + A[7] * B[4] + A[8] * B[7],
-        A[6] * B[2] + A[7] * B[5] + A[8] * B[8],
-    )
+    return tuple(A[i] * B[j] + A[i + 1] * B[j + 3] + A[i + 2] * B[j + 6] for i in (0, 3, 6) for j in range(3))
 
 
 def multiply_add(A, B, S):
     """Return A B + S, summed so that every product fuses with an addition."""
-    return (
-        A[0] * B[0] + (A[1] * B[3] + (A[2] * B[6] + S[0])),
-        A[0] * B[1] + (A[1] * B[4] + (A[2] * B[7] + S[1])),
-        A[0] * B[2] + (A[1] * B[5] + (A[2] * B[8] + S[2])),
-        A[3] * B[0] + (A[4] * B[3] + (A[5] * B[6] + S[3])),
-        A[3] * B[1] + (A[4] * B[4] + (A[5] * B[7] + S[4])),
-        A[3] * B[2] + (A[4] * B[5] + (A[5] * B[8] + S[5])),
-        A[6] * B[0] + (A[7] * B[3] + (A[8] * B[6] + S[6])),
-        A[6] * B[1] + (A[7] * B[4] + (A[8] * B[7] + S[7])),
-        A[6] * B[2] + (A[7] * B[5] + (A[8] * B[8] + S[8])),
+    return tuple(
+        A[i] * B[j] + (A[i + 1] * B[j + 3] + (A[i + 2] * B[j + 6] + S[i + j])) for i in (0, 3, 6) for j in range(3)
     )
 
 
@@ -113,28 +83,17 @@ def full(S):
 
 def scale_matrix(s, A):
     """Return s A of a scalar and a 9-tuple."""
-    return (s * A[0], s * A[1], s * A[2], s * A[3], s * A[4], s * A[5], s * A[6], s * A[7], s * A[8])
+    return tuple(s * a for a in A)
 
 
 def add_matrices(A, B):
-    """Return A + B of two 9-tuples."""
-    return (
-        A[0] + B[0],
-        A[1] + B[1],
-        A[2] + B[2],
-        A[3] + B[3],
-        A[4] + B[4],
-        A[5] + B[5],
-        A[6] + B[6],
-        A[7] + B[7],
-        A[8] + B[8],
-    )
+    """Return A + B of two tuples of any length."""
+    return tuple(a + b for a, b in zip(A, B, strict=True))
 
 
 def combine_matrices(s, A, t, B):
-    """Return s A + t B of scalars and 9-tuples."""
-    a, b, c = combine(s, A[:3], t, B[:3]), combine(s, A[3:6], t, B[3:6]), combine(s, A[6:], t, B[6:])
-    return (a[0], a[1], a[2], b[0], b[1], b[2], c[0], c[1], c[2])
+    """Return s A + t B of scalars and matrices, both whole or both symmetric."""
+    return tuple(s * a + t * b for a, b in zip(A, B, strict=True))
 
 
 def add_to_diagonal(S, d):
@@ -144,53 +103,28 @@ def add_to_diagonal(S, d):
 
 def times_transpose_upper(A, B):
     """Return the upper triangle of A Bᵀ, known to be symmetric."""
-    return (
-        A[0] * B[0] + A[1] * B[1] + A[2] * B[2],
-        A[0] * B[3] + A[1] * B[4] + A[2] * B[5],
-        A[0] * B[6] + A[1] * B[7] + A[2] * B[8],
-        A[3] * B[3] + A[4] * B[4] + A[5] * B[5],
-        A[3] * B[6] + A[4] * B[7] + A[5] * B[8],
-        A[6] * B[6] + A[7] * B[7] + A[8] * B[8],
-    )
+    return tuple(A[i] * B[j] + A[i + 1] * B[j + 1] + A[i + 2] * B[j + 2] for i in (0, 3, 6) for j in range(i, 9, 3))
 
 
 def times_transpose_upper_add(A, B, S):
     """Return the upper triangle of A Bᵀ + S, summed so that every product fuses with an addition (S symmetric, 6-tuple)."""
-    return (
-        A[0] * B[0] + (A[1] * B[1] + (A[2] * B[2] + S[0])),
-        A[0] * B[3] + (A[1] * B[4] + (A[2] * B[5] + S[1])),
-        A[0] * B[6] + (A[1] * B[7] + (A[2] * B[8] + S[2])),
-        A[3] * B[3] + (A[4] * B[4] + (A[5] * B[5] + S[3])),
-        A[3] * B[6] + (A[4] * B[7] + (A[5] * B[8] + S[4])),
-        A[6] * B[6] + (A[7] * B[7] + (A[8] * B[8] + S[5])),
+    T = full(S)
+    return tuple(
+        A[i] * B[j] + (A[i + 1] * B[j + 1] + (A[i + 2] * B[j + 2] + T[i + j // 3]))
+        for i in (0, 3, 6)
+        for j in range(i, 9, 3)
     )
 
 
 def minus_outer(A, a, b):
     """Return A − a bᵀ."""
-    return (
-        A[0] - a[0] * b[0],
-        A[1] - a[0] * b[1],
-        A[2] - a[0] * b[2],
-        A[3] - a[1] * b[0],
-        A[4] - a[1] * b[1],
-        A[5] - a[1] * b[2],
-        A[6] - a[2] * b[0],
-        A[7] - a[2] * b[1],
-        A[8] - a[2] * b[2],
-    )
+    return tuple(A[3 * i + j] - a[i] * b[j] for i in range(3) for j in range(3))
 
 
 def symmetric_minus_outer(S, a, b):
     """Return S − a bᵀ, known to be symmetric."""
-    return (
-        S[0] - a[0] * b[0],
-        S[1] - a[0] * b[1],
-        S[2] - a[0] * b[2],
-        S[3] - a[1] * b[1],
-        S[4] - a[1] * b[2],
-        S[5] - a[2] * b[2],
-    )
+    T = full(S)
+    return tuple(T[3 * i + j] - a[i] * b[j] for i in range(3) for j in range(i, 3))
 
 
 def skew_polynomial(identity, linear, quadratic, v):
@@ -243,7 +177,14 @@ def solved(F, v):
 
 def divided(X, F):
     """Return X S⁻¹ of a matrix X, from the factors of S."""
-    a0, a1, a2 = solved(F, (X[0], X[1], X[2]))
-    b0, b1, b2 = solved(F, (X[3], X[4], X[5]))
-    c0, c1, c2 = solved(F, (X[6], X[7], X[8]))
-    return (a0, a1, a2, b0, b1, b2, c0, c1, c2)
+    return solved(F, X[:3]) + solved(F, X[3:6]) + solved(F, X[6:])
+
+
+def congruent(M, S):
+    """Return the symmetric M S Mᵀ."""
+    return times_transpose_upper(multiply(M, full(S)), M)
+
+
+def plus_square(S, v):
+    """Return S + v vᵀ of a symmetric matrix."""
+    return symmetric_minus_outer(S, scale(-1.0, v), v)

@@ -34,6 +34,22 @@ def chain_start(chains, k):
     return first
 
 
+def products(x, y):
+    """Return the products of numbers at the nodes."""
+    return tuple(a * b for a, b in zip(x, y, strict=True))
+
+
+def plus_scaled(x, s, y):
+    """Return x + s y of numbers at the nodes."""
+    return tuple(a + b * s for a, b in zip(x, y, strict=True))
+
+
+def gauss_sum(dt, x, y):
+    """Return the integral of a product by Gauss's rule of five."""
+    p, w = products(x, y), tuple(dt * one for one in WEIGHTS)
+    return w[0] * (p[0] + p[4]) + w[1] * (p[1] + p[3]) + w[2] * p[2]
+
+
 def chain_step(decay, chains, k, first, dt):
     """Return what state k of a chain makes in dt of the states k − 2, k − 1 and k, and a root of what unit white noise on it makes of them.
 
@@ -49,30 +65,19 @@ def chain_step(decay, chains, k, first, dt):
         far, to_far = -decay[k - 2] * dt, chains[k - 2, 0] * dt
     a, b, c = 0.0, 0.0, 1.0
     af, bf, cf = 0.0, 0.0, 1.0
-    a0, b0, c0, p0 = 0.0, 0.0, 1.0, 1.0
-    a1, b1, c1, p1 = 0.0, 0.0, 1.0, 1.0
-    a2, b2, c2, p2 = 0.0, 0.0, 1.0, 1.0
-    a3, b3, c3, p3 = 0.0, 0.0, 1.0, 1.0
-    a4, b4, c4, p4 = 0.0, 0.0, 1.0, 1.0
+    # At Gauss's nodes.
+    zero, one = (0.0, 0.0, 0.0, 0.0, 0.0), (1.0, 1.0, 1.0, 1.0, 1.0)
+    A, B, C, powers = zero, zero, one, one
     for i in range(1, TERMS + 1):
         share = 1.0 / i
         a = share * (to_far * b + far * a)
         b = share * (to_middle * c + middle * b)
         c = share * (own * c)
         af, bf, cf = af + a, bf + b, cf + c
-        p0, p1, p2, p3, p4 = p0 * NODES[0], p1 * NODES[1], p2 * NODES[2], p3 * NODES[3], p4 * NODES[4]
-        a0, b0, c0 = a0 + p0 * a, b0 + p0 * b, c0 + p0 * c
-        a1, b1, c1 = a1 + p1 * a, b1 + p1 * b, c1 + p1 * c
-        a2, b2, c2 = a2 + p2 * a, b2 + p2 * b, c2 + p2 * c
-        a3, b3, c3 = a3 + p3 * a, b3 + p3 * b, c3 + p3 * c
-        a4, b4, c4 = a4 + p4 * a, b4 + p4 * b, c4 + p4 * c
-    w0, w1, w2 = dt * WEIGHTS[0], dt * WEIGHTS[1], dt * WEIGHTS[2]
-    q22 = w0 * (c0 * c0 + c4 * c4) + w1 * (c1 * c1 + c3 * c3) + w2 * c2 * c2
-    q12 = w0 * (b0 * c0 + b4 * c4) + w1 * (b1 * c1 + b3 * c3) + w2 * b2 * c2
-    q11 = w0 * (b0 * b0 + b4 * b4) + w1 * (b1 * b1 + b3 * b3) + w2 * b2 * b2
-    q02 = w0 * (a0 * c0 + a4 * c4) + w1 * (a1 * c1 + a3 * c3) + w2 * a2 * c2
-    q01 = w0 * (a0 * b0 + a4 * b4) + w1 * (a1 * b1 + a3 * b3) + w2 * a2 * b2
-    q00 = w0 * (a0 * a0 + a4 * a4) + w1 * (a1 * a1 + a3 * a3) + w2 * a2 * a2
+        powers = products(powers, NODES)
+        A, B, C = plus_scaled(A, a, powers), plus_scaled(B, b, powers), plus_scaled(C, c, powers)
+    q22, q12, q11 = gauss_sum(dt, C, C), gauss_sum(dt, B, C), gauss_sum(dt, B, B)
+    q02, q01, q00 = gauss_sum(dt, A, C), gauss_sum(dt, A, B), gauss_sum(dt, A, A)
     n22 = math.sqrt(q22)
     n21, n20 = q12 / n22, q02 / n22
     n11 = n10 = n00 = 0.0
@@ -114,14 +119,8 @@ def link_chains(decay, chains, dt, links):
                 links[k - 1, 0] = near / own
                 if number > 2:
                     links[k - 2, 1] = far / own
-                links[k, 2], links[k, 3], links[k, 4], links[k, 5], links[k, 6], links[k, 7] = (
-                    n20,
-                    n21,
-                    n22,
-                    n10,
-                    n11,
-                    n00,
-                )
+                links[k, 2], links[k, 3], links[k, 4] = n20, n21, n22
+                links[k, 5], links[k, 6], links[k, 7] = n10, n11, n00
 
 
 def feed_states(values, first, links):

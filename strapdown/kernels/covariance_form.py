@@ -17,6 +17,7 @@ import numpy as np
 from strapdown.kernels.algebra import (
     add,
     combine,
+    congruent,
     dot,
     full,
     matrix_times_vector,
@@ -25,7 +26,6 @@ from strapdown.kernels.algebra import (
     scale,
     symmetric_minus_outer,
     symmetric_times_vector,
-    times_transpose_upper,
     transpose_times_vector,
 )
 from strapdown.kernels.filter_step import predict as propagated
@@ -367,7 +367,7 @@ def correct(form, i, state, rows, e, variance):
 def turn_tangent(form, i, state, M):
     """Carry the covariance to another tangent space by M."""
     q, b, A, B, C = state
-    return q, b, times_transpose_upper(multiply(M, full(A)), M), multiply(M, B), C
+    return q, b, congruent(M, A), multiply(M, B), C
 
 
 def set_attitude(form, i, state, q, before):
@@ -428,4 +428,4 @@ def widen(form, memory):
 def corrected(q, A, B, correction):
     """Return q, A and B moved by a correction (3,), rad, as :func:`strapdown.kernels.iterated_update.seen_from` has it."""
     turn, M = seen_from(correction, A)
-    return quaternion_multiply(q, turn), times_transpose_upper(multiply(M, full(A)), M), multiply(M, B)
+    return quaternion_multiply(q, turn), congruent(M, A), multiply(M, B)

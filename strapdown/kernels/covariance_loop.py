@@ -35,18 +35,25 @@ from strapdown.kernels.measurement import vector_at
 
 def load_blocks(row):
     """Return (A, B, C) of 21 numbers."""
-    return (
-        (row[0], row[1], row[2], row[3], row[4], row[5]),
-        (row[6], row[7], row[8], row[9], row[10], row[11], row[12], row[13], row[14]),
-        (row[15], row[16], row[17], row[18], row[19], row[20]),
-    )
+    n = tuple(row[i] for i in range(21))
+    return n[:6], n[6:15], n[15:]
 
 
 def store_blocks(row, A, B, C):
     """Write (A, B, C) as 21 numbers."""
-    row[0], row[1], row[2], row[3], row[4], row[5] = A
-    row[6], row[7], row[8], row[9], row[10], row[11], row[12], row[13], row[14] = B
-    row[15], row[16], row[17], row[18], row[19], row[20] = C
+    for i, value in enumerate((*A, *B, *C)):
+        row[i] = value
+
+
+def error_with(cross, a, n):
+    """Return the covariances of attitude and bias error with state n of axis a of a coloured rate."""
+    c = tuple(cross[i, a, n] for i in range(6))
+    return c[:3], c[3:]
+
+
+def axis_vector(i):
+    """Return a unit vector along an axis."""
+    return (1.0 if i == 0 else 0.0, 1.0 if i == 1 else 0.0, 1.0 if i == 2 else 0.0)
 
 
 def driven(phi, phi12, dt, angle, rate):
@@ -63,7 +70,7 @@ def driven(phi, phi12, dt, angle, rate):
     if max(more_angle[0] + more_rate[0], more_angle[1] + more_rate[1], more_angle[2] + more_rate[2]) > 0.0:
         for i in range(3):
             column = scale(-1.0 / dt, (phi12[i], phi12[3 + i], phi12[6 + i]))
-            axis = (1.0 if i == 0 else 0.0, 1.0 if i == 1 else 0.0, 1.0 if i == 2 else 0.0)
+            axis = axis_vector(i)
             q11 = symmetric_minus_outer(q11, scale(-more_angle[i] * dt - more_rate[i] * dt**3 / 3.0, column), column)
             q12 = minus_outer(q12, scale(0.5 * dt * dt * more_rate[i], column), axis)
             C = symmetric_minus_outer(C, scale(-more_rate[i] * dt, axis), axis)
@@ -105,8 +112,8 @@ def shaped_rate(A, B, C, cross, gains, phi11, phi12, variance):
         ft = (0.0, 0.0, 0.0)
         fb = (0.0, 0.0, 0.0)
         for n in range(len(gains)):
-            ft = combine(1.0, ft, gains[n], (cross[0, a, n], cross[1, a, n], cross[2, a, n]))
-            fb = combine(1.0, fb, gains[n], (cross[3, a, n], cross[4, a, n], cross[5, a, n]))
+            t, b = error_with(cross, a, n)
+            ft, fb = combine(1.0, ft, gains[n], t), combine(1.0, fb, gains[n], b)
         column = (phi12[a], phi12[3 + a], phi12[6 + a])
         m = add(matrix_times_vector(phi11, ft), matrix_times_vector(phi12, fb))
         whole = combine(1.0, m, 0.5 * variance[a], column)
@@ -122,9 +129,9 @@ def reported(A, B, C, cross, gains, poles, variance, edge_variance, first):
         fb = (0.0, 0.0, 0.0)
         for n in range(len(gains)):
             weight = gains[n] * (1.0 if first else 0.5 * (1.0 + poles[n]))
-            ft = combine(1.0, ft, weight, (cross[0, a, n], cross[1, a, n], cross[2, a, n]))
-            fb = combine(1.0, fb, weight, (cross[3, a, n], cross[4, a, n], cross[5, a, n]))
-        axis = (1.0 if a == 0 else 0.0, 1.0 if a == 1 else 0.0, 1.0 if a == 2 else 0.0)
+            t, b = error_with(cross, a, n)
+            ft, fb = combine(1.0, ft, weight, t), combine(1.0, fb, weight, b)
+        axis = axis_vector(a)
         whole = combine(-1.0, fb, -0.5 * (variance[a] if first else edge_variance[a]), axis)
         B = minus_outer(B, scale(-1.0, ft), axis)
         C = symmetric_minus_outer(symmetric_minus_outer(C, whole, axis), axis, whole)
@@ -253,8 +260,7 @@ def propagate_shape(A, B, C, shapes, c, phi11, phi12, new_sample):
     A, B, C = shaped_rate(A, B, C, cross, gains, phi11, phi12, variance)
     for a in range(3):
         for n in range(len(gains)):
-            t = (cross[0, a, n], cross[1, a, n], cross[2, a, n])
-            b = (cross[3, a, n], cross[4, a, n], cross[5, a, n])
+            t, b = error_with(cross, a, n)
             t = add(matrix_times_vector(phi11, t), matrix_times_vector(phi12, b))
             drive = amplitude[a] * amplitude[a] * states[n]
             cross[0, a, n] = t[0] + phi12[a] * drive
@@ -268,9 +274,7 @@ def propagate_white(A, B, C, turn, dt, phi11, phi12, angle, rate):
     A, B, C = carried(A, B, C, phi11, phi12)
     if angle[0] + angle[1] + angle[2] + rate[0] + rate[1] + rate[2] > 0.0:
         q11, q12, q22 = driven(turn, phi12, dt, angle, rate)
-        A = (A[0] + q11[0], A[1] + q11[1], A[2] + q11[2], A[3] + q11[3], A[4] + q11[4], A[5] + q11[5])
-        B = add_matrices(B, q12)
-        C = (C[0] + q22[0], C[1] + q22[1], C[2] + q22[2], C[3] + q22[3], C[4] + q22[4], C[5] + q22[5])
+        A, B, C = add_matrices(A, q11), add_matrices(B, q12), add_matrices(C, q22)
     return A, B, C
 
 

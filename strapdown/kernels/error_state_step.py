@@ -19,12 +19,8 @@ All but the square roots is plain arithmetic, so that the same functions serve t
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
-
-import numpy as np
 
 from strapdown.kernels.algebra import (
-    add,
     add_matrices,
     combine,
     cross,
@@ -34,15 +30,12 @@ from strapdown.kernels.algebra import (
     scale,
     scale_matrix,
     skew_polynomial,
-    subtract,
     symmetric_minus_outer,
-    symmetric_times_vector,
     transpose_times_vector,
 )
 from strapdown.kernels.filter_step import process_noise, transition
 from strapdown.kernels.lane_values import lanes_of, load_like, store_like
-from strapdown.kernels.measurement import ATTITUDE, DIRECTION, HEADING, VERTICAL, heading_error
-from strapdown.kernels.rotation import logarithm, moved, quaternion_multiply, rotation_matrix, turned
+from strapdown.kernels.rotation import quaternion_multiply, rotation_matrix, turned
 from strapdown.kernels.series import LARGEST_ANGLE
 from strapdown.kernels.walk import MAX_TURN
 
@@ -54,9 +47,6 @@ CALLED = (
     "fill_noise",
     "carry",
     "carry_back",
-    "fill_rows",
-    "decorrelate",
-    "arm_noise",
     "turn_columns",
     "turn_values",
 )
@@ -86,21 +76,10 @@ THREE_WEIGHTS = (5.0 / 18.0, 8.0 / 18.0, 5.0 / 18.0)
 
 def inverse(A):
     """Return the inverse of a 3×3 matrix."""
-    c0 = A[4] * A[8] - A[5] * A[7]
-    c1 = A[5] * A[6] - A[3] * A[8]
-    c2 = A[3] * A[7] - A[4] * A[6]
-    d = 1.0 / (A[0] * c0 + A[1] * c1 + A[2] * c2)
-    return (
-        d * c0,
-        d * (A[2] * A[7] - A[1] * A[8]),
-        d * (A[1] * A[5] - A[2] * A[4]),
-        d * c1,
-        d * (A[0] * A[8] - A[2] * A[6]),
-        d * (A[2] * A[3] - A[0] * A[5]),
-        d * c2,
-        d * (A[1] * A[6] - A[0] * A[7]),
-        d * (A[0] * A[4] - A[1] * A[3]),
-    )
+    a, b, c = A[:3], A[3:6], A[6:]
+    x, y, z = cross(b, c), cross(c, a), cross(a, b)
+    d = 1.0 / dot(a, x)
+    return tuple(d * v[i] for i in range(3) for v in (x, y, z))
 
 
 def response(rate, u, decay):
@@ -134,26 +113,12 @@ def longest_step(dt, theta, limit):
 
 def error_matrix(gyro, k):
     """Return the matrix T of a state of the gyro."""
-    return (
-        gyro[k, 3],
-        gyro[k, 4],
-        gyro[k, 5],
-        gyro[k, 6],
-        gyro[k, 7],
-        gyro[k, 8],
-        gyro[k, 9],
-        gyro[k, 10],
-        gyro[k, 11],
-    )
+    return tuple(gyro[k, i] for i in range(3, 12))
 
 
 def gyro_matrix_times(gyro, k, v):
     """Return T v of a state's matrix T."""
-    return (
-        gyro[k, 3] * v[0] + gyro[k, 4] * v[1] + gyro[k, 5] * v[2],
-        gyro[k, 6] * v[0] + gyro[k, 7] * v[1] + gyro[k, 8] * v[2],
-        gyro[k, 9] * v[0] + gyro[k, 10] * v[1] + gyro[k, 11] * v[2],
-    )
+    return matrix_times_vector(error_matrix(gyro, k), v)
 
 
 def turning_matrix(rate, acceleration):
@@ -173,7 +138,7 @@ def turning_matrix(rate, acceleration):
     )
 
 
-def move(q, x, dt, part, decay, gyro, gyro_use, force_f, top, factor):
+def move(q, x, dt, part, model, top, factor):
     """Move attitude and optional states over an increment ``part``; return q, Φ11, the rate and (I + M)⁻¹.
 
     Leaves in ``factor`` the states' own e^{−λ dt}, and in ``top`` (n, 4) what each of all n states makes of the attitude and of the first
@@ -182,6 +147,7 @@ def move(q, x, dt, part, decay, gyro, gyro_use, force_f, top, factor):
     The specific force is taken at the middle of the step; how it changes with the attitude *error* is neglected, as it is small beside
     the bias that it makes.
     """
+    decay, gyro, gyro_use, force_f = model.decay, model.gyro, model.gyro_use, model.force_f
     r = combine(1.0, part, -dt, (x[0], x[1], x[2]))
     M = IDENTITY
     scaled = False
@@ -248,13 +214,14 @@ def add_column(top, k, column):
     top[6 + k, 2] += column[2]
 
 
-def step_noise(noise, dt, rate, D, angle_variance, rate_variance, decay, density, gyro, gyro_use):
+def step_noise(noise, dt, rate, D, model):
     """Write the covariance Q of the noise of a step: rows (n, 4), of the attitude Q_θθ, of any other state i Q_θi and Q_ii.
 
     Attitude and bias have the exact Q of :func:`strapdown.kernels.filter_step.process_noise` (the white noise of the gyro is given after
     its scale factor). A state that enters the gyro has its noise at Gauss's three nodes of the step.
     """
-    q11, q12, q22 = process_noise(scale(dt, rate), dt, angle_variance, rate_variance)
+    decay, density, gyro, gyro_use = model.decay, model.density, model.gyro, model.gyro_use
+    q11, q12, q22 = process_noise(scale(dt, rate), dt, model.angle_variance, model.rate_variance)
     for i in range(3):
         noise[3 + i, 0], noise[3 + i, 1], noise[3 + i, 2], noise[3 + i, 3] = q12[i], q12[3 + i], q12[6 + i], q22
     E = (IDENTITY, IDENTITY, IDENTITY)
@@ -420,237 +387,3 @@ def turn_columns(chains, A, F, end):
             for r in range(end):
                 F[r, x], F[r, y], F[r, z] = matrix_times_vector(A, (F[r, x], F[r, y], F[r, z]))
     return last
-
-
-def matrix_at(array, s, k):
-    """Return the 3×3 matrix that ends row (s, k) of an array (…, …, 15)."""
-    return (
-        array[s, k, 6],
-        array[s, k, 7],
-        array[s, k, 8],
-        array[s, k, 9],
-        array[s, k, 10],
-        array[s, k, 11],
-        array[s, k, 12],
-        array[s, k, 13],
-        array[s, k, 14],
-    )
-
-
-def across(d):
-    """Return unit vectors t1, t2 with t1 × t2 = d of a unit vector d."""
-    x, y, z = abs(d[0]), abs(d[1]), abs(d[2])
-    e = (1.0, 0.0, 0.0)
-    if y < x and y <= z:
-        e = (0.0, 1.0, 0.0)
-    elif z < x:
-        e = (0.0, 0.0, 1.0)
-    t = cross(e, d)
-    t = scale(1.0 / math.sqrt(dot(t, t)), t)
-    return t, cross(d, t)
-
-
-def put_row(H, row, h):
-    """Write the attitude's part of a row."""
-    H[row, 0], H[row, 1], H[row, 2] = h
-
-
-def offset_of(sensors, sensor_use, s, k, W):
-    """Return how state k shifts the vector of sensor s, body axes."""
-    a = (sensors[s, k, 0], sensors[s, k, 1], sensors[s, k, 2])
-    if sensor_use[s, k] & LEVER:
-        a = matrix_times_vector(W, a)
-    return a
-
-
-class Rows(NamedTuple):
-    """The rows of one measurement, ``y = H δx + noise``, of n states."""
-
-    H: np.ndarray
-    """(3, n or more)"""
-    y: np.ndarray
-    """(3,)"""
-    basis: np.ndarray
-    """(3, 3), the body axes that the rows measure along; of a direction that its states make longer or shorter, over that length: so its
-    noise is, too."""
-
-
-def fill_rows(q, x, kind, z, frame, length, s, sensors, sensor_use, W, rows):
-    """Write the rows of one measurement, and return how many: 2 direction, 3 vector, 1 heading, 3 attitude.
-
-    ``frame`` is the row of the schedule's frames as a 9-tuple, ``z`` the measured vector and ``length`` what it was divided by, or of a
-    direction or heading the strength of what is measured. ``W`` is the :func:`turning_matrix` of the instant, for lever arms.
-    ``sensor_use`` may be all zero: then the rows are those of the plain filter.
-    """
-    H, y, basis = rows
-    states = len(x) - 3
-    R = rotation_matrix(q)
-    for i in range(3):
-        for j in range(H.shape[1]):
-            H[i, j] = 0.0
-        for j in range(3):
-            basis[i, j] = 1.0 if i == j else 0.0
-    offset = (0.0, 0.0, 0.0)
-    fixed = (0.0, 0.0, 0.0)
-    carried = (0.0, 0.0, 0.0)
-    M = IDENTITY
-    coupled = False
-    for k in range(states):
-        use = sensor_use[s, k]
-        if use != 0:
-            coupled = True
-            c = x[3 + k]
-            if use & (OFFSET | LEVER):
-                offset = combine(1.0, offset, c / length, offset_of(sensors, sensor_use, s, k, W))
-            if use & FIXED:
-                d = (sensors[s, k, 3], sensors[s, k, 4], sensors[s, k, 5])
-                if use & CARRIED:
-                    carried = combine(1.0, carried, c / length, d)
-                else:
-                    fixed = combine(1.0, fixed, c / length, d)
-            if use & SCALE:
-                M = add_matrices(M, scale_matrix(c, matrix_at(sensors, s, k)))
-    if kind == ATTITUDE:
-        # The offset is a rotation vector between the sensor's axes and the body's.
-        predicted, J = moved(q, offset)
-        inverted = (predicted[0], -predicted[1], -predicted[2], -predicted[3])
-        t = logarithm(quaternion_multiply(inverted, (frame[0], frame[1], frame[2], frame[3])))
-        y[0], y[1], y[2] = t
-        for j in range(3):
-            column = turned_column(offset, j)
-            H[0, j], H[1, j], H[2, j] = column
-        for k in range(states):
-            if sensor_use[s, k] & OFFSET:
-                t = matrix_times_vector(J, (sensors[s, k, 0], sensors[s, k, 1], sensors[s, k, 2]))
-                H[0, 6 + k], H[1, 6 + k], H[2, 6 + k] = t
-        return 3
-    r = (frame[6], frame[7], frame[8])
-    if kind == HEADING:
-        D = inverse(M) if coupled else IDENTITY
-        clean = matrix_times_vector(D, subtract(z, offset))
-        p = subtract(matrix_times_vector(R, clean), carried)
-        m = subtract(p, fixed)
-        if m[0] * m[0] + m[1] * m[1] <= VERTICAL:
-            y[0] = 0.0  # a vertical vector shows no heading: its row is zero
-            return 1
-        y[0] = heading_error(IDENTITY, m, r)
-        if coupled:
-            # Derivatives where the heading is what is expected: those at the measured one go by its noise, which the offsets would follow.
-            stretch = math.sqrt((m[0] * m[0] + m[1] * m[1]) / (r[0] * r[0] + r[1] * r[1]))
-            m = (stretch * r[0], stretch * r[1], m[2])
-            p = add(m, fixed)
-            clean = transpose_times_vector(R, add(p, carried))
-        level = 1.0 / (m[0] * m[0] + m[1] * m[1])
-        g = (-level * m[1], level * m[0], 0.0)
-        put_row(H, 0, transpose_times_vector(R, cross(p, g)))
-        for k in range(states):
-            use = sensor_use[s, k]
-            if use != 0:
-                e = scale(1.0 / length, offset_of(sensors, sensor_use, s, k, W))
-                d = scale(1.0 / length, (sensors[s, k, 3], sensors[s, k, 4], sensors[s, k, 5]))
-                if use & SCALE:
-                    e = add(e, matrix_times_vector(matrix_at(sensors, s, k), clean))
-                e = matrix_times_vector(R, matrix_times_vector(D, e))
-                H[0, 6 + k] = -dot(g, add(e, d))
-        return 1
-    u = transpose_times_vector(R, (frame[0], frame[1], frame[2]))
-    v = transpose_times_vector(R, (frame[3], frame[4], frame[5]))
-    number = 2 if kind == DIRECTION else 3
-    third = transpose_times_vector(R, r)
-    if not coupled:
-        put_row(basis, 0, u)
-        put_row(basis, 1, v)
-        put_row(basis, 2, third)
-        put_row(H, 0, scale(-1.0, v))
-        put_row(H, 1, u)
-        y[0], y[1] = dot(u, z), dot(v, z)
-        if number == 3:
-            y[2] = dot(third, z) - 1.0
-        return number
-    turnable = transpose_times_vector(R, add(r, fixed))
-    seen = add(turnable, transpose_times_vector(R, carried))
-    m = add(matrix_times_vector(M, seen), offset)
-    shrink = 1.0
-    if number == 2:
-        shrink = 1.0 / math.sqrt(dot(m, m))
-        u, v = across(scale(shrink, m))
-    residual = z if number == 2 else subtract(z, m)
-    for i in range(number):
-        t = u if i == 0 else (v if i == 1 else third)
-        y[i] = dot(t, residual)
-        put_row(basis, i, scale(shrink, t))
-        # ∂m/∂δθ = (I + M) [R_fbᵀ (r + d)], and t · (A × δθ) = (t × A) · δθ
-        put_row(H, i, scale(shrink, cross(transpose_times_vector(M, t), turnable)))
-        for k in range(states):
-            use = sensor_use[s, k]
-            if use != 0:
-                e = offset_of(sensors, sensor_use, s, k, W)
-                if use & FIXED:
-                    d = transpose_times_vector(R, (sensors[s, k, 3], sensors[s, k, 4], sensors[s, k, 5]))
-                    e = add(e, matrix_times_vector(M, d))
-                e = scale(1.0 / length, e)
-                if use & SCALE:
-                    e = add(e, matrix_times_vector(matrix_at(sensors, s, k), seen))
-                H[i, 6 + k] = shrink * dot(t, e)
-    return number
-
-
-def lever_noise(r, variance, C):
-    """Return ``C + [r] diag(variance) [r]ᵀ`` (6-tuple)."""
-    return (
-        C[0] + r[2] * r[2] * variance[1] + r[1] * r[1] * variance[2],
-        C[1] - r[0] * r[1] * variance[2],
-        C[2] - r[0] * r[2] * variance[1],
-        C[3] + r[2] * r[2] * variance[0] + r[0] * r[0] * variance[2],
-        C[4] - r[1] * r[2] * variance[0],
-        C[5] + r[1] * r[1] * variance[0] + r[0] * r[0] * variance[1],
-    )
-
-
-def arm_noise(x, s, sensors, sensor_use, length, variance, C):
-    """Return C and what the gyro's angular acceleration, of these variances about the axes, adds to it: ``[r] diag(variance) [r]ᵀ``."""
-    r = (0.0, 0.0, 0.0)
-    for k in range(len(x) - 3):
-        if sensor_use[s, k] & LEVER:
-            r = combine(1.0, r, x[3 + k] / length, (sensors[s, k, 0], sensors[s, k, 1], sensors[s, k, 2]))
-    return lever_noise(r, variance, C)
-
-
-def decorrelate(H, y, rows, basis, C, spread):
-    """Make the rows of a measurement independent, whose noise in body axes has the covariance C (6-tuple); write their variances.
-
-    With ``T C Tᵀ = L D Lᵀ`` for the rows' axes T, the rows ``L⁻¹ H`` have noise of variances D.
-    """
-    t0 = (basis[0, 0], basis[0, 1], basis[0, 2])
-    t1 = (basis[1, 0], basis[1, 1], basis[1, 2])
-    t2 = (basis[2, 0], basis[2, 1], basis[2, 2])
-    c0 = symmetric_times_vector(C, t0)
-    spread[0] = dot(t0, c0)
-    if rows > 1:
-        l10 = dot(t1, c0) / spread[0]
-        c1 = symmetric_times_vector(C, t1)
-        spread[1] = dot(t1, c1) - l10 * l10 * spread[0]
-        subtract_row(H, y, 1, 0, l10)
-        if rows > 2:
-            l20 = dot(t2, c0) / spread[0]
-            l21 = (dot(t2, c1) - l20 * l10 * spread[0]) / spread[1]
-            spread[2] = dot(t2, symmetric_times_vector(C, t2)) - l20 * l20 * spread[0] - l21 * l21 * spread[1]
-            subtract_row(H, y, 2, 0, l20)
-            subtract_row(H, y, 2, 1, l21)
-
-
-def subtract_row(H, y, row, other, factor):
-    """Subtract a multiple of another row."""
-    y[row] -= factor * y[other]
-    for j in range(H.shape[1]):
-        H[row, j] -= factor * H[other, j]
-
-
-def turned_column(phi, j):
-    """Return column j of exp(−[φ]), any angle: what a body-side error is behind a further turn φ."""
-    inverted, _ = moved((1.0, 0.0, 0.0, 0.0), (-phi[0], -phi[1], -phi[2]))
-    w, v = inverted[0], (inverted[1], inverted[2], inverted[3])
-    e = (1.0 if j == 0 else 0.0, 1.0 if j == 1 else 0.0, 1.0 if j == 2 else 0.0)
-    # R e = e + 2 w v × e + 2 v × (v × e)
-    once = cross(v, e)
-    return add(e, scale(2.0, add(scale(w, once), cross(v, once))))

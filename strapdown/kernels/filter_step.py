@@ -17,6 +17,7 @@ from strapdown.kernels.algebra import (
     add_matrices,
     add_to_diagonal,
     combine,
+    congruent,
     dot,
     full,
     minus_outer,
@@ -26,7 +27,6 @@ from strapdown.kernels.algebra import (
     skew_polynomial,
     symmetric_minus_outer,
     symmetric_times_vector,
-    times_transpose_upper,
     times_transpose_upper_add,
     transpose,
     transpose_times_vector,
@@ -97,34 +97,9 @@ def predict(q, b, A, B, C, delta_theta, dt, angle_variance, rate_variance):
     )
 
 
-def chosen_triple(condition, a, b):
-    """Return the 3-vector a in the lanes where the condition holds, b in the others."""
-    return (
-        chosen(condition, a[0], b[0]),
-        chosen(condition, a[1], b[1]),
-        chosen(condition, a[2], b[2]),
-    )
-
-
-def chosen_quadruple(condition, a, b):
-    """Return the quaternion a in the lanes where the condition holds, b in the others."""
-    x, y, z = chosen_triple(condition, (a[1], a[2], a[3]), (b[1], b[2], b[3]))
-    return (chosen(condition, a[0], b[0]), x, y, z)
-
-
-def chosen_symmetric(condition, S, T):
-    """Return the symmetric matrix S in the lanes where the condition holds, T in the others."""
-    s0, s1, s2 = chosen_triple(condition, (S[0], S[1], S[2]), (T[0], T[1], T[2]))
-    s3, s4, s5 = chosen_triple(condition, (S[3], S[4], S[5]), (T[3], T[4], T[5]))
-    return (s0, s1, s2, s3, s4, s5)
-
-
-def chosen_matrix(condition, S, T):
-    """Return the matrix S in the lanes where the condition holds, T in the others."""
-    a = chosen_triple(condition, (S[0], S[1], S[2]), (T[0], T[1], T[2]))
-    b = chosen_triple(condition, (S[3], S[4], S[5]), (T[3], T[4], T[5]))
-    c = chosen_triple(condition, (S[6], S[7], S[8]), (T[6], T[7], T[8]))
-    return (a[0], a[1], a[2], b[0], b[1], b[2], c[0], c[1], c[2])
+def chosen_parts(condition, a, b):
+    """Return the tuple a in the lanes where the condition holds, b in the others."""
+    return tuple(chosen(condition, x, y) for x, y in zip(a, b, strict=True))
 
 
 def update_row(b, A, B, C, h, innovation, variance):
@@ -145,8 +120,8 @@ def update_row(b, A, B, C, h, innovation, variance):
     precise = s > SHORT_FORM * variance
     if anywhere(precise):
         d = combine(1.0, symmetric_times_vector(A, h), -variance, ka)
-        A = chosen_symmetric(precise, symmetric_minus_outer(A, d, ka), A)
-        B = chosen_matrix(precise, minus_outer(B, d, kb), B)
+        A = chosen_parts(precise, symmetric_minus_outer(A, d, ka), A)
+        B = chosen_parts(precise, minus_outer(B, d, kb), B)
     return (
         scale(innovation, ka),
         combine(1.0, b, innovation, kb),
@@ -168,11 +143,11 @@ def reset(q, A, B, correction):
     large = dot(correction, correction) > 1.0
     if anywhere(large):
         far, J = far_turn(correction)
-        moved = chosen_quadruple(large, unit(quaternion_multiply(q, far)), moved)
-        G = chosen_matrix(large, J, G)
+        moved = chosen_parts(large, unit(quaternion_multiply(q, far)), moved)
+        G = chosen_parts(large, J, G)
     return (
         moved,
-        times_transpose_upper(multiply(G, full(A)), G),
+        congruent(G, A),
         multiply(G, B),
     )
 
@@ -236,11 +211,11 @@ def update_direction_and_judge(q, b, A, B, C, R, u, v, z, variance):
     elif anywhere(together):
         at_once = rows_at_once(b, A, B, C, pa1, pa2, h1, e1, h2, y2, (s1, s12, s22))
         one_by_one = row_after_row(b, A, B, C, h1, e1, h2, y2, variance)
-        correction = chosen_triple(together, at_once[0], one_by_one[0])
-        b = chosen_triple(together, at_once[1], one_by_one[1])
-        A = chosen_symmetric(together, at_once[2], one_by_one[2])
-        B = chosen_matrix(together, at_once[3], one_by_one[3])
-        C = chosen_symmetric(together, at_once[4], one_by_one[4])
+        correction = chosen_parts(together, at_once[0], one_by_one[0])
+        b = chosen_parts(together, at_once[1], one_by_one[1])
+        A = chosen_parts(together, at_once[2], one_by_one[2])
+        B = chosen_parts(together, at_once[3], one_by_one[3])
+        C = chosen_parts(together, at_once[4], one_by_one[4])
         e2 = chosen(together, at_once[5], one_by_one[5])
         s2 = chosen(together, at_once[6], one_by_one[6])
         nis = chosen(together, at_once[7], one_by_one[7])

@@ -1,7 +1,7 @@
 """A gate and robust weights around a filter: a body of :mod:`strapdown.kernels.walk` over either form of the covariance.
 
 What a gate makes of refusals is in :mod:`strapdown.kernels.gate_rules`. The form (:mod:`strapdown.kernels.covariance_form` or
-:mod:`strapdown.kernels.root_form`) defines the functions left open here. Row 0 of its states is the filter, row 1 the restart candidate
+:mod:`strapdown.kernels.root_form`) defines the functions in ``OPEN``. Row 0 of its states is the filter, row 1 the restart candidate
 beside it while there is one, so that both go through one piece of code.
 """
 
@@ -13,6 +13,29 @@ from typing import NamedTuple
 import numpy as np
 
 from strapdown.kernels.algebra import add, factored, matrix_times_vector, scale, solved
+from strapdown.kernels.covariance_form import (
+    attitude_covariance,
+    attitude_of,
+    become,
+    bias_at,
+    correct,
+    digits_left,
+    innovation_covariance,
+    keep_row,
+    linearised,
+    load,
+    propagate,
+    relinearise,
+    save,
+    set_attitude,
+    start_candidate,
+    start_update,
+    step_limit,
+    step_of,
+    store_prediction,
+    turn_tangent,
+    widen,
+)
 from strapdown.kernels.gate_rules import (
     CANDIDATE,
     DROPPED,
@@ -78,7 +101,7 @@ OPEN = (
     "widen",
     "keep_row",
 )
-"""What a form defines; see :mod:`strapdown.kernels.covariance_form`."""
+"""What a form defines; here they are those of :mod:`strapdown.kernels.covariance_form`."""
 
 LENIENT = 1e3
 """A candidate, which starts with next to nothing known, may lose so many times more of its covariance's digits than the filter."""
@@ -126,90 +149,6 @@ class Outputs(NamedTuple):
     """(rows, 4): time, sensor, time of the first refusal and refusals in a row of each recovery."""
     lock_outs: np.ndarray
     """(rows, 4): times of the first and of the last refusal, sensor and number of refusals, 0 of one that a recovery reports."""
-
-
-def load(form, i):
-    """Return state i."""
-
-
-def save(form, i, state):
-    """Keep state i."""
-
-
-def become(form):
-    """Let the filter be what the candidate is."""
-
-
-def attitude_of(state):
-    """Return q_fb of a state."""
-
-
-def bias_at(form, i):
-    """Return the gyro bias of state i."""
-
-
-def step_limit(form):
-    """Return the longest step, s, that states other than the attitude bear."""
-
-
-def digits_left(form, i):
-    """Return the share of its variance that the least certain pivot of state i keeps."""
-
-
-def propagate(form, i, state, part, dt):
-    """Return a state after an increment over dt."""
-
-
-def store_prediction(form, i, state, k, part, dt, out):
-    """Write what a smoother needs of a prediction."""
-
-
-def attitude_covariance(form, i, state):
-    """Return the covariance of the attitude (6-tuple)."""
-
-
-def start_update(form, i):
-    """Begin the linearisation at the state itself."""
-
-
-def linearised(form, i, e, now_q, q, M, z, frame, noise, kind, sensor, prior):
-    """Return rows, y (3,), what of y the prior predicts (3,), variances (3,), θ/sin θ and cos θ of a direction's angle; seen from now_q."""
-
-
-def innovation_covariance(form, i, state, rows):
-    """Return H P Hᵀ (6-tuple)."""
-
-
-def step_of(form, i, state, rows, u, M, prior, q, now_q):
-    """Return the step (3,) from the linearisation that P Hᵀ u leads to, and the square of what it changes in the rows."""
-
-
-def relinearise(form, i, q, old_q, now_q, prior, fresh):
-    """Go to another point of linearisation; ``fresh``: the states beside the attitude go back to the state itself."""
-
-
-def correct(form, i, state, rows, e, variance):
-    """Update with independent rows of innovations e (3,), prior's tangent space; return the state and the attitude's correction."""
-
-
-def turn_tangent(form, i, state, M):
-    """Carry the covariance to another tangent space by M."""
-
-
-def set_attitude(form, i, state, q, before):
-    """Return the state at an attitude, in place of that ``before`` the measurement."""
-
-
-def start_candidate(form, memory, now, attitude_sigma, restart):
-    """Write row 1: the filter's state, as uncertain as a fresh start."""
-
-
-def widen(form, memory):
-    """Make the candidate what it would be had its bias started wider, if that holds it back."""
-
-
-def keep_row(form, state, row, out):
-    """Write the state at a kept edge."""
 
 
 # ------------------------------------------------------------------------------------------------------------------ the body of the walk

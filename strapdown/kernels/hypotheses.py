@@ -16,15 +16,14 @@ import numpy as np
 from strapdown.kernels.algebra import (
     add,
     combine,
+    congruent,
     dot,
-    full,
     matrix_times_vector,
     multiply,
     scale,
     skew_polynomial,
     subtract,
     symmetric_times_vector,
-    times_transpose_upper,
     transpose_times_vector,
 )
 from strapdown.kernels.filter_step import predict as propagated
@@ -55,7 +54,7 @@ from strapdown.kernels.rotation import (
     unit,
 )
 from strapdown.kernels.series import second, sinc
-from strapdown.kernels.state import load_state, store_state
+from strapdown.kernels.state import load_state, store_row, store_state
 from strapdown.kernels.walk import SQUARED_RANGE, step_within, turn_squared
 
 CALLED = ("updated", "moment_match", "normalized_weights")
@@ -88,9 +87,9 @@ def update_iterated(q, b, A, B, C, u, v, z, variance):
         squared = dot(step, step)
         turn = skew_polynomial(1.0, -sinc(squared), second(squared), step)
         q = unit(turned(q, step))
-        A = times_transpose_upper(multiply(turn, full(A)), turn)
+        A = congruent(turn, A)
         B = multiply(turn, B)
-        A_new = times_transpose_upper(multiply(turn, full(A_new)), turn)
+        A_new = congruent(turn, A_new)
         B_new = multiply(turn, B_new)
         m = matrix_times_vector(turn, subtract(m, step))
         if squared < SETTLED:
@@ -179,7 +178,7 @@ def moment_match(states, weight, between, out):
     mean = (0.0, 0.0, 0.0)
     for i in range(len(weight)):
         if weight[i] > 0.0:
-            mean = combine(1.0, mean, weight[i], (states[i, 4], states[i, 5], states[i, 6]))
+            mean = combine(1.0, mean, weight[i], vector_at(states[:, 4:], i))
     for n in range(12):
         between[n] = 0.0
     for n in range(28):
@@ -193,7 +192,7 @@ def moment_match(states, weight, between, out):
             d = logarithm(quaternion_multiply((q[0], -q[1], -q[2], -q[3]), own))
             e = subtract(b, mean)
             G = inverse_right_jacobian(d)
-            A = times_transpose_upper(multiply(G, full(A)), G)
+            A = congruent(G, A)
             B = multiply(G, B)
             k = 0
             for r in range(3):
@@ -418,12 +417,10 @@ def keep(state, row, e, body, out):
     if one_at == NEVER and edge % body.every == 0 and (row > 0 or body.on_edge):
         between, matched = body.room[:12], body.room[12:]
         moment_match(body.states, body.weight, between, matched)
-        for n in range(4):
-            out.attitude[written, n] = matched[n]
-        for n in range(3):
-            out.bias[written, n] = matched[4 + n]
-        for n in range(21):
-            out.covariance[written, n] = matched[7 + n]
+        q, b, A, B, C = load_state(matched)
+        store_row(out.attitude, written, q)
+        store_row(out.bias, written, b)
+        store_row(out.covariance, written, A + B + C)
         left = 0
         for i in range(len(body.weight)):
             if written < len(out.weights):

@@ -18,15 +18,15 @@ from strapdown.kernels.lane_values import (
     WIDTH,
     anywhere,
     chosen,
-    load,
     load_quadruples,
     load_triples,
     spread,
-    store,
     store_quadruples,
 )
+from strapdown.kernels.measurement import vector_at
 from strapdown.kernels.rotation import exponential, quaternion_multiply, renormalized
 from strapdown.kernels.series import LARGEST_ANGLE
+from strapdown.kernels.state import load_quaternion, store_several
 
 SEGMENT = 48
 """Steps of a lane in a block, at most."""
@@ -99,11 +99,8 @@ def accumulate_quaternions(steps, initial, work, attitude):
 
 def write_row(attitude, k, q):
     """Write one row, renormalised by one Newton step, off the chain of products."""
-    row = renormalized(q)
-    attitude[4 * k] = row[0]
-    attitude[4 * k + 1] = row[1]
-    attitude[4 * k + 2] = row[2]
-    attitude[4 * k + 3] = row[3]
+    for i, value in enumerate(renormalized(q)):
+        attitude[4 * k + i] = value
 
 
 def multiply_exponentials(vectors, start, length, work):
@@ -115,7 +112,7 @@ def multiply_exponentials(vectors, start, length, work):
         x = dot(phi, phi)
         largest = chosen(x > largest, x, largest)
         p = quaternion_multiply(p, exponential(phi))
-        store_lanes(work, 4 * WIDTH * k, p)
+        store_several(work, 4 * WIDTH * k, p)
     if anywhere(largest > _LARGEST_SQUARE):
         multiply_large_exponentials(vectors, start, length, work)
 
@@ -127,8 +124,8 @@ def multiply_large_exponentials(vectors, start, length, work):
         for i in range(WIDTH):
             row = 3 * (start + k + i * length)
             write_lane(work, 4 * BLOCK, i, large_exponential((vectors[row], vectors[row + 1], vectors[row + 2])))
-        p = quaternion_multiply(p, load_lanes(work, 4 * BLOCK))
-        store_lanes(work, 4 * WIDTH * k, p)
+        p = quaternion_multiply(p, load_quaternion(work, 4 * BLOCK))
+        store_several(work, 4 * WIDTH * k, p)
 
 
 def multiply_quaternions(steps, start, length, work):
@@ -136,7 +133,7 @@ def multiply_quaternions(steps, start, length, work):
     p = (spread(1.0), spread(0.0), spread(0.0), spread(0.0))
     for k in range(length):
         p = quaternion_multiply(p, load_quadruples(steps, 4 * (start + k), 4 * length))
-        store_lanes(work, 4 * WIDTH * k, p)
+        store_several(work, 4 * WIDTH * k, p)
 
 
 def turn_segments(q, start, length, work, attitude):
@@ -147,9 +144,9 @@ def turn_segments(q, start, length, work, attitude):
         q = quaternion_multiply(
             q, (work[ends + i], work[ends + WIDTH + i], work[ends + 2 * WIDTH + i], work[ends + 3 * WIDTH + i])
         )
-    starts = load_lanes(work, 4 * BLOCK)
+    starts = load_quaternion(work, 4 * BLOCK)
     for k in range(length):
-        rows = renormalized(quaternion_multiply(starts, load_lanes(work, 4 * WIDTH * k)))
+        rows = renormalized(quaternion_multiply(starts, load_quaternion(work, 4 * WIDTH * k)))
         store_quadruples(attitude, 4 * (start + k + 1), 4 * length, rows)
     return renormalized(q)
 
@@ -160,19 +157,6 @@ def write_lane(work, place, i, q):
     work[place + WIDTH + i] = q[1]
     work[place + 2 * WIDTH + i] = q[2]
     work[place + 3 * WIDTH + i] = q[3]
-
-
-def load_lanes(work, place):
-    """Return the quaternions of all lanes at ``place``."""
-    return load(work, place), load(work, place + WIDTH), load(work, place + 2 * WIDTH), load(work, place + 3 * WIDTH)
-
-
-def store_lanes(work, place, q):
-    """Write the quaternions of all lanes to ``place``."""
-    store(work, place, q[0])
-    store(work, place + WIDTH, q[1])
-    store(work, place + 2 * WIDTH, q[2])
-    store(work, place + 3 * WIDTH, q[3])
 
 
 def compressed_vectors(increments, coefficients, samples, vectors):
@@ -251,33 +235,18 @@ def pair_vectors(increments, samples, previous, tables, vectors):
     for k in range(len(vectors)):
         first = k * samples
         start = min(max(first - previous, 0), latest)
-        x, y, z = pair_correction(increments, start, tables[first - start])
+        phi = pair_correction(increments, start, tables[first - start])
         for i in range(first, first + samples):
-            x += increments[i, 0]
-            y += increments[i, 1]
-            z += increments[i, 2]
-        vectors[k, 0] = x
-        vectors[k, 1] = y
-        vectors[k, 2] = z
+            phi = add(phi, vector_at(increments, i))
+        vectors[k, 0], vectors[k, 1], vectors[k, 2] = phi
 
 
 def pair_correction(increments, first, pairs):
     """Return Σ_{i<j} K_ij Δθ_i × Δθ_j over the window that starts at row ``first``."""
-    x = 0.0
-    y = 0.0
-    z = 0.0
+    total = (0.0, 0.0, 0.0)
     for j in range(1, len(pairs)):
-        a = 0.0
-        b = 0.0
-        c = 0.0
+        before = (0.0, 0.0, 0.0)
         for i in range(j):
-            s = pairs[i, j]
-            a += s * increments[first + i, 0]
-            b += s * increments[first + i, 1]
-            c += s * increments[first + i, 2]
-        last = first + j
-        part = cross((a, b, c), (increments[last, 0], increments[last, 1], increments[last, 2]))
-        x += part[0]
-        y += part[1]
-        z += part[2]
-    return (x, y, z)
+            before = combine(1.0, before, pairs[i, j], vector_at(increments, first + i))
+        total = add(total, cross(before, vector_at(increments, first + j)))
+    return total

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from strapdown.kernels.algebra import add, combine, cross, dot, square_root
 from strapdown.kernels.integration import large_exponential, pair_correction
-from strapdown.kernels.rotation import quaternion_multiply, renormalized
+from strapdown.kernels.measurement import vector_at
+from strapdown.kernels.rotation import quaternion_multiply, renormalized, unit
+from strapdown.kernels.state import store_row
 
 NEGLIGIBLE = 2.0**-56
 """rad; powers of the rate that together turn less are left out, and the series ends when all terms to come turn less."""
@@ -43,13 +45,9 @@ def fitted_rates(increments, first, fit, rates):
     """
     window = len(fit)
     for m in range(window):
-        rates[0, m] = 0.0
-        rates[1, m] = 0.0
-        rates[2, m] = 0.0
+        rates[0, m], rates[1, m], rates[2, m] = 0.0, 0.0, 0.0
     for j in range(window):
-        x = increments[first + j, 0]
-        y = increments[first + j, 1]
-        z = increments[first + j, 2]
+        x, y, z = vector_at(increments, first + j)
         for m in range(window):
             rates[0, m] += fit[j, m] * x
             rates[1, m] += fit[j, m] * y
@@ -155,16 +153,12 @@ def polynomial_steps(increments, samples, previous, fits, correction, rates, ser
             bound, kept = fitted_rates(increments, start, fits[i - start], rates)
             step, ended = interval_quaternion(rates, kept, series)
             if bound > LARGEST_RATE or not ended:
-                step = large_exponential((increments[i, 0], increments[i, 1], increments[i, 2]))
+                step = large_exponential(vector_at(increments, i))
                 smooth = False
             q = quaternion_multiply(q, step)
         if smooth:
             q = quaternion_multiply(q, large_exponential(pair_correction(increments, start, correction)))
-        q = renormalized(q)
-        steps[k, 0] = q[0]
-        steps[k, 1] = q[1]
-        steps[k, 2] = q[2]
-        steps[k, 3] = q[3]
+        store_row(steps, k, renormalized(q))
 
 
 def magnus_4(b0, b1):
@@ -192,12 +186,6 @@ def commutator_free_4(b0, b1):
     )
 
 
-def normalized(q):
-    """Return q / |q|."""
-    s = 1.0 / square_root(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
-    return (s * q[0], s * q[1], s * q[2], s * q[3])
-
-
 def runge_kutta_4(start, middle, end):
     """Return the classical Runge–Kutta step of equation (17), normalised; the arguments are T × rate at 0, T/2, T."""
     k1 = (0.0, 0.5 * start[0], 0.5 * start[1], 0.5 * start[2])
@@ -205,7 +193,7 @@ def runge_kutta_4(start, middle, end):
     k3 = quaternion_times_vector((0.5 + 0.25 * k2[0], 0.25 * k2[1], 0.25 * k2[2], 0.25 * k2[3]), middle)
     k4 = quaternion_times_vector((0.5 + 0.5 * k3[0], 0.5 * k3[1], 0.5 * k3[2], 0.5 * k3[3]), end)
     s = 1.0 / 6.0
-    return normalized(
+    return unit(
         (
             1.0 + s * (k1[0] + 2.0 * (k2[0] + k3[0]) + k4[0]),
             s * (k1[1] + 2.0 * (k2[1] + k3[1]) + k4[1]),
@@ -223,15 +211,10 @@ def euler(increment):
 
 def weighted(increments, first, weights, row):
     """Return Σ_j weights[row, j] Δθ_j over the window that starts at row ``first``."""
-    x = 0.0
-    y = 0.0
-    z = 0.0
+    total = (0.0, 0.0, 0.0)
     for j in range(weights.shape[1]):
-        s = weights[row, j]
-        x += s * increments[first + j, 0]
-        y += s * increments[first + j, 1]
-        z += s * increments[first + j, 2]
-    return (x, y, z)
+        total = combine(1.0, total, weights[row, j], vector_at(increments, first + j))
+    return total
 
 
 def scheme_steps(increments, weights, scheme, steps):
@@ -252,8 +235,4 @@ def scheme_steps(increments, weights, scheme, steps):
             q = runge_kutta_4(a, b, c)
         else:
             q = euler(a)
-        q = renormalized(q)
-        steps[k, 0] = q[0]
-        steps[k, 1] = q[1]
-        steps[k, 2] = q[2]
-        steps[k, 3] = q[3]
+        store_row(steps, k, renormalized(q))

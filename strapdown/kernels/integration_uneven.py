@@ -5,6 +5,7 @@ from __future__ import annotations
 from strapdown.kernels.integration import large_exponential
 from strapdown.kernels.integration_polynomial import LARGEST_RATE, interval_quaternion, sized
 from strapdown.kernels.rotation import quaternion_multiply, renormalized
+from strapdown.kernels.state import store_row
 
 ROWS = 7
 """Rows of work space: nodes, divided differences and the polynomial's powers, the last two by axis."""
@@ -82,8 +83,4 @@ def uneven_steps(increments, edges, chosen, samples, previous, window, ratio, lo
             if bound > LARGEST_RATE or not ended:
                 step = large_exponential((increments[i, 0], increments[i, 1], increments[i, 2]))
             q = quaternion_multiply(q, step)
-        q = renormalized(q)
-        steps[j, 0] = q[0]
-        steps[j, 1] = q[1]
-        steps[j, 2] = q[2]
-        steps[j, 3] = q[3]
+        store_row(steps, j, renormalized(q))

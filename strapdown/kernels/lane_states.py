@@ -19,7 +19,6 @@ from strapdown.kernels.algebra import (
     add,
     add_matrices,
     combine,
-    cross,
     dot,
     full,
     matrix_times_vector,
@@ -27,18 +26,14 @@ from strapdown.kernels.algebra import (
     scale,
     scale_matrix,
     skew_polynomial,
-    square_root,
     subtract,
     symmetric_minus_outer,
-    symmetric_times_vector,
     times_transpose_upper_add,
-    transpose,
     transpose_times_vector,
 )
 from strapdown.kernels.error_state_step import (
     FACTORIALS,
     FORCE,
-    LEVER,
     OFFSET,
     SCALE,
     THREE_NODES,
@@ -46,17 +41,15 @@ from strapdown.kernels.error_state_step import (
     error_matrix,
     gyro_matrix_times,
     inverse,
-    lever_noise,
-    matrix_at,
-    offset_of,
     turning_matrix,
 )
 from strapdown.kernels.filter_step import SHORT_FORM, process_noise, reset, transition
 from strapdown.kernels.lane_angles import arctangent, rotation_vector
 from strapdown.kernels.lane_values import anywhere, chosen, lanes_of, load_like, store_like
-from strapdown.kernels.measurement import ATTITUDE, DIRECTION, HEADING, VERTICAL, frame_at, six_at
-from strapdown.kernels.montecarlo_run import store_four, store_triple, triple
-from strapdown.kernels.rotation import exponential, quaternion_multiply, right_jacobian, rotation_matrix, turned
+from strapdown.kernels.measurement import ATTITUDE, HEADING, frame_at, six_at
+from strapdown.kernels.montecarlo_run import four, store_several, triple
+from strapdown.kernels.rotation import right_jacobian, rotation_matrix, turned
+from strapdown.kernels.sensor_rows import arm_noise, decorrelate, fill_rows, identity
 from strapdown.kernels.walk import SQUARED_RANGE
 
 CALLED = (
@@ -68,10 +61,6 @@ CALLED = (
     "product",
     "minus_outer",
     "take_row",
-    "attitude_rows",
-    "heading_rows",
-    "vector_rows",
-    "decorrelate",
     "least_share",
     "keep",
 )
@@ -161,14 +150,14 @@ def place_of(n, i, j):
     return n * min(i, j) + max(i, j)
 
 
-def seen(work, like, place):
-    """Return a lane value of P by its place."""
-    return load_like(work.P, place * len(like), like)
-
-
 def one_of(array, place, like):
     """Return a lane value by its place."""
     return load_like(array, place * len(like), like)
+
+
+def seen(work, like, place):
+    """Return a lane value of P by its place."""
+    return one_of(work.P, place, like)
 
 
 def put(array, place, like, value):
@@ -176,26 +165,34 @@ def put(array, place, like, value):
     store_like(array, place * len(like), value)
 
 
-def identity(like):
-    """Return the identity matrix in lanes."""
-    one = like + 1.0
-    return (one, like, like, like, one, like, like, like, one)
+def state_at(x, i, like):
+    """Return bias or error state i."""
+    return one_of(x, i, like)
 
 
-def four(array, place, like):
-    """Return four neighbouring places."""
-    return (
-        one_of(array, place, like),
-        one_of(array, place + 1, like),
-        one_of(array, place + 2, like),
-        one_of(array, place + 3, like),
-    )
+def row_entry(H, r, i, like):
+    """Return an entry of the rows (3, n, lanes)."""
+    return one_of(H, H.shape[1] * r + i, like)
 
 
-def spread_six(like, array, e):
-    """Return row e of an array in all lanes."""
-    a = six_at(array, e)
-    return (like + a[0], like + a[1], like + a[2], like + a[3], like + a[4], like + a[5])
+def set_row_entry(H, r, i, like, value):
+    """Write an entry of the rows."""
+    put(H, H.shape[1] * r + i, like, value)
+
+
+def turned_by(q, phi):
+    """Return q ⊗ exp(φ) and J_r(φ) of a small turn."""
+    return turned(q, phi), right_jacobian(phi)
+
+
+def turn_vector(q):
+    """Return the rotation vector of a unit quaternion."""
+    return rotation_vector(q)
+
+
+def angle_of(y, x):
+    """Return the angle of a point, rad."""
+    return arctangent(y, x)
 
 
 def mark(work, like, good):
@@ -324,25 +321,24 @@ def follow(work, like, i, phi11, column, share, own, kept, noise):
     u = matrix_times_vector(phi11, triple(work.cross, 3 * i, like))
     v = combine(1.0, u, alone[OWN, i], column)
     top = matrix_times_vector(phi11, triple(work.top, 3 * i, like))
-    store_triple(work.top, 3 * i, like, combine(1.0, top, alone[KEPT, i], column))
-    store_triple(work.cross, 3 * i, like, combine(kept, v, 1.0, share))
+    store_several(work.top, 3 * i, like, combine(1.0, top, alone[KEPT, i], column))
+    store_several(work.cross, 3 * i, like, combine(kept, v, 1.0, share))
     alone[OWN, i] = kept * kept * alone[OWN, i] + own
     alone[KEPT, i] *= kept
-    return (
-        noise[0] + (column[0] * u[0] + v[0] * column[0]),
-        noise[1] + (column[0] * u[1] + v[0] * column[1]),
-        noise[2] + (column[0] * u[2] + v[0] * column[2]),
-        noise[3] + (column[1] * u[1] + v[1] * column[1]),
-        noise[4] + (column[1] * u[2] + v[1] * column[2]),
-        noise[5] + (column[2] * u[2] + v[2] * column[2]),
-    )
+    return crossed(noise, column, u, v)
+
+
+def crossed(S, a, u, v):
+    """Return S + a uᵀ + v aᵀ, known to be symmetric."""
+    T = full(S)
+    return tuple(T[3 * i + j] + (a[i] * u[j] + v[i] * a[j]) for i in range(3) for j in range(i, 3))
 
 
 def start_steps(work, like):
     """Forget the steps since P's."""
     for i in range(work.alone.shape[1]):
-        store_triple(work.top, 3 * i, like, (like, like, like))
-        store_triple(work.cross, 3 * i, like, (like, like, like))
+        store_several(work.top, 3 * i, like, (like, like, like))
+        store_several(work.cross, 3 * i, like, (like, like, like))
         work.alone[OWN, i] = 0.0
         work.alone[KEPT, i] = 1.0
 
@@ -389,11 +385,7 @@ def absorb(model, work, like, base, turn, noise):
 
 def axes_at(work, like, n, i):
     """Return what the three lines of axes hold of state i."""
-    return (
-        one_of(work.lines, n * AXES + i, like),
-        one_of(work.lines, n * (AXES + 1) + i, like),
-        one_of(work.lines, n * (AXES + 2) + i, like),
-    )
+    return tuple(one_of(work.lines, n * (AXES + a) + i, like) for a in range(3))
 
 
 def attitude_of(work, like, n):
@@ -404,7 +396,7 @@ def attitude_of(work, like, n):
 
 def put_attitude(work, like, base, n, S):
     """Write the covariance of the attitude."""
-    store_triple(work.P, base, like, (S[0], S[1], S[2]))
+    store_several(work.P, base, like, (S[0], S[1], S[2]))
     put(work.P, base + n + 1, like, S[3])
     put(work.P, base + n + 2, like, S[4])
     put(work.P, base + 2 * n + 2, like, S[5])
@@ -474,175 +466,36 @@ def take_row(work, like, use, r, y, variance):
     return error, s
 
 
-def sensed(work, model, like, s, length, W):
-    """Return the offset, body axes, and I + M of what a sensor measures, and whether any state is about it."""
-    use = model.sensor_use
-    offset = (like, like, like)
-    M = identity(like)
-    coupled = False
-    for k in range(use.shape[1]):
-        if use[s, k] != 0:
-            coupled = True
-            c = one_of(work.x, 3 + k, like)
-            if use[s, k] & (OFFSET | LEVER):
-                offset = combine(1.0, offset, c / length, offset_of(model.sensors, use, s, k, W))
-            if use[s, k] & SCALE:
-                M = add_matrices(M, scale_matrix(c, matrix_at(model.sensors, s, k)))
-    return offset, M, coupled
-
-
-def put_row(work, like, n, r, h):
-    """Write the attitude's part of a row of H."""
-    store_triple(work.rows, n * r, like, h)
-
-
-def attitude_rows(model, work, like, q, measured, s):
-    """Write H of a measured attitude; return y (3)."""
-    n, use = work.alone.shape[1], model.sensor_use
-    offset, _, _ = sensed(work, model, like, s, 1.0, identity(like))
-    mark(work, like, dot(offset, offset) <= SQUARED_RANGE)
-    predicted = turned(q, offset)
-    E = transpose(rotation_matrix(exponential(offset)))
-    J = right_jacobian(offset)
-    for r in range(3):
-        put_row(work, like, n, r, (E[3 * r], E[3 * r + 1], E[3 * r + 2]))
-    for k in range(use.shape[1]):
-        if use[s, k] != 0:
-            t = matrix_times_vector(J, (model.sensors[s, k, 0], model.sensors[s, k, 1], model.sensors[s, k, 2]))
-            for r in range(3):
-                put(work.rows, n * r + 6 + k, like, t[r])
-    return rotation_vector(quaternion_multiply((predicted[0], -predicted[1], -predicted[2], -predicted[3]), measured))
-
-
-def heading_rows(model, work, like, q, z, reference, length, s):
-    """Write H of the heading of a vector; return y."""
-    n, use = work.alone.shape[1], model.sensor_use
-    R = rotation_matrix(q)
-    offset, M, coupled = sensed(work, model, like, s, length, identity(like))
-    D = inverse(M)
-    m = matrix_times_vector(R, matrix_times_vector(D, subtract(z, offset)))
-    level = m[0] * m[0] + m[1] * m[1]
-    mark(work, like, level > VERTICAL)  # a vertical vector shows no heading
-    y = arctangent(m[0] * reference[1] - m[1] * reference[0], m[0] * reference[0] + m[1] * reference[1])
-    if coupled:
-        # Derivatives where the heading is what is expected: see error_state_step.fill_rows.
-        stretch = square_root(level / (reference[0] * reference[0] + reference[1] * reference[1]))
-        m = (stretch * reference[0], stretch * reference[1], m[2])
-    clean = transpose_times_vector(R, m)
-    g = (-m[1] / level, m[0] / level, like)
-    put_row(work, like, n, 0, transpose_times_vector(R, cross(m, g)))
-    for k in range(use.shape[1]):
-        if use[s, k] != 0:
-            e = scale(1.0 / length, offset_of(model.sensors, use, s, k, D))
-            w = add((like, like, like), e)
-            if use[s, k] & SCALE:
-                w = add(w, matrix_times_vector(matrix_at(model.sensors, s, k), clean))
-            put(work.rows, 6 + k, like, -dot(g, matrix_times_vector(R, matrix_times_vector(D, w))))
-    return y
-
-
-def across(d, like):
-    """Return unit vectors t1, t2 with t1 × t2 = d of a unit vector d, as ``error_state_step.across`` in each lane."""
-    one = like + 1.0
-    x, y, z = chosen(d[0] < 0.0, -d[0], d[0]), chosen(d[1] < 0.0, -d[1], d[1]), chosen(d[2] < 0.0, -d[2], d[2])
-    second = chosen(y < x, chosen(y <= z, one, like), like)
-    third = chosen(z < x, one - second, like)
-    t = cross((one - second - third, second, third), d)
-    t = scale(1.0 / square_root(dot(t, t)), t)
-    return t, cross(d, t)
-
-
-def vector_rows(model, work, like, q, z, frame, length, s, W, rows):
-    """Write H of a direction (two rows) or a whole vector (three); return y (3) and the rows' axes."""
-    n, use = work.alone.shape[1], model.sensor_use
-    R = rotation_matrix(q)
-    offset, M, coupled = sensed(work, model, like, s, length, W)
-    u = transpose_times_vector(R, (frame[0], frame[1], frame[2]))
-    v = transpose_times_vector(R, (frame[3], frame[4], frame[5]))
-    third = transpose_times_vector(R, (frame[6], frame[7], frame[8]))
-    m = add(matrix_times_vector(M, third), offset)
-    shrink = like + 1.0
-    residual = subtract(z, m)
-    if rows == 2:
-        residual = z
-        if coupled:
-            shrink = 1.0 / square_root(dot(m, m))
-            u, v = across(scale(shrink, m), like)
-    y = (dot(u, residual), dot(v, residual), dot(third, residual))
-    u, v, w = scale(shrink, u), scale(shrink, v), scale(shrink, third)
-    # ∂m/∂δθ = (I + M) [R_fbᵀ r], and t · (A × δθ) = (t × A) · δθ
-    put_row(work, like, n, 0, cross(transpose_times_vector(M, u), third))
-    put_row(work, like, n, 1, cross(transpose_times_vector(M, v), third))
-    put_row(work, like, n, 2, cross(transpose_times_vector(M, w), third))
-    for k in range(use.shape[1]):
-        if use[s, k] != 0:
-            e = add((like, like, like), scale(1.0 / length, offset_of(model.sensors, use, s, k, W)))
-            if use[s, k] & SCALE:
-                e = add(e, matrix_times_vector(matrix_at(model.sensors, s, k), third))
-            put(work.rows, 6 + k, like, dot(u, e))
-            put(work.rows, n + 6 + k, like, dot(v, e))
-            put(work.rows, 2 * n + 6 + k, like, dot(w, e))
-    return y, u, v, w
-
-
-def decorrelate(work, like, use, rows, y, T, C):
-    """Make the rows independent, as ``error_state_step.decorrelate``; return y and the variances (3)."""
-    t0, t1, t2 = T
-    c0, c1 = symmetric_times_vector(C, t0), symmetric_times_vector(C, t1)
-    d0 = dot(t0, c0)
-    l10, l20 = dot(t1, c0) / d0, dot(t2, c0) / d0
-    d1 = dot(t1, c1) - l10 * l10 * d0
-    l21 = (dot(t2, c1) - l20 * l10 * d0) / d1
-    d2 = dot(t2, symmetric_times_vector(C, t2)) - l20 * l20 * d0 - l21 * l21 * d1
-    n = work.alone.shape[1]
-    for i in range(n if rows > 1 else 0):
-        if i < 3 or (i >= 6 and use[i - 6] != 0):
-            h0 = one_of(work.rows, i, like)
-            h1 = one_of(work.rows, n + i, like) - l10 * h0
-            put(work.rows, n + i, like, h1)
-            if rows > 2:
-                put(work.rows, 2 * n + i, like, one_of(work.rows, 2 * n + i, like) - l20 * h0 - l21 * h1)
-    y1 = y[1] - l10 * y[0]
-    return (y[0], y1, y[2] - l20 * y[0] - l21 * y1), (d0, d1, d2)
-
-
-def arm_noise(model, work, like, s, length, variance, C):
-    """Return C and what the noise of the angular acceleration adds to it, as ``error_state_step.arm_noise``."""
-    r = (like, like, like)
-    for k in range(model.sensor_use.shape[1]):
-        if model.sensor_use[s, k] & LEVER:
-            c = one_of(work.x, 3 + k, like) / length
-            r = combine(1.0, r, c, (model.sensors[s, k, 0], model.sensors[s, k, 1], model.sensors[s, k, 2]))
-    return lever_noise(r, variance, C)
-
-
 def update(model, work, like, q, e, events, runs, out):
     """Update with measurement e; return q."""
     n = work.alone.shape[1]
     s, kind, length = events.sensor[e], events.kind[e], events.length[e]
     use = model.sensor_use[s]
-    value = four(runs.value, 4 * e, like)
-    z = (value[0], value[1], value[2])
-    frame, C = frame_at(events.frame, e), spread_six(like, events.noise, e)
-    one = like + 1.0
-    T = ((one, like, like), (like, one, like), (like, like, one))
-    rows = 3
-    if kind == ATTITUDE:
-        y = attitude_rows(model, work, like, q, value, s)
-    elif kind == HEADING:
-        rows = 1
-        error = heading_rows(model, work, like, q, z, (frame[6], frame[7], frame[8]), length, s)
-        y = (error, like, like)
-    else:
-        rows = 2 if kind == DIRECTION else 3
-        W = identity(like)
-        if len(runs.turning) > 0:
-            turn = subtract(triple(runs.turning, 9 * e, like), triple(work.x, 0, like))
-            W = turning_matrix(turn, triple(runs.turning, 9 * e + 3, like))
-            C = arm_noise(model, work, like, s, length, triple(runs.turning, 9 * e + 6, like), C)
-        y, t0, t1, t2 = vector_rows(model, work, like, q, z, frame, length, s, W, rows)
-        T = (t0, t1, t2)
-    y, variance = decorrelate(work, like, use, rows, y, T, C)
+    value, C = four(runs.value, 4 * e, like), six_at(events.noise, e)
+    W = identity(like)
+    if len(runs.turning) > 0 and kind not in (ATTITUDE, HEADING):
+        turn = subtract(triple(runs.turning, 9 * e, like), triple(work.x, 0, like))
+        W = turning_matrix(turn, triple(runs.turning, 9 * e + 3, like))
+    rows, y, axes, shown = fill_rows(
+        q,
+        work.x,
+        work.rows,
+        kind,
+        value,
+        frame_at(events.frame, e),
+        length,
+        s,
+        model.sensors,
+        model.sensor_use,
+        W,
+        like,
+    )
+    mark(work, like, shown)
+    C = (like + C[0], like + C[1], like + C[2], like + C[3], like + C[4], like + C[5])
+    if len(runs.turning) > 0:
+        variance = triple(runs.turning, 9 * e + 6, like)
+        C = arm_noise(work.x, s, model.sensors, model.sensor_use, length, variance, C, like)
+    y, variance = decorrelate(work.rows, use, rows, y, axes, C, like)
     for i in range(n):
         put(work.lines, n * STEP + i, like, like)
     for r in range(rows):
@@ -674,7 +527,7 @@ def hand_out(work, like, out, row, count):
 def keep(model, work, like, base, q, row, out):
     """Write a row of the outputs, the covariance from the P that begins at place ``base``."""
     n, written = work.alone.shape[1], work.written
-    store_four(written, 0, like, q)
+    store_several(written, 0, like, q)
     for i in range(n - 3):
         put(written, 4 + i, like, one_of(work.x, i, like))
     for i in range(n):

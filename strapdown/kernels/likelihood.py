@@ -23,6 +23,7 @@ from strapdown.kernels.measurement import (
     KIND,
     VECTOR,
     direction_rows,
+    frame_at,
     frame_row,
     heading_row,
     sigma_of,
@@ -30,7 +31,7 @@ from strapdown.kernels.measurement import (
 )
 from strapdown.kernels.rotation import quaternion_multiply, rotation_matrix
 from strapdown.kernels.series import LARGEST_ANGLE
-from strapdown.kernels.state import load_lanes, store_lanes
+from strapdown.kernels.state import load_lanes, load_quaternion, store_lanes, store_several
 from strapdown.kernels.walk import MAX_TURN, SQUARED_RANGE
 
 HALF_RANGE = 0.25 * SQUARED_RANGE
@@ -38,7 +39,9 @@ HALF_RANGE = 0.25 * SQUARED_RANGE
 FOUND = 12 * WIDTH
 """Place in the work space of innovations and variances; before it the rows of a measurement."""
 WORK = 18 * WIDTH
-ROOM = 22 * WIDTH
+WIDE = 21 * WIDTH
+"""Innovations and variances with those of an outlier."""
+ROOM = 27 * WIDTH
 """Size of the work space."""
 
 
@@ -126,35 +129,21 @@ def part_at(span, now, cuts):
 
 def put_row(rows, k, h, y):
     """Write row k of a measurement, h (3) and y in lanes, to the work space."""
-    start = 4 * WIDTH * k
-    store(rows, start, h[0])
-    store(rows, start + WIDTH, h[1])
-    store(rows, start + 2 * WIDTH, h[2])
-    store(rows, start + 3 * WIDTH, y)
+    store_several(rows, 4 * WIDTH * k, (*h, y))
 
 
-def axis_row(k):
-    """Return unit vector k in lanes."""
-    return (
-        spread(1.0 if k == 0 else 0.0),
-        spread(1.0 if k == 1 else 0.0),
-        spread(1.0 if k == 2 else 0.0),
-    )
+def put_axes(rows, y):
+    """Write the rows of a measured error of the attitude."""
+    for k in range(3):
+        put_row(rows, k, tuple(spread(1.0 if i == k else 0.0) for i in range(3)), y[k])
 
 
 def measured_rows(q, z, kind, t, triads, rows):
     """Write the rows of one measurement to ``rows`` and return how many take part in the update."""
     if kind == ATTITUDE:
-        measured = (
-            spread(triads[t, 0]),
-            spread(triads[t, 1]),
-            spread(triads[t, 2]),
-            spread(triads[t, 3]),
-        )
+        measured = frame_at(triads, t)
         y = rotation_vector(quaternion_multiply((q[0], -q[1], -q[2], -q[3]), measured))
-        put_row(rows, 0, axis_row(0), y[0])
-        put_row(rows, 1, axis_row(1), y[1])
-        put_row(rows, 2, axis_row(2), y[2])
+        put_axes(rows, y)
         return 3
     R = rotation_matrix(q)
     if kind == HEADING:
@@ -162,14 +151,12 @@ def measured_rows(q, z, kind, t, triads, rows):
         east, north = triads[t, 6], triads[t, 7]
         put_row(rows, 0, heading_row(R, z), arctangent(m[0] * north - m[1] * east, m[0] * east + m[1] * north))
         return 1
-    u = (triads[t, 0], triads[t, 1], triads[t, 2])
-    v = (triads[t, 3], triads[t, 4], triads[t, 5])
-    h1, y1, h2, y2 = direction_rows(R, u, v, z)
+    frame = frame_at(triads, t)
+    h1, y1, h2, y2 = direction_rows(R, frame[:3], frame[3:6], z)
     put_row(rows, 0, h1, y1)
     put_row(rows, 1, h2, y2)
     if kind == VECTOR:
-        r = (triads[t, 6], triads[t, 7], triads[t, 8])
-        store(rows, 8 * WIDTH, dot(transpose_times_vector(R, r), z) - 1.0)
+        store(rows, 8 * WIDTH, dot(transpose_times_vector(R, frame[6:]), z) - 1.0)
     return 2
 
 
@@ -226,21 +213,14 @@ def update(state, e, now, measured, body, out):
     z = value_of(measured, place, sensor)
     factor = load(body.factors, WIDTH * sensor)
     number = measured_rows(q, z, kind, frame_row(measured, place, sensor), measured.triads, room)
-    correction = (spread(0.0), spread(0.0), spread(0.0))
-    for r in range(number):
-        h, y = row_at(room, r)
-        innovation = y - dot(h, correction)
-        variance = variance_of(measured, place, sensor, kind, z, r) * factor
-        turn, b, A, B, C, s = update_row(b, A, B, C, h, innovation, variance)
-        correction = add(correction, turn)
-        store(room, FOUND + 2 * WIDTH * r, innovation)
-        store(room, FOUND + 2 * WIDTH * r + WIDTH, s)
+    correction, b, A, B, C = updated(b, A, B, C, number, measured, place, sensor, z, factor, room, FOUND)
     q, A, B = reset(q, A, B, correction)
     if kind == VECTOR:
-        store(room, FOUND + 4 * WIDTH, load(room, 8 * WIDTH))
-        store(room, FOUND + 5 * WIDTH, variance_of(measured, place, sensor, kind, z, 2) * factor)
         number = 3
-    add_likelihood(room, number, span, out)
+    for i in range(WIDTH):
+        deviance, product = deviance_of(room, FOUND, number, i)
+        out.minus_log[WIDTH * span + i] += 0.5 * (math.log(product) + deviance)
+        out.squares[WIDTH * span + i] += deviance
     if len(out.innovations) > 0:
         start = 6 * WIDTH * e
         for i in range(2 * WIDTH * number):
@@ -250,25 +230,41 @@ def update(state, e, now, measured, body, out):
     return q, b, A, B, C, span, kept
 
 
-def add_likelihood(room, number, span, out):
-    """Add a measurement's deviance and log determinant to the sums of its part."""
-    for i in range(WIDTH):
-        product = 1.0
-        deviance = 0.0
-        for r in range(number):
-            e = room[FOUND + 2 * WIDTH * r + i]
-            s = room[FOUND + 2 * WIDTH * r + WIDTH + i]
-            deviance += e * e / s
-            product *= s
-        out.minus_log[WIDTH * span + i] += 0.5 * (math.log(product) + deviance)
-        out.squares[WIDTH * span + i] += deviance
+def updated(b, A, B, C, number, measured, place, sensor, z, factor, room, found):
+    """Update with all variances of a measurement times ``factor``; return the attitude correction, b, A, B, C.
+
+    Innovations and their variances go to the work space at ``found``, in lanes; a vector's length has the third.
+    """
+    kind = measured.series[sensor, KIND]
+    correction = (spread(0.0), spread(0.0), spread(0.0))
+    for r in range(number):
+        h, y = row_at(room, r)
+        innovation = y - dot(h, correction)
+        variance = variance_of(measured, place, sensor, kind, z, r) * factor
+        turn, b, A, B, C, s = update_row(b, A, B, C, h, innovation, variance)
+        correction = add(correction, turn)
+        store_several(room, found + 2 * WIDTH * r, (innovation, s))
+    if kind == VECTOR:
+        variance = variance_of(measured, place, sensor, kind, z, 2) * factor
+        store_several(room, found + 4 * WIDTH, (load(room, 8 * WIDTH), variance))
+    return correction, b, A, B, C
+
+
+def deviance_of(room, found, number, i):
+    """Return the NIS of a measurement in lane i and the determinant of its innovations' covariance."""
+    deviance, product = 0.0, 1.0
+    for r in range(number):
+        e = room[found + 2 * WIDTH * r + i]
+        s = room[found + 2 * WIDTH * r + WIDTH + i]
+        deviance += e * e / s
+        product *= s
+    return deviance, product
 
 
 def row_at(room, r):
     """Return h (3) and y of row r in lanes from the work space."""
-    start = 4 * WIDTH * r
-    h = (load(room, start), load(room, start + WIDTH), load(room, start + 2 * WIDTH))
-    return h, load(room, start + 3 * WIDTH)
+    hy = load_quaternion(room, 4 * WIDTH * r)
+    return hy[:3], hy[3]
 
 
 def keep(state, row, e, body, out):
@@ -278,11 +274,6 @@ def keep(state, row, e, body, out):
         store_lanes(out.states, 28 * WIDTH * kept, q, b, A, B, C)
         kept += 1
     return q, b, A, B, C, span, kept
-
-
-def stopped(state):
-    """Go on to the end."""
-    return False
 
 
 def finish(state, row, e, body):

@@ -9,79 +9,30 @@ from __future__ import annotations
 
 import math
 
-from strapdown.kernels.algebra import add, dot, scale, subtract
-from strapdown.kernels.filter_step import reset, update_row
-from strapdown.kernels.lane_values import WIDTH, load, spread, store
-from strapdown.kernels.likelihood import FOUND, WORK, measured_rows, part_at, row_at, variance_of
+from strapdown.kernels.algebra import full, scale, subtract
+from strapdown.kernels.filter_step import reset
+from strapdown.kernels.lane_values import WIDTH, load
+from strapdown.kernels.likelihood import FOUND, WIDE, WORK, deviance_of, measured_rows, part_at, updated
 from strapdown.kernels.measurement import KIND, VECTOR, frame_row, value_of
-
-
-def add_deviance(room, place, e, s):
-    """Add e²/s in lanes to the work space at ``place``, and multiply what stands behind it by s."""
-    store(room, place, load(room, place) + e * e / s)
-    store(room, place + WIDTH, load(room, place + WIDTH) * s)
-
-
-def updated(b, A, B, C, number, measured, place, sensor, z, factor, room, found):
-    """Update with all variances of a measurement times ``factor``; return the attitude correction, b, A, B, C.
-
-    Its NIS and the determinant of its covariance, both in lanes, go to the work space at ``found``.
-    """
-    kind = measured.series[sensor, KIND]
-    store(room, found, spread(0.0))
-    store(room, found + WIDTH, spread(1.0))
-    correction = (spread(0.0), spread(0.0), spread(0.0))
-    for r in range(number):
-        h, y = row_at(room, r)
-        innovation = y - dot(h, correction)
-        variance = variance_of(measured, place, sensor, kind, z, r) * factor
-        turn, b, A, B, C, s = update_row(b, A, B, C, h, innovation, variance)
-        correction = add(correction, turn)
-        add_deviance(room, found, innovation, s)
-    if kind == VECTOR:
-        add_deviance(room, found, load(room, 8 * WIDTH), variance_of(measured, place, sensor, kind, z, 2) * factor)
-    return correction, b, A, B, C
 
 
 def between(w, x, y):
     """Return x + w (y − x) of two tuples of three."""
-    return (x[0] + w * (y[0] - x[0]), x[1] + w * (y[1] - x[1]), x[2] + w * (y[2] - x[2]))
+    return tuple(a + w * (b - a) for a, b in zip(x, y, strict=True))
+
+
+def between_matrix(w, S, T, x, y, u, v):
+    """Return the cross-covariance of a mixture, (1 − w) of S and w of T, of attitude (means x, y) and bias (means u, v)."""
+    d, g = scale(w * (1.0 - w), subtract(y, x)), subtract(v, u)
+    M = between(w, S, T)
+    return tuple(M[3 * i + j] + d[i] * g[j] for i in range(3) for j in range(3))
 
 
 def between_symmetric(w, S, T, x, y):
     """Return the covariance of a mixture, (1 − w) of (S, mean x) and w of (T, mean y), as upper triangle."""
     d = subtract(y, x)
-    v = scale(w * (1.0 - w), d)
-    s0, s1, s2 = between(w, (S[0], S[1], S[2]), (T[0], T[1], T[2]))
-    s3, s4, s5 = between(w, (S[3], S[4], S[5]), (T[3], T[4], T[5]))
-    return (
-        s0 + v[0] * d[0],
-        s1 + v[0] * d[1],
-        s2 + v[0] * d[2],
-        s3 + v[1] * d[1],
-        s4 + v[1] * d[2],
-        s5 + v[2] * d[2],
-    )
-
-
-def between_matrix(w, S, T, x, y, u, v):
-    """Return the cross-covariance of a mixture, of attitude (means x, y) and bias (means u, v)."""
-    d = scale(w * (1.0 - w), subtract(y, x))
-    g = subtract(v, u)
-    a = between(w, (S[0], S[1], S[2]), (T[0], T[1], T[2]))
-    b = between(w, (S[3], S[4], S[5]), (T[3], T[4], T[5]))
-    c = between(w, (S[6], S[7], S[8]), (T[6], T[7], T[8]))
-    return (
-        a[0] + d[0] * g[0],
-        a[1] + d[0] * g[1],
-        a[2] + d[0] * g[2],
-        b[0] + d[1] * g[0],
-        b[1] + d[1] * g[1],
-        b[2] + d[1] * g[2],
-        c[0] + d[2] * g[0],
-        c[1] + d[2] * g[1],
-        c[2] + d[2] * g[2],
-    )
+    v, M = scale(w * (1.0 - w), d), full(between(w, S, T))
+    return tuple(M[3 * i + j] + v[i] * d[j] for i in range(3) for j in range(i, 3))
 
 
 def update(state, e, now, measured, body, out):
@@ -93,13 +44,12 @@ def update(state, e, now, measured, body, out):
     sensor = measured.sensor[e]
     z = value_of(measured, place, sensor)
     factor = load(body.factors, WIDTH * sensor)
-    number = measured_rows(
-        q, z, measured.series[sensor, KIND], frame_row(measured, place, sensor), measured.triads, room
-    )
+    kind = measured.series[sensor, KIND]
+    number = measured_rows(q, z, kind, frame_row(measured, place, sensor), measured.triads, room)
     turn, b0, A0, B0, C0 = updated(b, A, B, C, number, measured, place, sensor, z, factor, room, FOUND)
     wide = factor * load(outliers, WIDTH)
-    other, b1, A1, B1, C1 = updated(b, A, B, C, number, measured, place, sensor, z, wide, room, FOUND + 2 * WIDTH)
-    weigh(e, span, body, out)
+    other, b1, A1, B1, C1 = updated(b, A, B, C, number, measured, place, sensor, z, wide, room, WIDE)
+    weigh(e, span, 3 if kind == VECTOR else number, body, out)
     w = load(room, FOUND)
     A = between_symmetric(w, A0, A1, turn, other)
     B = between_matrix(w, B0, B1, turn, other, b0, b1)
@@ -109,13 +59,15 @@ def update(state, e, now, measured, body, out):
     return q, b, A, B, C, span, kept
 
 
-def weigh(e, span, body, out):
+def weigh(e, span, number, body, out):
     """Leave the probability of an outlier in lanes in the work space, and add to the sums."""
     room, outliers, free = body.room, body.outliers, body.free
     base = 0.0
     for i in range(WIDTH):
-        inside = math.log1p(-outliers[i]) - 0.5 * (room[FOUND + i] + math.log(room[FOUND + WIDTH + i]))
-        outside = math.log(outliers[i]) - 0.5 * (room[FOUND + 2 * WIDTH + i] + math.log(room[FOUND + 3 * WIDTH + i]))
+        nis, product = deviance_of(room, FOUND, number, i)
+        inside = math.log1p(-outliers[i]) - 0.5 * (nis + math.log(product))
+        wide, product = deviance_of(room, WIDE, number, i)
+        outside = math.log(outliers[i]) - 0.5 * (wide + math.log(product))
         highest = max(inside, outside)
         value = -highest - math.log(math.exp(inside - highest) + math.exp(outside - highest))
         struck = math.exp(outside + value)
@@ -123,7 +75,7 @@ def weigh(e, span, body, out):
         if i == 0:
             base = value
             out.probability[e, 0] = struck
-            out.probability[e, 1] = room[FOUND]
+            out.probability[e, 1] = nis
         elif i <= free:
             room[WORK + i - 1] = (value - base) / body.step
         room[FOUND + i] = struck

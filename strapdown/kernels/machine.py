@@ -3,8 +3,9 @@
 A kernel names its helpers as ordinary module globals. :func:`compiled` follows those names, compiles each helper once, and binds the
 compiled twins together, so that the source needs no decorator and stays plain Python.
 
-A kernel may leave functions open: it names them in ``OPEN`` of its module, where they stand without a body. :func:`compiled` takes the
-modules that define them; so :func:`strapdown.kernels.walk.walk` is the loop of every filter.
+A kernel may leave functions open: it names them in ``OPEN`` of its module, where they stand without a body, or are those of one of the
+modules that define them. :func:`compiled` takes the modules that do; so :func:`strapdown.kernels.walk.walk` is the loop of every filter.
+Those in ``REPLACEABLE`` are its own where no other defines them.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import hashlib
 import platform
 from collections.abc import Callable
 from pathlib import Path
-from types import FunctionType, ModuleType
+from types import CodeType, FunctionType, ModuleType
 from typing import Any
 
 import numpy as np
@@ -37,45 +38,56 @@ def _is_kernel(value: object) -> bool:
     return isinstance(value, FunctionType) and (value.__module__ or "").startswith(PACKAGE)
 
 
+def _names(code: CodeType) -> tuple[str, ...]:
+    """Return the names that a function's code asks for, and those of generator expressions in it."""
+    inner = (_names(one) for one in code.co_consts if isinstance(one, CodeType))
+    return sum(inner, code.co_names)
+
+
 def _kernels_named(function: FunctionType) -> dict[str, FunctionType]:
     """Return the kernel functions that a function names, by name."""
-    named = {name: function.__globals__.get(name) for name in function.__code__.co_names}
+    named = {name: function.__globals__.get(name) for name in _names(function.__code__)}
     return {name: value for name, value in named.items() if isinstance(value, FunctionType) and _is_kernel(value)}
-
-
-def is_open(function: FunctionType) -> bool:
-    """Return whether a function is left open by its module, for another one to define."""
-    return function.__name__ in function.__globals__.get("OPEN", ())
 
 
 @functools.cache
 def _depends_on_parts(function: FunctionType) -> bool:
-    """Return whether a function is open or names, directly or not, one that is."""
-    return is_open(function) or any(_depends_on_parts(value) for value in _kernels_named(function).values())
+    """Return whether a function names, directly or not, one that its module leaves open."""
+    named = _kernels_named(function)
+    return any(name in _open(function) or _depends_on_parts(value) for name, value in named.items())
 
 
-def _defined(function: FunctionType, parts: tuple[ModuleType, ...]) -> FunctionType:
-    """Return what defines a function: itself, or of an open one that of the first module among ``parts`` that has it."""
-    if not is_open(function):
-        return function
+def _open(one: FunctionType | ModuleType) -> tuple[str, ...]:
+    """Return the names that a module, or that of a function, leaves open."""
+    names = one.__globals__ if isinstance(one, FunctionType) else vars(one)
+    return (*names.get("OPEN", ()), *names.get("REPLACEABLE", ()))
+
+
+def _defined(name: str, value: FunctionType, function: FunctionType, parts: tuple[ModuleType, ...]) -> FunctionType:
+    """Return what a name in a function stands for: its value, or where it is open that of the first among ``parts`` that has it."""
+    if name not in _open(function):
+        return value
     for module in parts:
-        found = getattr(module, function.__name__, None)
-        if isinstance(found, FunctionType) and not is_open(found):
+        found = getattr(module, name, None)
+        if isinstance(found, FunctionType) and name not in _open(module):
             return found
+    if name in function.__globals__.get("REPLACEABLE", ()):
+        return value
     names = ", ".join(module.__name__ for module in parts) or "nothing"
-    raise TypeError(f"{function.__module__} leaves {function.__name__} open, and {names} does not define it")
+    raise TypeError(f"{function.__module__} leaves {name} open, and {names} does not define it")
 
 
 def _twin(function: FunctionType, parts: tuple[ModuleType, ...]) -> FunctionType:
     """Return a copy of ``function`` whose kernel globals are the compiled helpers."""
     bound: dict[str, Any] = {"__name__": function.__module__}
-    for name in function.__code__.co_names:
+    for name in _names(function.__code__):
         if name in function.__globals__:
             value = function.__globals__[name]
             if isinstance(value, ModuleType) and value.__name__.startswith(PACKAGE):
                 raise TypeError(f"kernel {function.__name__} names module {name}; import its functions by name instead")
             if _is_kernel(value):
-                value = helper(_defined(value, parts), parts if _depends_on_parts(_defined(value, parts)) else ())
+                value = _defined(name, value, function, parts)
+                value = helper(value, parts if _depends_on_parts(value) else ())
             bound[name] = value
     twin = FunctionType(function.__code__, bound, function.__name__, function.__defaults__, function.__closure__)
     twin.__qualname__ = function.__qualname__

@@ -97,17 +97,7 @@ def frame_row(measured, place, sensor):
 
 def frame_at(triads, t):
     """Return row t of the frames as a 9-tuple."""
-    return (
-        triads[t, 0],
-        triads[t, 1],
-        triads[t, 2],
-        triads[t, 3],
-        triads[t, 4],
-        triads[t, 5],
-        triads[t, 6],
-        triads[t, 7],
-        triads[t, 8],
-    )
+    return tuple(triads[t, i] for i in range(9))
 
 
 def frame_of(measured, place, sensor):

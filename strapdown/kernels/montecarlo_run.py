@@ -35,7 +35,7 @@ from strapdown.kernels.lane_values import (
     restore_mode,
     store_like,
 )
-from strapdown.kernels.measurement import ATTITUDE, HEADING, VECTOR, heading_row, vector_at
+from strapdown.kernels.measurement import ATTITUDE, HEADING, VECTOR, frame_at, heading_row, vector_at
 from strapdown.kernels.noise import next_word, single_normals, stream_state
 from strapdown.kernels.rotation import exponential, quaternion_multiply, rotation_matrix, unit
 
@@ -167,42 +167,30 @@ def memory(sensors):
     return _SENSORS + _OF_A_SENSOR * sensors
 
 
-def stored_stream(streams, place, like):
-    """Return the four words of state of the streams in as many lanes as ``like`` has, at ``place`` of a flat array."""
-    n = len(like)
-    return (
-        load_like(streams, place, like),
-        load_like(streams, place + n, like),
-        load_like(streams, place + 2 * n, like),
-        load_like(streams, place + 3 * n, like),
-    )
-
-
-def store_stream(streams, place, like, s0, s1, s2, s3):
-    """Write what :func:`stored_stream` reads."""
-    n = len(like)
-    store_like(streams, place, s0)
-    store_like(streams, place + n, s1)
-    store_like(streams, place + 2 * n, s2)
-    store_like(streams, place + 3 * n, s3)
-
-
 def triple(memory, place, like):
     """Return three neighbouring places."""
-    n = len(like)
-    return (
-        load_like(memory, place * n, like),
-        load_like(memory, (place + 1) * n, like),
-        load_like(memory, (place + 2) * n, like),
-    )
+    return tuple(load_like(memory, (place + i) * len(like), like) for i in range(3))
 
 
-def store_triple(memory, place, like, v):
-    """Write three neighbouring places."""
-    n = len(like)
-    store_like(memory, place * n, v[0])
-    store_like(memory, (place + 1) * n, v[1])
-    store_like(memory, (place + 2) * n, v[2])
+def four(memory, place, like):
+    """Return four neighbouring places."""
+    return tuple(load_like(memory, (place + i) * len(like), like) for i in range(4))
+
+
+def nine(memory, place, like):
+    """Return nine neighbouring places."""
+    return tuple(load_like(memory, (place + i) * len(like), like) for i in range(9))
+
+
+def store_several(memory, place, like, values):
+    """Write neighbouring places."""
+    for i, value in enumerate(values):
+        store_like(memory, (place + i) * len(like), value)
+
+
+def by_axis(v, sizes, row):
+    """Return v with each component times that of a row of sizes."""
+    return tuple(v[i] * sizes[row, i] for i in range(3))
 
 
 def next_four(s0, s1, s2, s3):
@@ -217,14 +205,13 @@ def next_four(s0, s1, s2, s3):
 def refill(streams, source, ahead, count, like):
     """Draw the next normals of a source, ``count`` of them, a multiple of four."""
     n = len(like)
-    place = 4 * source * n
     begin = AHEAD * source * n
-    s0, s1, s2, s3 = stored_stream(streams, place, like)
+    s0, s1, s2, s3 = four(streams, 4 * source, like)
     for at in range(begin, begin + count * n, 4 * n):
         x, y, s0, s1, s2, s3 = next_four(s0, s1, s2, s3)
         store_like(ahead, at, x)
         store_like(ahead, at + 2 * n, y)
-    store_stream(streams, place, like, s0, s1, s2, s3)
+    store_several(streams, 4 * source, like, (s0, s1, s2, s3))
 
 
 def drawn(ahead, source, index, like):
@@ -234,11 +221,7 @@ def drawn(ahead, source, index, like):
 
 def drawn_triple(ahead, source, index, like):
     """Return three neighbouring normals."""
-    return (
-        drawn(ahead, source, index, like),
-        drawn(ahead, source, index + 1, like),
-        drawn(ahead, source, index + 2, like),
-    )
+    return tuple(drawn(ahead, source, index + i, like) for i in range(3))
 
 
 def normal_triple(streams, source, ahead, number, like):
@@ -264,8 +247,7 @@ def start_streams(keys, numbers, draws, like):
     """Fill the states of all streams of the runs of these numbers, ``keys`` (sources, 2), and draw what a run starts with."""
     number = load_like(numbers, 0, like)
     for source in range(len(keys)):
-        s0, s1, s2, s3 = stream_state(keys[source, 0], keys[source, 1], number)
-        store_stream(draws.streams, 4 * source * len(like), like, s0, s1, s2, s3)
+        store_several(draws.streams, 4 * source, like, stream_state(keys[source, 0], keys[source, 1], number))
     for source in (FLICKER, TURN_ON, START, DISPERSIONS):
         refill(draws.streams, source, draws.ahead, 3 * STATES, like)
 
@@ -275,24 +257,11 @@ def start_gyro(gyro, draws, like):
     n = len(like)
     sizes, poles_start, dispersion = gyro.sizes, gyro.poles_start, gyro.dispersion
     ahead, memory = draws.ahead, draws.memory
-    x = drawn_triple(ahead, TURN_ON, 0, like)
-    y = drawn_triple(ahead, TURN_ON, 3, like)
-    for i in range(3):
-        store_like(memory, (_WALK + i) * n, lanes_zero(like))
-    store_triple(
-        memory,
-        _TURN_ON,
-        like,
-        (x[0] * sizes[TURN_ON_SIGMA, 0], x[1] * sizes[TURN_ON_SIGMA, 1], x[2] * sizes[TURN_ON_SIGMA, 2]),
-    )
-    store_triple(
-        memory,
-        _MARKOV,
-        like,
-        (y[0] * sizes[MARKOV_START, 0], y[1] * sizes[MARKOV_START, 1], y[2] * sizes[MARKOV_START, 2]),
-    )
+    store_several(memory, _WALK, like, (like, like, like))
+    store_several(memory, _TURN_ON, like, by_axis(drawn_triple(ahead, TURN_ON, 0, like), sizes, TURN_ON_SIGMA))
+    store_several(memory, _MARKOV, like, by_axis(drawn_triple(ahead, TURN_ON, 3, like), sizes, MARKOV_START))
     for i in range(3 * STATES):
-        store_like(memory, (_STATES + i) * n, lanes_zero(like))
+        store_like(memory, (_STATES + i) * n, like)
     if len(poles_start) > 0:
         for axis in range(3):
             for j in range(0, STATES, 2):
@@ -304,25 +273,14 @@ def start_gyro(gyro, draws, like):
                     store_like(memory, at, state + poles_start[i, j + 1] * x1)
     for row in range(3):
         x = drawn_triple(ahead, DISPERSIONS, 3 * row, like)
-        store_triple(
-            memory,
-            _MATRIX + 3 * row,
-            like,
-            (x[0] * dispersion[row, 0], x[1] * dispersion[row, 1], x[2] * dispersion[row, 2]),
-        )
-
-
-def lanes_zero(like):
-    """Return zeros of the kind of ``like``."""
-    return like - like
+        store_several(memory, _MATRIX + 3 * row, like, by_axis(x, dispersion, row))
 
 
 def flicker_step(poles, gains, memory, axis, w, like):
     """Advance the flicker of one axis by a normal; return its value for B = 1."""
     n = len(like)
     base = (_STATES + axis * STATES) * n
-    even = lanes_zero(like)
-    odd = lanes_zero(like)
+    even = odd = like
     for i in range(0, STATES, 2):
         at = base + i * n
         a = poles[i] * load_like(memory, at, like) + w
@@ -338,7 +296,7 @@ def flicker_value(gains, memory, axis, like):
     """Return the flicker of the states as they are, for B = 1."""
     n = len(like)
     base = (_STATES + axis * STATES) * n
-    value = lanes_zero(like)
+    value = like
     for i in range(STATES):
         value = value + gains[i] * load_like(memory, base + i * n, like)
     return value
@@ -354,12 +312,8 @@ def drift_step(gyro, k, dt, true_increment, draws, like):
     if terms[0]:
         white = normal_triple(streams, GYRO, ahead, 2 * k, like)
         steps = normal_triple(streams, GYRO, ahead, 2 * k + 1, like)
-        after = (
-            walk[0] + sizes[WALK_SIGMA, 0] * steps[0],
-            walk[1] + sizes[WALK_SIGMA, 1] * steps[1],
-            walk[2] + sizes[WALK_SIGMA, 2] * steps[2],
-        )
-        store_triple(memory, _WALK, like, after)
+        after = add(walk, by_axis(steps, sizes, WALK_SIGMA))
+        store_several(memory, _WALK, like, after)
         drift = combine(dt, turn_on, 0.5 * dt, add(walk, after))
     else:
         white = normal_triple(streams, GYRO, ahead, k, like)
@@ -368,18 +322,10 @@ def drift_step(gyro, k, dt, true_increment, draws, like):
     if terms[1]:
         g = triple(memory, _MARKOV, like)
         x = normal_triple(streams, MARKOV, ahead, k, like)
-        after = (
-            sizes[MARKOV_DECAY, 0] * g[0] + sizes[MARKOV_SIGMA, 0] * x[0],
-            sizes[MARKOV_DECAY, 1] * g[1] + sizes[MARKOV_SIGMA, 1] * x[1],
-            sizes[MARKOV_DECAY, 2] * g[2] + sizes[MARKOV_SIGMA, 2] * x[2],
-        )
-        store_triple(memory, _MARKOV, like, after)
+        after = add(by_axis(g, sizes, MARKOV_DECAY), by_axis(x, sizes, MARKOV_SIGMA))
+        store_several(memory, _MARKOV, like, after)
         bias = add(bias, g)
-        drift = (
-            drift[0] + sizes[MARKOV_MEAN, 0] * (g[0] + after[0]),
-            drift[1] + sizes[MARKOV_MEAN, 1] * (g[1] + after[1]),
-            drift[2] + sizes[MARKOV_MEAN, 2] * (g[2] + after[2]),
-        )
+        drift = add(drift, by_axis(add(g, after), sizes, MARKOV_MEAN))
     if terms[2]:
         if k == 0:
             for axis in range(3):
@@ -392,22 +338,12 @@ def drift_step(gyro, k, dt, true_increment, draws, like):
             sizes[FLICKER_SIZE, 1] * flicker_step(poles, gains, memory, 1, x[1], like),
             sizes[FLICKER_SIZE, 2] * flicker_step(poles, gains, memory, 2, x[2], like),
         )
-        store_triple(memory, _BEFORE, like, now)
+        store_several(memory, _BEFORE, like, now)
         bias = combine(1.0, bias, 0.5, add(before, now))
         drift = combine(1.0, drift, dt, now)
     if terms[3]:
-        M = (
-            *triple(memory, _MATRIX, like),
-            *triple(memory, _MATRIX + 3, like),
-            *triple(memory, _MATRIX + 6, like),
-        )
-        drift = add(drift, matrix_times_vector(M, true_increment))
-    drift = (
-        drift[0] + sizes[WHITE_SIGMA, 0] * white[0],
-        drift[1] + sizes[WHITE_SIGMA, 1] * white[1],
-        drift[2] + sizes[WHITE_SIGMA, 2] * white[2],
-    )
-    return bias, drift
+        drift = add(drift, matrix_times_vector(nine(memory, _MATRIX, like), true_increment))
+    return bias, add(drift, by_axis(white, sizes, WHITE_SIGMA))
 
 
 def sensor_noise(e, events, draws, like):
@@ -418,44 +354,26 @@ def sensor_noise(e, events, draws, like):
     mine = _SENSORS + _OF_A_SENSOR * sensor
     source = SENSORS + 2 * sensor
     white = normal_triple(streams, source, ahead, number, like)
-    noise = (events.sigma[e, 0] * white[0], events.sigma[e, 1] * white[1], events.sigma[e, 2] * white[2])
+    noise = by_axis(white, events.sigma, e)
     if struck_below > np.uint64(0) or share > 0.0:
-        place = 4 * (source + 1) * len(like)
-        s0, s1, s2, s3 = stored_stream(streams, place, like)
+        s0, s1, s2, s3 = four(streams, 4 * (source + 1), like)
         word, s0, s1, s2, s3 = next_word(s0, s1, s2, s3)
         larger = chosen(word < struck_below, like - like + events.outlier_scale[sensor], 1.0)
-        noise = (larger * noise[0], larger * noise[1], larger * noise[2])
-        store_stream(streams, place, like, s0, s1, s2, s3)
+        noise = scale(larger, noise)
+        store_several(streams, 4 * (source + 1), like, (s0, s1, s2, s3))
         if share > 0.0:
             refill(streams, source + 1, ahead, 4, like)
             drive = scale(share, drawn_triple(ahead, source + 1, 0, like))
             if number > 0:
                 drive = combine(events.decay[e], triple(memory, mine, like), 1.0, drive)
-            store_triple(memory, mine, like, drive)
+            store_several(memory, mine, like, drive)
             noise = add(noise, drive)
     return noise
 
 
 def keep(kept, row, like, q, b, A, B, C, bias):
     """Write one epoch: :data:`KEPT` places."""
-    n = len(like)
-    at = row * KEPT * n
-    for i in range(4):
-        store_like(kept, at + i * n, q[i])
-    for i in range(6):
-        store_like(kept, at + (7 + i) * n, A[i])
-        store_like(kept, at + (22 + i) * n, C[i])
-    for i in range(9):
-        store_like(kept, at + (13 + i) * n, B[i])
-    for i in range(3):
-        store_like(kept, at + (4 + i) * n, b[i])
-        store_like(kept, at + (28 + i) * n, bias[i])
-
-
-def add_nis(nis, place, like, value):
-    """Add lanes to a place."""
-    at = place * len(like)
-    store_like(nis, at, load_like(nis, at, like) + value)
+    store_several(kept, row * KEPT, like, (*q, *b, *A, *B, *C, *bias))
 
 
 def update(q, b, A, B, C, e, events, draws, out, detail, like):
@@ -473,17 +391,15 @@ def update(q, b, A, B, C, e, events, draws, out, detail, like):
     if kind == ATTITUDE:
         measured = quaternion_multiply((exact[e, 0], exact[e, 1], exact[e, 2], exact[e, 3]), exponential(noise))
         y = rotation_vector(quaternion_multiply((q[0], -q[1], -q[2], -q[3]), measured))
-        variances = (events.variance[e, 0], events.variance[e, 1], events.variance[e, 2])
-        q, b, A, B, C, e1, s1, e2, s2, e3, s3 = update_residual(q, b, A, B, C, y, variances)
+        q, b, A, B, C, e1, s1, e2, s2, e3, s3 = update_residual(q, b, A, B, C, y, vector_at(events.variance, e))
         chi = e1 * e1 / s1 + e2 * e2 / s2 + e3 * e3 / s3
         z = (measured[1], measured[2], measured[3])
         z0 = measured[0]
     else:
-        z = add((exact[e, 0], exact[e, 1], exact[e, 2]), noise)
-        t = events.frame[e]
-        frames = events.frames
+        z = add(vector_at(exact, e), noise)
+        frame = frame_at(events.frames, events.frame[e])
         R = rotation_matrix(q)
-        r = (frames[t, 6], frames[t, 7], frames[t, 8])
+        r = frame[6:]
         variance = events.variance[e, 0]
         if kind != VECTOR:
             z = scale(inverse_root(dot(z, z)), z)
@@ -493,27 +409,18 @@ def update(q, b, A, B, C, e, events, draws, out, detail, like):
             q, b, A, B, C, e1, s1 = update_heading(q, b, A, B, C, heading_row(R, z), error, variance)
             chi = e1 * e1 / s1
         else:
-            u = (frames[t, 0], frames[t, 1], frames[t, 2])
-            v = (frames[t, 3], frames[t, 4], frames[t, 5])
-            q, b, A, B, C, e1, s1, e2, s2, chi = update_direction_and_judge(q, b, A, B, C, R, u, v, z, variance)
+            q, b, A, B, C, e1, s1, e2, s2, chi = update_direction_and_judge(
+                q, b, A, B, C, R, frame[:3], frame[3:6], z, variance
+            )
             if kind == VECTOR:
                 e3 = dot(transpose_times_vector(R, r), z) - 1.0
                 s3 = variance * one
                 chi = chi + e3 * e3 / variance
-    add_nis(out.nis, place, like, chi)
+    store_like(out.nis, place * len(like), load_like(out.nis, place * len(like), like) + chi)
     if detail is not None:
-        store_four(detail.values, 4 * e, like, (z0, z[0], z[1], z[2]))
-        store_four(detail.innovations, 6 * e, like, (e1, s1, e2, s2))
-        store_like(detail.innovations, (6 * e + 4) * len(like), e3)
-        store_like(detail.innovations, (6 * e + 5) * len(like), s3)
+        store_several(detail.values, 4 * e, like, (z0, z[0], z[1], z[2]))
+        store_several(detail.innovations, 6 * e, like, (e1, s1, e2, s2, e3, s3))
     return q, b, A, B, C
-
-
-def store_four(array, place, like, values):
-    """Write four neighbouring places."""
-    n = len(like)
-    for i in range(4):
-        store_like(array, (place + i) * n, values[i])
 
 
 def filter_start(bias, start, draws, like):
@@ -584,7 +491,7 @@ def advance(pattern, numbers, keys, gyro, start, events, every, draws, out, deta
             if due:
                 q, b, A, B, C = update(q, b, A, B, C, e, events, draws, out, detail, like)
                 e += 1
-            elif now >= end:
+            if now >= end and (e == count or events.time[e] > end):
                 break
         i = min(k + 1, steps - 1)
         whole = edges[i + 1] - edges[i]
@@ -593,7 +500,7 @@ def advance(pattern, numbers, keys, gyro, start, events, every, draws, out, deta
         bias = add(vector_at(gyro.true_bias, k + 1), bias)
         longest = gyro.substeps[i]
         if detail is not None and k + 1 < steps:
-            store_triple(detail.increments, 3 * (k + 1), like, theta)
+            store_several(detail.increments, 3 * (k + 1), like, theta)
         if k < 0:
             q, b = filter_start(bias, start, draws, like)
         if countdown == 0:

@@ -7,6 +7,7 @@ compensation: a chain of nodes then loses rounding of the deviations only.
 
 from __future__ import annotations
 
+from strapdown.kernels.algebra import add_matrices
 from strapdown.kernels.rotation import quaternion_multiply
 
 
@@ -87,24 +88,10 @@ def node_deviations(cosines, sines, factors, amplitudes, mean, half, rate, serie
 
 def advance(q, low, d):
     """Return q ⊗ (1 + d) of a quaternion held as the unevaluated sum ``q + low``, in the same form (two-sum, Knuth)."""
-    p = quaternion_multiply((q[0] + low[0], q[1] + low[1], q[2] + low[2], q[3] + low[3]), d)
-    s0 = q[0] + p[0]
-    s1 = q[1] + p[1]
-    s2 = q[2] + p[2]
-    s3 = q[3] + p[3]
-    b0 = s0 - q[0]
-    b1 = s1 - q[1]
-    b2 = s2 - q[2]
-    b3 = s3 - q[3]
-    return (
-        (s0, s1, s2, s3),
-        (
-            low[0] + ((q[0] - (s0 - b0)) + (p[0] - b0)),
-            low[1] + ((q[1] - (s1 - b1)) + (p[1] - b1)),
-            low[2] + ((q[2] - (s2 - b2)) + (p[2] - b2)),
-            low[3] + ((q[3] - (s3 - b3)) + (p[3] - b3)),
-        ),
-    )
+    p = quaternion_multiply(add_matrices(q, low), d)
+    s = add_matrices(q, p)
+    b = tuple(x - y for x, y in zip(s, q, strict=True))
+    return s, tuple(low[i] + ((q[i] - (s[i] - b[i])) + (p[i] - b[i])) for i in range(4))
 
 
 def chain(leaving, arriving, attitudes, lows):
@@ -119,7 +106,7 @@ def chain(leaving, arriving, attitudes, lows):
         a = (leaving[k, 0], leaving[k, 1], leaving[k, 2], leaving[k, 3])
         b = (arriving[k + 1, 0], -arriving[k + 1, 1], -arriving[k + 1, 2], -arriving[k + 1, 3])
         ab = quaternion_multiply(a, b)
-        q, low = advance(q, low, (a[0] + b[0] + ab[0], a[1] + b[1] + ab[1], a[2] + b[2] + ab[2], a[3] + b[3] + ab[3]))
+        q, low = advance(q, low, add_matrices(add_matrices(a, b), ab))
         for i in range(4):
             attitudes[k + 1, i] = q[i]
             lows[k + 1, i] = low[i]

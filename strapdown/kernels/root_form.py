@@ -15,29 +15,25 @@ from typing import NamedTuple
 import numpy as np
 
 from strapdown.kernels.algebra import (
+    add,
     combine,
+    congruent,
     cross,
     dot,
-    full,
     matrix_times_vector,
     multiply,
-    times_transpose_upper,
+    plus_square,
     transpose,
     transpose_times_vector,
 )
 from strapdown.kernels.chains import chain_start, chain_step, step_chains
 from strapdown.kernels.error_state_step import (
     OFFSET,
-    Rows,
-    arm_noise,
     carry,
-    decorrelate,
     fill_noise,
-    fill_rows,
     fixed_turn,
     follow,
     move,
-    put_row,
     step_noise,
     turn_columns,
     turn_rows,
@@ -66,6 +62,7 @@ from strapdown.kernels.measurement import (
     vector_at,
 )
 from strapdown.kernels.rotation import far_turn, quaternion_multiply, right_jacobian, turned, unit
+from strapdown.kernels.sensor_rows import arm_noise, decorrelate, fill_rows
 from strapdown.kernels.triangle import covariances, dot_rows, take_row, triangularise, variances, whole_bias
 from strapdown.kernels.walk import step_within, turn_squared
 
@@ -104,8 +101,6 @@ class Scratch(NamedTuple):
     """(3, 3, width of F): H of a measurement, H turned to the prior's tangent space, and F Hᵀ."""
     lines: np.ndarray
     """(9, width of F): in the order of the constants below."""
-    threes: np.ndarray
-    """(5, 3): y, variances of the rows, and the body axes that the rows measure along."""
     steps: np.ndarray
     """(2, 2, n, 4): of the steps since the factor's, and of the next, Φ and Q as :func:`strapdown.kernels.error_state_step.move` and
     :func:`strapdown.kernels.error_state_step.step_noise` leave them."""
@@ -233,19 +228,8 @@ def step(model, scratch, q, x, dt, part, more):
     """Propagate attitude and ``x`` alone, and add the step to those that the factor is behind by, where there are ``more``; return q."""
     now = 1 if more else 0
     top, noise, factor = scratch.steps[now, 0], scratch.steps[now, 1], scratch.lines[FACTOR + now]
-    q, _, rate, D = move(q, x, dt, part, model.decay, model.gyro, model.gyro_use, model.force_f, top, factor)
-    step_noise(
-        noise,
-        dt,
-        rate,
-        D,
-        model.angle_variance,
-        model.rate_variance,
-        model.decay,
-        model.density,
-        model.gyro,
-        model.gyro_use,
-    )
+    q, _, rate, D = move(q, x, dt, part, model, top, factor)
+    step_noise(noise, dt, rate, D, model)
     if more:
         size, first = len(x) + 3, scratch.lines[FACTOR]
         follow(scratch.steps[0, 0], first, scratch.steps[0, 1], top, factor, noise, size, model.changing)
@@ -314,13 +298,7 @@ def update(state, e, now, measured, body, out):
     """Update with a measurement."""
     q, segments, behind = state
     model, scratch, x, F = body.model, body.scratch, body.x[0], body.F[0]
-    H, y, spread, step, work = (
-        scratch.rows[0],
-        scratch.threes[0],
-        scratch.threes[1],
-        scratch.lines[STEP],
-        scratch.lines[WORK],
-    )
+    H, step, work = scratch.rows[0], scratch.lines[STEP], scratch.lines[WORK]
     size = len(x) + 3
     if behind > 0:
         absorb(model, scratch, x, F, 0.0)
@@ -328,30 +306,19 @@ def update(state, e, now, measured, body, out):
     s = measured.sensor[e]
     kind = measured.series[s, KIND]
     z = value_of(measured, place, s)
-    sigma = sigma_of(measured, place, s)
-    levered = len(body.turning) > 0 and body.turning[e, 6] > 0.0
-    rows = seen_rows(body, e, q, x, kind, z, frame_of(measured, place, s), s)
-    if levered or len(measured.noise) > 0:
+    arm = arm_variance(body, e)
+    rows, y, axes, shown = seen_rows(body, e, q, x, kind, z, frame_of(measured, place, s), s)
+    if arm[0] > 0.0 or len(measured.noise) > 0:
         C = noise_of(measured, place, s, kind, z)
-        if levered:
-            C = arm_noise(
-                x,
-                s,
-                model.sensors,
-                model.sensor_use,
-                body.length[e],
-                (body.turning[e, 6], body.turning[e, 7], body.turning[e, 8]),
-                C,
-            )
-        decorrelate(H, y, rows, scratch.threes[2:], C, spread)
+        y, spread = independent(body, e, x, s, rows, y, axes, C, arm)
+    elif kind == ATTITUDE:
+        spread = z
     else:
-        for r in range(rows):
-            spread[r] = sigma * sigma
-            if kind == ATTITUDE:
-                spread[r] = z[0] if r == 0 else (z[1] if r == 1 else z[2])
-            elif kind == DIRECTION:
-                basis = scratch.threes[2:]
-                spread[r] *= basis[r, 0] ** 2 + basis[r, 1] ** 2 + basis[r, 2] ** 2
+        variance = sigma_of(measured, place, s) * sigma_of(measured, place, s)
+        u, v = 1.0, 1.0
+        if kind == DIRECTION:
+            u, v = dot(axes[0], axes[0]), dot(axes[1], axes[1])
+        spread = (variance * u, variance * v, variance)
     for i in range(len(step)):
         step[i] = 0.0
     for r in range(rows):
@@ -363,7 +330,7 @@ def update(state, e, now, measured, body, out):
             step[i] += error / s2 * work[i]
         out.innovation[place, 2 * r] = error
         out.innovation[place, 2 * r + 1] = s2
-    if kind == HEADING and H[0, 0] == 0.0 and H[0, 1] == 0.0 and H[0, 2] == 0.0:
+    if kind == HEADING and not shown:
         out.innovation[place, 0] = math.nan  # of a vertical vector, which shows none: skipped
     a = (step[0], step[1], step[2])
     before = q
@@ -381,15 +348,35 @@ def update(state, e, now, measured, body, out):
 
 
 def seen_rows(form, e, q, x, kind, z, frame, sensor):
-    """Write H, y and the rows' axes of a measurement seen from a state to the scratch; return the number of rows."""
-    model, scratch = form.model, form.scratch
+    """Write H of a measurement seen from a state to the scratch; return what :func:`strapdown.kernels.sensor_rows.fill_rows` does."""
+    model, H = form.model, form.scratch.rows[0]
     W = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     t = form.turning
     if len(t) > 0:
         turn = (t[e, 0] - x[0], t[e, 1] - x[1], t[e, 2] - x[2])
         W = turning_matrix(turn, (t[e, 3], t[e, 4], t[e, 5]))
-    rows = Rows(scratch.rows[0], scratch.threes[0], scratch.threes[2:])
-    return fill_rows(q, x, kind, z, frame, form.length[e], sensor, model.sensors, model.sensor_use, W, rows)
+    for r in range(3):
+        for j in range(H.shape[1]):
+            H[r, j] = 0.0
+    value = (z[0], z[1], z[2], 0.0)
+    if kind == ATTITUDE:
+        value = frame[:4]
+    return fill_rows(q, x, H, kind, value, frame, form.length[e], sensor, model.sensors, model.sensor_use, W, 0.0)
+
+
+def arm_variance(form, e):
+    """Return the variances of the angular acceleration at a measurement by a lever arm; zeros at any other."""
+    if len(form.turning) > 0:
+        return (form.turning[e, 6], form.turning[e, 7], form.turning[e, 8])
+    return (0.0, 0.0, 0.0)
+
+
+def independent(form, e, x, sensor, rows, y, axes, C, arm):
+    """Make the rows in the scratch independent; return y and the variances."""
+    model = form.model
+    if arm[0] > 0.0:
+        C = arm_noise(x, sensor, model.sensors, model.sensor_use, form.length[e], arm, C, 0.0)
+    return decorrelate(form.scratch.rows[0], model.sensor_use[sensor], rows, y, axes, C, 0.0)
 
 
 def keep(state, row, e, body, out):
@@ -402,11 +389,6 @@ def keep(state, row, e, body, out):
         absorb(body.model, body.scratch, body.x[0], body.F[1], 0.0)
     write_row(body, 1 if behind > 0 else 0, q, row, out)
     return state
-
-
-def stopped(state):
-    """Go on to the end."""
-    return False
 
 
 def finish(state, row, e, body):
@@ -477,16 +459,10 @@ def store_prediction(form, i, q, k, part, dt, out):
 def attitude_covariance(form, i, q):
     """Return the covariance of the attitude (6-tuple)."""
     F = form.F[i]
-    s00 = s01 = s02 = s11 = s12 = s22 = 0.0
+    S = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     for j in range(form.x.shape[1] + 3):
-        a, b, c = F[j, 0], F[j, 1], F[j, 2]
-        s00 += a * a
-        s01 += a * b
-        s02 += a * c
-        s11 += b * b
-        s12 += b * c
-        s22 += c * c
-    return (s00, s01, s02, s11, s12, s22)
+        S = plus_square(S, vector_at(F, j))
+    return S
 
 
 def start_update(form, i):
@@ -504,36 +480,28 @@ def linearised(form, i, e, now_q, q, M, z, frame, noise, kind, sensor, prior):
     The rows stand in ``prior_H``, turned to the prior's tangent space, and as they are in ``H``.
     """
     model, scratch = form.model, form.scratch
-    H, y, spread, prior_H = scratch.rows[0], scratch.threes[0], scratch.threes[1], scratch.rows[1]
+    H, prior_H = scratch.rows[0], scratch.rows[1]
     size = form.x.shape[1] + 3
     now_x = scratch.lines[NOW_X, : size - 3]
-    rows = seen_rows(form, e, now_q, now_x, kind, z, frame, sensor)
-    far, along = seen_from_afar(kind, z, rows, y, scratch.threes[2:])
-    C = noise
-    if len(form.turning) > 0 and form.turning[e, 6] > 0.0:
-        arm = (form.turning[e, 6], form.turning[e, 7], form.turning[e, 8])
-        C = arm_noise(now_x, sensor, model.sensors, model.sensor_use, form.length[e], arm, noise)
-    decorrelate(H, y, rows, scratch.threes[2:], C, spread)
-    p0 = p1 = p2 = 0.0
-    for j in range(size, H.shape[1]):
-        for r in range(3):
-            prior_H[r, j] = 0.0
-    for j in range(size):
-        for r in range(3):
-            prior_H[r, j] = H[r, j]
-        p0 += H[0, j] * scratch.lines[PRIOR][j]
-        p1 += H[1, j] * scratch.lines[PRIOR][j]
-        p2 += H[2, j] * scratch.lines[PRIOR][j]
+    rows, y, axes, _ = seen_rows(form, e, now_q, now_x, kind, z, frame, sensor)
+    far, along = seen_from_afar(kind, z, rows, y, axes)
+    y, spread = independent(form, e, now_x, sensor, rows, y, axes, noise, arm_variance(form, e))
+    p = (0.0, 0.0, 0.0)
+    for j in range(H.shape[1]):
+        column = (H[0, j], H[1, j], H[2, j])
+        prior_H[0, j], prior_H[1, j], prior_H[2, j] = column
+        if j < size:
+            p = combine(1.0, p, scratch.lines[PRIOR][j], column)
     for r in range(3):
-        put_row(prior_H, r, transpose_times_vector(M, vector_at(H, r)))
+        prior_H[r, 0], prior_H[r, 1], prior_H[r, 2] = transpose_times_vector(M, vector_at(H, r))
     if len(model.chains) > 0:
         turn_columns(model.chains, transpose(fixed_turn(q, now_q)), prior_H, 3)
     two, three = rows > 1, rows > 2
     variance = (spread[0], spread[1] if two else 1.0, spread[2] if three else 1.0)
-    return rows, (y[0], y[1] if two else 0.0, y[2] if three else 0.0), (p0, p1, p2), variance, far, along
+    return rows, (y[0], y[1] if two else 0.0, y[2] if three else 0.0), p, variance, far, along
 
 
-def seen_from_afar(kind, z, rows, y, basis):
+def seen_from_afar(kind, z, rows, y, axes):
     """Return θ/sin θ of the angle θ between a measured and a predicted vector, and its cosine times their length; of other kinds 1, 1.
 
     The rows of a direction measure across what is predicted with the error states, those of a vector across the reference, along which
@@ -544,7 +512,7 @@ def seen_from_afar(kind, z, rows, y, basis):
     if rows == 3:
         along = y[2] + 1.0
     else:
-        d = cross(vector_at(basis, 0), vector_at(basis, 1))
+        d = cross(axes[0], axes[1])
         along = dot(d, z) / math.sqrt(dot(d, d))
     return arc_over_chord(math.sqrt(y[0] * y[0] + y[1] * y[1]), along), along
 
@@ -556,16 +524,10 @@ def innovation_covariance(form, i, q, rows):
     for r in range(3):
         for j in range(size):
             seen[r, j] = dot_rows(F, j, H, r) if r < rows else 0.0
-    s00 = s01 = s02 = s11 = s12 = s22 = 0.0
+    S = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     for j in range(size):
-        a, b, c = seen[0, j], seen[1, j], seen[2, j]
-        s00 += a * a
-        s01 += a * b
-        s02 += a * c
-        s11 += b * b
-        s12 += b * c
-        s22 += c * c
-    return (s00, s01, s02, s11, s12, s22)
+        S = plus_square(S, (seen[0, j], seen[1, j], seen[2, j]))
+    return S
 
 
 def step_of(form, i, state, rows, u, M, prior, q, now_q):
@@ -692,12 +654,11 @@ def start_candidate(form, memory, now, attitude_sigma, restart):
 
 def bias_variances(F, size):
     """Return the variances of the bias (3,) of a factor's covariance."""
-    x = y = z = 0.0
+    variances = (0.0, 0.0, 0.0)
     for j in range(size):
-        x += F[j, 3] * F[j, 3]
-        y += F[j, 4] * F[j, 4]
-        z += F[j, 5] * F[j, 5]
-    return (x, y, z)
+        b = (F[j, 3], F[j, 4], F[j, 5])
+        variances = add(variances, (b[0] * b[0], b[1] * b[1], b[2] * b[2]))
+    return variances
 
 
 def aged_chain(decay, chains, first, k, age):
@@ -734,7 +695,7 @@ def aged_chain(decay, chains, first, k, age):
     phi = (own0, near1, far2, 0.0, own1, near2, 0.0, 0.0, own2)
     Q = (q00, q01, q02, q11, q12, q22)
     for _ in range(doublings):
-        more = times_transpose_upper(multiply(phi, full(Q)), phi)
+        more = congruent(phi, Q)
         Q = (Q[0] + more[0], Q[1] + more[1], Q[2] + more[2], Q[3] + more[3], Q[4] + more[4], Q[5] + more[5])
         phi = multiply(phi, phi)
     return phi, Q

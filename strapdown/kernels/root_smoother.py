@@ -135,24 +135,11 @@ def prepare_step(segments, j, model, space):
     q = load_segment(segments, j, x, F, loose(model))
     dt = segments[j, 0]
     part = (segments[j, 1], segments[j, 2], segments[j, 3])
-    predicted, phi11, rate, D = move(
-        q, x, dt, part, model.decay, model.gyro, model.gyro_use, model.force_f, top, factor
-    )
+    predicted, phi11, rate, D = move(q, x, dt, part, model, top, factor)
     carry(F, size, loose(model), top, factor, model.changing)
     for k in range(model.changing):
         factor[k] = 1.0 / factor[k]  # as the way back needs it
-    step_noise(
-        driven,
-        dt,
-        rate,
-        D,
-        model.angle_variance,
-        model.rate_variance,
-        model.decay,
-        model.density,
-        model.gyro,
-        model.gyro_use,
-    )
+    step_noise(driven, dt, rate, D, model)
     rows = fill_noise(F, size, driven, noisy)
     if len(model.chains) > 0:
         rows = step_chains(F, size, rows, x, dt, model.decay, model.chains, space.links)

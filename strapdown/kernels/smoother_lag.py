@@ -38,19 +38,18 @@ from strapdown.kernels.smoother_loop import (
     MOVED,
     NOISE,
     ROW,
+    SIX,
     TURN,
-    load_matrix,
-    load_triple,
     move_states,
     prepare_gains,
     prepare_rows,
     prepare_shares,
     prepare_turns,
     start_covariance,
-    store_triple,
     write_filtered,
     write_smoothed,
 )
+from strapdown.kernels.state import load_matrix, load_triple, store_several
 
 # Places in the work space, from where the prepared groups of one pass begin.
 ERROR = GROUPS
@@ -132,31 +131,19 @@ def see_update(work, row, how):
             c * r3 + h * (r0 * e[2] + (r1 * e[1] - r2 * e[0])),
         )
         a = scale(2.0 * arcsine(dot(v, v)), v)
-        store_triple(work, ERROR, a)
+        store_several(work, ERROR, a)
         J = multiply(near_inverse_right_jacobian(a), right_jacobian(e))
     for c in range(3):
         store(work, ERROR + w * (3 + c), load(work, ERROR + w * (3 + c)) + work[t + 5 + c])
-    p = PASSES
-    a0, a1, a2 = load_triple(work, p)
-    a3, a4 = load(work, p + 6 * w), load(work, p + 7 * w)
-    a5 = load(work, p + 11 * w)
-    A = times_transpose_upper(multiply(J, full((a0, a1, a2, a3, a4, a5))), J)
-    b0, b1, b2 = load_triple(work, p + 3 * w)
-    b3, b4, b5 = load_triple(work, p + 8 * w)
-    b6, b7, b8 = load_triple(work, p + 12 * w)
-    B = multiply(J, (b0, b1, b2, b3, b4, b5, b6, b7, b8))
-    store_triple(work, p, (A[0], A[1], A[2]))
-    store_triple(work, p + 3 * w, (B[0], B[1], B[2]))
-    store(work, p + 6 * w, A[3])
-    store(work, p + 7 * w, A[4])
-    store_triple(work, p + 8 * w, (B[3], B[4], B[5]))
-    store(work, p + 11 * w, A[5])
-    store_triple(work, p + 12 * w, (B[6], B[7], B[8]))
+    turn_passes(work, J)
 
 
-def gain_row(work, g):
-    """Return the six numbers of the row of the gain that begins at g."""
-    return (work[g], work[g + 6], work[g + 12], work[g + 18], work[g + 24], work[g + 30])
+def turn_passes(work, J):
+    """Carry the attitude's part of the covariances by J."""
+    n = tuple(load(work, PASSES + WIDTH * i) for i in range(15))
+    A = times_transpose_upper(multiply(J, full((*n[:3], *n[6:8], n[11]))), J)
+    B = multiply(J, (*n[3:6], *n[8:11], *n[12:]))
+    store_several(work, PASSES, (*A[:3], *B[:3], *A[3:5], *B[3:6], A[5], *B[6:]))
 
 
 def six_products(g, v):
@@ -164,44 +151,19 @@ def six_products(g, v):
     return g[0] * v[0] + g[1] * v[1] + g[2] * v[2] + g[3] * v[3] + g[4] * v[4] + g[5] * v[5]
 
 
-def load_six(work, a, b, c, d, e, f):
-    """Return six lanes, counted in lanes from the covariances on."""
-    w = WIDTH
-    p = PASSES
-    return (
-        load(work, p + w * a),
-        load(work, p + w * b),
-        load(work, p + w * c),
-        load(work, p + w * d),
-        load(work, p + w * e),
-        load(work, p + w * f),
-    )
+def upper_place(i, j):
+    """Return the place of entry (i, j) in the upper triangle by rows."""
+    return min(i, j) * (11 - min(i, j)) // 2 + max(i, j)
 
 
-def noisy_rows(work, row, i, place, noise):
-    """Write rows i and i + 1 of G P_s Gᵀ + D, of which (i, i) stands at ``place``, its noise at ``noise``."""
-    w = WIDTH
-    z = PRODUCT + w * i
-    one, two = gain_row(work, row + i), gain_row(work, row + i + 1)
-    store(work, place, work[noise] + six_products(one, load_apart(work, z)))
-    below, noise_below = place + w * (5 - i), noise + (5 - i)
-    for j in range(1, 6 - i):
-        column = load_apart(work, z + w * j)
-        store(work, place + w * j, work[noise + j] + six_products(one, column))
-        store(work, below + w * j, work[noise_below + j] + six_products(two, column))
+def gain_row(work, g):
+    """Return the six numbers of the row of the gain that begins at g."""
+    return tuple(work[g + 6 * j] for j in SIX)
 
 
-def load_apart(work, z):
-    """Return a column of P_s Gᵀ."""
-    w = WIDTH
-    return (
-        load(work, z),
-        load(work, z + 6 * w),
-        load(work, z + 12 * w),
-        load(work, z + 18 * w),
-        load(work, z + 24 * w),
-        load(work, z + 30 * w),
-    )
+def load_six(work, start, places):
+    """Return six lanes, counted in lanes from a start."""
+    return tuple(load(work, start + WIDTH * i) for i in places)
 
 
 def step_passes(work, row):
@@ -209,35 +171,24 @@ def step_passes(work, row):
 
     Reading takes longer than multiplying: each number that is read is used two or three times.
     """
-    w = WIDTH
     row &= _NOT_NEGATIVE
-    z = PRODUCT
-    # Row r of P_s Gᵀ is G times row r of P_s.
-    e0, e1, e2 = load_triple(work, ERROR)
-    e3, e4, e5 = load_triple(work, ERROR + 3 * w)
-    a = (e0, e1, e2, e3, e4, e5)
-    b = load_six(work, 0, 1, 2, 3, 4, 5)
-    c = load_six(work, 1, 6, 7, 8, 9, 10)
-    for i in range(6):
-        g = gain_row(work, row + i)
-        store(work, ERROR + w * i, six_products(g, a))
-        store(work, z + w * i, six_products(g, b))
-        store(work, z + w * (6 + i), six_products(g, c))
-    b = load_six(work, 2, 7, 11, 12, 13, 14)
-    c = load_six(work, 3, 8, 12, 15, 16, 17)
-    for i in range(6):
-        g = gain_row(work, row + i)
-        store(work, z + w * (12 + i), six_products(g, b))
-        store(work, z + w * (18 + i), six_products(g, c))
-    b = load_six(work, 4, 9, 13, 16, 18, 19)
-    c = load_six(work, 5, 10, 14, 17, 19, 20)
-    for i in range(6):
-        g = gain_row(work, row + i)
-        store(work, z + w * (24 + i), six_products(g, b))
-        store(work, z + w * (30 + i), six_products(g, c))
-    noisy_rows(work, row, 0, PASSES, row + NOISE)
-    noisy_rows(work, row, 2, PASSES + 11 * w, row + NOISE + 11)
-    noisy_rows(work, row, 4, PASSES + 18 * w, row + NOISE + 18)
+    error = load_six(work, ERROR, SIX)
+    for r in (0, 2, 4):
+        # Rows r and r + 1 of P_s Gᵀ are G times those of P_s.
+        one, two = (load_six(work, PASSES, tuple(upper_place(k, j) for j in SIX)) for k in (r, r + 1))
+        for i in SIX:
+            g = gain_row(work, row + i)
+            if r == 0:
+                store(work, ERROR + WIDTH * i, six_products(g, error))
+            store(work, PRODUCT + WIDTH * (6 * r + i), six_products(g, one))
+            store(work, PRODUCT + WIDTH * (6 * r + 6 + i), six_products(g, two))
+    for i in (0, 2, 4):
+        rows = [(k, gain_row(work, row + k)) for k in (i, i + 1)]
+        for j in SIX[i:]:
+            column = load_six(work, PRODUCT, tuple(6 * r + j for r in SIX))
+            for k, g in rows[: j - i + 1]:
+                place = upper_place(k, j)
+                store(work, PASSES + WIDTH * place, work[row + NOISE + place] + six_products(g, column))
 
 
 def smooth_lagged(

@@ -33,6 +33,15 @@ from strapdown.kernels.rotation import (
 )
 from strapdown.kernels.series import LARGEST_ANGLE
 from strapdown.kernels.smoother_step import gain, kept_share, left_noise, step_noise
+from strapdown.kernels.state import (
+    SIZE,
+    load_matrix,
+    load_quaternion,
+    load_state,
+    load_triple,
+    store_row,
+    store_several,
+)
 
 ROW = 32
 """Numbers of a stored segment: dt, increment (3), state (28)."""
@@ -89,6 +98,7 @@ _NOTHING = 1e-30
 _LARGEST_SQUARE = LARGEST_ANGLE * LARGEST_ANGLE
 _NOT_NEGATIVE = 2**62 - 1
 _LANE = WIDTH - 1
+SIX = (0, 1, 2, 3, 4, 5)
 # An index and one of these: the same index, and the compiler sees that it is not negative, which it otherwise tests at each number read.
 
 
@@ -116,38 +126,10 @@ def locate_edges(edges, event_time, segments, number, starts_out):
     return k
 
 
-def store_triple(work, place, v):
-    """Write the lanes of three components."""
-    store(work, place, v[0])
-    store(work, place + WIDTH, v[1])
-    store(work, place + 2 * WIDTH, v[2])
-
-
-def load_triple(work, place):
-    """Return the lanes of three components."""
-    return (load(work, place), load(work, place + WIDTH), load(work, place + 2 * WIDTH))
-
-
 def store_columns(work, place, M):
     """Write a 3×3 block of G, its columns six numbers apart."""
-    store_triple(work, place, (M[0], M[3], M[6]))
-    store_triple(work, place + 6 * WIDTH, (M[1], M[4], M[7]))
-    store_triple(work, place + 12 * WIDTH, (M[2], M[5], M[8]))
-
-
-def store_matrix(work, place, M):
-    """Write the lanes of a 9-tuple."""
-    store_triple(work, place, (M[0], M[1], M[2]))
-    store_triple(work, place + 3 * WIDTH, (M[3], M[4], M[5]))
-    store_triple(work, place + 6 * WIDTH, (M[6], M[7], M[8]))
-
-
-def load_matrix(work, place):
-    """Return the lanes of a 9-tuple."""
-    a, b, c = load_triple(work, place)
-    d, e, f = load_triple(work, place + 3 * WIDTH)
-    g, h, i = load_triple(work, place + 6 * WIDTH)
-    return (a, b, c, d, e, f, g, h, i)
+    for column in range(3):
+        store_several(work, place + 6 * WIDTH * column, M[column::3])
 
 
 def prepare_turns(segments, start, work, group):
@@ -156,28 +138,21 @@ def prepare_turns(segments, start, work, group):
     dt, x, y, z = load_quadruples(segments, start, ROW)
     b0, b1, b2, _ = load_quadruples(segments, start + 8, ROW)
     next_b0, next_b1, next_b2, _ = load_quadruples(segments, start + ROW + 8, ROW)
-    store_triple(work, group + BIAS, (b0, b1, b2))
+    store_several(work, group + BIAS, (b0, b1, b2))
     step_b = (next_b0 - b0, next_b1 - b1, next_b2 - b2)
     phi = (x - dt * b0, y - dt * b1, z - dt * b2)
     store(work, STEP, dt)
-    store_triple(work, STEP + w, phi)
+    store_several(work, STEP + w, phi)
     q = load_quadruples(segments, start + 4, ROW)
-    store(work, group + ATTITUDE, q[0])
-    store_triple(work, group + ATTITUDE + w, (q[1], q[2], q[3]))
+    store_several(work, group + ATTITUDE, q)
     p = turned(q, phi)
     r = quaternion_multiply((p[0], -p[1], -p[2], -p[3]), load_quadruples(segments, start + ROW + 4, ROW))
     squared = r[1] * r[1] + r[2] * r[2] + r[3] * r[3]
     # Without an update the bias stays to the bit, the attitude to rounding.
     seen = chosen(dot(step_b, step_b) > 0.0, spread(1.0), squared) > _NOTHING
     if anywhere(seen):
-        t = COLUMNS + TURN * w
-        store(work, t, -r[3])
-        store(work, t + w, r[0])
-        store_triple(work, t + 2 * w, (r[1], r[2], r[3]))
-        store_triple(work, t + 5 * w, step_b)
-        store_triple(work, t + 8 * w, (r[2], -r[1], r[0]))
-        store(work, t + 11 * w, r[3])
-        store(work, t + 12 * w, -r[2])
+        turn = (-r[3], *r, *step_b, r[2], -r[1], r[0], r[3], -r[2])
+        store_several(work, COLUMNS + TURN * w, turn)
         near = chosen(r[0] > 0.0, squared, spread(1.0)) < 0.25 * SHORT
         how = chosen(near, spread(1.0), spread(2.0))
         store(work, group + MOVED, chosen(seen, how, spread(0.0)))
@@ -190,58 +165,38 @@ def prepare_shares(segments, start, work, angle_variance, rate_variance):
     w = WIDTH
     dt = load(work, STEP)
     phi = load_triple(work, STEP + w)
-    _, _, _, a0 = load_quadruples(segments, start + 8, ROW)
-    a1, a2, a3, a4 = load_quadruples(segments, start + 12, ROW)
-    a5, c0, c1, c2 = load_quadruples(segments, start + 16, ROW)
-    c3, c4, c5, c6 = load_quadruples(segments, start + 20, ROW)
-    c7, c8, d0, d1 = load_quadruples(segments, start + 24, ROW)
-    d2, d3, d4, d5 = load_quadruples(segments, start + 28, ROW)
+    P = load_covariance(segments, start + 8)
     q11, q12, q22 = step_noise(phi, dt, angle_variance, rate_variance)
-    n_tt, n_tb, n_bt, n_bb = kept_share(
-        (a0, a1, a2, a3, a4, a5),
-        (c0, c1, c2, c3, c4, c5, c6, c7, c8),
-        (d0, d1, d2, d3, d4, d5),
-        q11,
-        q12,
-        q22,
-    )
-    store_matrix(work, SHARE, n_tt)
-    store_matrix(work, SHARE + 9 * w, n_tb)
-    store_matrix(work, SHARE + 18 * w, n_bt)
-    store_matrix(work, SHARE + 27 * w, n_bb)
-    store_triple(work, SHARE + 36 * w, (q11[0], q11[1], q11[2]))
-    store_triple(work, SHARE + 39 * w, (q11[3], q11[4], q11[5]))
-    store_matrix(work, SHARE + 42 * w, q12)
-    store(work, SHARE + 51 * w, q22)
+    N = kept_share(*P, q11, q12, q22)
+    for i, part in enumerate(N):
+        store_several(work, SHARE + 9 * w * i, part)
+    store_several(work, SHARE + 36 * w, (*q11, *q12, q22))
+
+
+def load_covariance(segments, start):
+    """Return the blocks of eight segments' covariance, of which the first number is the fourth from ``segments[start]`` on."""
+    n = sum((load_quadruples(segments, start + 4 * i, ROW) for i in range(6)), ())[3:]
+    return n[:6], n[6:15], n[15:]
 
 
 def prepare_gains(work):
     """Keep G and D of the segments of :func:`prepare_shares`, a lane a segment."""
     w = WIDTH
-    N = (
-        load_matrix(work, SHARE),
-        load_matrix(work, SHARE + 9 * w),
-        load_matrix(work, SHARE + 18 * w),
-        load_matrix(work, SHARE + 27 * w),
-    )
-    q0, q1, q2 = load_triple(work, SHARE + 36 * w)
-    q3, q4, q5 = load_triple(work, SHARE + 39 * w)
-    d_tt, d_tb, d_bb = left_noise(
-        N, (q0, q1, q2, q3, q4, q5), load_matrix(work, SHARE + 42 * w), load(work, SHARE + 51 * w)
-    )
-    d = COLUMNS + NOISE * w
-    store_triple(work, d, (d_tt[0], d_tt[1], d_tt[2]))
-    store_triple(work, d + 3 * w, (d_tb[0], d_tb[1], d_tb[2]))
-    store_triple(work, d + 6 * w, (d_tt[3], d_tt[4], d_tb[3]))
-    store_triple(work, d + 9 * w, (d_tb[4], d_tb[5], d_tt[5]))
-    store_triple(work, d + 12 * w, (d_tb[6], d_tb[7], d_tb[8]))
-    store_triple(work, d + 15 * w, (d_bb[0], d_bb[1], d_bb[2]))
-    store_triple(work, d + 18 * w, (d_bb[3], d_bb[4], d_bb[5]))
+    N = load_share(work)
+    q = load_matrix(work, SHARE + 36 * w)[:6]
+    d_tt, d_tb, d_bb = left_noise(N, q, load_matrix(work, SHARE + 42 * w), load(work, SHARE + 51 * w))
+    upper = (*d_tt[:3], *d_tb[:3], *d_tt[3:5], *d_tb[3:6], d_tt[5], *d_tb[6:], *d_bb)
+    store_several(work, COLUMNS + NOISE * w, upper)
     g_tt, g_tb, g_bt, g_bb = gain(N, load_triple(work, STEP + w), load(work, STEP))
     store_columns(work, COLUMNS, g_tt)
     store_columns(work, COLUMNS + 3 * w, g_bt)
     store_columns(work, COLUMNS + 18 * w, g_tb)
     store_columns(work, COLUMNS + 21 * w, g_bb)
+
+
+def load_share(work):
+    """Return the blocks of N that :func:`prepare_shares` keeps."""
+    return tuple(load_matrix(work, SHARE + 9 * WIDTH * i) for i in range(4))
 
 
 def prepare_rows(work, group):
@@ -268,14 +223,7 @@ def times_columns(work, places, columns):
 
 def load_columns(work, first, last):
     """Return the six columns of a gain, three from each place."""
-    return (
-        load(work, first),
-        load(work, first + 6),
-        load(work, first + 12),
-        load(work, last),
-        load(work, last + 6),
-        load(work, last + 12),
-    )
+    return tuple(load(work, place + column) for place in (first, last) for column in (0, 6, 12))
 
 
 def carry_error(work, group, errors, i):
@@ -348,9 +296,7 @@ def fold_jacobians(work, group, errors):
                     work[JACOBIAN + w * c + i] = J[c]
         else:
             J = multiply(near_inverse_right_jacobian(a), right_jacobian(e))
-            store_triple(work, JACOBIAN, (J[0], J[1], J[2]))
-            store_triple(work, JACOBIAN + 3 * w, (J[3], J[4], J[5]))
-            store_triple(work, JACOBIAN + 6 * w, (J[6], J[7], J[8]))
+            store_several(work, JACOBIAN, J)
         for i in range(WIDTH):
             g = group + MATRICES * i
             x, y, z = load(work, g), load(work, g + 6), load(work, g + 12)
@@ -384,21 +330,9 @@ def carry_covariance(work, group, i):
     g += 18
     columns = load_columns(work, f, g)
     # Rows of P_s (G J)ᵀ, of which P_s is read from its upper triangle.
-    z = (
-        times_columns(work, (p, p + 1, p + 2, p + 3, p + 4, p + 5), columns),
-        times_columns(work, (p + 1, p + 9, p + 10, p + 11, p + 12, p + 13), columns),
-        times_columns(work, (p + 2, p + 10, p + 18, p + 19, p + 20, p + 21), columns),
-        times_columns(work, (p + 3, p + 11, p + 19, p + 27, p + 28, p + 29), columns),
-        times_columns(work, (p + 4, p + 12, p + 20, p + 28, p + 36, p + 37), columns),
-        times_columns(work, (p + 5, p + 13, p + 21, p + 29, p + 37, p + 45), columns),
-    )
-    p -= COVARIANCE_ROW
-    store(work, p, row_times(work, f, g, z, load(work, d)))
-    store(work, p + 8, row_times(work, f + 1, g + 1, z, load(work, d + 5)))
-    store(work, p + 16, row_times(work, f + 2, g + 2, z, load(work, d + 9)))
-    store(work, p + 24, row_times(work, f + 3, g + 3, z, load(work, d + 12)))
-    store(work, p + 32, row_times(work, f + 4, g + 4, z, load(work, d + 14)))
-    store(work, p + 40, row_times(work, f + 5, g + 5, z, load(work, d + 15)))
+    z = tuple(times_columns(work, tuple(p + 8 * min(r, c) + max(r, c) for c in SIX), columns) for r in SIX)
+    for r, begin in enumerate((0, 5, 9, 12, 14, 15)):
+        store(work, p - COVARIANCE_ROW + 8 * r, row_times(work, f + r, g + r, z, load(work, d + begin)))
 
 
 def move_states(work, group, errors, whole):
@@ -412,7 +346,7 @@ def move_states(work, group, errors, whole):
     beta1, beta2, _, _ = load_quadruples(work, errors + 4, w)
     b0, b1, b2 = load_triple(work, group + BIAS)
     t = SMOOTHED
-    store_triple(work, t + 4 * w, (b0 + beta0, b1 + beta1, b2 + beta2))
+    store_several(work, t + 4 * w, (b0 + beta0, b1 + beta1, b2 + beta2))
     e = (e0, e1, e2)
     if anywhere(dot(e, e) > _LARGEST_SQUARE):
         for i in range(WIDTH):
@@ -423,73 +357,65 @@ def move_states(work, group, errors, whole):
                 work[t + w * c + i] = q[c]
             for c in range(9):
                 work[JACOBIAN + w * c + i] = J[c]
-        j0, j1, j2 = load_triple(work, JACOBIAN)
-        j3, j4, j5 = load_triple(work, JACOBIAN + 3 * w)
-        j6, j7, j8 = load_triple(work, JACOBIAN + 6 * w)
-        J = (j0, j1, j2, j3, j4, j5, j6, j7, j8)
+        J = load_matrix(work, JACOBIAN)
     else:
-        x, y, z = load_triple(work, group + ATTITUDE + w)
-        q = turned((load(work, group + ATTITUDE), x, y, z), e)
-        store(work, t, q[0])
-        store_triple(work, t + w, (q[1], q[2], q[3]))
+        store_several(work, t, turned(load_quaternion(work, group + ATTITUDE), e))
         J = right_jacobian(e)
     a0, a1, a2, c0 = load_quadruples(work, COVARIANCE, COVARIANCE_ROW)
     a3, a4, c3, c4 = load_quadruples(work, COVARIANCE + 9, COVARIANCE_ROW)
     a5, c6, c7, c8 = load_quadruples(work, COVARIANCE + 18, COVARIANCE_ROW)
     A = times_transpose_upper(multiply(J, (a0, a1, a2, a1, a3, a4, a2, a4, a5)), J)
-    store_triple(work, t + 7 * w, (A[0], A[1], A[2]))
-    store_triple(work, t + 10 * w, (A[3], A[4], A[5]))
+    store_several(work, t + 7 * w, A)
     if whole:
         c1, c2, _, _ = load_quadruples(work, COVARIANCE + 4, COVARIANCE_ROW)
         c5, _, _, _ = load_quadruples(work, COVARIANCE + 13, COVARIANCE_ROW)
         B = multiply(J, (c0, c1, c2, c3, c4, c5, c6, c7, c8))
-        store_triple(work, t + 13 * w, (B[0], B[1], B[2]))
-        store_triple(work, t + 16 * w, (B[3], B[4], B[5]))
-        store_triple(work, t + 19 * w, (B[6], B[7], B[8]))
+        store_several(work, t + 13 * w, B)
+
+
+def lane_numbers(work, start):
+    """Return 13 numbers of a lane, of which the first stands at ``start``."""
+    return tuple(work[start + WIDTH * i] for i in range(13))
+
+
+def diagonal_block(work, start):
+    """Return the upper triangle of the 3×3 block that begins at ``start`` of rows of eight."""
+    return tuple(work[start + WIDTH * i + j] for i in range(3) for j in range(i, 3))
 
 
 def write_smoothed(work, i, k, attitude_out, bias_out, variance_out, covariance_out):
     """Write the smoothed state of segment i of a group to row k of the outputs."""
     i &= _LANE
     k &= _NOT_NEGATIVE
-    w = WIDTH
-    s = SMOOTHED + i
-    attitude_out[k, 0], attitude_out[k, 1] = work[s], work[s + w]
-    attitude_out[k, 2], attitude_out[k, 3] = work[s + 2 * w], work[s + 3 * w]
-    bias_out[k, 0], bias_out[k, 1], bias_out[k, 2] = work[s + 4 * w], work[s + 5 * w], work[s + 6 * w]
-    a = s + 7 * w
-    c = COVARIANCE + COVARIANCE_ROW * i + 27
-    variance_out[k, 0], variance_out[k, 1], variance_out[k, 2] = work[a], work[a + 3 * w], work[a + 5 * w]
-    variance_out[k, 3], variance_out[k, 4], variance_out[k, 5] = work[c], work[c + 9], work[c + 18]
+    n = lane_numbers(work, SMOOTHED + i)
+    C = diagonal_block(work, COVARIANCE + COVARIANCE_ROW * i + 27)
+    store_row(attitude_out, k, n[:4])
+    store_row(bias_out, k, n[4:7])
+    store_row(variance_out, k, (n[7], n[10], n[12], C[0], C[3], C[5]))
     if k < len(covariance_out):
-        for n in range(15):
-            covariance_out[k, n] = work[a + w * n]
-        covariance_out[k, 15], covariance_out[k, 16], covariance_out[k, 17] = work[c], work[c + 1], work[c + 2]
-        covariance_out[k, 18], covariance_out[k, 19], covariance_out[k, 20] = work[c + 9], work[c + 10], work[c + 18]
+        B = lane_numbers(work, SMOOTHED + 13 * WIDTH + i)[:9]
+        store_row(covariance_out, k, n[7:] + B + C)
 
 
 def write_filtered(segments, s, k, attitude_out, bias_out, variance_out, covariance_out):
     """Write the filtered state at ``segments[s]`` to row k of the outputs."""
-    for i in range(4):
-        attitude_out[k, i] = segments[s + i]
-    for i in range(3):
-        bias_out[k, i] = segments[s + 4 + i]
-    variance_out[k, 0], variance_out[k, 1], variance_out[k, 2] = segments[s + 7], segments[s + 10], segments[s + 12]
-    variance_out[k, 3], variance_out[k, 4], variance_out[k, 5] = segments[s + 22], segments[s + 25], segments[s + 27]
+    q, b, A, B, C = load_state(segments[s : s + SIZE])
+    store_row(attitude_out, k, q)
+    store_row(bias_out, k, b)
+    store_row(variance_out, k, (A[0], A[3], A[5], C[0], C[3], C[5]))
     if k < len(covariance_out):
-        for i in range(21):
-            covariance_out[k, i] = segments[s + 7 + i]
+        store_row(covariance_out, k, A + B + C)
 
 
 def start_covariance(work, p, segments, s):
     """Write the upper triangle of the filtered covariance at ``segments[s]`` to rows of eight."""
-    work[p], work[p + 1], work[p + 2] = segments[s], segments[s + 1], segments[s + 2]
-    work[p + 9], work[p + 10], work[p + 18] = segments[s + 3], segments[s + 4], segments[s + 5]
     for i in range(3):
         for j in range(3):
             work[p + 8 * i + 3 + j] = segments[s + 6 + 3 * i + j]
-    work[p + 27], work[p + 28], work[p + 29] = segments[s + 15], segments[s + 16], segments[s + 17]
-    work[p + 36], work[p + 37], work[p + 45] = segments[s + 18], segments[s + 19], segments[s + 20]
+            if i <= j:
+                place = i * (5 - i) // 2 + j
+                work[p + 8 * i + j] = segments[s + place]
+                work[p + 27 + 8 * i + j] = segments[s + 15 + place]
 
 
 def smooth_back(

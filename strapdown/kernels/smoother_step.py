@@ -35,28 +35,18 @@ from strapdown.kernels.filter_step import process_noise, transition
 
 def minus_product(S, A, B):
     """Return S − A B of 9-tuples, summed so that every product fuses with a subtraction."""
-    return (
-        ((S[0] - A[0] * B[0]) - A[1] * B[3]) - A[2] * B[6],
-        ((S[1] - A[0] * B[1]) - A[1] * B[4]) - A[2] * B[7],
-        ((S[2] - A[0] * B[2]) - A[1] * B[5]) - A[2] * B[8],
-        ((S[3] - A[3] * B[0]) - A[4] * B[3]) - A[5] * B[6],
-        ((S[4] - A[3] * B[1]) - A[4] * B[4]) - A[5] * B[7],
-        ((S[5] - A[3] * B[2]) - A[4] * B[5]) - A[5] * B[8],
-        ((S[6] - A[6] * B[0]) - A[7] * B[3]) - A[8] * B[6],
-        ((S[7] - A[6] * B[1]) - A[7] * B[4]) - A[8] * B[7],
-        ((S[8] - A[6] * B[2]) - A[7] * B[5]) - A[8] * B[8],
+    return tuple(
+        ((S[i + j] - A[i] * B[j]) - A[i + 1] * B[j + 3]) - A[i + 2] * B[j + 6] for i in (0, 3, 6) for j in range(3)
     )
 
 
 def minus_times_transpose_upper(S, A, B):
     """Return the upper triangle of S − A Bᵀ, known to be symmetric."""
-    return (
-        ((S[0] - A[0] * B[0]) - A[1] * B[1]) - A[2] * B[2],
-        ((S[1] - A[0] * B[3]) - A[1] * B[4]) - A[2] * B[5],
-        ((S[2] - A[0] * B[6]) - A[1] * B[7]) - A[2] * B[8],
-        ((S[3] - A[3] * B[3]) - A[4] * B[4]) - A[5] * B[5],
-        ((S[4] - A[3] * B[6]) - A[4] * B[7]) - A[5] * B[8],
-        ((S[5] - A[6] * B[6]) - A[7] * B[7]) - A[8] * B[8],
+    T = full(S)
+    return tuple(
+        ((T[i + j // 3] - A[i] * B[j]) - A[i + 1] * B[j + 1]) - A[i + 2] * B[j + 2]
+        for i in (0, 3, 6)
+        for j in range(i, 9, 3)
     )
 
 
@@ -96,8 +86,8 @@ def step_noise(phi, dt, angle_variance, rate_variance):
 
 def kept_share(A, B, C, q11, q12, q22):
     """Return the blocks of N = I − M, M = Q̄ (P + Q̄)⁻¹: what of a correction goes back to the state (A, B, C), not to the noise Q̄."""
-    W11 = (A[0] + q11[0], A[1] + q11[1], A[2] + q11[2], A[3] + q11[3], A[4] + q11[4], A[5] + q11[5])
-    m_tt, m_tb, m_bt, m_bb = noise_share(W11, add_matrices(B, q12), add_to_diagonal(C, q22), q11, q12, q22)
+    W = add_matrices(A, q11), add_matrices(B, q12), add_to_diagonal(C, q22)
+    m_tt, m_tb, m_bt, m_bb = noise_share(*W, q11, q12, q22)
     return identity_minus(m_tt), scale_matrix(-1.0, m_tb), scale_matrix(-1.0, m_bt), identity_minus(m_bb)
 
 

@@ -1,6 +1,6 @@
 """Helpers that are formulas are not compiled by numba but traced: run in Python on symbols that write LLVM instructions.
 
-Most helpers have neither loops nor branches on what is computed. Traced, they cost numba no function, no typing and no lowering, which
+Most helpers have neither long loops nor branches on what is computed. Traced, they cost numba no function, no typing and no lowering, which
 take it a millisecond an operation. Each operation is still numba's: its types, its instructions, its lanes. A function that asks a symbol
 for its value is no formula, and numba compiles it.
 """
@@ -23,6 +23,9 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from strapdown.kernels.packed import EMIT
+
+LONGEST = 4
+"""Turns of a loop that a trace writes out; those of a generator expression it writes out all."""
 
 
 class NotAFormula(Exception):  # noqa: N818 - says what a function is, and never leaves this module
@@ -116,6 +119,13 @@ class Symbol:
     def __init__(self, kind: Any, value: Any) -> None:
         self.type, self.value = kind, value
 
+    def __len__(self) -> int:
+        """Return the number of lanes."""
+        count = getattr(self.type, "count", None)
+        if count is None:
+            raise NotAFormula
+        return int(count)
+
 
 def _operation(function: Callable[..., Any]) -> Any:
     return lambda self, *others: Trace.now.apply(function, self, *others)
@@ -135,7 +145,7 @@ for _name in ("add", "sub", "mul", "truediv", "and_", "or_"):
 for _name in ("lt", "le", "gt", "ge", "eq", "ne", "neg", "invert", "getitem", "setitem"):
     setattr(Symbol, f"__{_name}__", _operation(getattr(operator, _name)))
 Symbol.__abs__ = _operation(abs)  # type: ignore[attr-defined]
-for _name in ("bool", "int", "float", "index", "len", "iter", "getattr", "pow", "rpow", "mod", "floordiv"):
+for _name in ("bool", "int", "float", "index", "iter", "getattr", "pow", "rpow", "mod", "floordiv"):
     setattr(Symbol, f"__{_name}__", _refuse)
 
 
@@ -163,8 +173,7 @@ class Formula:
     def __init__(self, function: FunctionType, plain: Any, *, called: bool) -> None:
         self.function, self.plain = function, plain
         self.pack = EMIT.get(function.__name__) if function.__module__.endswith(".algebra") else None
-        loops = any(step.opname.startswith("JUMP_BACKWARD") for step in dis.get_instructions(function))
-        self.never = called or loops
+        self.never = called
         self.signature = inspect.signature(function)
         self.known: dict[Any, bool] = {}
 
@@ -192,6 +201,13 @@ class Formula:
         return trace.apply(self.plain, *arguments)
 
 
+def _short_range(*bounds: Any) -> range:
+    """Return a range that a trace writes out; of one that is longer, or unknown, numba makes a loop."""
+    if any(isinstance(one, Symbol) for one in bounds) or len(range(*bounds)) > LONGEST:
+        raise NotAFormula
+    return range(*bounds)
+
+
 def _global(value: Any) -> Any:
     """Return what a global name stands for in a trace."""
     if value is math:
@@ -211,6 +227,8 @@ def traced(twin: FunctionType, plain: Any, *, called: bool) -> Any:
     ``twin`` is the function with globals that are compiled or traced; ``called``: it is long enough to be called by itself.
     """
     names = {name: _global(value) for name, value in twin.__globals__.items()}
+    if any(step.opname.startswith("JUMP_BACKWARD") for step in dis.get_instructions(twin)):
+        names["range"] = _short_range
     cells = tuple(CellType(_global(cell.cell_contents)) for cell in twin.__closure__ or ())
     function = FunctionType(twin.__code__, names, twin.__name__, twin.__defaults__, cells)
     function.__module__ = twin.__module__

@@ -12,7 +12,8 @@ from strapdown.kernels.algebra import combine, dot, scale
 from strapdown.kernels.measurement import vector_at
 from strapdown.kernels.series import LARGEST_ANGLE
 
-OPEN = ("begin", "keep", "is_small", "longest_step", "predict", "stopped", "update", "finish")
+OPEN = ("begin", "keep", "is_small", "longest_step", "predict", "update", "finish")
+REPLACEABLE = ("stopped",)
 
 
 MAX_TURN = 1e6
@@ -59,7 +60,8 @@ def keep(state, row, e, body, out):
 
 
 def stopped(state):
-    """Return whether the walk ends here."""
+    """Return whether the walk ends here; where a filter does not say, it goes on to the end."""
+    return False
 
 
 def finish(state, row, e, body):

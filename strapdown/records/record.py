@@ -221,11 +221,6 @@ def cut(record: ImuRecord, first: int, last: int) -> ImuRecord:
     -------
     ImuRecord
         The part. Measurements at the very first edge of the whole record belong to its first part.
-
-    Raises
-    ------
-    InputError
-        If the indices are out of range.
     """
     if not 0 <= first < last < len(record.time):
         raise InputError(
@@ -492,11 +487,6 @@ class Estimate(Listed):
         Estimate
             The estimate.
 
-        Raises
-        ------
-        InputError
-            If shapes do not fit, or a bias is given without its covariance.
-
         Examples
         --------
         >>> import numpy as np
@@ -551,11 +541,6 @@ class Estimate(Listed):
         -------
         ndarray (m, n)
             δθ, rad, body axes; δb, rad/s; error states in their units.
-
-        Raises
-        ------
-        InputError
-            If ``true_values`` does not name the error states of the estimate.
         """
         given = dict(true_values or {})
         if set(given) != set(self.error_states):

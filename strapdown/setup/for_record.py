@@ -32,13 +32,11 @@ def matched_setup(
     gyro: GyroSpec | None = None,
     *,
     states: bool | Sequence[str] | None = None,
-    smooth: bool = False,
 ) -> FilterSetup:
     """Return the filter setup that matches what a record's ``origin`` specifies of its gyro (or ``gyro`` does) and sensors.
 
     ``states``: True, with an error state for each error that is specified; names such as ``"gyro.scale"``, with these of them alone; False,
-    attitude and gyro bias only. By default with all of them where an error is specified that the filter would have no state for. For a
-    smoother (``smooth``) by default no state for gyro drifts, which smoothing does not have.
+    attitude and gyro bias only. By default with all of them where an error is specified that the filter would have no state for.
     """
     origin = record.origin or Origin()
     spec = gyro or origin.gyro
@@ -57,12 +55,10 @@ def matched_setup(
             spec, record, states=True, sensors=scenario.sensors, gravity_f=scenario.gravity_f
         )
     optional = chosen.states or States()
-    if states is None and smooth:
-        states = tuple(name for name in optional.names if name != "gyro.drift")
     if states is not None and states is not True:
         optional = optional.chosen(tuple(states)) if states else States()
     if not optional.names:
-        return plain if smooth else dataclasses.replace(chosen, states=None)
+        return dataclasses.replace(chosen, states=None)
     if "gyro.drift" not in optional.names:  # flicker without a state is matched by the two noises
         chosen = dataclasses.replace(chosen, process_noise=plain.process_noise)
     return dataclasses.replace(chosen, states=optional)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 
 from strapdown import units
 from strapdown.checks import Array, InputError, array, known_keys, non_negative, one_of, positive
-from strapdown.estimation import forward, together
+from strapdown.estimation import forward, smoothing, together
 from strapdown.estimation import model as modelling
 from strapdown.estimation.error_states import (
     BoundedVelocity,
@@ -33,6 +33,9 @@ from strapdown.vectors import GRAVITY_F, KINDS
 
 Entries = float | tuple[float, ...] | tuple[tuple[float, ...], ...]
 """A standard deviation: one for all axes or entries, or one each; 0: no state."""
+
+_BIAS = np.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])
+"""Which of attitude and bias is the bias."""
 
 
 def _entries(name: str, value: Any, shape: tuple[int, ...], unit: str) -> Entries:
@@ -155,11 +158,6 @@ class SensorStates:
         -------
         tuple of ErrorStates
             One block for each error of the sensor with a σ above zero.
-
-        Raises
-        ------
-        InputError
-            If a state does not go with this kind of measurement.
         """
         one_of(f"{sensor}: kind", kind, KINDS)
         found: list[ErrorStates] = []
@@ -294,11 +292,6 @@ class States(ByValue):
         -------
         tuple of ErrorStates
             Blocks of the gyro, then those of the sensors in the order of ``sensors``.
-
-        Raises
-        ------
-        InputError
-            If a sensor is unknown, or a state does not go with its kind of measurement.
         """
         found = list(self.gyro_blocks())
         for name, one in self.sensors.items():
@@ -309,23 +302,9 @@ class States(ByValue):
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the declared states, as :func:`chosen` accepts them."""
-        gyro = (
-            ("gyro.scale", _any(self.gyro_scale_sigma)),
-            ("gyro.misalignment", _any(self.gyro_misalignment_sigma)),
-            ("gyro.force", _any(self.gyro_force_sigma) or _any(self.gyro_cross_force_sigma)),
-            ("gyro.temperature", _any(self.gyro_temperature_sigma)),
-            ("gyro.drift", bool(self.gyro_drift_sigma)),
-        )
-        found = [name for name, there in gyro if there]
+        found = [f"gyro.{part}" for part, fields in _GYRO_PARTS.items() if _declared(self, fields)]
         for sensor, one in self.sensors.items():
-            parts = (
-                ("mounting", _any(one.mounting_sigma)),
-                ("bias", _any(one.bias_sigma)),
-                ("lever", _any(one.lever_arm_sigma)),
-                ("correlated", one.correlated_sigma > 0.0),
-                ("velocity", one.velocity_time > 0.0),
-            )
-            found += [f"{sensor}.{part}" for part, there in parts if there]
+            found += [f"{sensor}.{part}" for part, fields in _SENSOR_PARTS.items() if _declared(one, fields)]
         return tuple(found)
 
     def chosen(self, names: tuple[str, ...]) -> States:
@@ -340,43 +319,47 @@ class States(ByValue):
         -------
         States
             The same σ for these names, and 0 for all others.
-
-        Raises
-        ------
-        InputError
-            If a name is unknown.
         """
         for name in names:
             if not self.names:
                 raise InputError(f"states: {name!r} is asked for, and there is none to choose from")
             one_of("states: name", name, self.names)
-        kept = replace(
-            self,
-            gyro_scale_sigma=self.gyro_scale_sigma if "gyro.scale" in names else 0.0,
-            gyro_misalignment_sigma=self.gyro_misalignment_sigma if "gyro.misalignment" in names else 0.0,
-            gyro_force_sigma=self.gyro_force_sigma if "gyro.force" in names else 0.0,
-            gyro_cross_force_sigma=self.gyro_cross_force_sigma if "gyro.force" in names else 0.0,
-            gyro_temperature_sigma=self.gyro_temperature_sigma if "gyro.temperature" in names else 0.0,
-            gyro_drift_sigma=self.gyro_drift_sigma if "gyro.drift" in names else (),
-            gyro_drift_time=self.gyro_drift_time if "gyro.drift" in names else (),
-            gyro_fast_bias_sigma=self.gyro_fast_bias_sigma if "gyro.drift" in names else 0.0,
-        )
-        sensors = {}
-        for sensor, one in self.sensors.items():
-            correlated = f"{sensor}.correlated" in names
-            part = replace(
-                one,
-                mounting_sigma=one.mounting_sigma if f"{sensor}.mounting" in names else 0.0,
-                bias_sigma=one.bias_sigma if f"{sensor}.bias" in names else 0.0,
-                lever_arm_sigma=one.lever_arm_sigma if f"{sensor}.lever" in names else 0.0,
-                correlated_sigma=one.correlated_sigma if correlated else 0.0,
-                correlation_time=one.correlation_time if correlated else 0.0,
-            )
-            if f"{sensor}.velocity" not in names:
-                part = replace(part, **dict.fromkeys(VELOCITY, 0.0))  # type: ignore[arg-type]
-            if part.blocks(sensor, "direction", 1.0):
-                sensors[sensor] = part
-        return replace(kept, sensors=sensors)
+        sensors = {sensor: _kept(one, sensor, _SENSOR_PARTS, names) for sensor, one in self.sensors.items()}
+        used = {sensor: one for sensor, one in sensors.items() if one.blocks(sensor, "direction", 1.0)}
+        return replace(_kept(self, "gyro", _GYRO_PARTS, names), sensors=used)
+
+
+_GYRO_PARTS = {
+    "scale": ("gyro_scale_sigma",),
+    "misalignment": ("gyro_misalignment_sigma",),
+    "force": ("gyro_force_sigma", "gyro_cross_force_sigma"),
+    "temperature": ("gyro_temperature_sigma",),
+    "drift": ("gyro_drift_sigma",),
+}
+"""Fields that declare each state of the gyro, by its name."""
+_SENSOR_PARTS = {
+    "mounting": ("mounting_sigma",),
+    "bias": ("bias_sigma",),
+    "lever": ("lever_arm_sigma",),
+    "correlated": ("correlated_sigma",),
+    "velocity": tuple(VELOCITY),
+}
+"""The same of a sensor."""
+_BESIDE = {"gyro_drift_sigma": ("gyro_drift_time", "gyro_fast_bias_sigma"), "correlated_sigma": ("correlation_time",)}
+"""Fields that go with another and declare no state by themselves."""
+Part = TypeVar("Part", States, SensorStates)
+
+
+def _declared(states: States | SensorStates, fields: tuple[str, ...]) -> bool:
+    return any(_any(getattr(states, field)) for field in fields)
+
+
+def _kept(states: Part, owner: str, parts: Mapping[str, tuple[str, ...]], names: tuple[str, ...]) -> Part:
+    """Return the states of an owner, the gyro or a sensor, whose names are given."""
+    none = type(states)()
+    dropped = [field for part, fields in parts.items() if f"{owner}.{part}" not in names for field in fields]
+    dropped += [beside for field in dropped for beside in _BESIDE.get(field, ())]
+    return replace(states, **{field: getattr(none, field) for field in dropped})
 
 
 def _spread(diagonal: Entries, off_diagonal: Entries) -> tuple[Array, Array]:
@@ -388,21 +371,25 @@ def _spread(diagonal: Entries, off_diagonal: Entries) -> tuple[Array, Array]:
     return on, off
 
 
-def initial_state(initial: State, error_states: tuple[ErrorStates, ...]) -> State:
+def initial_state(initial: State, error_states: tuple[ErrorStates, ...], fast_bias_sigma: float = 0.0) -> State:
     """Return the state to start from where ``initial`` has the *whole* bias, the error states' part of it included.
 
     Its error is what ``initial`` says, whatever the parts are: of the bias ``b = β − Σ c e`` the covariance follows, so that a drift that
-    is large beside a well-known bias is known only together with it.
+    is large beside a well-known bias is known only together with it. The part too fast for a state, of σ ``fast_bias_sigma``, is in the
+    initial bias as well and lasts no longer than a sample: the states know the rest of the bias that much worse.
     """
-    plain = modelling.with_error_states(initial, error_states)
+    fast = np.diag(_BIAS * fast_bias_sigma**2)
+    plain = modelling.with_error_states(replace(initial, covariance=initial.covariance + fast), error_states)
     turn = np.eye(len(plain.covariance))
-    first = 6
-    for one in error_states:
-        turn[3:6, first : first + one.size] = -np.asarray(one.gyro_offset).T
-        first += one.size
+    turn[3:6, 6:] = -_offsets(error_states)
     sigma = np.sqrt(np.diag(plain.covariance))
     root = (turn @ (sigma[:, None] * np.linalg.cholesky(plain.covariance / np.outer(sigma, sigma)))).T
     return replace(plain, covariance=root.T @ root, factor=root)
+
+
+def _offsets(error_states: tuple[ErrorStates, ...]) -> Array:
+    """Return what a unit of each error state adds to the gyro's bias (3, m)."""
+    return np.concatenate([np.empty((3, 0)), *(np.asarray(one.gyro_offset).T for one in error_states)], axis=1)
 
 
 def run(
@@ -417,16 +404,13 @@ def run(
     robust: Robust | None = None,
     monitor: Monitor | None = None,
 ) -> Estimate:
-    """Run the filter with these states; its estimate is of the attitude and the whole gyro bias, drifts included, and of the error states.
-
-    An ``initial`` without values has the whole bias. Options are those of :func:`strapdown.estimation.run`.
-    """
+    """Run the filter with these states; it estimates the attitude, the whole gyro bias, drifts included, and the error states."""
     problem = prepared(record, process_noise, initial, states)
     options = forward.Options(
         every=every, full_covariance=full_covariance, gate=gate, robust=robust, whole_bias=True, together=True
     )
     found = forward.filtered(problem, options).estimate
-    return _reported(forward.watched(found, monitor, gate), states)
+    return _reported(forward.watched(found, monitor, gate), states, initial)
 
 
 def run_together(
@@ -436,27 +420,64 @@ def run_together(
     problems = [prepared(one, process_noise, start, states) for one, start in zip(records, initials, strict=True)]
     options = forward.Options(every=every, full_covariance=True, whole_bias=True, together=True)
     found = together.run(problems, every, lambda problem: forward.filtered(problem, options).estimate)
-    return [_reported(one, states) for one in found]
+    return [_reported(one, states, start) for one, start in zip(found, initials, strict=True)]
+
+
+def smooth(
+    record: ImuRecord,
+    process_noise: ProcessNoise,
+    initial: State,
+    states: States,
+    *,
+    full_covariance: bool = False,
+    error_state_covariance: bool = True,
+    **options: Any,
+) -> Estimate:
+    """Run the smoother with these states; with drifts among them its estimate is of the whole gyro bias.
+
+    An ``initial`` without values has the whole bias. Options are those of :func:`strapdown.estimation.smooth`. In the first second the
+    variance of the whole bias is an upper bound: the part too fast for a state is taken for independent of the initial error.
+    """
+    blocks = states.blocks({series.sensor: series.kind for series in record.vectors})
+    kept: dict[str, Any] = {"full_covariance": full_covariance, "error_state_covariance": error_state_covariance}
+    if not states.gyro_drift_sigma:
+        return smoothing.smooth(record, process_noise, initial, blocks, **kept, **options)
+    state = initial if len(initial.values) else initial_state(initial, blocks, states.gyro_fast_bias_sigma)
+    found = smoothing.smooth(record, process_noise, state, blocks, full_covariance=True, **options)
+    assert found.whole_covariance is not None
+    offsets = _offsets(blocks)
+    sums = np.eye(6, 6 + offsets.shape[1])
+    sums[3:, 6:] = offsets
+    covariance = sums @ found.whole_covariance @ sums.T + np.diag(_BIAS * states.gyro_fast_bias_sigma**2)
+    return replace(
+        found,
+        bias=found.bias + np.concatenate([one.values for one in found.error_states.values()], axis=1) @ offsets.T,
+        variance=np.einsum("kii->ki", covariance).copy(),
+        covariance=covariance if full_covariance else None,
+        whole_covariance=found.whole_covariance if full_covariance and error_state_covariance else None,
+    )
 
 
 def prepared(record: ImuRecord, process_noise: ProcessNoise, initial: State, states: States) -> forward.Problem:
     """Return a record prepared for the filter with these states."""
     error_states = states.blocks({series.sensor: series.kind for series in record.vectors})
-    state = initial if len(initial.values) else initial_state(initial, error_states)
+    state = initial if len(initial.values) else initial_state(initial, error_states, states.gyro_fast_bias_sigma)
     return forward.prepared(record, process_noise, state, error_states, driven=True)
 
 
-def _reported(found: Estimate, states: States) -> Estimate:
-    """Return an estimate whose bias is the whole one, what is too quick for a state in its variance."""
+def _reported(found: Estimate, states: States, initial: State) -> Estimate:
+    """Return an estimate whose bias is the whole one, the part too fast for a state in its variance."""
     assert found.whole_bias is not None
     assert found.whole_bias_variance is not None
-    fast = np.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0]) * states.gyro_fast_bias_sigma**2
+    fast = np.outer(np.ones(len(found.time)), _BIAS * states.gyro_fast_bias_sigma**2)
+    if not len(initial.values):
+        fast[0] *= -1.0  # the initial bias has this part, so its error has not
     covariance = found.whole_bias_covariance
     return replace(
         found,
         bias=found.whole_bias,
         variance=found.whole_bias_variance + fast,
-        covariance=None if covariance is None else covariance + np.diag(fast),
+        covariance=None if covariance is None else covariance + fast[:, :, None] * np.eye(6),
     )
 
 
@@ -488,7 +509,7 @@ SENSOR_FORM: tables.Form = {
     "correlated_sigma": tables.PLAIN,
     "correlation_time": tables.SECONDS,
     "frame": tables.PLAIN,
-    "varying": tables.PLAIN,
+    "varying": tables.FLAG,
     "lever_arm_sigma": tables.METRES,
     "velocity_time": tables.SECONDS,
     "velocity_sigma": _SPEED,
@@ -518,25 +539,6 @@ def from_table(table: Mapping[str, Any], place: str = "states") -> States:
         where = f"{place}: sensors: {name}"
         if not isinstance(content, Mapping):
             raise InputError(f"{where} is {content!r}; it must be a table, [{place}.sensors.{name}]")
-        by_sensor[name] = _placed(where, SensorStates, _plain(where, content), SENSOR_FORM)
+        by_sensor[name] = tables.build(SensorStates, content, SENSOR_FORM, where)
     own = {key: value for key, value in table.items() if key != "sensors"}
-    return _placed(place, States, own, FORM, sensors=by_sensor)  # type: ignore[no-any-return]
-
-
-def _plain(place: str, content: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a table whose bool goes through as one; tables take bools for slips."""
-    known_keys(place, content, tables.keys(SENSOR_FORM))
-    if "varying" in content and not isinstance(content["varying"], bool):
-        raise InputError(f"{place}: varying is {content['varying']!r}; it must be true or false")
-    return dict(content)
-
-
-def _placed(place: str, kind: Any, table: dict[str, Any], form: tables.Form, **more: Any) -> Any:
-    """Build from a table; what is refused names the place."""
-    if "varying" in table:
-        more["varying"] = table.pop("varying")
-    try:
-        return tables.build(kind, table, form, place, **more)
-    except InputError as error:
-        text = str(error)
-        raise InputError(text if text.startswith(place) else f"{place}: {text}") from None
+    return tables.build(States, own, FORM, place, sensors=by_sensor)  # type: ignore[no-any-return]

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from strapdown.kernels.algebra import add, multiply
+from strapdown.kernels.algebra import add, congruent, multiply
 from strapdown.kernels.filter_step import predict as propagated_body_side
-from strapdown.kernels.filters.extended import congruent, joseph_row
+from strapdown.kernels.filters.extended import joseph_row
 from strapdown.kernels.measurement import measurement_rows
 from strapdown.kernels.rotation import moved, unit
 

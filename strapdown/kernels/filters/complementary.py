@@ -11,6 +11,7 @@ import math
 from strapdown.kernels.algebra import (
     combine,
     combine_matrices,
+    congruent,
     cross,
     dot,
     factored,
@@ -25,7 +26,7 @@ from strapdown.kernels.algebra import (
     transpose_times_vector,
 )
 from strapdown.kernels.filters.body_side import from_body_side, propagated, to_body_side
-from strapdown.kernels.filters.extended import congruent, negated
+from strapdown.kernels.filters.extended import negated
 from strapdown.kernels.iterated_update import IDENTITY
 from strapdown.kernels.measurement import (
     ATTITUDE,
@@ -59,18 +60,6 @@ def held(A):
     return (min(A[0], most), 0.0, 0.0, min(A[3], most), 0.0, min(A[5], most))
 
 
-def combine_symmetric(s, A, t, B):
-    """Return s A + t B of two symmetric matrices."""
-    return (
-        s * A[0] + t * B[0],
-        s * A[1] + t * B[1],
-        s * A[2] + t * B[2],
-        s * A[3] + t * B[3],
-        s * A[4] + t * B[4],
-        s * A[5] + t * B[5],
-    )
-
-
 def corrected_covariance(A, B, C, M, V, gain, bias_gain):
     """Return the blocks of the covariance after a correction with gains of any size, not only Kalman's.
 
@@ -83,11 +72,11 @@ def corrected_covariance(A, B, C, M, V, gain, bias_gain):
     reduced = combine_matrices(1.0, B, -bias_gain, multiply(full(A), transpose(M)))
     MB = multiply(M, B)
     twice = (2.0 * MB[0], MB[1] + MB[3], MB[2] + MB[6], 2.0 * MB[4], MB[5] + MB[7], 2.0 * MB[8])
-    shown = combine_symmetric(1.0, congruent(M, A), 1.0, V)
+    shown = combine_matrices(1.0, congruent(M, A), 1.0, V)
     return (
-        combine_symmetric(1.0, congruent(left, A), gain * gain, V),
+        combine_matrices(1.0, congruent(left, A), gain * gain, V),
         combine_matrices(1.0, multiply(left, reduced), gain * bias_gain, noise),
-        combine_symmetric(1.0, combine_symmetric(1.0, C, -bias_gain, twice), bias_gain * bias_gain, shown),
+        combine_matrices(1.0, combine_matrices(1.0, C, -bias_gain, twice), bias_gain * bias_gain, shown),
     )
 
 

@@ -14,15 +14,14 @@ import numpy as np
 
 from strapdown.kernels.algebra import (
     combine,
+    congruent,
     dot,
-    full,
     matrix_times_vector,
     minus_outer,
     multiply,
     scale,
     symmetric_minus_outer,
     symmetric_times_vector,
-    times_transpose_upper,
     transpose,
     transpose_times_vector,
 )
@@ -152,11 +151,6 @@ def keep(state, row, e, body, out):
     return state
 
 
-def stopped(state):
-    """Go on to the end."""
-    return False
-
-
 def finish(state, row, e, body):
     """Leave the end state, body side."""
     q, b, A, B, C = state
@@ -171,11 +165,6 @@ def finish(state, row, e, body):
 def negated(v):
     """Return −v."""
     return (-v[0], -v[1], -v[2])
-
-
-def congruent(M, S):
-    """Return the symmetric M S Mᵀ."""
-    return times_transpose_upper(multiply(M, full(S)), M)
 
 
 def turned_in_fixed_axes(q, phi):

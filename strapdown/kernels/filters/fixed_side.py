@@ -6,6 +6,7 @@ from strapdown.kernels.algebra import (
     add,
     add_to_diagonal,
     combine,
+    congruent,
     full,
     matrix_times_vector,
     multiply,
@@ -16,7 +17,6 @@ from strapdown.kernels.algebra import (
 from strapdown.kernels.filter_step import process_noise, transition
 from strapdown.kernels.filters.extended import (
     attitude_turned_axes,
-    congruent,
     negated,
     rows_in_fixed_axes,
     turned_in_fixed_axes,

@@ -10,6 +10,7 @@ from strapdown.kernels.algebra import (
     add_matrices,
     add_to_diagonal,
     combine,
+    congruent,
     full,
     matrix_times_vector,
     multiply,
@@ -22,7 +23,6 @@ from strapdown.kernels.filter_step import process_noise, transition
 from strapdown.kernels.filters.extended import (
     attitude_turned_axes,
     bias_turned_axes,
-    congruent,
     negated,
     rows_in_fixed_axes,
     turned_in_fixed_axes,
