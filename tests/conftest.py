@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import functools
 import gc
 import sys
 from collections.abc import Callable, Iterator
@@ -12,10 +13,17 @@ from typing import Any
 import hypothesis
 import numpy as np
 import pytest
+import typer.main
 from matplotlib.figure import Figure
 
 hypothesis.settings.register_profile("fixed", derandomize=True)
 hypothesis.settings.load_profile("fixed")  # the same examples in every run
+
+gc.set_threshold(50_000, 20, 20)
+"""Objects of compiled kernels and of figures are many and live on: at Python's own 700, 10, 10 the collector takes 7 % of all time."""
+
+typer.main.get_command = functools.cache(typer.main.get_command)
+"""Each call of the program builds the parsers of all commands anew, 16 ms; that this is right once is enough."""
 
 BROAD = Path(__file__).resolve().parents[1] / ".." / "shared" / "data" / "broad"
 
@@ -40,6 +48,10 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         slow = [item for item in items if item.get_closest_marker("slow")]
         config.hook.pytest_deselected(items=slow)
         items[:] = [item for item in items if not item.get_closest_marker("slow")]
+
+
+def pytest_collection_finish() -> None:
+    gc.freeze()  # the modules stay
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -541,15 +541,16 @@ def test_ramp_interval_covers_over_200_seeds():
 
 
 def test_terms_that_are_not_there_are_bounded_not_invented():
+    """Of twelve records; a slow study takes two hundred."""
     supported, below = np.zeros(5), np.zeros(5)
-    for seed in range(25):
+    for seed in range(12):
         fit = allan.fit_noise(simulate([seed, 8], 4096, 0.01, N=1e-3), 0.01)
         supported += fit.supported[0]
         below += np.isnan(fit.estimate[0]) & (fit.lower[0] == 0.0) & (fit.upper[0] > 0.0)
         assert np.isnan(fit.covariance[0, 0, 1])
-    assert supported[1] == 25
-    assert np.all(supported[[0, 2, 3, 4]] <= 1)
-    assert_allclose(supported + below, 25.0)
+    assert supported[1] == 12
+    assert supported[[0, 2, 3, 4]].sum() <= 1  # each with a chance of 1e-3: two of 48 with one of 0.1 %
+    assert_allclose(supported + below, 12.0)
 
 
 def test_upper_bound_of_a_hidden_term_holds():

@@ -18,7 +18,7 @@ from strapdown.estimation.gating import Gate, Monitor, Robust
 from strapdown.estimation.schedule import schedule
 from strapdown.estimation.states import ProcessNoise, covariance_matrices, pack
 from strapdown.kernels import hypotheses, rotation
-from strapdown.kernels.machine import compiled
+from strapdown.kernels.machine import compiled, read_only
 from strapdown.kernels.series import LARGEST_ANGLE
 from strapdown.kernels.walk import walk
 from strapdown.motion import ConstantRate
@@ -196,7 +196,7 @@ def kernel_run(walked, record, events, states, process):
         every=1,
         room=np.empty(40),
     )
-    return out, walked(record.time, record.increments, events.measurements, 1, body, out)
+    return out, walked(read_only(record.time), read_only(record.increments), events.measurements, 1, body, out)
 
 
 def test_for_small_errors_it_is_the_plain_filter():

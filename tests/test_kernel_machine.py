@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import ast
 import importlib
-import json
 import math
+import multiprocessing
 import os
 import pkgutil
 import shutil
 import subprocess
 import sys
+from functools import partial
 from inspect import signature
+from multiprocessing.connection import Connection
 from pathlib import Path
 from types import FunctionType, ModuleType
+from typing import Any
 
+import numba
 import numpy as np
 import plain_kernels
 import pytest
@@ -376,36 +380,55 @@ def run(x):
 """
 
 ASK = """
-import json, sys
 from strapdown.kernels import machine, probe
 fast = machine.compiled(probe.run)
-answer = {"value": fast(1.0), "hits": sum(fast.stats.cache_hits.values()), "file": machine.__file__}
-for_compiling = {"strapdown.kernels.tracing", "numba.np.arrayobj", "scipy.linalg"}
-print(json.dumps({**answer, "loaded": sorted(for_compiling & set(sys.modules))}))
+answer = {"value": fast(1.0), "hits": sum(fast.stats.cache_hits.values())}
 """
+
+
+LOADED = """
+import sys
+from strapdown.kernels import machine, probe
+fast = machine.compiled(probe.run)
+fast(1.0)
+print(*fast.stats.cache_hits.values(), *{"strapdown.kernels.tracing", "numba.np.arrayobj", "scipy.linalg"} & set(sys.modules))
+"""
+
+
+def _answer(pipe: Connection, root: Path, code: str, arguments: tuple[str, ...]) -> None:
+    for name in [name for name in sys.modules if name.partition(".")[0] == "strapdown"]:
+        del sys.modules[name]
+    sys.path.insert(0, str(root))
+    numba.config.CACHE_DIR = str(root / "cache")
+    names = {"arguments": arguments}
+    exec(code, names)
+    assert names["machine"].__file__.startswith(str(root))
+    pipe.send(names["answer"])
+
+
+def in_a_new_process(root: Path, code: str, *arguments: str) -> Any:
+    """What ``answer`` is after code that imports the package copied to ``root``, in a fork: that spares it the start of numba."""
+    context = multiprocessing.get_context("fork")
+    here, there = context.Pipe(duplex=False)
+    child = context.Process(target=_answer, args=(there, root, code, arguments))
+    child.start()
+    there.close()
+    try:
+        return here.recv()
+    finally:
+        child.join()
 
 
 @pytest.fixture
 def copied_kernels(tmp_path):
-    """A copy of the kernels with a probe, a constant in one module and a helper in another, and a way to ask it in a new process."""
+    """A copy of the kernels with a probe, a constant in one module and a helper in another."""
     kernels = tmp_path / "strapdown" / "kernels"
     shutil.copytree(PACKAGE / "kernels", kernels, ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copy(PACKAGE / "__init__.py", tmp_path / "strapdown")
     (kernels / "probe.py").write_text(PROBE)
     (kernels / "probe_constants.py").write_text("FACTOR = 2.0\n")
     (kernels / "probe_helpers.py").write_text("def lifted(x):\n    return x + 1.0\n")
-
-    def ask() -> dict:
-        environment = {**os.environ, "PYTHONPATH": str(tmp_path), "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
-        done = subprocess.run(
-            [sys.executable, "-c", ASK], env=environment, cwd=tmp_path, capture_output=True, text=True, check=False
-        )
-        assert done.returncode == 0, done.stderr
-        answer = json.loads(done.stdout)
-        assert answer["file"].startswith(str(tmp_path))
-        return answer
-
-    return kernels, ask
+    return kernels
 
 
 def edit(path: Path, text: str) -> None:
@@ -417,13 +440,23 @@ def edit(path: Path, text: str) -> None:
     shutil.rmtree(path.parent / "__pycache__", ignore_errors=True)  # Python's own bytecode does go by them
 
 
+def test_a_kernel_from_the_cache_needs_nothing_that_only_compiles(copied_kernels):
+    root = copied_kernels.parent.parent
+    environment = {**os.environ, "PYTHONPATH": str(root), "NUMBA_CACHE_DIR": str(root / "cache")}
+    first, again = (
+        subprocess.run([sys.executable, "-c", LOADED], env=environment, check=True, capture_output=True, text=True)
+        for _ in range(2)
+    )
+    assert len(first.stdout.split()) == 3  # without hits
+    assert again.stdout.split() == ["1"]
+
+
 def test_cache_is_used_and_notices_edited_constants_and_helpers(copied_kernels):
-    kernels, ask = copied_kernels
+    kernels = copied_kernels
+    ask = partial(in_a_new_process, kernels.parent.parent, ASK)
     first, again = ask(), ask()
     assert (first["value"], first["hits"]) == (4.0, 0)
     assert (again["value"], again["hits"]) == (4.0, 1)
-    assert len(first["loaded"]) == 3
-    assert again["loaded"] == []  # a kernel from the cache needs nothing that only compiles
     edit(kernels / "probe_constants.py", "FACTOR = 3.0\n")
     changed = ask()
     assert (changed["value"], changed["hits"]) == (6.0, 0)
@@ -445,38 +478,29 @@ def run(x):
 """
 
 ASK_PARTS = """
-import importlib, json, sys
+import importlib
 from strapdown.kernels import machine, open_probe
-answers = []
-for names in sys.argv[1:]:
+answer = []
+for names in arguments:
     fast = machine.compiled(open_probe.run, *map(importlib.import_module, names.split(",")))
-    answers.append((fast(1.0), sum(fast.stats.cache_hits.values())))
-print(json.dumps(answers))
+    answer.append((fast(1.0), sum(fast.stats.cache_hits.values())))
 """
 
 
 def test_cache_distinguishes_what_open_functions_are_bound_to(copied_kernels):
     """One loop, two bodies of the same types: neither may be taken for the other, whichever was compiled first."""
-    kernels, _ = copied_kernels
-    root = kernels.parent.parent
+    kernels, root = copied_kernels, copied_kernels.parent.parent
     (kernels / "open_probe.py").write_text(OPEN_PROBE)
     for number in (3, 7):
         (kernels / f"term_{number}.py").write_text(f"def term(x):\n    return {number}.0 * x\n")
-    environment = {**os.environ, "PYTHONPATH": str(root), "NUMBA_CACHE_DIR": str(root / "cache")}
-
-    def ask(*bodies: str) -> list[list[float]]:
-        """Value and hits of each body, all in one new process."""
-        command = [sys.executable, "-c", ASK_PARTS, *bodies]
-        done = subprocess.run(command, env=environment, cwd=root, capture_output=True, text=True, check=True)
-        return json.loads(done.stdout)
-
+    ask = partial(in_a_new_process, root, ASK_PARTS)  # value and hits of each body
     three, seven = (f"strapdown.kernels.term_{number}" for number in (3, 7))
     own = root / "own.py"  # a body of one's own, outside the package
     own.write_text("def term(x):\n    return 3.0 * x\n")
-    assert ask(three, seven, "own") == [[6.0, 0], [14.0, 0], [6.0, 0]]
-    assert ask(f"{seven},{three}", three, "own") == [[14.0, 0], [6.0, 1], [6.0, 1]]
+    assert ask(three, seven, "own") == [(6.0, 0), (14.0, 0), (6.0, 0)]
+    assert ask(f"{seven},{three}", three, "own") == [(14.0, 0), (6.0, 1), (6.0, 1)]
     edit(own, "def term(x):\n    return 5.0 * x\n")
-    assert ask("own") == [[10.0, 0]]
+    assert ask("own") == [(10.0, 0)]
 
 
 def test_digest_depends_on_every_kernel_source(monkeypatch, tmp_path):

@@ -353,9 +353,10 @@ def outcomes(statistics):
     ]
 
 
-def test_no_legend_covers_a_curve_and_ticks_are_plain(run, statistics, outcomes, tmp_path):
+def test_no_legend_covers_a_curve_and_ticks_are_plain(run, statistics, outcomes):
     for name, figure in figures(run, statistics, outcomes).items():
-        plots.save(figure, tmp_path / "figure.png")
+        with matplotlib.rc_context(style.STYLE):
+            figure.draw_without_rendering()
         legends = [*figure.legends, *(ax.get_legend() for ax in figure.axes if ax.get_legend())]
         for legend in legends:
             place = legend.get_window_extent()

@@ -228,7 +228,7 @@ class Likelihood:
         innovations: bool = False,
     ) -> dict[str, Array]:
         """Run up to eight points over one record."""
-        kept = np.empty(0, np.int64) if epochs is None else np.asarray(epochs, np.int64)
+        kept = np.empty(0, np.int64) if epochs is None else np.ascontiguousarray(epochs, np.int64)
         room = pass_arrays(case, free, epochs=len(kept), innovations=innovations)
         run_lanes(case, self.lanes(case, points), room, free, kept)
         return room
