@@ -444,7 +444,9 @@ def test_a_kernel_from_the_cache_needs_nothing_that_only_compiles(copied_kernels
     root = copied_kernels.parent.parent
     environment = {**os.environ, "PYTHONPATH": str(root), "NUMBA_CACHE_DIR": str(root / "cache")}
     first, again = (
-        subprocess.run([sys.executable, "-c", LOADED], env=environment, check=True, capture_output=True, text=True)
+        subprocess.run(
+            [sys.executable, "-c", LOADED], cwd=root, env=environment, check=True, capture_output=True, text=True
+        )
         for _ in range(2)
     )
     assert len(first.stdout.split()) == 3  # without hits
