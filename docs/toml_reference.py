@@ -176,8 +176,8 @@ def _sensors() -> list[Section]:
         return Section(group="sensors", header=header, type=word, summary=_summary(subject), keys=keys)
 
     found = [
-        section(word, kind, (*_keys(kind, form), *_keys(vectors.Faults, scenarios._faults(unit))))
-        for word, (kind, form, unit) in scenarios._SENSORS.items()
+        section(word, kind, (*_keys(kind, form), *_keys(vectors.Faults, faults)))
+        for word, (kind, form, faults) in scenarios._SENSORS.items()
     ]
     return [*found, section("", orbit.CircularOrbit, _keys(orbit.CircularOrbit, scenarios._ORBIT), "[sensors.orbit]")]
 

@@ -92,8 +92,7 @@ def main(
     fit = allan.fit_noise(increments, sample_interval, kind="increments")
     figures = []
     if out is not None:
-        curves = allan.curves_by_axis(fit, deviation)
-        figures.append(plots.save(plots.allan_overview(deviation, fit, curves), Path(out) / "allan.png"))
+        figures.append(plots.save(plots.allan_overview(deviation, fit), Path(out) / "allan.png"))
     return Result(truth=coefficients(TRUTH), deviation=deviation, fit=fit, figures=tuple(figures))
 
 
@@ -142,7 +141,7 @@ def print_fit(fit: allan.NoiseFit, truth: Mapping[str, float]) -> None:
             f"{row['lower']:.4g} to {row['upper']:.4g}" if row["supported"] else f"not seen, below {row['upper']:.4g}"
         )
         print(
-            f"{'xyz'[row['axis']]} {term:20s} {interval:28s} {row['unit']:10s} truth {truth[term] / allan.UNITS[term][1]:.4g}"
+            f"{'xyz'[row['axis']]} {term:20s} {interval:28s} {row['unit']:10s} truth {truth[term] / allan.UNITS['gyro'][term][1]:.4g}"
         )
 
 

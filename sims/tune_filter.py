@@ -93,7 +93,7 @@ def draw(result, folder, objective):
     shown = [tuning.unit_of(name, [result.record]) for name in FREE]
     figure, (left, right) = plots.new_figure(1, 2, size=(11.0, 4.6))
     for number, one in enumerate((result.too_large, result.too_small)):
-        drawing.searches(one, 0, 1, shown, left, label=number == 0)
+        searches(one, shown, left, label=number == 0)
     left.set_title(f"{2 * len(result.too_large.starts)} searches", loc="left")
     values(result, right)
     plots.save(figure, folder / "tune_filter.png")
@@ -107,6 +107,23 @@ def draw(result, folder, objective):
         ),
         folder / "tune_filter-heldout.png",
     )
+
+
+def searches(tuned, shown, ax, *, label):
+    """Draw the start and the end of each search in the plane of the two parameters."""
+    from strapdown.plots import style
+
+    begin, end = (
+        [np.exp(points[:, j]) / unit.factor for j, unit in enumerate(shown[:2])]
+        for points in (tuned.starts, tuned.optima)
+    )
+    for k in range(len(tuned.starts)):
+        ax.plot([begin[0][k], end[0][k]], [begin[1][k], end[1][k]], color=style.CYCLE[0], linewidth=0.5, alpha=0.5)
+    ax.plot(*begin, "o", color=style.VERMILION, markersize=3.5, label="start of a search" if label else None)
+    ax.plot(*end, "o", color=style.BLUE, markersize=6, label="end of a search" if label else None)
+    names = [f"{one.name}, {unit.name}" for one, unit in zip(tuned.parameters, shown, strict=False)]
+    ax.set(xscale="log", yscale="log", xlabel=names[0], ylabel=names[1])
+    style.legend_above(ax)
 
 
 def values(result, ax):

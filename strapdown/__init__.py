@@ -10,7 +10,8 @@ Tasks
     ``covariance_analysis``, ``allan_deviation``, ``fit_noise``, ``initial_state``
 What they take
     ``Scenario``, ``GyroSpec``, ``VectorSensor``, ``FilterSetup``, ``ProcessNoise``, ``Gate``, ``Robust``; ``LiveFilter`` and
-    ``StepFilter`` filter sample by sample, compiled and on filterpy; ``InputError`` is raised on bad input.
+    ``StepFilter`` filter sample by sample, compiled and on filterpy. Every function raises ``InputError`` on bad input, which names the
+    value, its place and the remedy; a section *Raises* says what else a function refuses.
 More
     The submodules, each with its own ``__all__``, and below them ``estimation.error_states``, ``estimation.filters``,
     ``estimation.multiple_model``, ``montecarlo.campaign`` and ``montecarlo.cluster``. Names and submodules load when they are first used.

@@ -61,10 +61,7 @@ def _unmasked(name: str, value: ArrayLike, allow_nan: bool) -> ArrayLike:
 
 
 def numbers(name: str, value: ArrayLike, *, allow_nan: bool = False) -> Array:
-    """Return ``value`` as a float64 array of any shape; what is no number, though NumPy would make it one, is refused.
-
-    What a masked array masks becomes NaN where ``allow_nan`` lets it, and is refused where not.
-    """
+    """Return ``value`` as a float64 array of any shape; what is no number, though NumPy would make it one, is refused."""
     if type(value) is np.ndarray and value.dtype == np.float64:
         return value
     try:
@@ -164,10 +161,7 @@ def _unit(unit: str, glue: str = " ") -> str:
 
 
 def unit_quaternions(name: str, value: ArrayLike) -> Array:
-    """Return ``value`` as an array (..., 4) of unit quaternions; the norm errors of single precision are normalised away.
-
-    Those of double-precision rounding are left, so that a state handed on is the same to the bit.
-    """
+    """Return ``value`` as an array (..., 4) of unit quaternions; the norm errors of single precision are normalised away."""
     q = array(name, value, (..., 4))
     norm = lengths(q)
     off = np.abs(norm - 1.0)

@@ -183,10 +183,7 @@ class FilterOutcome:
 
     @property
     def consistent(self) -> bool:
-        """Whether NEES of the state, of the attitude and of the bias and the NIS all lie inside their bounds.
-
-        Four tests: a consistent filter passes all of them with at least 1 − 4 (1 − ``probability``).
-        """
+        """Whether NEES of the state, of the attitude and of the bias and the NIS all lie inside their bounds."""
         low, high = self.statistics.nis_bounds(self.probability)
         nees = all(
             self.statistics.verdict(self.epochs, subset, self.probability).consistent
@@ -398,11 +395,6 @@ def run(parameters: ConingParameters, *, progress: Callable[[int], None] | None 
     -------
     ConingStudy
         Drift of each algorithm, and the statistics of the filter with it on the same runs.
-
-    Raises
-    ------
-    InputError
-        If a parameter is out of range.
 
     References
     ----------

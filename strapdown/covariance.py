@@ -15,13 +15,14 @@ Gates, robust updates and everything else that depends on the data are not part 
 from __future__ import annotations
 
 import dataclasses
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from strapdown import coning, gyro, kinematics, quaternion, vectors
+from strapdown import coning, gyro, kinematics, quaternion, scenarios, vectors
 from strapdown.checks import Array, InputError, count, known_keys, non_negative
 from strapdown.estimation.states import covariance_matrices
 from strapdown.gyro import GyroSpec, flicker
@@ -151,12 +152,7 @@ class Analysis(Listed):
     beyond_linear: tuple[str, ...]
 
     def listing(self) -> Listing:
-        """Return the error budget at the last epoch, as a table.
-
-        Returns
-        -------
-        Listing
-        """
+        """Return the error budget at the last epoch, as a table."""
         rows = [
             (name, kind, figure(attitude / ARCSECOND), figure(bias / DEGREE_PER_HOUR))
             for name, kind, attitude, bias in self.budget()
@@ -699,7 +695,7 @@ def _considered_columns(scenario: Scenario, consider: Consider, path: _Path) -> 
 
 
 def analyse(
-    scenario: Scenario,
+    scenario: Scenario | str | os.PathLike[str],
     setup: FilterSetup | None = None,
     *,
     consider: Consider | None = None,
@@ -711,8 +707,8 @@ def analyse(
 
     Parameters
     ----------
-    scenario : Scenario
-        Motion, gyro, sensors and duration.
+    scenario : Scenario, str or path
+        As of :func:`strapdown.scenarios.simulate`.
     setup : FilterSetup, optional
         The filter. Default: matched to the scenario (:func:`strapdown.setup.matched`).
     consider : Consider, optional
@@ -739,10 +735,11 @@ def analyse(
 
     Examples
     --------
-    >>> from strapdown import covariance, scenarios
-    >>> found = covariance.analyse(scenarios.load_scenario("two-stars"))  # doctest: +SKIP
+    >>> import strapdown as sd
+    >>> found = sd.covariance_analysis("two-stars")  # doctest: +SKIP
     >>> print(found)  # doctest: +SKIP
     """
+    scenario = scenarios.chosen(scenario)
     setup = matched(scenario) if setup is None else setup
     consider = Consider() if consider is None else consider
     _check_considered(scenario, consider)
@@ -806,10 +803,7 @@ def _check_considered(scenario: Scenario, consider: Consider) -> None:
 def _propagated(
     path: _Path, edges: Array, random: _Random, columns: list[_Column], fixed: int, sensors: int
 ) -> covariance_loop.Outputs:
-    """Propagate the covariance of each random source and each error without noise through the filter's gains.
-
-    ``fixed``: number of the columns, the first of them, that are fixed errors.
-    """
+    """Propagate the covariance of each random source and each error without noise through the filter's gains."""
     rows, coloured = path.rows, random.coloured
     with_rate = [k for k, column in enumerate(columns) if column.rate is not None]
     place = np.full(len(columns), -1)

@@ -124,11 +124,6 @@ def inverse(q: ArrayLike) -> Array:
     ndarray (..., 4)
         The conjugate divided by the *squared* norm.
 
-    Raises
-    ------
-    InputError
-        If a quaternion is zero.
-
     Examples
     --------
     >>> inverse([2.0, 0.0, 0.0, 0.0]).tolist()
@@ -152,11 +147,6 @@ def normalize(q: ArrayLike) -> Array:
     -------
     ndarray (..., 4)
         Unit quaternions.
-
-    Raises
-    ------
-    InputError
-        If a quaternion is zero.
     """
     value = array("q", q, (..., 4))
     value = value / _scale(value)
@@ -410,11 +400,6 @@ def to_euler(q: ArrayLike, sequence: str = "ZYX") -> Array:
         Angles, rad. The middle one lies in [−π/2, π/2], or in [0, π] where the first and last axes are the same; the others in [−π,
         π]. In gimbal lock (a pitch of ±π/2) the last angle is 0, and SciPy warns.
 
-    Raises
-    ------
-    InputError
-        If the sequence is not one of three axes.
-
     Examples
     --------
     >>> to_euler([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)]).round(6).tolist()
@@ -440,11 +425,6 @@ def from_euler(angles: ArrayLike, sequence: str = "ZYX") -> Array:
     -------
     ndarray (..., 4)
         Unit quaternions q_fb, w ≥ 0.
-
-    Raises
-    ------
-    InputError
-        If the sequence is not one of three axes.
     """
     from scipy.spatial.transform import Rotation
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import functools
 import os
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -24,7 +23,6 @@ from strapdown import (
     allan,
     coning,
     consistency,
-    covariance,
     gyro,
     quaternion,
     recordings,
@@ -33,17 +31,16 @@ from strapdown import (
     units,
 )
 from strapdown import setup as setups
-from strapdown.allan import gaps as allan_gaps
 from strapdown.checks import Array, InputError, count, instance
 from strapdown.consistency import Judgement
-from strapdown.covariance import Analysis, Consider
+from strapdown.covariance import analyse as covariance_analysis
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.states import ProcessNoise, State
 from strapdown.files import written_beside
 from strapdown.gyro import GyroSpec
 from strapdown.recordings import Recording, recordfiles
 from strapdown.records import Estimate, ImuRecord, Origin, Truth
-from strapdown.scenarios import Scenario
+from strapdown.scenarios import Scenario, simulate
 from strapdown.setup import FilterSetup, for_record
 
 if TYPE_CHECKING:
@@ -78,46 +75,7 @@ SAME_STAMP = 1e-9
 """Largest difference of two stamps of one epoch, s."""
 
 
-# --------------------------------------------------------------------------------------------------------- simulate, read, write
-
-
-def simulate(scenario: Scenario | str | os.PathLike[str], *, seed: int | None = None, run: int = 0) -> ImuRecord:
-    """Simulate a scenario: gyro increments and vector measurements, with the true attitude and gyro bias.
-
-    Parameters
-    ----------
-    scenario : Scenario, str or path
-        A scenario, the name of a built-in one (``strapdown.scenarios.SCENARIOS``), or the path of its TOML file.
-    seed : int, optional
-        Of the random numbers; default the scenario's own.
-    run : int, default 0
-        Number of the run; runs of one seed are independent.
-
-    Returns
-    -------
-    ImuRecord
-        Its ``truth`` is known, and its ``origin`` is the scenario, which :func:`estimate` matches its filter to.
-
-    Raises
-    ------
-    InputError
-        If there is no such scenario, or its file has an unknown key or a value out of range.
-
-    Examples
-    --------
-    >>> import strapdown as sd
-    >>> record = sd.simulate("two-stars", seed=1)
-    >>> len(record.increments), [one.sensor for one in record.vectors]
-    (30000, ['star 1', 'star 2'])
-    """
-    return scenarios.simulate(_scenario(scenario), seed, run)
-
-
-def _scenario(given: Scenario | str | os.PathLike[str]) -> Scenario:
-    instance(
-        "scenario", given, (Scenario, str, os.PathLike), "give a Scenario, a built-in name, or the path of a TOML file"
-    )
-    return given if isinstance(given, Scenario) else scenarios.load_scenario(given)
+# ------------------------------------------------------------------------------------------------------------------ read, write
 
 
 def read(path: Any, **options: Any) -> ImuRecord | Recording | Estimate | Campaign:
@@ -195,11 +153,6 @@ def write(
         and :func:`strapdown.recordings.writers` lists those of recordings and estimates.
     **options
         Of the format (:func:`strapdown.recordings.write`): ``sequence`` and ``frame`` of an estimate as a table.
-
-    Raises
-    ------
-    InputError
-        If the ending names no format that holds such content.
 
     Examples
     --------
@@ -356,11 +309,12 @@ def estimate(
         _refuse("a record", setup=setup, initial=initial, states=states or None)
         for words in ahrs.doctor.at_rest(source):
             warnings.warn(f"{source.source}: {words}", stacklevel=2)
-        parameters = _recording_parameters(source, motion, noise)
+        begun: Recording | ahrs.Begun = ahrs.begin(source)
+        parameters = _recording_parameters(begun, motion, noise)
         if isinstance(noise, GyroSpec) and noise.temperature is not None:
-            source, parameters = ahrs.without_temperature(source, parameters, noise.temperature, walks=smooth)
+            begun, parameters = ahrs.without_temperature(source, parameters, noise.temperature, walks=smooth)
         found = ahrs.estimate(
-            source,
+            begun,
             parameters,
             latency=latency,
             calibration=calibration,
@@ -421,7 +375,7 @@ def _specification(noise: GyroSpec | NoiseFit) -> GyroSpec:
 
 
 def _recording_parameters(
-    source: Recording, motion: str | None, noise: GyroSpec | NoiseFit | ProcessNoise | None
+    source: Recording | ahrs.Begun, motion: str | None, noise: GyroSpec | NoiseFit | ProcessNoise | None
 ) -> ahrs.AhrsParameters:
     parameters = ahrs.MOTIONS[ahrs.motions.chosen(source, motion or "auto")[0]]
     if noise is None:
@@ -496,11 +450,6 @@ def integrate(
     AttitudeHistory
         ``time`` (k + 1,), s, and ``attitude`` (k + 1, 4), q_fb, at the edges of the algorithm's steps; samples left over are dropped.
 
-    Raises
-    ------
-    InputError
-        If there is no such algorithm, or fewer samples than one of its steps needs.
-
     Examples
     --------
     >>> import strapdown as sd
@@ -550,11 +499,6 @@ def check(
     -------
     Judgement
         ``verdict`` is "consistent", "not consistent" or "cannot tell"; ``findings`` are the statistics.
-
-    Raises
-    ------
-    InputError
-        If the truth is not that of the estimate's epochs, or a Monte Carlo has no finished run.
 
     Examples
     --------
@@ -666,11 +610,6 @@ def monte_carlo(
     Statistics
         For :func:`check`; the same to the bit for any number of threads.
 
-    Raises
-    ------
-    InputError
-        If there is no such scenario, or no machine computes it with this filter.
-
     Examples
     --------
     >>> import strapdown as sd
@@ -678,46 +617,8 @@ def monte_carlo(
     """
     from strapdown import montecarlo
 
-    chosen = plan(_scenario(scenario), setup=setup, seed=seed, states=states, dispersions=dispersions)
+    chosen = plan(scenarios.chosen(scenario), setup=setup, seed=seed, states=states, dispersions=dispersions)
     return montecarlo.run_plan(chosen, runs=runs, threads=threads, progress=progress)
-
-
-def covariance_analysis(
-    scenario: Scenario | str | os.PathLike[str],
-    setup: FilterSetup | None = None,
-    *,
-    consider: Consider | None = None,
-    epochs: int = 100,
-) -> Analysis:
-    """Predict the errors of a filter on a scenario without noise samples: σ and error budget by source.
-
-    Parameters
-    ----------
-    scenario : Scenario, str or path
-        As of :func:`simulate`.
-    setup : FilterSetup, optional
-        The filter; default: matched to the scenario.
-    consider : Consider, optional
-        Errors besides those of the scenario.
-    epochs : int, default 100
-        Intervals between the epochs of the result.
-
-    Returns
-    -------
-    Analysis
-        σ of attitude (rad, body axes) and bias (rad/s) over time, actual and by the filter's own covariance, and the error budget.
-
-    Raises
-    ------
-    InputError
-        As :func:`strapdown.covariance.analyse`.
-
-    Examples
-    --------
-    >>> import strapdown as sd
-    >>> budget = sd.covariance_analysis("two-stars")  # doctest: +SKIP
-    """
-    return covariance.analyse(_scenario(scenario), setup, consider=consider, epochs=epochs)
 
 
 # ----------------------------------------------------------------------------------------------------------------------- tune
@@ -761,11 +662,6 @@ def tune(
     Tuning
         ``setup`` is the tuned filter, for :func:`estimate` and :func:`monte_carlo`.
 
-    Raises
-    ------
-    InputError
-        If a parameter is unknown, or the options exclude each other.
-
     Examples
     --------
     >>> import strapdown as sd
@@ -808,19 +704,19 @@ def tune(
 
 def _samples(
     source: Recording | ImuRecord | GyroSamples | ArrayLike, sample_interval: float | None, sensor: str, kind: str
-) -> tuple[ArrayLike, float, str, bool]:
-    """Return samples, their interval, their kind and whether some are missing."""
+) -> tuple[ArrayLike, float, str]:
+    """Return samples, NaN where missing, their interval and their kind."""
     if isinstance(source, (Recording, ImuRecord)):
         source = recordings.samples_of(source, sensor, gaps=True)
     if isinstance(source, recordings.GyroSamples):
         if sample_interval is not None:
             raise InputError("sample_interval goes with an array; a recording has its own: leave it out")
-        return source.values, source.sample_interval, source.kind, bool(np.isnan(source.values).any())
+        return source.values, source.sample_interval, source.kind
     if sample_interval is None:
         raise InputError(
             "sample_interval is missing; an array does not know the time between its samples: give it in s"
         )
-    return source, sample_interval, kind, False
+    return source, sample_interval, kind
 
 
 def allan_deviation(
@@ -836,7 +732,7 @@ def allan_deviation(
     Parameters
     ----------
     source : Recording, ImuRecord, GyroSamples or array_like (n,) or (n, axes)
-        A recording may have gaps (:mod:`strapdown.allan.gaps`).
+        Missing samples are NaN (:mod:`strapdown.allan.gaps`).
     sample_interval : float, optional
         Of an array: time between its samples, s.
     sensor : {"gyro", "accelerometer", "magnetometer"}
@@ -851,11 +747,6 @@ def allan_deviation(
     AllanDeviation
         Deviation at each averaging time and axis, in the unit of the samples (increments: that unit per s), and its confidence band.
 
-    Raises
-    ------
-    InputError
-        If samples are not finite, too few, or at uneven intervals.
-
     Examples
     --------
     >>> import numpy as np
@@ -865,9 +756,7 @@ def allan_deviation(
     >>> round(float(found.deviation[0, 0]), 2)  # σ √(dt/τ)
     0.1
     """
-    values, interval, what, gaps = _samples(source, sample_interval, sensor, kind)
-    if gaps:
-        return allan_gaps.allan_deviation(values, interval, **options)
+    values, interval, what = _samples(source, sample_interval, sensor, kind)
     return allan.allan_deviation(values, interval, kind=what, **options)
 
 
@@ -886,11 +775,9 @@ def fit_noise(
     source : Recording, ImuRecord, GyroSamples or array_like (n,) or (n, axes)
         Samples at rest; a recording may have gaps.
     sample_interval : float, optional
-        Of an array: time between its samples, s.
-    sensor : {"gyro", "accelerometer", "magnetometer"}
-        Of a recording.
-    kind : {"rate", "increments"}
-        Of an array: averaged samples, or their integrals over each interval.
+        Of an array, s.
+    sensor, kind : str
+        As of :func:`allan_deviation`.
     **options
         ``highest_frequency``, ``terms``, ``level`` of :func:`strapdown.allan.fit_noise`.
 
@@ -899,17 +786,11 @@ def fit_noise(
     NoiseFit
         For ``noise`` of :func:`estimate`.
 
-    Raises
-    ------
-    InputError
-        If samples are not finite, too few, or at uneven intervals.
-
     Examples
     --------
     >>> import strapdown as sd
     >>> noise = sd.fit_noise(sd.read("rest.csv", units={"gyro": "deg/s"}))  # doctest: +SKIP
     >>> estimate = sd.estimate(record, noise=noise)  # doctest: +SKIP
     """
-    values, interval, what, gaps = _samples(source, sample_interval, sensor, kind)
-    fit: Callable[..., NoiseFit] = allan_gaps.fit_noise if gaps else functools.partial(allan.fit_noise, kind=what)
-    return dataclasses.replace(fit(values, interval, **options), sensor=sensor)
+    values, interval, what = _samples(source, sample_interval, sensor, kind)
+    return dataclasses.replace(allan.fit_noise(values, interval, kind=what, **options), sensor=sensor)

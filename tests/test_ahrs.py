@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+import strapdown
 from sims import hand_held
-from strapdown import ahrs, quaternion, setup
+from strapdown import ahrs, estimation, quaternion, setup
 from strapdown.ahrs import AhrsParameters, estimating, motions
 from strapdown.checks import InputError
 from strapdown.consistency import reference_errors
 from strapdown.estimation.error_states import BoundedVelocity
-from strapdown.recordings import Recording, hard_iron, read, sensor_delays
+from strapdown.recordings import Recording, hard_iron, read, sensor_delays, sensor_faults
 from strapdown.records import (
     Estimate,
     Innovations,
@@ -434,6 +435,21 @@ def test_a_hand_is_a_hand_however_it_was_recorded(run):
     assert motions.chosen(plain, "any") == ("any", np.inf)
 
 
+def test_the_quiet_second_and_the_faults_of_a_recording_are_found_once(monkeypatch):
+    plain, found = recording(), []
+    once = strapdown.estimate(plain)
+    real = sensor_faults.find
+    monkeypatch.setattr(sensor_faults, "find", lambda one: found.append(one) or real(one))
+    begun = ahrs.begin(plain)
+    assert ahrs.begin(begun) is begun
+    assert begun.recording is plain
+    assert motions.chosen(begun)[0] == "hand"
+    np.testing.assert_array_equal(ahrs.estimate(begun).estimate.attitude, once.attitude)
+    assert len(found) == 1
+    strapdown.estimate(plain)
+    assert len(found) == 2
+
+
 @pytest.mark.parametrize("name", ["hand", "vehicle"])
 def test_the_change_of_mean_acceleration_is_that_of_the_bounded_velocity(name):
     """``(v(2T) − 2 v(T) + v(0))/T`` by the transition of the process over T and its stationary covariance."""
@@ -507,6 +523,24 @@ def test_no_delay_is_found_where_nothing_shows_one():
     assert sigma > 0.01
 
 
+def test_the_turn_over_a_delay_is_that_of_the_trapezoids():
+    random = np.random.default_rng(2)
+    time = np.cumsum(random.uniform(0.001, 0.02, 400))
+    steady = Recording(source="steady", time=time, rate=np.tile([0.3, -2.0, 0.7], (400, 1)))
+    delay = random.uniform(-1.5, 1.5, 400) * (time[-1] - time[0])  # before the first sample and after the last too
+    turn = sensor_delays.turn_over(steady, delay)
+    np.testing.assert_allclose(turn, delay[:, None] * [0.3, -2.0, 0.7], rtol=1e-12, atol=1e-12)
+    # a rate that grows evenly is integrated exactly from stamp to stamp: ½ α (t₁² − t₀²)
+    growing = dataclasses.replace(steady, rate=np.outer(time, [1.0, -0.5, 0.2]))
+    other = random.integers(0, 400, 400)
+    expected = 0.5 * np.outer(time**2 - time[other] ** 2, [1.0, -0.5, 0.2])
+    np.testing.assert_allclose(sensor_delays.turn_over(growing, time - time[other]), expected, atol=1e-12)
+    # and between two stamps it turns evenly
+    share = random.uniform(0.0, 1.0, 399)
+    half = sensor_delays.turn_over(growing, np.append(0.0, share * np.diff(time)))[1:]
+    np.testing.assert_allclose(half, share[:, None] * 0.5 * np.outer(np.diff(time**2), [1.0, -0.5, 0.2]), atol=1e-14)
+
+
 def test_a_late_magnetometer_is_made_good(monkeypatch):
     found = ahrs.estimate(late(field=0.02), latency=0.0)
     assert found.delays.last_field == pytest.approx(0.02, abs=2e-3)
@@ -560,6 +594,28 @@ def test_a_latency_that_is_given_is_made_good():
     np.testing.assert_array_equal(compensated.estimate.time, delayed.time)
 
 
+def test_the_gyros_bias_is_taken_off_the_way_to_a_stamp_and_over_the_delay():
+    bias = np.array([5.0, -4.0, 3.0]) * DEGREE
+    plain = recording(12.0, bias=tuple(bias))
+    found, late_by, far = (ahrs.estimate(plain, latency=one) for one in (0.0, 0.02, 0.5))
+    used, q = found.recording, found.estimate.attitude
+    seen = found.estimate.bias
+    assert np.abs(seen - bias).max() < 0.2 * DEGREE
+    # from each step's stamp on, a sample at a time, by SciPy
+    turn = 0.5 * (used.rate[1:] + used.rate[:-1]) - seen[:-1]
+    by_gyro = Rotation.from_rotvec(turn * np.diff(used.time)[:, None])
+    step = np.searchsorted(found.record.time, used.time, side="right") - 1
+    same = step[1:] == step[:-1]
+    moved = quaternion.log(quaternion.multiply(quaternion.conjugate(q[:-1]), q[1:]))
+    assert same.mean() > 0.8
+    np.testing.assert_allclose(moved[same], by_gyro.as_rotvec()[same], atol=4e-5)  # without the bias 4e-4
+    ahead = quaternion.log(quaternion.multiply(quaternion.conjugate(q), late_by.estimate.attitude))
+    np.testing.assert_allclose(ahead, 0.02 * (used.rate - seen), atol=1e-4)  # without the bias 2e-3
+    ahead = quaternion.log(quaternion.multiply(quaternion.conjugate(q), far.estimate.attitude))
+    assert np.linalg.norm(ahead, axis=1).max() > 0.6
+    np.testing.assert_allclose(ahead, 0.5 * (used.rate - seen), atol=3e-3)
+
+
 @pytest.mark.parametrize(
     ("value", "words"), [(-1e-3, "latency is -0.001 s"), (np.nan, "latency is"), (60.0, "lasts 30 s")]
 )
@@ -604,6 +660,52 @@ def test_what_a_filter_cannot_estimate_is_part_of_sigma():
     )
     difference = given.estimate.covariance[:, :3, :3] - without.estimate.covariance[:, :3, :3]
     np.testing.assert_allclose(np.trace(difference, axis1=1, axis2=2), (0.012 / np.cos(DIP)) ** 2, rtol=0.02)
+
+
+@pytest.mark.parametrize("smooth", [False, True])
+def test_between_two_steps_the_attitudes_covariance_is_turned_with_the_unit(smooth):
+    """In fixed axes, but for the timing error along the rate, it is that of the step."""
+    found = ahrs.estimate(late(), latency=0.0025, full_covariance=True, smooth=smooth)
+    used, estimate = found.recording, found.estimate
+    P = estimate.covariance[:, :3, :3]
+    np.testing.assert_array_equal(P, P.transpose(0, 2, 1))
+    np.testing.assert_array_equal(np.einsum("kii->ki", estimate.covariance), estimate.variance)
+    R = quaternion.to_matrix(estimate.attitude)
+    timed = found.delays.sigma**2 * used.rate[:, :, None] * used.rate[:, None, :]
+    fixed = R @ (P - timed) @ R.transpose(0, 2, 1)
+    step = np.searchsorted(found.record.time, used.time, side="right") - 1
+    begin = np.searchsorted(step, np.arange(len(found.record.time)))
+    np.testing.assert_allclose(fixed, fixed[begin][step], atol=1e-12 * np.abs(fixed).max())
+    np.testing.assert_array_equal(estimate.bias, estimate.bias[begin][step])
+    without = ahrs.estimate(late(), latency=0.0025, smooth=smooth).estimate
+    np.testing.assert_array_equal(without.variance, estimate.variance)
+
+
+def test_the_level_of_the_acceleration_scales_the_tilt_alone():
+    """The filter's covariance in fixed axes, its first two rows and columns by one factor."""
+    unit = dataclasses.replace(ahrs.HAND_HELD, iron_sigma=0.0)
+    found = ahrs.estimate(recording(noise=1.0), unit, latency=0.0, full_covariance=True)
+    own = found.parameters.setup
+    blocks = own.states.blocks({one.sensor: one.kind for one in found.record.vectors})
+    plain = estimation.run(found.record, own.process_noise, found.initial, blocks, full_covariance=True)
+    rows = np.searchsorted(found.recording.time, plain.time)
+    rate = found.recording.rate[rows]
+    P = found.estimate.covariance[rows, :3, :3] - found.delays.sigma**2 * rate[:, :, None] * rate[:, None, :]
+    R, own_R = quaternion.to_matrix(found.estimate.attitude[rows]), quaternion.to_matrix(plain.attitude)
+    scaled = R @ P @ R.transpose(0, 2, 1)
+    ratio = scaled / (own_R @ plain.covariance[:, :3, :3] @ own_R.transpose(0, 2, 1))
+    tilt = np.sqrt(ratio[:, 0, 0])
+    assert tilt.min() < 0.9
+    np.testing.assert_allclose(ratio[:, 1, 1], tilt**2, rtol=1e-6)
+    np.testing.assert_allclose(ratio[:, 2, 2], 1.0, rtol=1e-6)
+    correlated = np.abs(scaled[:, 0, 2]) > 1e-3 * np.sqrt(scaled[:, 0, 0] * scaled[:, 2, 2])
+    assert correlated.mean() > 0.5
+    np.testing.assert_allclose(ratio[correlated, 0, 2], tilt[correlated], rtol=1e-6)
+    beside, with_bias = found.estimate.covariance[rows], own_R @ plain.covariance[:, :3, 3:]
+    with_bias[:, :2] *= tilt[:, None, None]
+    np.testing.assert_allclose(R @ beside[:, :3, 3:], with_bias, atol=1e-6 * np.abs(with_bias).max())
+    np.testing.assert_array_equal(beside[:, 3:, :3], beside[:, :3, 3:].transpose(0, 2, 1))
+    np.testing.assert_array_equal(beside[:, 3:, 3:], plain.covariance[:, 3:, 3:])
 
 
 def test_a_start_without_rest_is_as_uncertain_as_it_is_wrong():

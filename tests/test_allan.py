@@ -654,10 +654,8 @@ def test_fit_is_the_restricted_maximum():
     """At the optimum no small step in any coefficient raises the likelihood restricted for the ramp."""
     rate = simulate([4, 11], 2048, 1.0, **corners(2048, 60.0, 20.0))
     terms = allan.TERMS[:4]
-    starts = allan.spectrum.bin_starts(2047)
-    basis = np.stack([allan.spectrum.mean_power(term, 2048, 1.0, starts, 2047) for term in terms])
-    coefficient = allan.spectrum.cosine_transform(rate, 1.0)
-    bins = allan.spectrum.binned(coefficient, basis, starts, axis=0, largest=np.abs(rate).max(), dt=1.0, last=2047)
+    whole = allan.spectrum.segment(slice(0, 2048), 1.0, terms, None)
+    _, bins = allan.spectrum.binned([allan.spectrum.cosine_transform(rate, 1.0)], [whole], 1.0)
     best = allan.noise_fit._maximise(bins, allan.noise_fit._first_guess(bins), np.ones(4, dtype=bool))
     for i in range(4):
         for factor in (0.999, 1.001):
@@ -825,7 +823,7 @@ RECORD = np.random.default_rng(0).standard_normal(200)
         (lambda: allan.allan_deviation(RECORD, 0.1, taus=[]), "empty"),
         (lambda: allan.allan_deviation(RECORD, 0.1, level=95.0), "level is 95"),
         (lambda: allan.allan_deviation(RECORD.reshape(4, 50), 0.1), "50 axes"),
-        (lambda: allan.allan_deviation(np.append(RECORD, np.nan), 0.1), r"values\[200\] is nan"),
+        (lambda: allan.allan_deviation(np.append(RECORD, np.nan), 0.1, estimator="robust"), "has gaps"),
         (lambda: allan.allan_deviation([1.0, 2.0], 0.1), "2 samples"),
         (lambda: allan.fit_noise(RECORD[:50], 0.1), "50 samples"),
         (lambda: allan.fit_noise(RECORD, 0.1, terms=["angle_walk"]), "did you mean 'angle_random_walk'"),

@@ -46,7 +46,7 @@ def test_the_scenario_at_rest_gives_its_preset_back(run, tmp_path):
         assert np.all(np.abs(getattr(spec, term) / truth - 1.0) < most), term
         rows = [row for row in content["coefficients"] if row["term"] == term]
         assert [row["supported"] for row in rows] == [True] * 3
-        factor = allan.UNITS[term][1]
+        factor = allan.UNITS["gyro"][term][1]
         # Nine intervals at 95 %: two or more misses have a chance of 7 %, these have none.
         assert all(row["lower"] <= truth / factor <= row["upper"] for row in rows)
     assert sorted(commented(text)) == ["quantization_arcsec", "rate_ramp_deg_per_hour_per_hour"]

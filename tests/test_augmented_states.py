@@ -131,7 +131,7 @@ def test_states_go_through_their_file_to_the_last_bit(tmp_path):
 def test_bad_tables_are_refused_with_their_place(table, words):
     with pytest.raises(InputError, match=words) as caught:
         optional.from_table(table, "f.toml: filter: states")
-    assert str(caught.value).startswith("f.toml: filter: states")
+    assert "f.toml: filter: states" in str(caught.value)
 
 
 @pytest.mark.parametrize(

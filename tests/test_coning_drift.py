@@ -9,7 +9,7 @@ import pytest
 from sims.coning_algorithms import OWN, PUBLISHED, coning_increments, exact_error, rate_increments
 from strapdown import coning, quaternion
 from strapdown.checks import InputError
-from strapdown.coning import ALGORITHMS, ConingBudget, VibrationLine
+from strapdown.coning import ALGORITHMS, VibrationLine, vibration_drift
 
 
 def double_precision_drift(name, angle, ratio):
@@ -144,32 +144,28 @@ def simulated_drift(line, rate, name, seconds):
 @pytest.mark.parametrize("name", ["one-sample", "two-sample", "time-taylor-3"])
 def test_budget_agrees_with_simulation(phase, name):
     line = VibrationLine(frequency=5.0, angle=2e-3, angle_across=1e-3, phase=phase)
-    budget = ConingBudget(lines=(line,), sample_rates=(60.0,), algorithms=(name,))
-    assert budget.drift(name, 60.0) == pytest.approx(simulated_drift(line, 60.0, name, 20.0), rel=0.01)
+    assert vibration_drift((line,), name, 60.0) == pytest.approx(simulated_drift(line, 60.0, name, 20.0), rel=0.01)
 
 
 def test_budget_adds_lines():
     lines = (VibrationLine(frequency=5.0, angle=1e-3), VibrationLine(frequency=11.0, angle=3e-4, phase=-0.4))
-    budget = ConingBudget(lines=lines, sample_rates=(100.0, 200.0), algorithms=("one-sample", "two-sample"))
-    assert [row["algorithm"] for row in budget.rows()] == ["one-sample", "one-sample", "two-sample", "two-sample"]
-    alone = [ConingBudget(lines=(line,), sample_rates=(100.0,)).drift("two-sample", 100.0) for line in lines]
-    assert budget.drift("two-sample", 100.0) == pytest.approx(sum(alone), rel=1e-14)
-    assert budget.drift("one-sample", 100.0) == pytest.approx(4 * budget.drift("one-sample", 200.0), rel=0.05)
+    alone = [vibration_drift((line,), "two-sample", 100.0) for line in lines]
+    assert vibration_drift(lines, "two-sample", 100.0) == pytest.approx(sum(alone), rel=1e-14)
+    slow, fast = (vibration_drift(lines, "one-sample", rate) for rate in (100.0, 200.0))
+    assert slow == pytest.approx(4 * fast, rel=0.05)
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("algorithm", "rate", "message"),
     [
-        ({"lines": ()}, "lines is empty"),
-        ({"sample_rates": ()}, "sample_rates is empty"),
-        ({"sample_rates": (20.0,)}, "sample rate 20 Hz"),
-        ({"algorithms": ("five-samples",)}, "did you mean"),
+        ("two-sample", 20.0, "sample rate 20 Hz"),
+        ("two-sample", 0.0, "sample rate is 0"),
+        ("five-samples", 100.0, "did you mean"),
     ],
 )
-def test_budget_refuses_nonsense(change, message):
-    good = {"lines": (VibrationLine(frequency=5.0, angle=1e-3),), "sample_rates": (100.0,)}
+def test_budget_refuses_nonsense(algorithm, rate, message):
     with pytest.raises(InputError, match=message):
-        ConingBudget(**(good | change))
+        vibration_drift((VibrationLine(frequency=5.0, angle=1e-3),), algorithm, rate)
 
 
 @pytest.mark.parametrize("change", [{"frequency": 0.0}, {"angle": -1.0}, {"phase": math.nan}, {"angle_across": -1e-3}])

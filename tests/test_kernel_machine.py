@@ -376,10 +376,12 @@ def run(x):
 """
 
 ASK = """
-import json
+import json, sys
 from strapdown.kernels import machine, probe
 fast = machine.compiled(probe.run)
-print(json.dumps({"value": fast(1.0), "hits": sum(fast.stats.cache_hits.values()), "file": machine.__file__}))
+answer = {"value": fast(1.0), "hits": sum(fast.stats.cache_hits.values()), "file": machine.__file__}
+for_compiling = {"strapdown.kernels.tracing", "numba.np.arrayobj", "scipy.linalg"}
+print(json.dumps({**answer, "loaded": sorted(for_compiling & set(sys.modules))}))
 """
 
 
@@ -420,6 +422,8 @@ def test_cache_is_used_and_notices_edited_constants_and_helpers(copied_kernels):
     first, again = ask(), ask()
     assert (first["value"], first["hits"]) == (4.0, 0)
     assert (again["value"], again["hits"]) == (4.0, 1)
+    assert len(first["loaded"]) == 3
+    assert again["loaded"] == []  # a kernel from the cache needs nothing that only compiles
     edit(kernels / "probe_constants.py", "FACTOR = 3.0\n")
     changed = ask()
     assert (changed["value"], changed["hits"]) == (6.0, 0)

@@ -12,6 +12,7 @@ import pytest
 
 import strapdown as sd
 from strapdown import allan, gyro, recordings, records, scenarios
+from strapdown.allan import noise_fit
 from strapdown.allan import parameters as noise_parameters
 from strapdown.checks import InputError
 from strapdown.gyro.temperature import from_table
@@ -75,7 +76,7 @@ def test_each_sensor_is_identified_in_its_units(run, rest, sensor, truth, names,
             assert row["lower"] < truth[0] * factors[0] * 1.02
             assert row["upper"] > truth[0] * factors[0] * 0.98
     assert (tmp_path / "allan-results" / f"{stem}.png").exists()
-    assert noise_parameters.name(sensor, "angle_random_walk") in said
+    assert noise_fit.name(sensor, "angle_random_walk") in said
 
 
 def test_the_files_of_other_programs(run, rest, tmp_path):

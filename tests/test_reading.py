@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
+import faulthandler
 import gc
 import json
 import os
 import random
+import signal
 import subprocess
 import sys
+import threading
 import time
 import tracemalloc
 from pathlib import Path
+from types import SimpleNamespace
 
 import h5py
 import numpy as np
@@ -454,6 +458,77 @@ def test_what_is_no_hdf5_at_all_costs_no_child(tmp_path, monkeypatch):
     (tmp_path / "text.h5").write_text("time,gx\n")
     with pytest.raises(InputError, match=r"text\.h5 cannot be read as HDF5 \(it has no signature\)"):
         recordfiles.read_record(tmp_path / "text.h5")
+
+
+def _aborts(*_):
+    faulthandler.disable()  # which pytest has write to the terminal
+    os.abort()
+
+
+def _is_killed(*_):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="forks on Linux alone")
+@pytest.mark.parametrize(
+    ("end", "words"),
+    [
+        (_aborts, r"unit\.h5 is damaged: the HDF5 library crashes on it; take a copy, or make it again"),
+        (_is_killed, r"unit\.h5 is damaged: the HDF5 library does not come to an end"),
+    ],
+    ids=["crash", "limit"],
+)
+def test_a_crash_of_the_library_is_that_of_a_fork_and_reported_as_damage(tmp_path, monkeypatch, end, words):
+    with h5py.File(tmp_path / "unit.h5", "w") as file:
+        file["values"] = np.zeros(3)
+    monkeypatch.setattr(reading, "threading", SimpleNamespace(active_count=lambda: 1))  # pytest-xdist has one more
+    monkeypatch.setattr(reading, "_status_of_process", None)
+    monkeypatch.setattr(reading, "probe", end)
+    with pytest.raises(InputError, match=words), reading.hdf5(tmp_path / "unit.h5"):
+        pass
+
+
+@pytest.mark.parametrize("status", [0, -6])
+def test_beside_another_thread_a_new_process_tries_it(tmp_path, monkeypatch, status):
+    """A fork would hold for ever the locks that other threads have just then."""
+    path = tmp_path / "unit.h5"
+    with h5py.File(path, "w") as file:
+        file["values"] = np.zeros(3)
+    real, tried = reading._status_of_process, []
+    monkeypatch.setattr(reading, "_status_of_fork", None)
+    monkeypatch.setattr(reading, "_status_of_process", lambda *given: tried.append(given[0]) or status or real(*given))
+    done = threading.Event()
+    other = threading.Thread(target=done.wait)
+    other.start()
+    try:
+        if status:
+            with pytest.raises(InputError, match="the HDF5 library crashes on it"), reading.hdf5(path):
+                pass
+        else:
+            with reading.hdf5(path) as file:
+                assert file["values"].shape == (3,)
+    finally:
+        done.set()
+        other.join()
+    assert tried == [str(path)]
+
+
+# ----------------------------------------------------------------------------------------------------- no fault of the file
+
+
+def test_a_missing_library_is_no_damage_of_the_file(known, tmp_path, monkeypatch):
+    path = tmp_path / "scenario.toml"
+    path.write_bytes(known["scenario.toml"].content)
+
+    def lacking(*_):
+        raise ModuleNotFoundError("No module named 'scipy'", name="scipy")
+
+    monkeypatch.setattr(scenarios, "_from_table", lacking)
+    words = r"scenario\.toml is not read: .* \(No module named 'scipy'\); install strapdown again with pip"
+    with pytest.raises(InputError, match=words) as caught:
+        scenarios.load_scenario(path)
+    assert "damaged" not in str(caught.value)
+    assert isinstance(caught.value.__cause__, ModuleNotFoundError)
 
 
 # ----------------------------------------------------------------------------------------------------- wrong types, raw counts

@@ -187,11 +187,9 @@ def test_a_tuning_is_reported_from_its_json(folder, scenario, tmp_path):
 
 
 def test_gaps_become_null_not_nan():
-    chart = page.Chart(
-        title="t", unit="u", time=np.arange(3.0), series=(page.Series(label="a", value=np.array([1.0, np.nan, 2.0])),)
-    )
-    assert "NaN" not in page.chart(chart)
-    assert "null" in page.chart(chart)
+    chart = page.chart("t", "u", np.arange(3.0), [page.Series(label="a", value=np.array([1.0, np.nan, 2.0]))])
+    assert "NaN" not in chart
+    assert "null" in chart
 
 
 def test_the_band_of_a_long_chart_is_its_widest_in_each_column():
@@ -199,18 +197,12 @@ def test_the_band_of_a_long_chart_is_its_widest_in_each_column():
     time = np.arange(200_000) / 100.0
     sigma = 1.0 + np.mod(np.arange(200_000), 50) / 50.0
     sigma[100_000] = 9.0
-    chart = page.Chart(
-        title="t",
-        unit="u",
-        time=time,
-        series=(
-            page.Series(label="+", value=sigma, band=True),
-            page.Series(label="-", value=-sigma, band=True),
-            page.Series(label="error", value=np.random.default_rng(1).standard_normal(len(time))),
-        ),
-        bands=((0, 1),),
+    series = (
+        page.Series(label="+", value=sigma, band=True),
+        page.Series(label="-", value=-sigma, band=True),
+        page.Series(label="error", value=np.random.default_rng(1).standard_normal(len(time))),
     )
-    content = json.loads(re.search(r"json\">(.*?)</script>", page.chart(chart), re.S).group(1))
+    content = json.loads(re.search(r"json\">(.*?)</script>", page.chart("t", "u", time, series), re.S).group(1))
     when, upper, lower, _ = (np.array(row) for row in content["data"])
     assert 3000 < len(when) <= 6002
     assert upper.min() == pytest.approx(1.98)  # each column holds a whole tooth; its least would be 1
@@ -222,7 +214,7 @@ def test_a_chart_of_an_angle_breaks_where_it_wraps():
     time = np.linspace(0.0, 10.0, 50_001)
     angle = np.mod(90.0 * time + 180.0, 360.0) - 180.0
     series = (page.Series(label="yaw", value=angle, wraps=True),)
-    content = page.chart(page.Chart(title="t", unit="°", time=time, series=series))
+    content = page.chart("t", "°", time, series)
     data = json.loads(re.search(r"json\">(.*?)</script>", content, re.S).group(1))["data"][1]
     assert data.count(None) == 3  # 900° in all: past 180°, 540° and at the end 900°
     assert np.nanmax(np.abs(np.diff(np.array(data, float)))) < 180.0

@@ -48,7 +48,7 @@ def tabular(text):
 def test_csv_reads_back_to_the_bit(rows):
     keys = ("a", "b_deg", "c, d")
     held = [dict(zip(keys, row, strict=True)) for row in rows]
-    table = Table(name="t", caption="c", headings={key: key for key in keys}, rows=held)
+    table = Table(name="t", caption="c", columns=keys, rows=held)
     head, found = read_back(to_csv(table))
     assert head == list(keys)
     for row, given_row in zip(found, rows, strict=True):
@@ -66,7 +66,7 @@ def test_csv_reads_back_to_the_bit(rows):
 def test_latex_has_a_cell_for_each_value_and_nothing_unescaped(rows):
     keys = ("a", "b", "c")
     held = [dict(zip(keys, row, strict=True)) for row in rows]
-    text = to_latex(Table(name="t", caption="50 % of\nall", headings={key: key for key in keys}, rows=held))
+    text = to_latex(Table(name="t", caption="50 % of\nall", columns=keys, rows=held))
     columns, head, found = tabular(text)
     assert (len(columns), head) == (3, list(keys))
     assert len(found) == len(rows)
@@ -80,8 +80,9 @@ def test_latex_has_a_cell_for_each_value_and_nothing_unescaped(rows):
 
 
 def test_latex_rounds_and_aligns():
-    rows = [{"name": "100 % of a_b", "x": 1.23456e-8, "unit": "°/√h"}, {"name": "c", "x": -62.391, "unit": ""}]
-    table = Table(name="t", caption="c", headings={"name": "name", "x": "drift, °/h", "unit": "unit"}, rows=rows)
+    rows = [{"name": "100 % of a_b", "drift_deg_per_hour": 1.23456e-8, "unit": "°/√h"}]
+    rows.append({"name": "c", "drift_deg_per_hour": -62.391, "unit": ""})
+    table = Table(name="t", caption="c", columns=("name", "drift_deg_per_hour", "unit"), rows=rows)
     columns, head, found = tabular(to_latex(table))
     assert columns == "lrl"
     assert head == ["name", r"drift, $^\circ$/h", "unit"]
@@ -236,7 +237,7 @@ def test_the_tables_compile(written, tmp_path):
 
 
 def test_a_folder_is_made_and_files_appear_whole(tmp_path):
-    table = Table(name="t", caption="c", headings={"a": "a"}, rows=[{"a": 1.0}])
+    table = Table(name="t", caption="c", columns=["a"], rows=[{"a": 1.0}])
     assert write([table], tmp_path / "new" / "folder") == [
         tmp_path / "new" / "folder" / f"t.{end}" for end in ("csv", "tex")
     ]

@@ -16,6 +16,8 @@ from strapdown.ahrs.parameters import MOTIONS, AhrsParameters
 from strapdown.ahrs.preparing import Prepared as Prepared
 from strapdown.ahrs.preparing import prepare as prepare
 from strapdown.ahrs.preparing import without_temperature as without_temperature
+from strapdown.ahrs.starting import Begun as Begun
+from strapdown.ahrs.starting import begin as begin
 from strapdown.ahrs.starting import quiet_span as quiet_span
 from strapdown.ahrs.starting import resting_bias as resting_bias
 from strapdown.ahrs.starting import start as start

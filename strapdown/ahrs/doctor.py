@@ -21,7 +21,7 @@ import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -382,42 +382,50 @@ MIN_INTERVAL = 0.01
 """Vectors are taken at most so often, s."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Means:
-    """Means over windows of R_ab v_c, from which those of R A v follow for any axes A."""
+class _Windows(NamedTuple):
+    """Windows in which the body turns most, and the samples of a vector there."""
 
-    product: Array
-    """(windows, 3, 3, 3), v over its strength."""
+    rows: np.ndarray
+    """Their rows in the recording (m,)."""
+    vectors: Array
+    """Over their strength (m, 3)."""
+    begin: np.ndarray
+    """First sample of each window but the first."""
+    counts: np.ndarray
+    """Number of samples of each window."""
 
-    def vectors(self, axes: Array) -> Array:
-        """Return the mean of R A v over each window (..., windows, 3) for axes (..., 3, 3)."""
-        flat = self.product.reshape(len(self.product), 3, 9)
-        return np.asarray(np.moveaxis(flat @ axes.reshape(*axes.shape[:-2], 9).T, (0, 1), (-2, -1)))
+    def means(self, attitude: Array) -> Array:
+        """Return the means over each window of R_ab v_c (windows, 3, 3, 3), R of attitudes at the rows (m, 4)."""
+        turned = quaternion.to_matrix(attitude).reshape(-1, 9)
+        parts = zip(np.split(turned, self.begin), np.split(self.vectors, self.begin), strict=True)
+        sums = np.reshape([R.T @ w for R, w in parts], (-1, 3, 3, 3))
+        return np.asarray(sums / self.counts[:, None, None, None])
 
 
-def _means(recording: Recording, attitude: Array, vectors: Array, strength: float) -> _Means:
-    """Return the means of vectors turned by an attitude (n, 4), over the windows in which the body turns most."""
+def _turned(means: Array, axes: Array) -> Array:
+    """Return the mean of R A v over each window (..., windows, 3) for axes A (..., 3, 3)."""
+    flat = means.reshape(len(means), 3, 9)
+    return np.asarray(np.moveaxis(flat @ axes.reshape(*axes.shape[:-2], 9).T, (0, 1), (-2, -1)))
+
+
+def _windows(recording: Recording, vectors: Array | None, known: np.ndarray | bool = True) -> _Windows | None:
+    """Return the windows with samples of a vector, where the attitude is ``known``; None if there are none."""
+    strength = 0.0 if vectors is None else float(np.nanmedian(lengths(vectors)))
+    if vectors is None or not strength > 0.0:
+        return None
     step = max(1, round(MIN_INTERVAL / float(np.median(np.diff(recording.time)))))
     rows = slice(None, None, step)
-    time, v, q = recording.time[rows], vectors[rows] / strength, attitude[rows]
-    seen = np.isfinite(lengths(v)) & np.isfinite(lengths(q))
+    time, v = recording.time[rows], vectors[rows] / strength
+    seen = np.isfinite(lengths(v)) & np.broadcast_to(known, recording.time.shape)[rows]
     window = np.floor((time - time[0]) / SPAN).astype(int)
     number = int(window[-1]) + 1
     turning = np.bincount(window, lengths(recording.rate[rows]), number) / np.bincount(window, minlength=number).clip(1)
     counts = np.bincount(window[seen], minlength=number)
     full = np.flatnonzero(counts >= 0.5 * max(1.0, SPAN / float(np.median(np.diff(time)))))
     chosen = np.sort(full[np.argsort(-turning[full])][:WINDOWS])
-    if len(chosen) == 0:
-        return _Means(product=np.empty((0, 3, 3, 3)))
-    used = seen & np.isin(window, chosen)
+    used = np.flatnonzero(seen & np.isin(window, chosen))
     begin = np.flatnonzero(np.diff(window[used], prepend=-1))[1:]
-    turned, taken = quaternion.to_matrix(q[used]).reshape(-1, 9), v[used]
-    sums = [R.T @ w for R, w in zip(np.split(turned, begin), np.split(taken, begin), strict=True)]
-    return _Means(product=np.reshape(sums, (-1, 3, 3, 3)) / counts[chosen, None, None, None])
-
-
-def _strength(vectors: Array) -> float:
-    return float(np.nanmedian(lengths(vectors)))
+    return _Windows(step * used, v[used], begin, counts[chosen]) if len(chosen) else None
 
 
 # ------------------------------------------------------------------------------------------------------------------ with a reference
@@ -433,21 +441,25 @@ def _with_reference(recording: Recording) -> Iterator[Candidate]:
     first, last, turn = _turns(recording, known)
     if len(first) < 10:
         return
+    force = _windows(recording, recording.specific_force, known)
+    magnetic = _windows(recording, recording.magnetic_field, known)
     for reading, read in {"": lambda q: q, **ATTITUDE_READINGS}.items():
-        q = np.full(recording.true_attitude.shape, np.nan)
-        q[known] = quaternion.normalize(read(recording.true_attitude[known]))
-        reference = quaternion.log(quaternion.multiply(quaternion.conjugate(q[first]), q[last]))
+
+        def at(rows: np.ndarray, read: Callable[[Array], Array] = read) -> Array:
+            return quaternion.normalize(read(recording.true_attitude[rows]))  # type: ignore[index]
+
+        reference = quaternion.log(quaternion.multiply(quaternion.conjugate(at(first)), at(last)))
         if np.sum(np.linalg.norm(reference, axis=1)) < MIN_TURN:
             return
         gyro = _gyro_fits(turn, reference)
-        force = _sensor_means(recording, q, recording.specific_force)
-        magnetic = _sensor_means(recording, q, recording.magnetic_field)
+        up = None if force is None else _turned(force.means(at(force.rows)), _ALL)
+        north = None if magnetic is None else _turned(magnetic.means(at(magnetic.rows)), _ALL)
         for frame, to_enu in FRAMES.items():
             parts = {"gyro": gyro}
-            if force is not None:
-                parts["accelerometer"] = _force_fits(to_enu, force)
-            if magnetic is not None:
-                parts["magnetometer"] = _field_fits(to_enu, magnetic)
+            if up is not None:
+                parts["accelerometer"] = _force_fits(up @ to_enu.T)
+            if north is not None:
+                parts["magnetometer"] = _field_fits(north @ to_enu.T)
             common = tuple(
                 words
                 for words in (
@@ -473,14 +485,6 @@ def _turns(recording: Recording, known: np.ndarray) -> tuple[np.ndarray, np.ndar
     return first[chosen], first[chosen] + step, turn[chosen]
 
 
-def _sensor_means(recording: Recording, attitude: Array, vectors: Array | None) -> _Means | None:
-    strength = 0.0 if vectors is None else _strength(vectors)
-    if vectors is None or not strength > 0.0:
-        return None
-    means = _means(recording, attitude, vectors, strength)
-    return means if len(means.product) else None
-
-
 _Fits = dict[tuple[int, str], float]
 """Misfit by number of the axes in AXES, and words of the unit."""
 
@@ -496,16 +500,14 @@ def _gyro_fits(turn: Array, reference: Array) -> _Fits:
     }
 
 
-def _force_fits(to_enu: Array, means: _Means) -> _Fits:
-    """Return misfits of the mean specific force with the vertical."""
-    v = means.vectors(_ALL) @ to_enu.T
+def _force_fits(v: Array) -> _Fits:
+    """Return misfits of the mean specific force, by axes and window (48, windows, 3), East-North-Up, with the vertical."""
     misfit = 1.0 - 2.0 * v[..., 2].sum(axis=1) / (np.sum(v**2, axis=(1, 2)) + v.shape[1])
     return {(k, ""): float(value) for k, value in enumerate(misfit)}
 
 
-def _field_fits(to_enu: Array, means: _Means) -> _Fits:
-    """Return misfits of the mean field with the best one that points North, of any dip."""
-    v = means.vectors(_ALL) @ to_enu.T
+def _field_fits(v: Array) -> _Fits:
+    """Return misfits of the mean field, likewise, with the best one that points North, of any dip."""
     _, north, up = v.mean(axis=1).T
     along = np.where(north > 0.0, np.hypot(north, up), np.abs(up))
     misfit = 1.0 - 2.0 * along / (np.mean(np.sum(v**2, axis=2), axis=1) + 1.0)
@@ -561,23 +563,22 @@ def _without_reference(recording: Recording) -> Iterator[Candidate]:
     Increments P Δθ of proper axes P integrate to P R Pᵀ, so gyro axes P do to a vector's mean what axes Pᵀ of its own sensor do; improper
     ones are those of the inverted gyro, which is integrated by itself.
     """
-    series = {
-        name: vectors
+    windows = {
+        name: found
         for name, vectors in (
             ("accelerometer", recording.specific_force),
             ("magnetometer", recording.magnetic_field),
         )
-        if vectors is not None and _strength(vectors) > 0.0
+        if (found := _windows(recording, vectors)) is not None
     }
+    if not windows:
+        return
     turns = increments(recording)
     for unit, factor in GYRO_UNITS.items():
         changes = (unit,) if unit else ()
         for sign in (1.0, -1.0):
             attitude = coning.integrate(sign * factor * turns)
-            found = {name: _sensor_means(recording, attitude, vectors) for name, vectors in series.items()}
-            means = {name: mean for name, mean in found.items() if mean is not None}
-            if not means:
-                return
+            means = {name: one.means(attitude[one.rows]) for name, one in windows.items()}
             for k, matrix in enumerate(AXES):
                 if np.linalg.det(matrix) * sign > 0.0:
                     axes = dict.fromkeys(means, sign * matrix.T)
@@ -590,9 +591,9 @@ def _without_reference(recording: Recording) -> Iterator[Candidate]:
                         yield _candidate((_axes_change(name, k),), _fixed_misfits(means, axes), "vectors")
 
 
-def _fixed_misfits(means: dict[str, _Means], axes: dict[str, Array]) -> dict[str, float]:
+def _fixed_misfits(means: dict[str, Array], axes: dict[str, Array]) -> dict[str, float]:
     """Return by how much the means fall short of the vectors' strength, and the spread of the angle between two of them."""
-    vectors = {name: mean.vectors(axes[name]) for name, mean in means.items()}
+    vectors = {name: _turned(mean, axes[name]) for name, mean in means.items()}
     length = {name: np.linalg.norm(v, axis=1) for name, v in vectors.items()}
     misfit = {f"gyro and {name}": max(0.0, 1.0 - float(np.mean(size))) for name, size in length.items()}
     if len(vectors) == 2:

@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from strapdown import estimation, quaternion
+from strapdown import estimation
 from strapdown.ahrs.parameters import HAND_HELD, AhrsParameters
 from strapdown.ahrs.preparing import Prepared, prepare
-from strapdown.ahrs.starting import need_accelerometer, quiet_span
+from strapdown.ahrs.starting import Begun, begin
 from strapdown.checks import Array
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.memory import side_by_side
 from strapdown.estimation.schedule import joined
 from strapdown.kernels import recording_steps
 from strapdown.kernels.machine import compiled, read_only
-from strapdown.recordings import Recording, sensor_delays, sensor_faults, unit_calibration
+from strapdown.recordings import Recording, sensor_delays, unit_calibration
 from strapdown.recordings.hard_iron import low_pass
 from strapdown.recordings.recording import sampled
 from strapdown.recordings.sensor_delays import Delays
@@ -75,7 +76,7 @@ class AhrsEstimate:
 
 
 def estimate(
-    recording: Recording,
+    recording: Recording | Begun,
     parameters: AhrsParameters = HAND_HELD,
     *,
     latency: float | None = None,
@@ -89,8 +90,9 @@ def estimate(
 
     Parameters
     ----------
-    recording : Recording
-        Samples of gyro, accelerometer and, if there is one, magnetometer.
+    recording : Recording or Begun
+        Samples of gyro, accelerometer and, if there is one, magnetometer; as :func:`strapdown.ahrs.begin` returns it, where
+        :func:`strapdown.ahrs.motions.chosen` needs that too.
     parameters : AhrsParameters
         The filter's model of the unit and of its motion.
     latency : float, optional
@@ -119,16 +121,13 @@ def estimate(
     InputError
         If there is no accelerometer, a sensor has no valid sample in the quiet second, or the recording is too short.
     """
-    need_accelerometer(recording)
-    span = quiet_span(recording)
-    faults = sensor_faults.find(recording.since(span.start))
+    _, quiet, faults = begin(recording)
     used = faults.recording
     field_delay = None
     if calibration is not None:
         used, field_delay = calibration.applied(used), calibration.magnetometer_delay or None
         if parameters.gyro_scale_sigma > 0.0:
             parameters = replace(parameters, gyro_scale_sigma=calibration.sigma)
-    quiet = slice(0, span.stop - span.start)
     turned = sensor_delays.gyro_attitude(used)
     delays = sensor_delays.find(used, latency, field_delay, causal=not smooth, turned=turned)
     prepared = prepare(used, quiet, parameters, delays.field, causal=not smooth, turned=turned)
@@ -204,45 +203,31 @@ def _at_stamps(
     full_covariance: bool,
 ) -> Estimate:
     """Return the estimate at the recording's stamps: carried on by the gyro from the step before each, and over the delay of the gyro."""
-    edge, turned = prepared.edge, prepared.turned
-    row = np.repeat(np.arange(len(edge)), np.diff(edge, append=len(used.time)))
-    n = len(row)
+    edge, n = prepared.edge, len(used.time)
     attitude, bias, variance = side_by_side(*(((n, width), float) for width in (4, 3, 6)))
-    (own,) = side_by_side(((n, 3, 3), float))
-    filtered.bias.take(row, axis=0, out=bias, mode="clip")  # any other mode copies to a buffer first
+    (P,) = side_by_side(((n if full_covariance else 0, 6, 6), float))
     late = np.broadcast_to(delays.gyro, used.time.shape)
     ahead = -sensor_delays.turn_over(used, -late) if smooth else used.rate * late[:, None]
-    ahead -= bias * (used.time - filtered.time.take(row) + late)[:, None]
-    step = quaternion.multiply(filtered.attitude, quaternion.conjugate(turned[edge]))
-    assert filtered.covariance is not None
-    R = quaternion.to_matrix(filtered.attitude)
-    fixed = R @ filtered.covariance[:, :3, :3] @ R.transpose(0, 2, 1)
-    scale = np.ones((len(fixed), 3))
     level = _level(filtered, _over_steps(turn_variance, edge) > 0.0)
-    scale[:, :2] = np.sqrt(OWN_SHARE + ACCELERATION_SHARE * np.sqrt(level))[:, None]
-    fixed *= scale[:, :, None] * scale[:, None, :]
+    tilt = np.sqrt(OWN_SHARE + ACCELERATION_SHARE * np.sqrt(level))
+    assert filtered.covariance is not None
     iron = 0.0 if prepared.dip is None else (parameters.iron_sigma / np.cos(prepared.dip)) ** 2
+    at_steps = (filtered.attitude, filtered.bias, filtered.variance, filtered.covariance, tilt)
     compiled(recording_steps.carry_to_stamps)(
-        row, step, fixed, turned, ahead, read_only(used.rate), delays.sigma**2, iron, attitude, own
+        recording_steps.Steps(edge, *map(read_only, at_steps)),
+        recording_steps.Stamps(*map(read_only, (used.time, used.rate, prepared.turned, late, ahead))),
+        delays.sigma**2,
+        iron,
+        recording_steps.Carried(attitude, bias, variance, P),
     )
-    filtered.variance.take(row, axis=0, out=variance, mode="clip")
-    variance[:, :3] = np.einsum("kii->ki", own)
-    P = None
-    if full_covariance:
-        P = filtered.covariance.take(row, axis=0)
-        P[:, :3, :3] = own
-        P[:, :3, 3:] = (
-            quaternion.to_matrix(attitude).transpose(0, 2, 1)
-            @ (scale[:, :, None] * (R @ filtered.covariance[:, :3, 3:]))[row]
-        )
-        P[:, 3:, :3] = P[:, :3, 3:].transpose(0, 2, 1)
+    row = functools.partial(np.repeat, np.arange(len(edge)), np.diff(edge, append=n))
     sensors = {"accelerometer": used.specific_force, "magnetometer": used.magnetic_field}
     return Estimate(
         time=used.time,
         attitude=attitude,
         bias=bias,
         variance=variance,
-        covariance=P,
+        covariance=P if full_covariance else None,
         innovations=_innovations(filtered, level),
         skipped={
             name: len(samples) - int(np.count_nonzero(sampled(samples)))
@@ -255,16 +240,14 @@ def _at_stamps(
 
 
 class _OfRows(Mapping[str, ErrorStateEstimate]):
-    """Error states at some of the rows ``row`` (n,), each gathered when it is asked for."""
+    """Error states at the rows that ``row`` returns (n,), each gathered when it is asked for."""
 
-    def __init__(self, states: Mapping[str, ErrorStateEstimate], row: np.ndarray) -> None:
+    def __init__(self, states: Mapping[str, ErrorStateEstimate], row: Callable[[], np.ndarray]) -> None:
         self.states, self.row = states, row
 
     def __getitem__(self, name: str) -> ErrorStateEstimate:
-        block = self.states[name]
-        return replace(
-            block, values=block.values.take(self.row, axis=0), variance=block.variance.take(self.row, axis=0)
-        )
+        block, row = self.states[name], self.row()
+        return replace(block, values=block.values.take(row, axis=0), variance=block.variance.take(row, axis=0))
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.states)

@@ -11,10 +11,11 @@ import math
 import numpy as np
 
 from strapdown import coning
-from strapdown.ahrs import preparing, starting
+from strapdown.ahrs import preparing
 from strapdown.ahrs.parameters import HAND_HELD, MOTIONS, AhrsParameters
+from strapdown.ahrs.starting import Begun, begin, resting_bias
 from strapdown.checks import lengths, one_of
-from strapdown.recordings import Recording, increments, sensor_faults
+from strapdown.recordings import Recording, increments
 from strapdown.units import STANDARD_GRAVITY
 
 AUTO = "auto"
@@ -25,7 +26,7 @@ MIN_ACCELERATION = 0.5
 """RMS acceleration, m/s², of the models of a unit that hardly moves."""
 
 
-def chosen(recording: Recording, motion: str = AUTO, *, name: str = "motion") -> tuple[str, float]:
+def chosen(recording: Recording | Begun, motion: str = AUTO, *, name: str = "motion") -> tuple[str, float]:
     """Return the motion named, or the likelier one, and its log-likelihood beyond that of the other; infinite of the one named.
 
     ``name`` is what the caller calls it.
@@ -37,7 +38,7 @@ def chosen(recording: Recording, motion: str = AUTO, *, name: str = "motion") ->
     return best, found[best] - min(found.values())
 
 
-def likelihoods(recording: Recording) -> dict[str, float]:
+def likelihoods(recording: Recording | Begun) -> dict[str, float]:
     """Return the log-likelihoods of motion by a hand and by a vehicle: of the changes of mean specific force from span to span.
 
     In the frame that the gyro keeps, gravity changes with the error of the gyro alone: of its bias, of its scale, and where it was clipped.
@@ -46,7 +47,7 @@ def likelihoods(recording: Recording) -> dict[str, float]:
 
     Parameters
     ----------
-    recording : Recording
+    recording : Recording or Begun
         With an accelerometer.
 
     Returns
@@ -60,14 +61,11 @@ def likelihoods(recording: Recording) -> dict[str, float]:
     >>> max(found, key=found.get)  # doctest: +SKIP
     'hand'
     """
-    starting.need_accelerometer(recording)
-    span = starting.quiet_span(recording)
-    faults = sensor_faults.find(recording.since(span.start))
+    _, quiet, faults = begin(recording)
     used, force = faults.recording, faults.recording.specific_force
     assert force is not None
-    initial = starting.start(used, slice(0, span.stop - span.start), HAND_HELD)
-    dt = np.diff(used.time)
-    turns = increments(used) - initial.bias * dt[:, None]
+    bias, bias_sigma = resting_bias(used, quiet, HAND_HELD)
+    turns = increments(used) - bias * np.diff(used.time)[:, None]
     turned = coning.integrate(turns)
     steps, number = preparing.averages(force, turned, preparing.edges(used.time, HAND_HELD.step))
     acceleration = max(preparing.liveliest(steps, number > 0.0, HAND_HELD.step), MIN_ACCELERATION)
@@ -76,7 +74,7 @@ def likelihoods(recording: Recording) -> dict[str, float]:
     both = (number[1:] > 0.0) & (number[:-1] > 0.0)
     square = np.sum(np.diff(mean, axis=0) ** 2, axis=1)[both]
     angle = np.add.reduceat(lengths(turns), edge[:-1]) * HAND_HELD.gyro_scale_sigma
-    drift = angle**2 + np.add.reduceat(faults.turn_variance, edge[:-1]) + initial.covariance[3, 3] * SPAN**2
+    drift = angle**2 + np.add.reduceat(faults.turn_variance, edge[:-1]) + bias_sigma**2 * SPAN**2
     own = STANDARD_GRAVITY**2 * (drift[1:] + drift[:-1])[both]
     found = {}
     for name in ("hand", "vehicle"):

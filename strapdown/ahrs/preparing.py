@@ -89,8 +89,11 @@ def prepare(
     ]
     dip, iron = None, np.zeros(3)
     if recording.magnetic_field is not None:
-        back = quaternion.exp(-sensor_delays.turn_over(recording, field_delay)) if np.any(field_delay) else None
-        frame = turned if back is None else quaternion.multiply(turned, back)
+        frame = turned
+        if np.any(field_delay):
+            frame = np.empty_like(turned)
+            over = sensor_delays.turn_over(recording, field_delay)
+            compiled(recording_steps.turn_back)(read_only(turned), read_only(over), frame)
         field, number = averages(recording.magnetic_field, frame, edge)
         samples = headings.FieldSteps(
             field=field,
@@ -148,4 +151,7 @@ def liveliest(force: Array, shown: np.ndarray, step: float) -> float:
     """
     own = force[shown]
     spans = max(1, len(own) // round(LIVELY_SPAN / step))
-    return max(float(np.sqrt(np.mean(np.var(part, axis=0)))) for part in np.array_split(own, spans))
+    number = np.array([len(part) for part in np.array_split(own, spans)])[:, None]
+    begin = np.cumsum(number) - number[:, 0]
+    apart = own - np.repeat(np.add.reduceat(own, begin) / number, number[:, 0], axis=0)
+    return float(np.sqrt(np.max(np.mean(np.add.reduceat(apart**2, begin) / number, axis=1))))

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from strapdown import coning, estimation, quaternion
 from strapdown.ahrs.parameters import AhrsParameters
 from strapdown.checks import Array, InputError, lengths
-from strapdown.recordings import Recording
+from strapdown.recordings import Recording, sensor_faults
+from strapdown.recordings.sensor_faults import Faults
 from strapdown.vectors import wahba
 
 QUIET_SPAN = 1.0
@@ -18,6 +21,31 @@ def need_accelerometer(recording: Recording) -> None:
     """Refuse a recording that does not show the vertical."""
     if recording.specific_force is None:
         raise InputError(f"{recording.source} has no accelerometer, which shows the vertical; add columns ax, ay, az")
+
+
+class Begun(NamedTuple):
+    """A recording, and what every use of it begins with."""
+
+    recording: Recording
+    quiet: slice
+    """Samples of the first quiet second, counted from its first."""
+    faults: Faults
+    """Faults of the samples from there on."""
+
+
+def begin(recording: Recording | Begun) -> Begun:
+    """Return the recording with its first quiet second and the faults from there on; one begun before as it is.
+
+    Raises
+    ------
+    InputError
+        If there is no accelerometer, or the recording is too short.
+    """
+    if isinstance(recording, Begun):
+        return recording
+    need_accelerometer(recording)
+    span = quiet_span(recording)
+    return Begun(recording, slice(0, span.stop - span.start), sensor_faults.find(recording.since(span.start)))
 
 
 def quiet_span(recording: Recording) -> slice:

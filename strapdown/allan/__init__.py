@@ -19,7 +19,6 @@ from strapdown.allan.deviation import allan_deviation as allan_deviation
 from strapdown.allan.deviation import equivalent_degrees_of_freedom as equivalent_degrees_of_freedom
 from strapdown.allan.deviation import flicker_variance as flicker_variance
 from strapdown.allan.deviation import model_deviation as model_deviation
-from strapdown.allan.noise_fit import MISFIT_PROBABILITY as MISFIT_PROBABILITY
 from strapdown.allan.noise_fit import UNITS as UNITS
 from strapdown.allan.noise_fit import NoiseFit as NoiseFit
 from strapdown.allan.noise_fit import curves_by_axis as curves_by_axis

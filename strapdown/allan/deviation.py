@@ -165,12 +165,6 @@ def allan_deviation(
     AllanDeviation
         The deviation of each axis.
 
-    Raises
-    ------
-    InputError
-        If samples are not finite, a τ is outside [sample interval, half the record] (modified and Hadamard: a third), or ``kind``
-        or ``estimator`` is unknown.
-
     Notes
     -----
     The overlapping estimator equals ``allantools.oadev``, the modified one ``allantools.mdev`` and the Hadamard one
@@ -188,6 +182,12 @@ def allan_deviation(
     record, dt, scale = averaged(values, sample_interval, kind)
     checks.one_of("estimator", estimator, ESTIMATORS)
     level = confidence(level)
+    if np.isnan(record).any():
+        if estimator != "overlapping":
+            raise InputError(f"values has gaps (NaN), with which estimator {estimator!r} does not go; leave it out")
+        from strapdown.allan import gaps
+
+        return gaps.allan_deviation(scale * record, dt, taus=taus, level=level)
     samples = record.shape[0]
     multiples = _multiples(taus, samples, dt, _order(estimator))
     deviation = np.empty((record.shape[1], len(multiples)))
@@ -399,10 +399,7 @@ def flicker_variance(multiples: ArrayLike) -> Array:
 
 
 def model_deviation(parameters: Mapping[str, float], taus: ArrayLike, sample_interval: float) -> dict[str, Array]:
-    """Return the Allan deviation (t,), rad/s, of each noise term and of their sum, ``"total"``, at ``taus``, s.
-
-    ``parameters`` are coefficients, SI, by name in :data:`TERMS`; absent ones are zero.
-    """
+    """Return the Allan deviation (t,), rad/s, of each noise term and of their sum, ``"total"``, at ``taus``, s."""
     checks.known_keys("parameters", parameters, TERMS)
     tau = checks.array("taus", taus, ("t",))
     dt = checks.positive("sample_interval", sample_interval, unit="s")
@@ -427,10 +424,10 @@ def confidence(level: float) -> float:
 
 
 def averaged(values: ArrayLike, sample_interval: float, kind: str) -> tuple[Array, float, float]:
-    """Return the record (n, axes), its sample interval, and the factor that makes rates of its values."""
+    """Return the record (n, axes), NaN where a sample is missing, its sample interval, and the factor that makes rates of its values."""
     dt = checks.positive("sample_interval", sample_interval, unit="s")
     checks.one_of("kind", kind, ("rate", "increments"))
-    record = checks.array("values", values, ("n",) if np.ndim(values) == 1 else ("n", "axes"))
+    record = checks.array("values", values, ("n",) if np.ndim(values) == 1 else ("n", "axes"), allow_nan=True)
     if record.ndim == 1:
         record = record[:, None]
     if not 1 <= record.shape[1] <= 3:

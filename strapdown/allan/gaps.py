@@ -1,34 +1,26 @@
-"""Allan deviation and noise coefficients of a record with gaps: samples on an even grid, missing ones NaN.
+"""Allan deviation of a record with gaps: samples on an even grid, missing ones NaN.
 
 Gaps must not depend on the values lost: those of a lost packet do not, those of a sensor that saturates do.
 
-- :func:`allan_deviation` is the wavelet-variance estimator for gappy series of Mondal & Percival ("Wavelet variance analysis for gappy time
-  series", Ann. Inst. Stat. Math. 62, 2010) for the Haar wavelet, whose variance the Allan variance is. With the semivariogram of all pairs
-  of samples that are there, ``V_k = ½⟨(x_{t+k} − x_t)²⟩``, it is ``σ²(m) = −Σ_{k=1}^{2m−1} r_k V_k / m²``, r being the autocorrelation of m
-  times −1 and m times +1. It is unbiased for every noise of the table in :mod:`strapdown.allan`, whatever the gaps, and no sum of squares:
-  where few pairs are left it may come out below zero (6 % of records of white noise at a tenth of the record, a fifth of it lost); the
-  deviation is NaN there and its band unbounded. The band comes from simulated records of the same gaps and the power law at hand.
-- :func:`fit_noise` fits one set of coefficients to the cosine transforms of the segments between gaps: the likelihood within each
-  segment. The differences between the means of segments are not used, so that many short segments contain little information on a
-  random walk. Without a gap it is :func:`strapdown.allan.fit_noise`.
+This is the wavelet-variance estimator for gappy series of Mondal & Percival ("Wavelet variance analysis for gappy time series", Ann. Inst.
+Stat. Math. 62, 2010) for the Haar wavelet, whose variance the Allan variance is. With the semivariogram of all pairs of samples that are
+there, ``V_k = ½⟨(x_{t+k} − x_t)²⟩``, it is ``σ²(m) = −Σ_{k=1}^{2m−1} r_k V_k / m²``, r being the autocorrelation of m times −1 and m times
++1. It is unbiased for every noise of the table in :mod:`strapdown.allan`, whatever the gaps, and no sum of squares: where few pairs are
+left it may come out below zero (6 % of records of white noise at a tenth of the record, a fifth of it lost); the deviation is NaN there and
+its band unbounded. The band comes from simulated records of the same gaps and the power law at hand.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from strapdown import checks
-from strapdown.allan.deviation import NOISE_TYPES, TERMS, AllanDeviation
-from strapdown.allan.noise_fit import NoiseFit, fit_axis, misfit_of, of_axes
-from strapdown.allan.spectrum import Bins, bin_starts, cosine_transform, last_coefficient, mean_power, ramp_coefficients
+from strapdown.allan.deviation import NOISE_TYPES, AllanDeviation
 from strapdown.checks import Array, InputError
 
-SHORTEST = 64
-"""Samples of the shortest segment that a fit uses."""
 SIMULATED = 1 << 12
 """Largest number of samples of a simulated record; several samples of a longer record are one there."""
 RUNS = 400
@@ -38,18 +30,17 @@ WHOLE_RUNS = 50
 
 
 def allan_deviation(
-    values: ArrayLike, sample_interval: float, *, taus: ArrayLike | None = None, level: float = 0.95, seed: int = 0
+    record: Array, dt: float, *, taus: ArrayLike | None = None, level: float = 0.95, seed: int = 0
 ) -> AllanDeviation:
     """Return the Allan deviation of averaged samples with gaps (NaN), estimator ``"gaps"``, and its confidence band.
 
     By default at 12 averaging times a decade, up to a tenth of the record; NaN where too few pairs of samples are that far apart. The band
     comes from simulated records (``seed``).
     """
-    dt = checks.positive("sample_interval", sample_interval, unit="s")
-    if not 0.5 < level < 1.0:
-        raise InputError(f"level is {level:g}; a confidence lies between 0.5 and 1, for example 0.95")
-    record, known = _record(values)
-    samples = len(record)
+    known = np.asarray(~np.isnan(record).any(axis=1))
+    if known.sum() < 3:
+        raise InputError(f"values has {int(known.sum())} samples that are present; an Allan deviation needs at least 3")
+    samples, record = len(record), np.where(known[:, None], record, 0.0)
     wanted = dt * _multiples(samples // 10) if taus is None else taus
     multiples = np.unique(np.rint(np.atleast_1d(checks.array("taus", wanted, (...,))) / dt).astype(np.int64))
     if len(multiples) == 0 or multiples[0] < 1 or multiples[-1] > samples // 2:
@@ -76,16 +67,6 @@ def allan_deviation(
         samples=int(known.sum()),
         sample_interval=dt,
     )
-
-
-def _record(values: ArrayLike) -> tuple[Array, NDArray[np.bool_]]:
-    """Return samples (n, axes), zero where missing, and which are there."""
-    record = checks.array("values", values, ("n",) if np.ndim(values) == 1 else ("n", "axes"), allow_nan=True)
-    record = record[:, None] if record.ndim == 1 else record
-    known = np.asarray(~np.isnan(record).any(axis=1))
-    if known.sum() < 3:
-        raise InputError(f"values has {int(known.sum())} samples that are present; an Allan deviation needs at least 3")
-    return np.where(known[:, None], record, 0.0), known
 
 
 class _Pairs(NamedTuple):
@@ -211,95 +192,3 @@ def _noise(alpha: int, samples: int, random: np.random.Generator) -> Array:
     spectrum[1:] /= np.sqrt(np.arange(1, len(spectrum)))
     spectrum[0] = 0.0
     return np.asarray(irfft(spectrum, size)[:samples])
-
-
-class _Stretch(NamedTuple):
-    """One segment between gaps: its cosine coefficients, and their bins."""
-
-    coefficient: Array
-    starts: NDArray[np.int64]
-    last: int
-    basis: Array
-
-
-def stretches(known: NDArray[np.bool_], shortest: int = SHORTEST) -> list[slice]:
-    """Return the segments of samples between gaps, without those of fewer than ``shortest``."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], known, [False]]).astype(np.int8)))
-    return [slice(int(a), int(b)) for a, b in edges.reshape(-1, 2) if b - a >= shortest]
-
-
-def fit_noise(
-    values: ArrayLike,
-    sample_interval: float,
-    *,
-    terms: Sequence[str] = TERMS,
-    highest_frequency: float | None = None,
-    level: float = 0.95,
-) -> NoiseFit:
-    """Return the noise coefficients of averaged samples with gaps (NaN), with intervals; options as :func:`strapdown.allan.fit_noise`.
-
-    They come from the segments of at least :data:`SHORTEST` samples, which ``samples`` counts; ``misfit_probability`` is that of the worst
-    segment, times their number.
-    """
-    dt = checks.positive("sample_interval", sample_interval, unit="s")
-    record, known = _record(values)
-    places = stretches(known)
-    if not places:
-        raise InputError(f"values has no {SHORTEST} samples in a row without a gap; record with fewer gaps")
-    chosen = tuple(term for term in TERMS if term in {checks.one_of("terms: term", term, TERMS) for term in terms})
-    random_terms = tuple(term for term in chosen if term != "rate_ramp")
-    if not random_terms:
-        raise InputError("terms names no random noise; add one of quantization, angle_random_walk, …")
-    fits, misfits = [], []
-    for axis in range(record.shape[1]):
-        parts = [_stretch(record[place, axis].copy(), dt, random_terms, highest_frequency) for place in places]
-        each, whole = _bins(parts, dt)
-        largest = float(np.abs(record[known, axis]).max())
-        if not np.any(whole.square > (1e-13 * largest) ** 2 * whole.number):
-            raise InputError(
-                f"values, axis {axis}, holds no noise (it is constant or a straight line); pass a recorded sensor"
-            )
-        fit = fit_axis(whole, "rate_ramp" in chosen)
-        fits.append(fit)
-        found = []
-        for part, bins, place in zip(parts, each, places, strict=True):
-            best = fit.best._replace(variance=fit.best.theta @ bins.basis)
-            probability, what = misfit_of(part.coefficient, bins, best, random_terms, part.starts, part.last, dt)
-            found.append(
-                (probability, what if len(places) == 1 else f"in the segment from {place.start * dt:.6g} s {what}")
-            )
-        least = min(found, key=lambda one: one[0])
-        misfits.append((min(1.0, len(found) * least[0]), least[1]))
-    samples = sum(place.stop - place.start for place in places)
-    return of_axes(chosen, fits, misfits, level=level, samples=samples, sample_interval=dt)
-
-
-def _stretch(x: Array, dt: float, random_terms: tuple[str, ...], highest_frequency: float | None) -> _Stretch:
-    samples = len(x)
-    last = last_coefficient(samples, dt, highest_frequency)
-    if highest_frequency is not None and last < 1:
-        raise InputError(
-            f"highest_frequency is {highest_frequency:g} Hz: a segment of {samples} samples has nothing below; raise it"
-        )
-    starts = bin_starts(last)
-    basis = np.stack([mean_power(term, samples, dt, starts, last) for term in random_terms])
-    return _Stretch(cosine_transform(x, 1.0), starts, last, basis)
-
-
-def _bins(parts: Sequence[_Stretch], dt: float) -> tuple[list[Bins], Bins]:
-    """Return the sums over bins of each segment and of all, the lowest frequencies first; one ramp goes through all of them."""
-    ramps = [dt * ramp_coefficients(len(p.coefficient), np.arange(1, p.last + 1)) for p in parts]
-    slope = float(
-        sum(r @ p.coefficient[1 : p.last + 1] for r, p in zip(ramps, parts, strict=True)) / sum(r @ r for r in ramps)
-    )
-    each, frequency = [], []
-    for ramp, part in zip(ramps, parts, strict=True):
-        rest = part.coefficient[1 : part.last + 1] - slope * ramp
-        begin = part.starts - 1
-        sums = [np.add.reduceat(one, begin) for one in (np.ones_like(rest), rest * rest, rest * ramp, ramp * ramp)]
-        each.append(Bins(sums[0], sums[1], sums[2], sums[3], part.basis, slope))
-        frequency.append(part.starts / len(part.coefficient))
-    order = np.argsort(np.concatenate(frequency), kind="stable")
-    number, square, product, ramps_squared = (np.concatenate([one[k] for one in each])[order] for k in range(4))
-    basis = np.concatenate([one.basis for one in each], axis=1)[:, order]
-    return each, Bins(number, square, product, ramps_squared, basis, slope)

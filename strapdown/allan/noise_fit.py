@@ -19,7 +19,7 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -28,29 +28,57 @@ from strapdown import checks, units
 from strapdown.allan.deviation import TERMS, AllanDeviation, averaged, confidence, model_deviation
 from strapdown.allan.spectrum import (
     Bins,
+    Segment,
     bin_slices,
     bin_starts,
     binned,
     cosine_transform,
     expected_power,
-    last_coefficient,
     mean_power,
     ramp_coefficients,
+    segment,
 )
 from strapdown.checks import Array, InputError
 from strapdown.results import Listed, Listing, figure
 
 SYMBOLS = dict(zip(TERMS, "QNBKR", strict=True))
 
-
-UNITS = {
-    "quantization": ("arcsec", units.ARCSECOND),
-    "angle_random_walk": ("°/√h", units.DEGREE_PER_ROOT_HOUR),
-    "bias_instability": ("°/h", units.DEGREE_PER_HOUR),
-    "rate_random_walk": ("°/h/√h", units.DEGREE_PER_HOUR_PER_ROOT_HOUR),
-    "rate_ramp": ("°/h/h", units.DEGREE_PER_HOUR / 3600.0),
+SENSORS = ("gyro", "accelerometer", "magnetometer")
+_MICRO_G = 1e-6 * units.STANDARD_GRAVITY
+UNITS: Mapping[str, Mapping[str, tuple[str, float]]] = {
+    "gyro": {
+        "quantization": ("arcsec", units.ARCSECOND),
+        "angle_random_walk": ("°/√h", units.DEGREE_PER_ROOT_HOUR),
+        "bias_instability": ("°/h", units.DEGREE_PER_HOUR),
+        "rate_random_walk": ("°/h/√h", units.DEGREE_PER_HOUR_PER_ROOT_HOUR),
+        "rate_ramp": ("°/h/h", units.DEGREE_PER_HOUR / 3600.0),
+    },
+    "accelerometer": {
+        "quantization": ("mm/s", 1e-3),
+        "angle_random_walk": ("µg/√Hz", _MICRO_G),
+        "bias_instability": ("µg", _MICRO_G),
+        "rate_random_walk": ("µg/√h", _MICRO_G / 60.0),
+        "rate_ramp": ("µg/h", _MICRO_G / 3600.0),
+    },
+    "magnetometer": {
+        "quantization": ("nT s", 1e-9),
+        "angle_random_walk": ("nT/√Hz", 1e-9),
+        "bias_instability": ("nT", 1e-9),
+        "rate_random_walk": ("nT/√h", 1e-9 / 60.0),
+        "rate_ramp": ("nT/h", 1e-9 / 3600.0),
+    },
 }
-"""Unit at the rim and its factor to SI, for each term."""
+"""Unit at the rim and its factor to SI, for each term of each sensor."""
+NAMES: Mapping[str, Mapping[str, str]] = {
+    "gyro": {},
+    "accelerometer": {
+        "angle_random_walk": "velocity_random_walk",
+        "rate_random_walk": "acceleration_random_walk",
+        "rate_ramp": "acceleration_ramp",
+    },
+    "magnetometer": {"angle_random_walk": "white_noise", "rate_random_walk": "random_walk", "rate_ramp": "ramp"},
+}
+"""Name of a term by sensor, where it differs from that of a gyro."""
 
 
 TERM_COST = 1.5
@@ -69,6 +97,9 @@ SUPPORT_PROBABILITY = 1e-3
 MISFIT_PROBABILITY = 1e-3
 """Value of ``NoiseFit.misfit_probability`` below which the record contains more than the noises."""
 
+
+SHORTEST = 64
+"""Samples of the shortest segment without a gap that a fit uses."""
 
 _STRETCHES = 64
 
@@ -120,23 +151,24 @@ class NoiseFit(Listed):
     sample_interval: float
     sensor: str = "gyro"
 
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What of an axis is no such noise, a sentence each."""
+        return tuple(
+            f"axis {'xyz'[axis]} holds more than such noises: {what} (probability {max(probability, 1e-99):.0e})"
+            for axis, (probability, what) in enumerate(zip(self.misfit_probability, self.misfit, strict=True))
+            if probability < MISFIT_PROBABILITY
+        )
+
     def listing(self) -> Listing:
         """Return the coefficients with their intervals, as a table."""
         rows = []
         for row in table(self):
-            axis, term, seen = int(str(row["axis"])), str(row["term"]), bool(row["supported"])
-            factor = 1.0 if self.sensor == "gyro" else UNITS[term][1]
-            unit = str(row["unit"]) if self.sensor == "gyro" else "SI"
-            estimate, lower, upper = (float(row[end]) * factor for end in ("estimate", "lower", "upper"))  # type: ignore[arg-type]
-            first = (figure(estimate), figure(lower)) if seen else ("not seen", "")
-            rows.append(("xyz"[axis], f"{term} ({row['symbol']})", unit, *first, figure(upper)))
-        notes = [
-            f"axis {'xyz'[axis]} holds more than such noises: {what} (probability {max(probability, 1e-99):.0e})"
-            for axis, (probability, what) in enumerate(zip(self.misfit_probability, self.misfit, strict=True))
-            if probability < MISFIT_PROBABILITY
-        ]
+            seen = (figure(row["estimate"]), figure(row["lower"])) if row["supported"] else ("not seen", "")
+            what = f"{row['term']} ({row['symbol']})"
+            rows.append(("xyz"[row["axis"]], what, row["unit"], *seen, figure(row["upper"])))
         title = f"Noise of the {self.sensor}, {self.samples} samples of {self.sample_interval:.6g} s, {100.0 * self.level:g} % intervals"
-        return Listing(title, ("axis", "term", "unit", "estimate", "from", "to"), rows, notes, left=3)
+        return Listing(title, ("axis", "term", "unit", "estimate", "from", "to"), rows, self.warnings, left=3)
 
 
 def fit_noise(
@@ -153,7 +185,8 @@ def fit_noise(
     Parameters
     ----------
     values : array_like (n,) or (n, axes)
-        Averaged-rate samples, rad/s, or angle increments, rad; at least 64 samples, at most three axes.
+        Averaged-rate samples, rad/s, or angle increments, rad, at most three axes. Missing ones, NaN, must not depend on the values
+        lost; the segments between them of at least 64 samples are used, which ``samples`` of the result counts.
     sample_interval : float
         Sample interval, s.
     kind : {"rate", "increments"}, default "rate"
@@ -171,17 +204,13 @@ def fit_noise(
     NoiseFit
         Coefficients, SI, of each axis.
 
-    Raises
-    ------
-    InputError
-        If samples are not finite, the record has no noise or is too short, or a term is unknown.
-
     Notes
     -----
     The squared DCT-II coefficients of the record, j = 1 … n − 1 at frequency j/(2 n dt), are modelled as independent χ² of one
     degree of freedom around ``Σ θ_i V_i(j)``, θ = (Q², N², B², K²) ≥ 0, V the exact expectation for each noise on a finite record;
     a rate ramp is a mean. Coefficients are pooled in bins of 5 % in frequency. θ maximises the likelihood restricted for the ramp
-    (REML).
+    (REML). In a record with gaps the likelihood is that within each segment: the differences between the means of segments are not used,
+    so that many short ones contain little information on a random walk. ``misfit_probability`` is that of the worst, times their number.
 
     Which terms the sensor has is not known, and where one is absent, at the bound θ = 0 of the model, twice the fall of the
     likelihood of the *other* terms is no χ²: with all terms in the model their upper ends would be too low and their lower ends
@@ -199,33 +228,40 @@ def fit_noise(
     level = confidence(level)
     chosen = tuple(checks.one_of("terms: term", term, TERMS) for term in terms)
     chosen = tuple(term for term in TERMS if term in chosen)
-    if not set(chosen) - {"rate_ramp"}:
-        raise InputError("terms names no random noise; add one of quantization, angle_random_walk, …")
-    samples = record.shape[0]
-    if samples < 64:
-        raise InputError(f"values has {samples} samples; at least 64 are needed to separate the noises")
-    last = last_coefficient(samples, dt, highest_frequency)
-    if highest_frequency is not None and last < 32:
-        raise InputError(f"highest_frequency is {highest_frequency:g} Hz: only {last} coefficients lie below; raise it")
-    starts = bin_starts(last)
     random_terms = tuple(term for term in chosen if term != "rate_ramp")
-    basis = np.stack([mean_power(term, samples, dt, starts, last) for term in random_terms])
+    if not random_terms:
+        raise InputError("terms names no random noise; add one of quantization, angle_random_walk, …")
+    places = without_gaps(np.asarray(~np.isnan(record).any(axis=1)))
+    if not places:
+        raise InputError(
+            f"values has {len(record)} samples; at least {SHORTEST} are needed to separate the noises, in a row without a gap"
+        )
+    segments = [segment(place, dt, random_terms, highest_frequency) for place in places]
+    lasts = [one.last for one in segments]
+    if highest_frequency is not None and (sum(lasts) < 32 or min(lasts) < 1):
+        raise InputError(
+            f"highest_frequency is {highest_frequency:g} Hz: only {sum(lasts)} coefficients lie below; raise it"
+        )
     fits, misfits = [], []
     for axis in range(record.shape[1]):
         rate = record[:, axis]
-        coefficient = cosine_transform(rate, scale)
-        bins = binned(
-            coefficient,
-            basis,
-            starts,
-            axis=axis,
-            largest=scale * float(max(np.max(rate), -np.min(rate))),
-            dt=dt,
-            last=last,
-        )
-        fits.append(fit_axis(bins, "rate_ramp" in chosen))
-        misfits.append(misfit_of(coefficient, bins, fits[-1].best, random_terms, starts, last, dt))
-    return of_axes(chosen, fits, misfits, level=level, samples=samples, sample_interval=dt)
+        coefficients = [cosine_transform(rate[place], scale) for place in places]
+        each, whole = binned(coefficients, segments, dt)
+        largest = scale * float(max(np.nanmax(rate), -np.nanmin(rate)))
+        if not np.any(whole.square > (1e-13 * largest) ** 2 * whole.number):
+            raise InputError(
+                f"values, axis {axis}, holds no noise (it is constant or a straight line); pass a recorded sensor"
+            )
+        fits.append(fit_axis(whole, "rate_ramp" in chosen))
+        misfits.append(_worst_misfit(coefficients, each, fits[-1].best, random_terms, segments, dt))
+    samples = sum(place.stop - place.start for place in places)
+    return _of_axes(chosen, fits, misfits, level=level, samples=samples, sample_interval=dt)
+
+
+def without_gaps(known: NDArray[np.bool_]) -> list[slice]:
+    """Return the segments of samples between gaps, without those of fewer than :data:`SHORTEST`."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], known, [False]]).astype(np.int8)))
+    return [slice(int(a), int(b)) for a, b in edges.reshape(-1, 2) if b - a >= SHORTEST]
 
 
 def expected_errors(parameters: Mapping[str, float], samples: int, sample_interval: float) -> dict[str, float]:
@@ -286,10 +322,7 @@ def to_gyro_parameters(fit: NoiseFit) -> dict[str, float | tuple[float, ...]]:
 
 
 def upper_bounds(fit: NoiseFit) -> dict[str, float | tuple[float, ...]]:
-    """Return the upper ends, SI, by term, one or one an axis, of the intervals of the terms that some axis does not support.
-
-    The record cannot exclude coefficients up to these; a filter that must not be overconfident may use them.
-    """
+    """Return the upper ends, SI, by term, one or one an axis, of the intervals of the terms that some axis does not support."""
     return _by_name(fit, fit.upper, np.asarray(~fit.supported.all(axis=0)))
 
 
@@ -301,24 +334,20 @@ def _by_name(fit: NoiseFit, values: Array, wanted: NDArray[np.bool_]) -> dict[st
     }
 
 
-def table(fit: NoiseFit) -> list[dict[str, object]]:
+def name(sensor: str, term: str) -> str:
+    """Return the name of a term for a sensor."""
+    return NAMES[checks.one_of("sensor", sensor, SENSORS)].get(term, term)
+
+
+def table(fit: NoiseFit) -> list[dict[str, Any]]:
     """Return one row per axis and term for printing, in the units of :data:`UNITS`: estimate, lower and upper (NaN: no such value)."""
-    rows: list[dict[str, object]] = []
+    rows = []
     for axis, i in np.ndindex(*fit.estimate.shape):
         term = fit.terms[i]
-        unit, factor = UNITS[term]
-        rows.append(
-            {
-                "axis": axis,
-                "term": term,
-                "symbol": SYMBOLS[term],
-                "estimate": float(fit.estimate[axis, i] / factor),
-                "lower": float(fit.lower[axis, i] / factor),
-                "upper": float(fit.upper[axis, i] / factor),
-                "unit": unit,
-                "supported": bool(fit.supported[axis, i]),
-            }
-        )
+        unit, factor = UNITS[fit.sensor][term]
+        ends = {end: float(getattr(fit, end)[axis, i] / factor) for end in ("estimate", "lower", "upper")}
+        known = {"unit": unit, "supported": bool(fit.supported[axis, i])}
+        rows.append({"axis": axis, "term": name(fit.sensor, term), "symbol": SYMBOLS[term], **ends, **known})
     return rows
 
 
@@ -360,10 +389,7 @@ def _loss(bins: Bins, theta: Array, slope: float | None, restricted: bool) -> Op
 def _maximise(
     bins: Bins, start: Array, free: NDArray[np.bool_], *, slope: float | None = None, restricted: bool = True
 ) -> Optimum:
-    """Return the most likely theta ≥ 0 by Fisher scoring, each step a non-negative least-squares problem, with step halving.
-
-    Components that are not ``free`` keep their values in ``start``.
-    """
+    """Return the most likely theta ≥ 0 by Fisher scoring, each step a non-negative least-squares problem, with step halving."""
     from scipy.optimize import nnls
 
     held = np.where(free, 0.0, start)
@@ -496,7 +522,7 @@ def _covariance(fit: AxisFit, estimate: Array) -> Array:
     return covariance
 
 
-def of_axes(
+def _of_axes(
     terms: tuple[str, ...],
     fits: Sequence[AxisFit],
     misfits: Sequence[tuple[float, str]],
@@ -538,10 +564,7 @@ def of_axes(
 
 
 def _fit_ramp(fit: AxisFit, level: float) -> tuple[float, float, float]:
-    """Return estimate, lower and upper of the ramp; unsupported: NaN, 0 and a bound on its size.
-
-    The ramp's own interval profiles the unrestricted likelihood: how far K may go to explain the trend is part of it.
-    """
+    """Return estimate, lower and upper of the ramp; unsupported: NaN, 0 and a bound on its size."""
     from scipy.optimize import brentq
     from scipy.stats import chi2
 
@@ -568,22 +591,35 @@ def _fit_ramp(fit: AxisFit, level: float) -> tuple[float, float, float]:
 # Misfit
 
 
-def misfit_of(
-    coefficient: Array,
-    bins: Bins,
+def _worst_misfit(
+    coefficients: Sequence[Array],
+    each: Sequence[Bins],
     best: Optimum,
     random_terms: tuple[str, ...],
-    starts: NDArray[np.int64],
-    last: int,
+    segments: Sequence[Segment],
     dt: float,
+) -> tuple[float, str]:
+    """Return the least probability of :func:`_misfit_of` over the segments, times their number, and its description."""
+    found = []
+    for coefficient, bins, one in zip(coefficients, each, segments, strict=True):
+        own = best._replace(variance=best.theta @ bins.basis)
+        probability, what = _misfit_of(coefficient, bins, own, random_terms, one, dt)
+        where = "" if len(segments) == 1 else f"in the segment from {one.place.start * dt:.6g} s "
+        found.append((probability, where + what))
+    probability, what = min(found, key=lambda one: one[0])
+    return min(1.0, len(found) * probability), what
+
+
+def _misfit_of(
+    coefficient: Array, bins: Bins, best: Optimum, random_terms: tuple[str, ...], one: Segment, dt: float
 ) -> tuple[float, str]:
     """Return the probability of a departure from the fit this large, and its description; overwrites ``coefficient``.
 
     Divided by their fitted sizes and transformed back, the coefficients are a white series of unit variance. A turn or a step of the
     bias, whose spectrum may pass for a random walk's, stands out in it. Of three tests the smallest probability is multiplied by three.
     """
-    samples = len(coefficient)
-    for s in bin_slices(starts, last):
+    samples, last = len(coefficient), one.last
+    for s in bin_slices(one.starts, last):
         j = np.arange(s.start, s.stop)
         variance = np.zeros(len(j))
         for term, theta in zip(random_terms, best.theta, strict=True):

@@ -26,9 +26,9 @@ from typing import Any
 
 import numpy as np
 
-from strapdown import checks, gyro, units
+from strapdown import checks, gyro
 from strapdown.allan import noise_fit
-from strapdown.allan.noise_fit import NoiseFit
+from strapdown.allan.noise_fit import UNITS, NoiseFit, name
 from strapdown.checks import InputError
 
 __all__ = [
@@ -38,59 +38,10 @@ __all__ = [
     "to_toml",
 ]
 
-SENSORS = ("gyro", "accelerometer", "magnetometer")
-_MICRO_G = 1e-6 * units.STANDARD_GRAVITY
-UNITS: Mapping[str, Mapping[str, tuple[str, float]]] = {
-    "gyro": noise_fit.UNITS,
-    "accelerometer": {
-        "quantization": ("mm/s", 1e-3),
-        "angle_random_walk": ("µg/√Hz", _MICRO_G),
-        "bias_instability": ("µg", _MICRO_G),
-        "rate_random_walk": ("µg/√h", _MICRO_G / 60.0),
-        "rate_ramp": ("µg/h", _MICRO_G / 3600.0),
-    },
-    "magnetometer": {
-        "quantization": ("nT s", 1e-9),
-        "angle_random_walk": ("nT/√Hz", 1e-9),
-        "bias_instability": ("nT", 1e-9),
-        "rate_random_walk": ("nT/√h", 1e-9 / 60.0),
-        "rate_ramp": ("nT/h", 1e-9 / 3600.0),
-    },
-}
-"""Unit at the rim and its factor to SI, for each term of each sensor."""
-NAMES: Mapping[str, Mapping[str, str]] = {
-    "gyro": {},
-    "accelerometer": {
-        "angle_random_walk": "velocity_random_walk",
-        "rate_random_walk": "acceleration_random_walk",
-        "rate_ramp": "acceleration_ramp",
-    },
-    "magnetometer": {"angle_random_walk": "white_noise", "rate_random_walk": "random_walk", "rate_ramp": "ramp"},
-}
-"""Name of a term by sensor, where it differs from that of a gyro."""
 _KEYS = {"mm/s": "mm_per_s", "µg/√Hz": "ug_per_sqrt_hz", "µg": "ug", "µg/√h": "ug_per_sqrt_hour", "µg/h": "ug_per_hour"}
 _KEYS |= {"nT s": "nt_s", "nT/√Hz": "nt_per_sqrt_hz", "nT": "nt", "nT/√h": "nt_per_sqrt_hour", "nT/h": "nt_per_hour"}
 PX4_STEP = 0.01
 """s: EKF2_PREDICT_US as PX4 comes."""
-
-
-def name(sensor: str, term: str) -> str:
-    """Return the name of a term for a sensor."""
-    return NAMES[checks.one_of("sensor", sensor, SENSORS)].get(term, term)
-
-
-def table(fit: NoiseFit, sensor: str = "gyro") -> list[dict[str, object]]:
-    """Return one row per axis and term for printing, as :func:`strapdown.allan.table`, in the names and units of a sensor."""
-    checks.one_of("sensor", sensor, SENSORS)
-    rows = noise_fit.table(fit)
-    for row in rows:
-        term = str(row["term"])
-        unit, factor = UNITS[sensor][term]
-        ratio = noise_fit.UNITS[term][1] / factor
-        if sensor != "gyro":
-            row |= {end: float(row[end]) * ratio for end in ("estimate", "lower", "upper")}  # type: ignore[arg-type]
-        row |= {"term": name(sensor, term), "unit": unit}
-    return rows
 
 
 def key(sensor: str, term: str) -> tuple[str, float]:
@@ -98,25 +49,24 @@ def key(sensor: str, term: str) -> tuple[str, float]:
     if sensor == "gyro":
         suffix, factor = gyro.FORM[term][0]
         return f"{term}_{suffix}", factor
-    unit, factor = UNITS[checks.one_of("sensor", sensor, SENSORS)][term]
+    unit, factor = UNITS[checks.one_of("sensor", sensor, noise_fit.SENSORS)][term]
     return f"{name(sensor, term)}_{_KEYS[unit]}", factor
 
 
-def to_toml(fit: NoiseFit, sensor: str = "gyro") -> dict[str, dict[str, Any]]:
+def to_toml(fit: NoiseFit) -> dict[str, dict[str, Any]]:
     """Return a sensor's table for TOML: the terms that are supported, 0 on an axis that does not show one.
 
     Parameters
     ----------
     fit : NoiseFit
         Coefficients of one sensor.
-    sensor : {"gyro", "accelerometer", "magnetometer"}, default "gyro"
-        Kind of the sensor.
 
     Returns
     -------
     dict
         Table with the unit in each key, to six digits; that of a gyro is the input of :func:`strapdown.gyro.read_spec`.
     """
+    sensor = fit.sensor
     rounded: dict[str, Any] = {}
     for term, value in noise_fit.to_gyro_parameters(fit).items():
         factor = key(sensor, term)[1]

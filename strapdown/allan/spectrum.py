@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from strapdown.checks import Array, InputError, positive
+from strapdown.checks import Array, positive
 
 BIN_GROWTH = 1.05
 
@@ -124,21 +125,43 @@ def cosine_transform(values: Array, scale: float) -> Array:
     return np.asarray(coefficient)
 
 
-def binned(
-    coefficient: Array, basis: Array, starts: NDArray[np.int64], *, axis: int, largest: float, dt: float, last: int
-) -> Bins:
-    """Return the sums over bins of coefficients 1 … last; ``largest`` is the record's largest size, against rounding."""
-    low = np.arange(1, min(last, 1 << 20) + 1)
-    ramp = dt * ramp_coefficients(len(coefficient), low)
-    slope = float(ramp @ coefficient[1 : len(low) + 1] / (ramp @ ramp))
-    sums = []
-    for s in bin_slices(starts, last):
-        ramp = dt * ramp_coefficients(len(coefficient), np.arange(s.start, s.stop))
-        rest = coefficient[s] - slope * ramp
-        sums.append((len(rest), rest @ rest, rest @ ramp, ramp @ ramp))
-    count, square, product, ramp_square = np.array(sums, dtype=float).T
-    if not np.any(square > (1e-13 * largest) ** 2 * count):
-        raise InputError(
-            f"values, axis {axis}, holds no noise (it is constant or a straight line); pass a recorded gyro"
-        )
-    return Bins(count, square, product, ramp_square, basis, slope)
+class Segment(NamedTuple):
+    """A segment of a record without a gap: the bins of its cosine coefficients, and the expected square in each of every noise."""
+
+    place: slice
+    starts: NDArray[np.int64]
+    last: int
+    basis: Array
+
+
+def segment(place: slice, dt: float, terms: Sequence[str], highest_frequency: float | None) -> Segment:
+    """Return the bins of a segment of samples."""
+    samples = place.stop - place.start
+    last = last_coefficient(samples, dt, highest_frequency)
+    starts = bin_starts(last)
+    return Segment(place, starts, last, np.stack([mean_power(term, samples, dt, starts, last) for term in terms]))
+
+
+def binned(coefficients: Sequence[Array], segments: Sequence[Segment], dt: float) -> tuple[list[Bins], Bins]:
+    """Return the sums over bins of each segment and of all, the lowest frequencies first; one ramp goes through all segments."""
+    low = [c[1 : min(one.last, 1 << 20) + 1] for c, one in zip(coefficients, segments, strict=True)]
+    ramps = [
+        dt * ramp_coefficients(len(c), np.arange(1, len(part) + 1)) for c, part in zip(coefficients, low, strict=True)
+    ]
+    slope = float(sum(r @ c for r, c in zip(ramps, low, strict=True)) / sum(r @ r for r in ramps))
+    each = []
+    for coefficient, one in zip(coefficients, segments, strict=True):
+        sums = []
+        for s in bin_slices(one.starts, one.last):
+            ramp = dt * ramp_coefficients(len(coefficient), np.arange(s.start, s.stop))
+            rest = coefficient[s] - slope * ramp
+            sums.append((len(rest), rest @ rest, rest @ ramp, ramp @ ramp))
+        number, square, product, ramp_square = np.array(sums, dtype=float).T
+        each.append(Bins(number, square, product, ramp_square, one.basis, slope))
+    frequency = [one.starts / len(c) for c, one in zip(coefficients, segments, strict=True)]
+    order = np.argsort(np.concatenate(frequency), kind="stable")
+    joined = {
+        name: np.concatenate([getattr(bins, name) for bins in each], axis=-1)[..., order]
+        for name in ("number", "square", "product", "ramp", "basis")
+    }
+    return each, Bins(**joined, first_slope=slope)

@@ -27,7 +27,7 @@ import sys
 import traceback
 import warnings
 from collections.abc import Callable
-from typing import Annotated, Any
+from typing import Any
 
 import typer
 
@@ -52,10 +52,10 @@ from strapdown.files.reading import NoDigestWarning
 
 @app.callback(invoke_without_command=True)
 def _about(
-    version: Annotated[bool, typer.Option("--version", help="Print the version and stop.", is_eager=True)] = False,
-    quiet: Annotated[
-        bool, typer.Option("--quiet", help="Show no progress on standard error; may stand after the command too.")
-    ] = False,
+    version: bool = typer.Option(False, "--version", help="Print the version and stop.", is_eager=True),
+    quiet: bool = typer.Option(
+        False, "--quiet", help="Show no progress on standard error; may stand after the command too."
+    ),
 ) -> None:
     if quiet:
         be_quiet()

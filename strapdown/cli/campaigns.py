@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import signal
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import typer
 
+from strapdown.checks import InputError, count
 from strapdown.cli.filters import default_words, filter_of_scenario, own_filter
 from strapdown.cli.terminal import (
-    Tables,
+    TABLES,
     command,
     console,
     counted,
@@ -29,6 +32,7 @@ from strapdown.cli.terminal import (
     writable,
     written,
 )
+from strapdown.files import write_json
 
 if TYPE_CHECKING:
     from types import FrameType
@@ -46,81 +50,62 @@ _CAMPAIGN_SUFFIXES = (".h5", ".hdf5")
 class _Model:
     """Filter and errors; a file of a campaign has its own."""
 
-    filter_file: Annotated[
-        Path | None,
-        typer.Option(
-            "--filter",
-            help="TOML with a table named filter, as `strapdown tune` writes it; or FILE.py:NAME, a filter of your own in a Python file, "
-            "which is executed. Default: the filter that matches the scenario.",
-        ),
-    ] = None
-    gyro: Annotated[
-        Path | None,
-        typer.Option(
-            help="TOML with a table named gyro, a data sheet's: the filter is matched to it, not to the scenario's gyro."
-        ),
-    ] = None
-    dispersions: Annotated[
-        Path | None,
-        typer.Option(
-            help="TOML with a table named dispersions: initial errors and gyro parameters that differ from run to run."
-        ),
-    ] = None
-    seed: Annotated[int | None, typer.Option(help="Seed; the scenario's own if not given.")] = None
-    float32: Annotated[bool, typer.Option("--float32", help="Compute in single precision; with lanes only.")] = False
-    states: Annotated[
-        bool | None,
-        typer.Option(
-            "--states/--no-states",
-            help="With or without a state for each error that the scenario specifies. Default: with them, where there are such errors and "
-            "no filter, --float32 or lanes are asked for.",
-        ),
-    ] = None
+    filter_file: Path | None = typer.Option(
+        None,
+        "--filter",
+        help="TOML with a table named filter, as `strapdown tune` writes it; or FILE.py:NAME, a filter of your own in a Python file, "
+        "which is executed. Default: the filter that matches the scenario.",
+    )
+    gyro: Path | None = typer.Option(
+        None,
+        help="TOML with a table named gyro, a data sheet's: the filter is matched to it, not to the scenario's gyro.",
+    )
+    dispersions: Path | None = typer.Option(
+        None,
+        help="TOML with a table named dispersions: initial errors and gyro parameters that differ from run to run.",
+    )
+    seed: int | None = typer.Option(None, help="Seed; the scenario's own if not given.")
+    float32: bool = typer.Option(False, "--float32", help="Compute in single precision; with lanes only.")
+    states: bool | None = typer.Option(
+        None,
+        "--states/--no-states",
+        help="With or without a state for each error that the scenario specifies. Default: with them, where there are such errors and "
+        "no filter, --float32 or lanes are asked for.",
+    )
 
 
 @dataclass(frozen=True)
 class _Computing:
     """Runs and what computes them."""
 
-    runs: Annotated[int | None, typer.Option(help="Number of runs; 1000, or that of the file resumed.")] = None
-    threads: Annotated[int | None, typer.Option(help="Threads; one a core if not given.")] = None
-    machine: Annotated[
-        str,
-        typer.Option(
-            help="lanes: eight runs at once in vector registers; scalar: any scenario and filter; auto: lanes where they can."
-        ),
-    ] = "auto"
-    chunk: Annotated[int | None, typer.Option(help="Runs between merges and writes; the machine's if not given.")] = (
-        None
+    runs: int | None = typer.Option(None, help="Number of runs; 1000, or that of the file resumed.")
+    threads: int | None = typer.Option(None, help="Threads; one a core if not given.")
+    machine: str = typer.Option(
+        "auto",
+        help="lanes: eight runs at once in vector registers; scalar: any scenario and filter; auto: lanes where they can.",
     )
-    workers: Annotated[int | None, typer.Option(help="Number of processes to use instead of threads (needs Dask).")] = (
-        None
+    chunk: int | None = typer.Option(None, help="Runs between merges and writes; the machine's if not given.")
+    workers: int | None = typer.Option(None, help="Number of processes to use instead of threads (needs Dask).")
+    cluster: str | None = typer.Option(
+        None,
+        help="Compute on the Dask scheduler at this address, tcp://HOST:8786, or tls:// with Dask's certificates configured. Scheduler "
+        "and workers can run any code here (they send pickles): name only one that you trust as you trust your own account.",
     )
-    cluster: Annotated[
-        str | None,
-        typer.Option(
-            help="Compute on the Dask scheduler at this address, tcp://HOST:8786, or tls:// with Dask's certificates configured. Scheduler "
-            "and workers can run any code here (they send pickles): name only one that you trust as you trust your own account."
-        ),
-    ] = None
 
 
 @dataclass(frozen=True)
 class _Output:
     """Output."""
 
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            help="HDF5 file; NAME-montecarlo.h5 after the name, or the TOML file, of the scenario if not given."
-        ),
-    ] = None
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with the file, if it exists.")] = False
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Begin anew although the file exists.")] = False
-    replay: Annotated[
-        int | None, typer.Option(help="Compute this one run again and write it in full detail: record and estimate.")
-    ] = None
-    tables: Tables = None
+    out: Path | None = typer.Option(
+        None, help="HDF5 file; NAME-montecarlo.h5 after the name, or the TOML file, of the scenario if not given."
+    )
+    resume: bool = typer.Option(False, "--resume", help="Go on with the file, if it exists.")
+    overwrite: bool = typer.Option(False, "--overwrite", help="Begin anew although the file exists.")
+    replay: int | None = typer.Option(
+        None, help="Compute this one run again and write it in full detail: record and estimate."
+    )
+    tables: Path | None = TABLES
 
 
 @command
@@ -134,8 +119,6 @@ def montecarlo(
     output: _Output,
 ) -> None:
     """Run a scenario many times through a filter and judge the filter: exit status 0 consistent, 1 not, 2 cannot tell (or bad input)."""
-    from strapdown.checks import InputError
-    from strapdown.files import write_json
     from strapdown.montecarlo import summary
 
     source = Path(scenario)
@@ -165,7 +148,6 @@ def montecarlo(
 
 def _planned(source: Path, scenario: str, model: _Model, machine: str) -> tuple[Campaign | None, Plan]:
     """Return the campaign that a file holds, if it is one's, and the plan."""
-    from strapdown.checks import InputError
     from strapdown.montecarlo import campaign as campaigns
 
     if source.suffix.lower() not in _CAMPAIGN_SUFFIXES:
@@ -182,8 +164,6 @@ def _planned(source: Path, scenario: str, model: _Model, machine: str) -> tuple[
 
 def _check_files(target: Path, *, replaced: bool) -> None:
     """Refuse a file that cannot be written, or a report beside it that is another's; ``replaced``: what is there may be."""
-    from strapdown.checks import InputError
-
     writable("out", target, suffixes=_CAMPAIGN_SUFFIXES)
     beside = target.with_suffix(".json")
     if beside.exists() and not target.exists() and not replaced:
@@ -194,7 +174,6 @@ def _check_files(target: Path, *, replaced: bool) -> None:
 def _computed(plan: Plan, target: Path, name: str, computing: _Computing, output: _Output) -> Campaign:
     """Compute the runs, in threads or on Dask, and write them to the file as they are finished."""
     from strapdown import montecarlo as engine
-    from strapdown.checks import InputError, count
     from strapdown.montecarlo import campaign as campaigns
 
     runs = computing.runs
@@ -268,7 +247,6 @@ def asked_to_stop() -> Iterator[Callable[[], None]]:
 def _plan(scenario: str, model: _Model) -> Plan:
     from strapdown import montecarlo as engine
     from strapdown import workflows
-    from strapdown.checks import InputError
     from strapdown.gyro import read_spec
     from strapdown.setup import matched
 
@@ -301,8 +279,6 @@ def _plan(scenario: str, model: _Model) -> Plan:
 
 def _with_filter(held: Campaign, own: Own, source: Path) -> Campaign:
     """Return a campaign with its filter's code, which its file does not hold."""
-    from strapdown.checks import InputError
-
     if held.plan.setup.estimator != own:
         raise InputError(
             f"{own.name} as its file stands is not the filter of {source}, {held.plan.setup.estimator_name}; take the file as it was, or "
@@ -339,7 +315,6 @@ def _judged(campaign: Campaign) -> Judgement:
 
 def _print_result(campaign: Campaign) -> int:
     """Show the statistics and the verdict; return the exit status."""
-    from strapdown.checks import InputError
     from strapdown.cli.judgement import status_of
     from strapdown.montecarlo import summary
     from strapdown.montecarlo.verdicts import bound_of
@@ -442,9 +417,6 @@ def _replayed(target: Path, run: int) -> list[Path]:
 
 
 def _replay(plan: Plan, run: int, machine: str, target: Path) -> None:
-    import json
-
-    import numpy as np
 
     from strapdown import consistency, setup
     from strapdown import montecarlo as engine

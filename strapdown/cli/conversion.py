@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from strapdown.checks import InputError
 from strapdown.cli.reading import RECORDING_HELP, Layout
 from strapdown.cli.terminal import command, console, writable, written
 
@@ -32,14 +33,13 @@ def convert(
         ),
     ],
     layout: Layout,
-    reference: Annotated[
-        Path | None, typer.Option(help="TUM trajectory whose attitudes become the recording's reference.")
-    ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace OUT if it is there.")] = False,
+    reference: Path | None = typer.Option(
+        None, help="TUM trajectory whose attitudes become the recording's reference."
+    ),
+    force: bool = typer.Option(False, "--force", help="Replace OUT if it is there."),
 ) -> None:
     """Convert a recording, a simulated record or an estimate: IN is recognised by its content, OUT written by its ending."""
     from strapdown import recordings
-    from strapdown.checks import InputError
     from strapdown.records import read_estimate
 
     options = layout.options(source)

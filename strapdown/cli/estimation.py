@@ -7,8 +7,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import typer
 
+from strapdown.checks import InputError, count, non_negative, one_of
 from strapdown.cli.filters import ChosenStates, filter_for
 from strapdown.cli.reading import RECORDING_HELP, Layout
 from strapdown.cli.terminal import (
@@ -25,9 +27,11 @@ from strapdown.cli.terminal import (
     writable,
     written,
 )
+from strapdown.files import reading, usable_folder, write_json
+from strapdown.units import DEGREE, DEGREE_PER_HOUR, DEGREE_PER_HOUR_PER_ROOT_HOUR, DEGREE_PER_ROOT_HOUR
 
 if TYPE_CHECKING:
-    from strapdown.ahrs import AhrsEstimate, AhrsParameters
+    from strapdown.ahrs import AhrsEstimate, AhrsParameters, Begun
     from strapdown.estimation.states import State
     from strapdown.recordings import Recording
     from strapdown.recordings.recordfiles import RecordFile
@@ -57,35 +61,27 @@ ABOUT_IT = ("estimate.html", "estimate.report.json")
 class _Shared:
     """Filter."""
 
-    gyro: Annotated[
-        Path | None,
-        typer.Option(
-            help="TOML with a table named gyro, as `strapdown allan` writes it: the gyro noise of the filter."
-        ),
-    ] = None
-    gate: Annotated[
-        float | None,
-        typer.Option(help="Refuse measurements beyond this quantile (0.999) of chi-squared, and recover."),
-    ] = None
-    robust: Annotated[
-        str | None, typer.Option(help="Weigh measurements by the size of their innovations: huber or student.")
-    ] = None
-    full_covariance: Annotated[
-        bool | None,
-        typer.Option(
-            "--full-covariance/--variances",
-            help="Write whole 6 x 6 covariances, or only their diagonals; whole ones by default where there is a specification or a "
-            "reference attitude.",
-        ),
-    ] = None
-    observability: Annotated[
-        bool,
-        typer.Option("--observability", help="Report how observable each state is, optional ones included."),
-    ] = False
-    smooth: Annotated[
-        bool,
-        typer.Option("--smooth", help="Use the samples after each time too, by the fixed-interval smoother."),
-    ] = False
+    gyro: Path | None = typer.Option(
+        None, help="TOML with a table named gyro, as `strapdown allan` writes it: the gyro noise of the filter."
+    )
+    gate: float | None = typer.Option(
+        None, help="Refuse measurements beyond this quantile (0.999) of chi-squared, and recover."
+    )
+    robust: str | None = typer.Option(
+        None, help="Weigh measurements by the size of their innovations: huber or student."
+    )
+    full_covariance: bool | None = typer.Option(
+        None,
+        "--full-covariance/--variances",
+        help="Write whole 6 x 6 covariances, or only their diagonals; whole ones by default where there is a specification or a "
+        "reference attitude.",
+    )
+    observability: bool = typer.Option(
+        False, "--observability", help="Report how observable each state is, optional ones included."
+    )
+    smooth: bool = typer.Option(
+        False, "--smooth", help="Use the samples after each time too, by the fixed-interval smoother."
+    )
 
     @property
     def robustness(self) -> dict[str, Any]:
@@ -101,33 +97,27 @@ class _Shared:
 class _Specified:
     """With a specification, as in recordings of `strapdown simulate`."""
 
-    filter_file: Annotated[
-        Path | None,
-        typer.Option(
-            "--filter",
-            help="TOML with a table named filter, as `strapdown tune` writes it; by default one that matches.",
-        ),
-    ] = None
-    states: Annotated[
-        bool | None,
-        typer.Option(
-            "--states/--no-states",
-            help="With or without a state for each error in it (scale, misalignment, drift, hard iron, …). By default with them, where "
-            "there are such errors.",
-        ),
-    ] = None
-    state: Annotated[
-        list[str] | None,
-        typer.Option(help="Only this one of those states, such as gyro.scale or SENSOR.bias; may be repeated."),
-    ] = None
-    attitude: Annotated[
-        str | None,
-        typer.Option(help="Initial attitude body to fixed, w,x,y,z; by default from the first measurements."),
-    ] = None
-    from_truth: Annotated[
-        bool, typer.Option("--from-truth", help="With a truth: start there, off by errors drawn from the filter's σ.")
-    ] = False
-    every: Annotated[int, typer.Option(help="Store every n-th filter step.")] = 1
+    filter_file: Path | None = typer.Option(
+        None,
+        "--filter",
+        help="TOML with a table named filter, as `strapdown tune` writes it; by default one that matches.",
+    )
+    states: bool | None = typer.Option(
+        None,
+        "--states/--no-states",
+        help="With or without a state for each error in it (scale, misalignment, drift, hard iron, …). By default with them, where "
+        "there are such errors.",
+    )
+    state: list[str] | None = typer.Option(
+        None, help="Only this one of those states, such as gyro.scale or SENSOR.bias; may be repeated."
+    )
+    attitude: str | None = typer.Option(
+        None, help="Initial attitude body to fixed, w,x,y,z; by default from the first measurements."
+    )
+    from_truth: bool = typer.Option(
+        False, "--from-truth", help="With a truth: start there, off by errors drawn from the filter's σ."
+    )
+    every: int = typer.Option(1, help="Store every n-th filter step.")
 
     @property
     def chosen_states(self) -> ChosenStates:
@@ -139,59 +129,43 @@ class _Specified:
 class _Recorded:
     """Without a specification."""
 
-    motion: Annotated[
-        str | None,
-        typer.Option(
-            help="What moves the unit: hand, of bounded velocity; vehicle, whose acceleration lasts for seconds; auto (default), the "
-            "likelier of both; or any, whose acceleration is white noise, without states for the gyro's scale."
-        ),
-    ] = None
-    latency: Annotated[
-        float | None,
-        typer.Option(
-            help="Delay of the gyro's samples, ms, that of its low-pass; 0: point samples. By default half a sample interval."
-        ),
-    ] = None
-    calibration: Annotated[
-        Path | None,
-        typer.Option(help="calibration.toml of an earlier recording of the same unit; a new one is written."),
-    ] = None
-    temperature: Annotated[
-        Path | None,
-        typer.Option(
-            help="gyro-temperature.toml of `strapdown allan --temperature`, the gyro's bias over temperature, subtracted first; the "
-            "error of its slope is estimated (with --smooth and --observability it becomes a random walk)."
-        ),
-    ] = None
+    motion: str | None = typer.Option(
+        None,
+        help="What moves the unit: hand, of bounded velocity; vehicle, whose acceleration lasts for seconds; auto (default), the "
+        "likelier of both; or any, whose acceleration is white noise, without states for the gyro's scale.",
+    )
+    latency: float | None = typer.Option(
+        None,
+        help="Delay of the gyro's samples, ms, that of its low-pass; 0: point samples. By default half a sample interval.",
+    )
+    calibration: Path | None = typer.Option(
+        None, help="calibration.toml of an earlier recording of the same unit; a new one is written."
+    )
+    temperature: Path | None = typer.Option(
+        None,
+        help="gyro-temperature.toml of `strapdown allan --temperature`, the gyro's bias over temperature, subtracted first; the "
+        "error of its slope is estimated (with --smooth and --observability it becomes a random walk).",
+    )
 
 
 @dataclass(frozen=True, eq=False)
 class _Output:
     """Output."""
 
-    out: Annotated[Path, typer.Option(help="Folder for estimate.h5, errors.json and the figures.")] = Path(
-        "estimate-results"
+    out: Path = typer.Option(Path("estimate-results"), help="Folder for estimate.h5, errors.json and the figures.")
+    to: list[Path] | None = typer.Option(
+        None,
+        help="Write the estimate to this file too, in the format of its ending: .csv, .tsv, .parquet, .tum, .h5, .rrd (Rerun), and of "
+        "a recording .bag, .mcap or .db3 with orientation and covariance filled in; may be repeated.",
     )
-    to: Annotated[
-        list[Path] | None,
-        typer.Option(
-            help="Write the estimate to this file too, in the format of its ending: .csv, .tsv, .parquet, .tum, .h5, .rrd (Rerun), and of "
-            "a recording .bag, .mcap or .db3 with orientation and covariance filled in; may be repeated."
-        ),
-    ] = None
-    euler: Annotated[
-        str | None, typer.Option(help="With --to a table: Euler angles of this sequence, ZYX if not given.")
-    ] = None
-    frame: Annotated[
-        str | None,
-        typer.Option(
-            help="With --to: fixed frame of the output, enu (if not given) or ned; body axes stay as they are."
-        ),
-    ] = None
-    figures: Annotated[
-        bool, typer.Option("--figures", help="Draw the estimate, its states and errors; --format does too.")
-    ] = False
-    form: Annotated[FigureFormat | None, FORMAT] = None
+    euler: str | None = typer.Option(None, help="With --to a table: Euler angles of this sequence, ZYX if not given.")
+    frame: str | None = typer.Option(
+        None, help="With --to: fixed frame of the output, enu (if not given) or ned; body axes stay as they are."
+    )
+    figures: bool = typer.Option(
+        False, "--figures", help="Draw the estimate, its states and errors; --format does too."
+    )
+    form: FigureFormat | None = typer.Option(None, "--format", help=FORMAT.help)
 
     @property
     def drawn_as(self) -> FigureFormat | None:
@@ -218,7 +192,6 @@ def estimate(
     The accelerometer gives the vertical and the magnetometer the heading; where the recording holds its specification, as one of `strapdown
     simulate` does, the filter is matched to that.
     """
-    from strapdown.files import usable_folder
     from strapdown.recordings import is_record
     from strapdown.records import read_attributes
 
@@ -240,8 +213,6 @@ def estimate(
 
 def _check_kind(recording: Path, options: list[str], specified: bool) -> None:
     """Refuse options that need a specification where there is none, and the other way round."""
-    from strapdown.checks import InputError
-
     if options and specified:
         raise InputError(
             f"{options[0]} goes with a recording without a specification; {recording} holds one, of `strapdown simulate`"
@@ -253,12 +224,8 @@ def _check_kind(recording: Path, options: list[str], specified: bool) -> None:
 
 
 def _exports(output: _Output, recording: Path, *, changed: bool) -> Exports:
-    """Return the further files of an estimate; what cannot be written is refused.
-
-    ``changed``: the samples are read in other axes than those of the file.
-    """
+    """Return the further files of an estimate; what cannot be written is refused."""
     from strapdown import recordings
-    from strapdown.checks import InputError, one_of
     from strapdown.records import outputs
 
     frame = None if output.frame is None else one_of("--frame", output.frame.upper(), outputs.FRAMES)
@@ -291,8 +258,6 @@ def _export(exports: Exports, estimate: Estimate, recording: Recording | None) -
 def _estimate_specified(path: Path, shared: _Shared, options: _Specified, output: _Output, exports: Exports) -> None:
     """Run the filter over a recording that holds its specification, report and write its estimate."""
     from strapdown import workflows
-    from strapdown.checks import InputError, count
-    from strapdown.files import reading
     from strapdown.recordings.recordfiles import read_record_file
 
     every = count("every", options.every)
@@ -336,7 +301,6 @@ def _write_specified(
 ) -> list[Path]:
     """Write the estimate and what is known of it, and print its errors; return the files."""
     from strapdown import setup
-    from strapdown.files import write_json
     from strapdown.records import write_estimate
 
     result, truth = run.estimate, run.truth
@@ -362,8 +326,6 @@ def _write_specified(
 
 
 def _say_nis(result: Estimate, path: Path) -> None:
-    import numpy as np
-
     seen = {s: i for s, i in result.innovations.items() if np.sum(i.used)}
     if seen:
         each = ", ".join(f"{np.mean(i.nis[i.used]) / i.innovation.shape[1]:.3g} {s}" for s, i in seen.items())
@@ -373,7 +335,6 @@ def _say_nis(result: Estimate, path: Path) -> None:
 def _observability(out: Path, source: str, record: ImuRecord, chosen: FilterSetup, initial: State) -> Path:
     """Print and write how observable each state is; return the file."""
     from strapdown import setup
-    from strapdown.files import write_json
 
     with progress_bar("observability"):
         shown = setup.observability(record, chosen, initial)
@@ -449,10 +410,7 @@ def _print_states(result: Any, record: ImuRecord) -> dict[str, Any]:
 
 def _start(record: ImuRecord, chosen: FilterSetup, attitude: str | None, from_truth: bool) -> Start | None:
     """Return the start that the options give; None: from the first measurements."""
-    import numpy as np
-
     from strapdown import setup
-    from strapdown.checks import InputError
     from strapdown.setup.for_record import Start, drawn_start
 
     if attitude is not None and from_truth:
@@ -492,10 +450,7 @@ def _print_result(result: Estimate) -> None:
 
 def _errors(result: Estimate, truth: Any) -> dict[str, float]:
     """Return errors and consistency over the second half, degrees and degrees an hour."""
-    import numpy as np
-
     from strapdown import consistency
-    from strapdown.units import DEGREE, DEGREE_PER_HOUR
 
     half = slice(len(result.time) // 2, None)
     error = consistency.errors(result.attitude[half], result.bias[half], truth.attitude[half], truth.bias[half])
@@ -517,23 +472,21 @@ def _estimate_recording(
 ) -> None:
     """Run the filter over a recording: accelerometer as the vertical, magnetometer as the heading."""
     from strapdown import ahrs
-    from strapdown.checks import non_negative, one_of
     from strapdown.consistency import reference_errors
     from strapdown.recordings import unit_calibration
-    from strapdown.units import DEGREE, DEGREE_PER_HOUR_PER_ROOT_HOUR, DEGREE_PER_ROOT_HOUR
 
     motion = one_of("--motion", options.motion or "auto", ("auto", *ahrs.MOTIONS))
     late = None if options.latency is None else 1e-3 * non_negative("--latency", options.latency, unit="ms")
     robustness = shared.robustness
     carried = None if options.calibration is None else unit_calibration.read(options.calibration)
-    source, parameters, motion, odds = _read_recording(recording, layout, motion, shared, options.temperature)
+    begun, parameters, motion, odds = _read_recording(recording, layout, motion, shared, options.temperature)
     with progress_bar("smoothing" if shared.smooth else "filtering"):
         result = ahrs.estimate(
-            source,
+            begun,
             parameters,
             latency=late,
             calibration=carried,
-            full_covariance=source.true_attitude is not None
+            full_covariance=begun.recording.true_attitude is not None
             if shared.full_covariance is None
             else shared.full_covariance,
             smooth=shared.smooth,
@@ -554,7 +507,7 @@ def _estimate_recording(
         paths.append(_observability(out, used.source, result.record, parameters.setup, result.initial))
     if rms is not None:
         paths.append(_rms(out, used.source, rms))
-    paths += _export(exports, result.estimate, source)
+    paths += _export(exports, result.estimate, begun.recording)
     if output.drawn_as is not None:
         frame = _fixed_frame(used)
         paths += _drawn(out, output.drawn_as, result.estimate, used.source, used=used, errors=errors, fixed_frame=frame)
@@ -563,7 +516,7 @@ def _estimate_recording(
 
 def _read_recording(
     recording: Path, layout: dict[str, Any], motion: str, shared: _Shared, temperature: Path | None
-) -> tuple[Recording, AhrsParameters, str, float]:
+) -> tuple[Begun, AhrsParameters, str, float]:
     """Return the recording, its bias over temperature subtracted, the filter's parameters with the noise of the gyro given, and the motion.
 
     With the motion comes its log-likelihood beyond that of the other, infinite where it was given.
@@ -576,7 +529,8 @@ def _read_recording(
     with progress_bar("reading"):
         source = recordings.read(recording, **layout)
     doubt(source, recording)
-    motion, odds = ahrs.motions.chosen(source, motion, name="--motion")
+    begun = ahrs.begin(source)
+    motion, odds = ahrs.motions.chosen(begun, motion, name="--motion")
     parameters = ahrs.MOTIONS[motion]
     if shared.gyro is not None:
         from strapdown import workflows  # which imports much more
@@ -586,7 +540,8 @@ def _read_recording(
     if warm is not None:
         walks = shared.smooth or shared.observability
         source, parameters = ahrs.without_temperature(source, parameters, warm, walks=walks)
-    return source, parameters, motion, odds
+        begun = ahrs.begin(source)
+    return begun, parameters, motion, odds
 
 
 def _fixed_frame(used: Recording) -> str:
@@ -602,7 +557,6 @@ def _write_recording(
 ) -> list[Path]:
     """Write the estimate, its states and the calibration; return the files."""
     from strapdown import setup
-    from strapdown.files import write_json
     from strapdown.recordings import unit_calibration
     from strapdown.records import write_estimate
 
@@ -665,8 +619,6 @@ def _say_recording(result: AhrsEstimate, parameters: AhrsParameters, motion: str
 
 def _rms(out: Path, source: str, rms: dict[str, float]) -> Path:
     """Print and write the RMS errors against the reference, degrees; return the file."""
-    from strapdown.files import write_json
-
     write_json(out / "errors.json", {"source": source, **{f"{name}_rmse_deg": value for name, value in rms.items()}})
     rows = table("RMS error over the movement phase, degrees", *rms, left=0)
     rows.add_row(*(f"{value:.2f}" for value in rms.values()))
@@ -683,10 +635,6 @@ def _rested(parameters: AhrsParameters, result: AhrsEstimate) -> bool:
 
 def _model(moved_by: str, odds: float, parameters: AhrsParameters, result: AhrsEstimate) -> str:
     """Return in words the model of a recording's motion, and the bias that the filter started from."""
-    import numpy as np
-
-    from strapdown.units import DEGREE
-
     if moved_by == "any":
         return "Motion: any, its acceleration modelled as white noise."
     bias, sigma = result.initial.bias / DEGREE, np.sqrt(result.initial.covariance[3, 3]) / DEGREE

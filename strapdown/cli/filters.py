@@ -5,6 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+import numpy as np
+
+from strapdown.checks import InputError
+from strapdown.files import reading
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
@@ -27,8 +32,6 @@ def filter_for(
 ) -> tuple[FilterSetup, list[str]]:
     """Return the filter, and what to say of it: of a file, or matched to the gyro's specification and the record's sensors."""
     from strapdown import setup
-    from strapdown.checks import InputError
-    from strapdown.files import reading
     from strapdown.gyro import read_spec
     from strapdown.setup.for_record import matched_setup, unmodelled_errors
 
@@ -73,8 +76,6 @@ def default_words(names: Sequence[str]) -> str:
 
 def need_angles(filter_file: Path, chosen: FilterSetup, held: RecordFile) -> None:
     """Refuse σ of the record's sensors that cannot be in rad, but where the record's own are as wide."""
-    import numpy as np
-
     from strapdown import setup
 
     fine = {one.sensor: one.kind for one in held.record.vectors if len(one.time) and np.max(one.sigma) <= np.pi}

@@ -6,11 +6,13 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import typer
 
+from strapdown.checks import InputError
 from strapdown.cli.reading import RECORDING_HELP, Layout
 from strapdown.cli.terminal import (
-    Tables,
+    TABLES,
     command,
     console,
     json_target,
@@ -24,6 +26,8 @@ from strapdown.cli.terminal import (
     writable,
     written,
 )
+from strapdown.files import reading
+from strapdown.units import DEGREE, DEGREE_PER_HOUR
 
 if TYPE_CHECKING:
     from strapdown.recordings import Recording
@@ -32,8 +36,8 @@ if TYPE_CHECKING:
 
 @command
 def algorithms(
-    time: Annotated[bool, typer.Option(help="Measure the time a sample takes on this machine (a few seconds).")] = True,
-    tables: Tables = None,
+    time: bool = typer.Option(True, help="Measure the time a sample takes on this machine (a few seconds)."),
+    tables: Path | None = TABLES,
 ) -> None:
     """List the integration algorithms: samples, orders, drift constant, what they need, time a sample."""
     from strapdown import coning
@@ -74,14 +78,11 @@ def algorithms(
 def integrate(
     recording: Annotated[Path, typer.Argument(help=f"Simulated record (HDF5). {RECORDING_HELP}.")],
     layout: Layout,
-    algorithm: Annotated[str, typer.Option(help="Name of the algorithm; see `strapdown algorithms`.")] = "four-sample",
-    out: Annotated[Path, typer.Option(help="HDF5 file for the attitude.")] = Path("attitude.h5"),
+    algorithm: str = typer.Option("four-sample", help="Name of the algorithm; see `strapdown algorithms`."),
+    out: Path = typer.Option(Path("attitude.h5"), help="HDF5 file for the attitude."),
 ) -> None:
     """Integrate a gyro recording to attitude, starting at the true attitude if the file holds it, else at the identity."""
-    import numpy as np
-
     from strapdown import coning, quaternion, recordings, records, workflows
-    from strapdown.files import reading
     from strapdown.recordings import recordfiles
 
     writable("out", out, suffixes=(".h5", ".hdf5"), sources=(recording,))
@@ -132,16 +133,12 @@ def coning_budget(
         Path, typer.Option(help="CSV of vibration lines: frequency_hz, angle_deg[, angle_across_deg, phase_deg].")
     ],
     rate: Annotated[list[float], typer.Option(help="Gyro samples a second, Hz; may be given several times.")],
-    algorithm: Annotated[list[str] | None, typer.Option(help="Algorithm; may be given several times.")] = None,
-    json: Annotated[
-        Path | None, typer.Option(help="Write the table as JSON too, to this file; - for standard output.")
-    ] = None,
-    tables: Tables = None,
+    algorithm: list[str] | None = typer.Option(None, help="Algorithm; may be given several times."),
+    json: Path | None = typer.Option(None, help="Write the table as JSON too, to this file; - for standard output."),
+    tables: Path | None = TABLES,
 ) -> None:
     """Predict the drift that an angular vibration spectrum leaves, for each algorithm and sample rate."""
     from strapdown import coning
-    from strapdown.checks import InputError
-    from strapdown.units import DEGREE, DEGREE_PER_HOUR
 
     json_target(json, psd)
     tables_folder(tables)
@@ -151,24 +148,23 @@ def coning_budget(
         raise InputError(
             f"{psd} holds an amplitude of {largest / DEGREE:.4g}°; that of a vibration is below 90°: check the unit"
         )
-    chosen = {"algorithms": tuple(algorithm)} if algorithm else {}
-    budget = coning.ConingBudget(lines=lines, sample_rates=tuple(rate), **chosen)
+    rows: list[dict[str, Any]] = [
+        {
+            "algorithm": name,
+            "sample_rate_hz": r,
+            "drift_deg_per_hour": coning.vibration_drift(lines, name, r) / DEGREE_PER_HOUR,
+        }
+        for name in algorithm or coning.drift.BUDGETED
+        for r in rate
+    ]
     listing = table(
         f"Drift about the third axis left by {len(lines)} vibration lines, °/h",
         "algorithm",
         *(f"{r:g} Hz" for r in rate),
     )
-    for name in budget.algorithms:
-        listing.add_row(name, *(f"{budget.drift(name, r) / DEGREE_PER_HOUR:.4g}" for r in rate))
+    for k in range(0, len(rows), len(rate)):
+        listing.add_row(rows[k]["algorithm"], *(f"{row['drift_deg_per_hour']:.4g}" for row in rows[k : k + len(rate)]))
     show(listing)
-    rows = [
-        {
-            "algorithm": row["algorithm"],
-            "sample_rate_hz": row["sample_rate"],
-            "drift_deg_per_hour": float(row["drift"]) / DEGREE_PER_HOUR,
-        }
-        for row in budget.rows()
-    ]
     paths = tables_written(tables, "coning budget", rows)
     if json is not None:
         put_json(json, {"lines": len(lines), "budget": rows})

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import typer
 from rich.text import Text
 
+from strapdown.checks import InputError
 from strapdown.cli.filters import no_state_words
 from strapdown.cli.reading import RECORDING_HELP, Layout
 from strapdown.cli.terminal import (
@@ -21,10 +22,12 @@ from strapdown.cli.terminal import (
     progress_bar,
     put_json,
     show,
+    show_listing,
     table,
     writable,
     written,
 )
+from strapdown.files import reading
 
 if TYPE_CHECKING:
     from strapdown.consistency import Judgement
@@ -41,30 +44,23 @@ CONSISTENT, NOT, CANNOT_TELL = 0, 1, 2
 class _Foreign:
     """With a truth: an estimate of any filter."""
 
-    truth: Annotated[
-        Path | None,
-        typer.Option(
-            help="Reference attitudes, of any clock and frames: a simulated record, TUM, EuRoC, CSV, ROS bag. What differs is printed."
-        ),
-    ] = None
-    error_frame: Annotated[
-        str,
-        typer.Option(
-            help="How the covariance is meant, body, fixed or euler (roll, pitch, yaw); find takes what the errors fit."
-        ),
-    ] = "find"
-    align: Annotated[
-        str,
-        typer.Option(
-            help="What is estimated and removed: any of time,fixed,body (frames), or none; auto: a clock's offset, and rotations beyond 5°."
-        ),
-    ] = "auto"
-    aligned: Annotated[
-        Path | None,
-        typer.Option(help="HDF5 file for the estimate as it was judged, which `strapdown report` reads."),
-    ] = None
-    topic: Annotated[str | None, typer.Option(help="Topic of the estimate, where a bag holds several.")] = None
-    truth_topic: Annotated[str | None, typer.Option(help="Topic of the truth, where a bag holds several.")] = None
+    truth: Path | None = typer.Option(
+        None,
+        help="Reference attitudes, of any clock and frames: a simulated record, TUM, EuRoC, CSV, ROS bag. What differs is printed.",
+    )
+    error_frame: str = typer.Option(
+        "find",
+        help="How the covariance is meant, body, fixed or euler (roll, pitch, yaw); find takes what the errors fit.",
+    )
+    align: str = typer.Option(
+        "auto",
+        help="What is estimated and removed: any of time,fixed,body (frames), or none; auto: a clock's offset, and rotations beyond 5°.",
+    )
+    aligned: Path | None = typer.Option(
+        None, help="HDF5 file for the estimate as it was judged, which `strapdown report` reads."
+    )
+    topic: str | None = typer.Option(None, help="Topic of the estimate, where a bag holds several.")
+    truth_topic: str | None = typer.Option(None, help="Topic of the truth, where a bag holds several.")
 
 
 @command
@@ -77,27 +73,24 @@ def check(
         ),
     ],
     foreign: _Foreign,
-    probability: Annotated[
-        float, typer.Option(help="Probability that a right filter passes all tests together, at least.")
-    ] = 0.99,
-    record: Annotated[
-        Path | None, typer.Option(help="Record that an estimate was made from: with it, likely causes are named.")
-    ] = None,
-    filter_file: Annotated[
-        Path | None,
-        typer.Option(
-            "--filter",
-            help="TOML with the table named filter that the estimate was made with; by default that in the estimate.",
-        ),
-    ] = None,
-    json: Annotated[Path | None, typer.Option("--json", help="File for all statistics; - for standard output.")] = None,
+    probability: float = typer.Option(
+        0.99, help="Probability that a right filter passes all tests together, at least."
+    ),
+    record: Path | None = typer.Option(
+        None, help="Record that an estimate was made from: with it, likely causes are named."
+    ),
+    filter_file: Path | None = typer.Option(
+        None,
+        "--filter",
+        help="TOML with the table named filter that the estimate was made with; by default that in the estimate.",
+    ),
+    json: Path | None = typer.Option(None, "--json", help="File for all statistics; - for standard output."),
 ) -> None:
     """Judge whether a filter is consistent: exit status 0 consistent, 1 not, 2 cannot tell (or bad input).
 
     With --record the verdict takes the statistics and the causes that were looked for together. With --truth the estimate may be of any
     filter; clocks and frames are compared first. An estimate from elsewhere without a truth is judged by its innovations, if it has any.
     """
-    from strapdown.checks import InputError
     from strapdown.consistency.bounds import tail
 
     json_target(json, result, record, filter_file, foreign.truth)
@@ -135,7 +128,6 @@ def check(
 def _judged_own(result: Path, probability: float, *, with_record: bool) -> tuple[Judgement, dict[str, Any]]:
     """Judge a result of this package; return the verdict and what the JSON says of it."""
     from strapdown import consistency, records
-    from strapdown.checks import InputError
     from strapdown.report import findings
 
     attributes = records.read_attributes(result)
@@ -175,15 +167,12 @@ def status_of(judgement: Judgement) -> int:
 
 def _is_own(path: Path) -> bool:
     """Return whether a file is, or should be by its name, a result of this package; one that is missing is reported as such."""
-    from strapdown.files import reading
-
     return not path.exists() or path.suffix.lower() in (".h5", ".hdf5") or (path.is_file() and reading.is_hdf5(path))
 
 
 def _judged_foreign(result: Path, options: _Foreign, probability: float) -> tuple[Judgement, dict[str, Any]]:
     """Judge an estimate from elsewhere; return the verdict and what the JSON says of it."""
     from strapdown import consistency
-    from strapdown.checks import InputError
     from strapdown.consistency import foreign
     from strapdown.recordings.attitudes import read_attitudes
     from strapdown.records import write_estimate
@@ -244,23 +233,8 @@ def _show_explanations(found: Checked) -> None:
 
 
 def _show_statistics(judgement: Judgement) -> None:
-    rows = table(
-        "Statistics of the filter against what they are of a right one",
-        "statistic",
-        "of",
-        "value",
-        f"{100.0 * judgement.probability:g} % bounds",
-        "p-value",
-        "samples",
-        "",
-        left=2,
-    )
-    for one in judgement.findings:
-        bounds = f"{one.low:.4g} to {one.high:.4g}" if math.isfinite(one.low) else ""
-        mark = Text("FAIL", style="red") if one.rejected else Text("pass", style="green")
-        rows.add_row(one.name, one.label, f"{one.value:.4g}", bounds, f"{one.p_value:.2g}", f"{one.samples:.4g}", mark)
     if judgement.findings:
-        show(rows)
+        show_listing(judgement.listing(), "Statistics of the filter against what they are of a right one")
         console.print(
             "Each p-value is that of its statistic alone; bounds, pass and FAIL take all together "
             f"(a right filter fails with at most {100.0 * (1.0 - judgement.probability):.2g} %). NIS and NEES are per degree of freedom."
@@ -271,8 +245,6 @@ def _diagnosed(
     result: Path, record: Path, filter_file: Path | None, judgement: Judgement
 ) -> tuple[dict[str, Any], Diagnosis | None]:
     """Show the causes that a record gives evidence of; return them as plain values, and with the verdict by all evidence, if any."""
-    import numpy as np
-
     from strapdown import diagnosis, estimation, records
     from strapdown.recordings import recordfiles
     from strapdown.setup.for_record import unmodelled_errors
@@ -296,11 +268,7 @@ def _diagnosed(
         found = diagnosis.diagnose(
             accepted(held.record, estimate), chosen, initial, probability=judgement.probability, judgement=judgement
         )
-    rows = table("Causes by what they would explain", "cause", "of", "gain", "ln p", "", left=2)
-    for cause in found.considered[:8]:
-        mark = Text("likely", style="red") if cause in found.causes else Text("no")
-        rows.add_row(cause.name, cause.of, f"{cause.gain:.4g}", f"{cause.log_p:.4g}", mark)
-    show(rows)
+    show_listing(found.listing(), "Causes by what they would explain")
     content = {**found.summary(), "without_a_state": list(missing)}
     own = _not_of_the_search(chosen, estimate)
     if own:
@@ -313,7 +281,6 @@ def _diagnosed(
 def _filter_of(result: Path, filter_file: Path | None) -> FilterSetup:
     """Return the setup that an estimate was made with, as a file gives it or as the estimate itself does."""
     from strapdown import records, setup
-    from strapdown.checks import InputError
 
     if filter_file is not None:
         return setup.read_setup(filter_file)
@@ -325,10 +292,6 @@ def _filter_of(result: Path, filter_file: Path | None) -> FilterSetup:
 
 def _need_same(result: Path, estimate: Estimate, path: Path, record: ImuRecord) -> None:
     """Refuse a record that an estimate was not made from."""
-    import numpy as np
-
-    from strapdown.checks import InputError
-
     unknown = sorted(set(estimate.innovations) - {series.sensor for series in record.vectors})
     if unknown or not np.isin(estimate.time, record.time).all():
         what = f"has no sensor {unknown[0]!r}" if unknown else "has other stamps"
@@ -348,9 +311,9 @@ def _not_of_the_search(chosen: FilterSetup, estimate: Estimate) -> str:
 def doctor(
     recording: Annotated[Path, typer.Argument(help=f"{RECORDING_HELP}.")],
     layout: Layout,
-    json: Annotated[
-        Path | None, typer.Option("--json", help="File for the explanations and their scores; - for standard output.")
-    ] = None,
+    json: Path | None = typer.Option(
+        None, "--json", help="File for the explanations and their scores; - for standard output."
+    ),
 ) -> None:
     """Find the conventions that a recording follows, by trying the others: exit status 0 as declared, 1 wrong, 2 cannot tell."""
     from strapdown import recordings

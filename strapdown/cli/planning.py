@@ -6,13 +6,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import typer
 
+from strapdown.checks import InputError, finite, non_negative
 from strapdown.cli.filters import filter_of_scenario
 from strapdown.cli.terminal import (
+    FORMAT,
+    TABLES,
     FigureFormat,
-    Format,
-    Tables,
     command,
     console,
     progress_bar,
@@ -24,6 +26,8 @@ from strapdown.cli.terminal import (
     writable,
     written,
 )
+from strapdown.files import usable_folder, write_json
+from strapdown.units import ARCSECOND, DEGREE, DEGREE_PER_HOUR, STANDARD_GRAVITY
 
 if TYPE_CHECKING:
     from strapdown.covariance import Consider
@@ -31,8 +35,6 @@ if TYPE_CHECKING:
 
 def _named(option: str, values: list[str] | None) -> dict[str, float]:
     """Return the numbers of options NAME=VALUE."""
-    from strapdown.checks import InputError, finite
-
     found = {}
     for text in values or []:
         name, equals, number = text.rpartition("=")
@@ -50,7 +52,6 @@ def _named(option: str, values: list[str] | None) -> dict[str, float]:
 
 def _in_own_units(biases: dict[str, float], sensors: Any) -> dict[str, float]:
     """Return sensor biases in the unit of each sensor's σ, of numbers in nT, m/s² or arcsec."""
-    from strapdown.units import ARCSECOND
     from strapdown.vectors import Accelerometer, Magnetometer
 
     sizes = {sensor.name: {Magnetometer: 1e-9, Accelerometer: 1.0}.get(type(sensor), ARCSECOND) for sensor in sensors}
@@ -61,33 +62,27 @@ def _in_own_units(biases: dict[str, float], sensors: Any) -> dict[str, float]:
 class _Errors:
     """Errors besides those that the filter models."""
 
-    scale_factor: Annotated[float, typer.Option(help="Consider gyro scale factors of this 1σ, ppm.")] = 0.0
-    misalignment: Annotated[float, typer.Option(help="Consider gyro misalignments of this 1σ, mrad.")] = 0.0
-    g_sensitivity: Annotated[float, typer.Option(help="Consider gyro g-sensitivities of this 1σ, °/h/g.")] = 0.0
-    sensor_bias: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="Consider a sensor's bias of this 1σ on each axis, NAME=VALUE: nT, m/s², or arcsec. Repeatable."
-        ),
-    ] = None
-    mounting: Annotated[
-        list[str] | None,
-        typer.Option(help="Consider a sensor turned on the body by this 1σ about each axis, NAME=ARCSEC. Repeatable."),
-    ] = None
-    time_offset: Annotated[
-        list[str] | None, typer.Option(help="Consider a sensor that measures late by this 1σ, NAME=MS. Repeatable.")
-    ] = None
-    attitude_sigma: Annotated[
-        float | None, typer.Option(help="Actual 1σ of the initial attitude, each axis, degrees; else the filter's.")
-    ] = None
-    bias_sigma: Annotated[
-        float | None, typer.Option(help="Actual 1σ of the initial bias, each axis, °/h; else the filter's.")
-    ] = None
+    scale_factor: float = typer.Option(0.0, help="Consider gyro scale factors of this 1σ, ppm.")
+    misalignment: float = typer.Option(0.0, help="Consider gyro misalignments of this 1σ, mrad.")
+    g_sensitivity: float = typer.Option(0.0, help="Consider gyro g-sensitivities of this 1σ, °/h/g.")
+    sensor_bias: list[str] | None = typer.Option(
+        None, help="Consider a sensor's bias of this 1σ on each axis, NAME=VALUE: nT, m/s², or arcsec. Repeatable."
+    )
+    mounting: list[str] | None = typer.Option(
+        None, help="Consider a sensor turned on the body by this 1σ about each axis, NAME=ARCSEC. Repeatable."
+    )
+    time_offset: list[str] | None = typer.Option(
+        None, help="Consider a sensor that measures late by this 1σ, NAME=MS. Repeatable."
+    )
+    attitude_sigma: float | None = typer.Option(
+        None, help="Actual 1σ of the initial attitude, each axis, degrees; else the filter's."
+    )
+    bias_sigma: float | None = typer.Option(
+        None, help="Actual 1σ of the initial bias, each axis, °/h; else the filter's."
+    )
 
     def check(self) -> None:
         """Refuse negative σ, in the unit that they were given in."""
-        from strapdown.checks import non_negative
-
         units = {"scale_factor": "ppm", "misalignment": "mrad", "g_sensitivity": "°/h/g"}
         for name, unit in (units | {"attitude_sigma": "degrees", "bias_sigma": "°/h"}).items():
             non_negative("--" + name.replace("_", "-"), getattr(self, name) or 0.0, unit=unit)
@@ -95,7 +90,6 @@ class _Errors:
     def considered(self, sensors: Any) -> Consider:
         """Return the errors in SI, for a scenario's sensors."""
         from strapdown.covariance import Consider
-        from strapdown.units import ARCSECOND, DEGREE_PER_HOUR, STANDARD_GRAVITY
 
         return Consider(
             scale_factor=1e-6 * self.scale_factor,
@@ -111,24 +105,20 @@ class _Errors:
 def covariance(
     scenario: Annotated[str, typer.Argument(help="Name of a built-in scenario, or a TOML file.")],
     errors: _Errors,
-    filter_file: Annotated[
-        Path | None,
-        typer.Option(
-            "--filter",
-            help="TOML with a table named filter, as `strapdown tune` writes it; without it the filter that matches the scenario.",
-        ),
-    ] = None,
-    epochs: Annotated[int, typer.Option(help="Epochs over the scenario's time.")] = 100,
-    out: Annotated[Path, typer.Option(help="Folder for covariance.json and the figure.")] = Path("covariance-results"),
-    form: Format = FigureFormat.png,
-    tables: Tables = None,
+    filter_file: Path | None = typer.Option(
+        None,
+        "--filter",
+        help="TOML with a table named filter, as `strapdown tune` writes it; without it the filter that matches the scenario.",
+    ),
+    epochs: int = typer.Option(100, help="Epochs over the scenario's time."),
+    out: Path = typer.Option(Path("covariance-results"), help="Folder for covariance.json and the figure."),
+    form: FigureFormat = FORMAT,
+    tables: Path | None = TABLES,
 ) -> None:
     """Predict a filter's errors and their budget by source, in one pass without noise."""
     from strapdown import covariance as analysis
     from strapdown import plots, setup
-    from strapdown.files import usable_folder, write_json
     from strapdown.plots.style import save_as
-    from strapdown.units import DEGREE, DEGREE_PER_HOUR
 
     errors.check()
     chosen = scenario_named(scenario)
@@ -160,11 +150,9 @@ def covariance(
 
 
 def _print_result(name: str, found: Any, integration: str, *, matched: bool) -> None:
-    import numpy as np
 
     from strapdown.covariance import LARGEST_LINEAR
     from strapdown.plots.style import angle_unit, rate_unit
-    from strapdown.units import DEGREE
 
     rms, sigma = found.rms[-1], found.filter_sigma[-1]
     unit, size = angle_unit(np.concatenate([rms[:3], sigma[:3]]))
@@ -216,10 +204,6 @@ def _print_result(name: str, found: Any, integration: str, *, matched: bool) -> 
 
 def _summary(name: str, found: Any) -> dict[str, Any]:
     """Return the analysis for JSON, units in the key names."""
-    import numpy as np
-
-    from strapdown.units import ARCSECOND, DEGREE_PER_HOUR
-
     units = np.array([ARCSECOND] * 3 + [DEGREE_PER_HOUR] * 3)
 
     def parts(values: Any) -> dict[str, Any]:

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import typer
 
+from strapdown.checks import InputError, one_of
 from strapdown.cli.terminal import given
 
 RECORDING_HELP = (
@@ -21,26 +22,18 @@ RECORDING_HELP = (
 class Samples:
     """Layout of the recording."""
 
-    gyro_unit: Annotated[str | None, typer.Option(help="Table: unit of the gyro, rad/s, deg/s, mrad/s or mdeg/s.")] = (
-        None
+    gyro_unit: str | None = typer.Option(None, help="Table: unit of the gyro, rad/s, deg/s, mrad/s or mdeg/s.")
+    accelerometer_unit: str | None = typer.Option(None, help="Table: unit of the accelerometer, m/s2, g or mg.")
+    magnetometer_unit: str | None = typer.Option(None, help="Table: unit of the magnetometer, T, mT, uT, nT, G or mG.")
+    time_unit: str | None = typer.Option(None, help="Table: unit of the time, s, ms, us or ns.")
+    columns: str | None = typer.Option(
+        None,
+        metavar="ROLE=NAME,…",
+        help="Table: its columns where they are not the usual ones, unit in parentheses: time=timestamp(us),gx=gyro_x(dps),gy=….",
     )
-    accelerometer_unit: Annotated[str | None, typer.Option(help="Table: unit of the accelerometer, m/s2, g or mg.")] = (
-        None
+    topic: str | None = typer.Option(
+        None, help="Bag or flight log: topic of the inertial unit, where there are several."
     )
-    magnetometer_unit: Annotated[
-        str | None, typer.Option(help="Table: unit of the magnetometer, T, mT, uT, nT, G or mG.")
-    ] = None
-    time_unit: Annotated[str | None, typer.Option(help="Table: unit of the time, s, ms, us or ns.")] = None
-    columns: Annotated[
-        str | None,
-        typer.Option(
-            metavar="ROLE=NAME,…",
-            help="Table: its columns where they are not the usual ones, unit in parentheses: time=timestamp(us),gx=gyro_x(dps),gy=….",
-        ),
-    ] = None
-    topic: Annotated[
-        str | None, typer.Option(help="Bag or flight log: topic of the inertial unit, where there are several.")
-    ] = None
 
     @property
     def units(self) -> dict[str, str]:
@@ -51,7 +44,6 @@ class Samples:
     def options(self, path: Path) -> dict[str, Any]:
         """Return the options of :func:`strapdown.recordings.read` that are given; a simulated record takes none of them."""
         from strapdown import recordings
-        from strapdown.checks import InputError
 
         if recordings.is_record(path):
             for option in given(self):
@@ -70,26 +62,21 @@ class Samples:
 class Layout(Samples):
     """Layout of the recording."""
 
-    axes: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="[SENSOR=]AXES",
-            help="Recorded axes that become the body's x, y, z: x,-y,-z of a unit whose z axis points down, magnetometer=y,x,-z of one "
-            "sensor; may be repeated.",
-        ),
-    ] = None
-    invert: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="SENSOR",
-            help="Sensor of inverted sign: accelerometer (of one that reads -g upward at rest), magnetometer or gyro; may be repeated.",
-        ),
-    ] = None
+    axes: list[str] | None = typer.Option(
+        None,
+        metavar="[SENSOR=]AXES",
+        help="Recorded axes that become the body's x, y, z: x,-y,-z of a unit whose z axis points down, magnetometer=y,x,-z of one "
+        "sensor; may be repeated.",
+    )
+    invert: list[str] | None = typer.Option(
+        None,
+        metavar="SENSOR",
+        help="Sensor of inverted sign: accelerometer (of one that reads -g upward at rest), magnetometer or gyro; may be repeated.",
+    )
 
     def options(self, path: Path) -> dict[str, Any]:
         """Return the options of :func:`strapdown.recordings.read` that are given; a simulated record takes none of them."""
         from strapdown import recordings
-        from strapdown.checks import one_of
 
         found = super().options(path)
         if self.axes:
@@ -102,7 +89,6 @@ class Layout(Samples):
 def _axes(texts: Sequence[str]) -> str | dict[str, str]:
     """Return the axes of the whole unit, or those of sensors by name."""
     from strapdown import recordings
-    from strapdown.checks import InputError, one_of
 
     single = {}
     for text in texts:

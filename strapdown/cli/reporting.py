@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from strapdown.cli.terminal import command, console, progress_bar, writable, written
+from strapdown.files.reading import existing_file
 
 
 @command
@@ -15,16 +16,15 @@ def report(
     result: Annotated[
         Path, typer.Argument(help="HDF5 file of `strapdown estimate` or `montecarlo`, or the JSON of `strapdown tune`.")
     ],
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="The page, .html; beside the result, of its name, if not given.")
-    ] = None,
-    probability: Annotated[
-        float, typer.Option(help="That a right filter is not called wrong by any test, between 0 and 1.")
-    ] = 0.99,
+    out: Path | None = typer.Option(
+        None, "--out", "-o", help="The page, .html; beside the result, of its name, if not given."
+    ),
+    probability: float = typer.Option(
+        0.99, help="That a right filter is not called wrong by any test, between 0 and 1."
+    ),
 ) -> None:
     """Write a self-contained HTML page about a result: verdict in words, numbers, figures, how to reproduce it; the statistics as JSON."""
     from strapdown import report as reports
-    from strapdown.files.reading import existing_file
 
     existing_file(result)
     page = result.with_suffix(".html") if out is None else out

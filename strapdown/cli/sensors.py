@@ -2,29 +2,33 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import typer
 
+from strapdown.checks import InputError, count, one_of, positive
 from strapdown.cli.reading import RECORDING_HELP, Samples
 from strapdown.cli.terminal import (
+    FORMAT,
+    TABLES,
     FigureFormat,
-    Format,
-    Tables,
     command,
     console,
     need_own,
     progress_bar,
     scenario_named,
     show,
+    show_listing,
     table,
     tables_folder,
     tables_written,
     writable,
     written,
 )
+from strapdown.files import plain, usable_folder, write_json, written_beside
 
 if TYPE_CHECKING:
     from strapdown import allan as identification
@@ -48,17 +52,12 @@ def scenarios() -> None:
 @command
 def simulate(
     scenario: Annotated[str, typer.Argument(help="Name of a built-in scenario, or a TOML file.")],
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            help="HDF5 file, or CSV by its suffix; by default .h5 after the name, or the TOML file, of the scenario."
-        ),
-    ] = None,
-    seed: Annotated[int | None, typer.Option(help="Seed; the scenario's own if not given.")] = None,
-    run: Annotated[int, typer.Option(help="Number of the run of this seed.")] = 0,
-    show: Annotated[
-        bool, typer.Option(help="Print the scenario as TOML, to start a file of one's own, and stop.")
-    ] = False,
+    out: Path | None = typer.Option(
+        None, help="HDF5 file, or CSV by its suffix; by default .h5 after the name, or the TOML file, of the scenario."
+    ),
+    seed: int | None = typer.Option(None, help="Seed; the scenario's own if not given."),
+    run: int = typer.Option(0, help="Number of the run of this seed."),
+    show: bool = typer.Option(False, help="Print the scenario as TOML, to start a file of one's own, and stop."),
 ) -> None:
     """Simulate a scenario: a record with its truth."""
     from strapdown import scenarios as catalogue
@@ -104,33 +103,28 @@ def simulate(
 class _Identification:
     """Identification."""
 
-    rate: Annotated[float | None, typer.Option(help="Samples a second, Hz; for NPY.")] = None
-    highest_frequency: Annotated[
-        float | None,
-        typer.Option(help="Hz; the fit leaves out what lies above: a low-pass filter's shape, vibration."),
-    ] = None
-    robust: Annotated[
-        bool, typer.Option(help="Deviation by medians, which outliers hardly change; the fit is not affected.")
-    ] = False
-    temperature: Annotated[
-        int | None,
-        typer.Option(
-            metavar="ORDER",
-            help="Regress the bias on the recorded temperature, by a polynomial of this order, and identify the noise of what is left.",
-        ),
-    ] = None
+    rate: float | None = typer.Option(None, help="Samples a second, Hz; for NPY.")
+    highest_frequency: float | None = typer.Option(
+        None, help="Hz; the fit leaves out what lies above: a low-pass filter's shape, vibration."
+    )
+    robust: bool = typer.Option(
+        False, help="Deviation by medians, which outliers hardly change; the fit is not affected."
+    )
+    temperature: int | None = typer.Option(
+        None,
+        metavar="ORDER",
+        help="Regress the bias on the recorded temperature, by a polynomial of this order, and identify the noise of what is left.",
+    )
 
 
 @dataclass(frozen=True, eq=False)
 class _Exports:
     """Files for other programs."""
 
-    kalibr: Annotated[bool, typer.Option("--kalibr", help="Write imu.yaml too; needs gyro and accelerometer.")] = False
-    factor: Annotated[float, typer.Option(help="Factor on the noise in imu.yaml; 5 to 10 are usual.")] = 1.0
-    px4: Annotated[bool, typer.Option("--px4", help="Write px4.params of EKF2 too; needs gyro and accelerometer.")] = (
-        False
-    )
-    matlab: Annotated[bool, typer.Option("--matlab", help="Write imu_sensor.m, for imuSensor, too.")] = False
+    kalibr: bool = typer.Option(False, "--kalibr", help="Write imu.yaml too; needs gyro and accelerometer.")
+    factor: float = typer.Option(1.0, help="Factor on the noise in imu.yaml; 5 to 10 are usual.")
+    px4: bool = typer.Option(False, "--px4", help="Write px4.params of EKF2 too; needs gyro and accelerometer.")
+    matlab: bool = typer.Option(False, "--matlab", help="Write imu_sensor.m, for imuSensor, too.")
 
     @property
     def files(self) -> list[str]:
@@ -140,8 +134,6 @@ class _Exports:
 
     def check(self, sensors: list[str]) -> None:
         """Refuse files that need another sensor, and a factor that is none."""
-        from strapdown.checks import InputError, positive
-
         if (self.kalibr or self.px4) and not {"gyro", "accelerometer"} <= set(sensors):
             raise InputError("--kalibr and --px4 need both: --sensor gyro --sensor accelerometer")
         positive("--factor", self.factor)
@@ -149,7 +141,6 @@ class _Exports:
     def write(self, fits: dict[str, identification.NoiseFit], out: Path, source: str, topic: str | None) -> None:
         """Write the files that are asked for."""
         from strapdown.allan import parameters
-        from strapdown.files import written_beside
 
         made = {
             "imu.yaml": lambda: parameters.to_kalibr(fits, factor=self.factor, topic=topic or "/imu0", source=source),
@@ -169,9 +160,9 @@ class _Exports:
 class _Output:
     """Output."""
 
-    out: Annotated[Path, typer.Option(help="Folder for gyro.toml, allan.json and the figure.")] = Path("allan-results")
-    form: Format = FigureFormat.png
-    tables: Tables = None
+    out: Path = typer.Option(Path("allan-results"), help="Folder for gyro.toml, allan.json and the figure.")
+    form: FigureFormat = FORMAT
+    tables: Path | None = TABLES
 
 
 @command
@@ -184,19 +175,16 @@ def allan(
     options: _Identification,
     exports: _Exports,
     output: _Output,
-    sensor: Annotated[
-        list[str] | None,
-        typer.Option(help="gyro (if not given), accelerometer or magnetometer; may be repeated."),
-    ] = None,
+    sensor: list[str] | None = typer.Option(
+        None, help="gyro (if not given), accelerometer or magnetometer; may be repeated."
+    ),
 ) -> None:
     """Identify a sensor's noise from a recording at rest: Allan deviation, fitted coefficients, specification as TOML."""
-    from strapdown.allan import parameters as noise_parameters
-    from strapdown.checks import count, one_of
-    from strapdown.files import usable_folder
+    from strapdown.allan.noise_fit import SENSORS
 
     chosen = list(dict.fromkeys(sensor or ["gyro"]))
     for one in chosen:
-        one_of("--sensor", one, noise_parameters.SENSORS)
+        one_of("--sensor", one, SENSORS)
     exports.check(chosen)
     if options.temperature is not None:
         count("--temperature", options.temperature)
@@ -226,14 +214,8 @@ def _identify(
     recording: Path, sensor: str, layout: dict[str, Any], options: _Identification, output: _Output
 ) -> identification.NoiseFit:
     """Identify one sensor, print and write what was found."""
-    import numpy as np
-
     from strapdown import allan as identification
     from strapdown import plots, recordings
-    from strapdown.allan import gaps as allan_gaps
-    from strapdown.allan import parameters as noise_parameters
-    from strapdown.checks import InputError
-    from strapdown.files import written_beside
     from strapdown.plots.style import save_as
 
     out, (specification, numbers, figure_name, _) = output.out, _names(sensor, output.form)
@@ -248,9 +230,16 @@ def _identify(
         if options.temperature is not None:
             values = _regressed(recording, sensor, source, options.temperature, out, paths)
         with progress_bar("fit, deviation, figure", 3) as advance:
-            fit, deviation = _fitted(values, source, options, gaps=gaps)
+            fit = identification.fit_noise(
+                values, source.sample_interval, kind=source.kind, highest_frequency=options.highest_frequency
+            )
+            fit = replace(fit, sensor=sensor)
+            estimator = "robust" if options.robust else "overlapping"
+            deviation = identification.allan_deviation(
+                values, source.sample_interval, kind=source.kind, estimator=estimator
+            )
             advance(2)
-            figure = plots.allan_overview(deviation, fit, identification.curves_by_axis(fit, deviation), sensor=sensor)
+            figure = plots.allan_overview(deviation, fit)
             advance(1)
     except InputError as error:
         raise InputError(f"{recording.name}: {error}") from None
@@ -260,24 +249,21 @@ def _identify(
     for remark in source.remarks:
         console.print(remark)
     if gaps:
+        shortest = identification.noise_fit.SHORTEST
         console.print(
-            f"With gaps: the fit uses {fit.samples} samples in stretches of {allan_gaps.SHORTEST} or more, the deviation all there are."
+            f"With gaps: the fit uses {fit.samples} samples in stretches of {shortest} or more, the deviation all there are."
         )
-    rows = noise_parameters.table(fit, sensor)
-    _show_coefficients(rows)
-    warnings = [
-        f"axis {'xyz'[axis]} holds more than such noises: {what} (probability {max(probability, 1e-99):.0e})"
-        for axis, (probability, what) in enumerate(zip(fit.misfit_probability, fit.misfit, strict=True))
-        if probability < identification.MISFIT_PROBABILITY
-    ]
+    rows = identification.table(fit)
+    show_listing(fit.listing(), f"Noise coefficients with {100.0 * fit.level:g} % intervals")
+    console.print("Of a term not seen in this record, the last column bounds what it could hide.")
     with written_beside(out / specification) as temporary:
-        temporary.write_text(_specification(fit, f"{recording.name}, {length}", warnings, sensor), encoding="utf-8")
-    _write_numbers(out / numbers, recording.name, fit, deviation, rows, sensor)
+        temporary.write_text(_specification(fit, f"{recording.name}, {length}"), encoding="utf-8")
+    _write_numbers(out / numbers, recording.name, fit, deviation, rows)
     paths += save_as({out / figure_name: figure}, output.form)
     written(out / specification, out / numbers, *paths, *tables_written(output.tables, "allan", rows, sensor))
-    for warning in warnings:
+    for warning in fit.warnings:
         console.print(f"warning: {warning}", highlight=False)
-    if warnings:
+    if fit.warnings:
         console.print(
             f"Cut the recording to where the {sensor} rests, or leave a filter's band out by --highest-frequency."
         )
@@ -285,39 +271,8 @@ def _identify(
     return fit
 
 
-def _fitted(
-    values: Any, source: GyroSamples, options: _Identification, *, gaps: bool
-) -> tuple[identification.NoiseFit, identification.AllanDeviation]:
-    """Return the noise coefficients and the Allan deviation of samples, which may have gaps."""
-    from strapdown import allan as identification
-    from strapdown.allan import gaps as allan_gaps
-
-    interval, highest = source.sample_interval, options.highest_frequency
-    if gaps:
-        fit = allan_gaps.fit_noise(values, interval, highest_frequency=highest)
-        return fit, allan_gaps.allan_deviation(values, interval)
-    fit = identification.fit_noise(values, interval, kind=source.kind, highest_frequency=highest)
-    estimator = "robust" if options.robust else "overlapping"
-    return fit, identification.allan_deviation(values, interval, kind=source.kind, estimator=estimator)
-
-
-def _show_coefficients(rows: list[dict[str, Any]]) -> None:
-    listing = table("Noise coefficients with 95 % intervals", "axis", "term", "unit", "estimate", "from", "to", left=3)
-    for row in rows:
-        estimate = f"{row['estimate']:.4g}" if row["supported"] else "not seen"
-        lower = f"{row['lower']:.4g}" if row["supported"] else ""
-        term = f"{row['term']} ({row['symbol']})"
-        listing.add_row("xyz"[int(row["axis"])], term, str(row["unit"]), estimate, lower, f"{row['upper']:.4g}")
-    show(listing)
-    console.print("Of a term not seen in this record, the last column bounds what it could hide.")
-
-
 def _plausible(recording: Path, sensor: str, source: GyroSamples) -> None:
     """Refuse samples that no sensor gives, from which squares would leave the range of doubles."""
-    import numpy as np
-
-    from strapdown.checks import InputError
-
     if source.values.shape[1] not in (1, 3):
         raise InputError(
             f"{recording.name} has {source.values.shape[1]} columns; a {sensor} has three axes, or pass one column, (n,) or (n, 1)"
@@ -334,12 +289,9 @@ def _plausible(recording: Path, sensor: str, source: GyroSamples) -> None:
 
 def _regressed(recording: Path, sensor: str, source: GyroSamples, order: int, out: Path, paths: list[Path]) -> Any:
     """Return the samples without their dependence on temperature, which is printed and written."""
-    import numpy as np
     import tomli_w
 
     from strapdown.allan import temperature as allan_temperature
-    from strapdown.checks import InputError
-    from strapdown.files import written_beside
     from strapdown.gyro.temperature import STEM, BiasOverTemperature, to_table
 
     if source.temperature is None:
@@ -379,30 +331,22 @@ def _write_numbers(
     source: str,
     fit: identification.NoiseFit,
     deviation: identification.AllanDeviation,
-    rows: list[dict[str, object]],
-    sensor: str,
+    rows: list[dict[str, Any]],
 ) -> None:
-    """Write coefficients and deviation as JSON, which has no word for NaN."""
-    import math
-
-    from strapdown.files import write_json
-
-    number = lambda value: None if isinstance(value, float) and not math.isfinite(value) else value  # noqa: E731
-    unit = {"gyro": "rad_per_s", "accelerometer": "m_per_s2", "magnetometer": "t"}[sensor]
-    write_json(
-        path,
-        {
-            "source": source,
-            "sample_interval_s": fit.sample_interval,
-            "level": fit.level,
-            "coefficients": [{key: number(value) for key, value in row.items()} for row in rows],
-            "misfit_probability": [float(p) for p in fit.misfit_probability],
-            "misfit": list(fit.misfit),
-            "estimator": deviation.estimator,
-            "tau_s": [float(tau) for tau in deviation.taus],
-            f"deviation_{unit}": [[number(float(x)) for x in axis] for axis in deviation.deviation],
-        },
-    )
+    """Write coefficients and deviation as JSON."""
+    unit = {"gyro": "rad_per_s", "accelerometer": "m_per_s2", "magnetometer": "t"}[fit.sensor]
+    table = {
+        "source": source,
+        "sample_interval_s": fit.sample_interval,
+        "level": fit.level,
+        "coefficients": rows,
+        "misfit_probability": fit.misfit_probability,
+        "misfit": fit.misfit,
+        "estimator": deviation.estimator,
+        "tau_s": deviation.taus,
+        f"deviation_{unit}": deviation.deviation,
+    }
+    write_json(path, plain(table))
 
 
 _LARGEST_RATE = 1e12
@@ -410,18 +354,19 @@ _LARGEST_RATE = 1e12
 _DISTRUST = "do not trust these intervals"
 
 
-def _specification(fit: identification.NoiseFit, source: str, warnings: list[str], sensor: str) -> str:
+def _specification(fit: identification.NoiseFit, source: str) -> str:
     """Return the text of gyro.toml, or of another sensor's: the terms seen, and as comments bounds of the others, and warnings."""
     import tomli_w
 
     from strapdown import allan as identification
     from strapdown.allan import parameters as noise_parameters
 
+    sensor = fit.sensor
     lines = [f"{sensor.capitalize()} noise by `strapdown allan` from {source}."]
-    lines += [f"WARNING: {warning}." for warning in warnings]
-    if warnings:
+    lines += [f"WARNING: {warning}." for warning in fit.warnings]
+    if fit.warnings:
         lines.append(f"WARNING: {_DISTRUST}, nor this file.")
-    text = _commented(lines) + "\n" + tomli_w.dumps(noise_parameters.to_toml(fit, sensor))
+    text = _commented(lines) + "\n" + tomli_w.dumps(noise_parameters.to_toml(fit))
     partly, wholly = [], []
     for term, bound in identification.upper_bounds(fit).items():
         key, factor = noise_parameters.key(sensor, term)

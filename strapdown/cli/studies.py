@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
+from strapdown.checks import InputError, positive
 from strapdown.cli.terminal import (
+    FORMAT,
+    TABLES,
     FigureFormat,
-    Format,
-    Tables,
     command,
     console,
     counted,
@@ -24,6 +25,8 @@ from strapdown.cli.terminal import (
     writable,
     written,
 )
+from strapdown.files import usable_folder, write_json
+from strapdown.units import DEGREE
 
 if TYPE_CHECKING:
     from strapdown.coning import Algorithm
@@ -85,18 +88,16 @@ _ROUNDED = 1e-3
 class _Scenario:
     """Motion and runs."""
 
-    angle: Annotated[float, typer.Option(help="Half-angle of the cone, degrees.")] = 0.7
-    frequency: Annotated[float, typer.Option(help="Coning frequency, Hz.")] = 10.0
-    rate: Annotated[float, typer.Option(help="Gyro samples a second, Hz.")] = 100.0
-    duration: Annotated[float, typer.Option(help="Length of each run, s.")] = 240.0
-    runs: Annotated[int, typer.Option(help="Monte Carlo runs.")] = 100
-    seed: Annotated[int, typer.Option(help="Seed; the same one gives the same runs.")] = 1
+    angle: float = typer.Option(0.7, help="Half-angle of the cone, degrees.")
+    frequency: float = typer.Option(10.0, help="Coning frequency, Hz.")
+    rate: float = typer.Option(100.0, help="Gyro samples a second, Hz.")
+    duration: float = typer.Option(240.0, help="Length of each run, s.")
+    runs: int = typer.Option(100, help="Monte Carlo runs.")
+    seed: int = typer.Option(1, help="Seed; the same one gives the same runs.")
 
     def parameters(self, own: tuple[Algorithm, ...]) -> ConingParameters:
         """Return the parameters of the study, ``own`` algorithms compared too; what no algorithm follows is refused."""
         from strapdown import coning_study
-        from strapdown.checks import InputError, positive
-        from strapdown.units import DEGREE
 
         if positive("--angle", self.angle, unit="degrees") >= 90.0:  # in the unit that it was given in
             raise InputError(f"--angle is {self.angle:g} degrees; a cone's half-angle is below a right angle")
@@ -113,21 +114,18 @@ class _Scenario:
 @command
 def coning(
     motion: _Scenario,
-    out: Annotated[Path, typer.Option(help="Folder for coning.json and the figures.")] = Path("coning-results"),
-    algorithm: Annotated[
-        list[Path] | None,
-        typer.Option(
-            help="TOML file of algorithms of your own, coefficients as textbooks write them; compared beside the package's. May be given "
-            "several times."
-        ),
-    ] = None,
-    form: Format = FigureFormat.png,
-    tables: Tables = None,
+    out: Path = typer.Option(Path("coning-results"), help="Folder for coning.json and the figures."),
+    algorithm: list[Path] | None = typer.Option(
+        None,
+        help="TOML file of algorithms of your own, coefficients as textbooks write them; compared beside the package's. May be given "
+        "several times.",
+    ),
+    form: FigureFormat = FORMAT,
+    tables: Path | None = TABLES,
 ) -> None:
     """Study coning: the drift of each integration algorithm, and what a filter makes of it."""
     from strapdown import coning_study, plots
     from strapdown.coning import read_algorithms
-    from strapdown.files import usable_folder, write_json
 
     own = tuple(one for path in algorithm or () for one in read_algorithms(path))
     parameters = motion.parameters(own)

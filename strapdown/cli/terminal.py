@@ -10,7 +10,7 @@ import inspect
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+from typing import TYPE_CHECKING, Any, get_type_hints
 
 import typer
 from rich import box
@@ -18,10 +18,13 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from strapdown.checks import InputError
 from strapdown.cli.progress import errors, progress_bar, rate_text
+from strapdown.files import json_text, output_file, usable_folder, write_json
 
 if TYPE_CHECKING:
     from strapdown.recordings import Recording
+    from strapdown.results import Listing
     from strapdown.scenarios import Scenario
 
 __all__ = [
@@ -39,6 +42,7 @@ __all__ = [
     "rate_text",
     "scenario_named",
     "show",
+    "show_listing",
     "table",
     "verdict",
     "writable",
@@ -84,26 +88,25 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
 
 
 def _options(group: Any) -> list[inspect.Parameter]:
-    """Return the fields of a group as parameters; the first line of its docstring is their heading in --help."""
-    hints = get_type_hints(group, include_extras=True)
+    """Return the fields of a group as parameters, their options the defaults; the first line of its docstring is the heading in --help."""
+    hints = get_type_hints(group)
     found = []
     for field in dataclasses.fields(group):
-        option = copy.copy(hints[field.name].__metadata__[0])
+        option: Any = copy.copy(field.default)
         option.rich_help_panel = group.__doc__.partition("\n")[0].rstrip(".")
-        annotation: Any = Annotated[hints[field.name].__origin__, option]
         kind = inspect.Parameter.KEYWORD_ONLY
-        found.append(inspect.Parameter(field.name, kind, default=field.default, annotation=annotation))
+        found.append(inspect.Parameter(field.name, kind, default=option, annotation=hints[field.name]))
     return found
 
 
 def given(group: Any) -> list[str]:
     """Return the options of a group that were given, as on the command line."""
-    hints = get_type_hints(type(group), include_extras=True)
     flags = []
     for field in dataclasses.fields(group):
-        if getattr(group, field.name) not in (field.default, []):
-            flag = hints[field.name].__metadata__[0].default
-            flags.append(flag.partition("/")[0] if isinstance(flag, str) else "--" + field.name.replace("_", "-"))
+        option: Any = field.default
+        if getattr(group, field.name) not in (option.default, []):
+            flag = option.param_decls[0] if option.param_decls else "--" + field.name.replace("_", "-")
+            flags.append(flag.partition("/")[0])
     return flags
 
 
@@ -115,13 +118,11 @@ class FigureFormat(enum.StrEnum):
     svg = "svg"
 
 
-FORMAT: Any = typer.Option("--format", help="Format of the figures.")
-Format = Annotated[FigureFormat, FORMAT]
+FORMAT: Any = typer.Option(FigureFormat.png, "--format", help="Format of the figures.")
 """Option of every command that draws."""
-Tables = Annotated[
-    Path | None,
-    typer.Option("--tables", help="Folder to write the tables to as well, as CSV with every digit and as LaTeX."),
-]
+TABLES: Any = typer.Option(
+    None, "--tables", help="Folder to write the tables to as well, as CSV with every digit and as LaTeX."
+)
 """Option of every command that prints the tables of a study."""
 
 
@@ -131,10 +132,7 @@ def counted(number: int, what: str) -> str:
 
 
 def table(title: str, *columns: str, left: int = 1) -> Table:
-    """Print the title and return an empty table, its first ``left`` columns text and the others numbers.
-
-    The title stands outside because one longer than its table would wrap inside it.
-    """
+    """Print the title and return an empty table, its first ``left`` columns text and the others numbers."""
     console.print(Text(title, style="bold"))
     result = Table(box=box.SIMPLE_HEAD, header_style="", pad_edge=False, padding=(0, 1, 0, 0))
     for k, column in enumerate(columns):
@@ -151,6 +149,15 @@ def show(rows: Table) -> None:
         console.width = width
 
 
+def show_listing(listing: Listing, title: str) -> None:
+    """Show the table of a result under another title, without its notes."""
+    rows = table(title, *listing.columns, left=listing.left)
+    styles = {"pass": "green", "FAIL": "red", "likely": "red"}
+    for row in listing.rows:
+        rows.add_row(*(Text(cell, style=styles.get(cell, "")) for cell in row))
+    show(rows)
+
+
 def tables_written(folder: Path | None, study: str, *results: Any) -> list[Path]:
     """Write the tables of a study to the folder of ``--tables``, if one is given, and return the files."""
     if folder is None:
@@ -162,8 +169,6 @@ def tables_written(folder: Path | None, study: str, *results: Any) -> list[Path]
 
 def tables_folder(folder: Path | None) -> None:
     """Refuse a folder of ``--tables`` that cannot be written to, before anything is computed."""
-    from strapdown.files import usable_folder
-
     if folder is not None:
         usable_folder("--tables", folder)
 
@@ -174,12 +179,7 @@ def verdict(good: bool) -> Text:
 
 
 def scenario_named(name: str) -> Scenario:
-    """Return the scenario of a name or a TOML file whose numbers can be computed with, not only read.
-
-    Refused are numbers beyond :data:`LARGEST_NUMBER`, a duration shorter than one gyro sample, and more measurements of a sensor than
-    :data:`MAX_MEASUREMENTS`: each would end deep inside, as an infinity or for want of memory.
-    """
-    from strapdown.checks import InputError
+    """Return the scenario of a name or a TOML file whose numbers can be computed with, not only read."""
     from strapdown.scenarios import load_scenario, scenario_to_table
 
     chosen = load_scenario(name)
@@ -215,14 +215,7 @@ def _numbers(place: str, content: Any) -> Iterator[tuple[str, float]]:
 def writable(
     option: str, *targets: Path, suffixes: tuple[str, ...] = (), sources: tuple[Path | str | None, ...] = ()
 ) -> None:
-    """Refuse files that a command is going to write but cannot, before it computes what goes into them.
-
-    A folder of that name stands in the way, the folder that they go to may not be written or lies below a file, the suffix is none of
-    ``suffixes`` (where given), or a target is one of the ``sources`` that are read.
-    """
-    from strapdown.checks import InputError
-    from strapdown.files import output_file
-
+    """Refuse files that a command is going to write but cannot, before it computes what goes into them."""
     for target in targets:
         if target.is_dir():
             raise InputError(
@@ -234,8 +227,6 @@ def writable(
 
 def need_own(target: Path, command: str, own: Callable[[Path], bool]) -> None:
     """Refuse to replace a file that the command did not write, of which there may be no other copy; its own it may make again."""
-    from strapdown.checks import InputError
-
     try:
         replaceable = not target.exists() or own(target)
     except InputError:
@@ -272,8 +263,6 @@ def json_target(json: Path | None, *sources: Path | None) -> None:
 
 def put_json(json: Path | None, content: Any) -> None:
     """Write JSON where it was asked for."""
-    from strapdown.files import json_text, write_json
-
     if json == STANDARD_OUTPUT:
         sys.stdout.write(json_text(content))
     elif json is not None:

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import math
+import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
+import numpy as np
 import typer
 
+from strapdown.checks import InputError, count, one_of
 from strapdown.cli.reading import Layout
 from strapdown.cli.terminal import (
+    FORMAT,
+    TABLES,
     FigureFormat,
-    Format,
-    Tables,
     command,
     console,
     doubt,
@@ -26,6 +29,8 @@ from strapdown.cli.terminal import (
     writable,
     written,
 )
+from strapdown.files import plain, write_json, written_beside
+from strapdown.units import DEGREE
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -40,8 +45,6 @@ if TYPE_CHECKING:
 
 FIGURES = ("likelihood", "heldout")
 """Figures that are drawn beside the filter, by the ends of their names."""
-PRIOR_FACTOR = 3.0
-"""One standard deviation of a prior, where none is given."""
 MAX_EXAMINED = 4
 """Records that are looked at for what the tuned filter leaves unexplained."""
 WORSE = 1.05
@@ -52,35 +55,23 @@ WORSE = 1.05
 class _Filter:
     """Filter to start from."""
 
-    free: Annotated[
-        str | None,
-        typer.Option(
-            help="Parameters to tune, with commas: gyro.arw, gyro.rrw, SENSOR.sigma, initial.attitude, initial.bias, "
-            "gate.probability (as --gate); SENSOR.sigma.x, .y, .z (about one body axis); or filter.scale alone. If not given the "
-            "gyro's two and every sensor's; of a recording without --truth or --rmse filter.scale, and no other."
-        ),
-    ] = None
-    filter_file: Annotated[
-        Path | None,
-        typer.Option("--filter", help="TOML with a table named filter; by default one that matches the records."),
-    ] = None
-    integration: Annotated[
-        str | None, typer.Option(help="Integration algorithm (`strapdown algorithms`); the filter's if not given.")
-    ] = None
-    states: Annotated[
-        bool,
-        typer.Option(
-            "--states",
-            help="Give the filter the optional states that the record's specified errors call for; --free may name their sizes too, such "
-            "as gyro.scale_sigma, SENSOR.correlated_sigma, SENSOR.correlation_time.",
-        ),
-    ] = False
-    prior: Annotated[
-        str | None,
-        typer.Option(help="Weak prior of the gyro's noise: TOML of `strapdown allan`, or the name of a preset."),
-    ] = None
-    prior_factor: Annotated[float, typer.Option(help="One standard deviation of the prior is a factor of this.")] = (
-        PRIOR_FACTOR
+    free: str | None = typer.Option(
+        None,
+        help="Parameters to tune, with commas: gyro.arw, gyro.rrw, SENSOR.sigma, initial.attitude, initial.bias, "
+        "gate.probability (as --gate); SENSOR.sigma.x, .y, .z (about one body axis); or filter.scale alone. If not given the "
+        "gyro's two and every sensor's; of a recording without --truth or --rmse filter.scale, and no other.",
+    )
+    filter_file: Path | None = typer.Option(
+        None, "--filter", help="TOML with a table named filter; by default one that matches the records."
+    )
+    states: bool = typer.Option(
+        False,
+        "--states",
+        help="Give the filter the optional states that the record's specified errors call for; --free may name their sizes too, such "
+        "as gyro.scale_sigma, SENSOR.correlated_sigma, SENSOR.correlation_time.",
+    )
+    prior: str | None = typer.Option(
+        None, help="Weak prior of the gyro's noise: TOML of `strapdown allan`, or the name of a preset."
     )
 
     @property
@@ -88,24 +79,15 @@ class _Filter:
         """Parameters named, if any are."""
         return None if self.free is None else [name.strip() for name in self.free.split(",") if name.strip()]
 
-    @property
-    def algorithm(self) -> Any:
-        """Integration algorithm, if one is named."""
-        from strapdown import coning
-        from strapdown.checks import one_of
-
-        name = self.integration
-        return None if name is None else coning.ALGORITHMS[one_of("integration", name, coning.ALGORITHMS)]
-
     def setup(self, *, plan: bool) -> FilterSetup | None:
         """Return the filter of the file, if there is one; states that it or a plan cannot have are refused."""
         from strapdown.setup import read_setup
 
         chosen = None if self.filter_file is None else read_setup(self.filter_file)
         if self.states and chosen is not None:
-            raise _refusal("--filter holds the filter's states itself, in [filter.states]; leave --states out")
+            raise InputError("--filter holds the filter's states itself, in [filter.states]; leave --states out")
         if plan and (self.states or (chosen is not None and chosen.states is not None)):
-            raise _refusal(
+            raise InputError(
                 "--plan knows no optional states; leave --states away, and [filter.states] out of the filter"
             )
         return chosen
@@ -115,7 +97,7 @@ class _Filter:
         from strapdown import tuning
 
         if self.names == []:
-            raise _refusal(f"--free is {self.free!r} and names no parameter; name some, or leave it out")
+            raise InputError(f"--free is {self.free!r} and names no parameter; name some, or leave it out")
         wanted = [name for name in self.names or [] if name not in tuning.GATED]
         wanted = wanted or list(tuning.default_names([case.record for case in cases]))
         if self.filter_file is None or any(name.startswith(("gyro.", "filter.")) for name in wanted):
@@ -128,11 +110,9 @@ class _Filter:
         from strapdown.gyro import datasheets, read_spec
 
         if self.prior is None:
-            if self.prior_factor != PRIOR_FACTOR:
-                raise _refusal("--prior-factor goes with --prior, the noise that it is about")
             return {}
         spec = read_spec(self.prior) if Path(self.prior).suffix == ".toml" else datasheets.preset(self.prior).spec
-        found = tuning.priors_from_gyro(spec, record, factor=self.prior_factor)
+        found = tuning.priors_from_gyro(spec, record)
         return {name: prior for name, prior in found.items() if name in names}
 
 
@@ -140,32 +120,22 @@ class _Filter:
 class _Objective:
     """Objective, by default the likelihood of all innovations."""
 
-    truth: Annotated[bool, typer.Option("--truth", help="Tune by the errors against the truth and their σ.")] = False
-    rmse: Annotated[
-        bool,
-        typer.Option(
-            "--rmse", help="Tune by the RMS attitude error against the truth; then all σ alike by innovations."
-        ),
-    ] = False
-    gate: Annotated[
-        bool,
-        typer.Option(
-            "--gate",
-            help="Model outliers too, their share and scale, and set the filter's gate where an outlier is the likelier explanation.",
-        ),
-    ] = False
-    spacing: Annotated[
-        float,
-        typer.Option(
-            help="Use a sensor's samples this many seconds apart, with the weight of all: for disturbances that last."
-        ),
-    ] = 0.0
-    holdout: Annotated[
-        float | None, typer.Option(help="Share of the data held out, to judge the filter before and after on.")
-    ] = None
-    holdout_by: Annotated[str, typer.Option(help="Hold out the end of each record (time), or whole ones (record).")] = (
-        "time"
+    truth: bool = typer.Option(False, "--truth", help="Tune by the errors against the truth and their σ.")
+    rmse: bool = typer.Option(
+        False, "--rmse", help="Tune by the RMS attitude error against the truth; then all σ alike by innovations."
     )
+    gate: bool = typer.Option(
+        False,
+        "--gate",
+        help="Model outliers too, their share and scale, and set the filter's gate where an outlier is the likelier explanation.",
+    )
+    spacing: float = typer.Option(
+        0.0, help="Use a sensor's samples this many seconds apart, with the weight of all: for disturbances that last."
+    )
+    holdout: float | None = typer.Option(
+        None, help="Share of the data held out, to judge the filter before and after on."
+    )
+    holdout_by: str = typer.Option("time", help="Hold out the end of each record (time), or whole ones (record).")
 
     @property
     def name(self) -> str:
@@ -176,7 +146,6 @@ class _Objective:
     def split(self, cases: Sequence[Case]) -> tuple[tuple[Case, ...], tuple[Case, ...]]:
         """Return the data to tune on and those held out."""
         from strapdown import tuning
-        from strapdown.checks import one_of
 
         if self.holdout is None:
             return tuple(cases), ()
@@ -187,33 +156,31 @@ class _Objective:
 class _Search:
     """Search."""
 
-    starts: Annotated[int, typer.Option(help="Searches: one from the filter, the others from random starts.")] = 4
-    factor: Annotated[float, typer.Option(help="Random starts are off by up to this factor, either way.")] = 30.0
-    seed: Annotated[int, typer.Option(help="Of the random starts.")] = 0
-    threads: Annotated[int | None, typer.Option(help="Threads; one a core if not given.")] = None
+    starts: int = typer.Option(4, help="Searches: one from the filter, the others from random starts.")
+    factor: float = typer.Option(30.0, help="Random starts are off by up to this factor, either way.")
+    seed: int = typer.Option(0, help="Of the random starts.")
+    threads: int | None = typer.Option(None, help="Threads; one a core if not given.")
 
 
 @dataclass(frozen=True)
 class _Planning:
     """Plan, before there are records."""
 
-    plan: Annotated[bool, typer.Option("--plan", help="Predict how well records will determine each parameter.")] = (
-        False
+    plan: bool = typer.Option(False, "--plan", help="Predict how well records will determine each parameter.")
+    length: str | None = typer.Option(
+        None, help="Lengths of a record, s, with commas; that of the scenario if not given."
     )
-    length: Annotated[
-        str | None, typer.Option(help="Lengths of a record, s, with commas; that of the scenario if not given.")
-    ] = None
 
 
 @dataclass(frozen=True)
 class _Output:
     """Output."""
 
-    out: Annotated[
-        Path, typer.Option("--out", "-o", help="TOML for --filter of other commands; JSON and figures go beside it.")
-    ] = Path("filter.toml")
-    form: Format = FigureFormat.png
-    tables: Tables = None
+    out: Path = typer.Option(
+        Path("filter.toml"), "--out", "-o", help="TOML for --filter of other commands; JSON and figures go beside it."
+    )
+    form: FigureFormat = FORMAT
+    tables: Path | None = TABLES
 
 
 class _Found(NamedTuple):
@@ -233,8 +200,8 @@ def tune(
     records: Annotated[
         list[Path],
         typer.Argument(
-            help="Records (HDF5 of `strapdown simulate`) or recordings (BROAD HDF5, CSV), all of one unit; with --plan one record, or the "
-            "name or TOML file of a scenario."
+            help="Records (HDF5 of `strapdown simulate`) or recordings (BROAD HDF5, CSV), all of one unit; with --plan the name or "
+            "TOML file of a scenario."
         ),
     ],
     start: _Filter,
@@ -245,27 +212,21 @@ def tune(
     output: _Output,
 ) -> None:
     """Tune the filter by maximum likelihood, with an interval for each parameter."""
-    import os
-
     from strapdown import recordings, tuning
-    from strapdown.checks import count
 
     workers = count("threads", search.threads if search.threads is not None else os.cpu_count() or 1)
-    algorithm = start.algorithm
     chosen = start.setup(plan=planning.plan)
     if planning.plan:
-        _plan(records, chosen, algorithm, start.names, planning.length, workers)
+        _plan(records, chosen, start.names, planning.length, workers)
         return
     if planning.length is not None:
-        raise _refusal("--length is for --plan; the records' own length is taken")
+        raise InputError("--length is for --plan; the records' own length is taken")
     count("seed", search.seed, least=0)
     _check_files(records, start.filter_file, output)
     cases, before, gyros = _cases(records, chosen, start, layout)
     if not (goal.truth or goal.rmse or all(recordings.is_record(path) for path in records)):
         names, spacing = tuning.by_innovations(start.names, goal.spacing, gate=goal.gate, prior=start.prior)
         start, goal = replace(start, free=",".join(names)), replace(goal, spacing=spacing)
-    if algorithm is not None:
-        before = replace(before, integration=algorithm)
     if (before.gate or before.robust) and not (goal.truth or goal.gate):
         console.print(
             "The filter's gate and weights are not applied: what passes a gate is the likelier the narrower it is. --gate models outliers, "
@@ -322,19 +283,13 @@ def _tuned(
     return _Found(result, objective, gate, comparison, examined, worst)
 
 
-def _refusal(words: str) -> Exception:
-    from strapdown.checks import InputError
-
-    return InputError(words)
-
-
 def _check_files(records: Sequence[Path], filter_file: Path | None, output: _Output) -> None:
     """Refuse a record that is given twice, and files that cannot be written or are not this command's."""
     from strapdown.report import tunings
 
     for k, path in enumerate(records):
         if path.exists() and any(path.samefile(other) for other in records[:k] if other.exists()):
-            raise _refusal(f"{path} is given twice; a record counts once")
+            raise InputError(f"{path} is given twice; a record counts once")
     sources, out = (*records, filter_file), output.out
     report = out.with_suffix(".json")
     writable("out", out, suffixes=(".toml",), sources=sources)
@@ -390,7 +345,6 @@ def _cases(
 ) -> tuple[list[Case], FilterSetup, dict[str, GyroSpec]]:
     """Return the records to tune on, the filter to start from, and the gyros of the records that hold theirs."""
     from strapdown import recordings, tuning
-    from strapdown.checks import InputError
     from strapdown.cli.filters import filter_for, need_angles
     from strapdown.recordings import recordfiles
 
@@ -489,8 +443,6 @@ def _print_gate(found: TunedGate) -> None:
 
 def _anees(one: Performance) -> str:
     """Return the ANEES as a table shows it: of attitude and bias, or where only the attitude is known of that."""
-    import numpy as np
-
     if math.isfinite(one.anees):
         return _figure(one.anees)
     return f"{_figure(float(np.nanmean(one.nees[0].mean)))} (attitude)" if one.nees else "-"
@@ -498,7 +450,6 @@ def _anees(one: Performance) -> str:
 
 def _print_comparison(comparison: Comparison, *, truth: bool) -> None:
     from strapdown.report import tunings
-    from strapdown.units import DEGREE
 
     listing = table(
         "On the data held out", "filter", "log likelihood", "NIS", "99 % bounds", "ANEES", "attitude RMS, °", "verdict"
@@ -530,7 +481,6 @@ def _print_comparison(comparison: Comparison, *, truth: bool) -> None:
 
 def _write(found: _Found, records: Sequence[ImuRecord], paths: Sequence[Path], of: str, output: _Output) -> None:
     from strapdown import tuning
-    from strapdown.files import write_json, written_beside
     from strapdown.plots import tuning as drawing
     from strapdown.plots.style import save_as
     from strapdown.report import tunings
@@ -558,15 +508,12 @@ def _write(found: _Found, records: Sequence[ImuRecord], paths: Sequence[Path], o
 
 
 def _report(found: _Found, units: Sequence[Unit], paths: Sequence[Path], of: str) -> dict[str, Any]:
-    import numpy as np
-
-    number = lambda value: None if isinstance(value, float) and not math.isfinite(value) else value  # noqa: E731
     result, gate, comparison = found.result, found.gate, found.comparison
     content: dict[str, Any] = {
         "records": [path.name for path in paths],
         "parameters": [
             {
-                **{key: number(value) for key, value in vars(one).items()},
+                **vars(one),
                 "note": _note(one, unit),
                 "unit": unit.name,
                 "si_per_unit": unit.factor,
@@ -581,9 +528,9 @@ def _report(found: _Found, units: Sequence[Unit], paths: Sequence[Path], of: str
     }
     if gate is not None:
         content["gate"] = {
-            "probability": number(gate.probability),
-            "lower": number(gate.lower),
-            "upper": number(gate.upper),
+            "probability": gate.probability,
+            "lower": gate.lower,
+            "upper": gate.upper,
             "thresholds": gate.thresholds,
         }
     if comparison is not None:
@@ -591,59 +538,37 @@ def _report(found: _Found, units: Sequence[Unit], paths: Sequence[Path], of: str
             name: {
                 "log_likelihood_per_innovation": one.log_likelihood,
                 "nis_per_degree": one.nis,
-                "nis_bounds": list(one.nis_bounds),
-                "anees_per_state": number(one.anees),
-                "attitude_rms_rad": number(one.attitude_rms),
-                "nees_per_state": {course.of: number(float(np.nanmean(course.mean))) for course in one.nees},
+                "nis_bounds": one.nis_bounds,
+                "anees_per_state": one.anees,
+                "attitude_rms_rad": one.attitude_rms,
+                "nees_per_state": {course.of: np.nanmean(course.mean) for course in one.nees},
                 "judgements": [judgement.summary() for judgement in one.judgements],
             }
             for name, one in (("before", comparison.before), ("after", comparison.after))
         }
-    return content
+    return plain(content)  # type: ignore[no-any-return]
 
 
 def _plan(
-    records: Sequence[Path],
-    chosen: FilterSetup | None,
-    algorithm: Any,
-    names: list[str] | None,
-    length: str | None,
-    threads: int,
+    sources: Sequence[Path], chosen: FilterSetup | None, names: list[str] | None, length: str | None, threads: int
 ) -> None:
     from strapdown import scenarios, setup, tuning
-    from strapdown.checks import InputError
-    from strapdown.recordings import recordfiles
 
-    if len(records) != 1:
-        raise InputError(f"--plan takes one record or scenario; {len(records)} are given")
-    source: Any
-    path = records[0]
-    if recordfiles.is_record(path):
-        file = recordfiles.read_record_file(path)
-        source, example = file.record, file.record
-        if chosen is None and file.gyro is None:
-            raise InputError(
-                f"{path} does not hold its gyro's specification; give the filter to plan with, --filter filter.toml"
-            )
-        modelled = chosen or setup.matched_to_record(file.gyro, file.record)  # type: ignore[arg-type]
-        whole = float(file.record.time[-1] - file.record.time[0])
-    else:
-        source = scenarios.load_scenario(path)
-        modelled = chosen or setup.matched(source)
-        example = scenarios.simulate(source)
-        whole = source.duration
-    if algorithm is not None:
-        modelled = replace(modelled, integration=algorithm)
-    lengths = [whole] if length is None else _numbers(length)
+    if len(sources) != 1:
+        raise InputError(f"--plan takes one scenario; {len(sources)} are given")
+    lengths = None if length is None else _numbers(length)
+    scenario = scenarios.load_scenario(sources[0])
+    modelled = chosen or setup.matched(scenario)
+    example = scenarios.simulate(scenario)
     wanted = names or list(tuning.default_names([example]))
     with progress_bar("simulated records", 4) as advance:
-        found = tuning.plan(source, modelled, wanted, lengths=lengths, threads=threads, progress=advance)
+        found = tuning.plan(
+            scenario, modelled, wanted, lengths=lengths or [scenario.duration], threads=threads, progress=advance
+        )
     _print_plan(found, [example])
 
 
 def _numbers(text: str) -> list[float]:
-    from strapdown.checks import InputError
-
     try:
         return [float(part) for part in text.split(",")]
     except ValueError:

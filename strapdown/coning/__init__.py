@@ -5,8 +5,8 @@ after, into its rotation δq; attitude advances by ``q ← q ⊗ δq``, the solu
 
 - ``coefficients``: The mathematics of the tables, in exact rationals.
 - ``algorithms``: :class:`Algorithm`, the catalogue :data:`ALGORITHMS`, and :func:`algorithm_rows`, its printed table.
-- ``stepping``: :func:`integrate`, :func:`integrate_rates`, :func:`rotation_vectors`: from records to attitude.
-- ``drift``: :func:`predicted_coning_drift`, :class:`ConingBudget`: the drift that vibration leaves.
+- ``stepping``: :func:`integrate`, :func:`rotation_vectors`: from records to attitude.
+- ``drift``: :func:`predicted_coning_drift`, :func:`vibration_drift`: the drift that vibration leaves.
 
 What to choose: ``"four-sample"`` for ordinary work; ``"matched-1-8-8"`` for recorded data or where a delay of eight samples is
 allowed; ``"matched-2-8"`` in real time; ``"matched-4-11"`` in real time with a quiet gyro. (Its long one-sided fit amplifies noise
@@ -17,14 +17,12 @@ family is this package's own; :func:`strapdown.coning.coefficients.matched_corre
 from strapdown.coning.algorithms import ALGORITHMS, Algorithm, read_algorithms
 from strapdown.coning.algorithms import algorithm_rows as algorithm_rows
 from strapdown.coning.algorithms import named as named
-from strapdown.coning.drift import ConingBudget as ConingBudget
 from strapdown.coning.drift import VibrationLine as VibrationLine
 from strapdown.coning.drift import predicted_coning_drift
 from strapdown.coning.drift import read_vibration as read_vibration
-from strapdown.coning.drift import (
-    small_angle_drift as small_angle_drift,
-)
-from strapdown.coning.stepping import increments_from_rates, integrate, integrate_rates, rotation_vectors
+from strapdown.coning.drift import small_angle_drift as small_angle_drift
+from strapdown.coning.drift import vibration_drift as vibration_drift
+from strapdown.coning.stepping import increments_from_rates, integrate, rotation_vectors
 from strapdown.coning.stepping import time_per_sample as time_per_sample
 
 # Imported as itself above and not listed here: for the package alone.
@@ -33,7 +31,6 @@ __all__ = [
     "Algorithm",
     "increments_from_rates",
     "integrate",
-    "integrate_rates",
     "predicted_coning_drift",
     "read_algorithms",
     "rotation_vectors",

@@ -179,11 +179,6 @@ class Algorithm:
         Algorithm
             The algorithm, its orders and drift constant derived.
 
-        Raises
-        ------
-        InputError
-            If the coefficients leave no increment in the step or are not numbers.
-
         Examples
         --------
         >>> own = Algorithm.from_coefficients("ignagni-3", ["9/20", "27/20"])
@@ -240,11 +235,6 @@ class Algorithm:
         Algorithm
             The algorithm, its orders and drift constant derived.
 
-        Raises
-        ------
-        InputError
-            If a product is not one of two different increments of the window.
-
         Examples
         --------
         >>> own = Algorithm.from_products("miller-3", 3, [(1, 3, "9/20"), (1, 2, "27/40"), (2, 3, "27/40")])
@@ -292,11 +282,6 @@ class Algorithm:
         -------
         Algorithm
             The algorithm.
-
-        Raises
-        ------
-        InputError
-            If a key is unknown or missing, or a value is not what it must be.
         """
         checks.known_keys(
             place, table, ("name", "samples", "previous", "following", "coefficients", "products", "source")
@@ -340,11 +325,6 @@ class Algorithm:
         -------
         Algorithm
             The algorithm.
-
-        Raises
-        ------
-        InputError
-            If the file does not hold exactly one valid table.
         """
         found = read_algorithms(path)
         if len(found) > 1:
@@ -482,11 +462,6 @@ def read_algorithms(path: str | os.PathLike[str]) -> tuple[Algorithm, ...]:
     -------
     tuple of Algorithm
         The algorithms.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, is not TOML, has no such table, or a table is not one of an algorithm.
     """
     with reading.from_file(path):
         content = reading.toml(path)
@@ -608,40 +583,23 @@ def matched(samples: int, previous: int, following: int = 0) -> Algorithm:
     )
 
 
-def magnus(order: int) -> Algorithm:
-    """Return the Magnus integrator of order 4 (three samples) or 6 (four samples), on moments of the rate polynomial."""
-    return Algorithm(
-        name=f"magnus-{order}",
-        solver=f"magnus-{order}",
-        samples={4: 3, 6: 4}[order],
-        order=order,
-        drift_order=order,
-        source="Blanes, Casas, Ros 2000",
-    )
+def scheme(name: str, solver: str, samples: int, order: int, source: str) -> Algorithm:
+    """Return an integrator of the quaternion equation for smooth rates, on the rate polynomial through the N increments of a step."""
+    return Algorithm(name=name, solver=solver, samples=samples, order=order, drift_order=order, source=source)
 
 
-def commutator_free() -> Algorithm:
-    """Return the commutator-free integrator of order 4: two exponentials, exp(½B₀ − 2B₁) ⊗ exp(½B₀ + 2B₁), three samples."""
-    return Algorithm(
-        name="commutator-free-4",
-        solver="commutator-free-4",
-        samples=3,
-        order=4,
-        drift_order=4,
-        source="Blanes, Moan 2006",
-    )
-
-
-def runge_kutta() -> Algorithm:
-    """Return classical Runge–Kutta on equation (17), with rates at 0, T/2, T of the polynomial through three increments."""
-    return Algorithm(
-        name="runge-kutta-4", solver="runge-kutta-4", samples=3, order=4, drift_order=4, source="Kutta 1901"
-    )
-
-
-def euler() -> Algorithm:
-    """Return q + ½ q ⊗ Δθ, normalised: the scheme of many small projects."""
-    return Algorithm(name="quaternion-euler", solver="euler", samples=1, order=2, drift_order=2, source="Euler 1768")
+_SCHEMES = {
+    # On moments of the polynomial.
+    "magnus-4": ("magnus-4", 3, 4, "Blanes, Casas, Ros 2000"),
+    "magnus-6": ("magnus-6", 4, 6, "Blanes, Casas, Ros 2000"),
+    # exp(½B₀ − 2B₁) ⊗ exp(½B₀ + 2B₁).
+    "commutator-free-4": ("commutator-free-4", 3, 4, "Blanes, Moan 2006"),
+    # On equation (17), with rates at 0, T/2, T.
+    "runge-kutta-4": ("runge-kutta-4", 3, 4, "Kutta 1901"),
+    # q + ½ q ⊗ Δθ, normalised: that of many small projects.
+    "quaternion-euler": ("euler", 1, 2, "Euler 1768"),
+}
+"""Solver, samples, order (of the drift too) and source of each."""
 
 
 def _fitted_order(samples: int) -> int:
@@ -688,12 +646,8 @@ def _makers() -> dict[str, Callable[[], Algorithm]]:
         makers[f"uncompressed-{n}"] = functools.partial(uncompressed_optimal, n)
     for n in range(2, 9):
         makers[f"polynomial-{n}"] = functools.partial(polynomial, n)
+    makers |= {name: functools.partial(scheme, name, *of) for name, of in _SCHEMES.items()}
     makers |= {
-        "magnus-4": functools.partial(magnus, 4),
-        "magnus-6": functools.partial(magnus, 6),
-        "commutator-free-4": commutator_free,
-        "runge-kutta-4": runge_kutta,
-        "quaternion-euler": euler,
         "one-sample-rate-2": functools.partial(compressed, 1, 0, 2),
         "two-sample-rate-2": functools.partial(compressed, 2, 0, 2),
         "four-sample-rate-2": functools.partial(compressed, 4, 0, 2),
@@ -722,10 +676,7 @@ def named(algorithm: str | Algorithm) -> Algorithm:
 
 
 def algorithm_rows() -> list[dict[str, str | int | float]]:
-    """Return the printed table of the catalogue, one row an algorithm.
-
-    The drift constant is C of the leading drift −C β² ω λ^(drift order) under small coning, λ = ω × sample interval.
-    """
+    """Return the printed table of the catalogue, one row an algorithm."""
     return [
         {
             "name": a.name,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import math
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -62,24 +63,16 @@ def _motion(angle: float, frequency: float, sample_interval: float) -> tuple[flo
 
 @dataclass(frozen=True, kw_only=True)
 class VibrationLine:
-    """One line of an angular vibration spectrum: two orthogonal axes at one frequency.
-
-    Parameters
-    ----------
-    frequency : float
-        Frequency, Hz.
-    angle : float
-        Amplitude about the first axis, rad.
-    angle_across : float, optional
-        Amplitude about the second axis, rad; ``angle`` if not given.
-    phase : float, default π/2
-        Lag of the second axis behind the first, rad; π/2 is coning, 0 or π rocking without drift.
-    """
+    """One line of an angular vibration spectrum: two orthogonal axes at one frequency."""
 
     frequency: float
+    """Hz."""
     angle: float
+    """Amplitude about the first axis, rad."""
     angle_across: float | None = None
+    """Amplitude about the second axis, rad; ``angle`` if not given."""
     phase: float = 0.5 * math.pi
+    """Lag of the second axis behind the first, rad; π/2 is coning, 0 or π rocking without drift."""
 
     def __post_init__(self) -> None:
         """Check the fields."""
@@ -96,75 +89,34 @@ class VibrationLine:
         return self.angle * across * math.sin(self.phase)
 
 
-@dataclass(frozen=True, kw_only=True)
-class ConingBudget:
-    """The drift that a vibration spectrum leaves with each algorithm at each sample rate.
+BUDGETED = ("one-sample", "two-sample", "four-sample", "matched-4-11", "matched-1-8-8")
+"""Algorithms of a drift budget where none are named."""
 
-    Lines at different frequencies do not drift together (their products average out), so the drifts of the lines add. Angles are taken
-    as small: of each drift the part in β² is counted. The β⁴ floor of the rotation-vector forms comes on top; it matters above a degree
-    or so (``sims/coning_algorithms.py`` shows where).
 
-    Parameters
-    ----------
-    lines : tuple of VibrationLine
-        Lines of the spectrum.
-    sample_rates : tuple of float
-        Sample rates, Hz.
-    algorithms : tuple of str, default ("one-sample", "two-sample", "four-sample", "matched-4-11", "matched-1-8-8")
-        Names of :data:`ALGORITHMS`.
+def vibration_drift(lines: Sequence[VibrationLine], algorithm: str | Algorithm, sample_rate: float) -> float:
+    """Return the drift about the third axis, rad/s, that a vibration spectrum leaves with an algorithm at a sample rate, Hz.
+
+    Lines at different frequencies do not drift together (their products average out), so their drifts add. Angles are taken as small: of
+    each drift the part in β² is counted. The β⁴ floor of rotation-vector forms comes on top; it matters above a degree or so.
     """
-
-    lines: tuple[VibrationLine, ...]
-    sample_rates: tuple[float, ...]
-    algorithms: tuple[str, ...] = ("one-sample", "two-sample", "four-sample", "matched-4-11", "matched-1-8-8")
-
-    def __post_init__(self) -> None:
-        """Check the fields."""
-        if not self.lines:
-            raise InputError("lines is empty; give at least one VibrationLine")
-        if not self.sample_rates:
-            raise InputError("sample_rates is empty; give at least one rate in Hz")
-        for name in self.algorithms:
-            named(name)
-        highest = max(line.frequency for line in self.lines)
-        for rate in self.sample_rates:
-            checks.positive("sample rate", rate, unit="Hz")
-            if 2.0 * math.pi * highest / rate > 1.0:
-                raise InputError(
-                    f"sample rate {rate:g} Hz is below 2π × the highest line, {highest:g} Hz: the drift series does not serve there; "
-                    f"sample at {2.0 * math.pi * highest:.4g} Hz or more, or leave out the line"
-                )
-
-    def drift(self, algorithm: str, sample_rate: float) -> float:
-        """Return the sum of the drifts of the lines about the third axis, rad/s, at a sample rate, Hz."""
-        return math.fsum(self.drifts(algorithm, sample_rate))
-
-    def drifts(self, algorithm: str, sample_rate: float) -> tuple[float, ...]:
-        """Return the drift of each line about the third axis, rad/s, at a sample rate, Hz."""
-        table = named(algorithm)
-        omegas = [2.0 * math.pi * line.frequency for line in self.lines]
-        return tuple(
-            line.coning_square * omega * small_angle_drift(table, omega / sample_rate)
-            for line, omega in zip(self.lines, omegas, strict=True)
+    table, rate = named(algorithm), checks.positive("sample rate", sample_rate, unit="Hz")
+    omegas = [2.0 * math.pi * line.frequency for line in lines]
+    if max(omegas, default=0.0) > rate:
+        raise InputError(
+            f"sample rate {rate:g} Hz is below 2π × the highest line, {max(omegas) / (2.0 * math.pi):g} Hz: the drift series does not "
+            f"serve there; sample at {max(omegas):.4g} Hz or more, or leave out the line"
         )
-
-    def rows(self) -> list[dict[str, str | float]]:
-        """Return the drifts as a table, one row per algorithm and rate."""
-        return [
-            {"algorithm": name, "sample_rate": rate, "drift": self.drift(name, rate)}
-            for name in self.algorithms
-            for rate in self.sample_rates
-        ]
+    drifts = (
+        line.coning_square * w * small_angle_drift(table, w / rate) for line, w in zip(lines, omegas, strict=True)
+    )
+    return math.fsum(drifts)
 
 
 _COLUMNS = ("frequency_hz", "angle_deg", "angle_across_deg", "phase_deg")
 
 
 def read_vibration(path: str | os.PathLike[str]) -> tuple[VibrationLine, ...]:
-    """Read vibration lines from CSV with the columns ``frequency_hz, angle_deg[, angle_across_deg][, phase_deg]``.
-
-    Without the optional columns the second axis has the amplitude of the first and lags it by 90°: coning.
-    """
+    """Read vibration lines from CSV with the columns ``frequency_hz, angle_deg[, angle_across_deg][, phase_deg]``."""
     file = Path(path)
     with reading.from_file(file):
         return _vibration(file, reading.text(file).splitlines())

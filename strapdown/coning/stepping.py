@@ -66,11 +66,6 @@ def integrate(
     -------
     ndarray (n // N + 1, 4)
         Unit quaternions q_fb, first the initial attitude.
-
-    Raises
-    ------
-    InputError
-        If the algorithm or frame is unknown, or an input has the wrong shape or is not finite.
     """
     table = named(algorithm)
     checks.one_of("frame", frame, ("body", "fixed"))
@@ -105,43 +100,6 @@ def integrate(
     return quaternion.conjugate(attitude) if frame == "fixed" else attitude
 
 
-def integrate_rates(
-    rates: ArrayLike,
-    sample_interval: float,
-    algorithm: str | Algorithm = "four-sample-rate-2",
-    initial_attitude: ArrayLike = IDENTITY,
-    *,
-    frame: str = "body",
-) -> Array:
-    """Return the attitude at the step edges from rate samples.
-
-    An algorithm made for rates (``…-rate-2``) uses the quadrature named by its number and compensates in the drift what the
-    quadrature loses. Any other is given eight-point quadrature: drift and periodic error are then of order λ⁸ at best. The plain
-    trapezoid with a coning correction made for increments drifts by β²ωλ²/12, as much as no correction.
-
-    Parameters
-    ----------
-    rates : array_like (n + 1, 3)
-        Rates at the edges of n equal sample intervals, rad/s, axes by ``frame``.
-    sample_interval : float
-        Interval between samples, s.
-    algorithm : str or Algorithm, default "four-sample-rate-2"
-        Name in :data:`ALGORITHMS`, or an algorithm.
-    initial_attitude : array_like (4,), default identity
-        Unit quaternion q_fb at the first sample.
-    frame : {"body", "fixed"}, default "body"
-        Axes of the rates.
-
-    Returns
-    -------
-    ndarray (n // N + 1, 4)
-        Unit quaternions q_fb, first the initial attitude.
-    """
-    table = named(algorithm)
-    points = table.rate_points or 8
-    return integrate(increments_from_rates(rates, sample_interval, points), table, initial_attitude, frame=frame)
-
-
 def increments_from_rates(rates: ArrayLike, sample_interval: float, points: int = 2) -> Array:
     """Return rotation increments from rate samples at the edges of the intervals.
 
@@ -152,18 +110,14 @@ def increments_from_rates(rates: ArrayLike, sample_interval: float, points: int 
     sample_interval : float
         Interval between samples, s.
     points : int, default 2
-        Even number of nearest samples whose interpolating polynomial is integrated; 2 is the trapezoid rule.
+        Even number of nearest samples whose interpolating polynomial is integrated; 2 is the trapezoid rule. For an algorithm made for
+        rates its ``rate_points``; for another 8, as the trapezoid with a correction made for increments drifts as much as no correction.
 
     Returns
     -------
     ndarray (n, 3)
         Increments, rad. For an oscillation they are too small by a relative error of order λ^points. Near the ends the samples used
         lie to one side.
-
-    Raises
-    ------
-    InputError
-        If ``points`` is odd or there are fewer than two samples.
 
     Examples
     --------

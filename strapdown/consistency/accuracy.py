@@ -13,10 +13,7 @@ from strapdown.checks import Array, InputError, array, count, increasing, positi
 
 
 def convergence_time(time: ArrayLike, magnitude: ArrayLike, threshold: float) -> float:
-    """Return the first time, s, from which on ``magnitude`` (n,) stays at or below ``threshold`` to the end; NaN if it never does.
-
-    Of an error, of its RMS over runs, or of a σ, in the unit of the threshold.
-    """
+    """Return the first time, s, from which on ``magnitude`` (n,) stays at or below ``threshold`` to the end; NaN if it never does."""
     stamps = increasing("time", time)
     size = array("magnitude", magnitude, (len(stamps),))
     above = np.flatnonzero(np.abs(size) > positive("threshold", threshold))
@@ -87,11 +84,6 @@ def reference_errors(attitude: ArrayLike, reference: ArrayLike) -> ReferenceErro
     -------
     ReferenceErrors
         Angles, rad; NaN where the reference is unknown.
-
-    Raises
-    ------
-    InputError
-        If the shapes differ, or a reference is the zero quaternion.
 
     References
     ----------

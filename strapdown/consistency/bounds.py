@@ -46,11 +46,6 @@ def mean_bounds(degrees: int, samples: float, probability: float = 0.99) -> tupl
     low, high : float
         Bounds of the mean, one half of the remaining probability beyond each.
 
-    Raises
-    ------
-    InputError
-        If a number is out of range.
-
     References
     ----------
     Y. Bar-Shalom, X. R. Li, T. Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, section 5.4.2.
@@ -123,10 +118,7 @@ def log_mean_distribution(value: float, degrees: int, samples: int) -> float:
 
 
 def log_mean_bounds(degrees: int, samples: int, probability: float = 0.99) -> tuple[float, float]:
-    """Return two-sided bounds of the mean of ``samples`` independent values of ln χ² of ``degrees`` degrees of freedom, exact.
-
-    The logarithm does not let one large error hide many small ones, nor the reverse; its moments are those of :func:`log_moments`.
-    """
+    """Return two-sided bounds of the mean of ``samples`` independent values of ln χ² of ``degrees`` degrees of freedom, exact."""
     from scipy.optimize import brentq
 
     outside = tail(probability)

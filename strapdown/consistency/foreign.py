@@ -302,6 +302,11 @@ class _Series:
     covariance: Array | None = None
     bias: Array | None = None
 
+    def at(self, rows: np.ndarray, time: Array, attitude: Array) -> _Series:
+        """Return other times and attitudes with the covariances and biases of these rows."""
+        P, bias = (None if one is None else one[rows] for one in (self.covariance, self.bias))
+        return _Series(time, attitude, P, bias)
+
 
 def _series(
     prefix: str, time: ArrayLike, attitude: ArrayLike, covariance: ArrayLike | None, bias: ArrayLike | None
@@ -415,12 +420,7 @@ def _at_common_times(own: _Series, theirs: _Series, offset: float) -> tuple[_Ser
         at = theirs.time[inside] - offset
         near = np.clip(np.searchsorted(own.time, at), 1, len(own.time) - 1)
         near -= (at - own.time[near - 1]) < (own.time[near] - at)
-        own = _Series(
-            at,
-            interpolated(at, own.time, own.attitude, _bridged(own)),
-            None if own.covariance is None else own.covariance[near],
-            None if own.bias is None else own.bias[near],
-        )
+        own = own.at(near, at, interpolated(at, own.time, own.attitude, _bridged(own)))
         q, bias = theirs.attitude[inside], None if theirs.bias is None else theirs.bias[inside]
         good = np.isfinite(own.attitude[:, 0])
     else:
@@ -436,12 +436,7 @@ def _at_common_times(own: _Series, theirs: _Series, offset: float) -> tuple[_Ser
             "give both of one clock, or --align time (align= in Python)"
         )
     return (
-        _Series(
-            own.time[good] + offset,
-            own.attitude[good],
-            None if own.covariance is None else own.covariance[good],
-            None if own.bias is None else own.bias[good],
-        ),
+        own.at(good, own.time[good] + offset, own.attitude[good]),
         Truth(attitude=q[good], bias=np.full((int(good.sum()), 3), np.nan) if bias is None else bias[good]),
     )
 
@@ -453,10 +448,7 @@ def _rates(series: _Series) -> tuple[Array, Array]:
 
 
 def coarse_offset(own_time: Array, own_speed: Array, true_time: Array, true_speed: Array) -> float:
-    """Return the offset, s, to be added to the first times, at which two series of angular speeds correlate best; 0 if nothing stands out.
-
-    Speeds are the same in all frames.
-    """
+    """Return the offset, s, to be added to the first times, at which two series of angular speeds agree best; 0 if nothing stands out."""
     step = max(float(np.median(np.diff(own_time))), float(np.median(np.diff(true_time))))
     apart = own_time[-1] < true_time[0] or true_time[-1] < own_time[0]
     base = true_time[0] - own_time[0] if apart else 0.0
@@ -528,11 +520,7 @@ def _descended(
         if not free.any():
             residual = now
             break
-        J = np.zeros((len(r), 3, 7))
-        J[:, :, :3] = np.swapaxes(quaternion.to_matrix(aligned), 1, 2)
-        J[:, :, 3:6] = np.eye(3)
-        J[:, :, 6] = -_speed_of(matched.time, truth.attitude)
-        J = J[:, :, free]
+        J = _jacobian(matched.time, aligned, truth)[:, :, free]
         information = np.einsum("mij,mik->jk", J, J)
         scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
         value, vector = np.linalg.eigh(information * np.outer(scale, scale))
@@ -562,10 +550,14 @@ def _descended(
     )
 
 
-def _speed_of(time: Array, attitude: Array) -> Array:
-    """Return body rates (m, 3) at the times."""
-    middle, rate = _rates(_Series(time, attitude))
-    return np.stack([np.interp(time, middle, rate[:, k]) for k in range(3)], axis=1)
+def _jacobian(time: Array, aligned: Array, truth: Truth) -> Array:
+    """Return the derivatives (m, 3, 7) of the attitude error by rotations of the fixed and body frames and an offset of the clock."""
+    middle, rate = _rates(_Series(time, truth.attitude))
+    J = np.zeros((len(time), 3, 7))
+    J[:, :, :3] = np.swapaxes(quaternion.to_matrix(aligned), 1, 2)
+    J[:, :, 3:6] = np.eye(3)
+    J[:, :, 6] = -np.stack([np.interp(time, middle, rate[:, k]) for k in range(3)], axis=1)
+    return J
 
 
 def _aligned(
@@ -618,11 +610,7 @@ def _in_truth_axes(P: Array, own: _Series, truth: Truth, alignment: Alignment) -
     T = np.kron(np.eye(size // 3), turn)
     result = T @ P @ T.T
     if alignment.estimated:
-        aligned = replace_attitude(own.attitude, alignment)
-        J = np.zeros((len(P), 3, 7))
-        J[:, :, :3] = np.swapaxes(quaternion.to_matrix(aligned), 1, 2)
-        J[:, :, 3:6] = np.eye(3)
-        J[:, :, 6] = -_speed_of(own.time, truth.attitude)
+        J = _jacobian(own.time, replace_attitude(own.attitude, alignment), truth)
         result[:, :3, :3] += J @ alignment.covariance @ np.swapaxes(J, 1, 2)
     return np.asarray(result)
 
@@ -633,10 +621,7 @@ def _in_truth_axes(P: Array, own: _Series, truth: Truth, alignment: Alignment) -
 def explanations(
     error: Array, readings: Mapping[str, Array], chosen: str, truth: Truth, time: Array, attitude: Array
 ) -> tuple[Explanation, ...]:
-    """Return what would explain the attitude errors (m, 3) better than the covariance alone, the likeliest first.
-
-    Constant rotations and an offset in time are fitted by weighted least squares, and what they gain is held against χ²; a scale of σ too.
-    """
+    """Return what would explain the attitude errors (m, 3) better than the covariance alone, the likeliest first."""
     from scipy.special import chdtrc
 
     P = readings[chosen][:, :3, :3]
@@ -645,10 +630,11 @@ def explanations(
     before = float(np.mean(white * white))
     effective = effective_samples(white / math.sqrt(max(before, 1e-300))) if m > 10 else 1.0
     factor = np.linalg.cholesky(P)
+    whole = _jacobian(time, attitude, truth)
     designs = {
-        "constant rotation of the fixed frame (heading, gravity)": np.swapaxes(quaternion.to_matrix(attitude), 1, 2),
-        "constant rotation of the body frame (mounting)": np.tile(np.eye(3), (m, 1, 1)),
-        "offset of the clock, delay": -_speed_of(time, truth.attitude)[:, :, None],
+        "constant rotation of the fixed frame (heading, gravity)": whole[:, :, :3],
+        "constant rotation of the body frame (mounting)": whole[:, :, 3:6],
+        "offset of the clock, delay": whole[:, :, 6:],
     }
     found = []
     for name, J in designs.items():
@@ -665,14 +651,8 @@ def explanations(
         size = f"{1e3 * x[0]:.4g} ms" if len(x) == 1 else f"{', '.join(f'{v / DEGREE:.3g}' for v in x)}°"
         found.append(Explanation(name=name, value=size, nees=after, p_value=float(chdtrc(len(x), max(gain, 0.0)))))
     scale_gain = 3.0 * effective * (before - 1.0 - math.log(max(before, 1e-300)))
-    found.append(
-        Explanation(
-            name=SCALE,
-            value=f"{math.sqrt(before):.3g}",
-            nees=1.0,
-            p_value=float(chdtrc(1, max(scale_gain, 0.0))),
-        )
-    )
+    p_value = float(chdtrc(1, max(scale_gain, 0.0)))
+    found.append(Explanation(name=SCALE, value=f"{math.sqrt(before):.3g}", nees=1.0, p_value=p_value))
     probabilities = frame_probabilities(error, {name: P[:, :3, :3] for name, P in readings.items()})
     for name, P_other in readings.items():
         if name == chosen or probabilities[name] <= probabilities[chosen]:

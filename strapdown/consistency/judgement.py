@@ -28,6 +28,7 @@ from strapdown.consistency.whiteness import (
     ljung_box,
     mean_innovation_p_value,
 )
+from strapdown.files import plain
 from strapdown.records import Estimate, Truth
 from strapdown.results import Listed, Listing, figure
 
@@ -182,12 +183,7 @@ class Judgement(Listed):
         return tuple(one.of for one in self.power if not one.of.startswith(_INNOVATIONS))
 
     def listing(self) -> Listing:
-        """Return the verdict and each statistic with its bounds, as a table.
-
-        Returns
-        -------
-        Listing
-        """
+        """Return the verdict and each statistic with its bounds, as a table."""
         rows = [
             (
                 one.name,
@@ -195,11 +191,12 @@ class Judgement(Listed):
                 figure(one.value),
                 f"{figure(one.low)} to {figure(one.high)}" if math.isfinite(one.low) else "",
                 figure(one.p_value, 2),
+                figure(one.samples),
                 "FAIL" if one.rejected else "pass",
             )
             for one in self.findings
         ]
-        columns = ("statistic", "of", "value", f"{100.0 * self.probability:g} % bounds", "p-value", "")
+        columns = ("statistic", "of", "value", f"{100.0 * self.probability:g} % bounds", "p-value", "samples", "")
         return Listing(
             f"{self.verdict}: {self.reason}", columns, rows, [f"Note: {one}." for one in self.limits], left=2
         )
@@ -219,22 +216,16 @@ class Judgement(Listed):
         dict
             Verdict, reason, probability, findings, limits, power and unmodelled errors by these names.
         """
-        plain = lambda x: None if isinstance(x, float) and not math.isfinite(x) else x  # noqa: E731
-        return {
+        table = {
             "verdict": self.verdict,
             "reason": self.reason,
             "probability": self.probability,
-            "findings": [
-                {
-                    **{name: plain(value) for name, value in vars(one).items()},
-                    "means": one.means if one.rejected else "",
-                }
-                for one in self.findings
-            ],
-            "limits": list(self.limits),
-            "power": [{"of": one.of, "factor": plain(one.factor)} for one in self.power],
-            "unmodelled": list(self.unmodelled),
+            "findings": [{**vars(one), "means": one.means if one.rejected else ""} for one in self.findings],
+            "limits": self.limits,
+            "power": [{"of": one.of, "factor": one.factor} for one in self.power],
+            "unmodelled": self.unmodelled,
         }
+        return plain(table)  # type: ignore[no-any-return]
 
 
 def judge(
@@ -269,11 +260,6 @@ def judge(
     Judgement
         Its ``power`` says for each state how wrong a σ the tests would have shown. An error state has no truth here, and is not
         tested.
-
-    Raises
-    ------
-    InputError
-        If the truth has other epochs than the estimate, or the probability is not between 0 and 1.
 
     References
     ----------

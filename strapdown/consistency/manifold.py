@@ -36,11 +36,6 @@ def errors(attitude: ArrayLike, bias: ArrayLike, true_attitude: ArrayLike, true_
     ndarray (..., 6)
         Attitude error as a rotation vector in the body frame, rad, and bias error, rad/s.
 
-    Raises
-    ------
-    InputError
-        If the shapes do not agree, or a quaternion is not of unit length.
-
     Examples
     --------
     >>> from strapdown import consistency, quaternion
@@ -60,10 +55,7 @@ def errors(attitude: ArrayLike, bias: ArrayLike, true_attitude: ArrayLike, true_
 
 
 def whitened(error: ArrayLike, covariance: ArrayLike) -> Array:
-    """Return L⁻¹ e (..., n) with P = L Lᵀ: independent standard normals if the covariance is right.
-
-    The first k components are those of the marginal of the first k states.
-    """
+    """Return L⁻¹ e (..., n) with P = L Lᵀ: independent standard normals if the covariance is right."""
     e = array("error", error, (..., "n"))
     P = array("covariance", covariance, (..., e.shape[-1], e.shape[-1]))
     try:

@@ -108,11 +108,6 @@ def judge_runs(
     -------
     Judgement
         "consistent" only where the runs would have shown a σ of attitude or bias wrong by :data:`.judgement.RESOLUTION`.
-
-    Raises
-    ------
-    InputError
-        If the probability is not between 0 and 1.
     """
     tail(probability)
     last = len(statistics.finite) - 1

@@ -19,10 +19,7 @@ MAX_LAGS = 20
 
 
 def usual_lags(samples: int) -> int:
-    """Return the number of lags that a whiteness test takes by default: a fiftieth of the samples, from 1 to 20.
-
-    More of them make the test's χ² distribution worse than its tails at 1 % bear.
-    """
+    """Return the number of lags that a whiteness test takes by default: a fiftieth of the samples, from 1 to 20."""
     return max(1, min(MAX_LAGS, samples // 50))
 
 

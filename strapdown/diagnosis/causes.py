@@ -8,6 +8,7 @@ from typing import Any
 
 from strapdown.checks import Array
 from strapdown.consistency import Finding, Judgement
+from strapdown.files import plain
 from strapdown.results import Listed, Listing, figure
 
 LIKELIER = math.log(20.0)
@@ -81,18 +82,13 @@ class Diagnosis(Listed):
     probability: float
 
     def listing(self) -> Listing:
-        """Return the causes considered, the likeliest first, as a table.
-
-        Returns
-        -------
-        Listing
-        """
+        """Return the causes considered, the likeliest first, as a table."""
         rows = [
-            (one.name, one.of, figure(one.gain), figure(one.log_p), "significant" if one in self.causes else "")
+            (one.name, one.of, figure(one.gain), figure(one.log_p), "likely" if one in self.causes else "no")
             for one in self.considered[:8]
         ]
         notes = self.words.splitlines()
-        return Listing("Causes by log-likelihood gained", ("cause", "of", "gain", "ln p", ""), rows, notes, left=2)
+        return Listing("Causes by what they would explain", ("cause", "of", "gain", "ln p", ""), rows, notes, left=2)
 
     @property
     def alternatives(self) -> tuple[Cause, ...]:
@@ -130,24 +126,9 @@ class Diagnosis(Listed):
             All hypotheses with their figures and whether they are significant, the probability, and the verdict as of
             :meth:`strapdown.consistency.Judgement.summary`.
         """
-        number = lambda x: float(x) if math.isfinite(x) else None  # noqa: E731
-
-        def row(cause: Cause) -> dict[str, Any]:
-            return {
-                "name": cause.name,
-                "of": cause.of,
-                "estimate": [number(x) for x in cause.estimate],
-                "standard_error": [number(x) for x in cause.standard_error],
-                "unit": cause.unit,
-                "gain": number(cause.gain),
-                "log_p": number(cause.log_p),
-                "words": cause.words,
-                "significant": cause in self.causes,
-                "alternative": cause in self.alternatives,
-            }
-
-        return {
-            "probability": self.probability,
-            "causes": [row(cause) for cause in self.considered],
-            "judgement": self.judgement.summary(),
-        }
+        causes = [
+            {**vars(one), "significant": one in self.causes, "alternative": one in self.alternatives}
+            for one in self.considered
+        ]
+        table = {"probability": self.probability, "causes": causes, "judgement": self.judgement.summary()}
+        return plain(table)  # type: ignore[no-any-return]

@@ -656,7 +656,7 @@ def _in_factor(problem: Problem, options: Options) -> Passed:
     kept = size if options.error_state_covariance else 6
     stands = np.tri(size, dtype=bool)
     stands[: model.loose, : model.loose] = True
-    stored = np.empty((options.segments + 1 if options.segments else 0, 5 + size + np.sum(stands)))
+    (stored,) = side_by_side(((options.segments + 1 if options.segments else 0, 5 + size + int(np.sum(stands))), float))
     out = root_form.Outputs(
         attitude=np.empty((rows, 4)),
         x=np.empty((rows, size - 3)),

@@ -332,7 +332,7 @@ class _FactorForm:
         kept = size if options.error_state_covariance else 6
         whole = (edges if options.full_covariance else 0, kept, kept)
         shapes = (edges, 4), (edges, size - 3), (edges, size), whole
-        return [np.empty(shape) for shape in shapes]
+        return side_by_side(*((shape, float) for shape in shapes))
 
     def estimate(self, outputs: Sequence[Array], options: Options) -> Estimate:
         """Return the smoothed states as an estimate."""

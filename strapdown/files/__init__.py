@@ -10,6 +10,7 @@ from __future__ import annotations
 from strapdown.files.writing import json_text as json_text
 from strapdown.files.writing import locked as locked
 from strapdown.files.writing import output_file as output_file
+from strapdown.files.writing import plain as plain
 from strapdown.files.writing import seal as seal
 from strapdown.files.writing import set_attributes as set_attributes
 from strapdown.files.writing import usable_folder as usable_folder

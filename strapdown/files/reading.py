@@ -62,10 +62,7 @@ class NoDigestWarning(UserWarning):
 
 @contextlib.contextmanager
 def from_file(path: Name) -> Iterator[None]:
-    """Raise any exception within as an InputError that names the file.
-
-    The content of the file is the input of the code within, so any exception is the file's fault; the original is chained to the error.
-    """
+    """Raise any exception within as an InputError that names the file: its fault, but for a library that is not installed."""
     try:
         yield
     except InputError as error:
@@ -75,6 +72,11 @@ def from_file(path: Name) -> Iterator[None]:
         raise InputError(said if Path(path).name in said else f"{path}: {said}") from error.__cause__
     except MemoryError:
         raise InputError(f"{path} does not fit into memory; cut it into parts") from None
+    except ImportError as error:
+        raise InputError(
+            f"{path} is not read: a library that strapdown needs is missing or broken ({error}); install strapdown again with pip, which "
+            "brings its libraries"
+        ) from error
     except Exception as error:
         what = _short(f"{type(error).__name__}: {error}" if isinstance(error, LookupError) else str(error))
         raise InputError(

@@ -26,6 +26,8 @@ Form = Mapping[str, Choice]
 PLAIN: Choice = (("", 1.0),)
 TEXT: Choice = (("", 0.0),)
 """Words and names; what has this choice holds no number."""
+FLAG: Choice = (("", 2.0),)
+"""What is true or false."""
 RATIO: Choice = (("ratio", 1.0),)
 PPM: Choice = (("ppm", 1e-6), ("ratio", 1.0))
 SECONDS: Choice = (("s", 1.0),)
@@ -51,21 +53,15 @@ def keys(form: Form) -> dict[str, tuple[str, float]]:
 
 
 def encode(value: Any, form: Form) -> dict[str, Any]:
-    """Return a dataclass as a table; fields at their default are left out."""
+    """Return a dataclass as a table; fields at their default, and None, are left out."""
     table: dict[str, Any] = {}
     for field in dataclasses.fields(value):
-        if field.name not in form:
-            continue
-        content = getattr(value, field.name)
-        if field.default is not dataclasses.MISSING:
-            default = field.default
-        elif field.default_factory is not dataclasses.MISSING:
+        content, default = getattr(value, field.name), field.default
+        if field.default_factory is not dataclasses.MISSING:
             default = field.default_factory()
-        else:
-            default = None
-        if default is not None and _same(content, default):
-            continue
-        table.update(_entry(field.name, content, form[field.name]))
+        known = default is not dataclasses.MISSING and default is not None
+        if field.name in form and content is not None and not (known and _same(content, default)):
+            table.update(_entry(field.name, content, form[field.name]))
     return table
 
 
@@ -75,7 +71,7 @@ def _same(a: Any, b: Any) -> bool:
 
 def _entry(name: str, content: Any, choice: Choice) -> dict[str, Any]:
     if isinstance(content, str | bool | int):
-        return {name if choice in (PLAIN, TEXT) else f"{name}_{choice[0][0]}": content}
+        return {name if choice in (PLAIN, TEXT, FLAG) else f"{name}_{choice[0][0]}": content}
     for suffix, factor in choice:
         exact = _exact_quotient(np.asarray(content, np.float64), factor)
         if exact is not None:
@@ -110,6 +106,10 @@ def _number(content: Any, factor: float, choice: Choice, place: str) -> Any:
     if choice == TEXT:
         if not isinstance(content, str):
             raise InputError(f"{place} is {content!r}; it must be a text in quotes")
+        return content
+    if choice == FLAG:
+        if not isinstance(content, bool):
+            raise InputError(f"{place} is {content!r}; it must be true or false")
         return content
     if choice == PLAIN and isinstance(content, str):
         return content
@@ -166,10 +166,7 @@ Kind = TypeVar("Kind")
 
 
 def read(path: str | os.PathLike[str], name: str, remedy: str, make: Callable[[Mapping[str, Any], str], Kind]) -> Kind:
-    """Return what ``make`` makes of the table ``[name]`` of a TOML file; ``remedy`` says what to do where there is none.
-
-    ``make`` is called with the table and what it is called in errors.
-    """
+    """Return what ``make`` makes of the table ``[name]`` of a TOML file; ``remedy`` says what to do where there is none."""
     with reading.from_file(path):
         table = reading.toml(path).get(name)
         if not isinstance(table, dict):

@@ -7,6 +7,7 @@ import datetime
 import hashlib
 import io
 import json
+import math
 import os
 import platform
 import tempfile
@@ -22,10 +23,7 @@ from strapdown.files.reading import BLOCK, SEAL
 
 @contextlib.contextmanager
 def written_beside(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Yield a temporary path in the same folder; on success it replaces ``path``, on any error it is removed.
-
-    Missing parent folders are made. The suffix is kept, so that writers which look at it (matplotlib) are content.
-    """
+    """Yield a temporary path in the same folder; on success it replaces ``path``, on any error it is removed."""
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(prefix=f".{target.stem}-", suffix=target.suffix, dir=target.parent)
@@ -127,10 +125,7 @@ def set_attributes(node: Any, values: Mapping[str, Any]) -> None:
 
 
 def usable_folder(name: str, folder: str | os.PathLike[str]) -> None:
-    """Refuse a folder that results cannot go to, before they are computed: one below a file, or that may not be written.
-
-    Nothing is made; the folder appears with the first file written.
-    """
+    """Refuse a folder that results cannot go to, before they are computed: one below a file, or that may not be written."""
     place = Path(folder).absolute()
     while not place.exists():
         place = place.parent
@@ -151,6 +146,17 @@ def output_file(
         if target.exists() and Path(source).exists() and target.samefile(source):
             raise InputError(f"{name} is {target}, the very file that is read; choose another name")
     usable_folder(name, target.parent)
+
+
+def plain(value: Any) -> Any:
+    """Return a value as JSON holds it: arrays as lists, numbers that are not finite as null."""
+    if isinstance(value, (np.ndarray, np.generic)):
+        value = value.tolist()
+    if isinstance(value, Mapping):
+        return {key: plain(one) for key, one in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(one) for one in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def json_text(content: Any) -> str:

@@ -52,10 +52,7 @@ def _registry() -> Any:
 
 
 def parse(name: str, text: str, wanted: str, example: str = "") -> float:
-    """Return a quantity given as text, in the unit ``wanted``; another dimension is refused.
-
-    Understands pint's syntax, ``sqrt(…)``, √ and °; ``h`` is the hour, ``g`` standard gravity and ``Hz`` 1/s.
-    """
+    """Return a quantity given as text, in the unit ``wanted``; another dimension is refused."""
     registry = _registry()
     if not isinstance(text, str):
         raise InputError(f"{name} is {text!r}; give it as text with its unit, such as {example!r}")
@@ -99,11 +96,6 @@ def from_datasheet(**quantities: str) -> GyroSpec:
     GyroSpec
         The specification, SI.
 
-    Raises
-    ------
-    InputError
-        If a quantity is unknown, is not text with a unit, or has another dimension.
-
     Notes
     -----
     IEEE Std 952 defines B by the PSD B²/(2π f), whose Allan deviation is flat at √(2 ln 2/π) B = 0.664 B. Most sheets print the
@@ -138,38 +130,25 @@ def _shaped(name: str, number: float) -> float | Array:
     return number
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Preset:
-    """A gyro on the market, by its public data sheet.
-
-    Parameters
-    ----------
-    name : str
-        Key in :data:`PRESETS`.
-    title : str
-        Maker, type and range.
-    grade : str
-        Kind of gyro, such as "consumer MEMS".
-    document : str
-        Data sheet of the stated figures.
-    checked : str
-        How the stated figures were checked against that sheet.
-    rate : float
-        A sample rate at which it is commonly run, Hz.
-    stated : mapping of str to str
-        Figures of the sheet, in its own units.
-    assumed : mapping of str to str
-        Figures that the sheet does not give in this form, assumed of the size usual for the grade.
-    """
+    """A gyro on the market, by its public data sheet."""
 
     name: str
     title: str
+    """Maker, type and range."""
     grade: str
+    """Kind of gyro, such as "consumer MEMS"."""
     document: str
+    """Data sheet of the stated figures."""
     checked: str
+    """How the stated figures were checked against that sheet."""
     rate: float
+    """A sample rate at which it is commonly run, Hz."""
     stated: Mapping[str, str]
+    """Figures of the sheet, in its own units."""
     assumed: Mapping[str, str]
+    """Figures that the sheet does not give in this form, assumed of the size usual for the grade."""
 
     @property
     def spec(self) -> GyroSpec:
@@ -177,143 +156,120 @@ class Preset:
         return from_datasheet(**{**self.assumed, **self.stated})
 
 
-def _preset(
-    name: str,
-    title: str,
-    grade: str,
-    document: str,
-    checked: str,
-    rate: float,
-    stated: dict[str, str],
-    assumed: dict[str, str],
-) -> tuple[str, Preset]:
-    return name, Preset(
-        name=name,
-        title=title,
-        grade=grade,
-        document=document,
-        checked=checked,
-        rate=rate,
-        stated=stated,
-        assumed=assumed,
-    )
-
-
 SHEET = "against the sheet"
 QUOTED = "against others who quote the sheet, and agree"
 
 
-PRESETS: dict[str, Preset] = dict(
-    [
-        _preset(
-            "mpu-9250",
-            "InvenSense MPU-9250, ±250 °/s",
-            "consumer MEMS",
-            "InvenSense PS-MPU-9250A-01 rev. 1.0, Product Specification, table 1",
-            SHEET,
-            200.0,
-            {"arw": "0.01 deg/s/sqrt(Hz)", "range": "250 deg/s"},
-            {
-                "bias_instability": "15 deg/h",
-                "rrw": "60 deg/h/sqrt(h)",
-                "turn_on_bias": "1 deg/s",
-                "rate_resolution": "0.0076293945 deg/s",
-            },
-        ),
-        _preset(
-            "bmi088",
-            "Bosch Sensortec BMI088, ±2000 °/s",
-            "consumer MEMS",
-            "Bosch Sensortec BST-BMI088-DS001, gyroscope specification",
-            QUOTED,
-            400.0,
-            {"arw": "0.014 deg/s/sqrt(Hz)", "range": "2000 deg/s"},
-            {"bias_instability": "4 deg/h", "rrw": "30 deg/h/sqrt(h)", "turn_on_bias": "0.5 deg/s"},
-        ),
-        _preset(
-            "adis16470",
-            "Analog Devices ADIS16470",
-            "industrial MEMS",
-            "Analog Devices ADIS16470 Data Sheet Rev. C, features and specifications",
-            SHEET,
-            500.0,
-            {"arw": "0.008 deg/s/sqrt(Hz)", "bias_instability": "8 deg/h", "range": "2000 deg/s"},
-            {"rrw": "30 deg/h/sqrt(h)", "turn_on_bias": "0.1 deg/s"},
-        ),
-        _preset(
-            "adis16467-1",
-            "Analog Devices ADIS16467-1",
-            "industrial MEMS",
-            "Analog Devices ADIS16467 Data Sheet, features",
-            SHEET,
-            500.0,
-            {
-                "arw": "0.15 deg/sqrt(h)",
-                "bias_instability": "2 deg/h",
-                "range": "125 deg/s",
-                "misalignment": "0.05 deg",
-            },
-            {"rrw": "10 deg/h/sqrt(h)", "turn_on_bias": "0.1 deg/s"},
-        ),
-        _preset(
-            "stim300",
-            "Sensonor STIM300",
-            "tactical MEMS",
-            "Sensonor TS1524 rev. 9, STIM300 Datasheet",
-            SHEET,
-            500.0,
-            {
-                "arw": "0.15 deg/sqrt(h)",
-                "bias_instability": "0.5 deg/h",
-                "range": "400 deg/s",
-                "scale_factor": "500 ppm",
-                "misalignment": "1 mrad",
-                "g_sensitivity": "1 deg/h/g",
-            },
-            {"rrw": "1 deg/h/sqrt(h)", "turn_on_bias": "10 deg/h"},
-        ),
-        _preset(
-            "hg4930",
-            "Honeywell HG4930CA51",
-            "tactical MEMS",
-            "Honeywell HG4930 Inertial Measurement Unit data sheet, model CA51",
-            QUOTED,
-            600.0,
-            {
-                "arw": "0.04 deg/sqrt(h)",
-                "bias_instability": "0.25 deg/h",
-                "turn_on_bias": "7 deg/h",
-                "range": "200 deg/s",
-            },
-            {"rrw": "0.5 deg/h/sqrt(h)"},
-        ),
-        _preset(
-            "dsp-1760",
-            "KVH DSP-1760",
-            "fibre-optic",
-            "KVH 54-0924 Rev. A, DSP-1760 Technical Manual, product specifications",
-            QUOTED,
-            1000.0,
-            {"arw": "0.012 deg/sqrt(h)", "bias_instability": "0.05 deg/h", "range": "490 deg/s"},
-            {"rrw": "0.05 deg/h/sqrt(h)", "turn_on_bias": "2 deg/h"},
-        ),
-        _preset(
-            "hg9900",
-            "Honeywell HG9900, ring laser gyros GG1320AN",
-            "navigation, ring laser",
-            "Honeywell N61-1638-000-000, HG9900 Inertial Measurement Unit brochure",
-            QUOTED,
-            300.0,
-            {"arw": "0.002 deg/sqrt(h)", "turn_on_bias": "0.0035 deg/h", "scale_factor": "5 ppm"},
-            {
-                "bias_instability": "0.002 deg/h",
-                "rrw": "0.001 deg/h/sqrt(h)",
-                "angle_resolution": "1 arcsec",
-                "range": "400 deg/s",
-            },
-        ),
-    ]
+_SHEETS = (
+    Preset(
+        "mpu-9250",
+        "InvenSense MPU-9250, ±250 °/s",
+        "consumer MEMS",
+        "InvenSense PS-MPU-9250A-01 rev. 1.0, Product Specification, table 1",
+        SHEET,
+        200.0,
+        {"arw": "0.01 deg/s/sqrt(Hz)", "range": "250 deg/s"},
+        {
+            "bias_instability": "15 deg/h",
+            "rrw": "60 deg/h/sqrt(h)",
+            "turn_on_bias": "1 deg/s",
+            "rate_resolution": "0.0076293945 deg/s",
+        },
+    ),
+    Preset(
+        "bmi088",
+        "Bosch Sensortec BMI088, ±2000 °/s",
+        "consumer MEMS",
+        "Bosch Sensortec BST-BMI088-DS001, gyroscope specification",
+        QUOTED,
+        400.0,
+        {"arw": "0.014 deg/s/sqrt(Hz)", "range": "2000 deg/s"},
+        {"bias_instability": "4 deg/h", "rrw": "30 deg/h/sqrt(h)", "turn_on_bias": "0.5 deg/s"},
+    ),
+    Preset(
+        "adis16470",
+        "Analog Devices ADIS16470",
+        "industrial MEMS",
+        "Analog Devices ADIS16470 Data Sheet Rev. C, features and specifications",
+        SHEET,
+        500.0,
+        {"arw": "0.008 deg/s/sqrt(Hz)", "bias_instability": "8 deg/h", "range": "2000 deg/s"},
+        {"rrw": "30 deg/h/sqrt(h)", "turn_on_bias": "0.1 deg/s"},
+    ),
+    Preset(
+        "adis16467-1",
+        "Analog Devices ADIS16467-1",
+        "industrial MEMS",
+        "Analog Devices ADIS16467 Data Sheet, features",
+        SHEET,
+        500.0,
+        {
+            "arw": "0.15 deg/sqrt(h)",
+            "bias_instability": "2 deg/h",
+            "range": "125 deg/s",
+            "misalignment": "0.05 deg",
+        },
+        {"rrw": "10 deg/h/sqrt(h)", "turn_on_bias": "0.1 deg/s"},
+    ),
+    Preset(
+        "stim300",
+        "Sensonor STIM300",
+        "tactical MEMS",
+        "Sensonor TS1524 rev. 9, STIM300 Datasheet",
+        SHEET,
+        500.0,
+        {
+            "arw": "0.15 deg/sqrt(h)",
+            "bias_instability": "0.5 deg/h",
+            "range": "400 deg/s",
+            "scale_factor": "500 ppm",
+            "misalignment": "1 mrad",
+            "g_sensitivity": "1 deg/h/g",
+        },
+        {"rrw": "1 deg/h/sqrt(h)", "turn_on_bias": "10 deg/h"},
+    ),
+    Preset(
+        "hg4930",
+        "Honeywell HG4930CA51",
+        "tactical MEMS",
+        "Honeywell HG4930 Inertial Measurement Unit data sheet, model CA51",
+        QUOTED,
+        600.0,
+        {
+            "arw": "0.04 deg/sqrt(h)",
+            "bias_instability": "0.25 deg/h",
+            "turn_on_bias": "7 deg/h",
+            "range": "200 deg/s",
+        },
+        {"rrw": "0.5 deg/h/sqrt(h)"},
+    ),
+    Preset(
+        "dsp-1760",
+        "KVH DSP-1760",
+        "fibre-optic",
+        "KVH 54-0924 Rev. A, DSP-1760 Technical Manual, product specifications",
+        QUOTED,
+        1000.0,
+        {"arw": "0.012 deg/sqrt(h)", "bias_instability": "0.05 deg/h", "range": "490 deg/s"},
+        {"rrw": "0.05 deg/h/sqrt(h)", "turn_on_bias": "2 deg/h"},
+    ),
+    Preset(
+        "hg9900",
+        "Honeywell HG9900, ring laser gyros GG1320AN",
+        "navigation, ring laser",
+        "Honeywell N61-1638-000-000, HG9900 Inertial Measurement Unit brochure",
+        QUOTED,
+        300.0,
+        {"arw": "0.002 deg/sqrt(h)", "turn_on_bias": "0.0035 deg/h", "scale_factor": "5 ppm"},
+        {
+            "bias_instability": "0.002 deg/h",
+            "rrw": "0.001 deg/h/sqrt(h)",
+            "angle_resolution": "1 arcsec",
+            "range": "400 deg/s",
+        },
+    ),
 )
+PRESETS = {one.name: one for one in _SHEETS}
 """Presets by name, from consumer MEMS to navigation grade. Where a sheet gives a turn-on bias by another word (offset, repeatability) or
 leaves the rate random walk out, as nearly all do, the figure is under ``assumed``."""
 
@@ -330,11 +286,6 @@ def preset(name: str) -> Preset:
     -------
     Preset
         The preset.
-
-    Raises
-    ------
-    InputError
-        If the name is unknown; the message names the nearest known one.
 
     Examples
     --------

@@ -33,10 +33,7 @@ _POLES = (-0.92314517, -0.60000265, -0.10898167)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Shaping:
-    """A shaping filter of unit flicker: ``x ← p x + w``, ``y = g · x``, with w one standard normal per sample.
-
-    For a bias instability B the noise is B y; its PSD B²/(2π f) does not depend on the sample interval.
-    """
+    """A shaping filter of unit flicker: ``x ← p x + w``, ``y = g · x``, with w one standard normal per sample."""
 
     decrements: Array
     """1 − p of each state (n,), exact where p itself is rounded; the time constants are sample interval / decrement."""

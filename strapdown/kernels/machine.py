@@ -10,7 +10,6 @@ Those in ``REPLACEABLE`` are its own where no other defines them.
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import hashlib
 import platform
@@ -77,18 +76,28 @@ def _defined(name: str, value: FunctionType, function: FunctionType, parts: tupl
     raise TypeError(f"{function.__module__} leaves {name} open, and {names} does not define it")
 
 
+@functools.cache
+def _checked(
+    function: FunctionType, parts: tuple[ModuleType, ...]
+) -> dict[str, tuple[FunctionType, tuple[ModuleType, ...]]]:
+    """Return what defines each kernel that a function names, by name, with its own parts; wrong names, those of theirs too, are refused."""
+    found = {}
+    for name in _names(function.__code__):
+        value = function.__globals__.get(name)
+        if isinstance(value, ModuleType) and value.__name__.startswith(PACKAGE):
+            raise TypeError(f"kernel {function.__name__} names module {name}; import its functions by name instead")
+        if isinstance(value, FunctionType) and _is_kernel(value):
+            value = _defined(name, value, function, parts)
+            found[name] = (value, parts if _depends_on_parts(value) else ())
+            _checked(*found[name])
+    return found
+
+
 def _twin(function: FunctionType, parts: tuple[ModuleType, ...]) -> FunctionType:
     """Return a copy of ``function`` whose kernel globals are the compiled helpers."""
-    bound: dict[str, Any] = {"__name__": function.__module__}
-    for name in _names(function.__code__):
-        if name in function.__globals__:
-            value = function.__globals__[name]
-            if isinstance(value, ModuleType) and value.__name__.startswith(PACKAGE):
-                raise TypeError(f"kernel {function.__name__} names module {name}; import its functions by name instead")
-            if _is_kernel(value):
-                value = _defined(name, value, function, parts)
-                value = helper(value, parts if _depends_on_parts(value) else ())
-            bound[name] = value
+    bound: dict[str, Any] = {name: helper(*one) for name, one in _checked(function, parts).items()}
+    others = (name for name in _names(function.__code__) if name in function.__globals__ and name not in bound)
+    bound |= {"__name__": function.__module__, **{name: function.__globals__[name] for name in others}}
     twin = FunctionType(function.__code__, bound, function.__name__, function.__defaults__, function.__closure__)
     twin.__qualname__ = function.__qualname__
     twin.__doc__ = function.__doc__
@@ -148,17 +157,32 @@ def compiled(function: Callable[..., Any], *parts: ModuleType) -> Any:
 
     from strapdown.kernels.compiler import KernelCompiler
 
+    if not isinstance(function, FunctionType) or not _is_kernel(function):
+        raise TypeError(f"{function!r} does not live in {PACKAGE}; move it there before compiling it")
+    _checked(function, parts)
+    # Twins are built only to compile: a tenth of a warm `strapdown estimate`.
+    twin = functools.partial(_twin, function, parts)
+
     class KernelCache(FunctionCache):  # type: ignore[misc]
         def _index_key(self, signature: Any, codegen: Any) -> Any:
             names = tuple(module.__name__ for module in parts)
             return (*super()._index_key(signature, codegen), names, sources_digest(parts))
 
-    if not _is_kernel(function):
-        raise TypeError(f"{function!r} does not live in {PACKAGE}; move it there before compiling it")
+        def load_overload(self, signature: Any, target: Any) -> Any:
+            # Not numba's own, which first imports and declares all that might be compiled, SciPy's linear algebra included.
+            found = None
+            with self._guard_against_spurious_io_errors():
+                found = self._load_overload(signature, target)
+            if found is None:
+                dispatcher._compiler.py_func = twin()
+            return found
+
     options = {"pipeline_class": KernelCompiler, "no_cfunc_wrapper": True, **_options()}
-    dispatcher = numba.njit(**options)(_twin(function, parts))  # type: ignore[arg-type]
-    with contextlib.suppress(RuntimeError):  # no writable place for a cache: compile in every process
-        dispatcher._cache = KernelCache(dispatcher.py_func)
+    dispatcher = numba.njit(**options)(function)
+    try:
+        dispatcher._cache = KernelCache(function)
+    except RuntimeError:  # no writable place for a cache: compile in every process
+        dispatcher._compiler.py_func = twin()
     return dispatcher
 
 

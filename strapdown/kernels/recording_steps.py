@@ -3,8 +3,22 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
-from strapdown.kernels.rotation import quaternion_multiply
+import numpy as np
+
+from strapdown.kernels.algebra import (
+    combine,
+    dot,
+    full,
+    multiply,
+    scale,
+    symmetric_minus_outer,
+    times_transpose_upper,
+    transpose,
+)
+from strapdown.kernels.rotation import exponential, quaternion_multiply, rotation_matrix, unit
+from strapdown.kernels.series import LARGEST_ANGLE
 
 
 def average_samples(samples, frame, edge, total, number):
@@ -29,40 +43,144 @@ def average_samples(samples, frame, edge, total, number):
         number[i] = count
 
 
-def carry_to_stamps(row, step, covariance_f, turned, ahead, rate, timing, iron, attitude, covariance):
-    """Carry attitudes at steps to the stamps of samples, and their covariance (k, 3, 3), fixed axes, to body axes there (n, 3, 3).
+def turned_by(q, v):
+    """Return q ⊗ exp(v) of norm one, the rotation vector v being of any length."""
+    square = dot(v, v)
+    if square < LARGEST_ANGLE * LARGEST_ANGLE:
+        return unit(quaternion_multiply(q, exponential(v)))
+    angle = math.sqrt(square)
+    s = math.sin(0.5 * angle) / angle
+    return unit(quaternion_multiply(q, (math.cos(0.5 * angle), s * v[0], s * v[1], s * v[2])))
 
-    Attitude n is ``step[row] ⊗ turned[n] ⊗ exp(ahead[n])``. The covariance includes a timing error of variance ``timing``, s², along the
-    rate, and ``iron``, rad², about the vertical.
+
+def turn_over(time, rate, late, sums, turn):
+    """Write the rotation vector (n, 3) by which a unit turned over ``late`` (n,), s, before each stamp, by the trapezoids of its rates.
+
+    Before the first and after the last sample it turns on at their rates. ``sums`` (n, 3) is work space.
     """
-    for n in range(len(row)):
-        k = row[n]
-        vx, vy, vz = ahead[n, 0], ahead[n, 1], ahead[n, 2]
-        angle = math.sqrt(vx * vx + vy * vy + vz * vz)
-        s = 0.5 if angle < 1e-8 else math.sin(0.5 * angle) / angle
-        q = quaternion_multiply(
-            (step[k, 0], step[k, 1], step[k, 2], step[k, 3]),
-            (turned[n, 0], turned[n, 1], turned[n, 2], turned[n, 3]),
+    n = len(time)
+    for c in range(3):
+        sums[0, c] = 0.0
+    for i in range(1, n):
+        half = 0.5 * (time[i] - time[i - 1])
+        for c in range(3):
+            sums[i, c] = sums[i - 1, c] + half * (rate[i - 1, c] + rate[i, c])
+    k = 0
+    for i in range(n):
+        then = time[i] - late[i]
+        while k < n - 1 and time[k + 1] <= then:
+            k += 1
+        while k > 0 and time[k] > then:
+            k -= 1
+        beyond = then - time[k]
+        inside = beyond >= 0.0 and k < n - 1
+        share = beyond / (time[k + 1] - time[k]) if inside else 0.0
+        for c in range(3):
+            step = share * (sums[k + 1, c] - sums[k, c]) if inside else beyond * rate[k, c]
+            turn[i, c] = sums[i, c] - (sums[k, c] + step)
+
+
+def turn_back(attitude, turn, result):
+    """Write the attitudes (n, 4) before the unit turned by ``turn`` (n, 3)."""
+    for i in range(len(turn)):
+        q = (attitude[i, 0], attitude[i, 1], attitude[i, 2], attitude[i, 3])
+        result[i, 0], result[i, 1], result[i, 2], result[i, 3] = turned_by(q, (-turn[i, 0], -turn[i, 1], -turn[i, 2]))
+
+
+class Steps(NamedTuple):
+    """Estimate at the filter's steps."""
+
+    edge: np.ndarray
+    """Sample at which each step is (k,), the first at the start."""
+    attitude: np.ndarray
+    bias: np.ndarray
+    variance: np.ndarray
+    """(k, 6)"""
+    covariance: np.ndarray
+    """(k, 6, 6)"""
+    tilt: np.ndarray
+    """Factor (k,) on the σ of the tilt."""
+
+
+class Stamps(NamedTuple):
+    """What is known at every sample."""
+
+    time: np.ndarray
+    rate: np.ndarray
+    turned: np.ndarray
+    """Attitude by the gyro alone (n, 4)."""
+    late: np.ndarray
+    """Delay of the stamp behind the motion (n,), s."""
+    ahead: np.ndarray
+    """Rotation vector (n, 3) over that delay, by the gyro."""
+
+
+class Carried(NamedTuple):
+    """Estimate at the stamps."""
+
+    attitude: np.ndarray
+    bias: np.ndarray
+    variance: np.ndarray
+    """(n, 6)"""
+    covariance: np.ndarray
+    """(n, 6, 6), or (0, 6, 6)."""
+
+
+def carry_to_stamps(steps, stamps, timing, iron, out):
+    """Carry the estimate at each step by the gyro to the stamps up to the next one, and over their delay.
+
+    The covariance includes a timing error of variance ``timing``, s², along the rate, and ``iron``, rad², about the vertical.
+    """
+    for k in range(len(steps.edge)):
+        first = steps.edge[k]
+        last = steps.edge[k + 1] if k + 1 < len(steps.edge) else len(stamps.time)
+        begin = (steps.attitude[k, 0], steps.attitude[k, 1], steps.attitude[k, 2], steps.attitude[k, 3])
+        t = stamps.turned
+        since = quaternion_multiply(begin, (t[first, 0], -t[first, 1], -t[first, 2], -t[first, 3]))
+        bias = (steps.bias[k, 0], steps.bias[k, 1], steps.bias[k, 2])
+        P = steps.covariance
+        body = (P[k, 0, 0], P[k, 0, 1], P[k, 0, 2], P[k, 1, 1], P[k, 1, 2], P[k, 2, 2])
+        R = rotation_matrix(begin)
+        xx, xy, xz, yy, yz, zz = times_transpose_upper(multiply(R, full(body)), R)
+        s = steps.tilt[k]
+        fixed = full((s * s * xx, s * s * xy, s * xz, s * s * yy, s * yz, zz))
+        across = (
+            P[k, 0, 3],
+            P[k, 0, 4],
+            P[k, 0, 5],
+            P[k, 1, 3],
+            P[k, 1, 4],
+            P[k, 1, 5],
+            P[k, 2, 3],
+            P[k, 2, 4],
+            P[k, 2, 5],
         )
-        w, x, y, z = quaternion_multiply(q, (math.cos(0.5 * angle), s * vx, s * vy, s * vz))
-        scale = 1.0 / math.sqrt(w * w + x * x + y * y + z * z)
-        w, x, y, z = scale * w, scale * x, scale * y, scale * z
-        attitude[n, 0], attitude[n, 1], attitude[n, 2], attitude[n, 3] = w, x, y, z
-        R = (
-            (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
-            (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
-            (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
-        )
-        for j in range(3):
-            a, b, c = R[0][j], R[1][j], R[2][j]
-            px = covariance_f[k, 0, 0] * a + covariance_f[k, 0, 1] * b + covariance_f[k, 0, 2] * c
-            py = covariance_f[k, 1, 0] * a + covariance_f[k, 1, 1] * b + covariance_f[k, 1, 2] * c
-            pz = covariance_f[k, 2, 0] * a + covariance_f[k, 2, 1] * b + covariance_f[k, 2, 2] * c
-            for i in range(j + 1):
-                p = R[0][i] * px + R[1][i] * py + R[2][i] * pz
-                p += timing * rate[n, i] * rate[n, j] + iron * R[2][i] * R[2][j]
-                covariance[n, i, j] = p
-                covariance[n, j, i] = p
+        across = multiply(R, across)
+        a, b = scale(s, across[:3]), scale(s, across[3:6])
+        across = (a[0], a[1], a[2], b[0], b[1], b[2], across[6], across[7], across[8])
+        for n in range(first, last):
+            late = stamps.time[n] - stamps.time[first] + stamps.late[n]
+            v = combine(1.0, (stamps.ahead[n, 0], stamps.ahead[n, 1], stamps.ahead[n, 2]), -late, bias)
+            q = turned_by(quaternion_multiply(since, (t[n, 0], t[n, 1], t[n, 2], t[n, 3])), v)
+            R = rotation_matrix(q)
+            own = times_transpose_upper(multiply(transpose(R), fixed), transpose(R))
+            w = (stamps.rate[n, 0], stamps.rate[n, 1], stamps.rate[n, 2])
+            own = symmetric_minus_outer(own, scale(-timing, w), w)
+            up = (R[6], R[7], R[8])  # in body axes
+            own = full(symmetric_minus_outer(own, scale(-iron, up), up))
+            out.attitude[n, 0], out.attitude[n, 1], out.attitude[n, 2], out.attitude[n, 3] = q
+            out.bias[n, 0], out.bias[n, 1], out.bias[n, 2] = bias
+            out.variance[n, 0], out.variance[n, 1], out.variance[n, 2] = own[0], own[4], own[8]
+            for i in range(3, 6):
+                out.variance[n, i] = steps.variance[k, i]
+            if n < len(out.covariance):
+                mixed = multiply(transpose(R), across)
+                for i in range(3):
+                    for j in range(3):
+                        out.covariance[n, i, j] = own[3 * i + j]
+                        out.covariance[n, i, 3 + j] = mixed[3 * i + j]
+                        out.covariance[n, 3 + j, i] = mixed[3 * i + j]
+                        out.covariance[n, 3 + i, 3 + j] = P[k, 3 + i, 3 + j]
 
 
 def low_pass(values, share, result):

@@ -18,9 +18,9 @@ import os
 import platform
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -47,53 +47,43 @@ FORMAT = 1
 SHARE = 0.1
 """Largest share of the time that is spent writing the file; chunks that finish faster are written several at a time."""
 
-_UNITS: dict[str, tuple[str, str]] = {
-    "time": ("s", "epochs"),
-    "finite": ("1", "runs whose error and covariance are finite numbers, by epoch"),
-    "error_sum": ("rad (columns 0-2), rad/s (columns 3-5)", "sum over runs of the error (dtheta, db)"),
-    "error_product_sum": ("rad^2, rad^2/s, (rad/s)^2", "sum over runs of error times its transpose"),
-    "covariance_sum": ("rad^2, rad^2/s, (rad/s)^2", "sum over runs of the filter's own covariance"),
-    "nees_sum": ("1", "sum over runs of the NEES of the state (6 degrees of freedom), the attitude (3), the bias (3)"),
-    "log_nees_sum": ("1", "sum over runs of the natural logarithm of the same"),
-    "coverage": ("1", "runs whose error lies inside 1, 2, 3 sigma, by epoch and state"),
-    "histogram": (
-        "1",
-        "runs by epoch, column (6 absolute errors, 3 NEES) and bin; see bins_per_octave and the exponents",
+
+class _Array(NamedTuple):
+    """An array of the statistics in the file."""
+
+    shape: tuple[int | str, ...]
+    """Lengths that the plan gives are named."""
+    meaning: str
+    unit: str = "1"
+    counts: bool = False
+    """Whether it holds whole numbers."""
+
+
+_ERROR, _PRODUCT = "rad (columns 0-2), rad/s (columns 3-5)", "rad^2, rad^2/s, (rad/s)^2"
+_RUNS = "runs by epoch, column (6 absolute errors, 3 NEES) and bin; see bins_per_octave and the exponents"
+_ARRAYS = {
+    "time": _Array(("epochs",), "epochs", "s"),
+    "finite": _Array(("epochs",), "runs whose error and covariance are finite numbers, by epoch", counts=True),
+    "error_sum": _Array(("epochs", 6), "sum over runs of the error (dtheta, db)", _ERROR),
+    "error_product_sum": _Array(("epochs", 6, 6), "sum over runs of error times its transpose", _PRODUCT),
+    "covariance_sum": _Array(("epochs", 6, 6), "sum over runs of the filter's own covariance", _PRODUCT),
+    "nees_sum": _Array(
+        ("epochs", 3), "sum over runs of the NEES of the state (6 degrees of freedom), the attitude (3), the bias (3)"
     ),
-    "nis_edges": ("s", "edges of the spans of time of the NIS"),
-    "sensor_nis_sum": ("1", "sum over runs of the NIS, by sensor and span of time"),
-    "sensor_degrees": ("1", "sum over runs of its degrees of freedom"),
-    "sensor_refused": ("1", "measurements that the gate refused"),
-    "worst_run": ("1", "numbers of the worst runs"),
-    "worst_score": ("1", "their largest NEES of the state"),
-    "example_run": ("1", "numbers of the example runs"),
-    "example_error": ("rad (columns 0-2), rad/s (columns 3-5)", "errors of the example runs by epoch"),
-    "example_sigma": ("rad (columns 0-2), rad/s (columns 3-5)", "the filter's own standard deviations in them"),
+    "log_nees_sum": _Array(("epochs", 3), "sum over runs of the natural logarithm of the same"),
+    "coverage": _Array(("epochs", 6, 3), "runs whose error lies inside 1, 2, 3 sigma, by epoch and state", counts=True),
+    "histogram": _Array(("epochs", 9, BINS), _RUNS, counts=True),
+    "nis_edges": _Array(("edges",), "edges of the spans of time of the NIS", "s"),
+    "sensor_nis_sum": _Array(("sensors", "spans"), "sum over runs of the NIS, by sensor and span of time"),
+    "sensor_degrees": _Array(("sensors", "spans"), "sum over runs of its degrees of freedom", counts=True),
+    "sensor_refused": _Array(("sensors", "spans"), "measurements that the gate refused", counts=True),
+    "worst_run": _Array(("worst",), "numbers of the worst runs", counts=True),
+    "worst_score": _Array(("worst",), "their largest NEES of the state"),
+    "example_run": _Array(("examples",), "numbers of the example runs", counts=True),
+    "example_error": _Array(("examples", "epochs", 6), "errors of the example runs by epoch", _ERROR),
+    "example_sigma": _Array(("examples", "epochs", 6), "the filter's own standard deviations in them", _ERROR),
 }
-
-
-_BY_EPOCH = (
-    "finite",
-    "error_sum",
-    "error_product_sum",
-    "covariance_sum",
-    "nees_sum",
-    "log_nees_sum",
-    "coverage",
-    "histogram",
-)
-"""Arrays with one row an epoch, sums over runs whose numbers are finite."""
-
-_COUNTED = (
-    "finite",
-    "coverage",
-    "histogram",
-    "sensor_degrees",
-    "sensor_refused",
-    "worst_run",
-    "example_run",
-)
-"""Arrays of counts, whole numbers."""
+"""Arrays of the statistics by name."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -210,12 +200,8 @@ def run(
         Start anew although the file exists.
     chunk : int, optional
         Runs between merges; default the file's, or the machine's.
-    machine : {"auto", "lanes", "scalar"}
-        "auto": the lanes if they support every term of the plan.
-    threads : int, optional
-        Default: one a core.
-    workers : Workers, optional
-        What computes the chunks instead of threads (:func:`strapdown.montecarlo.cluster.on_dask`).
+    machine, threads, workers : optional
+        As of :func:`strapdown.montecarlo.run_plan`.
     progress : callable, optional
         Called with the number of runs just finished, first with those that the file held.
 
@@ -401,43 +387,31 @@ def _put_statistics(group: Any, statistics: Statistics) -> None:
         "first_nees_exponent": NEES_EXPONENT,
     }
     set_attributes(group, attributes)
-    for name, (unit, meaning) in _UNITS.items():
-        put(group, name, getattr(statistics, name), unit, meaning)
+    for name, one in _ARRAYS.items():
+        put(group, name, getattr(statistics, name), one.unit, one.meaning)
 
 
 def _statistics_of(group: Any, plan: Plan) -> Statistics:
     """Return the statistics in a group, whose shapes must be those of a plan with these epochs and sensors."""
     attributes = reading.attributes(group)
-    arrays = {f.name: reading.numbers(group, f.name) for f in fields(Statistics) if f.name not in ("runs", "sensors")}
+    arrays = {name: reading.numbers(group, name) for name in _ARRAYS}
     place = f"{group.file.filename}: {group.name.lstrip('/')}"
-    epochs, spans, sensors = plan.epochs + 1, plan.nis_bins, len(plan.sensors)
-    worst, examples = len(arrays["worst_run"]), len(arrays["example_run"])
-    wanted: dict[str, tuple[int, ...]] = {
-        "time": (epochs,),
-        "finite": (epochs,),
-        "error_sum": (epochs, 6),
-        "error_product_sum": (epochs, 6, 6),
-        "covariance_sum": (epochs, 6, 6),
-        "nees_sum": (epochs, 3),
-        "log_nees_sum": (epochs, 3),
-        "coverage": (epochs, 6, 3),
-        "histogram": (epochs, 9, BINS),
-        "nis_edges": (spans + 1,),
-        "sensor_nis_sum": (sensors, spans),
-        "sensor_degrees": (sensors, spans),
-        "sensor_refused": (sensors, spans),
-        "worst_run": (worst,),
-        "worst_score": (worst,),
-        "example_run": (examples,),
-        "example_error": (examples, epochs, 6),
-        "example_sigma": (examples, epochs, 6),
+    lengths = {
+        "epochs": plan.epochs + 1,
+        "edges": plan.nis_bins + 1,
+        "spans": plan.nis_bins,
+        "sensors": len(plan.sensors),
+        "worst": len(arrays["worst_run"]),
+        "examples": len(arrays["example_run"]),
     }
     for name, value in arrays.items():
-        if value.shape != wanted[name] or (name in _BY_EPOCH and not np.isfinite(value).all()):
+        wanted = tuple(lengths[n] if isinstance(n, str) else n for n in _ARRAYS[name].shape)
+        sums = _ARRAYS[name].shape[0] == "epochs" and name != "time"  # over runs whose numbers are finite
+        if value.shape != wanted or (sums and not np.isfinite(value).all()):
             raise InputError(
-                f"{place}: {name} has shape {value.shape}, wanted {wanted[name]}, or is not finite; it is damaged: run the campaign anew"
+                f"{place}: {name} has shape {value.shape}, wanted {wanted}, or is not finite; it is damaged: run the campaign anew"
             )
-        if value.dtype.kind != ("i" if name in _COUNTED else "f"):
+        if value.dtype.kind != ("i" if _ARRAYS[name].counts else "f"):
             raise InputError(f"{place}: {name} is of type {value.dtype}; the file is damaged: run the campaign anew")
     names = tuple(reading.from_json(attributes["sensors"], f"{place}: sensors"))
     if names != plan.sensors:
@@ -457,11 +431,6 @@ def read(path: str | os.PathLike[str]) -> Campaign:
     -------
     Campaign
         With the statistics of the runs finished so far.
-
-    Raises
-    ------
-    InputError
-        If the file does not exist, is truncated, is of another kind, or was written by a newer version.
     """
     return _stored(Path(path))[0]
 

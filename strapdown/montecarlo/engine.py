@@ -12,7 +12,7 @@ from typing import Any, Protocol
 
 from strapdown.checks import InputError, count, one_of
 from strapdown.montecarlo import scalar
-from strapdown.montecarlo.plan import Dispersions, Plan
+from strapdown.montecarlo.plan import Plan
 from strapdown.montecarlo.statistics import Replay, Statistics, merge
 from strapdown.records import Origin
 from strapdown.scenarios import Scenario
@@ -116,11 +116,6 @@ def replay(plan: Plan, run: int, *, machine: str = "auto") -> Replay:
     -------
     Replay
         Record, initial state and estimate.
-
-    Raises
-    ------
-    InputError
-        If the number is negative, or the machine cannot compute the plan.
     """
     found = machine_named(choose(plan, machine).machine).replay(plan, count("run", run, least=0))
     spec = scalar.dispersed(plan.scenario.gyro, plan.dispersions, plan.seed, run)
@@ -206,10 +201,7 @@ class Window:
 
 
 def in_threads(threads: int | None = None) -> Workers:
-    """Return workers that are threads of this process; default one a core.
-
-    They are daemons: Ctrl-C does not wait for the chunks that are running.
-    """
+    """Return workers that are threads of this process; default one a core."""
     number = os.cpu_count() or 1 if threads is None else count("threads", threads)
 
     def work_through(work: Work, chunks: Chunks) -> Iterator[tuple[int, Parts]]:
@@ -293,11 +285,6 @@ def run_plan(
     -------
     Statistics
         Sums over all the runs, merged in the order of the chunks.
-
-    Raises
-    ------
-    InputError
-        If no machine computes the plan, or a number is out of range.
     """
     chosen = choose(plan, machine).machine
     size = machine_named(chosen).CHUNK if chunk is None else count("chunk", chunk)
@@ -311,13 +298,11 @@ def run(
     *,
     runs: int,
     seed: int,
-    epochs: int = 100,
-    nis_bins: int = 100,
-    dispersions: Dispersions | None = None,
     chunk: int | None = None,
     threads: int | None = None,
     machine: str = "scalar",
     progress: Callable[[int], None] | None = None,
+    **options: Any,
 ) -> list[Statistics]:
     """Run several filter setups on the same simulated runs and return the statistics of each.
 
@@ -333,43 +318,22 @@ def run(
         Number of independent runs.
     seed : int
         Seed of all random streams.
-    epochs : int, default 100
-        Intervals between the epochs of the statistics.
-    nis_bins : int, default 100
-        Spans of time of the NIS.
-    dispersions : Dispersions, optional
-        Initial errors and gyro parameters that differ from run to run.
-    chunk : int, optional
-        Runs between merges; default the machine's.
-    threads : int, optional
-        Default: one a core.
+    chunk, threads : int, optional
+        As of :func:`run_plan`.
     machine : {"scalar", "auto", "lanes"}
         "auto": the lanes if they support every setup.
     progress : callable, optional
-        Called with the number of runs just finished.
+        As of :func:`run_plan`.
+    **options
+        Other fields of :class:`Plan`, such as ``epochs``.
 
     Returns
     -------
     list of Statistics
         One a setup.
-
-    Raises
-    ------
-    InputError
-        If no machine computes a setup, or a number is out of range.
     """
     count("runs", runs)
-    plans = tuple(
-        Plan(
-            scenario=scenario,
-            setup=one,
-            seed=seed,
-            epochs=epochs,
-            nis_bins=nis_bins,
-            dispersions=dispersions or Dispersions(),
-        )
-        for one in setups
-    )
+    plans = tuple(Plan(scenario=scenario, setup=one, seed=seed, **options) for one in setups)
     names = {choose(plan, machine).machine for plan in plans}
     work = Work(plans=plans, machine=names.pop() if len(names) == 1 else scalar.NAME)
     size = machine_named(work.machine).CHUNK if chunk is None else count("chunk", chunk)

@@ -150,13 +150,7 @@ def _prepared(plan: Plan) -> _Prepared:
 
 def _quiet(spec: GyroSpec) -> GyroSpec:
     """Return the gyro without what differs from run to run."""
-    none = (
-        "angle_random_walk",
-        "rate_random_walk",
-        "bias_instability",
-        "markov_noise",
-        "turn_on_bias_sigma",
-    )
+    none = ("angle_random_walk", "rate_random_walk", "bias_instability", "markov_noise", "turn_on_bias_sigma")
     silent: dict[str, Any] = dict.fromkeys(none, 0.0)
     return replace(spec, **silent, range=np.inf)
 
@@ -177,7 +171,9 @@ def _prepare(plan: Plan) -> _Prepared:
     )
     steps = quiet if algorithm.name == "one-sample" else compress(quiet, algorithm)
     n = algorithm.samples
-    series = tuple(_nominal(sensor, scenario, plan.seed) for sensor in scenario.sensors)
+    # Of some run: times, kinds, references and nominal σ are those of all runs.
+    ends = scenario.motion, scenario.edges[0], scenario.edges[-1]
+    series = tuple(one.observe(*ends, generator(plan.seed, 0, one.name)) for one in scenario.sensors)
     record = replace(steps, vectors=series)
     modelled = setup.modelled_record(replace(quiet, vectors=series), plan.setup)
     events = schedule(modelled.vectors, float(record.time[0]), float(record.time[-1]))
@@ -285,17 +281,8 @@ def _gyro_terms(plan: Plan, dt: float, steps: int) -> tuple[Any, ...]:
     )
 
 
-def _nominal(sensor: Any, scenario: Scenario, seed: int) -> VectorMeasurements:
-    """Return the series of a sensor in some run: its times, kind, references and nominal σ are those of all runs."""
-    series = sensor.observe(scenario.motion, scenario.edges[0], scenario.edges[-1], generator(seed, 0, sensor.name))
-    return series  # type: ignore[no-any-return]
-
-
 def _exact(sensor: Any, scenario: Scenario, series: VectorMeasurements) -> tuple[Array, Array, Array]:
-    """Return the values of a sensor without noise (m, 4), its true σ (m, 3), and the scale of its noise (m,), as the filter takes them.
-
-    Vectors are taken over the length of their references, an attitude as a quaternion.
-    """
+    """Return the values of a sensor without noise (m, 4), its true σ (m, 3), and the scale of its noise (m,), as the filter takes them."""
     silent = replace(sensor.faults, outlier_probability=0.0, correlated_sigma=0.0)
     changes: dict[str, Any] = {"faults": silent}
     if isinstance(sensor, AttitudeSensor):
@@ -509,10 +496,7 @@ def _example(kept: Array, truth: Array) -> tuple[Array, Array]:
 
 
 def replay(plan: Plan, run: int, *, width: int = 1) -> Replay:
-    """Return one run in full detail, bitwise what it is among the others.
-
-    The record is at the filter's steps: an increment is what the coning algorithm makes of its gyro samples.
-    """
+    """Return one run in full detail, bitwise what it is among the others."""
     number = count("run", run, least=0)
     group = _Group(plan, width, every=1, detail=True)
     group.advance(number)

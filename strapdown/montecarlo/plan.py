@@ -96,7 +96,7 @@ class Dispersions:
         dict
             Values by key; the ending of a key is its unit (``attitude_sigma_deg``).
         """
-        return tables.encode(self, {n: choice for n, choice in _FORM.items() if getattr(self, n) is not None})
+        return tables.encode(self, _FORM)
 
 
 _FORM: tables.Form = {

@@ -7,11 +7,13 @@ whether it is one of a campaign or a replay.
 from __future__ import annotations
 
 import contextlib
+import functools
 import hashlib
 import weakref
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -118,20 +120,10 @@ class _Remembered:
                     self._known.popitem(last=False)
         return answer
 
-    def attitude(self, time: ArrayLike) -> Array:
-        return self._answer("attitude", time)
-
-    def body_rate(self, time: ArrayLike) -> Array:
-        return self._answer("body_rate", time)
-
-    def fixed_rate(self, time: ArrayLike) -> Array:
-        return self._answer("fixed_rate", time)
-
-    def body_angular_acceleration(self, time: ArrayLike) -> Array:
-        return self._answer("body_angular_acceleration", time)
-
-    def increments(self, edges: ArrayLike) -> Array:
-        return self._answer("increments", edges)
+    attitude = functools.partialmethod(_answer, "attitude")
+    body_rate = functools.partialmethod(_answer, "body_rate")
+    body_angular_acceleration = functools.partialmethod(_answer, "body_angular_acceleration")
+    increments = functools.partialmethod(_answer, "increments")
 
 
 _SCENARIOS: weakref.WeakKeyDictionary[Plan, Scenario] = weakref.WeakKeyDictionary()
@@ -186,18 +178,25 @@ class Sums:
     """Statistics of one plan in the making, run by run."""
 
     def __init__(self, plan: Plan, runs: int) -> None:
-        m, s = plan.epochs + 1, len(plan.sensors)
+        m, s, k = plan.epochs + 1, len(plan.sensors), plan.nis_bins
         self.plan = plan
-        self.runs = runs
-        self.time, self.nis_edges = plan.time, plan.nis_edges
-        self.finite = np.zeros(m, np.int64)
-        self.error = np.zeros((m, 6))
-        self.product, self.covariance = np.zeros((m, 6, 6)), np.zeros((m, 6, 6))
-        self.nees, self.log_nees = np.zeros((m, 3)), np.zeros((m, 3))
-        self.coverage = np.zeros((m, 6, 3), np.int64)
-        self.histogram = np.zeros((m, 9, BINS), np.int64)
-        self.nis = np.zeros((s, plan.nis_bins))
-        self.degrees, self.refused = np.zeros((s, plan.nis_bins), np.int64), np.zeros((s, plan.nis_bins), np.int64)
+        self.sums = SimpleNamespace(
+            time=plan.time,
+            runs=runs,
+            finite=np.zeros(m, np.int64),
+            error_sum=np.zeros((m, 6)),
+            error_product_sum=np.zeros((m, 6, 6)),
+            covariance_sum=np.zeros((m, 6, 6)),
+            nees_sum=np.zeros((m, 3)),
+            log_nees_sum=np.zeros((m, 3)),
+            coverage=np.zeros((m, 6, 3), np.int64),
+            histogram=np.zeros((m, 9, BINS), np.int64),
+            nis_edges=plan.nis_edges,
+            sensors=plan.sensors,
+            sensor_nis_sum=np.zeros((s, k)),
+            sensor_degrees=np.zeros((s, k), np.int64),
+            sensor_refused=np.zeros((s, k), np.int64),
+        )
         self.scores: list[tuple[int, float]] = []
         self.examples: list[tuple[int, Array, Array]] = []
 
@@ -219,7 +218,7 @@ class Sums:
         """Add the estimate of one run."""
         assert record.truth is not None
         assert estimate.covariance is not None
-        rows = slice(None) if regular else _at_epochs(estimate.time, self.time)
+        rows = slice(None) if regular else _at_epochs(estimate.time, self.sums.time)
         edges = np.searchsorted(record.time, estimate.time[rows])
         P = estimate.covariance[rows]
         known = np.isfinite(estimate.attitude[rows]).all(axis=1)
@@ -244,17 +243,17 @@ class Sums:
         else:
             nees = np.stack([_nees(error[:, a:b], P[:, a:b, a:b]) for a, b in ((0, 6), (0, 3), (3, 6))], axis=1)
         good = np.isfinite(nees).all(axis=1) & np.isfinite(error).all(axis=1) & np.isfinite(P).all(axis=(1, 2))
-        m = np.flatnonzero(good)
+        m, sums = np.flatnonzero(good), self.sums
         e, squares = error[m], nees[m]
-        self.finite[m] += 1
-        self.error[m] += e
-        self.product[m] += e[:, :, None] * e[:, None, :]
-        self.covariance[m] += P[m]
-        self.nees[m] += squares
-        self.log_nees[m] += np.log(np.maximum(squares, _TINY))
-        self.coverage[m] += np.abs(e)[:, :, None] <= sigma[m][:, :, None] * np.array([1.0, 2.0, 3.0])
+        sums.finite[m] += 1
+        sums.error_sum[m] += e
+        sums.error_product_sum[m] += e[:, :, None] * e[:, None, :]
+        sums.covariance_sum[m] += P[m]
+        sums.nees_sum[m] += squares
+        sums.log_nees_sum[m] += np.log(np.maximum(squares, _TINY))
+        sums.coverage[m] += np.abs(e)[:, :, None] <= sigma[m][:, :, None] * np.array([1.0, 2.0, 3.0])
         bins = np.concatenate([bin_of(np.abs(e), ERROR_EXPONENT), bin_of(squares, NEES_EXPONENT)], axis=1)
-        self.histogram[m[:, None], np.arange(9), bins] += 1
+        sums.histogram[m[:, None], np.arange(9), bins] += 1
         self.scores.append((run, float(nees[:, 0].max()) if good.all() else np.inf))
         if run < EXAMPLES:
             self.examples.append((run, error, sigma))
@@ -265,35 +264,21 @@ class Sums:
             if sensor not in estimate.innovations:  # a filter of one's own may give none
                 continue
             innovations = estimate.innovations[sensor]
-            place = np.clip(np.searchsorted(self.nis_edges, innovations.time, side="left") - 1, 0, bins - 1)
+            place = np.clip(np.searchsorted(self.sums.nis_edges, innovations.time, side="left") - 1, 0, bins - 1)
             used = innovations.used
-            self.nis[i] += np.bincount(place[used], weights=innovations.nis[used], minlength=bins)
-            self.degrees[i] += np.bincount(place[used], minlength=bins) * innovations.innovation.shape[1]
-            self.refused[i] += np.bincount(place[~used], minlength=bins)
+            self.sums.sensor_nis_sum[i] += np.bincount(place[used], weights=innovations.nis[used], minlength=bins)
+            self.sums.sensor_degrees[i] += np.bincount(place[used], minlength=bins) * innovations.innovation.shape[1]
+            self.sums.sensor_refused[i] += np.bincount(place[~used], minlength=bins)
 
     @property
     def statistics(self) -> Statistics:
         """Statistics of the runs added so far."""
         run, score = (np.array(column) for column in zip(*self.scores, strict=True))
         worst_run, worst_score = worst(run.astype(np.int64), score.astype(np.float64))
-        m = len(self.time)
+        m = len(self.sums.time)
         kept: Any = list(zip(*self.examples, strict=True)) or [(), np.empty((0, m, 6)), np.empty((0, m, 6))]
         return Statistics(
-            time=self.time,
-            runs=self.runs,
-            finite=self.finite,
-            error_sum=self.error,
-            error_product_sum=self.product,
-            covariance_sum=self.covariance,
-            nees_sum=self.nees,
-            log_nees_sum=self.log_nees,
-            coverage=self.coverage,
-            histogram=self.histogram,
-            nis_edges=self.nis_edges,
-            sensors=self.plan.sensors,
-            sensor_nis_sum=self.nis,
-            sensor_degrees=self.degrees,
-            sensor_refused=self.refused,
+            **vars(self.sums),
             worst_run=worst_run,
             worst_score=worst_score,
             example_run=np.array(kept[0], np.int64),

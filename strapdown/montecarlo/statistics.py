@@ -178,12 +178,7 @@ class Statistics(Listed):
     example_sigma: Array
 
     def listing(self) -> Listing:
-        """Return NEES and NIS per degree of freedom, and the errors at the end, as a table.
-
-        Returns
-        -------
-        Listing
-        """
+        """Return NEES and NIS per degree of freedom, and the errors at the end, as a table."""
         from strapdown.montecarlo.verdicts import summary
 
         report = summary(self)

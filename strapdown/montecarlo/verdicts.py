@@ -9,6 +9,7 @@ import numpy as np
 
 from strapdown import consistency, covariance, units
 from strapdown.checks import Array, InputError
+from strapdown.files import plain
 from strapdown.montecarlo.plan import Plan
 from strapdown.montecarlo.statistics import COVERED, Counts, Statistics, judged_epochs
 from strapdown.setup import MEKF, matched
@@ -70,9 +71,9 @@ def summary(
     for subset in statistics.subsets:
         mean, one = statistics.verdict(chosen, subset).mean, found["ANEES", subset]
         nees[subset] = {
-            "anees": _number(mean.mean()),
-            "least": _number(mean.min()),
-            "greatest": _number(mean.max()),
+            "anees": mean.mean(),
+            "least": mean.min(),
+            "greatest": mean.max(),
             "bounds": [one.low, one.high],
             "epochs_outside": int(np.sum(~((mean >= one.low) & (mean <= one.high)))),
             "consistent": not one.rejected,
@@ -80,7 +81,7 @@ def summary(
     nis = [
         {
             "sensor": statistics.sensors[i],
-            "nis": _number(statistics.sensor_nis[i]),
+            "nis": statistics.sensor_nis[i],
             "bounds": [one.low, one.high],
             "degrees_of_freedom": int(statistics.sensor_degrees[i].sum()),
             "refused": int(statistics.sensor_refused[i].sum()),
@@ -89,7 +90,7 @@ def summary(
         for i in seen
         for one in [found["NIS", statistics.sensors[i]]]
     ]
-    return {
+    table = {
         "runs": statistics.runs,
         "failed_runs": statistics.failed,
         "probability": probability,
@@ -100,29 +101,27 @@ def summary(
         "last_epoch": _last_epoch(statistics),
         **({} if bound is None else {"rms_over_root_cramer_rao_bound": _efficiency(statistics, bound, chosen)}),
         "worst_runs": [
-            {"run": int(run), "largest_nees": _number(score)}
+            {"run": int(run), "largest_nees": score}
             for run, score in zip(statistics.worst_run, statistics.worst_score, strict=True)
         ],
         "consistent": statistics.failed == 0 and judgement.verdict != "not consistent",
     }
+    return plain(table)  # type: ignore[no-any-return]
 
 
-def _coverage(statistics: Statistics, epochs: Counts) -> dict[str, list[float | None]]:
+def _coverage(statistics: Statistics, epochs: Counts) -> dict[str, Any]:
     """Return the share of errors inside 1, 2, 3 σ over the axes and the judged epochs."""
     covered = statistics.covered[epochs]
-    return {
-        name: [_number(x) for x in covered[:, rows].mean(axis=(0, 1))]
-        for name, rows in (("attitude", slice(0, 3)), ("bias", slice(3, 6)))
-    }
+    return {"attitude": covered[:, :3].mean(axis=(0, 1)), "bias": covered[:, 3:].mean(axis=(0, 1))}
 
 
-def _efficiency(statistics: Statistics, bound: Array, epochs: Counts) -> dict[str, list[float | None]]:
+def _efficiency(statistics: Statistics, bound: Array, epochs: Counts) -> dict[str, Any]:
     """Return the RMS over the judged epochs of the RMS error over the root of the bound, by axis, and its bounds at one epoch."""
     ratio = np.sqrt(np.mean(efficiency(statistics, bound)[epochs] ** 2, axis=0))
     parts = {"attitude": ratio[:3], "bias": ratio[3:]}
     low, high = consistency.mean_bounds(1, statistics.runs)
     return {
-        **{name: [_number(x) for x in values] for name, values in parts.items() if np.isfinite(values).all()},
+        **{name: values for name, values in parts.items() if np.isfinite(values).all()},
         "bounds_of_an_efficient_filter": [low**0.5, high**0.5],
     }
 
@@ -136,13 +135,8 @@ def _last_epoch(statistics: Statistics) -> dict[str, Any]:
     ):
         for what in ("mean_error", "rms_error", "sigma"):
             values = getattr(statistics, what)[-1, rows] / factor
-            result[f"{name}_{what}_{unit}"] = [_number(x) for x in values]
+            result[f"{name}_{what}_{unit}"] = values
         for q in QUANTILES:
             values = statistics.error_quantile(q)[-1, rows] / factor
-            result[f"{name}_error_quantile_{q:g}_{unit}"] = [_number(x) for x in values]
+            result[f"{name}_error_quantile_{q:g}_{unit}"] = values
     return result
-
-
-def _number(value: Any) -> float | None:
-    """Return a float, None where it is not finite: JSON has no word for that."""
-    return float(value) if np.isfinite(value) else None

@@ -57,11 +57,6 @@ class Composed:
         t = times(time)
         return self._carried_rate(t) + self.vibration.body_rate(t)
 
-    def fixed_rate(self, time: ArrayLike) -> Array:
-        """Return w_f = w_base,f + R_base w_v,f, rad/s."""
-        t = times(time)
-        return self.base.fixed_rate(t) + quaternion.rotate(self.base.attitude(t), self.vibration.fixed_rate(t))
-
     def body_angular_acceleration(self, time: ArrayLike) -> Array:
         """Return dw_b/dt = R_vᵀ ẇ_base − w_v × R_vᵀ w_base + ẇ_v, rad/s²."""
         t = times(time)

@@ -57,12 +57,6 @@ class Coning:
         across = self.rate * math.sin(self.angle)
         return stacked(-across * sine, across * cosine, self._rate_along)
 
-    def fixed_rate(self, time: ArrayLike) -> Array:
-        """Return w_f = (−ω sinβ sin ωt, ω sinβ cos ωt, ω(1 − cosβ)), rad/s."""
-        cosine, sine = cosine_sine((self.rate, 0.0), times(time))
-        across = self.rate * math.sin(self.angle)
-        return stacked(-across * sine, across * cosine, -self._rate_along)
-
     def body_angular_acceleration(self, time: ArrayLike) -> Array:
         """Return dw_b/dt = −ω² sinβ (cos ωt, sin ωt, 0), rad/s²."""
         cosine, sine = cosine_sine((self.rate, 0.0), times(time))
@@ -122,13 +116,6 @@ class SpinCone:
         cosine, sine = cosine_sine((self.spin_rate, 0.0), times(time))
         across = self.precession_rate * math.sin(self.angle)
         return stacked(across * sine, across * cosine, self._rate_along)
-
-    def fixed_rate(self, time: ArrayLike) -> Array:
-        """Return w_f = (Ω_s sinβ sin Ω_p t, −Ω_s sinβ cos Ω_p t, Ω_p + Ω_s cosβ), rad/s."""
-        cosine, sine = cosine_sine((self.precession_rate, 0.0), times(time))
-        across = self.spin_rate * math.sin(self.angle)
-        along = (self.precession_rate + self.spin_rate) - 2.0 * self.spin_rate * math.sin(0.5 * self.angle) ** 2
-        return stacked(across * sine, -across * cosine, along)
 
     def body_angular_acceleration(self, time: ArrayLike) -> Array:
         """Return dw_b/dt, rad/s²."""

@@ -54,11 +54,6 @@ class ConstantRate:
         """Return w_b, rad/s."""
         return np.broadcast_to(np.array(self.rate), (*times(time).shape, 3)).copy()
 
-    def fixed_rate(self, time: ArrayLike) -> Array:
-        """Return w_f, rad/s: constant too."""
-        w_f = quaternion.rotate(np.array(self.initial_attitude), np.array(self.rate))
-        return np.broadcast_to(w_f, (*times(time).shape, 3)).copy()
-
     def body_angular_acceleration(self, time: ArrayLike) -> Array:
         """Return zeros, rad/s²."""
         return np.zeros((*times(time).shape, 3))

@@ -11,7 +11,7 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import ArrayLike
 
-from strapdown import checks, kinematics, quaternion
+from strapdown import checks, quaternion
 from strapdown.checks import Array
 from strapdown.motion.exact_phase import cosine_sine, harmonic_integrals
 from strapdown.motion.parameters import IDENTITY, edge_stamps, store_attitude, store_number, store_vector, times
@@ -104,10 +104,6 @@ class HarmonicRates:
         stamps = edge_stamps(edges)
         steady = np.diff(stamps)[:, None] * np.array(self.mean)
         return self._sum(lambda h: harmonic_integrals((h.rate, 0.0), stamps, h.phase)[0], steady, (len(stamps) - 1,))
-
-    def fixed_rate(self, time: ArrayLike) -> Array:
-        """Return w_f, rad/s."""
-        return kinematics.body_to_fixed_rate(self.attitude(time), self.body_rate(time))
 
     @property
     def _largest_rate(self) -> float:

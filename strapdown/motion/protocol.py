@@ -52,21 +52,6 @@ class Motion(Protocol):
         """
         ...
 
-    def fixed_rate(self, time: ArrayLike) -> Array:
-        """Return the angular rate in fixed axes, w_f of equation (3) of *Quaternion differentiation*.
-
-        Parameters
-        ----------
-        time : array_like (...)
-            Times, s.
-
-        Returns
-        -------
-        ndarray (..., 3)
-            w_f, rad/s.
-        """
-        ...
-
     def body_angular_acceleration(self, time: ArrayLike) -> Array:
         """Return the angular acceleration in body axes, dw_b/dt.
 

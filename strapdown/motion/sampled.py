@@ -107,12 +107,6 @@ class SampledAttitude:
         """Return ``w_b = 2 vec(s* ⊗ ṡ)/|s|²``, rad/s."""
         return self._smooth_rate(times(time))
 
-    def fixed_rate(self, time: ArrayLike) -> Array:
-        """Return ``w_f = 2 vec(ṡ ⊗ s*)/|s|²``, rad/s."""
-        s, velocity = self._smooth(times(time), 1)
-        product = quaternion.multiply(velocity, quaternion.conjugate(s))[..., 1:]
-        return np.asarray(2.0 * product / np.sum(s * s, axis=-1, keepdims=True))
-
     def body_angular_acceleration(self, time: ArrayLike) -> Array:
         """Return ``dw_b/dt = 2 vec(s* ⊗ s̈)/|s|² − 2 w_b (s · ṡ)/|s|²``, rad/s²."""
         s, velocity, acceleration = self._smooth(times(time), 2)

@@ -74,10 +74,6 @@ class Slew:
         """Return w_b, rad/s."""
         return np.asarray(self._rate(*self._elapsed(times(time)))[..., None] * np.array(self.rotation_vector))
 
-    def fixed_rate(self, time: ArrayLike) -> Array:
-        """Return w_f, rad/s: the same axis, as the initial attitude shows it."""
-        return quaternion.rotate(np.array(self.initial_attitude), self.body_rate(time))
-
     def body_angular_acceleration(self, time: ArrayLike) -> Array:
         """Return dw_b/dt, rad/s²."""
         since, until = self._elapsed(times(time))

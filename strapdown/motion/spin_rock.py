@@ -68,11 +68,6 @@ class SpinRock:
         cosine, sine = cosine_sine((self.spin_rate, 0.0), t)
         return stacked(rock_rate * cosine, -rock_rate * sine, self.spin_rate)
 
-    def fixed_rate(self, time: ArrayLike) -> Array:
-        """Return w_f = (α̇, −Ω_s sin α, Ω_s cos α), rad/s."""
-        rock, rock_rate, _ = self._rock(times(time))
-        return stacked(rock_rate, -self.spin_rate * np.sin(rock), self.spin_rate * np.cos(rock))
-
     def body_angular_acceleration(self, time: ArrayLike) -> Array:
         """Return dw_b/dt, rad/s²."""
         t = times(time)

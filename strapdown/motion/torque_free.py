@@ -11,7 +11,7 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import ArrayLike
 
-from strapdown import checks, kinematics, quaternion
+from strapdown import checks, quaternion
 from strapdown.checks import Array
 from strapdown.motion.constant_rate import ConstantRate
 from strapdown.motion.euler_poinsot import EulerPoinsot
@@ -86,10 +86,6 @@ class TorqueFree:
     def body_rate(self, time: ArrayLike) -> Array:
         """Return w_b, rad/s."""
         return self._solution.body_rate(times(time))
-
-    def fixed_rate(self, time: ArrayLike) -> Array:
-        """Return w_f, rad/s."""
-        return kinematics.body_to_fixed_rate(self.attitude(time), self.body_rate(time))
 
     def body_angular_acceleration(self, time: ArrayLike) -> Array:
         """Return dw_b/dt from Euler's equations, ``I ẇ = (I w) × w``, rad/s²."""

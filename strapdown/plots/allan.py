@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from strapdown.allan import AllanDeviation, NoiseFit
-from strapdown.allan.parameters import UNITS, name
+from strapdown.allan import AllanDeviation, NoiseFit, curves_by_axis
+from strapdown.allan.noise_fit import UNITS, name
 from strapdown.checks import Array
 from strapdown.plots.style import (
     AXES,
@@ -28,17 +28,11 @@ from strapdown.plots.style import (
 
 
 def allan_axis(
-    deviation: AllanDeviation,
-    fit: NoiseFit,
-    curves: Mapping[str, Array],
-    axis: int,
-    ax: Axes | None = None,
-    *,
-    sensor: str = "gyro",
+    deviation: AllanDeviation, fit: NoiseFit, curves: Mapping[str, Array], axis: int, ax: Axes | None = None
 ) -> Axes:
     """Draw one axis of an Allan deviation with its confidence band, the fit, and the fitted terms (``curves``, SI at the same τ)."""
     ax = axes_or_new(ax)
-    unit, scale = UNITS[sensor]["bias_instability"]
+    unit, scale = UNITS[fit.sensor]["bias_instability"]
     upper = np.where(np.isfinite(deviation.upper[axis]), deviation.upper[axis], np.nan)
     band = (deviation.lower[axis] / scale, upper / scale)
     ax.fill_between(
@@ -55,7 +49,7 @@ def allan_axis(
                 "--",
                 color=colors[term],
                 linewidth=1.1,
-                label=name(sensor, term).replace("_", " "),
+                label=name(fit.sensor, term).replace("_", " "),
             )
     low, high = np.nanmin(deviation.deviation[axis]) / scale, np.nanmax(deviation.deviation[axis]) / scale
     ax.set_ylim(0.2 * low, 3.0 * high)
@@ -64,10 +58,8 @@ def allan_axis(
     return ax
 
 
-def allan_overview(
-    deviation: AllanDeviation, fit: NoiseFit, curves: Sequence[Mapping[str, Array]], *, sensor: str = "gyro"
-) -> Figure:
-    """Draw each axis of an Allan deviation with its fit, side by side, in the units of a sensor.
+def allan_overview(deviation: AllanDeviation, fit: NoiseFit) -> Figure:
+    """Draw each axis of an Allan deviation with its fit, side by side, in the units of the sensor.
 
     Parameters
     ----------
@@ -75,21 +67,17 @@ def allan_overview(
         SI.
     fit : NoiseFit
         Of the same samples.
-    curves : sequence of mapping
-        For each axis the fitted terms and their total at the same averaging times, SI, as :func:`strapdown.allan.curves_by_axis` gives.
-    sensor : {"gyro", "accelerometer", "magnetometer"}
-        Determines the units of the vertical axis.
 
     Returns
     -------
     Figure
         One panel for each axis of the sensor.
     """
-    unit, scale = UNITS[sensor]["bias_instability"]
+    unit, scale = UNITS[fit.sensor]["bias_instability"]
     number = len(deviation.deviation)
     figure, axes = new_figure(1, number, size=(1.5 + 4.2 * number, 4.8), sharey=True, squeeze=False)
-    for axis in range(number):
-        ax = allan_axis(deviation, fit, curves[axis], axis, axes[0, axis], sensor=sensor)
+    for axis, curves in enumerate(curves_by_axis(fit, deviation)):
+        ax = allan_axis(deviation, fit, curves, axis, axes[0, axis])
         ax.set_title(f"{AXES[axis]} axis", loc="left")
         ax.set_ylabel(f"Allan deviation, {unit}" if axis == 0 else "")
     drawn = deviation.deviation[deviation.deviation > 0.0] / scale

@@ -73,10 +73,7 @@ def _largest(share: Array) -> float:
 
 
 def _shares(analysis: Analysis, part: slice) -> dict[str, Array]:
-    """Return the share (m,) of each source in the mean square error; errors of every run are one share, for they add as errors.
-
-    NaN where there is no error to share.
-    """
+    """Return the share (m,) of each source in the mean square error; errors of every run are one share, for they add as errors."""
     total = np.sum(analysis.rms[:, part] ** 2, axis=1)
     total = np.where(total > 0.0, total, np.nan)
     share = {

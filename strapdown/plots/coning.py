@@ -69,10 +69,7 @@ def drift_by_algorithm(drifts: Sequence[Drift], ax: Axes | None = None) -> Axes:
 
 
 def coning_errors(outcomes: Sequence[FilterOutcome]) -> Figure:
-    """Draw the errors about the cone's axis inside the filter's ±3σ for each integration algorithm: attitude above, bias below.
-
-    The bias panels share one vertical scale where the errors allow it; a larger one is marked.
-    """
+    """Draw the errors about the cone's axis inside the filter's ±3σ for each integration algorithm: attitude above, bias below."""
     figure, axes = new_figure(2, len(outcomes), size=(3.1 * len(outcomes), 5.2), sharex=True, squeeze=False)
     for j, outcome in enumerate(outcomes):
         s = outcome.statistics
@@ -97,11 +94,7 @@ def coning_errors(outcomes: Sequence[FilterOutcome]) -> Figure:
 
 
 def coning_consistency(outcomes: Sequence[FilterOutcome]) -> Figure:
-    """Draw NEES of attitude and of bias and NIS over time for each integration algorithm, with the bounds of a consistent filter.
-
-    Marks below the curves are the epochs that the verdict is about. Where a filter that passes leaves the bounds at an epoch that was not
-    judged, the panel says so.
-    """
+    """Draw NEES of attitude and of bias and NIS over time for each integration algorithm, with the bounds of a consistent filter."""
     figure, axes = new_figure(1, 3, size=(12.0, 4.6))
     named = [(outcome.integration, outcome.statistics) for outcome in outcomes]
     first = outcomes[0]
@@ -176,10 +169,7 @@ def _leaves(outcome: FilterOutcome, subset: str, bounds: tuple[float, float]) ->
 
 
 def draw_coning_study(study: ConingStudy, folder: str | os.PathLike[str], form: str = "png") -> list[Path]:
-    """Write the figures of a coning study to a folder, made if it is missing; return the files.
-
-    ``drift``, ``errors`` and ``consistency``; ``algorithms`` too for algorithms of one's own.
-    """
+    """Write the figures of a coning study to a folder, made if it is missing; return the files."""
     figure, ax = new_figure(size=(7.0, 4.2))
     drift_by_algorithm(study.drifts, ax)
     p = study.parameters

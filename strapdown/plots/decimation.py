@@ -36,10 +36,7 @@ def column_starts(time: Array, columns: int) -> NDArray[np.int64]:
 
 
 def extreme_rows(time: Array, value: Array, columns: int = LINE_COLUMNS) -> NDArray[np.int64]:
-    """Return the indices, in order, of the samples that a line needs: of each column the least and the largest, and both ends.
-
-    A column of NaN keeps two of them, so that gaps stay. A series of at most two samples a column is kept whole.
-    """
+    """Return the indices, in order, of the samples that a line needs: of each column the least and the largest, and both ends."""
     n = len(value)
     if n <= 2 * columns:
         return np.arange(n)
@@ -61,10 +58,7 @@ def decimated(time: Array, value: Array, columns: int = LINE_COLUMNS) -> tuple[A
 
 
 def envelope(time: Array, low: Array, high: Array | None = None, columns: int = BAND_COLUMNS) -> Envelope:
-    """Return the least of ``low`` and the largest of ``high`` (``low`` if not given) in each column.
-
-    A series of at most one sample a column is kept whole.
-    """
+    """Return the least of ``low`` and the largest of ``high`` (``low`` if not given) in each column."""
     high = low if high is None else high
     if len(time) <= columns:
         return Envelope(time, low, high)

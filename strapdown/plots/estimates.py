@@ -90,10 +90,7 @@ def angle_labels(fixed_frame: str = "") -> tuple[str, str, str]:
 
 
 def wraps(angle: Array, rows: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the places in ``rows`` before which an angle (n,) in degrees wraps round ±180°, so that its line should break.
-
-    Where it turns by more than half a turn from one row to the next, a line that fills the span is what there is to see.
-    """
+    """Return the places in ``rows`` before which an angle (n,) in degrees wraps round ±180°, so that its line should break."""
     turned = np.unwrap(angle, period=360.0)[rows]
     return np.flatnonzero((np.abs(np.diff(angle[rows])) > 180.0) & (np.abs(np.diff(turned)) < 180.0)) + 1
 

@@ -101,10 +101,7 @@ def nis_over_record(
     window: int = 50,
     probability: float = 0.99,
 ) -> Axes:
-    """Draw the NIS of one sensor per degree of freedom over time, its running mean over ``window``, and the bounds of one measurement.
-
-    ``bounds`` hold the NIS of one measurement of a consistent filter with ``probability``.
-    """
+    """Draw the NIS of one sensor per degree of freedom over time, its running mean over ``window``, and the bounds of one measurement."""
     ax = axes_or_new(ax)
     degrees = innovations.innovation.shape[1]
     value = innovations.nis / degrees

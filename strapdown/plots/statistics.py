@@ -151,10 +151,7 @@ def state_unit(state: int, value: Array) -> tuple[str, float]:
 
 
 def fan(statistics: Statistics, state: int, ax: Axes | None = None) -> Axes:
-    """Draw quantiles of |error| of a ``state`` (0 to 5) over the runs, beside those that the filter predicts.
-
-    Bands: 50, 90 and 99 % of the runs. Lines: the same quantiles of a normal error of the filter's σ.
-    """
+    """Draw quantiles of |error| of a ``state`` (0 to 5) over the runs, beside those that the filter predicts."""
     ax = axes_or_new(ax)
     shares = ((0.99, 2.5758), (0.9, 1.6449), (0.5, 0.6745))
     settled = max(1, len(statistics.time) // 20)
@@ -218,10 +215,7 @@ def coverage_by_state(statistics: Statistics, epoch: int = -1, ax: Axes | None =
 def covariance_ellipses(
     claimed: Array, found: Array, pair: tuple[int, int] = (0, 1), ax: Axes | None = None, *, probability: float = 0.95
 ) -> Axes:
-    """Draw the ellipses that hold ``probability`` of the errors of two states by the filter's covariance, and of the actual errors.
-
-    ``claimed`` is the filter's mean covariance P at one epoch, ``found`` the mean e eᵀ over the runs there (6, 6), rad and rad/s.
-    """
+    """Draw the ellipses that hold ``probability`` of the errors of two states by the filter's covariance, and of the actual errors."""
     from scipy.stats import chi2
 
     ax = axes_or_new(ax)

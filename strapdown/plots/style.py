@@ -132,10 +132,7 @@ def save(figure: Figure, path: str | os.PathLike[str]) -> Path:
 
 
 def save_as(figures: Mapping[Path, Figure], form: str) -> list[Path]:
-    """Write figures, by path, whose suffix is replaced, in one format; return the files.
-
-    The same figure of an earlier run in another format is removed.
-    """
+    """Write figures, by path, whose suffix is replaced, in one format; return the files."""
     one_of("format", form, FORMATS)
     written = [save(figure, path.with_suffix(f".{form}")) for path, figure in figures.items()]
     for path in figures:

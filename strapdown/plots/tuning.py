@@ -1,4 +1,4 @@
-"""Tuning: the likelihood along each parameter, the filter before and after on held-out data, searches from many starts."""
+"""Tuning: the likelihood along each parameter, the filter before and after on held-out data."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, NullFormatter
 
 from strapdown.checks import Array
-from strapdown.plots.style import BLUE, CYCLE, SKY, VERMILION, axes_or_new, ink, legend_above, legend_below, new_figure
+from strapdown.plots.style import BLUE, SKY, VERMILION, axes_or_new, ink, legend_above, legend_below, new_figure
 from strapdown.tuning import Comparison, Slices, Tuning
 from strapdown.tuning.parameters import Unit
 
@@ -118,23 +118,3 @@ def _course(
     ax.axhline(1.0, color=ink(), linewidth=0.6, linestyle=":")
     ax.set_ylabel(label)
     legend_above(ax)
-
-
-def searches(
-    tuning: Tuning, first: int, second: int, units: Sequence[Unit], ax: Axes | None = None, *, label: bool = True
-) -> Axes:
-    """Draw the start and the end of each search in the plane of two parameters."""
-    ax = axes_or_new(ax)
-    pairs = [(first, units[first]), (second, units[second])]
-    begin = [np.exp(tuning.starts[:, j]) / unit.factor for j, unit in pairs]
-    end = [np.exp(tuning.optima[:, j]) / unit.factor for j, unit in pairs]
-    for k in range(len(tuning.starts)):
-        ax.plot([begin[0][k], end[0][k]], [begin[1][k], end[1][k]], color=CYCLE[0], linewidth=0.5, alpha=0.5)
-    ax.plot(*begin, "o", color=VERMILION, markersize=3.5, label="start of a search" if label else None)
-    ax.plot(*end, "o", color=BLUE, markersize=6, label="end of a search" if label else None)
-    ax.set_xscale("log")
-    ax.set_yscale("log")
-    ax.set_xlabel(f"{tuning.parameters[first].name}, {units[first].name}")
-    ax.set_ylabel(f"{tuning.parameters[second].name}, {units[second].name}")
-    legend_above(ax)
-    return ax

@@ -12,6 +12,8 @@ import numpy as np
 
 from strapdown import coning, quaternion
 from strapdown.checks import Array, InputError, non_negative
+from strapdown.kernels import recording_steps
+from strapdown.kernels.machine import compiled, read_only
 from strapdown.recordings.recording import Recording, increments, sampled
 
 FIELD_SPAN = 0.2
@@ -175,12 +177,8 @@ def turn_over(recording: Recording, delay: Array | float) -> Array:
     Over a negative delay it is the turn to come, negative; before the first and after the last sample the unit turns on at their rates. The
     delay is so short that turns of its parts add up.
     """
-    time = recording.time
-    late = np.broadcast_to(np.asarray(delay, np.float64), time.shape)
-    sums = np.zeros((len(time), 3))
-    np.cumsum(increments(recording), axis=0, out=sums[1:])
-    then = time - late
-    before = np.stack([np.interp(then, time, one) for one in sums.T], axis=1)
-    for outside, end in ((then < time[0], 0), (then > time[-1], -1)):
-        before[outside] += (then[outside] - time[end])[:, None] * recording.rate[end]
-    return np.subtract(sums, before, out=before)
+    late = np.broadcast_to(np.asarray(delay, np.float64), recording.time.shape)
+    sums, turn = np.empty((2, len(late), 3))
+    given = (read_only(one) for one in (recording.time, recording.rate, late))
+    compiled(recording_steps.turn_over)(*given, sums, turn)
+    return turn

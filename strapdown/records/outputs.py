@@ -83,11 +83,6 @@ def euler(attitude: ArrayLike, sequence: str = "ZYX", covariance: ArrayLike | No
         ``angles`` (n, 3) in the order of the sequence, rad. To first order ``δθ = E δφ``, the columns of E being the axes of the
         three rotations in the body frame, so that ``σ²`` is the diagonal of ``E⁻¹ P E⁻ᵀ``.
 
-    Raises
-    ------
-    InputError
-        If the sequence is not one of three axes.
-
     Examples
     --------
     >>> euler([[1.0, 0.0, 0.0, 0.0]]).angles.tolist()

@@ -60,11 +60,6 @@ def write(
     -------
     Report
         Paths of the page and of the statistics (``.report.json``), and the verdict in words.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, truncated, or of another kind.
     """
     source = Path(result)
     existing_file(source)

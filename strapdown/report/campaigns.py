@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from strapdown import consistency, plots, records
 from strapdown.checks import Array, InputError
+from strapdown.files import plain
 from strapdown.montecarlo import campaign, verdicts
 from strapdown.montecarlo.statistics import SUBSETS, Statistics
 from strapdown.plots.statistics import STATES, state_unit
@@ -59,32 +60,25 @@ def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
             page.provenance({k: v for k, v in attributes.items() if k not in ("plan", "conventions") and v != ""}),
         ),
     )
-    return content, {
+    table = {
         "source": path.name,
         "judgement": judgement.summary(),
         "runs": statistics.runs,
         "failed_runs": statistics.failed,
-        "time_s": statistics.time.tolist(),
-        "anees": {name: statistics.anees[:, SUBSETS[name][0]].tolist() for name in statistics.subsets},
-        "rms_error_si": statistics.rms_error[:, : len(_estimated(statistics))].tolist(),
-        "sigma_si": statistics.sigma[:, : len(_estimated(statistics))].tolist(),
-        **(
-            {}
-            if bound is None
-            else {"rms_over_root_cramer_rao_bound": [_plain(x) for x in _over_bound(statistics, bound)]}
-        ),
-        "nis_by_sensor": dict(zip(statistics.sensors, _plain(statistics.sensor_nis), strict=True)),
-        "worst_runs": statistics.worst_run.tolist(),
+        "time_s": statistics.time,
+        "anees": {name: statistics.anees[:, SUBSETS[name][0]] for name in statistics.subsets},
+        "rms_error_si": statistics.rms_error[:, : len(_estimated(statistics))],
+        "sigma_si": statistics.sigma[:, : len(_estimated(statistics))],
+        **({} if bound is None else {"rms_over_root_cramer_rao_bound": _over_bound(statistics, bound)}),
+        "nis_by_sensor": dict(zip(statistics.sensors, statistics.sensor_nis, strict=True)),
+        "worst_runs": statistics.worst_run,
     }
+    return content, plain(table)
 
 
 def _estimated(statistics: Statistics) -> tuple[str, ...]:
     """Return the names of the states that the filter estimates."""
     return STATES if statistics.has_bias else STATES[:3]
-
-
-def _plain(values: Any) -> list[float | None]:
-    return [float(x) if np.isfinite(x) else None for x in values]
 
 
 def _over_bound(statistics: Statistics, bound: Array) -> Array:

@@ -145,18 +145,8 @@ def _over_time(estimate: Estimate, truth: Truth | None, fixed_frame: str) -> str
                     page.Series(label=f"{what.lower()} {axis}", value=value, colour=_COLOURS[k]),
                 )
                 reach = 1.3 * max(float(bound[settled].max()), float(np.abs(value[settled]).max()))
-                charts.append(
-                    page.chart(
-                        page.Chart(
-                            title=f"{what} {axis}",
-                            unit=f"{what.lower()} {axis}, {unit}",
-                            time=estimate.time,
-                            series=series,
-                            bands=((0, 1),),
-                            reach=reach,
-                        )
-                    )
-                )
+                label = f"{what.lower()} {axis}, {unit}"
+                charts.append(page.chart(f"{what} {axis}", label, estimate.time, series, reach=reach))
         if estimate.has_bias:
             figure = page.figure(
                 lambda: plots.error_overview(estimate, truth),
@@ -168,23 +158,15 @@ def _over_time(estimate: Estimate, truth: Truth | None, fixed_frame: str) -> str
             page.Series(label=name, value=euler[:, k], colour=_COLOURS[k], wraps=True)
             for k, name in enumerate(angle_labels(fixed_frame))
         )
-        charts.append(
-            page.chart(
-                page.Chart(title="Attitude, Euler angles Z-Y-X", unit="angle, °", time=estimate.time, series=series)
-            )
-        )
+        charts.append(page.chart("Attitude, Euler angles Z-Y-X", "angle, °", estimate.time, series))
         unit, size = rate_unit(3.0 * sigma[settled, 3:])
         series = tuple(
             page.Series(label=AXES[k], value=estimate.bias[:, k] / size, colour=_COLOURS[k]) for k in range(3)
         )
-        charts.append(
-            page.chart(page.Chart(title="Gyro bias", unit=f"gyro bias, {unit}", time=estimate.time, series=series))
-        )
+        charts.append(page.chart("Gyro bias", f"gyro bias, {unit}", estimate.time, series))
         spread = np.linalg.norm(sigma[:, :3], axis=1) / DEGREE
         series = (page.Series(label="σ, root sum square of the three axes", value=spread),)
-        charts.append(
-            page.chart(page.Chart(title="Attitude σ", unit="attitude σ, °", time=estimate.time, series=series))
-        )
+        charts.append(page.chart("Attitude σ", "attitude σ, °", estimate.time, series))
         figure = page.figure(
             lambda: plots.estimate_overview(estimate, fixed_frame=fixed_frame), "Attitude, gyro bias in ±3σ, attitude σ"
         )

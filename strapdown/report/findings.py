@@ -66,10 +66,7 @@ def judged(
 
 
 def _filter_of(path: Path, attributes: Mapping[str, Any]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the error states of the filter of an estimate, and the errors, in words, that its scenario specifies beside them.
-
-    Nothing where the file does not hold them, or holds them as another version wrote them.
-    """
+    """Return the error states of the filter of an estimate, and the errors, in words, that its scenario specifies beside them."""
     if "filter" not in attributes:
         return (), ()
     try:

@@ -37,23 +37,9 @@ class Series:
     colour: str = "--a"
     """A colour of page.css."""
     band: bool = False
-    """An edge of a band, which is filled and not drawn itself."""
+    """An edge of a band, upper or after it lower, which is filled and not drawn itself."""
     wraps: bool = False
     """An angle in degrees, whose line breaks where it wraps round ±180°."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Chart:
-    """An interactive time series."""
-
-    title: str
-    unit: str
-    time: Array
-    series: tuple[Series, ...]
-    bands: tuple[tuple[int, int], ...] = ()
-    """Pairs (upper, lower) of series, counted from 0, with the space between them filled."""
-    reach: float | None = None
-    """The vertical axis shows ±reach at first; None: everything."""
 
 
 def text(content: Any) -> str:
@@ -121,37 +107,35 @@ def _image(draw: Callable[[], Figure], theme: str) -> tuple[str, bool]:
     return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode(), drawn.get_figwidth() > _WIDE
 
 
-def chart(one: Chart) -> str:
-    """Return the place of an interactive chart with its data.
-
-    A long series is reduced to the extremes of each column of time, a band to its widest in each column.
-    """
-    lines = [series.value for series in one.series if not series.band]
+def chart(title: str, unit: str, time: Array, series: Sequence[Series], *, reach: float | None = None) -> str:
+    """Return the place of an interactive time series with its data, its vertical axis ±``reach`` at first, or everything."""
+    lines = [one.value for one in series if not one.band]
+    bands = [k for k, one in enumerate(series) if one.band][::2]
     columns = CHART_POINTS // (2 * len(lines))
-    rows = np.unique(np.concatenate([extreme_rows(one.time, value, columns) for value in lines]))
-    reduced = len(rows) < len(one.time)
-    shown = [series.value[rows] for series in one.series]
+    rows = np.unique(np.concatenate([extreme_rows(time, value, columns) for value in lines]))
+    reduced = len(rows) < len(time)
+    shown = [one.value[rows] for one in series]
     if reduced:
-        starts = column_starts(one.time, columns)
+        starts = column_starts(time, columns)
         group = np.searchsorted(starts, rows, side="right") - 1
-        for upper, lower in one.bands:
-            shown[upper] = np.fmax.reduceat(one.series[upper].value, starts)[group]
-            shown[lower] = np.fmin.reduceat(one.series[lower].value, starts)[group]
-    for k, series in enumerate(one.series):
-        if series.wraps:
-            shown[k] = np.where(np.isin(np.arange(len(rows)), wraps(series.value, rows)), np.nan, shown[k])
+        for k in bands:
+            shown[k] = np.fmax.reduceat(series[k].value, starts)[group]
+            shown[k + 1] = np.fmin.reduceat(series[k + 1].value, starts)[group]
+    for k, one in enumerate(series):
+        if one.wraps:
+            shown[k] = np.where(np.isin(np.arange(len(rows)), wraps(one.value, rows)), np.nan, shown[k])
     content = {
-        "unit": one.unit,
-        "series": [{"label": s.label, "colour": s.colour, "band": s.band} for s in one.series],
-        "bands": [[1 + upper, 1 + lower] for upper, lower in one.bands],
-        "range": None if one.reach is None else [-one.reach, one.reach],
-        "data": [_numbers(one.time[rows]), *(_numbers(values) for values in shown)],
+        "unit": unit,
+        "series": [{"label": s.label, "colour": s.colour, "band": s.band} for s in series],
+        "bands": [[1 + k, 2 + k] for k in bands],
+        "range": None if reach is None else [-reach, reach],
+        "data": [_numbers(time[rows]), *(_numbers(values) for values in shown)],
     }
     plain = json.dumps(content, allow_nan=False).replace("</", "<\\/")
-    widest = ", band at its widest" if one.bands else ""
-    note = f" ({len(rows)} of {len(one.time)} times, extremes kept{widest})" if reduced else ""
+    widest = ", band at its widest" if bands else ""
+    note = f" ({len(rows)} of {len(time)} times, extremes kept{widest})" if reduced else ""
     return (
-        f'<div class="chart"><h3>{text(one.title + note)}</h3><div class="plot"></div>'
+        f'<div class="chart"><h3>{text(title + note)}</h3><div class="plot"></div>'
         f'<script type="application/json">{plain}</script></div>'
     )
 

@@ -1,6 +1,6 @@
 """Tables of studies, written as CSV with every digit and as LaTeX for a paper.
 
-A study's numbers are rows with the unit in each key, as its JSON has them; :class:`Table` adds the headings that LaTeX prints.
+A study's numbers are rows with the unit in each key, as its JSON has them; LaTeX prints the key in words.
 """
 
 from __future__ import annotations
@@ -24,28 +24,24 @@ Value = str | float | int | bool | None
 """A cell; None and NaN are empty ones."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Table:
     """One table of a study."""
 
     name: str
     """Name of the files."""
     caption: str
-    headings: Mapping[str, str]
-    """Heading in LaTeX of each key of the rows, in the order of the columns; other keys are not written."""
+    columns: Sequence[str]
+    """Keys of the rows, in the order of the columns; other keys are not written."""
     rows: Sequence[Mapping[str, Any]]
 
     def cells(self) -> list[list[Value]]:
         """Return the values, one list a row."""
-        return [[row[key] for key in self.headings] for row in self.rows]
+        return [[row[key] for key in self.columns] for row in self.rows]
 
 
 def write(tables: Sequence[Table], folder: str | os.PathLike[str]) -> list[Path]:
-    r"""Write tables to a folder, made if missing, as ``NAME.csv`` and ``NAME.tex``; return the files.
-
-    The CSV has the keys as its header and numbers that read back to the bit; the LaTeX is a ``tabular`` with four digits, to input into a
-    document that loads ``booktabs``.
-    """
+    r"""Write tables to a folder, made if missing, as ``NAME.csv`` and ``NAME.tex``; return the files."""
     written = []
     for table in tables:
         for suffix, content in (("csv", to_csv(table)), ("tex", to_latex(table))):
@@ -59,7 +55,7 @@ def to_csv(table: Table) -> str:
     """Return a table as CSV (RFC 4180), UTF-8, with one header line."""
     stream = io.StringIO()
     writer = csv.writer(stream)
-    writer.writerow(table.headings)
+    writer.writerow(table.columns)
     writer.writerows([["" if _empty(cell) else cell for cell in row] for row in table.cells()])
     return stream.getvalue()
 
@@ -69,10 +65,10 @@ def to_latex(table: Table) -> str:
     rows = table.cells()
     sides = [
         "l" if any(isinstance(row[k], (str, bool, np.bool_)) for row in rows) else "r"
-        for k in range(len(table.headings))
+        for k in range(len(table.columns))
     ]
     lines = [f"% {_line(table.caption)}", "% needs \\usepackage{booktabs}", f"\\begin{{tabular}}{{{''.join(sides)}}}"]
-    lines += ["\\toprule", _row(_escaped(heading) for heading in table.headings.values()), "\\midrule"]
+    lines += ["\\toprule", _row(_escaped(_heading(key)) for key in table.columns), "\\midrule"]
     lines += [_row(_cell(cell) for cell in row) for row in rows]
     lines += ["\\bottomrule", "\\end{tabular}"]
     return "\n".join(lines) + "\n"
@@ -130,72 +126,55 @@ def _escaped(text: str) -> str:
     return "".join(rf"$\sqrt{{\mathrm{{{part}}}}}$" if k % 2 else part for k, part in enumerate(plain))
 
 
+_UNITS = {"_deg_per_hour": ", °/h", "_arcsec": ", arcsec", "_hz": ", Hz", "_rad": ", rad"}
+_WORDS = {"rms": "RMS", "sigma": "σ", "anees": "ANEES", "nis": "NIS"}
+
+
+def _heading(key: str) -> str:
+    """Return a key in words, its unit after a comma."""
+    unit = next((unit for unit in _UNITS if key.endswith(unit)), "")
+    words = key.removesuffix(unit).split("_")
+    return " ".join(_WORDS.get(word, word) for word in words) + _UNITS.get(unit, "")
+
+
 def of_coning(summary: Mapping[str, Any]) -> list[Table]:
     """Return the tables of a coning study's :meth:`~strapdown.coning_study.ConingStudy.summary`: ``drift`` and ``filters``."""
     scenario = summary["scenario"]
     case = f"coning {scenario['angle_deg']:g}° at {scenario['frequency_hz']:g} Hz, gyro at {scenario['rate_hz']:g} Hz"
     rows = [{**row, "bias_mean_z_deg_per_hour": row["bias_mean_deg_per_hour"][2]} for row in summary["filter"]]
+    errors = ("attitude_rms_arcsec", "attitude_sigma_arcsec", "bias_rms_deg_per_hour", "bias_sigma_deg_per_hour")
+    tests = ("bias_mean_z_deg_per_hour", "anees_attitude", "anees_bias", "nis", "consistent")
     return [
         Table(
-            name="drift",
-            caption=f"Drift about the cone's axis by integration algorithm, {case}",
-            headings={
-                "algorithm": "algorithm",
-                "samples": "samples",
-                "drift_deg_per_hour": "measured, °/h",
-                "predicted_deg_per_hour": "predicted, °/h",
-            },
-            rows=summary["integration"],
+            "drift",
+            f"Drift about the cone's axis by integration algorithm, {case}",
+            ("algorithm", "samples", "drift_deg_per_hour", "predicted_deg_per_hour"),
+            summary["integration"],
         ),
         Table(
-            name="filters",
-            caption=f"The same filter on each algorithm, {scenario['runs']} runs, {case}",
-            headings={
-                "integration": "algorithm",
-                "attitude_rms_arcsec": "attitude RMS, arcsec",
-                "attitude_sigma_arcsec": "attitude σ, arcsec",
-                "bias_rms_deg_per_hour": "bias RMS, °/h",
-                "bias_sigma_deg_per_hour": "bias σ, °/h",
-                "bias_mean_z_deg_per_hour": "mean bias error z, °/h",
-                "anees_attitude": "ANEES attitude",
-                "anees_bias": "ANEES bias",
-                "nis": "NIS",
-                "consistent": "consistent",
-            },
-            rows=rows,
+            "filters",
+            f"The same filter on each algorithm, {scenario['runs']} runs, {case}",
+            ("integration", *errors, *tests),
+            rows,
         ),
     ]
 
 
 def of_algorithms(rows: Sequence[Mapping[str, Any]]) -> list[Table]:
-    """Return the table of the integration algorithms, of the rows of :func:`strapdown.coning.algorithm_rows`.
-
-    A key ``ns_per_sample``, where the rows have it, becomes a column.
-    """
+    """Return the table of the integration algorithms, of the rows of :func:`strapdown.coning.algorithm_rows`, with their times if given."""
     keyed = [{key.replace(" ", "_"): value for key, value in row.items()} for row in rows]
-    headings = {
-        "name": "algorithm",
-        "needs": "needs",
-        "samples": "N",
-        "previous": "previous",
-        "following": "following",
-        "order": "order",
-        "drift_order": "drift order",
-        "drift_constant": "drift constant",
-        "ns_per_sample": "ns a sample",
-        "source": "source",
-    }
-    shown = {key: heading for key, heading in headings.items() if all(key in row for row in keyed)}
+    known = ("name", "needs", "samples", "previous", "following", "order", "drift_order", "drift_constant")
+    shown = [key for key in (*known, "ns_per_sample", "source") if all(key in row for row in keyed)]
     caption = (
         "Integration algorithms: drift under small coning is -C β² ω (ωh)^n, C the drift constant and n the drift order"
     )
-    return [Table(name="algorithms", caption=caption, headings=shown, rows=keyed)]
+    return [Table("algorithms", caption, shown, keyed)]
 
 
 def of_vibration(rows: Sequence[Mapping[str, Any]]) -> list[Table]:
     """Return the table of the drift that a vibration spectrum leaves, of rows ``algorithm, sample_rate_hz, drift_deg_per_hour``."""
-    headings = {"algorithm": "algorithm", "sample_rate_hz": "gyro rate, Hz", "drift_deg_per_hour": "drift, °/h"}
-    return [Table(name="coning-budget", caption="Drift left by a vibration spectrum", headings=headings, rows=rows)]
+    columns = ("algorithm", "sample_rate_hz", "drift_deg_per_hour")
+    return [Table("coning-budget", "Drift left by a vibration spectrum", columns, rows)]
 
 
 def of_montecarlo(summary: Mapping[str, Any]) -> list[Table]:
@@ -210,56 +189,30 @@ def of_montecarlo(summary: Mapping[str, Any]) -> list[Table]:
     ]
     last, coverage = summary["last_epoch"], summary["coverage"]
     quantiles = sorted(key.split("_")[3] for key in last if key.startswith("attitude_error_quantile_"))
+    sizes = ("mean_error", "rms_error", "sigma", *(f"error_quantile_{q}" for q in quantiles))
     errors = [
-        {
-            "state": f"{what} {axis}",
-            "unit": shown,
-            **{key: last[f"{what}_{key}_{unit}"][k] for key in ("mean_error", "rms_error", "sigma")},
-            **{f"error_quantile_{q}": last[f"{what}_error_quantile_{q}_{unit}"][k] for q in quantiles},
-        }
+        {"state": f"{what} {axis}", "unit": shown, **{key: last[f"{what}_{key}_{unit}"][k] for key in sizes}}
         for what, unit, shown in (("attitude", "arcsec", "arcsec"), ("bias", "deg_per_hour", "°/h"))
         if f"{what}_rms_error_{unit}" in last  # a filter may estimate no bias
         for k, axis in enumerate("xyz")
     ]
-    shares = [
-        {"of": what, **{f"inside_{k + 1}_sigma": share for k, share in enumerate(coverage[what])}} for what in coverage
-    ]
+    inside = [f"inside_{k}_sigma" for k in (1, 2, 3)]
+    shares = [{"of": what, **dict(zip(inside, coverage[what], strict=True))} for what in coverage]
     runs = f"{summary['runs']} runs"
     return [
         Table(
-            name="consistency",
-            caption=f"NEES and NIS per degree of freedom, {runs}, bounds {100 * summary['probability']:g} % together",
-            headings={
-                "statistic": "statistic",
-                "of": "of",
-                "mean": "mean",
-                "least": "least",
-                "greatest": "greatest",
-                "lower_bound": "lower bound",
-                "upper_bound": "upper bound",
-                "consistent": "consistent",
-            },
-            rows=rows,
+            "consistency",
+            f"NEES and NIS per degree of freedom, {runs}, bounds {100 * summary['probability']:g} % together",
+            ("statistic", "of", "mean", *_RANGE, "lower_bound", "upper_bound", "consistent"),
+            rows,
         ),
         Table(
-            name="errors",
-            caption=f"Errors at {last['time_s']:g} s, {runs}; quantiles of the absolute error",
-            headings={
-                "state": "state",
-                "unit": "unit",
-                "mean_error": "mean",
-                "rms_error": "RMS",
-                "sigma": "σ of the filter",
-                **{f"error_quantile_{q}": f"{100 * float(q):g} %" for q in quantiles},
-            },
-            rows=errors,
+            "errors",
+            f"Errors at {last['time_s']:g} s, {runs}; quantiles of the absolute error",
+            ("state", "unit", *sizes),
+            errors,
         ),
-        Table(
-            name="coverage",
-            caption=f"Share of errors inside 1, 2 and 3 σ at the judged epochs, {runs}",
-            headings={"of": "of", **{f"inside_{k}_sigma": f"inside {k}σ" for k in (1, 2, 3)}},
-            rows=shares,
-        ),
+        Table("coverage", f"Share of errors inside 1, 2 and 3 σ at the judged epochs, {runs}", ("of", *inside), shares),
     ]
 
 
@@ -273,22 +226,12 @@ def _ends(part: Mapping[str, Any]) -> dict[str, Any]:
 
 def of_covariance(budget: Sequence[tuple[str, str, float, float]]) -> list[Table]:
     """Return the error budget of :meth:`strapdown.covariance.Analysis.budget`, largest attitude error first."""
+    columns = ("source", "kind", "attitude_arcsec", "bias_deg_per_hour")
     rows = [
-        {
-            "source": source,
-            "kind": kind,
-            "attitude_arcsec": attitude / ARCSECOND,
-            "bias_deg_per_hour": bias / DEGREE_PER_HOUR,
-        }
+        dict(zip(columns, (source, kind, attitude / ARCSECOND, bias / DEGREE_PER_HOUR), strict=True))
         for source, kind, attitude, bias in sorted(budget, key=lambda row: -row[2])
     ]
-    headings = {
-        "source": "source",
-        "kind": "kind",
-        "attitude_arcsec": "attitude, arcsec",
-        "bias_deg_per_hour": "bias, °/h",
-    }
-    return [Table(name="budget", caption="Error budget at the end, RMS of one axis", headings=headings, rows=rows)]
+    return [Table("budget", "Error budget at the end, RMS of one axis", columns, rows)]
 
 
 def of_tuning(content: Mapping[str, Any]) -> list[Table]:
@@ -299,46 +242,21 @@ def of_tuning(content: Mapping[str, Any]) -> list[Table]:
         | {"lower_95": per(one, "lower"), "upper_95": per(one, "upper")}
         for one in content["parameters"]
     ]
-    tables = [
-        Table(
-            name="parameters",
-            caption="Tuned noise parameters with 95 % intervals",
-            headings={
-                "name": "parameter",
-                "unit": "unit",
-                "before": "before",
-                "after": "after",
-                "lower_95": "from",
-                "upper_95": "to",
-                "identified": "identified",
-            },
-            rows=rows,
-        )
-    ]
+    columns = ("name", "unit", "before", "after", "lower_95", "upper_95", "identified")
+    tables = [Table("parameters", "Tuned noise parameters with 95 % intervals", columns, rows)]
     if "held_out" in content:
         held = [
             {**one, "filter": name, "nis_lower": one["nis_bounds"][0], "nis_upper": one["nis_bounds"][1]}
             for name, one in content["held_out"].items()
         ]
-        headings = {
-            "filter": "filter",
-            "log_likelihood_per_innovation": "log likelihood an innovation",
-            "nis_per_degree": "NIS",
-            "nis_lower": "lower bound",
-            "nis_upper": "upper bound",
-            "anees_per_state": "ANEES",
-            "attitude_rms_rad": "attitude RMS, rad",
-        }
+        statistics = ("log_likelihood_per_innovation", "nis_per_degree", "nis_lower", "nis_upper", "anees_per_state")
         caption = "The filter before and after tuning on data held out; NIS with 99 % bounds"
-        tables.append(Table(name="held-out", caption=caption, headings=headings, rows=held))
+        tables.append(Table("held-out", caption, ("filter", *statistics, "attitude_rms_rad"), held))
     return tables
 
 
 def of_allan(rows: Sequence[Mapping[str, Any]], sensor: str) -> list[Table]:
-    """Return the noise coefficients of a sensor, of the rows of :func:`strapdown.allan.parameters.table`, as ``SENSOR-noise``.
-
-    The estimate is empty for a term that the record does not show; its upper end bounds what the record could hide.
-    """
+    """Return the noise coefficients of a sensor, of the rows of :func:`strapdown.allan.table`, as ``SENSOR-noise``."""
     shown = [
         {
             **row,
@@ -348,18 +266,8 @@ def of_allan(rows: Sequence[Mapping[str, Any]], sensor: str) -> list[Table]:
         }
         for row in rows
     ]
-    headings = {
-        "axis": "axis",
-        "term": "term",
-        "symbol": "symbol",
-        "unit": "unit",
-        "estimate": "estimate",
-        "lower": "from",
-        "upper": "to",
-        "supported": "seen",
-    }
-    caption = f"Noise coefficients of the {sensor} with 95 % intervals"
-    return [Table(name=f"{sensor}-noise", caption=caption, headings=headings, rows=shown)]
+    columns = ("axis", "term", "symbol", "unit", "estimate", "lower", "upper", "supported")
+    return [Table(f"{sensor}-noise", f"Noise coefficients of the {sensor} with 95 % intervals", columns, shown)]
 
 
 STUDIES: dict[str, Callable[..., list[Table]]] = {

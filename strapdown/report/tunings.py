@@ -149,10 +149,7 @@ def read(path: Path) -> dict[str, Any]:
 
 
 def verdict(content: dict[str, Any]) -> tuple[str, str, list[str]]:
-    """Return the verdict on the tuned filter, its reason, and what contradicts it: on held-out data the worst of its judgements.
-
-    Without such data it is that on the data that the filter was tuned on, which is said.
-    """
+    """Return the verdict on the tuned filter, its reason, and what contradicts it: on held-out data the worst of its judgements."""
     held = content.get("held_out")
     if not held:
         return _on_its_own_data(content)

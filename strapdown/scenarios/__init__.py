@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from strapdown import gyro, motion, vectors
-from strapdown.checks import Array, InputError, array, count, finite, known_keys, one_of, positive
+from strapdown.checks import Array, InputError, array, count, finite, instance, known_keys, one_of, positive
 from strapdown.files import reading, tables
 from strapdown.files.tables import Form
 from strapdown.gyro import GyroSpec
@@ -175,7 +175,15 @@ class Scenario:
         return np.arange(round(self.duration * self.rate) + 1) / self.rate
 
 
-def simulate(scenario: Scenario, seed: int | None = None, run: int = 0) -> ImuRecord:
+def chosen(given: Scenario | str | os.PathLike[str]) -> Scenario:
+    """Return a scenario, given itself, by a built-in name, or by the path of its TOML file."""
+    instance(
+        "scenario", given, (Scenario, str, os.PathLike), "give a Scenario, a built-in name, or the path of a TOML file"
+    )
+    return given if isinstance(given, Scenario) else load_scenario(given)
+
+
+def simulate(scenario: Scenario | str | os.PathLike[str], seed: int | None = None, run: int = 0) -> ImuRecord:
     """Simulate one run of a scenario: gyro increments, vector measurements and the truth.
 
     Each sensor draws from a random stream of its own (seed, run, name), so adding one changes nothing of the others. With sampling jitter
@@ -184,25 +192,26 @@ def simulate(scenario: Scenario, seed: int | None = None, run: int = 0) -> ImuRe
 
     Parameters
     ----------
-    scenario : Scenario
-        Motion, gyro and sensors.
+    scenario : Scenario, str or path
+        A scenario, the name of a built-in one (:data:`SCENARIOS`), or the path of its TOML file.
     seed : int, optional
-        Default: the scenario's own.
+        Of the random numbers; default the scenario's own.
     run : int, default 0
-        Runs of one seed are independent.
+        Number of the run; runs of one seed are independent.
 
     Returns
     -------
     ImuRecord
-        With ``truth`` and ``origin``.
+        Its ``truth`` is known, and its ``origin`` is the scenario, which :func:`strapdown.estimate` matches its filter to.
 
     Examples
     --------
-    >>> from strapdown import scenarios
-    >>> record = scenarios.simulate(scenarios.load_scenario("two-stars"))
-    >>> record.increments.shape, record.truth.attitude.shape
-    ((30000, 3), (30001, 4))
+    >>> import strapdown as sd
+    >>> record = sd.simulate("two-stars", seed=1)
+    >>> record.truth.attitude.shape, [one.sensor for one in record.vectors]
+    ((30001, 4), ['star 1', 'star 2'])
     """
+    scenario = chosen(scenario)
     seed = scenario.seed if seed is None else seed
     spec, nominal = scenario.gyro, scenario.edges
     edges, stamps = gyro.sampling(spec, nominal, generator(seed, run, "gyro sampling"))
@@ -281,54 +290,45 @@ _FIXED_OF_SENSORS = ("hard_iron", "bias", "lever_arm_b")
 
 # ------------------------------------------------------------------------------------------------------------------------ files
 
+_OWN = ("harmonics", "faults", "orbit", "acceleration_f")
+"""Fields that are no keys: tables, or functions that no file holds."""
+
+
+def _form(kind: Any, units: Form) -> Form:
+    """Return the keys of a class; what ``units`` leaves out is a plain number or word."""
+    return {one.name: units.get(one.name, tables.PLAIN) for one in dataclasses.fields(kind) if one.name not in _OWN}
+
+
+_OF_MOTIONS: dict[str, tables.Choice] = {
+    "angle": tables.DEGREES,
+    "frequency": tables.HERTZ,
+    "precession_rate": tables.DEGREES_PER_SECOND,
+    "spin_rate": tables.DEGREES_PER_SECOND,
+    "rate": tables.DEGREES_PER_SECOND,
+    "rock_angle": tables.DEGREES,
+    "rock_frequency": tables.HERTZ,
+    "rock_phase": tables.DEGREES,
+    "rotation_vector": tables.DEGREES,
+    "duration": tables.SECONDS,
+    "start": tables.SECONDS,
+    "inertia": (("kg_m2", 1.0),),
+    "initial_rate": tables.DEGREES_PER_SECOND,
+    "time": tables.SECONDS,
+    "ends": tables.TEXT,
+    "mean": tables.DEGREES_PER_SECOND,
+}
 _MOTIONS: dict[str, tuple[type, Form]] = {
-    "coning": (motion.Coning, {"angle": tables.DEGREES, "frequency": tables.HERTZ}),
-    "spin-cone": (
-        motion.SpinCone,
-        {
-            "precession_rate": tables.DEGREES_PER_SECOND,
-            "spin_rate": tables.DEGREES_PER_SECOND,
-            "angle": tables.DEGREES,
-        },
-    ),
-    "constant-rate": (
-        motion.ConstantRate,
-        {"rate": tables.DEGREES_PER_SECOND, "initial_attitude": tables.PLAIN},
-    ),
-    "spin-rock": (
-        motion.SpinRock,
-        {
-            "rock_angle": tables.DEGREES,
-            "rock_frequency": tables.HERTZ,
-            "spin_rate": tables.DEGREES_PER_SECOND,
-            "rock_phase": tables.DEGREES,
-        },
-    ),
-    "slew": (
-        motion.Slew,
-        {
-            "rotation_vector": tables.DEGREES,
-            "duration": tables.SECONDS,
-            "start": tables.SECONDS,
-            "initial_attitude": tables.PLAIN,
-        },
-    ),
-    "torque-free": (
-        motion.TorqueFree,
-        {
-            "inertia": (("kg_m2", 1.0),),
-            "initial_rate": tables.DEGREES_PER_SECOND,
-            "initial_attitude": tables.PLAIN,
-        },
-    ),
-    "sampled": (
-        motion.SampledAttitude,
-        {"time": tables.SECONDS, "attitudes": tables.PLAIN, "degree": tables.PLAIN, "ends": tables.TEXT},
-    ),
-    "harmonic-rates": (
-        motion.HarmonicRates,
-        {"mean": tables.DEGREES_PER_SECOND, "initial_attitude": tables.PLAIN},
-    ),
+    word: (kind, _form(kind, _OF_MOTIONS))
+    for word, kind in {
+        "coning": motion.Coning,
+        "spin-cone": motion.SpinCone,
+        "constant-rate": motion.ConstantRate,
+        "spin-rock": motion.SpinRock,
+        "slew": motion.Slew,
+        "torque-free": motion.TorqueFree,
+        "sampled": motion.SampledAttitude,
+        "harmonic-rates": motion.HarmonicRates,
+    }.items()
 }
 """Motions by their word in a file. Besides: "rest", "composed" (tables ``base`` and ``vibration``)."""
 
@@ -340,79 +340,38 @@ _ORBIT: Form = {
 }
 
 
-def _faults(unit: tables.Choice) -> Form:
-    return {
-        "latency": tables.SECONDS,
-        "outages": tables.SECONDS,
-        "outlier_probability": tables.PLAIN,
-        "outlier_scale": tables.PLAIN,
-        "correlated_sigma": unit,
-        "correlation_time": tables.SECONDS,
-        "drop_probability": tables.PLAIN,
-        "duty_period": tables.SECONDS,
-        "duty_share": tables.PLAIN,
-    }
-
-
-_NAMED: Form = {"name": tables.TEXT, "rate": tables.HERTZ, "phase": tables.SECONDS, "kind": tables.TEXT}
-_SENSORS: dict[str, tuple[type, Form, tables.Choice]] = {
-    "direction": (
-        vectors.VectorSensor,
-        {**_NAMED, "reference_f": tables.PLAIN, "sigma": tables.ARCSECONDS},
-        tables.ARCSECONDS,
-    ),
-    "attitude": (
-        vectors.AttitudeSensor,
-        {
-            "name": tables.TEXT,
-            "rate": tables.HERTZ,
-            "phase": tables.SECONDS,
-            "boresight": tables.PLAIN,
-            "sigma_across": tables.ARCSECONDS,
-            "sigma_about": tables.ARCSECONDS,
-        },
-        tables.ARCSECONDS,
-    ),
-    "magnetometer": (
-        vectors.Magnetometer,
-        {
-            **_NAMED,
-            "field_f": tables.NANOTESLAS,
-            "sigma": tables.NANOTESLAS,
-            "hard_iron": tables.NANOTESLAS,
-            "soft_iron": tables.PLAIN,
-        },
-        tables.NANOTESLAS,
-    ),
-    "accelerometer": (
-        vectors.Accelerometer,
-        {
-            **_NAMED,
-            "sigma": tables.METRES_PER_SECOND_SQUARED,
-            "bias": tables.METRES_PER_SECOND_SQUARED,
-            "gravity_f": tables.METRES_PER_SECOND_SQUARED,
-            "lever_arm_b": tables.METRES,
-        },
-        tables.METRES_PER_SECOND_SQUARED,
-    ),
-    "horizon": (
-        vectors.HorizonSensor,
-        {"name": tables.TEXT, "rate": tables.HERTZ, "phase": tables.SECONDS, "sigma": tables.ARCSECONDS},
-        tables.ARCSECONDS,
-    ),
-    "heading-pair": (
-        vectors.HeadingPair,
-        {
-            "name": tables.TEXT,
-            "rate": tables.HERTZ,
-            "phase": tables.SECONDS,
-            "sigma": tables.METRES,
-            "baseline_b": tables.METRES,
-        },
-        tables.METRES,
-    ),
+_OF_SENSORS: dict[str, tables.Choice] = {
+    "name": tables.TEXT,
+    "kind": tables.TEXT,
+    "rate": tables.HERTZ,
+    "phase": tables.SECONDS,
+    "field_f": tables.NANOTESLAS,
+    "hard_iron": tables.NANOTESLAS,
+    "bias": tables.METRES_PER_SECOND_SQUARED,
+    "gravity_f": tables.METRES_PER_SECOND_SQUARED,
+    "lever_arm_b": tables.METRES,
+    "baseline_b": tables.METRES,
+    "latency": tables.SECONDS,
+    "outages": tables.SECONDS,
+    "correlation_time": tables.SECONDS,
+    "duty_period": tables.SECONDS,
 }
-"""Sensors by their word in a file: class, keys, unit of the correlated noise. A magnetometer takes a table ``orbit`` for a field, and a
+_SENSORS: dict[str, tuple[type, Form, Form]] = {
+    word: (
+        kind,
+        _form(kind, _OF_SENSORS | dict.fromkeys(("sigma", "sigma_across", "sigma_about"), unit)),
+        _form(vectors.Faults, _OF_SENSORS | {"correlated_sigma": unit}),
+    )
+    for word, (kind, unit) in {
+        "direction": (vectors.VectorSensor, tables.ARCSECONDS),
+        "attitude": (vectors.AttitudeSensor, tables.ARCSECONDS),
+        "magnetometer": (vectors.Magnetometer, tables.NANOTESLAS),
+        "accelerometer": (vectors.Accelerometer, tables.METRES_PER_SECOND_SQUARED),
+        "horizon": (vectors.HorizonSensor, tables.ARCSECONDS),
+        "heading-pair": (vectors.HeadingPair, tables.METRES),
+    }.items()
+}
+"""Sensors by their word in a file: class, keys, keys of its faults. A magnetometer takes a table ``orbit`` for a field, and a
 horizon sensor has one."""
 
 _TOP_FORM: Form = {
@@ -438,11 +397,6 @@ def load_scenario(name_or_path: str | os.PathLike[str]) -> Scenario:
     -------
     Scenario
         In SI units and radians, whatever the units of the keys.
-
-    Raises
-    ------
-    InputError
-        If there is neither, or the file is no TOML, lacks a key, or has an unknown one (the nearest known one is named).
 
     Examples
     --------
@@ -557,9 +511,8 @@ def _read_gyro(table: dict[str, Any], place: str) -> tuple[str, GyroSpec]:
 def _read_sensor(entry: Any, place: str) -> Sensor:
     table = _table(entry, place)
     word = _word(table, place, _SENSORS)
-    kind, form, unit = _SENSORS[word]
+    kind, form, faults = _SENSORS[word]
     orbit = table.pop("orbit", None) if word in ("magnetometer", "horizon") else None
-    faults = _faults(unit)
     known_keys(place, table, {**tables.keys(form), **tables.keys(faults)})
     amiss = {key: table.pop(key) for key in list(table) if key in tables.keys(faults)}
     more: dict[str, Any] = {"faults": tables.build(vectors.Faults, amiss, faults, place)}
@@ -576,22 +529,22 @@ def _write_sensor(sensor: Any) -> dict[str, Any]:
     word = next((word for word, (kind, _, _) in _SENSORS.items() if type(sensor) is kind), None)
     if word is None:
         raise InputError(f"a sensor of class {type(sensor).__name__} has no form in a file; keep it in Python")
-    _, form, unit = _SENSORS[word]
+    _, form, faults = _SENSORS[word]
     if getattr(sensor, "acceleration_f", None) is not None:
         raise InputError(f"{sensor.name}: acceleration_f is a function, which has no form in a file; keep it in Python")
     if isinstance(sensor, vectors.HorizonSensor):
-        own = {**tables.encode(sensor, form), **tables.encode(sensor.faults, _faults(unit))}
+        own = {**tables.encode(sensor, form), **tables.encode(sensor.faults, faults)}
         return {"type": word, **own, "orbit": tables.encode(sensor.orbit, _ORBIT)}
     field = getattr(sensor, "field_f", None)
     if not callable(field):
-        return {"type": word, **tables.encode(sensor, form), **tables.encode(sensor.faults, _faults(unit))}
+        return {"type": word, **tables.encode(sensor, form), **tables.encode(sensor.faults, faults)}
     orbit = getattr(field, "__self__", None)
     if not isinstance(orbit, CircularOrbit):
         raise InputError(
             f"{sensor.name}: field_f is a function of its own, which has no form in a file; keep it in Python"
         )
     rest = {name: choice for name, choice in form.items() if name != "field_f"}
-    table = {"type": word, **tables.encode(sensor, rest), **tables.encode(sensor.faults, _faults(unit))}
+    table = {"type": word, **tables.encode(sensor, rest), **tables.encode(sensor.faults, faults)}
     return {**table, "orbit": tables.encode(orbit, _ORBIT)}
 
 
@@ -625,7 +578,7 @@ def scenario_to_toml(scenario: Scenario) -> str:
 
 @functools.cache
 def builtin_rows() -> tuple[dict[str, object], ...]:
-    """Return one row a built-in scenario for printing: name, description, duration s, rate Hz, motion, gyro, sensors."""
+    """Return one row a built-in scenario for printing: name, description, duration s, rate Hz, gyro."""
     rows = []
     for name in SCENARIOS:
         table = reading.toml(_BUILTIN / f"{name}.toml")
@@ -635,9 +588,7 @@ def builtin_rows() -> tuple[dict[str, object], ...]:
                 "description": table["description"],
                 "duration_s": table["duration_s"],
                 "rate_hz": table["rate_hz"],
-                "motion": table["motion"]["type"],
                 "gyro": table["gyro"].get("preset", "own figures"),
-                "sensors": ", ".join(sensor["name"] for sensor in table.get("sensors", [])),
             }
         )
     return tuple(rows)

@@ -291,45 +291,41 @@ def unmodelled_errors(
     >>> setup.unmodelled_errors(GyroSpec(angle_random_walk=1e-5, scale_factor=(1e-4, 0.0, 0.0)))
     ("the gyro's scale factor of 100 ppm",)
     """
-    found = []
-    known = set() if states is None else set(states.names)
-    largest = {
-        name: float(np.max(np.abs(getattr(spec, name)))) for name in ("scale_factor", "asymmetry", "misalignment")
-    }
-    words = {"scale_factor": ("scale factor", 1e-6, "ppm"), "asymmetry": ("asymmetry", 1e-6, "ppm")}
-    words["misalignment"] = ("misalignment", 1e-3, "mrad")
-    covering = {"scale_factor": "gyro.scale", "misalignment": "gyro.misalignment"}
-    for name, (what, size, unit) in words.items():
-        if largest[name] > 0.0 and covering.get(name) not in known:
-            found.append(f"the gyro's {what} of {largest[name] / size:.3g} {unit}")
-    if np.any(np.asarray(spec.bias_instability) > 0.0) and "gyro.drift" not in known:
-        instability = float(np.max(spec.bias_instability)) / units.DEGREE_PER_HOUR
-        found.append(f"the gyro's flicker of {instability:.3g} °/h, covered in the attitude but not in the bias")
-    felt = np.any(np.asarray(spec.g_sensitivity) != 0.0) and np.any(np.asarray(gravity_f) != 0.0)
-    if felt and "gyro.force" not in known:
-        found.append("the gyro's sensitivity to acceleration")
-    if spec.temperature is not None and "gyro.temperature" not in known:
-        found.append("the gyro's bias over temperature")
-    if float(np.max(spec.quantization)) > 0.0 or float(np.max(spec.rate_resolution)) > 0.0:
-        found.append("the gyro's quantisation")
+    scale, asymmetry, misalignment, flicker = (
+        float(np.max(np.abs(getattr(spec, name))))
+        for name in ("scale_factor", "asymmetry", "misalignment", "bias_instability")
+    )
+    found: list[tuple[Any, str, str]] = [
+        (scale, "gyro.scale", f"the gyro's scale factor of {scale / 1e-6:.3g} ppm"),
+        (asymmetry, "", f"the gyro's asymmetry of {asymmetry / 1e-6:.3g} ppm"),
+        (misalignment, "gyro.misalignment", f"the gyro's misalignment of {misalignment / 1e-3:.3g} mrad"),
+        (
+            flicker,
+            "gyro.drift",
+            f"the gyro's flicker of {flicker / units.DEGREE_PER_HOUR:.3g} °/h, covered in the attitude but not in the bias",
+        ),
+        (np.any(gravity_f) * spec.g_sensitivity, "gyro.force", "the gyro's sensitivity to acceleration"),
+        (spec.temperature is not None, "gyro.temperature", "the gyro's bias over temperature"),
+        (np.max(spec.quantization) + np.max(spec.rate_resolution), "", "the gyro's quantisation"),
+    ]
     for sensor in sensors:
-        if np.any(np.asarray(getattr(sensor, "hard_iron", 0.0)) != 0.0) and f"{sensor.name}.bias" not in known:
-            found.append(f"the hard iron of the {sensor.name}")
-        if np.any(np.asarray(getattr(sensor, "soft_iron", 0.0)) != 0.0):
-            found.append(f"the soft iron of the {sensor.name}")
-        if np.any(np.asarray(getattr(sensor, "bias", 0.0)) != 0.0) and f"{sensor.name}.bias" not in known:
-            found.append(f"the bias of the {sensor.name}")
-        if np.any(np.asarray(getattr(sensor, "lever_arm_b", 0.0)) != 0.0) and f"{sensor.name}.lever" not in known:
-            found.append(f"the accelerations that the {sensor.name} feels at its lever arm")
-        if getattr(sensor, "acceleration_f", None) is not None and f"{sensor.name}.velocity" not in known:
-            found.append(f"the acceleration of the point that the {sensor.name} is at")
-        faults = getattr(sensor, "faults", None)
-        correlated = faults is not None and getattr(faults, "correlated_sigma", 0.0) > 0.0
-        if correlated and f"{sensor.name}.correlated" not in known:
-            found.append(f"the correlated noise of the {sensor.name}")
-        if faults is not None and getattr(faults, "outlier_probability", 0.0) > 0.0:
-            found.append(f"the outliers of the {sensor.name}")
-    return tuple(found)
+        name, faults = sensor.name, getattr(sensor, "faults", vectors.Faults())
+        accelerated = getattr(sensor, "acceleration_f", None) is not None
+        found += [
+            (getattr(sensor, "hard_iron", 0.0), f"{name}.bias", f"the hard iron of the {name}"),
+            (getattr(sensor, "soft_iron", 0.0), "", f"the soft iron of the {name}"),
+            (getattr(sensor, "bias", 0.0), f"{name}.bias", f"the bias of the {name}"),
+            (
+                getattr(sensor, "lever_arm_b", 0.0),
+                f"{name}.lever",
+                f"the accelerations that the {name} feels at its lever arm",
+            ),
+            (accelerated, f"{name}.velocity", f"the acceleration of the point that the {name} is at"),
+            (faults.correlated_sigma, f"{name}.correlated", f"the correlated noise of the {name}"),
+            (faults.outlier_probability, "", f"the outliers of the {name}"),
+        ]
+    known = () if states is None else states.names
+    return tuple(words for size, state, words in found if np.any(size) and state not in known)
 
 
 def _linear_sigma(record: ImuRecord) -> float:
@@ -366,10 +362,7 @@ def _need_white(noise: Mapping[str, float]) -> None:
 
 
 def measurement_density(record: ImuRecord) -> float:
-    """Return the variance of a measurement about an axis times the interval between measurements, rad² s, over all sensors and axes.
-
-    A direction measures two axes of three, a heading one; infinite where there is no measurement.
-    """
+    """Return the variance of a measurement about an axis times the interval between measurements, rad² s, over all sensors and axes."""
     information = sum(_information(series) for series in record.vectors)
     length = float(record.time[-1] - record.time[0])
     return length / information if information > 0.0 else float("inf")
@@ -450,11 +443,6 @@ def run(record: ImuRecord, setup: FilterSetup, initial: State, **options: Any) -
     -------
     Estimate
         With ``error_states`` where the setup has any.
-
-    Raises
-    ------
-    InputError
-        If the setup has a σ or a state for a sensor that the record does not have, or an argument is out of range.
     """
     if setup.estimator != MEKF:
         return _run_other(modelled_record(record, setup), setup, initial, **options)
@@ -506,12 +494,8 @@ def smooth(record: ImuRecord, setup: FilterSetup, initial: State, **options: Any
 
     Parameters
     ----------
-    record : ImuRecord
-        At the gyro's rate.
-    setup : FilterSetup
-        Filter whose noise, σ, error states, gate and integration algorithm are applied.
-    initial : State
-        State at the first edge.
+    record, setup, initial : ImuRecord, FilterSetup, State
+        As of :func:`run`.
     **options
         Of :func:`strapdown.estimation.smooth`.
 
@@ -571,11 +555,6 @@ def initial_state(
     -------
     State
         Attitude and bias with independent errors of these σ.
-
-    Raises
-    ------
-    InputError
-        If a shape is wrong, or the quaternion is not of unit length.
     """
     return estimation.initial_state(
         attitude, bias=bias, attitude_sigma=setup.attitude_sigma, bias_sigma=setup.bias_sigma
@@ -613,8 +592,7 @@ def to_table(setup: FilterSetup) -> dict[str, Any]:
     if setup.sigma:
         table["sigma"] = {name: list(s) if isinstance(s, tuple) else s for name, s in setup.sigma.items()}
     if setup.gate is not None:
-        known = {name: choice for name, choice in _GATE_FORM.items() if getattr(setup.gate, name) is not None}
-        table["gate"] = tables.encode(setup.gate, known)
+        table["gate"] = tables.encode(setup.gate, _GATE_FORM)
         if setup.gate.recovery is None:
             table["gate"]["recovery"] = NEVER
     if setup.robust is not None:
@@ -641,13 +619,10 @@ def from_table(table: Mapping[str, Any], place: str = "filter") -> FilterSetup:
         sigma = _part(table, "sigma", place)
         parts["sigma"] = {name: _sigma(f"{place}: sigma: {name}", value) for name, value in sigma.items()}
     if "gate" in table:
-        content = dict(_part(table, "gate", place))
-        if content.get("recovery") == NEVER:
-            parts["gate"] = tables.build(
-                Gate, {k: v for k, v in content.items() if k != "recovery"}, _GATE_FORM, f"{place}: gate", recovery=None
-            )
-        else:
-            parts["gate"] = tables.build(Gate, content, _GATE_FORM, f"{place}: gate")
+        content = _part(table, "gate", place)
+        never = {name: None for name in ("recovery",) if content.get(name) == NEVER}
+        given = {key: value for key, value in content.items() if key not in never}
+        parts["gate"] = tables.build(Gate, given, _GATE_FORM, f"{place}: gate", **never)
     if "robust" in table:
         parts["robust"] = tables.build(Robust, _part(table, "robust", place), _ROBUST_FORM, f"{place}: robust")
     if "states" in table:
@@ -668,10 +643,7 @@ def from_table(table: Mapping[str, Any], place: str = "filter") -> FilterSetup:
 
 
 def need_angles(setup: FilterSetup, kinds: Mapping[str, str], place: str) -> None:
-    """Raise an error for a σ beyond half a turn of a sensor that measures angles: it must have been meant in another unit than rad.
-
-    ``kinds`` are those of the sensors by their names; whole vectors ("vector") may have any σ. ``place`` is what is named in the error.
-    """
+    """Raise an error for a σ beyond half a turn of a sensor that measures angles: it must have been meant in another unit than rad."""
     for name, sigma in setup.sigma.items():
         largest = float(np.max(sigma))
         if kinds.get(name, "vector") != "vector" and largest > np.pi:
@@ -718,10 +690,5 @@ def read_setup(path: str | os.PathLike[str]) -> FilterSetup:
     -------
     FilterSetup
         Setup of the table, in SI units and radians.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, is no TOML, or has no such table or an unknown key.
     """
     return tables.read(path, "filter", "`strapdown tune` writes one", from_table)

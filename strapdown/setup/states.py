@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 
@@ -158,11 +158,6 @@ class SensorStates:
         -------
         tuple of ErrorStates
             One block for each error of the sensor with a σ above zero.
-
-        Raises
-        ------
-        InputError
-            If a state does not go with this kind of measurement.
         """
         one_of(f"{sensor}: kind", kind, KINDS)
         found: list[ErrorStates] = []
@@ -297,11 +292,6 @@ class States(ByValue):
         -------
         tuple of ErrorStates
             Blocks of the gyro, then those of the sensors in the order of ``sensors``.
-
-        Raises
-        ------
-        InputError
-            If a sensor is unknown, or a state does not go with its kind of measurement.
         """
         found = list(self.gyro_blocks())
         for name, one in self.sensors.items():
@@ -312,23 +302,9 @@ class States(ByValue):
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the declared states, as :func:`chosen` accepts them."""
-        gyro = (
-            ("gyro.scale", _any(self.gyro_scale_sigma)),
-            ("gyro.misalignment", _any(self.gyro_misalignment_sigma)),
-            ("gyro.force", _any(self.gyro_force_sigma) or _any(self.gyro_cross_force_sigma)),
-            ("gyro.temperature", _any(self.gyro_temperature_sigma)),
-            ("gyro.drift", bool(self.gyro_drift_sigma)),
-        )
-        found = [name for name, there in gyro if there]
+        found = [f"gyro.{part}" for part, fields in _GYRO_PARTS.items() if _declared(self, fields)]
         for sensor, one in self.sensors.items():
-            parts = (
-                ("mounting", _any(one.mounting_sigma)),
-                ("bias", _any(one.bias_sigma)),
-                ("lever", _any(one.lever_arm_sigma)),
-                ("correlated", one.correlated_sigma > 0.0),
-                ("velocity", one.velocity_time > 0.0),
-            )
-            found += [f"{sensor}.{part}" for part, there in parts if there]
+            found += [f"{sensor}.{part}" for part, fields in _SENSOR_PARTS.items() if _declared(one, fields)]
         return tuple(found)
 
     def chosen(self, names: tuple[str, ...]) -> States:
@@ -343,43 +319,47 @@ class States(ByValue):
         -------
         States
             The same σ for these names, and 0 for all others.
-
-        Raises
-        ------
-        InputError
-            If a name is unknown.
         """
         for name in names:
             if not self.names:
                 raise InputError(f"states: {name!r} is asked for, and there is none to choose from")
             one_of("states: name", name, self.names)
-        kept = replace(
-            self,
-            gyro_scale_sigma=self.gyro_scale_sigma if "gyro.scale" in names else 0.0,
-            gyro_misalignment_sigma=self.gyro_misalignment_sigma if "gyro.misalignment" in names else 0.0,
-            gyro_force_sigma=self.gyro_force_sigma if "gyro.force" in names else 0.0,
-            gyro_cross_force_sigma=self.gyro_cross_force_sigma if "gyro.force" in names else 0.0,
-            gyro_temperature_sigma=self.gyro_temperature_sigma if "gyro.temperature" in names else 0.0,
-            gyro_drift_sigma=self.gyro_drift_sigma if "gyro.drift" in names else (),
-            gyro_drift_time=self.gyro_drift_time if "gyro.drift" in names else (),
-            gyro_fast_bias_sigma=self.gyro_fast_bias_sigma if "gyro.drift" in names else 0.0,
-        )
-        sensors = {}
-        for sensor, one in self.sensors.items():
-            correlated = f"{sensor}.correlated" in names
-            part = replace(
-                one,
-                mounting_sigma=one.mounting_sigma if f"{sensor}.mounting" in names else 0.0,
-                bias_sigma=one.bias_sigma if f"{sensor}.bias" in names else 0.0,
-                lever_arm_sigma=one.lever_arm_sigma if f"{sensor}.lever" in names else 0.0,
-                correlated_sigma=one.correlated_sigma if correlated else 0.0,
-                correlation_time=one.correlation_time if correlated else 0.0,
-            )
-            if f"{sensor}.velocity" not in names:
-                part = replace(part, **dict.fromkeys(VELOCITY, 0.0))  # type: ignore[arg-type]
-            if part.blocks(sensor, "direction", 1.0):
-                sensors[sensor] = part
-        return replace(kept, sensors=sensors)
+        sensors = {sensor: _kept(one, sensor, _SENSOR_PARTS, names) for sensor, one in self.sensors.items()}
+        used = {sensor: one for sensor, one in sensors.items() if one.blocks(sensor, "direction", 1.0)}
+        return replace(_kept(self, "gyro", _GYRO_PARTS, names), sensors=used)
+
+
+_GYRO_PARTS = {
+    "scale": ("gyro_scale_sigma",),
+    "misalignment": ("gyro_misalignment_sigma",),
+    "force": ("gyro_force_sigma", "gyro_cross_force_sigma"),
+    "temperature": ("gyro_temperature_sigma",),
+    "drift": ("gyro_drift_sigma",),
+}
+"""Fields that declare each state of the gyro, by its name."""
+_SENSOR_PARTS = {
+    "mounting": ("mounting_sigma",),
+    "bias": ("bias_sigma",),
+    "lever": ("lever_arm_sigma",),
+    "correlated": ("correlated_sigma",),
+    "velocity": tuple(VELOCITY),
+}
+"""The same of a sensor."""
+_BESIDE = {"gyro_drift_sigma": ("gyro_drift_time", "gyro_fast_bias_sigma"), "correlated_sigma": ("correlation_time",)}
+"""Fields that go with another and declare no state by themselves."""
+Part = TypeVar("Part", States, SensorStates)
+
+
+def _declared(states: States | SensorStates, fields: tuple[str, ...]) -> bool:
+    return any(_any(getattr(states, field)) for field in fields)
+
+
+def _kept(states: Part, owner: str, parts: Mapping[str, tuple[str, ...]], names: tuple[str, ...]) -> Part:
+    """Return the states of an owner, the gyro or a sensor, whose names are given."""
+    none = type(states)()
+    dropped = [field for part, fields in parts.items() if f"{owner}.{part}" not in names for field in fields]
+    dropped += [beside for field in dropped for beside in _BESIDE.get(field, ())]
+    return replace(states, **{field: getattr(none, field) for field in dropped})
 
 
 def _spread(diagonal: Entries, off_diagonal: Entries) -> tuple[Array, Array]:
@@ -424,10 +404,7 @@ def run(
     robust: Robust | None = None,
     monitor: Monitor | None = None,
 ) -> Estimate:
-    """Run the filter with these states; its estimate is of the attitude and the whole gyro bias, drifts included, and of the error states.
-
-    An ``initial`` without values has the whole bias. Options are those of :func:`strapdown.estimation.run`.
-    """
+    """Run the filter with these states; it estimates the attitude, the whole gyro bias, drifts included, and the error states."""
     problem = prepared(record, process_noise, initial, states)
     options = forward.Options(
         every=every, full_covariance=full_covariance, gate=gate, robust=robust, whole_bias=True, together=True
@@ -532,7 +509,7 @@ SENSOR_FORM: tables.Form = {
     "correlated_sigma": tables.PLAIN,
     "correlation_time": tables.SECONDS,
     "frame": tables.PLAIN,
-    "varying": tables.PLAIN,
+    "varying": tables.FLAG,
     "lever_arm_sigma": tables.METRES,
     "velocity_time": tables.SECONDS,
     "velocity_sigma": _SPEED,
@@ -562,25 +539,6 @@ def from_table(table: Mapping[str, Any], place: str = "states") -> States:
         where = f"{place}: sensors: {name}"
         if not isinstance(content, Mapping):
             raise InputError(f"{where} is {content!r}; it must be a table, [{place}.sensors.{name}]")
-        by_sensor[name] = _placed(where, SensorStates, _plain(where, content), SENSOR_FORM)
+        by_sensor[name] = tables.build(SensorStates, content, SENSOR_FORM, where)
     own = {key: value for key, value in table.items() if key != "sensors"}
-    return _placed(place, States, own, FORM, sensors=by_sensor)  # type: ignore[no-any-return]
-
-
-def _plain(place: str, content: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a table whose bool goes through as one; tables take bools for slips."""
-    known_keys(place, content, tables.keys(SENSOR_FORM))
-    if "varying" in content and not isinstance(content["varying"], bool):
-        raise InputError(f"{place}: varying is {content['varying']!r}; it must be true or false")
-    return dict(content)
-
-
-def _placed(place: str, kind: Any, table: dict[str, Any], form: tables.Form, **more: Any) -> Any:
-    """Build from a table; what is refused names the place."""
-    if "varying" in table:
-        more["varying"] = table.pop("varying")
-    try:
-        return tables.build(kind, table, form, place, **more)
-    except InputError as error:
-        text = str(error)
-        raise InputError(text if text.startswith(place) else f"{place}: {text}") from None
+    return tables.build(States, own, FORM, place, sensors=by_sensor)  # type: ignore[no-any-return]

@@ -48,7 +48,6 @@ from strapdown.tuning.parameters import values_of as values_of
 from strapdown.tuning.parameters import with_values as with_values
 from strapdown.tuning.planning import Plan as Plan
 from strapdown.tuning.planning import plan
-from strapdown.tuning.planning import simulated_again as simulated_again
 from strapdown.tuning.procedure import GATED as GATED
 from strapdown.tuning.procedure import tune
 from strapdown.tuning.starting import by_innovations as by_innovations

@@ -104,10 +104,7 @@ def value_of(states: States, name: str) -> float:
 
 
 def with_state_values(states: States, values: Mapping[str, float]) -> States:
-    """Return states with other values of these parameters; several axes or drifts keep their ratios.
-
-    With the drifts goes what of the bias is too quick for them: it is the same flicker.
-    """
+    """Return states with other values of these parameters; several axes or drifts keep their ratios."""
     changed: dict[str, Any] = {}
     sensors: dict[str, SensorStates] = dict(states.sensors)
     for name, value in values.items():
@@ -125,10 +122,7 @@ def with_state_values(states: States, values: Mapping[str, float]) -> States:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ExtendedLikelihood:
-    """Minus the log likelihood of the innovations of a filter with optional states; built by :func:`likelihood`.
-
-    A point is the vector of the logarithms of the free parameters.
-    """
+    """Minus the log likelihood of the innovations of a filter with optional states; built by :func:`likelihood`."""
 
     names: tuple[str, ...]
     chosen: FilterSetup
@@ -222,10 +216,7 @@ class ExtendedLikelihood:
             return list(pool.map(work, jobs))
 
     def estimates(self, number: int, points: Array, epochs: np.ndarray) -> tuple[Array, Array, Array]:
-        """Return q_fb (m, k, 4), bias (m, k, 3) and P (m, k, 6, 6) on record ``number`` at edges (m,), at points (k, p).
-
-        The filter is that of the setup, with its gate and robust weights.
-        """
+        """Return q_fb (m, k, 4), bias (m, k, 3) and P (m, k, 6, 6) on record ``number`` at edges (m,), at points (k, p)."""
         found = [self._estimate(self.setup(point), self.cases[number], full_covariance=True) for point in points]
         rows = [(one.attitude[epochs], one.bias[epochs], one.covariance[epochs]) for one in found]  # type: ignore[index]
         attitude, bias, P = (np.stack(parts, axis=1) for parts in zip(*rows, strict=True))

@@ -241,12 +241,7 @@ class Tuning(Listed):
     composite: bool = False
 
     def listing(self) -> Listing:
-        """Return the parameters with their intervals, as a table; σ of sensors in rad or the unit of the vector.
-
-        Returns
-        -------
-        Listing
-        """
+        """Return the parameters with their intervals, as a table; σ of sensors in rad or the unit of the vector."""
         rows = []
         for one in self.parameters:
             unit = fixed_unit(one.name)
@@ -444,10 +439,7 @@ def _curved(objective: Objective, best: Optimum) -> Local:
 
 
 def rescaled(tuning: Tuning, factor: float) -> Tuning:
-    """Return a tuning with every σ of its filter scaled alike, which the size of the attitude error does not determine.
-
-    ``factor`` is that of ``filter.scale``, tuned by the innovations of the filter that has the smallest errors.
-    """
+    """Return a tuning with every σ of its filter scaled alike, which the size of the attitude error does not determine."""
     positive("factor", factor)
     names = ("value", "most_likely", "lower", "upper")
     return replace(
@@ -520,10 +512,7 @@ def _wald(best: Optimum, j: int, error: float) -> _Known:
 def _profiled(
     objective: Objective, best: Optimum, j: int, priors: Mapping[str, Prior], error: float, swollen: float
 ) -> _Known:
-    """Follow the profile likelihood of parameter j to where it has fallen enough on either side.
-
-    ``swollen`` is how many times too fast it falls.
-    """
+    """Follow the profile likelihood of parameter j to where it has fallen enough on either side."""
     from scipy.integrate import simpson
     from scipy.optimize import brentq
 

@@ -39,11 +39,6 @@ def split(cases: Sequence[Case], share: float, by: By = "time") -> tuple[tuple[C
     -------
     tuned, held : tuple of Case
         Cases to tune on, and cases held out. By time both have the same records, with other ``first`` and ``last``.
-
-    Raises
-    ------
-    InputError
-        If ``share`` is not between 0 and 1, or there are too few records to hold one out.
     """
     if not 0.0 < share < 1.0:
         raise InputError(f"holdout is {share:g}; it must lie between 0 and 1")

@@ -196,10 +196,7 @@ class Likelihood:
         return found[:, :, 0, : len(points)], found[:, :, 1, : len(points)]
 
     def lanes(self, case: Prepared, points: Array) -> dict[str, Array]:
-        """Return what a kernel takes of up to eight points (k, p), flat: ``noise``, ``factors`` of the sensors' variances, ``state``.
-
-        The first point fills the lanes that are left.
-        """
+        """Return what a kernel takes of up to eight points (k, p), flat: ``noise``, ``factors`` of the sensors' variances, ``state``."""
         rows = np.concatenate([points, np.repeat(points[:1], WIDTH - len(points), axis=0)])
         lane = {name: np.exp(rows[:, j]) for j, name in enumerate(self.names)}
         base = dict(zip(self.names, np.exp(self.start), strict=True))
@@ -316,11 +313,6 @@ def likelihood(
     -------
     Likelihood
         For :func:`fit`.
-
-    Raises
-    ------
-    InputError
-        If there is no record, a name is unknown or comes twice, or a parameter starts from zero.
     """
     setup.need_mekf(chosen, "tuning by name")
     if not cases:

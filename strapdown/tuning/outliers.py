@@ -55,10 +55,7 @@ OWN = (OUTLIER_SHARE, OUTLIER_SCALE)
 
 @dataclass(frozen=True, kw_only=True)
 class ContaminatedLikelihood:
-    """Minus the log likelihood of records of which some measurements are outliers; built by :func:`contaminated_likelihood`.
-
-    The last two parameters are the outliers' share and scale.
-    """
+    """Minus the log likelihood of records of which some measurements are outliers; built by :func:`contaminated_likelihood`."""
 
     base: Likelihood
     first: tuple[float, float]
@@ -165,10 +162,7 @@ class TunedGate:
 
 
 def tuned_gate(objective: ContaminatedLikelihood, tuning: Tuning, *, draws: int = 2000) -> TunedGate:
-    """Return the gate at the Bayes threshold, its interval from that of share and scale.
-
-    The gate is the setup's own, or the default one, with another probability.
-    """
+    """Return the gate at the Bayes threshold, its interval from that of share and scale."""
     share, scale = tuning[OUTLIER_SHARE], tuning[OUTLIER_SCALE]
     seen = _seen(objective, tuning.point[:-2])
     best, thresholds = _probability(seen, np.array([[share.value, scale.value]]))

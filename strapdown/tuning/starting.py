@@ -131,10 +131,7 @@ NOISES = (
 
 
 def one_gyro(specs: Mapping[str, GyroSpec]) -> None:
-    """Refuse records, by name, whose gyros are of different noise: one set of parameters would fit none of them.
-
-    Turn-on bias, scale factor and misalignment may differ, as they do from one gyro of a kind to the next.
-    """
+    """Refuse records, by name, whose gyros are of different noise: one set of parameters would fit none of them."""
     names = list(specs)
     for name in names[1:]:
         for field in NOISES:

@@ -27,6 +27,7 @@ from strapdown.diagnosis import Cause
 from strapdown.diagnosis.likelihood import Model, log_p, run
 from strapdown.diagnosis.turning import PLAUSIBLE, turns
 from strapdown.estimation.states import ProcessNoise
+from strapdown.files import plain
 from strapdown.records import Estimate, ImuRecord, cut
 from strapdown.setup import FilterSetup
 from strapdown.tuning.fitting import Tuning
@@ -122,22 +123,14 @@ class Unmodelled:
             "suspected": self.suspected,
             "words": list(self.words),
             "moves_with_the_rate": self.moves_with_the_rate,
-            "scale_factor": {
-                "value": [float(x) for x in self.scale_factor.value],
-                "standard_error": [float(x) for x in self.scale_factor.standard_error],
-                "gain": self.scale_factor.gain,
-                "p_value": self.scale_factor.p_value,
-            },
+            "scale_factor": plain(vars(self.scale_factor)),
             "causes": [cause.words for cause in self.causes],
             "judgement": self.judgement.summary(),
         }
 
 
 def unmodelled(case: Case, chosen: FilterSetup, *, probability: float = 0.99) -> Unmodelled:
-    """Return what the part of a record that a filter was tuned on says against the tuned filter.
-
-    The filter is run some twenty times; where the innovations are not of the right shape some hundred times more, for their causes.
-    """
+    """Return what the part of a record that a filter was tuned on says against the tuned filter."""
     tail(probability)
     judgement = performance([case], chosen).judgements[0]
     record = seen(case)
@@ -178,10 +171,7 @@ def accepted(record: ImuRecord, estimate: Estimate) -> ImuRecord:
 
 
 def scale_factor(record: ImuRecord, noise: ProcessNoise, initial: estimation.State) -> ScaleFactor:
-    """Return the scale factor of the gyro that explains most beside a filter of this noise, or of less walk of the bias.
-
-    ``record`` as the filter processes it (:func:`strapdown.setup.modelled_record`).
-    """
+    """Return the scale factor of the gyro that explains most beside a filter of this noise, or of less walk of the bias."""
     rate_angle = turns(record, noise, initial)
     levels = LEVELS if noise.rate_random_walk > 0.0 else LEVELS[:1]
     tuned = run(Model(record=record, noise=noise, initial=initial))

@@ -19,7 +19,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -41,10 +41,12 @@ from strapdown.checks import (
 )
 from strapdown.kernels import gyro_errors
 from strapdown.kernels.machine import compiled
-from strapdown.motion import Motion
-from strapdown.motion.orbit import CircularOrbit
 from strapdown.results import ByValue
 from strapdown.units import STANDARD_GRAVITY
+
+if TYPE_CHECKING:
+    from strapdown.motion import Motion
+    from strapdown.motion.orbit import CircularOrbit
 
 Kind = Literal["direction", "heading", "vector", "attitude"]
 KINDS: dict[str, int] = {"direction": 2, "heading": 1, "vector": 3, "attitude": 3}
@@ -333,10 +335,7 @@ def _missing(value: Array) -> np.ndarray:
 
 
 def _of_known(name: str, value: Array, missing: np.ndarray, stand_in: Array | Callable[[Array], ArrayLike]) -> Array:
-    """Return a property of each sample (m, ...), NaN of a missing sample (m,) replaced by ``stand_in``.
-
-    ``stand_in`` is an array of the same length, or a function of the known entries.
-    """
+    """Return a property of each sample (m, ...), NaN of a missing sample (m,) replaced by ``stand_in``."""
     if not np.isnan(np.sum(value)):
         return value
     lost = np.isnan(value.reshape(len(value), -1)).any(axis=1)
@@ -597,8 +596,28 @@ def _body(motion: Any, time: Array, vector_f: Array) -> Array:
     return quaternion.rotate(quaternion.conjugate(attitude(time)), vector_f)
 
 
+class _Sampled:
+    """A sensor with a rate and faults of its own; :meth:`_measured` of the class is what it measures."""
+
+    name: str
+    rate: float
+    phase: float
+    faults: Faults
+
+    def observe(self, motion: Any, start: float, end: float, generator: np.random.Generator) -> VectorMeasurements:
+        """Return noisy measurements over (start, end] of a motion, or of an attitude q_fb given as a function of time."""
+        time = sample_times(self.rate, self.phase, start, end)
+        white, correlated = self.faults.noise(time, generator)
+        measured = self._measured(motion, time, white, correlated)
+        return self.faults.heard(VectorMeasurements(sensor=self.name, time=time, **measured), generator)
+
+    def _measured(self, motion: Any, time: Array, white: Array, correlated: Array) -> dict[str, Any]:
+        """Return the fields of the series of measurements, from white noise of unit σ and correlated noise (m, 3)."""
+        raise NotImplementedError
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
-class VectorSensor(ByValue):
+class VectorSensor(_Sampled, ByValue):
     """A sensor of one known direction: a star, the sun, a beacon.
 
     Parameters
@@ -633,26 +652,20 @@ class VectorSensor(ByValue):
         _check_sampling(self.name, self.sigma, "rad", self.rate, self.phase)
         one_of(f"{self.name}: kind", self.kind, ("direction", "heading"))
 
-    def observe(self, motion: Any, start: float, end: float, generator: np.random.Generator) -> VectorMeasurements:
-        """Return noisy measurements over (start, end] of a motion, or of an attitude q_fb given as a function of time."""
-        time = sample_times(self.rate, self.phase, start, end)
-        white, correlated = self.faults.noise(time, generator)
+    def _measured(self, motion: Any, time: Array, white: Array, correlated: Array) -> dict[str, Any]:
         noisy = _body(motion, time, self.reference_f) + self.sigma * white + correlated
         # The noise of a heading is that across the direction over its horizontal part.
         level = float(np.hypot(self.reference_f[0], self.reference_f[1])) if self.kind == "heading" else 1.0
-        series = VectorMeasurements(
-            sensor=self.name,
-            kind=self.kind,
-            time=time,
-            vector_b=_unit(noisy),
-            reference_f=self.reference_f,
-            sigma=np.full(len(time), self.sigma / level),
-        )
-        return self.faults.heard(series, generator)
+        return {
+            "kind": self.kind,
+            "vector_b": _unit(noisy),
+            "reference_f": self.reference_f,
+            "sigma": np.full(len(time), self.sigma / level),
+        }
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class HorizonSensor(ByValue):
+class HorizonSensor(_Sampled, ByValue):
     """An earth-horizon sensor on an orbit: the direction of the earth's centre, which moves in the fixed frame.
 
     Parameters
@@ -680,23 +693,19 @@ class HorizonSensor(ByValue):
 
     def __post_init__(self) -> None:
         """Check every field."""
+        from strapdown.motion.orbit import CircularOrbit  # all motions come with it, and recordings need none
+
         _check_sampling(self.name, self.sigma, "rad", self.rate, self.phase)
         instance(f"{self.name}: orbit", self.orbit, CircularOrbit, "give an orbit.CircularOrbit")
 
-    def observe(self, motion: Any, start: float, end: float, generator: np.random.Generator) -> VectorMeasurements:
-        """Return directions over (start, end]."""
-        time = sample_times(self.rate, self.phase, start, end)
-        white, correlated = self.faults.noise(time, generator)
+    def _measured(self, motion: Any, time: Array, white: Array, correlated: Array) -> dict[str, Any]:
         down_f = -_unit(self.orbit.position(time).reshape(-1, 3))
-        series = VectorMeasurements(
-            sensor=self.name,
-            kind="direction",
-            time=time,
-            vector_b=_unit(_body(motion, time, down_f) + self.sigma * white + correlated),
-            reference_f=down_f,
-            sigma=np.full(len(time), self.sigma),
-        )
-        return self.faults.heard(series, generator)
+        return {
+            "kind": "direction",
+            "vector_b": _unit(_body(motion, time, down_f) + self.sigma * white + correlated),
+            "reference_f": down_f,
+            "sigma": np.full(len(time), self.sigma),
+        }
 
 
 Boresight = str | tuple[float, ...] | tuple[tuple[float, ...], ...]
@@ -729,7 +738,7 @@ def _boresight(name: str, value: Any) -> str | tuple[float, ...]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class AttitudeSensor:
+class AttitudeSensor(_Sampled):
     """A star tracker that gives the attitude as a quaternion; coarse about its boresight, fine across it.
 
     Parameters
@@ -783,10 +792,7 @@ class AttitudeSensor:
         assert self.covariance is not None
         return np.sqrt(np.diag(self.covariance))
 
-    def observe(self, motion: Any, start: float, end: float, generator: np.random.Generator) -> VectorMeasurements:
-        """Return ``q_measured = q ⊗ exp(v)`` over (start, end]."""
-        time = sample_times(self.rate, self.phase, start, end)
-        white, correlated = self.faults.noise(time, generator)
+    def _measured(self, motion: Any, time: Array, white: Array, correlated: Array) -> dict[str, Any]:
         attitude = motion if callable(motion) else motion.attitude
         noise = self.sigma_axes * white
         if not isinstance(self.boresight, str):
@@ -794,19 +800,16 @@ class AttitudeSensor:
             noise = self.sigma_across * white + (self.sigma_about - self.sigma_across) * (white @ b)[:, None] * b
         error = quaternion.exp(noise + correlated)
         whole = self.covariance
-        series = VectorMeasurements(
-            sensor=self.name,
-            kind="attitude",
-            time=time,
-            attitude=quaternion.multiply(attitude(time), error).reshape(-1, 4),
-            sigma_axes=self.sigma_axes if whole is None else None,
-            covariance=whole,
-        )
-        return self.faults.heard(series, generator)
+        return {
+            "kind": "attitude",
+            "attitude": quaternion.multiply(attitude(time), error).reshape(-1, 4),
+            "sigma_axes": self.sigma_axes if whole is None else None,
+            "covariance": whole,
+        }
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Magnetometer(ByValue):
+class Magnetometer(_Sampled, ByValue):
     """A magnetometer in a known field: ``m_b = (I + S) R_fbᵀ B_f + h + v``, S soft iron, h hard iron (the residual of the calibration).
 
     Parameters
@@ -856,10 +859,7 @@ class Magnetometer(ByValue):
         object.__setattr__(self, "hard_iron", array(f"{self.name}: hard_iron", self.hard_iron, (3,)))
         object.__setattr__(self, "soft_iron", array(f"{self.name}: soft_iron", self.soft_iron, (3, 3)))
 
-    def observe(self, motion: Any, start: float, end: float, generator: np.random.Generator) -> VectorMeasurements:
-        """Return measurements over (start, end]; the sigma of a direction is the noise over the field's strength."""
-        time = sample_times(self.rate, self.phase, start, end)
-        white, correlated = self.faults.noise(time, generator)
+    def _measured(self, motion: Any, time: Array, white: Array, correlated: Array) -> dict[str, Any]:
         varies = callable(self.field_f)
         true_f = (
             array(f"{self.name}: field_f", self.field_f(time), (len(time), 3))
@@ -871,15 +871,12 @@ class Magnetometer(ByValue):
         strength = np.broadcast_to(np.linalg.norm(true_f, axis=-1), time.shape)
         level = np.broadcast_to(np.hypot(true_f[..., 0], true_f[..., 1]), time.shape)
         scale = {"vector": np.ones(len(time)), "direction": strength, "heading": level}[self.kind]
-        series = VectorMeasurements(
-            sensor=self.name,
-            kind=self.kind,
-            time=time,
-            vector_b=measured if self.kind == "vector" else _unit(measured),
-            reference_f=true_f if varies else np.asarray(self.field_f),
-            sigma=self.sigma / scale,
-        )
-        return self.faults.heard(series, generator)
+        return {
+            "kind": self.kind,
+            "vector_b": measured if self.kind == "vector" else _unit(measured),
+            "reference_f": true_f if varies else np.asarray(self.field_f),
+            "sigma": self.sigma / scale,
+        }
 
 
 def specific_force(
@@ -927,7 +924,7 @@ def specific_force(
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Accelerometer(ByValue):
+class Accelerometer(_Sampled, ByValue):
     """An accelerometer used as a sensor of the vertical: right at rest, in error by the acceleration of the body.
 
     Parameters
@@ -973,28 +970,22 @@ class Accelerometer(ByValue):
             object.__setattr__(self, name, array(f"{self.name}: {name}", getattr(self, name), (3,)))
         _direction(f"{self.name}: gravity_f", self.gravity_f)
 
-    def observe(self, motion: Motion, start: float, end: float, generator: np.random.Generator) -> VectorMeasurements:
-        """Return measurements of the direction up over (start, end]; ``motion`` must give rates too."""
-        time = sample_times(self.rate, self.phase, start, end)
-        white, correlated = self.faults.noise(time, generator)
+    def _measured(self, motion: Motion, time: Array, white: Array, correlated: Array) -> dict[str, Any]:
         exact = specific_force(
             motion, time, lever_arm_b=self.lever_arm_b, acceleration_f=self.acceleration_f, gravity_f=self.gravity_f
         )
         measured = exact + self.bias + self.sigma * white + correlated
         whole = self.kind == "vector"
-        series = VectorMeasurements(
-            sensor=self.name,
-            kind=self.kind,
-            time=time,
-            vector_b=measured if whole else _unit(measured),
-            reference_f=-self.gravity_f,
-            sigma=np.full(len(time), self.sigma / (1.0 if whole else float(np.linalg.norm(self.gravity_f)))),
-        )
-        return self.faults.heard(series, generator)
+        return {
+            "kind": self.kind,
+            "vector_b": measured if whole else _unit(measured),
+            "reference_f": -self.gravity_f,
+            "sigma": np.full(len(time), self.sigma / (1.0 if whole else float(np.linalg.norm(self.gravity_f)))),
+        }
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class HeadingPair(ByValue):
+class HeadingPair(_Sampled, ByValue):
     """Two GNSS antennas on the body: the heading of the line between them.
 
     The line is known in the body and measured in the fixed frame, so ``vector_b`` is exact and ``reference_f`` (m, 3) has the noise.
@@ -1028,20 +1019,14 @@ class HeadingPair(ByValue):
         object.__setattr__(self, "baseline_b", array(f"{self.name}: baseline_b", self.baseline_b, (3,)))
         _direction(f"{self.name}: baseline_b", self.baseline_b)
 
-    def observe(self, motion: Any, start: float, end: float, generator: np.random.Generator) -> VectorMeasurements:
-        """Return headings over (start, end]."""
-        time = sample_times(self.rate, self.phase, start, end)
-        white, correlated = self.faults.noise(time, generator)
+    def _measured(self, motion: Any, time: Array, white: Array, correlated: Array) -> dict[str, Any]:
         attitude = motion if callable(motion) else motion.attitude
         line_f = quaternion.rotate(attitude(time), self.baseline_b).reshape(-1, 3)
         level = np.hypot(line_f[:, 0], line_f[:, 1])
         measured = (line_f + self.sigma * white + correlated) * np.array([1.0, 1.0, 0.0])
-        series = VectorMeasurements(
-            sensor=self.name,
-            kind="heading",
-            time=time,
-            vector_b=np.tile(_unit(self.baseline_b), (len(time), 1)),
-            reference_f=measured,
-            sigma=self.sigma / level,
-        )
-        return self.faults.heard(series, generator)
+        return {
+            "kind": "heading",
+            "vector_b": np.tile(_unit(self.baseline_b), (len(time), 1)),
+            "reference_f": measured,
+            "sigma": self.sigma / level,
+        }

@@ -111,11 +111,6 @@ def from_vertical_and_heading(up_b: ArrayLike, magnetic_b: ArrayLike) -> Array:
     ndarray (..., 4)
         Unit quaternions q_fb. The vertical is met exactly; of the field only the horizontal part counts, which points North
         whatever the dip.
-
-    Raises
-    ------
-    InputError
-        If a vector is zero or not finite, or the field is vertical.
     """
     up, field = _directions("up_b", up_b), _directions("magnetic_b", magnetic_b)
     _refuse_parallel("up_b", "magnetic_b", up, field, MIN_HORIZONTAL_ANGLE)
