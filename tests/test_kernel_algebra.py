@@ -139,8 +139,8 @@ KERNELS: dict[str, tuple[Callable, tuple[int, ...], Callable]] = {
         (U, V, V),
         lambda s, a, b: upper(symmetric(s) - outer(a, b)),
     ),
-    "congruent": (algebra.congruent, (M, U), lambda A, s: upper(matrix(A) @ symmetric(s) @ swapped(matrix(A)))),
     "plus_square": (algebra.plus_square, (U, V), lambda s, v: upper(symmetric(s) + outer(v, v))),
+    "congruent": (algebra.congruent, (M, U), lambda A, s: upper(matrix(A) @ symmetric(s) @ swapped(matrix(A)))),
     "skew_polynomial": (
         algebra.skew_polynomial,
         (S, S, S, V),

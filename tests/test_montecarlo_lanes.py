@@ -71,6 +71,7 @@ def test_one_lane_is_eight_bit_for_bit_in_the_replay():
     np.testing.assert_array_equal(chunk.covariance_sum, estimate.covariance[:: PLAN.every])
     e = errors(estimate.attitude, estimate.bias, truth.attitude, truth.bias)[:: PLAN.every]
     np.testing.assert_allclose(chunk.error_sum, e, rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(chunk.error_product_sum, e[:, :, None] * e[:, None], rtol=1e-8, atol=1e-17)
     P = estimate.covariance[:: PLAN.every]
     for column, part in enumerate((slice(0, 6), slice(0, 3), slice(3, 6))):
         wanted = nees(e[:, part], P[:, part, part])

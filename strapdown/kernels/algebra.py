@@ -51,7 +51,11 @@ def matrix_times_vector(A, v):
 
 def transpose_times_vector(A, v):
     """Return Aᵀ v."""
-    return tuple(A[i] * v[0] + A[i + 3] * v[1] + A[i + 6] * v[2] for i in range(3))
+    return (
+        A[0] * v[0] + A[3] * v[1] + A[6] * v[2],
+        A[1] * v[0] + A[4] * v[1] + A[7] * v[2],
+        A[2] * v[0] + A[5] * v[1] + A[8] * v[2],
+    )
 
 
 def symmetric_times_vector(S, v):

@@ -69,7 +69,8 @@ def angle_of(y, x):
 
 def identity(like):
     """Return the identity matrix."""
-    return tuple(like + 1.0 if i % 4 == 0 else like for i in range(9))
+    one = like + 1.0
+    return (one, like, like, like, one, like, like, like, one)
 
 
 def triple_at(array, s, k, first):
@@ -92,8 +93,9 @@ def offset_of(sensors, sensor_use, s, k, W):
 
 def put_row(H, row, like, h):
     """Write the attitude's part of a row."""
-    for i in range(3):
-        set_row_entry(H, row, i, like, h[i])
+    set_row_entry(H, row, 0, like, h[0])
+    set_row_entry(H, row, 1, like, h[1])
+    set_row_entry(H, row, 2, like, h[2])
 
 
 def across(d, like):
