@@ -186,7 +186,7 @@ def _sensors() -> list[Section]:
 
 
 def _keys(kind: type, form: tables.Form) -> tuple[Key, ...]:
-    meanings, hints = _meanings(kind), typing.get_type_hints(kind)
+    meanings, hints = _meanings(kind), typing.get_type_hints(kind, localns={"CircularOrbit": orbit.CircularOrbit})
     fields = {field.name: field for field in dataclasses.fields(kind)}
     return tuple(_key(fields[name], hints[name], choice, meanings.get(name, "")) for name, choice in form.items())
 

@@ -16,8 +16,9 @@ import numpy as np
 import strapdown
 from strapdown import estimation, gyro, motion, scenarios, setup, vectors
 from strapdown.diagnosis import Cause
+from strapdown.motion.orbit import CircularOrbit
 
-FOR_CHECKERS = {"GyroSpec": gyro.GyroSpec, "Scenario": scenarios.Scenario}
+FOR_CHECKERS = {"CircularOrbit": CircularOrbit, "GyroSpec": gyro.GyroSpec, "Scenario": scenarios.Scenario}
 """Types that a module imports for type checkers alone: they stand above it."""
 
 

@@ -34,6 +34,7 @@ from strapdown.allan.spectrum import (
     binned,
     cosine_transform,
     expected_power,
+    last_coefficient,
     mean_power,
     ramp_coefficients,
     segment,
@@ -236,12 +237,12 @@ def fit_noise(
         raise InputError(
             f"values has {len(record)} samples; at least {SHORTEST} are needed to separate the noises, in a row without a gap"
         )
-    segments = [segment(place, dt, random_terms, highest_frequency) for place in places]
-    lasts = [one.last for one in segments]
+    lasts = [last_coefficient(place.stop - place.start, dt, highest_frequency) for place in places]
     if highest_frequency is not None and (sum(lasts) < 32 or min(lasts) < 1):
         raise InputError(
             f"highest_frequency is {highest_frequency:g} Hz: only {sum(lasts)} coefficients lie below; raise it"
         )
+    segments = [segment(place, dt, random_terms, highest_frequency) for place in places]
     fits, misfits = [], []
     for axis in range(record.shape[1]):
         rate = record[:, axis]
