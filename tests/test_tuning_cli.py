@@ -104,6 +104,9 @@ def test_plan_says_how_long_a_record_is_needed(run, tmp_path):
     status, said, complaint = run("tune", "--plan", path, "--free", "gyro.arw,sun.sigma")
     assert status == 0, complaint
     assert "60 s" in said
+    record = tmp_path / "two.h5"
+    assert run("simulate", path, "--out", record)[0] == 0
+    assert run("tune", "--plan", record, "--free", "gyro.arw,sun.sigma")[:2] == (0, said)
     assert not (tmp_path / "filter.toml").exists()
 
 

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 
     from strapdown.gyro import GyroSpec
     from strapdown.records import ImuRecord
+    from strapdown.scenarios import Scenario
     from strapdown.setup import FilterSetup
     from strapdown.tuning import Case, Comparison, Performance, Plan, TunedGate, Tuning, Unmodelled
     from strapdown.tuning.fitting import Estimated
@@ -200,8 +201,8 @@ def tune(
     records: Annotated[
         list[Path],
         typer.Argument(
-            help="Records (HDF5 of `strapdown simulate`) or recordings (BROAD HDF5, CSV), all of one unit; with --plan the name or "
-            "TOML file of a scenario."
+            help="Records (HDF5 of `strapdown simulate`) or recordings (BROAD HDF5, CSV), all of one unit; with --plan a "
+            "scenario: its name, its TOML file or a record simulated from it."
         ),
     ],
     start: _Filter,
@@ -553,11 +554,12 @@ def _plan(
     sources: Sequence[Path], chosen: FilterSetup | None, names: list[str] | None, length: str | None, threads: int
 ) -> None:
     from strapdown import scenarios, setup, tuning
+    from strapdown.recordings import recordfiles
 
     if len(sources) != 1:
         raise InputError(f"--plan takes one scenario; {len(sources)} are given")
     lengths = None if length is None else _numbers(length)
-    scenario = scenarios.load_scenario(sources[0])
+    scenario = _scenario_of(sources[0]) if recordfiles.is_record(sources[0]) else scenarios.load_scenario(sources[0])
     modelled = chosen or setup.matched(scenario)
     example = scenarios.simulate(scenario)
     wanted = names or list(tuning.default_names([example]))
@@ -566,6 +568,16 @@ def _plan(
             scenario, modelled, wanted, lengths=lengths or [scenario.duration], threads=threads, progress=advance
         )
     _print_plan(found, [example])
+
+
+def _scenario_of(path: Path) -> Scenario:
+    """Return the scenario that a record was simulated from."""
+    from strapdown.recordings import recordfiles
+
+    origin = recordfiles.read_record_file(path).with_origin(str(path)).origin
+    if origin is None or origin.scenario is None:
+        raise InputError(f"{path} does not hold its scenario; give the scenario's name or TOML file to --plan")
+    return origin.scenario
 
 
 def _numbers(text: str) -> list[float]:
