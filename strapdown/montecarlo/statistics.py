@@ -44,7 +44,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from strapdown import consistency, estimation
+from strapdown import consistency, estimation, units
 from strapdown.checks import Array, InputError
 from strapdown.consistency import Verdict
 from strapdown.records import Estimate, ImuRecord
@@ -179,9 +179,7 @@ class Statistics(Listed):
 
     def listing(self) -> Listing:
         """Return NEES and NIS per degree of freedom, and the errors at the end, as a table."""
-        from strapdown.montecarlo.verdicts import summary
-
-        report = summary(self)
+        judgement = consistency.judge_runs(self)
         rows = [
             (
                 f"{one.name} of {one.label}",
@@ -189,20 +187,24 @@ class Statistics(Listed):
                 f"{one.low:.4f} to {one.high:.4f}",
                 "FAIL" if one.rejected else "pass",
             )
-            for one in consistency.judge_runs(self).findings
+            for one in judgement.findings
             if one.is_ratio
         ]
-        last = report["last_epoch"]
+
+        def at_the_end(values: Array, axes: slice, unit: float) -> str:
+            return ", ".join(figure(x) for x in (values[-1, axes] / unit).tolist())
+
         notes = [
-            f"{what} at {last['time_s']:.6g} s (x, y, z), {words}: RMS error {numbers[0]}, σ {numbers[1]}"
-            for what, unit, words in (("attitude", "arcsec", "arcsec"), ("bias", "deg_per_hour", "°/h"))
-            for numbers in [
-                [", ".join(figure(x) for x in last[f"{what}_{key}_{unit}"]) for key in ("rms_error", "sigma")]
-            ]
+            f"{what} at {self.time[-1]:.6g} s (x, y, z), {words}: "
+            f"RMS error {at_the_end(self.rms_error, axes, unit)}, σ {at_the_end(self.sigma, axes, unit)}"
+            for what, axes, words, unit in (
+                ("attitude", slice(0, 3), "arcsec", units.ARCSECOND),
+                ("bias", slice(3, 6), "°/h", units.DEGREE_PER_HOUR),
+            )
         ]
         if self.failed:
             notes.append(f"{self.failed} runs failed: no finite error or covariance")
-        title = f"{self.runs} runs, per degree of freedom (1 expected); {100.0 * report['probability']:g} % bounds of all together"
+        title = f"{self.runs} runs, per degree of freedom (1 expected); {100.0 * judgement.probability:g} % bounds of all together"
         return Listing(title, ("statistic", "value", "bounds", ""), rows, notes)
 
     @property
