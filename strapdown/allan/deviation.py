@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from strapdown import checks
+from strapdown.allan import gaps
 from strapdown.allan.spectrum import flicker_covariance
 from strapdown.checks import Array, InputError
 from strapdown.kernels.allan import accumulate, second_difference_sizes, second_difference_squares
@@ -185,9 +186,9 @@ def allan_deviation(
     if np.isnan(record).any():
         if estimator != "overlapping":
             raise InputError(f"values has gaps (NaN), with which estimator {estimator!r} does not go; leave it out")
-        from strapdown.allan import gaps
-
-        return gaps.allan_deviation(scale * record, dt, taus=taus, level=level)
+        found = gaps.allan_deviation(scale * record, dt, taus=taus, level=level)._asdict()
+        noise_type = np.vectorize(NOISE_TYPES.__getitem__)(found.pop("alphas"))
+        return AllanDeviation(**found, noise_type=noise_type, level=level, estimator="gaps", sample_interval=dt)
     samples = record.shape[0]
     multiples = _multiples(taus, samples, dt, _order(estimator))
     deviation = np.empty((record.shape[1], len(multiples)))

@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from strapdown import checks
-from strapdown.allan.deviation import NOISE_TYPES, AllanDeviation
 from strapdown.checks import Array, InputError
 
 SIMULATED = 1 << 12
@@ -29,10 +28,22 @@ WHOLE_RUNS = 50
 """The same of records longer than :data:`SIMULATED`, with all their samples."""
 
 
+class Deviation(NamedTuple):
+    """Allan deviation (axes, k) at taus (k,), its confidence band, degrees of freedom and power laws; samples that are present."""
+
+    taus: Array
+    deviation: Array
+    lower: Array
+    upper: Array
+    edf: Array
+    alphas: NDArray[np.int64]
+    samples: int
+
+
 def allan_deviation(
     record: Array, dt: float, *, taus: ArrayLike | None = None, level: float = 0.95, seed: int = 0
-) -> AllanDeviation:
-    """Return the Allan deviation of averaged samples with gaps (NaN), estimator ``"gaps"``, and its confidence band.
+) -> Deviation:
+    """Return the Allan deviation of averaged samples with gaps (NaN), and its confidence band.
 
     By default at 12 averaging times a decade, up to a tenth of the record; NaN where too few pairs of samples are that far apart. The band
     comes from simulated records (``seed``).
@@ -55,17 +66,14 @@ def allan_deviation(
     edf, low, high = _spread(known, multiples, alphas, level, seed)
     variance = np.where(variance > 0.0, variance, np.nan)
     deviation = np.sqrt(variance)
-    return AllanDeviation(
+    return Deviation(
         taus=np.asarray(multiples * dt),
         deviation=deviation,
         lower=np.nan_to_num(np.sqrt(variance / high), nan=0.0),
         upper=np.where((low > 0.0) & (variance > 0.0), np.sqrt(variance / np.where(low > 0.0, low, 1.0)), np.inf),
         edf=edf,
-        noise_type=np.vectorize(NOISE_TYPES.__getitem__)(alphas),
-        level=level,
-        estimator="gaps",
+        alphas=alphas,
         samples=int(known.sum()),
-        sample_interval=dt,
     )
 
 
@@ -105,7 +113,7 @@ class _Pairs(NamedTuple):
 
 
 def _power_laws(multiples: NDArray[np.int64], variance: Array) -> NDArray[np.int64]:
-    """Return the power law of the noise at each τ, a key of NOISE_TYPES, from the local slope of the Allan variance."""
+    """Return the power law of the noise at each τ, the exponent of f in the PSD of the rate, from the local slope of the Allan variance."""
     usable = np.flatnonzero(variance > 0.0)
     if len(usable) < 3:
         return np.zeros(len(multiples), np.int64)
