@@ -119,6 +119,14 @@ def test_no_circle_of_imports():
     graphlib.TopologicalSorter(graph).prepare()  # raises CycleError and names the circle
 
 
+def test_no_circle_of_modules():
+    graph = {
+        module: {other for name in imports(tree) if (other := internal(name))} - {module}
+        for module, tree in sources().items()
+    }
+    graphlib.TopologicalSorter(graph).prepare()
+
+
 @pytest.mark.parametrize(("one", "other"), STRANGERS)
 def test_strangers_never_meet(one, other):
     for module, tree in sources().items():
