@@ -793,4 +793,4 @@ def fit_noise(
     >>> estimate = sd.estimate(record, noise=noise)  # doctest: +SKIP
     """
     values, interval, what = _samples(source, sample_interval, sensor, kind)
-    return dataclasses.replace(allan.fit_noise(values, interval, kind=what, **options), sensor=sensor)
+    return allan.fit_noise(values, interval, kind=what, sensor=sensor, **options)

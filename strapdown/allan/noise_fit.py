@@ -18,7 +18,7 @@ import functools
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -177,6 +177,7 @@ def fit_noise(
     sample_interval: float,
     *,
     kind: str = "rate",
+    sensor: str = "gyro",
     terms: Sequence[str] = TERMS,
     highest_frequency: float | None = None,
     level: float = 0.95,
@@ -192,6 +193,8 @@ def fit_noise(
         Sample interval, s.
     kind : {"rate", "increments"}, default "rate"
         Kind of the values.
+    sensor : {"gyro", "accelerometer", "magnetometer"}, default "gyro"
+        Sensor of the values, in m/s² or T where it is no gyro.
     terms : sequence of str, default TERMS
         Terms to fit, of :data:`TERMS`.
     highest_frequency : float, optional
@@ -227,6 +230,7 @@ def fit_noise(
     """
     record, dt, scale = averaged(values, sample_interval, kind)
     level = confidence(level)
+    checks.one_of("sensor", sensor, SENSORS)
     chosen = tuple(checks.one_of("terms: term", term, TERMS) for term in terms)
     chosen = tuple(term for term in TERMS if term in chosen)
     random_terms = tuple(term for term in chosen if term != "rate_ramp")
@@ -256,7 +260,8 @@ def fit_noise(
         fits.append(fit_axis(whole, "rate_ramp" in chosen))
         misfits.append(_worst_misfit(coefficients, each, fits[-1].best, random_terms, segments, dt))
     samples = sum(place.stop - place.start for place in places)
-    return _of_axes(chosen, fits, misfits, level=level, samples=samples, sample_interval=dt)
+    fit = _of_axes(chosen, fits, misfits, level=level, samples=samples, sample_interval=dt)
+    return replace(fit, sensor=sensor)
 
 
 def without_gaps(known: NDArray[np.bool_]) -> list[slice]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -231,9 +231,12 @@ def _identify(
             values = _regressed(recording, sensor, source, options.temperature, out, paths)
         with progress_bar("fit, deviation, figure", 3) as advance:
             fit = identification.fit_noise(
-                values, source.sample_interval, kind=source.kind, highest_frequency=options.highest_frequency
+                values,
+                source.sample_interval,
+                kind=source.kind,
+                sensor=sensor,
+                highest_frequency=options.highest_frequency,
             )
-            fit = replace(fit, sensor=sensor)
             estimator = "robust" if options.robust else "overlapping"
             deviation = identification.allan_deviation(
                 values, source.sample_interval, kind=source.kind, estimator=estimator
@@ -251,7 +254,7 @@ def _identify(
     if gaps:
         shortest = identification.noise_fit.SHORTEST
         console.print(
-            f"With gaps: the fit uses {fit.samples} samples in stretches of {shortest} or more, the deviation all there are."
+            f"With gaps: the fit uses {fit.samples} samples in segments of {shortest} or more, the deviation all there are."
         )
     rows = identification.table(fit)
     show_listing(fit.listing(), f"Noise coefficients with {100.0 * fit.level:g} % intervals")
