@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -59,6 +61,7 @@ def rates(time: np.ndarray, path: Callable[[np.ndarray], Rotation] = path) -> np
     return (8.0 * (turned(h) - turned(-h)) - (turned(2 * h) - turned(-2 * h))) / (12.0 * h)
 
 
+@functools.cache
 def recording(duration: float = 30.0, bias: tuple[float, ...] = (0.0, 0.0, 0.0), noise: float = 0.0) -> Recording:
     time = 100.0 + np.arange(round(duration * RATE)) / RATE
     attitude = path(time - 100.0)
@@ -467,13 +470,15 @@ def test_the_change_of_mean_acceleration_is_that_of_the_bounded_velocity(name):
 
 
 def test_all_trials_of_broad_are_of_a_hand(broad):
-    assert min(motions.chosen(read(file))[1] for file in broad.glob("*.hdf5")) > 100.0
-    assert {motions.chosen(read(file))[0] for file in broad.glob("*.hdf5")} == {"hand"}
+    names, odds = zip(*(motions.chosen(trial(file)) for file in broad.glob("*.hdf5")), strict=True)
+    assert set(names) == {"hand"}
+    assert min(odds) > 100.0
 
 
 # ---------------------------------------------------------------------------------------------------- latency
 
 
+@functools.cache
 def late(gyro: float = 0.0, field: float = 0.0, bias: tuple[float, ...] = (0.0, 0.0, 0.0)) -> Recording:
     """Half a minute of brisk motion; gyro and accelerometer show what was ``gyro`` s ago, the magnetometer ``field`` s more."""
     time = np.arange(round(30.0 * RATE)) / RATE
@@ -720,11 +725,21 @@ def test_a_start_without_rest_is_as_uncertain_as_it_is_wrong():
 # ---------------------------------------------------------------------------------------------------- BROAD
 
 
+trial = functools.cache(read)
+"""A BROAD trial, read once."""
+
+
+@functools.cache
+def score(file: Path, smooth: bool) -> hand_held.Score:
+    """Score of a trial as recorded."""
+    return hand_held.ours(trial(file), None, smooth=smooth)[1]
+
+
 def test_mean_error_over_the_broad_trials(broad):
     """One parameter set for all: mean total RMSE over the movement below 6° (issue A), and no trial lost."""
     totals = {}
     for file in sorted(broad.glob("*.hdf5")):
-        result = ahrs.estimate(read(file), AhrsParameters())
+        result = ahrs.estimate(trial(file), AhrsParameters())
         errors = reference_errors(result.estimate.attitude, result.recording.true_attitude)
         totals[file.stem] = errors.rms(result.recording.movement)["total"] / DEGREE
     assert len(totals) >= 11
@@ -734,7 +749,7 @@ def test_mean_error_over_the_broad_trials(broad):
 
 def test_the_magnetometer_of_the_broad_trials_is_late(broad):
     """By 11 ms beside the gyro, in every trial by itself to within its σ."""
-    found = np.array([sensor_delays.magnetometer_delay(read(file)) for file in sorted(broad.glob("*.hdf5"))])
+    found = np.array([sensor_delays.magnetometer_delay(trial(file)) for file in sorted(broad.glob("*.hdf5"))])
     assert np.all(np.abs(found[:, 0] - 0.0112) < 3.0 * found[:, 1] + 3e-4)
     assert np.sum(found[:, 1] < 5e-4) >= 5
 
@@ -742,17 +757,16 @@ def test_the_magnetometer_of_the_broad_trials_is_late(broad):
 def test_sigma_holds_on_broad_trials(broad):
     """The 95 % regions, as recorded, of the fastest trials, whose delays matter most."""
     for number in ("07", "21"):
-        recording = read(next(broad.glob(f"{number}_*.hdf5")))
         for smooth in (False, True):
-            _, score = hand_held.ours(recording, None, smooth=smooth)
-            assert score.coverage[0] > 0.9, (number, smooth, score)
-            assert score.errors[0] < score.sigma < 4.0 * score.errors[0], (number, smooth, score)
+            one = score(next(broad.glob(f"{number}_*.hdf5")), smooth)
+            assert one.coverage[0] > 0.9, (number, smooth, one)
+            assert one.errors[0] < one.sigma < 4.0 * one.errors[0], (number, smooth, one)
 
 
 @pytest.mark.parametrize("smooth", [False, True])
 def test_the_inclinations_sigma_is_neither_too_small_nor_too_large(broad, smooth):
     """The 95 % regions of the inclination, as recorded, over slow and fast motion."""
-    held = [hand_held.ours(read(file), None, smooth=smooth)[1].coverage[2] for file in sorted(broad.glob("*.hdf5"))]
+    held = [score(file, smooth).coverage[2] for file in sorted(broad.glob("*.hdf5"))]
     assert 0.92 < np.mean(held) < 0.985, held
     assert min(held) > 0.8, held
 
@@ -799,7 +813,7 @@ def test_the_velocity_of_a_hand_is_that_which_the_recording_shows():
 
 def test_innovations_of_broad_are_as_large_as_their_variance_says(broad):
     """NIS per degree of freedom; between 0.005 and 0.35 with one motion for all."""
-    found = [hand_held.ours(read(file), 4.1e-3)[1].nis[0] for file in sorted(broad.glob("*.hdf5"))]
+    found = [score(file, False).nis[0] for file in sorted(broad.glob("*.hdf5"))]
     assert 0.2 < min(found) < max(found) < 0.9, found
 
 

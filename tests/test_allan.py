@@ -460,11 +460,17 @@ def coverage(seeds, samples, first, second, ramp=0.0):
 
 
 def test_intervals_cover_small_study():
-    inside, supported, _ = coverage(40, 8192, 150.0, 20.0, ramp=20.0)
+    inside, supported, ratio = coverage(40, 8192, 150.0, 20.0, ramp=20.0)
     assert np.all(inside.sum(axis=0) >= 33)  # 95 % of 40 is 38; 33 or fewer has a chance of 0.3 %
     assert inside.sum() >= 0.91 * inside.size
     assert inside.sum() <= 0.985 * inside.size
     assert np.all(supported.mean(axis=0) > 0.9)
+    truth = dict(zip(allan.TERMS[:4], corners(8192, 150.0, 20.0).values(), strict=True))
+    expected = allan.expected_errors({**truth, "rate_ramp": 1.0}, 8192, 1.0)
+    error = ratio[:, :3] - 1.0
+    relative = [expected[term] / truth[term] for term in allan.TERMS[:3]]
+    # A standard deviation from 40 lies within 29 % of the true one but for a chance of 1 %.
+    assert np.all(np.abs(np.sqrt(np.nanmean(error**2, axis=0)) / relative - 1.0) < 0.29), relative
 
 
 def test_intervals_cover_where_a_term_is_at_the_edge_of_being_seen():
@@ -491,17 +497,6 @@ def test_intervals_cover_where_a_term_is_at_the_edge_of_being_seen():
     assert 0.3 < np.mean(seen) < 0.9
     assert np.all(np.abs(np.mean(inside, axis=0) - 0.955) < 0.04)
     assert 0.005 < np.mean(above) < 0.05  # 0.025; one-sided bounds give 0.065 here
-
-
-def test_recovery_small_study():
-    result = sim.case("22 min, strong B", 10)
-    share = result.covered[:, :3].mean()
-    assert 0.86 <= share <= 0.99
-    for term in allan.TERMS[:3]:
-        assert np.all(result.supported[:, allan.TERMS.index(term)])
-        # A standard deviation from 30 lies within 33 % of the true one but for a chance of 1 %.
-        assert 0.67 < result.relative_rms(term) * result.truth[term] / result.expected[term] < 1.33
-    assert result.relative_rms("bias_instability") < 0.1
 
 
 @pytest.mark.slow
@@ -551,19 +546,6 @@ def test_terms_that_are_not_there_are_bounded_not_invented():
     assert supported[1] == 12
     assert supported[[0, 2, 3, 4]].sum() <= 1  # each with a chance of 1e-3: two of 48 with one of 0.1 %
     assert_allclose(supported + below, 12.0)
-
-
-def test_upper_bound_of_a_hidden_term_holds():
-    """A random walk that few records show stays under its bound in nearly all of those that do not."""
-    K, held, hidden = 6.0 / 4096, 0, 0
-    for seed in range(80):
-        fit = allan.fit_noise(
-            simulate([seed, 9], 4096, 1.0, N=1.0, K=K), 1.0, terms=("angle_random_walk", "rate_random_walk")
-        )
-        hidden += not fit.supported[0, 1]
-        held += not fit.supported[0, 1] and fit.upper[0, 1] >= K
-    assert hidden >= 20
-    assert 0.90 * hidden <= held <= hidden
 
 
 def test_bound_is_where_the_likelihood_falls():

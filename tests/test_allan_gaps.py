@@ -56,8 +56,7 @@ def test_the_estimator_is_unbiased_whatever_the_gaps(kind, lost):
     assert np.abs(error).max() < 4.0
 
 
-@pytest.mark.parametrize("kind", ["white", "walk"])
-@pytest.mark.parametrize("lost", ["single", "long"])
+@pytest.mark.parametrize(("kind", "lost"), [("white", "long"), ("walk", "single")])
 def test_its_band_covers_the_truth(kind, lost):
     """95 % intervals over 300 records at each τ up to a tenth of the record: between 89 and 99.5 %."""
     covers(kind, gaps(500, lost, seed=1), np.array([1, 3, 10, 30, 50]))

@@ -215,7 +215,7 @@ def test_without_blocks_the_smoother_is_the_plain_smoother():
 
 @pytest.mark.parametrize("option", OPTIONS)
 def test_both_faces_are_one_filter(option):
-    record, initial, blocks = record_of(duration=2.0, anisotropic=option == "all"), start(), OPTIONS[option]
+    record, initial, blocks = record_of(duration=1.0, anisotropic=option == "all"), start(), OPTIONS[option]
     whole = estimation.run(record, NOISE, initial, blocks, full_covariance=True)
     step = in_steps.run(record, NOISE, estimation.with_error_states(initial, blocks), blocks)
     P = whole.whole_covariance if blocks else whole.covariance

@@ -194,7 +194,7 @@ def small_record(blocks, scale, *, seed=3, steps=8, dt=0.1, late=False, off=(1.0
     for k in range(steps):
         turn = RATE * dt * (1.0 + 0.3 * np.sin(2.0 * time[k]))
         increments[k] = turn
-        for _ in range(20):  # what the model turns into this
+        for _ in range(10):  # what the model turns into this
             increments[k] += turn - turns_of(blocks, increments[k : k + 1], dt, q[k : k + 1], b[None], c[k : k + 1])[0]
         increments[k] += noise.angle_random_walk * math.sqrt(dt) * rng.standard_normal(3)
         q[k + 1] = quaternion.multiply(q[k], quaternion.exp(turn))

@@ -39,39 +39,23 @@ def double_precision_drift(name, angle, ratio):
 
 @pytest.mark.parametrize("name", list(ALGORITHMS))
 def test_double_precision_agrees_with_thirty_digits(name):
-    for angle, ratio in ((0.02, 0.3), (0.3, 0.6)):
-        true = float(exact_error(name, angle, ratio, digits=30).drift)
-        step = ALGORITHMS[name].samples * ratio
-        rounding = 6e-16 / step / min(abs(math.sin(0.5 * step)), 1.0)
-        assert double_precision_drift(name, angle, ratio) == pytest.approx(true, rel=0.01, abs=rounding)
-
-
-COMPRESSED = [
-    name for name in ALGORITHMS if ALGORITHMS[name].solver == "compressed" and not ALGORITHMS[name].rate_points
-]
-
-
-@pytest.mark.parametrize("name", COMPRESSED)
-def test_drift_is_the_closed_form_and_its_order_is_2m(name):
-    # With digits enough β can be so small that no second-order floor shows, for every N and p.
-    m = ALGORITHMS[name].samples + ALGORITHMS[name].previous
-    ratios = np.geomspace(0.003, 0.03, 4)
-    drifts = np.array(
-        [float(exact_error(name, 1e-30, float(lam), digits=150).drift / mp.mpf(1e-30) ** 2) for lam in ratios]
-    )
-    c = math.factorial(m) ** 2 / (2 * math.factorial(2 * m + 1))
-    np.testing.assert_allclose(drifts, -c * ratios ** (2.0 * m), rtol=0.02)
-    slope = np.polyfit(np.log(ratios), np.log(-drifts), 1)[0]
-    assert slope == pytest.approx(2 * m, abs=0.05)
+    angle, ratio = 0.3, 0.6
+    true = float(exact_error(name, angle, ratio, digits=30).drift)
+    step = ALGORITHMS[name].samples * ratio
+    rounding = 6e-16 / step / min(abs(math.sin(0.5 * step)), 1.0)
+    assert double_precision_drift(name, angle, ratio) == pytest.approx(true, rel=0.01, abs=rounding)
 
 
 @pytest.mark.parametrize("name", list(ALGORITHMS))
 def test_drift_order_and_constant_of_every_table(name):
-    table = ALGORITHMS[name]
-    ratios = (0.02, 0.04)
-    drifts = [float(exact_error(name, 1e-32, lam, digits=150).drift / mp.mpf(1e-32) ** 2) for lam in ratios]
-    assert math.log2(drifts[1] / drifts[0]) == pytest.approx(table.drift_order, abs=0.05)
-    assert drifts[0] == pytest.approx(-float(table.drift_constant) * ratios[0] ** table.drift_order, rel=0.02)
+    """With digits enough β can be so small that no second-order floor shows; a wrong order is a factor of 2,500."""
+    table, ratio = ALGORITHMS[name], 0.02
+    drift = float(exact_error(name, 1e-32, ratio, digits=150).drift / mp.mpf(1e-32) ** 2)
+    assert drift == pytest.approx(-float(table.drift_constant) * ratio**table.drift_order, rel=0.02)
+    if table.solver == "compressed" and not table.rate_points:
+        m = table.samples + table.previous
+        assert table.drift_order == 2 * m
+        assert float(table.drift_constant) == pytest.approx(math.factorial(m) ** 2 / (2 * math.factorial(2 * m + 1)))
 
 
 @pytest.mark.parametrize("name", list(ALGORITHMS))
@@ -96,10 +80,8 @@ def test_one_sample_drift_is_exact_at_any_angle():
 @pytest.mark.parametrize(
     ("angle_degrees", "ratio"),
     [
-        (0.01, 1.0),
         (3.0, 0.6),
         (45.0, 0.02),
-        (45.0, 1.0),
     ],
 )
 def test_own_best_beats_every_published_algorithm(angle_degrees, ratio):

@@ -54,7 +54,8 @@ def test_own_best_leads_on_random_manoeuvres():
     assert max(least) > 100 * sim.MANOEUVRE_ROUNDING  # there was something to beat
 
 
-def test_a_verdict_names_what_was_lost():
+def test_a_verdict_names_what_was_lost(monkeypatch):
+    monkeypatch.setattr(sim, "PUBLISHED", ("two-sample", "eight-sample"))
     comparison = sim.compare([0.1], [0.5])
     comparison.drift["two-sample"][0][0] = 0.0
     verdict = sim.judge(comparison, "matched-2-8")

@@ -287,13 +287,12 @@ ORBITAL = setup.FilterSetup(
 
 def test_the_noise_of_a_gyro_is_not_taken_for_a_scale_factor():
     """To scale the increments is to scale their noise too, and a filter with less noise has smaller innovations."""
-    for seed in range(2):
-        record = scenarios.simulate(SLOW_TURN, seed=seed)
-        found = diagnosis.diagnose(record, ORBITAL, start(record, ORBITAL, seed, 1e-3))
-        assert named(found) is None
-        (scale,) = (cause for cause in found.considered if cause.name == "scale factor")
-        assert np.all(np.abs(scale.estimate) < 3.0 * scale.standard_error)
-        assert scale.gain < 6.0
+    record = scenarios.simulate(SLOW_TURN, seed=0)
+    found = diagnosis.diagnose(record, ORBITAL, start(record, ORBITAL, 0, 1e-3))
+    assert named(found) is None
+    (scale,) = (cause for cause in found.considered if cause.name == "scale factor")
+    assert np.all(np.abs(scale.estimate) < 3.0 * scale.standard_error)
+    assert scale.gain < 6.0
 
 
 @pytest.mark.slow
@@ -334,10 +333,9 @@ def cone(algorithm: str, seed: int, truth: bool) -> diagnosis.Diagnosis:
 @pytest.mark.parametrize("truth", [True, False], ids=["with truth", "without"])
 def test_commutation_is_named_with_the_rate_that_it_implies(algorithm, truth):
     predicted = coning.predicted_coning_drift(coning.ALGORITHMS[algorithm], 0.7 * units.DEGREE, 10.0, 0.01)
-    for seed in range(2):
-        found = cone(algorithm, seed, truth)
-        assert named(found) == ("commutation", algorithm)
-        assert found.causes[0].estimate == pytest.approx([0.0, 0.0, predicted], abs=0.06 * abs(predicted))
+    found = cone(algorithm, 0, truth)
+    assert named(found) == ("commutation", algorithm)
+    assert found.causes[0].estimate == pytest.approx([0.0, 0.0, predicted], abs=0.06 * abs(predicted))
     assert "°/h" in found.words
 
 
@@ -421,14 +419,11 @@ def test_outliers_are_counted_and_sized():
     assert outliers("star", 1.2 * random.standard_normal((4000, 2))).estimate[1] >= 3.0
 
 
-@pytest.mark.parametrize(
-    "matrix", [np.diag([-1.0, -1.0, 1.0]), np.eye(3)[[1, 0, 2]], -np.eye(3)], ids=["flipped", "swapped", "inverted"]
-)
-def test_check_names_a_wrong_axis_on_the_command_line(run, tmp_path, matrix):
-    """The grossest faults: many causes explain them, several of the same name and sensor."""
+def test_check_names_a_wrong_axis_on_the_command_line(run, tmp_path):
+    """Two axes swapped: the grossest faults: many causes explain them, several of the same name and sensor."""
     made = scenario()
     record = scenarios.simulate(made, seed=1)
-    record = replace(record, increments=record.increments @ matrix.T)
+    record = replace(record, increments=record.increments[:, [1, 0, 2]])
     recordfiles.write_record(tmp_path / "record.h5", record, gyro_spec=made.gyro, seed=1, run=0)
     assert run("estimate", "record.h5", "--from-truth", "--out", "out")[::2] == (0, "")
     status, said, error = run("check", "out/estimate.h5", "--record", "record.h5", "--json", "check.json")

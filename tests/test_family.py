@@ -15,8 +15,6 @@ import numpy as np
 import pytest
 from filterpy.common import van_loan_discretization
 from filterpy.kalman import JulierSigmaPoints, KalmanFilter, MerweScaledSigmaPoints, UnscentedKalmanFilter
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from plain_kernels import plain
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm, solve_discrete_are
@@ -151,30 +149,9 @@ def difference(estimate, reference):
 # ------------------------------------------------------------------------------------------------------------ the fixed side
 
 
-@settings(max_examples=25, deadline=None)
-@given(
-    seed=st.integers(0, 2**32 - 1),
-    attitude_sigma=st.floats(-4.0, -0.7).map(lambda x: 10.0**x),
-    bias_sigma=st.floats(-5.0, -2.0).map(lambda x: 10.0**x),
-    kinds=st.sampled_from([("direction",), ("direction", "heading"), ("direction", "vector", "heading")]),
-)
-def test_fixed_side_equals_the_mekf(seed, attitude_sigma, bias_sigma, kinds):
-    rng = np.random.default_rng(seed)
-    record = simulated(rng, kinds=kinds, sigma=10.0 ** rng.uniform(-3.0, -1.0), intervals=100)
-    initial = started(record, rng, attitude_sigma=attitude_sigma, bias_sigma=bias_sigma)
-    reference = filters.run("mekf", record, BELIEF, initial, full_covariance=True)
-    fixed = filters.run("fixed-side", record, BELIEF, initial, full_covariance=True)
-    attitude, _, covariance = difference(fixed, reference)
-    assert max(attitude, covariance) < 1e-12
-    np.testing.assert_allclose(fixed.bias, reference.bias, rtol=0.0, atol=1e-12)
-    for sensor, innovations in reference.innovations.items():
-        np.testing.assert_allclose(fixed.innovations[sensor].whitened, innovations.whitened, rtol=0.0, atol=1e-10)
-
-
 @pytest.mark.parametrize("name", ["right-invariant", "two-frame", "equivariant", "geometric", "schmidt"])
-@pytest.mark.parametrize("seed", range(3))
-def test_without_its_reset_it_is_another_filter(name, seed):
-    rng = np.random.default_rng(seed)
+def test_without_its_reset_it_is_another_filter(name):
+    rng = np.random.default_rng(0)
     record = simulated(rng)
     initial = started(record, rng, attitude_sigma=0.2, bias_sigma=1e-3)
     reference = filters.run("mekf", record, BELIEF, initial, full_covariance=True)
@@ -393,51 +370,8 @@ def test_invariant_filters_never_see_what_one_reference_hides():
 # ------------------------------------------------------------------------------------------------------------- agreement
 
 
-def heading_record(angles_measured, increments, dt, sigma, every):
-    """A body at rest but for tiny turns about z, its heading measured every few intervals."""
-    n = len(increments)
-    time = np.arange(n + 1) * dt
-    r = np.array([1.0, 0.0, 0.0])
-    z = np.stack([np.cos(angles_measured), -np.sin(angles_measured), np.zeros_like(angles_measured)], axis=-1)
-    series = VectorMeasurements(
-        sensor="heading", kind="heading", time=time[every::every], vector_b=z, reference_f=r, sigma=sigma
-    )
-    turns = np.stack([np.zeros(n), np.zeros(n), increments], axis=-1)
-    return ImuRecord(time=time, increments=turns, vectors=(series,))
-
-
-@pytest.mark.parametrize("name", [*EXTENDED, "usque"])
-def test_small_angles_about_one_axis_are_the_kalman_filter(name):
-    rng = np.random.default_rng(9)
-    n, every, dt, sigma = 120, 4, 0.5, 1e-6
-    sv, su = 3e-7, 2e-8
-    measured, increments = 1e-6 * rng.standard_normal(n // every), 1e-6 * rng.standard_normal(n)
-    record = heading_record(measured, increments, dt, sigma, every)
-    initial = estimation.initial_state(
-        [1.0, 0.0, 0.0, 0.0], attitude_sigma=[1e-9, 1e-9, 2e-6], bias_sigma=[1e-10, 1e-10, 1e-6]
-    )
-    noise = estimation.ProcessNoise(angle_random_walk=sv, rate_random_walk=su)
-    estimate = filters.run(name, record, noise, initial, full_covariance=True)
-    kf = KalmanFilter(dim_x=2, dim_z=1)
-    kf.x, kf.P = np.zeros((2, 1)), np.diag([4e-12, 1e-12])
-    kf.F, kf.H, kf.R = np.array([[1.0, -dt], [0.0, 1.0]]), np.array([[1.0, 0.0]]), np.array([[sigma**2]])
-    q12 = -(su**2) * dt**2 / 2.0
-    kf.Q = np.array([[sv**2 * dt + su**2 * dt**3 / 3.0, q12], [q12, su**2 * dt]])
-    B = np.array([[1.0], [0.0]])
-    for k in range(n):
-        kf.predict(u=np.array([[increments[k]]]), B=B)
-        if (k + 1) % every == 0:
-            kf.update(measured[(k + 1) // every - 1])
-        scale = np.sqrt(np.diag(kf.P))
-        angle = quaternion.log(estimate.attitude[k + 1])[2]
-        got = np.array([angle, estimate.bias[k + 1, 2]])
-        np.testing.assert_allclose(got / scale, kf.x[:, 0] / scale, rtol=0.0, atol=1e-8)
-        P = estimate.covariance[k + 1][np.ix_([2, 5], [2, 5])]
-        np.testing.assert_allclose(P / np.outer(scale, scale), kf.P / np.outer(scale, scale), rtol=0.0, atol=1e-8)
-
-
-@pytest.mark.parametrize("points", [JulierSigmaPoints(6, kappa=0.5), MerweScaledSigmaPoints(6, 0.5, 2.0, 0.0)])
-def test_usque_of_either_sigma_points_tends_to_the_mekf(points):
+def test_usque_of_other_sigma_points_tends_to_the_mekf():
+    points = MerweScaledSigmaPoints(6, 0.5, 2.0, 0.0)
     rng = np.random.default_rng(11)
     record = simulated(rng, intervals=60, measurements=10, sigma=1e-5, noise=(1e-6, 1e-8))
     noise = estimation.ProcessNoise(angle_random_walk=1e-6, rate_random_walk=1e-8)
@@ -986,95 +920,6 @@ def test_the_equivariant_error_does_not_hang_on_the_trajectory(name):
     assert np.abs(one[4] - other[4]).max() > 0.01 * scale
 
 
-def by_matrices(name, record, noise, initial):
-    """States (q, b, P) at the edges and NIS by plain matrices: Van Loan's discretisation, one update of all rows, Joseph's form.
-
-    Of the equivariant filter in (δφ, β) and by the group exponential, of Schmidt's in (δθ, δb) with a bias gain of zero.
-    """
-    fixed = name == "equivariant"
-    q, b, P = initial.attitude, initial.bias, initial.covariance
-    if fixed:
-        T = np.kron(np.eye(2), quaternion.to_matrix(q))
-        P = T @ P @ T.T
-    density = np.diag([noise.angle_random_walk**2] * 3 + [noise.rate_random_walk**2] * 3)
-    events = sorted((t, i, k) for i, s in enumerate(record.vectors) for k, t in enumerate(s.time))
-    rows, nis, now = [], [], record.time[0]
-
-    def report():
-        T = np.kron(np.eye(2), quaternion.to_matrix(q).T) if fixed else np.eye(6)
-        rows.append((q, b, T @ P @ T.T))
-
-    report()
-    for begin, end, increment in zip(record.time, record.time[1:], record.increments, strict=False):
-        for t, i, k in [e for e in events if begin < e[0] <= end] + [(end, -1, -1)]:
-            dt, now = t - now, t
-            phi = increment * (dt / (end - begin)) - b * dt
-            w = phi / dt
-            F = np.zeros((6, 6))
-            F[:3, 3:] = -np.eye(3)
-            if fixed:
-                F[3:, 3:] = kinematics.skew(quaternion.rotate(q, w))
-            else:
-                F[:3, :3] = -kinematics.skew(w)
-            step = expm(F * dt)
-            big = expm(np.block([[-F, density], [np.zeros((6, 6)), F.T]]) * dt)
-            P = step @ P @ step.T + step @ big[:6, 6:]
-            q = quaternion.multiply(q, quaternion.exp(phi))
-            if i < 0:
-                continue
-            series, R = record.vectors[i], quaternion.to_matrix(q)
-            z, r = series.vector_b[k], series.references_f[k]
-            rows_b = unit_vector_basis(R.T @ r)
-            y = rows_b @ (z - R.T @ r)
-            H = np.zeros((2, 6))
-            H[:, :3] = rows_b @ kinematics.skew(R.T @ r)
-            if fixed:
-                H = equivariant_rows(rows_b, R, z, r)
-            N = series.sigma[k] ** 2 * np.eye(2)
-            S = H @ P @ H.T + N
-            K = P @ H.T @ np.linalg.inv(S)
-            if not fixed:
-                K[3:] = 0.0
-            left = np.eye(6) - K @ H
-            P = left @ P @ left.T + K @ N @ K.T
-            a, c = (K @ y)[:3], (K @ y)[3:]
-            nis.append(y @ np.linalg.solve(S, y))
-            if fixed:
-                b = b + R.T @ kinematics.right_jacobian(a) @ c
-                q = quaternion.multiply(quaternion.exp(a), q)
-            else:
-                G = np.eye(6)
-                G[:3, :3] = kinematics.right_jacobian(a)
-                P = G @ P @ G.T
-                q = quaternion.multiply(q, quaternion.exp(a))
-        report()
-    return rows, nis
-
-
-@pytest.mark.parametrize("name", ["equivariant", "schmidt"])
-@pytest.mark.parametrize("seed", range(3))
-def test_equivariant_and_schmidt_equal_plain_matrices(name, seed):
-    """Many steps and updates from a quarter of a radian off, to rounding."""
-    rng = np.random.default_rng([52, seed])
-    record = simulated(rng, intervals=40, dt=0.3, kinds=("direction",), measurements=25, sigma=0.05, noise=(0.02, 0.01))
-    noise = estimation.ProcessNoise(angle_random_walk=0.02, rate_random_walk=0.01)
-    M = rng.standard_normal((6, 6)) * np.array([0.25] * 3 + [0.05] * 3)[:, None]
-    initial = estimation.State(
-        attitude=quaternion.multiply(record.truth.attitude[0], quaternion.exp([0.2, -0.1, 0.15])),
-        bias=np.array([0.02, -0.01, 0.015]),
-        covariance=M @ M.T,
-    )
-    rows, nis = by_matrices(name, record, noise, initial)
-    estimate = filters.run(name, record, noise, initial, full_covariance=True)
-    for k, (q, b, P) in enumerate(rows):
-        assert quaternion.angle_between(estimate.attitude[k], q) < 1e-12
-        np.testing.assert_allclose(estimate.bias[k], b, rtol=0.0, atol=1e-12)
-        sigma = np.sqrt(np.diag(P))
-        scale = np.outer(sigma, sigma)
-        np.testing.assert_allclose(estimate.covariance[k] / scale, P / scale, rtol=0.0, atol=1e-12)
-    np.testing.assert_allclose(estimate.innovations["direction"].nis, nis, rtol=1e-9)
-
-
 def test_schmidt_never_changes_the_bias_nor_what_is_known_of_it():
     rng = np.random.default_rng(53)
     record = simulated(rng, kinds=tuple(REFERENCES), form="covariance", noise=(1e-4, 0.0))
@@ -1089,56 +934,6 @@ def test_schmidt_never_changes_the_bias_nor_what_is_known_of_it():
     walking = filters.run("schmidt", record, BELIEF, initial, full_covariance=True)
     grown = initial.covariance[3:, 3:] + 1e-12 * record.time[:, None, None] * np.eye(3)
     np.testing.assert_allclose(walking.covariance[:, 3:, 3:], grown, rtol=1e-12, atol=1e-22)
-
-
-def test_schmidt_is_consistent_where_the_bias_is_drawn_from_its_prior():
-    """ANEES of the attitude, two-sided; the gain that holds the bias for known and the MEKF with that model are far above."""
-    runs, values = 200, {"schmidt": [], "ignored": []}
-    noise = estimation.ProcessNoise(angle_random_walk=1e-4, rate_random_walk=0.0)
-    for run in range(runs):
-        rng = np.random.default_rng([54, run])
-        record = simulated(
-            rng,
-            intervals=60,
-            dt=0.5,
-            kinds=("direction", "vector"),
-            measurements=20,
-            noise=(1e-4, 0.0),
-            sigma=2e-3,
-            body=motion.ConstantRate(rate=(0.05, -0.1, 0.3)),
-        )
-        initial = started(record, rng, attitude_sigma=0.01, bias_sigma=1e-3)
-        known = estimation.initial_state(initial.attitude, attitude_sigma=0.01, bias_sigma=1e-9, bias=initial.bias)
-        for kind, name, begun in (("schmidt", "schmidt", initial), ("ignored", "mekf", known)):
-            estimate = filters.run(name, record, noise, begun, every=20, full_covariance=True)
-            e = consistency.errors(
-                estimate.attitude, estimate.bias, record.truth.attitude[::20], record.truth.bias[::20]
-            )[1:, :3]
-            P = estimate.covariance[1:, :3, :3]
-            values[kind].append(np.einsum("ki,ki->k", e, np.linalg.solve(P, e[..., None])[..., 0]) / 3.0)
-    schmidt, ignored = (
-        Verdict(mean=np.mean(values[kind], axis=0), degrees=3, runs=runs, probability=0.999) for kind in values
-    )
-    assert schmidt.consistent
-    assert not ignored.consistent
-    assert np.min(ignored.mean) > 2.0
-
-
-def test_equivariant_is_consistent_from_wide_starts():
-    """ANEES of all six states, two-sided, from starts of ten degrees and more, where the order of the rows begins to count."""
-    runs, nees, doubted = 200, [], []
-    for run in range(runs):
-        rng = np.random.default_rng([55, run])
-        record = simulated(rng, intervals=60, dt=0.3, kinds=("direction", "vector"), measurements=20, sigma=0.02)
-        initial = started(record, rng, attitude_sigma=10.0 * DEGREE, bias_sigma=1e-3)
-        for belief, values in ((record, nees), (halved(record), doubted)):
-            estimate = filters.run("equivariant", belief, BELIEF, initial, every=20, full_covariance=True)
-            e = consistency.errors(
-                estimate.attitude, estimate.bias, record.truth.attitude[::20], record.truth.bias[::20]
-            )
-            values.append(consistency.nees(e, estimate.covariance)[1:] / 6.0)
-    assert Verdict(mean=np.mean(nees, axis=0), degrees=6, runs=runs, probability=0.999).consistent
-    assert not Verdict(mean=np.mean(doubted, axis=0), degrees=6, runs=runs, probability=0.999).consistent
 
 
 # ------------------------------------------------------------------------------------------------- USQUE and complementary
@@ -1327,34 +1122,6 @@ def test_no_noise_and_no_error_stay_no_error(name):
     error = consistency.errors(estimate.attitude, estimate.bias, record.truth.attitude, record.truth.bias)
     assert np.abs(error[:, :3]).max() < 1e-12
     assert np.abs(error[:, 3:]).max() < 1e-12
-
-
-@pytest.mark.parametrize("name", filters.FILTERS)
-def test_consistent_from_small_errors(name):
-    """ANEES of attitude and bias within two-sided 99 % bounds at three epochs; outside when the noise is modelled half as large."""
-    runs = 30 if name == "usque" else 50
-    nees, doubted = [], []
-    for run in range(runs):
-        rng = np.random.default_rng([18, run])
-        record = simulated(rng, intervals=90, kinds=("direction", "vector"), measurements=25, dt=0.3)
-        initial = started(record, rng, attitude_sigma=0.5 * DEGREE, bias_sigma=5e-4)
-        for belief, values in ((record, nees), (halved(record), doubted)):
-            if name == "usque" and values is doubted:
-                continue
-            estimate = filters.run(name, belief, BELIEF, initial, every=30, full_covariance=True)
-            error = consistency.errors(
-                estimate.attitude, estimate.bias, record.truth.attitude[::30], record.truth.bias[::30]
-            )
-            values.append(consistency.nees(error, estimate.covariance)[1:] / 6.0)
-    assert Verdict(mean=np.mean(nees, axis=0), degrees=6, runs=runs, probability=0.99).consistent
-    if doubted:
-        assert not Verdict(mean=np.mean(doubted, axis=0), degrees=6, runs=runs, probability=0.99).consistent
-
-
-def halved(record):
-    """The same record, its measurements modelled twice as good as they are."""
-    vectors = tuple(dataclasses.replace(s, sigma=0.5 * s.sigma) for s in record.vectors)
-    return dataclasses.replace(record, vectors=vectors)
 
 
 @cache
@@ -1548,7 +1315,7 @@ def assert_sound(estimate):
 
 @pytest.mark.parametrize("name", filters.FILTERS)
 def test_every_filter_stays_finite_from_any_start(name):
-    for seed in range(8 if name == "usque" else 40):
+    for seed in range(8 if name == "usque" else 24):
         record, initial = wild(seed, 60 if name == "usque" else 300)
         assert_sound(filters.run(name, record, BELIEF, initial, full_covariance=True))
 

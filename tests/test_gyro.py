@@ -629,9 +629,7 @@ def judged(outcome):
 
 
 def test_filters_on_presets_with_flicker(tmp_path):
-    result = flicker_in_filter.main(
-        presets=("mpu-9250", "adis16470", "stim300"), runs=24, duration=300.0, rate=20.0, out=tmp_path
-    )
+    result = flicker_in_filter.main(presets=("mpu-9250", "adis16470"), runs=24, duration=300.0, rate=20.0, out=tmp_path)
     for outcome in result.outcomes:
         judged(outcome)
     blind = result.outcomes[0]

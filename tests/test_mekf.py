@@ -116,7 +116,7 @@ def stepped(record, initial, saver=None):
 @pytest.mark.parametrize("fast", [False, True], ids=["slow turn", "12 rad/s"])
 def test_both_faces_are_one_filter(fast):
     body_motion = motion.ConstantRate(rate=(80.0, -60.0, 70.0)) if fast else None  # 1.2 rad a sample: sub-steps
-    record = with_vector_series(simulate(scenario(body_motion, duration=4.0), 1))
+    record = with_vector_series(simulate(scenario(body_motion, duration=2.0), 1))
     record = with_moving_reference(with_attitude_series(record))
     initial = off(record)
     whole = estimation.run(record, NOISE, initial, full_covariance=True)

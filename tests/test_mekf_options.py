@@ -144,9 +144,16 @@ def near(record, error=(5e-3, -5e-3, 4e-3), sigma=1e-2):
     return initial_state(attitude, attitude_sigma=sigma, bias_sigma=3e-3)
 
 
-@pytest.mark.parametrize("schedule", SCHEDULES)
-@pytest.mark.parametrize("kind", sensors())
-@pytest.mark.parametrize("option", OPTIONS)
+def alternating(*, odd: bool = False):
+    """Return each option with each kind, and each of them with one of the two schedules: so they meet in pairs."""
+    return [
+        (option, kind, list(SCHEDULES)[(i + j + odd) % 2])
+        for i, option in enumerate(OPTIONS)
+        for j, kind in enumerate(sensors())
+    ]
+
+
+@pytest.mark.parametrize(("option", "kind", "schedule"), alternating())
 def test_both_faces_are_one_filter(option, kind, schedule):
     given, whole = OPTIONS[option]
     record = simulate(scenario(SCHEDULES[schedule](sensors()[kind]), duration=2.0), 5)
@@ -202,10 +209,14 @@ def consistency_of(kind, schedule, option, runs, sigma_factor=1.0):
 @pytest.mark.parametrize("runs", [12, pytest.param(400, marks=pytest.mark.slow)])
 def test_every_option_is_consistent_and_a_broken_one_is_not(kind, schedule, runs):
     for option in OPTIONS:
+        if runs == 12 and (option, kind, schedule) not in alternating(odd=True):
+            continue
         verdicts, (nis, low, high) = consistency_of(kind, schedule, option, runs)
         for verdict in verdicts:
             assert verdict.consistent, (option, verdict.mean, verdict.simultaneous_bounds)
         assert low < nis < high, (option, nis, low, high)
+    if runs == 12 and ("covariance", kind, schedule) not in alternating():
+        return
     for factor in (0.5, 3.0):
         (broken, _), _ = consistency_of(kind, schedule, "covariance", max(runs, 40), sigma_factor=factor)
         assert not broken.consistent, (factor, broken.mean)
@@ -219,7 +230,8 @@ def test_every_option_is_consistent_and_a_broken_one_is_not(kind, schedule, runs
 def test_the_plain_filter_is_consistent_over_thousands_of_runs_and_not_with_sigma_a_tenth_off(kind, schedule):
     """ANEES of attitude, bias and both; 99 % over the whole grid."""
     found = {}
-    for factor in (1.0, 1.1, 1.0 / 1.1):
+    off = 1.1 if ("plain", kind, schedule) in alternating() else 1.0 / 1.1
+    for factor in (1.0, off):
         belief = FilterSetup(process_noise=NOISE, attitude_sigma=1e-2, bias_sigma=1e-3, measurement_sigma_factor=factor)
         chosen = scenario(SCHEDULES[schedule](sensors(Faults())[kind]))
         plan = montecarlo.Plan(scenario=chosen, setup=belief, seed=21, epochs=4)

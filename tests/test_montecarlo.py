@@ -114,7 +114,7 @@ def test_the_filter_is_consistent_from_large_errors_too():
     assert verdict.consistent, verdict.mean
 
 
-@pytest.mark.parametrize(("threads", "chunk"), [(1, 10), (2, 3), (3, 40)])
+@pytest.mark.parametrize(("threads", "chunk"), [(2, 10), (3, 3)])
 def test_statistics_do_not_depend_on_threads(threads, chunk):
     one = montecarlo.run(SCENARIO, (setup(),), runs=12, seed=1, threads=1, chunk=10)[0]
     other = montecarlo.run(SCENARIO, (setup(),), runs=12, seed=1, threads=threads, chunk=chunk)[0]

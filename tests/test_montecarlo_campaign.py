@@ -95,7 +95,7 @@ def test_the_file_describes_itself(tmp_path):
         assert set(file["statistics"]) == names
 
 
-@pytest.mark.parametrize("end", [8, 13, 21, 24])
+@pytest.mark.parametrize("end", [8, 13])
 def test_a_campaign_can_be_extended_to_the_same_bits(tmp_path, end):
     """From ends on whole chunks and on short ones."""
     path = tmp_path / "c.h5"
@@ -206,13 +206,13 @@ def _killed(path, runs, *, after=None, die_at=0):
 def test_killed_at_random_moments_a_campaign_goes_on_to_the_same_bits(tmp_path):
     scalar.run_chunk(PLAN, 0, 1)  # compiled before the children fork
     path = tmp_path / "c.h5"
-    runs, kills, total, folds = 120, 0, None, {}
+    runs, kills, total, folds = 80, 0, None, {}
     for first, number in engine.chunks_of(runs, CHUNK):
         part = scalar.run_chunk(PLAN, first, number)
         total = part if total is None else statistics.merge(total, part)
         folds[total.runs] = total
     random = np.random.default_rng(8)
-    for _ in range(24):
+    for _ in range(10):
         if not _killed(path, runs, after=random.uniform(0.02, 0.15)):
             break
         kills += 1
@@ -227,7 +227,7 @@ def test_killed_at_random_moments_a_campaign_goes_on_to_the_same_bits(tmp_path):
 
 
 @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
-@pytest.mark.parametrize("die_at", [1, 5, 18, 19, 31])
+@pytest.mark.parametrize("die_at", [1, 18, 31])
 def test_killed_in_the_middle_of_writing_the_file_is_the_one_before(tmp_path, die_at):
     scalar.run_chunk(PLAN, 0, 1)
     path = tmp_path / "c.h5"

@@ -256,7 +256,7 @@ def test_summary_of_a_right_filter_and_of_a_wrong_one():
     for share, expected in zip(summary["coverage"]["attitude"], summary["coverage"]["expected"], strict=True):
         assert abs(share - expected) < 4.0 * np.sqrt(expected * (1.0 - expected) / 200)  # 3 axes, correlated epochs
     wrong = montecarlo.run_plan(
-        planned(scenario=perfect, setup=replace(SETUP, measurement_sigma_factor=0.5)), runs=200, machine="scalar"
+        planned(scenario=perfect, setup=replace(SETUP, measurement_sigma_factor=0.5)), runs=50, machine="scalar"
     )
     assert not montecarlo.summary(wrong)["consistent"]
 

@@ -231,27 +231,6 @@ def test_the_bias_over_temperature_is_subtracted_and_its_error_becomes_a_walk():
         from_table({k: v for k, v in given.items() if k != "bias_rad_per_s"}, "file: gyro")
 
 
-def test_estimate_reads_the_table_that_allan_writes(run, tmp_path):
-    """The unit warms up again, another way: its estimated bias is that of a unit without the dependence, to the slope's interval."""
-    for name, seed, constant, slope in (("first", 1, 60.0, 2e-3), ("second", 2, 20.0, 2e-3), ("without", 2, 20.0, 0.0)):
-        whole = at_rest(20_000, seed)
-        T = 25.0 + 10.0 * (1.0 - np.exp(-whole.time / constant))
-        bias = slope * (T - 30.0)[:, None] * [1.0, -1.0, 0.0]
-        recordings.write(replace(whole, rate=whole.rate + bias, temperature=T), tmp_path / f"{name}.csv")
-    assert run("allan", "first.csv", "--temperature", 1)[0] == 0
-    path = tmp_path / "allan-results" / "gyro-temperature.toml"
-    table = tomllib.loads(path.read_text())["gyro"]["temperature"]
-    status, said, error = run("estimate", "second.csv", "--temperature", path, "--out", "second")
-    assert (status, "bias over temperature is subtracted" in said) == (0, True), error
-    assert run("estimate", "without.csv", "--out", "without")[0] == 0
-    second, without = (records.read_estimate(tmp_path / name / "estimate.h5") for name in ("second", "without"))
-    # The mean belongs to the first recording, and neither filter knows its bias at once.
-    change = (second.bias - without.bias)[len(without.bias) // 20 :]
-    reach = 4.0 * np.array(table["sigma_rad_per_s_per_k"])
-    assert (np.abs(change - change[-1]) < reach * 10.0).all()
-    assert reach.max() < 1e-3  # less than half the slope that was subtracted
-
-
 def test_a_simulated_unit_goes_through_allan_and_its_table_into_the_filter(run, tmp_path):
     """Round trip: the scenario's polynomial lies inside the intervals, and the filter that reads the table finds the turn-on bias."""
     rest = """
@@ -353,10 +332,9 @@ def through_a_bag(folder, seed: int, others: float) -> tuple[np.ndarray, list[bo
     return np.array(axes), numbers
 
 
-@pytest.mark.parametrize("others", [1.0, 0.2], ids=["axes alike", "one much larger"])
-def test_a_simulated_unit_through_a_bag_is_found_again(tmp_path, others):
+def test_a_simulated_unit_through_a_bag_is_found_again(tmp_path):
     pytest.importorskip("rosbags", reason="rosbags is not installed: pip install 'strapdown[formats]'")
-    axes, numbers = zip(*(through_a_bag(tmp_path, seed, others) for seed in range(4)), strict=True)
+    axes, numbers = zip(*(through_a_bag(tmp_path, seed, 0.2) for seed in range(4)), strict=True)
     assert 40 <= np.sum(axes) <= 48  # of 48 at 95 %: 45.6, σ 1.5
     assert 13 <= np.sum(numbers) <= 16
 

