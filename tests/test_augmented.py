@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from plain_kernels import called
 
-from strapdown import consistency, estimation, kinematics, motion, quaternion, records
+from strapdown import estimation, kinematics, motion, quaternion, records
 from strapdown.checks import InputError
 from strapdown.estimation import error_states
 from strapdown.estimation.gating import Gate
@@ -175,39 +175,6 @@ OPTIONS: dict[str, tuple[error_states.ErrorStates, ...]] = {
 
 def scaled(P: np.ndarray, sigma: np.ndarray) -> np.ndarray:
     return P / (sigma[..., :, None] * sigma[..., None, :])
-
-
-# ------------------------------------------------------------------------------------------------------- without blocks: the plain filter
-
-
-FAST = motion.ConstantRate(rate=(30.0, -20.0, 25.0))
-
-
-@pytest.mark.parametrize("body_motion", [SWAY, FAST], ids=["sway", "44 rad/s"])
-@pytest.mark.parametrize("anisotropic", [False, True])
-def test_without_blocks_it_is_the_plain_filter(body_motion, anisotropic):
-    record, initial = record_of(body_motion, anisotropic=anisotropic), start(body_motion)
-    one = estimation.run(record, NOISE, initial, every=3, full_covariance=True)
-    other = estimation.run(record, NOISE, initial, every=3, full_covariance=True)
-    assert np.array_equal(one.time, other.time)
-    error = consistency.errors(one.attitude, one.bias, other.attitude, other.bias)
-    assert np.max(np.abs(error) / one.sigma) < 5e-12
-    assert np.max(np.abs(scaled(one.covariance - other.covariance, one.sigma))) < 5e-12
-    assert dict(one.skipped) == dict(other.skipped)
-    for name, innovations in one.innovations.items():
-        np.testing.assert_allclose(other.innovations[name].nis, innovations.nis, rtol=1e-9, atol=1e-12)
-        if not anisotropic:
-            np.testing.assert_allclose(other.innovations[name].whitened, innovations.whitened, rtol=0, atol=1e-11)
-
-
-def test_without_blocks_the_smoother_is_the_plain_smoother():
-    record, initial = record_of(), start(error=(0.2, -0.3, 0.1))
-    initial = dataclasses.replace(initial, covariance=100.0 * initial.covariance)
-    one = estimation.smooth(record, NOISE, initial, full_covariance=True)
-    other = estimation.smooth(record, NOISE, initial, full_covariance=True)
-    error = consistency.errors(one.attitude, one.bias, other.attitude, other.bias)
-    assert np.max(np.abs(error) / one.sigma) < 1e-8
-    assert np.max(np.abs(scaled(one.covariance - other.covariance, one.sigma))) < 1e-8
 
 
 # ------------------------------------------------------------------------------------------------------------------------ two faces

@@ -563,52 +563,8 @@ def assert_same_events(one, other):
         assert (a.start, a.end, a.value) == pytest.approx((b.start, b.end, b.value))
 
 
-@pytest.mark.parametrize("robust", [None, Robust(), Robust(kind="huber")], ids=["gate", "Student", "Huber"])
-@pytest.mark.parametrize("case", CASES)
-def test_without_blocks_it_is_the_plain_filter(case, robust):
-    """Every kind of sensor, from anywhere at all; what these sensors have besides is an error of both filters, which may keep them lost."""
-    for run in range(4):
-        one = made(case, run, duration=3.0)
-        given = {"gate": Gate(recovery=5), "robust": robust, "full_covariance": True}
-        start = lost(one.initial, run)
-        plain = estimation.run(one.record, NOISE, start, **given)
-        other = estimation.run(one.record, NOISE, start, (), **given)
-        assert plain.events  # it has recovered, or reports that it is locked out
-        assert_same_events(plain, other)
-        error = consistency.errors(other.attitude, other.bias, plain.attitude, plain.bias)
-        assert np.max(np.abs(error) / plain.sigma) < 1e-9
-        scale = plain.sigma[:, :, None] * plain.sigma[:, None, :]
-        assert np.max(np.abs(other.covariance - plain.covariance) / scale) < 1e-9
-        for sensor, innovations in plain.innovations.items():
-            np.testing.assert_allclose(other.innovations[sensor].weight, innovations.weight, atol=1e-9)
-            np.testing.assert_allclose(other.innovations[sensor].variance, innovations.variance, rtol=1e-6)
-            np.testing.assert_allclose(other.innovations[sensor].nis, innovations.nis, rtol=1e-6, atol=1e-6)
-
-
-@pytest.mark.parametrize("robust", [None, Robust(), Robust(kind="huber")], ids=["gate", "Student", "Huber"])
-@pytest.mark.parametrize("case", CASES)
-def test_without_blocks_and_errors_of_theirs_it_is_the_plain_filter(case, robust):
-    """The same of sensors without such errors, of which both filters are right."""
-    for run in range(4):
-        one = made(case, run, duration=3.0, states=0.0)
-        given = {"gate": Gate(recovery=5), "robust": robust, "full_covariance": True}
-        start = lost(one.initial, run)
-        plain = estimation.run(one.record, NOISE, start, **given)
-        other = estimation.run(one.record, NOISE, start, (), **given)
-        assert recoveries(plain)
-        assert_same_events(plain, other)
-        error = consistency.errors(other.attitude, other.bias, plain.attitude, plain.bias)
-        assert np.max(np.abs(error) / plain.sigma) < 1e-9
-        scale = plain.sigma[:, :, None] * plain.sigma[:, None, :]
-        assert np.max(np.abs(other.covariance - plain.covariance) / scale) < 1e-9
-        for sensor, innovations in plain.innovations.items():
-            np.testing.assert_allclose(other.innovations[sensor].weight, innovations.weight, atol=1e-9)
-            np.testing.assert_allclose(other.innovations[sensor].variance, innovations.variance, rtol=1e-6)
-            np.testing.assert_allclose(other.innovations[sensor].nis, innovations.nis, rtol=1e-6, atol=1e-6)
-
-
 @pytest.mark.parametrize("gap", [False, True], ids=["lost start", "gap"])
-@pytest.mark.parametrize("at", [(7,), (20, 21), (40, 90), (5, 10, 15, 100), range(1, 150)], ids=len)
+@pytest.mark.parametrize("at", [(7,), (20, 21), range(1, 150)], ids=len)
 def test_in_parts_a_gate_goes_on_as_in_one(at, gap):
     """Cut before, within and after the time that a candidate runs: its state, all counts and the prior of states that change go on."""
     one = made("hard iron", 3, duration=3.0)

@@ -8,11 +8,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from strapdown import consistency, estimation, quaternion, scenarios, setup
-from strapdown.estimation.states import ProcessNoise
+from strapdown import consistency, scenarios, setup
 from strapdown.montecarlo.scalar import start
-from strapdown.records import ImuRecord
-from strapdown.vectors import VectorMeasurements
 
 LENGTH = {"coning": 12.0, "tumbling-satellite": 120.0, "low-orbit": 2400.0, "magnetometer-only": 5400.0, "rest": 120.0}
 """Seconds of the runs of the small study; the others are whole."""
@@ -156,29 +153,3 @@ def test_the_quicker_part_of_flicker_is_reported_of_the_bias():
     whole = scenario.gyro.bias_instability**2 * flicker.shaping(len(record.increments)).variance
     held = fast + sum(sigma**2 for sigma in chosen.states.gyro_drift_sigma)
     assert 0.6 * whole < held < 1.0 * whole
-
-
-def test_a_correction_of_any_size_is_that_of_the_plain_filter():
-    """Starts all round the sphere with a wide prior: corrections up to several radians, beyond the range of the polynomials."""
-    noise = ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-6)
-    for seed in range(40):
-        draw = np.random.default_rng(seed)
-        start = estimation.initial_state(
-            quaternion.normalize(draw.standard_normal(4)), attitude_sigma=2.0 if seed % 2 else 20.0, bias_sigma=1e-3
-        )
-        series = tuple(
-            VectorMeasurements(sensor=name, kind="direction", time=[0.0], vector_b=[r], reference_f=r, sigma=sigma)
-            for name, r, sigma in (("up", [0.0, 0.0, 1.0], 0.02), ("north", [0.0, 0.6, -0.8], 0.05))
-        )
-        tracker = VectorMeasurements(
-            sensor="tracker", kind="attitude", time=[0.0], attitude=[[1.0, 0.0, 0.0, 0.0]], sigma_axes=[1e-3] * 3
-        )
-        for vectors in (series, (tracker,)):
-            record = ImuRecord(time=[0.0, 1.0], increments=np.zeros((1, 3)), vectors=vectors)
-            plain = estimation.run(record, noise, start, full_covariance=True)
-            wide = estimation.run(record, noise, start, full_covariance=True)
-            apart = quaternion.log(quaternion.multiply(quaternion.conjugate(plain.attitude), wide.attitude))
-            assert np.abs(apart).max() < 1e-9
-            sigma = np.sqrt(plain.variance)
-            difference = (plain.covariance - wide.covariance) / (sigma[:, :, None] * sigma[:, None, :])
-            assert np.abs(difference).max() < 1e-9

@@ -177,20 +177,9 @@ def uneven() -> ImuRecord:
 # ---------------------------------------------------------------------------------------------- without states: the plain filter
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        {},
-        {"gate": Gate(probability=0.99, recovery=None)},
-        {"robust": Robust()},
-        {"robust": Robust(kind="huber"), "gate": Gate(recovery=None)},
-        {"gate": Gate(recovery=None), "monitor": Monitor(window=20, probability=0.9)},
-    ],
-    ids=["plain", "gate", "student", "huber and gate", "gate and monitor"],
-)
-@pytest.mark.parametrize("kind", ["vector", "direction"])
-def test_without_states_it_is_the_plain_filter_gates_and_all(kind, options):
-    record = missing(simulated(kind=kind, outlier_probability=0.1))
+def test_without_states_it_is_the_plain_filter_gates_and_all():
+    record = missing(simulated(kind="direction", outlier_probability=0.1))
+    options = {"gate": Gate(recovery=None), "robust": Robust(), "monitor": Monitor(window=20, probability=0.9)}
     initial = begun(record)
     one = estimation.run(record, NOISE, initial, every=7, full_covariance=True, **options)
     other = optional.run(record, NOISE, initial, States(), every=7, full_covariance=True, **options)
@@ -201,20 +190,18 @@ def test_without_states_it_is_the_plain_filter_gates_and_all(kind, options):
     assert [(event.kind, event.start, event.end) for event in other.events] == [
         (event.kind, event.start, event.end) for event in one.events
     ]
-    assert ("monitor" in options) == any(event.kind == "divergence" for event in one.events)
+    assert any(event.kind == "divergence" for event in one.events)
     assert [(event.sensor, event.value) for event in other.events] == [
         (event.sensor, pytest.approx(event.value)) for event in one.events
     ]
     assert other.skipped == one.skipped == {"mag": 7, "acc": 0}
     assert other.refused == one.refused
-    if "gate" in options:
-        assert sum(one.refused.values()) > 10
+    assert sum(one.refused.values()) > 10
     for sensor, innovations in one.innovations.items():
         found = other.innovations[sensor]
         np.testing.assert_allclose(found.innovation, innovations.innovation, atol=1e-10)
         np.testing.assert_allclose(found.variance, innovations.variance, rtol=1e-9)
-        if innovations.weight is not None:
-            np.testing.assert_allclose(found.weight, innovations.weight, atol=1e-9)
+        np.testing.assert_allclose(found.weight, innovations.weight, atol=1e-9)
 
 
 def missing(record):

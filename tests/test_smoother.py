@@ -536,7 +536,6 @@ def test_a_wrong_start_is_mended_to_its_very_beginning() -> None:
 def test_frames_are_a_matter_of_choice() -> None:
     case = CASES["asynchronous"]
     record, initial = simulated(case, np.random.default_rng(12))
-    plain = estimation.smooth(record, case.noise, initial, full_covariance=True)
     p = quaternion.normalize([0.3, -0.5, 0.7, 0.2])
     back = quaternion.conjugate(p)
     directions = tuple(s for s in record.vectors if s.kind != "heading")  # a heading knows which axis is vertical
@@ -923,8 +922,6 @@ def test_several_recoveries_and_a_record_in_parts() -> None:
     )
     twice = ImuRecord(time=record.time, increments=increments, vectors=vectors, truth=truth)
     whole = estimation.smooth(twice, NOISE, initial, gate=GATE, full_covariance=True)
-    on_factors = estimation.smooth(twice, NOISE, initial, gate=GATE, full_covariance=True)
-    assert_same(whole, on_factors, 1e-9)
     assert [event.kind for event in whole.events] == ["recovery", "recovery"]
     first, second = np.searchsorted(record.time, [event.start for event in whole.events])
     off = np.max(np.abs(errors(whole, twice) / whole.sigma), axis=1)
@@ -1162,7 +1159,7 @@ def test_gain_and_what_it_leaves(decades: float) -> None:
         np.testing.assert_allclose(left / scale, expected_left / scale, rtol=0, atol=1e-10)
 
 
-@pytest.mark.parametrize("intervals", [*range(1, 20), 31, 32, 33])
+@pytest.mark.parametrize("intervals", [*range(1, 11), 16, 17])
 def test_any_number_of_segments(intervals: int) -> None:
     # Segments are taken in groups of eight, the last of which may be smaller.
     case = dataclasses.replace(CASES["directions"], attitude_sigma=0.2, bias_sigma=0.02, duration=1.0)

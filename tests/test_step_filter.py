@@ -144,20 +144,6 @@ def divergences(events):
     return [event for event in events if event.kind == "divergence"]
 
 
-@pytest.mark.parametrize("option", ["plain", "gate"])
-def test_without_blocks_a_monitor_reports_what_the_plain_filter_s_does(option):
-    record = record_of(1.2)
-    given = {"gate": Gate(recovery=4)} if option == "gate" else {}
-    initial = begun(record, "lost")
-    plain = estimation.run(record, NOISE, initial, monitor=WATCH, **given)
-    other = estimation.run(record, NOISE, initial, monitor=WATCH, **given)
-    assert divergences(plain.events)
-    assert len(plain.events) == len(other.events)
-    for one, same in zip(plain.events, other.events, strict=True):
-        assert (one.kind, one.start, one.end, one.sensor) == (same.kind, same.start, same.end, same.sensor)
-        assert one.value == pytest.approx(same.value, rel=1e-8)
-
-
 @pytest.mark.parametrize("gate", [None, Gate(recovery=None)], ids=["none", "gate"])
 @pytest.mark.parametrize("states", ["bias, drift and sway"])
 def test_a_monitor_watches_both_faces_alike(states, gate):
