@@ -252,31 +252,6 @@ def test_nis_is_that_of_the_whole_innovation(name, kind):
 # -------------------------------------------------------------------------------------------- the two-frames group and others
 
 
-def compose(first, second):
-    """The group law of the two-frames group, attitude and body vector: (R₁, b₁) • (R₂, b₂) = (R₁R₂, b₂ + R₂ᵀ b₁)."""
-    return (
-        quaternion.multiply(first[0], second[0]),
-        second[1] + quaternion.rotate(quaternion.conjugate(second[0]), first[1]),
-    )
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_two_frame_correction_is_the_group_exponential(seed):
-    rng = np.random.default_rng(seed)
-    a, c, b = 0.3 * rng.standard_normal(3), rng.standard_normal(3), rng.standard_normal(3)
-    q = quaternion.exp(rng.standard_normal(3))
-    squarings = 17
-    small, n = a / 2**squarings, c / 2**squarings
-    element = (quaternion.exp(small), n - 0.5 * np.cross(small, n))
-    for _ in range(squarings):
-        element = compose(element, element)
-    wanted = compose(element, (q, b))
-    nothing = (0.0,) * 6, (0.0,) * 9, (0.0,) * 6
-    got = two_frame.closed(tuple(q), tuple(b), *nothing, tuple(a), tuple(c))
-    np.testing.assert_allclose(got[0], wanted[0], atol=1e-10)
-    np.testing.assert_allclose(got[1], wanted[1], atol=1e-9)
-
-
 def matrix_of(A, B, C):
     P = np.empty((6, 6))
     P[:3, :3], P[3:, 3:] = np.reshape(mekf_full(A), (3, 3)), np.reshape(mekf_full(C), (3, 3))
@@ -296,54 +271,6 @@ def blocks_of(P):
         tuple(map(float, P[:3, 3:].ravel())),
         tuple(map(float, P[3:, 3:][upper])),
     )
-
-
-@pytest.mark.parametrize("angle", [1e-9, 1e-4, 0.02, 0.4])
-def test_two_frame_propagation_is_that_of_its_linear_system(angle):
-    """F = [[0, −I], [0, [w_f]]] is constant at constant rate: Van Loan's discretisation is an oracle."""
-    rng = np.random.default_rng(7)
-    dt = 0.3
-    q, b = quaternion.exp(rng.standard_normal(3)), rng.standard_normal(3)
-    phi = angle * np.array([0.6, -0.64, 0.48])
-    w_f = quaternion.rotate(q, phi) / dt
-    M = rng.standard_normal((6, 6))
-    P = M @ M.T
-    F = np.zeros((6, 6))
-    F[:3, 3:], F[3:, 3:] = -np.eye(3), kinematics.skew(w_f)
-    transition, Q = van_loan_discretization(F, np.diag([0.7] * 3 + [0.9] * 3), dt)
-    _, A, B, C = two_frame.propagated(tuple(q), tuple(b), *blocks_of(P), tuple(phi + b * dt), dt, 0.49, 0.81)
-    np.testing.assert_allclose(matrix_of(A, B, C), transition @ P @ transition.T + Q, rtol=1e-12, atol=1e-12)
-
-
-@pytest.mark.parametrize("size", [0.1, 1.0, 1.8])
-def test_geometric_update_is_what_its_error_says(size):
-    """η = b_true − exp(−[δθ]) b: the covariance goes there by finite differences at b, and comes back at b⁺ = exp(−[a]) b + c_η."""
-    rng = np.random.default_rng(8)
-    b, a, c = rng.standard_normal(3), rng.standard_normal(3), rng.standard_normal(3)
-    a *= size / np.linalg.norm(a)
-    M = rng.standard_normal((6, 6))
-    P = M @ M.T
-    h = 1e-6
-
-    def to_eta(bias):
-        numeric = np.zeros((6, 6))
-        for j, e in enumerate(np.eye(6)):
-            ends = [
-                np.concatenate([s * e[:3], bias + s * e[3:] - expm(-kinematics.skew(s * e[:3])) @ bias])
-                for s in (h, -h)
-            ]
-            numeric[:, j] = (ends[0] - ends[1]) / (2.0 * h)
-        return numeric
-
-    q = quaternion.exp(rng.standard_normal(3))
-    A, B, C = blocks_of(P)
-    moved_q, moved_b, A, B, C = geometric.closed(tuple(q), tuple(b), A, B, C, tuple(a), tuple(c))
-    eta = (to_eta(b) @ np.concatenate([a, c]))[3:]
-    wanted = expm(-kinematics.skew(a)) @ b + eta
-    np.testing.assert_allclose(moved_b, wanted, rtol=0.0, atol=1e-8)
-    np.testing.assert_allclose(moved_q, quaternion.multiply(q, quaternion.exp(a)), rtol=0.0, atol=1e-12)
-    G = np.linalg.solve(to_eta(wanted), to_eta(b))
-    np.testing.assert_allclose(matrix_of(A, B, C), G @ P @ G.T, rtol=1e-7, atol=1e-7)
 
 
 def test_invariant_filters_never_see_what_one_reference_hides():

@@ -9,8 +9,7 @@ from in_steps import transition_and_noise
 
 from strapdown import kinematics, quaternion
 from strapdown.estimation.states import ProcessNoise, State, covariance_matrices
-from strapdown.kernels import filter_step, measurement
-from strapdown.kernels.machine import compiled
+from strapdown.kernels import filter_step
 
 RATES = [
     np.array([0.0, 0.0, 0.0]),
@@ -116,112 +115,6 @@ def test_update_of_rows_is_the_kalman_update_at_fifty_digits(sigma, bias_sigma, 
     assert nis == pytest.approx(exact_nis, rel=1e-9)
 
 
-@pytest.mark.parametrize("ratio", [1e-7, 1e-5, 1e-3, 1.0, 1e3])
-def test_covariance_stays_positive_definite_whatever_the_noise(ratio):
-    """Measurements from ten million times better to a thousand times worse than the prior, again and again.
-
-    Better still, and the ratio of the variances falls below the rounding of a covariance matrix held in double precision.
-    """
-    generator = np.random.default_rng(3)
-    state = random_state(generator)
-    q, b = tuple(state.attitude), tuple(state.bias)
-    A, B, C = blocks(state.covariance)
-    sigma = ratio * 2e-2
-    predict, update = compiled(filter_step.predict), compiled(filter_step.update_direction)
-    for k in range(500):
-        R = tuple(quaternion.to_matrix(np.array(q)).ravel())
-        frame = np.linalg.qr(generator.normal(size=(3, 3)))[0]
-        frame *= np.linalg.det(frame)
-        z = np.reshape(R, (3, 3)).T @ frame[2]
-        q, b, A, B, C, *_ = update(q, b, A, B, C, R, tuple(frame[0]), tuple(frame[1]), tuple(z), sigma**2)
-        P = matrix(A, B, C)
-        d = np.sqrt(np.diag(P))
-        assert np.all(np.isfinite(d)), k
-        assert np.linalg.eigvalsh(P / np.outer(d, d))[0] > 0.0, k
-        q, A, B, C = predict(q, b, A, B, C, (1e-3, -2e-3, 5e-4), 0.01, (1e-5) ** 2, (1e-7) ** 2)
-
-
-@pytest.mark.parametrize("sigma", [1e-5, 1e-3, 1e-2, 1.0])
-@pytest.mark.parametrize("seed", range(4))
-def test_a_direction_is_two_rows_whichever_way_it_is_taken(sigma, seed):
-    """Both rows at once (noise like the prior's) and one after the other (noise far below it) are the same update."""
-    generator = np.random.default_rng(seed)
-    state = random_state(generator)
-    q, b = tuple(state.attitude), tuple(state.bias)
-    A, B, C = blocks(state.covariance)
-    R = tuple(quaternion.to_matrix(state.attitude).ravel())
-    frame = np.linalg.qr(generator.normal(size=(3, 3)))[0]
-    frame *= np.linalg.det(frame)
-    z = np.reshape(R, (3, 3)).T @ frame[2] + 1e-2 * generator.normal(size=3)
-    one = filter_step.update_direction(q, b, A, B, C, R, tuple(frame[0]), tuple(frame[1]), tuple(z), sigma**2)
-    h1, y1, h2, y2 = filter_step.direction_rows(R, tuple(frame[0]), tuple(frame[1]), tuple(z))
-    first, b, A, B, C, s1 = filter_step.update_row(b, A, B, C, h1, y1, sigma**2)
-    e2 = y2 - np.dot(h2, first)
-    second, b, A, B, C, s2 = filter_step.update_row(b, A, B, C, h2, e2, sigma**2)
-    q, A, B = filter_step.reset(q, A, B, tuple(np.add(first, second)))
-    P, other = matrix(A, B, C), matrix(*one[2:5])
-    d = np.sqrt(np.diag(P))
-    assert np.abs((P - other) / np.outer(d, d)).max() < 1e-11
-    assert np.allclose(one[0], q, atol=1e-13)
-    assert np.allclose(one[1], b, atol=1e-12 * np.abs(b).max() + 1e-15)
-    assert np.allclose(one[5:], [y1, s1, e2, s2], rtol=1e-11)
-
-
-def test_direction_rows_are_the_derivative_of_the_measurement():
-    generator = np.random.default_rng(5)
-    q = quaternion.normalize(generator.normal(size=4))
-    frame = np.linalg.qr(generator.normal(size=(3, 3)))[0]
-    frame *= np.linalg.det(frame)
-    u, v, r = frame
-    R = tuple(quaternion.to_matrix(q).ravel())
-    for delta in np.eye(3) * 1e-6:
-        true = quaternion.multiply(q, quaternion.exp(delta))
-        z = quaternion.rotate(quaternion.conjugate(true), r)
-        h1, y1, h2, y2 = filter_step.direction_rows(R, tuple(u), tuple(v), tuple(z))
-        assert y1 == pytest.approx(np.dot(h1, delta), abs=3e-12)
-        assert y2 == pytest.approx(np.dot(h2, delta), abs=3e-12)
-
-
-def test_reset_is_the_change_of_tangent_space():
-    """The new error is Log(exp(−a) ⊗ exp(δ)) for δ about a: its derivative by δ is J_r(a), found here by differences."""
-    generator = np.random.default_rng(6)
-    P = random_state(generator).covariance
-    A, B, C = blocks(P)
-    a = np.array([0.3, -0.2, 0.1])
-    G = np.empty((3, 3))
-    step = 1e-6
-    for j in range(3):
-        shift = np.zeros(3)
-        shift[j] = step
-        plus = quaternion.log(quaternion.multiply(quaternion.exp(-a), quaternion.exp(a + shift)))
-        minus = quaternion.log(quaternion.multiply(quaternion.exp(-a), quaternion.exp(a - shift)))
-        G[:, j] = (plus - minus) / (2.0 * step)
-    big = scipy.linalg.block_diag(G, np.eye(3))
-    q, A, B = filter_step.reset((1.0, 0.0, 0.0, 0.0), A, B, tuple(a))
-    assert np.allclose(matrix(A, B, C), big @ P @ big.T, rtol=0.0, atol=1e-9 * P.max())
-    assert np.allclose(q, quaternion.exp(a), rtol=0.0, atol=1e-15)
-
-
-def test_plain_python_and_compiled_are_one():
-    generator = np.random.default_rng(7)
-    state = random_state(generator)
-    A, B, C = blocks(state.covariance)
-    arguments = (tuple(state.attitude), tuple(state.bias), A, B, C, (1e-2, -3e-2, 2e-2), 0.01, 1e-8, 1e-12)
-    plain = filter_step.predict(*arguments)
-    fast = compiled(filter_step.predict)(*arguments)
-    for one, other in zip(plain, fast, strict=True):
-        assert np.allclose(one, other, rtol=1e-13, atol=1e-16 * np.abs(other).max())
-
-
-@pytest.mark.parametrize("angle", [1.0, 2.0, np.pi, 6.0, 20.0])
-def test_a_far_turn_is_the_exponential_and_its_jacobian(angle):
-    phi = angle * np.array([0.48, -0.6, 0.64])
-    q, J = filter_step.far_turn(tuple(phi))
-    wanted = quaternion.exp(phi)
-    assert np.allclose(q, wanted * np.sign(np.dot(q, wanted)), rtol=0.0, atol=1e-13)
-    assert np.allclose(np.reshape(J, (3, 3)), kinematics.right_jacobian(phi), rtol=0.0, atol=1e-13)
-
-
 @pytest.mark.parametrize("angle", [0.9, 1.1, 3.0, 12.0])
 def test_a_reset_of_any_size_is_a_rotation_of_the_covariance(angle):
     """Either side of where the polynomials give way; A and B against J_r in NumPy, q of norm one."""
@@ -236,11 +129,3 @@ def test_a_reset_of_any_size_is_a_rotation_of_the_covariance(angle):
     assert abs(abs(np.dot(moved, quaternion.multiply(q, quaternion.exp(c)))) - 1.0) < 1e-9
     assert np.allclose(A, (G @ P[:3, :3] @ G.T)[np.triu_indices(3)], rtol=0.0, atol=1e-8)
     assert np.allclose(np.reshape(B, (3, 3)), G @ P[:3, 3:], rtol=0.0, atol=1e-8)
-
-
-def test_a_vertical_vector_has_no_heading():
-    R = tuple(quaternion.to_matrix(quaternion.exp(np.array([0.3, -0.2, 0.9]))).ravel())
-    up = R[6:]
-    assert measurement.heading_row(R, up) == (0.0, 0.0, 0.0)
-    aside = np.array(up) + 1e-6 * np.array(R[:3])
-    assert np.linalg.norm(measurement.heading_row(R, tuple(aside))) > 1e5

@@ -1053,26 +1053,6 @@ def angles(rng: np.random.Generator) -> np.ndarray:
     )
 
 
-def test_rotation_kernels_at_any_angle() -> None:
-    rng = np.random.default_rng(0)
-    for angle in angles(rng):
-        phi = angle * quaternion.normalize(np.append(rng.standard_normal(3), 0.0))[:3]
-        q = quaternion.exp(phi)
-        for sign in (1.0, -1.0):
-            found = rotation.logarithm(tuple(sign * q))
-            np.testing.assert_allclose(found, phi, rtol=0, atol=4e-15 * angle if angle < 3.0 else 1e-13)
-        np.testing.assert_allclose(
-            np.reshape(rotation.inverse_right_jacobian(tuple(phi)), (3, 3)),
-            kinematics.inverse_right_jacobian(phi),
-            rtol=0,
-            atol=1e-14,
-        )
-        start = quaternion.normalize(rng.standard_normal(4))
-        moved, J = rotation.moved(tuple(start), tuple(phi))
-        np.testing.assert_allclose(moved, quaternion.multiply(start, q), rtol=0, atol=1e-15)
-        np.testing.assert_allclose(np.reshape(J, (3, 3)), kinematics.right_jacobian(phi), rtol=0, atol=1e-14)
-
-
 def blocks(P: np.ndarray) -> tuple:
     upper = np.triu_indices(3)
     return tuple(P[:3, :3][upper]), tuple(P[:3, 3:].ravel()), tuple(P[3:, 3:][upper])
@@ -1114,51 +1094,6 @@ def test_composed_rotations_at_any_angle() -> None:
             np.testing.assert_allclose(found, expected, rtol=0, atol=1e-15 * (one + other))
 
 
-def test_noise_seen_from_the_start_of_a_step() -> None:
-    rng = np.random.default_rng(2)
-    noise = ProcessNoise(angle_random_walk=2e-3, rate_random_walk=3e-2)
-    sizes = angles(rng)
-    for angle in sizes[sizes <= LARGEST_ANGLE]:
-        turn = angle * quaternion.normalize(np.append(rng.standard_normal(3), 0.0))[:3]
-        dt = 10.0 ** rng.uniform(-3, 1)
-        F, Q = transition_and_noise(turn, dt, noise)
-        back = np.linalg.inv(F)
-        expected = back @ Q @ back.T
-        q11, q12, q22 = smoother_step.step_noise(tuple(turn), dt, noise.angle_random_walk**2, noise.rate_random_walk**2)
-        bias = np.array([q22, 0.0, 0.0, q22, 0.0, q22])
-        found = covariance_matrices(np.array([*q11, *q12, *bias]))
-        scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
-        np.testing.assert_allclose(found / scale, expected / scale, rtol=0, atol=1e-13)
-
-
-@pytest.mark.parametrize("decades", [0.0, 3.0, 8.0])
-def test_gain_and_what_it_leaves(decades: float) -> None:
-    # The textbook's P Φᵀ P⁻⁻¹ and P − G P⁻ Gᵀ in 60 digits, over a prior that spans so many decades.
-    rng = np.random.default_rng(3)
-    dt, sv, su = 0.05, 1e-4, 1e-5
-    noise = ProcessNoise(angle_random_walk=sv, rate_random_walk=su)
-    for _ in range(5):
-        turn = 0.1 * rng.standard_normal(3)
-        F, Q = transition_and_noise(turn, dt, noise)
-        P = random_covariance(rng, decades)
-        q11, q12, q22 = smoother_step.step_noise(tuple(turn), dt, sv**2, su**2)
-        N = smoother_step.kept_share(*blocks(P), q11, q12, q22)
-        tt, tb, bt, bb = (np.reshape(block, (3, 3)) for block in smoother_step.gain(N, tuple(turn), dt))
-        found = np.block([[tt, tb], [bt, bb]])
-        upper, across, lower = smoother_step.left_noise(N, q11, q12, q22)
-        left = covariance_matrices(np.array([*upper, *across, *lower]))
-        with mpmath.workdps(60):
-            p, f, r = (mpmath.matrix(m.tolist()) for m in (P, F, Q))
-            predicted = f * p * f.T + r
-            gain = p * f.T * predicted**-1
-            exact = p - gain * predicted * gain.T
-            expected, expected_left = (np.array(m.tolist(), dtype=float) for m in (gain, exact))
-        unit = np.repeat([1.0, 1e-2], 3)
-        np.testing.assert_allclose(found * unit / unit[:, None], expected * unit / unit[:, None], rtol=0, atol=1e-11)
-        scale = np.sqrt(np.outer(np.diag(expected_left), np.diag(expected_left)))
-        np.testing.assert_allclose(left / scale, expected_left / scale, rtol=0, atol=1e-10)
-
-
 @pytest.mark.parametrize("intervals", [*range(1, 11), 16, 17])
 def test_any_number_of_segments(intervals: int) -> None:
     # Segments are taken in groups of eight, the last of which may be smaller.
@@ -1186,23 +1121,6 @@ def test_corrections_beyond_the_series(angle: float) -> None:
     moved = quaternion.log(quaternion.multiply(quaternion.conjugate(filtered.attitude), one.attitude))
     assert (np.linalg.norm(moved, axis=1).max() > LARGEST_ANGLE) == (angle > 0.35)
     assert_same(one, fixed_side_smoother(record, case.noise, initial), 1e-8)
-
-
-def test_noise_share() -> None:
-    rng = np.random.default_rng(0)
-    for _ in range(20):
-        P = random_covariance(rng)
-        q11, q12 = random_covariance(rng)[:3, :3] * 1e-2, 1e-7 * rng.standard_normal((3, 3))
-        Q = np.block([[q11, q12], [q12.T, 1e-10 * np.eye(3)]])
-        M = smoother_step.noise_share(*blocks(P), blocks(Q)[0], tuple(q12.ravel()), 1e-10)
-        found = np.block(
-            [[np.reshape(M[0], (3, 3)), np.reshape(M[1], (3, 3))], [np.reshape(M[2], (3, 3)), np.reshape(M[3], (3, 3))]]
-        )
-        expected = Q @ np.linalg.inv(P)
-        scale = np.repeat([1.0, 1e-2], 3)
-        np.testing.assert_allclose(
-            found / np.outer(scale, 1 / scale), expected / np.outer(scale, 1 / scale), rtol=0, atol=1e-11
-        )
 
 
 @pytest.mark.parametrize("decades", [2.0, 8.0, 12.0])

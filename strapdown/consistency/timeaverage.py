@@ -127,11 +127,10 @@ def effective_samples(white: ArrayLike, first: int | None = None) -> float:
     A = np.linalg.lstsq(z[:-1], z[1:], rcond=None)[0].T
     # Least squares makes the memory of a series of known mean too short by 2/m of itself (Kendall 1954).
     A = A * (1.0 + 2.0 / m)
-    power, total = np.eye(n), 0.0
-    for tau in range(1, m):
-        power = A @ power
-        share = float(np.sum(power[:k, :k] ** 2)) / k
-        total += (1.0 - tau / m) * min(share, 1.0)
-        if share < 1e-6:
-            break
+    powers = A[None]  # A^τ from τ = 1 on, twice as many at a time until they have died out
+    while len(powers) < m - 1 and np.sum(powers[-1, :k, :k] ** 2) >= 1e-6 * k:
+        powers = np.concatenate([powers, powers[: m - 1 - len(powers)] @ powers[-1]])
+    share = np.minimum(np.sum(powers[: m - 1, :k, :k] ** 2, axis=(1, 2)) / k, 1.0)
+    share = share[: 1 + np.argmax(share < 1e-6)] if np.any(share < 1e-6) else share
+    total = float(np.sum((1.0 - np.arange(1, len(share) + 1) / m) * share))
     return float(max(1.0, m / (1.0 + 2.0 * total)))
