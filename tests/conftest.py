@@ -13,17 +13,12 @@ from typing import Any
 import hypothesis
 import numpy as np
 import pytest
-import typer.main
-from matplotlib.figure import Figure
 
 hypothesis.settings.register_profile("fixed", derandomize=True)
 hypothesis.settings.load_profile("fixed")  # the same examples in every run
 
 gc.set_threshold(50_000, 20, 20)
 """Objects of compiled kernels and of figures are many and live on: at Python's own 700, 10, 10 the collector takes 7 % of all time."""
-
-typer.main.get_command = functools.cache(typer.main.get_command)
-"""Each call of the program builds the parsers of all commands anew, 16 ms; that this is right once is enough."""
 
 BROAD = Path(__file__).resolve().parents[1] / ".." / "shared" / "data" / "broad"
 
@@ -51,6 +46,10 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def pytest_collection_finish() -> None:
+    import typer.main
+
+    # Each call of the program builds the parsers of all commands anew, 16 ms; that this is right once is enough.
+    typer.main.get_command = functools.cache(typer.main.get_command)
     gc.freeze()  # the modules stay
 
 
@@ -68,12 +67,14 @@ def pytest_sessionfinish() -> None:
 
 PIXEL = base64.b64decode("iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAAAAAA6fptVAAAACklEQVR42mP4DwABAQEAHLCMmQAAAABJRU5ErkJggg==")
 """A PNG."""
-draw = Figure.savefig
 
 
 @pytest.fixture(scope="session")
 def blank() -> Callable[..., None]:
     """Return what stands for ``Figure.savefig`` where the pixels do not matter: drawing a figure takes half a second."""
+    from matplotlib.figure import Figure
+
+    draw = Figure.savefig
 
     def savefig(figure: Figure, target: Any, **options: Any) -> None:
         if hasattr(target, "write"):
@@ -92,7 +93,7 @@ def figures_are_blank(
 ) -> None:
     """Save blank figures in tests without the mark ``draws``; what fixtures of a whole module save is drawn."""
     if not request.node.get_closest_marker("draws"):
-        monkeypatch.setattr(Figure, "savefig", blank)
+        monkeypatch.setattr("matplotlib.figure.Figure.savefig", blank)
 
 
 @pytest.fixture(scope="session")

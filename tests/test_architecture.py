@@ -283,4 +283,4 @@ def test_modules_load_neither_compiler_nor_plots():
     """All but the drawing ones, in one process: numba and matplotlib come when first needed."""
     extends_the_compiler = {*MACHINES} - {"kernels.machine"}  # loaded by that one, when a kernel is compiled
     names = sorted(n for n in sources() if n and unit(n) not in DRAWING and n not in extends_the_compiler)
-    assert not loaded_by(EACH.format(names)) & {"numba", "llvmlite", "matplotlib"}
+    assert not loaded_by(EACH.format(names)) & {"numba", "llvmlite", "matplotlib", "pandas", "dask", "distributed"}

@@ -263,19 +263,6 @@ def test_weights_are_the_densities_of_the_measurement():
     assert np.allclose(out.weights[0], np.array(densities) / np.sum(densities), rtol=1e-4)
 
 
-def test_compiled_and_plain_are_the_same(monkeypatch):
-    record, belief = orbit(0, duration=120.0)
-    fast = multiple_model.run(record, belief, hypotheses=8, every=30)
-    monkeypatch.setattr(multiple_model, "compiled", plain)
-    slow = multiple_model.run(record, belief, hypotheses=8, every=30)
-    assert np.allclose(fast.estimate.attitude, slow.estimate.attitude, atol=1e-9)
-    assert np.allclose(fast.estimate.covariance, slow.estimate.covariance, rtol=1e-6, atol=1e-16)
-    assert np.allclose(fast.weights, slow.weights, atol=1e-7)
-
-
-# -------------------------------------------------------------------------------------------------------------- what it is for
-
-
 def starts(runs, hypotheses, **options):
     outcomes = []
     for run in range(runs):

@@ -118,6 +118,7 @@ def test_an_output_that_cannot_hold_every_letter_gets_question_marks():
 
 
 SMALL = ("--runs", 3, "--duration", 24, "--seed", 5)
+MILLER = Path(__file__).resolve().parents[1] / "docs" / "examples" / "miller-1983.toml"
 
 SCENARIO_KEYS = {"angle_deg", "frequency_hz", "rate_hz", "duration_s", "runs", "seed"}
 INTEGRATION_KEYS = {"algorithm", "samples", "drift_deg_per_hour", "predicted_deg_per_hour"}
@@ -135,12 +136,18 @@ FILTER_KEYS = {
 }
 
 
+def studied(out: Path) -> tuple[object, ...]:
+    return (*SMALL, "--algorithm", out.with_name("own.toml"), "--algorithm", MILLER)
+
+
 @pytest.fixture(scope="module")
 def coning(tmp_path_factory) -> tuple[Path, dict, str]:
-    """One small study: its folder, its JSON and what was printed."""
+    """One small study, with two algorithms of one's own: its folder, its JSON and what was printed."""
     out = tmp_path_factory.mktemp("coning") / "results"
+    own = '[algorithm]\nname = "rounded"\ncoefficients = [0.5143, 0.8762, 2.0381]\n'
+    out.with_name("own.toml").write_text(own, encoding="utf-8")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "argv", ["strapdown", "coning", *map(str, SMALL), "--out", str(out)])
+        patch.setattr(sys, "argv", ["strapdown", "coning", *map(str, studied(out)), "--out", str(out)])
         with cli.console.capture() as said, pytest.raises(SystemExit) as end:
             cli.main()
     assert not end.value.code
@@ -148,14 +155,27 @@ def coning(tmp_path_factory) -> tuple[Path, dict, str]:
 
 
 def test_coning_json_has_the_keys_that_others_read(coning):
-    """Exactly those of issue A at the top, those at least below: more may come, none may go."""
+    """Those at least: more may come, none may go."""
     _, study, _ = coning
-    assert set(study) == {"scenario", "integration", "filter"}
     assert set(study["scenario"]) >= SCENARIO_KEYS
     assert all(set(row) >= INTEGRATION_KEYS for row in study["integration"])
     assert all(set(row) >= FILTER_KEYS for row in study["filter"])
-    assert [row["algorithm"] for row in study["integration"]] == list(ALGORITHMS)
-    assert [row["integration"] for row in study["filter"]] == list(ALGORITHMS)
+    own = ["rounded", "miller-3"]
+    assert [row["algorithm"] for row in study["integration"]] == [*ALGORITHMS, *own]
+    assert [row["integration"] for row in study["filter"]] == [*ALGORITHMS, *own]
+    assert [one["name"] for one in study["own"]] == own
+
+
+def test_coning_studies_algorithms_of_ones_own(coning):
+    out, study, said = coning
+    said = " ".join(said.split())
+    assert "0.003571 = 1/280" in said
+    assert "rounded drifts from (ωh)^2 on" in said
+    rows = {row["algorithm"]: row for row in study["integration"]}
+    predicted = rows["miller-3"]["predicted_deg_per_hour"]
+    assert rows["miller-3"]["drift_deg_per_hour"] == pytest.approx(predicted, rel=0.02)
+    assert predicted == pytest.approx(rows["three-sample"]["predicted_deg_per_hour"], rel=0.2)
+    assert (out / "algorithms.png").stat().st_size > 10_000
 
 
 def test_coning_json_holds_sound_values(coning):
@@ -208,7 +228,7 @@ def test_coning_writes_figures_and_says_where(coning):
 
 
 def test_coning_is_the_same_for_the_same_seed(run, coning, tmp_path):
-    status, _, _ = run("coning", *SMALL, "--out", tmp_path / "again")
+    status, _, _ = run("coning", *studied(coning[0]), "--out", tmp_path / "again")
     assert status == 0
     assert json.loads((tmp_path / "again" / "coning.json").read_text()) == coning[1]
 
@@ -216,6 +236,8 @@ def test_coning_is_the_same_for_the_same_seed(run, coning, tmp_path):
 @pytest.mark.filterwarnings("error")
 def test_a_short_study_warns_of_nothing(run, tmp_path):
     assert run("coning", "--runs", 1, "--duration", 12, "--out", tmp_path / "short")[0] == 0
+    # Exactly the keys of issue A, where no algorithm is one's own.
+    assert set(json.loads((tmp_path / "short" / "coning.json").read_text())) == {"scenario", "integration", "filter"}
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 from filterpy.common import van_loan_discretization
 from filterpy.kalman import JulierSigmaPoints, KalmanFilter, MerweScaledSigmaPoints, UnscentedKalmanFilter
-from plain_kernels import plain
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm, solve_discrete_are
 from scipy.optimize import brentq
@@ -362,23 +361,6 @@ def test_steps_hold_the_whole_record_once():
     clock = np.cumsum(steps.dt)
     np.testing.assert_allclose(clock[steps.event >= 0], events.time, rtol=1e-12)
     np.testing.assert_allclose(clock[steps.row >= 0], record.time[::4], rtol=1e-12)
-
-
-@pytest.mark.parametrize("name", [name for name in filters.FILTERS if name not in ("mekf", "usque")])
-def test_plain_python_equals_compiled(name, monkeypatch):
-    rng = np.random.default_rng(15)
-    record = simulated(rng, intervals=15, kinds=tuple(REFERENCES), measurements=4, form="covariance")
-    initial = started(record, rng, attitude_sigma=0.1, bias_sigma=1e-3)
-    fast = filters.run(name, record, BELIEF, initial, full_covariance=True)
-    monkeypatch.setattr(extended, "compiled", plain)
-    slow = filters.run(name, record, BELIEF, initial, full_covariance=True)
-    for part in ("attitude", "bias", "covariance"):
-        np.testing.assert_allclose(getattr(fast, part), getattr(slow, part), rtol=0.0, atol=1e-13)
-    for sensor, one in slow.innovations.items():
-        for part in ("innovation", "variance"):
-            np.testing.assert_allclose(
-                getattr(fast.innovations[sensor], part), getattr(one, part), rtol=0.0, atol=1e-13
-            )
 
 
 def test_every_definition_among_the_kernels_is_a_filter():
@@ -1095,13 +1077,6 @@ def test_consistent_for_every_kind(name, kind, form):
     assert np.max(doubted.mean) > 1.0
 
 
-@pytest.mark.parametrize(("kind", "form"), SHARPEST)
-def test_usque_is_consistent_for_every_kind(kind, form):
-    right, doubted = (anees("usque", kind, form, 16, factor) for factor in (1.0, 1.0 / 3.0))
-    assert right.consistent
-    assert not doubted.consistent
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", filters.FILTERS)
 @pytest.mark.parametrize(("kind", "form"), CASES)
@@ -1434,24 +1409,6 @@ def comparison():
     sys.modules["filter_family"] = module
     spec.loader.exec_module(module)
     return module
-
-
-def test_study_says_which_filter_is_consistent(comparison):
-    """From small errors all are right; from large ones the MEKF is overconfident, the invariant filters less so, the baseline not."""
-    names = [name for name in filters.FILTERS if name != "usque"]
-    result = comparison.main(runs=25, duration=120.0, filters=names, seed=3)
-    for name in names:
-        assert result.outcome("small", name).consistent
-        assert result.outcome("small", name).converged == 1.0
-    at = 10
-    for case in ("large", "one direction"):
-        mekf_, invariant, baseline = (
-            result.outcome(case, name).anees[at] for name in ("mekf", "right-invariant", "mahony")
-        )
-        assert mekf_ > 3.0 * invariant > 9.0 * baseline
-        np.testing.assert_allclose(
-            result.outcome(case, "fixed-side").anees, result.outcome(case, "mekf").anees, rtol=1e-6
-        )
 
 
 def test_study_runs_small_and_draws(comparison, tmp_path):

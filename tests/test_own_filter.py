@@ -297,18 +297,6 @@ def test_a_campaign_goes_on_and_is_replayed(own, tmp_path):
     assert "textbook" not in campaigns.report(path, 0.99)[0]
 
 
-def test_on_dask_it_gives_the_same_bits(own):
-    pytest.importorskip("distributed")
-    from strapdown.montecarlo.cluster import dask_client, on_dask
-
-    def by_value(record, initial):  # known to this process alone
-        return estimation.run(record, noise, initial, full_covariance=True)
-
-    noise = SETUP.process_noise
-    with dask_client(workers=1) as client:
-        same(own, montecarlo.run_plan(with_filter(by_value), runs=12, chunk=5, workers=on_dask(client)))
-
-
 @pytest.mark.parametrize("name", ["right-invariant", "mahony"])
 def test_the_packages_other_filters_run_in_a_monte_carlo_by_name(name):
     def by_hand(record, initial):

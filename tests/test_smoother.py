@@ -19,8 +19,7 @@ from strapdown.checks import InputError
 from strapdown.estimation import forward, recovery_segments, smoothing
 from strapdown.estimation.gating import Gate
 from strapdown.estimation.states import ProcessNoise, covariance_matrices
-from strapdown.kernels import rotation, smoother_lag, smoother_loop, smoother_step
-from strapdown.kernels.machine import compiled
+from strapdown.kernels import rotation, smoother_step
 from strapdown.kernels.series import LARGEST_ANGLE
 from strapdown.records import Estimate, ImuRecord, Truth
 from strapdown.vectors import VectorMeasurements, triad
@@ -725,22 +724,6 @@ def test_fixed_lag_where_corrections_are_large(angle: float) -> None:
         np.testing.assert_allclose(difference, 0.0, rtol=0, atol=1e-11)
 
 
-def test_plain_python_equals_compiled_for_a_lag() -> None:
-    case = dataclasses.replace(CASES["asynchronous"], duration=1.0)
-    record, initial = simulated(case, np.random.default_rng(9))
-    starts, segments = filtered_segments(record, case.noise, initial)
-    first = np.arange(len(record.time) - 12)
-    results = []
-    for back in (smoother_lag.smooth_lagged, compiled(smoother_lag.smooth_lagged)):
-        out = [np.zeros((len(record.time), size)) for size in (4, 3, 6, 21)]
-        work = np.empty(smoother_lag.lag_work_size(3))
-        variances = (case.noise.angle_random_walk**2, case.noise.rate_random_walk**2)
-        back(segments.reshape(-1), starts, first, first + 11, *variances, work, *out)
-        results.append(out)
-    for plain, fast in zip(*results, strict=True):
-        np.testing.assert_allclose(plain, fast, rtol=1e-9, atol=1e-12 * np.abs(fast).max())
-
-
 def test_a_bias_that_turns_more_than_the_increments_say() -> None:
     """Steps are cut by the turn without the bias: a still gyro with a large bias takes more segments than its increments suggest."""
     rng = np.random.default_rng(5)
@@ -1154,21 +1137,6 @@ def test_one_step_keeps_its_digits_where_the_covariance_is_ill_conditioned(decad
         worst_textbook = max(worst_textbook, np.max(np.abs(plain - expected) / scale))
         assert np.linalg.eigvalsh(found / scale)[0] > 0.0
     assert decades < 12.0 or worst_textbook > 1e-8  # what the other form is for
-
-
-def test_plain_python_equals_compiled() -> None:
-    case = dataclasses.replace(CASES["asynchronous"], duration=2.0)
-    record, initial = simulated(case, np.random.default_rng(9))
-    starts, segments = filtered_segments(record, case.noise, initial)
-    results = []
-    for back in (smoother_loop.smooth_back, compiled(smoother_loop.smooth_back)):
-        out = [np.empty((len(record.time), size)) for size in (4, 3, 6, 21)]
-        work = np.empty(smoother_loop.WORK_SIZE)
-        variances = (case.noise.angle_random_walk**2, case.noise.rate_random_walk**2)
-        back(segments.reshape(-1), starts, 0, *variances, work, *out)
-        results.append(out)
-    for plain, fast in zip(*results, strict=True):
-        np.testing.assert_allclose(plain, fast, rtol=1e-9, atol=1e-12 * np.abs(fast).max())
 
 
 def test_edges_are_found_exactly() -> None:
