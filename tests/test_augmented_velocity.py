@@ -604,7 +604,7 @@ def test_other_models_of_the_acceleration_are_worse():
     """As many runs: what lasts of first-order noise passes for tilt, white noise as large gives up what the velocity bounds, and without
     any the filter follows each push.
     """
-    found = {model: judged("velocity", model, 24, 6.0) for model in MODELS}
+    found = {model: judged("velocity", model, 24, 12.0) for model in MODELS}
     tilt = {model: np.sqrt(np.mean(one["error"] ** 2)) for model, one in found.items()}
     assert tilt["coloured"] > 1.7 * tilt["bounded velocity"], tilt
     assert tilt["white"] > 1.1 * tilt["bounded velocity"], tilt
