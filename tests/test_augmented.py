@@ -619,30 +619,6 @@ def test_the_smoother_is_the_textbook_one(option):
     assert np.max(np.abs(scaled(one.whole_covariance - P, sigma))) < 1e-8
 
 
-@pytest.mark.parametrize("option", [name for name in OPTIONS if name != "none"])
-def test_the_smoother_is_never_worse_than_the_filter(option):
-    record, blocks = record_of(), OPTIONS[option]
-    ahead = estimation.run(record, NOISE, start(), blocks, full_covariance=True)
-    both = estimation.smooth(record, NOISE, start(), blocks, full_covariance=True)
-    sigma = np.sqrt(np.einsum("kii->ki", ahead.whole_covariance))
-    # By the whole matrix, but for the turn of the tangent space, which is of second order.
-    T = carried_by(blocks, turn_to(both.attitude, ahead.attitude))
-    after = T @ both.whole_covariance @ np.swapaxes(T, 1, 2)
-    gained = np.linalg.eigvalsh(scaled(ahead.whole_covariance - after, sigma))
-    assert gained.min() > -2e-2 * np.max(sigma[:, :3])
-    assert np.all(np.sqrt(np.einsum("kii->ki", after)[:, 6:]) <= sigma[:, 6:] * (1.0 + 1e-9))
-    assert np.all(both.sigma <= ahead.sigma * (1.0 + 1e-3))
-    assert np.all(both.sigma[:100] < ahead.sigma[:100])
-    np.testing.assert_allclose(both.whole_covariance[-1], ahead.whole_covariance[-1], rtol=1e-12, atol=1e-30)
-    # What does not change is one number over the whole record.
-    for block in blocks:
-        still = (block.decay == 0.0) & (block.density == 0.0)
-        found = both.error_states[block.name]
-        assert (
-            np.max(np.abs(found.values[:, still] - found.values[-1, still]) / found.sigma[:, still], initial=0.0) < 1e-9
-        )
-
-
 @pytest.mark.parametrize(
     "option", ["gyro scale", "gyro drift", "hard iron that walks", "a carried offset of a heading", "all"]
 )

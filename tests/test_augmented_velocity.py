@@ -484,17 +484,6 @@ def test_the_smoother_is_one_least_squares_problem(poles):
     np.testing.assert_allclose(np.einsum("kii->ki", found.whole_covariance), variance, rtol=1e-4)
 
 
-@pytest.mark.parametrize("poles", ["velocity", "position"])
-def test_the_smoother_is_better_than_the_filter(poles):
-    block = block_of(poles)
-    record, _ = record_of(block)
-    ahead = estimation.run(record, NOISE, start(), (block,), full_covariance=True)
-    both = estimation.smooth(record, NOISE, start(), (block,), full_covariance=True)
-    assert np.all(both.sigma <= ahead.sigma * (1.0 + 1e-3))
-    assert np.all(both.error_states[block.name].sigma <= ahead.error_states[block.name].sigma * (1.0 + 1e-3))
-    np.testing.assert_allclose(both.whole_covariance[-1], ahead.whole_covariance[-1], rtol=1e-10, atol=1e-16)
-
-
 def test_the_observability_report_knows_its_states():
     block = block_of("velocity")
     record, _ = record_of(block)

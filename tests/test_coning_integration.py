@@ -461,30 +461,6 @@ def test_rate_samples_cost_what_the_docstring_says():
     assert drift(made) == pytest.approx(-float(ALGORITHMS["two-sample-rate-2"].drift_constant) * lam**4, rel=0.05)
 
 
-def test_plain_python_kernels_equal_the_compiled_ones():
-    generator = np.random.default_rng(7)
-    increments = 0.1 * generator.standard_normal((12, 3))
-    for kernel, arguments, shape in [
-        (kernels.compressed_vectors, (increments.reshape(-1), np.array([0.7, 0.2, -0.1]), 2), (18,)),
-        (kernels.pair_vectors, (increments, 2, 1, generator.standard_normal((3, 4, 4))), (6, 3)),
-        (
-            polynomial_kernels.scheme_steps,
-            (increments, generator.standard_normal((3, 3)), polynomial_kernels.MAGNUS_6),
-            (4, 4),
-        ),
-        (
-            polynomial_kernels.scheme_steps,
-            (increments, generator.standard_normal((3, 3)), polynomial_kernels.RUNGE_KUTTA_4),
-            (4, 4),
-        ),
-    ]:
-        plain, fast = np.zeros(shape), np.zeros(shape)
-        kernel(*arguments, plain)
-        compiled(kernel)(*arguments, fast)
-        np.testing.assert_allclose(fast, plain, atol=1e-14)
-        assert np.any(plain)
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

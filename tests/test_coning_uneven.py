@@ -10,8 +10,6 @@ from scipy.integrate import solve_ivp
 from strapdown import coning, motion, quaternion
 from strapdown.checks import InputError
 from strapdown.coning import ALGORITHMS
-from strapdown.kernels import integration_polynomial, integration_uneven
-from strapdown.kernels.machine import compiled
 from strapdown.records import ImuRecord, compress
 
 CONE = motion.Coning(angle=math.radians(1.0), frequency=10.0)
@@ -152,19 +150,6 @@ def test_noise_is_not_blown_up(name, shortest):
     left = found - (turn + noise).reshape(-1, n, 3).sum(axis=1)
     assert np.sqrt(np.mean(left**2)) < 6.0 * 0.02 * 1e-6
     assert np.abs(left).max() < 40.0 * 0.02 * 1e-6
-
-
-def test_compiled_and_plain_agree():
-    edges = STAMPS["half and one and a quarter"][:33]
-    increments = CONE.increments(edges)
-    outputs = []
-    for run in (integration_uneven.uneven_steps, compiled(integration_uneven.uneven_steps)):
-        steps = np.empty((8, 4))
-        run(increments, edges, np.arange(8), 4, 2, 8, 4.0, 4,
-            np.empty((integration_uneven.ROWS, 9)), np.empty((4, 8)),
-            np.empty((integration_polynomial.TERMS_PER_SAMPLE * 8 + integration_polynomial.EXTRA_TERMS, 4)), steps)  # fmt: skip
-        outputs.append(steps)
-    np.testing.assert_allclose(outputs[0], outputs[1], atol=1e-15)
 
 
 def test_data_too_rough_for_a_polynomial_are_taken_one_by_one():

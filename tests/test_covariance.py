@@ -264,15 +264,6 @@ def test_a_wrong_gain_obeys_the_lyapunov_equation():
     )
 
 
-def test_the_source_runs_uncompiled(monkeypatch):
-    scenario = everything(duration=12.0)
-    fast = covariance.analyse(scenario, BELIEF, consider=Consider(scale_factor=1e-4), epochs=3)
-    monkeypatch.setattr(covariance, "compiled", lambda function: function)
-    slow = covariance.analyse(scenario, BELIEF, consider=Consider(scale_factor=1e-4), epochs=3)
-    assert np.allclose(slow.contributions, fast.contributions, rtol=1e-9, atol=1e-24)
-    assert np.allclose(slow.considered_errors, fast.considered_errors, rtol=1e-9, atol=1e-18)
-
-
 # ----------------------------------------------------------------------------------------------------- errors without noise
 
 

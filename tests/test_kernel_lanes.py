@@ -13,7 +13,7 @@ import plain_kernels
 import pytest
 from numba.core.errors import TypingError
 
-from strapdown.kernels import integration, lane_values, machine, rotation, series
+from strapdown.kernels import integration, lane_values, machine, rotation
 from strapdown.kernels.algebra import square_root
 from strapdown.kernels.filter_step import predict, update_direction
 from strapdown.kernels.lane_angles import arctangent, inverse_root, rotation_vector
@@ -359,53 +359,6 @@ def states():
     return rows.T.copy()
 
 
-def predicted(state, phi, dt, angle_variance, rate_variance, out):
-    """Propagate the runs in eight lanes; q 0-3, b 4-6, A 7-12, B 13-21, C 22-27, each row of lanes after the other."""
-    q, A, B, C = predict(
-        (load(state, 0), load(state, 8), load(state, 16), load(state, 24)),
-        (load(state, 32), load(state, 40), load(state, 48)),
-        (load(state, 56), load(state, 64), load(state, 72), load(state, 80), load(state, 88), load(state, 96)),
-        (
-            load(state, 104),
-            load(state, 112),
-            load(state, 120),
-            load(state, 128),
-            load(state, 136),
-            load(state, 144),
-            load(state, 152),
-            load(state, 160),
-            load(state, 168),
-        ),
-        (load(state, 176), load(state, 184), load(state, 192), load(state, 200), load(state, 208), load(state, 216)),
-        (load(phi, 0), load(phi, 8), load(phi, 16)),
-        dt,
-        angle_variance,
-        rate_variance,
-    )
-    for i in range(4):
-        store(out, 8 * i, q[i])
-    for i in range(6):
-        store(out, 56 + 8 * i, A[i])
-        store(out, 176 + 8 * i, C[i])
-    for i in range(9):
-        store(out, 104 + 8 * i, B[i])
-
-
-def test_the_filters_prediction_over_lanes():
-    state = states()
-    phi = 0.1 * RANDOM.standard_normal((3, WIDTH))
-    noise = (0.01, 1e-6, 1e-8)
-    fast = state.copy()
-    kernel(predicted)(state.reshape(-1), phi.reshape(-1), *noise, fast.reshape(-1))
-    scalar = plain_kernels.called(predict)
-    for step in (predict, scalar):
-        for i in range(WIDTH):
-            run = tuple(map(tuple, np.split(state[:, i], [4, 7, 13, 22])))
-            q, A, B, C = step(*run, tuple(phi[:, i]), *noise)
-            slow = np.r_[q, state[4:7, i], A, B, C]
-            np.testing.assert_allclose(fast[:, i], slow, rtol=1e-12, atol=1e-15 * np.abs(slow[7:]).max())
-
-
 def run_of(rows, like):
     """Return (q, b, A, B, C) of so many runs, from 28 rows of them."""
     n = len(like)
@@ -543,33 +496,6 @@ def test_a_run_has_the_same_bits_whatever_its_neighbours_and_on_the_scalar_machi
     for row, value, fast in zip(rows[:8], inputs[:8], alone[:8], strict=True):
         stepped_scalars(row, value, variance, plain)
         np.testing.assert_allclose(fast, plain, rtol=1e-9, atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    "function", [series.cosine, series.sinc, series.second, series.third, series.fourth, series.fifth]
-)
-def test_series_over_lanes(function):
-    over_lanes = machine.helper(function)
-
-    def apply(a, out):
-        store(out, 0, over_lanes(load(a, 0)))
-
-    x, out = RANDOM.uniform(0.0, 0.11, WIDTH), np.empty(WIDTH)
-    kernel(apply)(x, out)
-    np.testing.assert_allclose(out, function(x), rtol=4e-16)
-
-
-def test_a_matrix_of_lanes():
-    def apply(a, out):
-        R = rotation_matrix(load_quadruples(a, 0, 4))
-        for i in range(9):
-            store(out, 8 * i, R[i])
-
-    q = RANDOM.standard_normal((WIDTH, 4))
-    q /= np.linalg.norm(q, axis=1)[:, None]
-    out = np.empty((9, WIDTH))
-    kernel(apply)(q.reshape(-1), out.reshape(-1))
-    np.testing.assert_allclose(out, rotation.rotation_matrix(tuple(q.T)), atol=4e-16)
 
 
 # ---------------------------------------------------------------------------------------------------- any width of machine

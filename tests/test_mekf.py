@@ -4,10 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import scipy.integrate
-import scipy.linalg
 from filterpy.common import Saver
-from filterpy.kalman import KalmanFilter
 
 from strapdown import coning, consistency, estimation, gyro, motion, quaternion, records, vectors
 from strapdown.checks import InputError
@@ -178,40 +175,6 @@ def test_without_noise_there_is_no_error():
     assert np.abs(error[:, 3:]).max() < np.finfo(float).eps / 0.1
 
 
-def test_small_angles_about_one_axis_are_the_linear_kalman_filter():
-    """One axis, a body at rest, directions across it: two-state filterpy KalmanFilter with the exact two-state model."""
-    dt, steps, sigma = 0.1, 300, 1e-6
-    angle = 1e-6 * generator(1, 0, "angle").standard_normal(steps)
-    delta = 1e-7 * generator(1, 0, "gyro").standard_normal(steps)
-    time = dt * np.arange(steps + 1)
-    increments = np.zeros((steps, 3))
-    increments[:, 2] = delta
-    # A turn θ about z shows the fixed x axis at (cos θ, −sin θ, 0) in the body.
-    seen = np.stack([np.cos(angle), -np.sin(angle), np.zeros(steps)], axis=-1)
-    series = VectorMeasurements(
-        sensor="x",
-        kind="direction",
-        time=time[1:],
-        vector_b=seen,
-        reference_f=[1.0, 0.0, 0.0],
-        sigma=np.full(steps, sigma),
-    )
-    noise = ProcessNoise(angle_random_walk=1e-7, rate_random_walk=1e-8)
-    initial = initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=1e-5, bias_sigma=1e-6)
-    result = estimation.run(ImuRecord(time=time, increments=increments, vectors=(series,)), noise, initial)
-    kf = KalmanFilter(dim_x=2, dim_z=1, dim_u=1)
-    kf.F, kf.B, kf.H = np.array([[1.0, -dt], [0.0, 1.0]]), np.array([[1.0], [0.0]]), np.array([[1.0, 0.0]])
-    v, u = noise.angle_random_walk**2, noise.rate_random_walk**2
-    kf.Q = np.array([[v * dt + u * dt**3 / 3, -u * dt**2 / 2], [-u * dt**2 / 2, u * dt]])
-    kf.R, kf.P, kf.x = np.array([[sigma**2]]), np.diag([1e-10, 1e-12]), np.zeros((2, 1))
-    for k in range(steps):
-        kf.predict(u=np.array([[delta[k]]]))
-        kf.update(angle[k])
-        estimate = quaternion.log(result.attitude[k + 1])[2], result.bias[k + 1, 2]
-        assert np.allclose(estimate, kf.x.ravel(), rtol=1e-9, atol=1e-15)
-        assert np.allclose(result.variance[k + 1, [2, 5]], np.diag(kf.P), rtol=1e-9)
-
-
 def test_steady_state_is_farrenkopfs_closed_form():
     """One axis at rest (Farrenkopf 1978; the covariance is that of two states however many axes there are)."""
     dt, sigma, steps = 1.0, 1e-4, 20_000
@@ -233,56 +196,6 @@ def test_steady_state_is_farrenkopfs_closed_form():
     for axis in (1, 2):  # the axes that the fixed x direction shows
         assert after[axis, axis] == pytest.approx(sigma**2 * (1.0 - zeta**-2), rel=1e-9)
         assert after[3 + axis, 3 + axis] == pytest.approx(bias, rel=1e-9)
-
-
-def test_steady_state_of_a_turning_body_solves_the_riccati_equation():
-    """Three axes, two directions a second, the body turning at a constant rate: scipy.linalg.solve_discrete_are.
-
-    Seen from a frame that turns with the body the directions must turn too, so the references are along and across the spin axis, and
-    the period of measurement is a whole turn.
-    """
-    dt, sigma = 0.5, 1e-4
-    w = np.array(
-        [0.0, 0.0, 2.0 * np.pi / dt / 8.0]
-    )  # an eighth of a turn a step, measured each step with σ alike across all axes
-    body_motion = motion.ConstantRate(rate=tuple(w))
-    steps = 4000
-    time = dt * np.arange(steps + 1)
-    noise = ProcessNoise(angle_random_walk=3e-5, rate_random_walk=1e-6)
-    axes = np.eye(3)
-    series = tuple(
-        VectorMeasurements(
-            sensor=f"axis {i}",
-            kind="direction",
-            time=time[1:],
-            vector_b=quaternion.rotate(quaternion.conjugate(body_motion.attitude(time[1:])), axes[i]),
-            reference_f=axes[i],
-            sigma=sigma,
-        )
-        for i in range(3)
-    )
-    record = ImuRecord(time=time, increments=body_motion.increments(time), vectors=series)
-    initial = initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=1e-3, bias_sigma=1e-4)
-    after = estimation.run(record, noise, initial, every=steps, full_covariance=True).covariance[-1]
-    # Three orthogonal equal directions give the information 2/σ² about every axis, in whatever frame.
-    F = scipy.linalg.expm(np.block([[-_skew(w), -np.eye(3)], [np.zeros((3, 6))]]) * dt)
-    grid = np.linspace(0.0, dt, 2001)
-    G = np.diag([noise.angle_random_walk**2] * 3 + [noise.rate_random_walk**2] * 3)
-    slices = [scipy.linalg.expm(np.block([[-_skew(w), -np.eye(3)], [np.zeros((3, 6))]]) * s) for s in grid]
-    Q = scipy.integrate.simpson([f @ G @ f.T for f in slices], x=grid, axis=0)
-    H = np.hstack([np.eye(3), np.zeros((3, 3))])
-    scale = np.diag([1e4] * 3 + [1e6] * 3)  # like sizes for the solver
-    prior = scipy.linalg.solve_discrete_are(
-        (scale @ F @ np.linalg.inv(scale)).T,
-        (H @ np.linalg.inv(scale)).T,
-        scale @ Q @ scale,
-        np.eye(3) * sigma**2 / 2.0,
-    )
-    prior = np.linalg.inv(scale) @ prior @ np.linalg.inv(scale)
-    gain = prior @ H.T @ np.linalg.inv(H @ prior @ H.T + np.eye(3) * sigma**2 / 2.0)
-    posterior = (np.eye(6) - gain @ H) @ prior
-    d = np.sqrt(np.diag(posterior))
-    assert np.abs((after - posterior) / np.outer(d, d)).max() < 1e-7
 
 
 def _skew(w):
@@ -350,18 +263,6 @@ def test_a_correction_of_more_than_a_radian_keeps_the_norm():
     estimate, end = estimation.run_part(record, NOISE, initial)
     assert abs(np.linalg.norm(estimate.attitude[0]) - 1.0) < 1e-14
     assert np.linalg.norm(end.attitude) == pytest.approx(1.0, abs=1e-14)
-
-
-def test_a_long_outage_grows_the_covariance_as_the_closed_form_says():
-    dt, steps = 0.1, 5000
-    record = ImuRecord(time=dt * np.arange(steps + 1), increments=np.zeros((steps, 3)))
-    initial = initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=1e-3, bias_sigma=1e-4)
-    end = estimation.run(record, NOISE, initial, every=steps, full_covariance=True).covariance[-1]
-    T = dt * steps
-    v, u = NOISE.angle_random_walk**2, NOISE.rate_random_walk**2
-    assert end[0, 0] == pytest.approx(1e-6 + 1e-8 * T**2 + v * T + u * T**3 / 3.0, rel=1e-10)
-    assert end[0, 3] == pytest.approx(-1e-8 * T - u * T**2 / 2.0, rel=1e-10)
-    assert end[3, 3] == pytest.approx(1e-8 + u * T, rel=1e-10)
 
 
 def test_one_interval_or_many_at_constant_rate_are_the_same():

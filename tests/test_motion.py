@@ -662,26 +662,6 @@ def test_chained_nodes_keep_their_norm_without_normalisation():
     assert np.abs(np.sum(attitudes**2 + 2.0 * attitudes * lows, axis=-1) - 1.0).max() < 2e-14
 
 
-def test_harmonic_kernels_are_the_same_in_plain_python():
-    from strapdown.kernels.machine import compiled
-    from strapdown.kernels.motion_harmonic import chain, node_deviations
-
-    truth = HarmonicRates(harmonics=elliptic_vibration(10.0, 1.0), mean=(0.1, -0.2, 0.05))
-    factors, amplitudes, mean = truth._arrays
-    cosines, sines = truth._node_phases(truth._spacing * np.arange(4.0))
-    results = []
-    for machine in (lambda kernel: kernel, compiled):
-        before, after = np.empty((4, 4)), np.empty((4, 4))
-        machine(node_deviations)(
-            cosines, sines, factors, amplitudes, mean, 0.5 * truth._spacing,
-            np.empty((harmonic._TERMS, 3)), np.empty((harmonic._TERMS + 1, 4)), before, after,
-        )  # fmt: skip
-        attitudes, lows = np.tile([1.0, 0.0, 0.0, 0.0], (4, 1)), np.zeros((4, 4))
-        machine(chain)(after, before, attitudes, lows)
-        results.append(np.concatenate([before, after, attitudes]))
-    assert np.abs(results[0] - results[1]).max() < 3e-16
-
-
 # ---------------------------------------------------------------------------------------------------- sampled motions
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import math
 
 import filterpy.common
@@ -253,51 +252,6 @@ def test_equals_the_fixed_side_reference(name: str) -> None:
 # --------------------------------------------------------------------------------------------------------------- linear and oracles
 
 
-def test_single_axis_equals_filterpy() -> None:
-    # Turns about the fixed z axis with headings measured are exactly linear: angle and bias of one axis.
-    rng = np.random.default_rng(3)
-    n, sigma = 400, 0.01
-    noise = ProcessNoise(angle_random_walk=3e-3, rate_random_walk=1e-3)
-    time = np.concatenate([[0.0], np.cumsum(rng.uniform(0.01, 0.05, n))])
-    dt = np.diff(time)
-    angle = 0.3 * rng.standard_normal(n) * dt
-    turned = np.concatenate([[0.0], np.cumsum(angle)])
-    picked = np.arange(4, n + 1, 4)
-    heading = turned[picked] + 0.05 + sigma * rng.standard_normal(len(picked))
-    series = VectorMeasurements(
-        sensor="compass",
-        kind="heading",
-        time=time[picked],
-        vector_b=np.stack([np.cos(heading), -np.sin(heading), np.zeros(len(picked))], axis=-1),
-        reference_f=NORTH,
-        sigma=np.full(len(picked), sigma),
-    )
-    record = ImuRecord(time=time, increments=np.outer(angle, DOWN), vectors=(series,))
-    initial = estimation.initial_state(quaternion.IDENTITY, attitude_sigma=0.1, bias_sigma=0.01)
-    estimate = estimation.smooth(record, noise, initial, full_covariance=True)
-
-    kalman = filterpy.kalman.KalmanFilter(dim_x=2, dim_z=1)  # of the deviation from the summed increments, and the bias
-    kalman.x, kalman.P = np.zeros(2), np.diag([0.01, 1e-4])
-    kalman.H, kalman.R = np.array([[1.0, 0.0]]), np.array([[sigma**2]])
-    xs, Ps, Fs, Qs = [kalman.x], [kalman.P], [np.eye(2)], [np.zeros((2, 2))]
-    for k in range(n):
-        kalman.F = np.array([[1.0, -dt[k]], [0.0, 1.0]])
-        kalman.Q = noise.angle_random_walk**2 * np.diag([dt[k], 0.0]) + noise.rate_random_walk**2 * np.array(
-            [[dt[k] ** 3 / 3.0, -(dt[k] ** 2) / 2.0], [-(dt[k] ** 2) / 2.0, dt[k]]]
-        )
-        kalman.predict()
-        if k + 1 in picked:
-            kalman.update(heading[np.searchsorted(picked, k + 1)] - turned[k + 1])
-        for kept, value in zip((xs, Ps, Fs, Qs), (kalman.x, kalman.P, kalman.F, kalman.Q), strict=True):
-            kept.append(np.array(value))
-    x, P, _, _ = kalman.rts_smoother(np.array(xs), np.array(Ps), Fs, Qs)
-    found = 2.0 * np.arctan2(estimate.attitude[:, 3], estimate.attitude[:, 0]) - turned
-    np.testing.assert_allclose(found, x[:, 0], rtol=0, atol=1e-9 * 0.05)
-    np.testing.assert_allclose(estimate.bias[:, 2], x[:, 1], rtol=0, atol=1e-9 * 0.01)
-    axis = estimate.covariance[:, 2::3, 2::3]
-    np.testing.assert_allclose(axis, P, rtol=1e-9, atol=0)
-
-
 def least_squares_estimate(
     record: ImuRecord, noise: ProcessNoise, initial: estimation.State, guess: Estimate
 ) -> np.ndarray:
@@ -434,43 +388,6 @@ def test_a_wrong_gyro_model_is_outside(wrong: float, above: bool) -> None:
 # ----------------------------------------------------------------------------------------------------------- never worse, the ends
 
 
-def scaled(case: Case, factor: float) -> Case:
-    """All errors by one factor smaller: the smaller, the more linear."""
-    noise = ProcessNoise(
-        angle_random_walk=factor * case.noise.angle_random_walk, rate_random_walk=factor * case.noise.rate_random_walk
-    )
-    return dataclasses.replace(
-        case,
-        noise=noise,
-        sensors=tuple((kind, reference, factor * sigma, times) for kind, reference, sigma, times in case.sensors),
-        attitude_sigma=factor * case.attitude_sigma,
-        bias_sigma=factor * case.bias_sigma,
-    )
-
-
-@pytest.mark.parametrize(("factor", "curvature"), [(1.0, 1e-5), (1e-3, 1e-10)])
-@pytest.mark.parametrize("name", CASES)
-def test_never_worse_than_the_filter(name: str, factor: float, curvature: float) -> None:
-    case = scaled(CASES[name], factor)
-    record, initial = simulated(case, np.random.default_rng(7))
-    smoothed = estimation.smooth(record, case.noise, initial, full_covariance=True)
-    filtered = estimation.run(record, case.noise, initial, full_covariance=True)
-    # In one tangent space, P_filter − P_smoothed is positive semi-definite: no direction of the state is worse. But for the curvature of
-    # the rotations, of second order in the corrections: two moves of a tangent space are not quite one.
-    moved = quaternion.log(quaternion.multiply(quaternion.conjugate(filtered.attitude), smoothed.attitude))
-    G = np.tile(np.eye(6), (len(moved), 1, 1))
-    G[:, :3, :3] = kinematics.inverse_right_jacobian(moved)
-    carried = G @ smoothed.covariance @ np.swapaxes(G, 1, 2)
-    factor_inverse = np.linalg.inv(np.linalg.cholesky(filtered.covariance))
-    shares = np.linalg.eigvalsh(factor_inverse @ carried @ np.swapaxes(factor_inverse, 1, 2))
-    assert shares.max() < 1.0 + curvature
-    assert shares.min() > 0.0
-    if factor < 1.0:  # else the axes themselves turn, by the angle of the correction
-        early = record.time < 0.9 * record.time[-1]
-        assert np.all(smoothed.variance <= filtered.variance * (1.0 + 1e-12))
-        assert np.all(smoothed.variance[early] < filtered.variance[early])
-
-
 def test_last_state_is_the_filters() -> None:
     case = CASES["asynchronous"]
     record, initial = simulated(case, np.random.default_rng(7))
@@ -492,84 +409,6 @@ def test_without_measurements_it_is_the_filter() -> None:
     assert_same(smoothed, estimation.run(record, case.noise, initial, full_covariance=True), 1e-8)
 
 
-def exact_record(case: Case) -> ImuRecord:
-    """Noise-free data of a body at constant rate, which is the filter's own model, with a constant bias."""
-    silent = ProcessNoise(angle_random_walk=1e-300, rate_random_walk=0.0)
-    sensors = tuple((kind, reference, 0.0, times) for kind, reference, _, times in case.sensors)
-    quiet = simulate(dataclasses.replace(case, motion=TURN, noise=silent, sensors=sensors), np.random.default_rng(1))
-    sigma = [s[2] for s in case.sensors]
-    vectors = tuple(
-        dataclasses.replace(series, sigma=np.full(len(series.time), value))
-        for series, value in zip(quiet.vectors, sigma, strict=True)
-    )
-    return dataclasses.replace(quiet, vectors=vectors)
-
-
-def test_no_noise_no_error() -> None:
-    case = CASES["asynchronous"]
-    record = exact_record(case)
-    exact = estimation.initial_state(
-        record.truth.attitude[0], attitude_sigma=0.1, bias_sigma=0.01, bias=record.truth.bias[0]
-    )
-    assert np.max(np.abs(errors(estimation.smooth(record, case.noise, exact), record))) < 1e-12
-
-
-def test_a_wrong_start_is_mended_to_its_very_beginning() -> None:
-    # Without noise in data or gyro model and with a wide prior, what is left of an initial error is what the measurements' σ lets pass.
-    case = dataclasses.replace(CASES["directions"], noise=ProcessNoise(angle_random_walk=1e-9, rate_random_walk=0.0))
-    record = exact_record(case)
-    wrong = estimation.initial_state(
-        quaternion.multiply(record.truth.attitude[0], quaternion.exp(np.array([1e-4, -2e-4, 3e-4]))),
-        attitude_sigma=1.0,
-        bias_sigma=1.0,
-        bias=record.truth.bias[0] + np.array([2e-5, -1e-5, 3e-5]),
-    )
-    estimate = estimation.smooth(record, case.noise, wrong)
-    before = errors(estimation.run(record, case.noise, wrong), record)[0]
-    assert np.all(np.abs(errors(estimate, record)[0]) < 1e-3 * np.abs(before))
-
-
-# ------------------------------------------------------------------------------------------------------------------- invariances
-
-
-def test_frames_are_a_matter_of_choice() -> None:
-    case = CASES["asynchronous"]
-    record, initial = simulated(case, np.random.default_rng(12))
-    p = quaternion.normalize([0.3, -0.5, 0.7, 0.2])
-    back = quaternion.conjugate(p)
-    directions = tuple(s for s in record.vectors if s.kind != "heading")  # a heading knows which axis is vertical
-    record = dataclasses.replace(record, vectors=directions)
-    plain = estimation.smooth(record, case.noise, initial, full_covariance=True)
-    other_fixed = dataclasses.replace(
-        record,
-        vectors=tuple(dataclasses.replace(s, reference_f=quaternion.rotate(p, s.reference_f)) for s in directions),
-    )
-    start = dataclasses.replace(initial, attitude=quaternion.multiply(p, initial.attitude))
-    found = estimation.smooth(other_fixed, case.noise, start, full_covariance=True)
-    found = dataclasses.replace(found, attitude=quaternion.multiply(back, found.attitude))
-    assert_same(found, plain, 1e-9)
-    other_body = dataclasses.replace(
-        record,
-        increments=quaternion.rotate(back, record.increments),
-        vectors=tuple(dataclasses.replace(s, vector_b=quaternion.rotate(back, s.vector_b)) for s in directions),
-        truth=None,
-    )
-    start = dataclasses.replace(
-        initial, attitude=quaternion.multiply(initial.attitude, p), bias=quaternion.rotate(back, initial.bias)
-    )
-    found = estimation.smooth(other_body, case.noise, start, full_covariance=True)
-    T = np.kron(np.eye(2), quaternion.to_matrix(p))
-    covariance = T @ found.covariance @ T.T
-    found = dataclasses.replace(
-        found,
-        attitude=quaternion.multiply(found.attitude, back),
-        bias=quaternion.rotate(p, found.bias),
-        covariance=covariance,
-        variance=np.diagonal(covariance, axis1=1, axis2=2),
-    )
-    assert_same(found, plain, 1e-9)
-
-
 def test_large_turns_are_split_into_sub_steps() -> None:
     case = dataclasses.replace(
         CASES["directions"],
@@ -587,25 +426,6 @@ def test_large_turns_are_split_into_sub_steps() -> None:
     fine = estimation.smooth(split, case.noise, initial, full_covariance=True)
     every = {name: getattr(fine, name)[::parts] for name in ("time", "attitude", "bias", "variance", "covariance")}
     assert_same(coarse, dataclasses.replace(fine, **every), 1e-9)
-
-
-def test_a_measurement_without_information_changes_nothing() -> None:
-    # It splits intervals, so the segments are others.
-    case = CASES["directions"]
-    record, initial = simulated(case, np.random.default_rng(13))
-    plain = estimation.smooth(record, case.noise, initial, full_covariance=True)
-    rng = np.random.default_rng(0)
-    time = np.sort(np.concatenate([rng.uniform(0.0, 20.0, 300), record.time[10:20], [0.0, 20.0]]))
-    blind = VectorMeasurements(
-        sensor="blind",
-        kind="direction",
-        time=time,
-        vector_b=np.tile(DOWN, (len(time), 1)),
-        reference_f=DOWN,
-        sigma=np.full(len(time), 1e8),
-    )
-    record = dataclasses.replace(record, vectors=(*record.vectors, blind))
-    assert_same(estimation.smooth(record, case.noise, initial, full_covariance=True), plain, 1e-8)
 
 
 def test_a_start_half_way_round_is_survived() -> None:
@@ -748,15 +568,6 @@ def test_a_bias_that_turns_more_than_the_increments_say() -> None:
         np.testing.assert_allclose(whole.variance, cut.variance[::10], rtol=1e-8)
     with pytest.raises(InputError, match="many times round in each gyro interval"):
         smoothed(1, 1e4)
-
-
-def test_more_lag_more_certain() -> None:
-    case = CASES["directions"]
-    record, initial = simulated(case, np.random.default_rng(9))
-    variances = [estimation.smooth(record, case.noise, initial, lag=lag).variance for lag in (0.0, 0.5, 2.0, 30.0)]
-    middle = len(record.time) // 2
-    for less, more in itertools.pairwise(variances):
-        assert np.all(more[middle] < less[middle])
 
 
 def test_a_negative_lag_is_refused() -> None:
