@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import doctest
+import functools
 import importlib
 import inspect
 import pkgutil
@@ -127,10 +128,11 @@ def _members(protocol: Any) -> list[str]:
 def _faults(name: str) -> list[str]:
     """Return what is missing in the documentation of one name."""
     checks = {"GL08", "SS01", "SS03", "SS06"} if _in_protocol(name) else CHECKS
-    found = validate(name, _Reference)
+    parsed = functools.cache(_Reference)
+    found = validate(name, parsed)
     faults = [f"{code} {message}" for code, message in found["errors"] if code in checks]
     if "GL08" not in " ".join(faults):
-        for parameter, (kind, text) in _Reference(name).doc_all_parameters.items():
+        for parameter, (kind, text) in parsed(obj_name=name).doc_all_parameters.items():
             unit = UNITS.get(parameter)
             if unit and not re.search(rf"(?<![\w/²√]){unit}(?![\w/²√])", f"{kind} {' '.join(text)}"):
                 faults.append(f"the description of {parameter} does not name its unit, {unit}")
