@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -24,11 +24,13 @@ from strapdown.gyro import GyroSpec
 from strapdown.kernels.lane_values import WIDTH
 from strapdown.records import Estimate, ImuRecord, compress
 from strapdown.results import ByValue
-from strapdown.scenarios import Scenario, simulate
 from strapdown.setup import matching
 from strapdown.setup import states as optional
 from strapdown.setup.states import SensorStates, States
 from strapdown.vectors import VectorMeasurements
+
+if TYPE_CHECKING:
+    from strapdown.scenarios import Scenario
 
 __all__ = [
     "FilterSetup",
@@ -169,6 +171,8 @@ def matched(scenario: Scenario, *, attitude_sigma: float | None = None, states: 
     >>> from strapdown import scenarios, setup
     >>> print(setup.to_toml(setup.matched(scenarios.load_scenario("two-stars"))))  # doctest: +SKIP
     """
+    from strapdown.scenarios import simulate  # and every motion
+
     return matched_to_record(
         scenario.gyro,
         simulate(scenario),
