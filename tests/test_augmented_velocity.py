@@ -89,7 +89,7 @@ def exactly(A: np.ndarray, q: np.ndarray, dt: float, digits: int = 60) -> tuple[
 # ---------------------------------------------------------------------------------------------------------- transition and noise
 
 
-@pytest.mark.parametrize("dt", [1e-5, 1e-3, 0.017, 0.3, 2.0])
+@pytest.mark.parametrize("dt", [1e-5, 0.017, 2.0])
 @pytest.mark.parametrize("poles", POLES)
 def test_transition_and_noise_are_those_of_van_loan(poles, dt):
     block = block_of(poles)

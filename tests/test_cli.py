@@ -236,13 +236,6 @@ def test_coning_is_the_same_for_the_same_seed(run, coning, tmp_path):
     assert json.loads((tmp_path / "again" / "coning.json").read_text()) == coning[1]
 
 
-@pytest.mark.filterwarnings("error")
-def test_a_short_study_warns_of_nothing(run, tmp_path):
-    assert run("coning", "--runs", 1, "--duration", 12, "--out", tmp_path / "short")[0] == 0
-    # Exactly the keys of issue A, where no algorithm is one's own.
-    assert set(json.loads((tmp_path / "short" / "coning.json").read_text())) == {"scenario", "integration", "filter"}
-
-
 @pytest.mark.parametrize(
     ("options", "words"),
     [
