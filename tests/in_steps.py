@@ -34,6 +34,28 @@ def update(f, series, k):
     return getattr(f, f"update_{series.kind}")(series.vector_b[k], series.references_f[k], **given)
 
 
+def fed(f, record, after=lambda used: None):
+    """Give a record to a filter, intervals cut at the measurements; return attitudes, biases and covariances at the intervals' ends.
+
+    ``after`` is called after each measurement, with whether it was used.
+    """
+    events = sorted((t, i, k) for i, series in enumerate(record.vectors) for k, t in enumerate(series.time))
+    rows = []
+    for n, delta in enumerate(record.increments):
+        now, end = record.time[n], record.time[n + 1]
+        whole = end - now
+        while events and events[0][0] <= end:
+            t, i, k = events.pop(0)
+            if t > now:
+                f.predict(delta * ((t - now) / whole), t - now)
+                now = t
+            after(update(f, record.vectors[i], k))
+        if end > now:
+            f.predict(delta * ((end - now) / whole), end - now)
+        rows.append((f.attitude, f.bias, f.P))
+    return [np.array(column) for column in zip(*rows, strict=True)]
+
+
 def run(record, process_noise, initial, error_states=(), **options):
     """Return what the step-by-step filter makes of a record: the states at every edge, and innovations, counts and events."""
     sensors = [series.sensor for series in record.vectors]

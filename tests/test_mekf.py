@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import in_steps
 import numpy as np
 import pytest
 from filterpy.common import Saver
@@ -83,31 +84,10 @@ def with_moving_reference(record):
 
 
 def stepped(record, initial, saver=None):
-    """Run the step-by-step face over a record, splitting intervals at the measurements: a plain loop of its own."""
+    """Run the step-by-step face over a record, splitting intervals at the measurements."""
     f = StepFilter(NOISE, initial)
     history = Saver(f) if saver else None
-    events = sorted((t, i, k) for i, s in enumerate(record.vectors) for k, t in enumerate(s.time))
-    out = []
-    for k, delta in enumerate(record.increments):
-        now, end = record.time[k], record.time[k + 1]
-        whole = end - now
-        while events and events[0][0] <= end:
-            t, i, j = events.pop(0)
-            if t > now:
-                f.predict(delta * ((t - now) / whole), t - now)
-                now = t
-            series = record.vectors[i]
-            if series.kind == "attitude":
-                f.update_attitude(series.attitude[j], series.sigma_axes[j])
-            else:
-                update = {"direction": f.update_direction, "vector": f.update_vector, "heading": f.update_heading}
-                update[series.kind](series.vector_b[j], series.references_f[j], series.sigma[j])
-            if history is not None:
-                history.save()
-        if end > now:
-            f.predict(delta * ((end - now) / whole), end - now)
-        out.append((f.attitude, f.bias, f.P))
-    return [np.array(x) for x in zip(*out, strict=True)], history
+    return in_steps.fed(f, record, lambda used: None if history is None else history.save()), history
 
 
 @pytest.mark.parametrize("fast", [False, True], ids=["slow turn", "12 rad/s"])

@@ -113,23 +113,9 @@ OPTIONS = {
 
 
 def stepped(record, initial, **options):
-    """Run the step face over a record in a plain loop."""
-    f = GatedStepFilter(NOISE, initial, time=record.time[0], **options)
-    events = sorted((t, i, k) for i, s in enumerate(record.vectors) for k, t in enumerate(s.time))
-    out, results = [], []
-    for n, delta in enumerate(record.increments):
-        now, end = record.time[n], record.time[n + 1]
-        whole = end - now
-        while events and events[0][0] <= end:
-            t, i, k = events.pop(0)
-            if t > now:
-                f.predict(delta * ((t - now) / whole), t - now)
-                now = t
-            results.append(in_steps.update(f, record.vectors[i], k))
-        if end > now:
-            f.predict(delta * ((end - now) / whole), end - now)
-        out.append((f.attitude, f.bias, f.P))
-    return f, [np.array(x) for x in zip(*out, strict=True)], results
+    """Run the step face over a record."""
+    f, used = GatedStepFilter(NOISE, initial, time=record.time[0], **options), []
+    return f, in_steps.fed(f, record, used.append), used
 
 
 def assert_same(estimate, attitude, bias, P, tolerance=1e-10):
