@@ -22,6 +22,7 @@ hypothesis.settings.load_profile("fixed")  # the same examples in every run
 
 gc.set_threshold(50_000, 20, 20)
 """Objects of compiled kernels and of figures are many and live on: at Python's own 700, 10, 10 the collector takes 7 % of all time."""
+gc.disable()  # until all is collected: what modules hold stays
 
 cli.register()
 typer.main.get_command = functools.cache(typer.main.get_command)
@@ -54,6 +55,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 def pytest_collection_finish() -> None:
     gc.freeze()  # the modules stay
+    gc.enable()
 
 
 @pytest.fixture(scope="module", autouse=True)
