@@ -240,6 +240,21 @@ def test_effective_samples_of_an_autoregression_are_known():
         assert timeaverage.effective_samples(z) == pytest.approx(expected, rel=0.06)
 
 
+@pytest.mark.parametrize(("m", "memory"), [(30, 0.95), (700, 0.999), (3000, 0.5), (3000, 0.9999)])
+@pytest.mark.parametrize("first", [None, 1])
+def test_effective_samples_are_the_sum_over_lags(m, memory, first):
+    """The documented formula, term by term, of the same matrix."""
+    drive = np.random.default_rng(m).standard_normal((m, 3))
+    z = scipy.signal.lfilter([1.0], [1.0, -memory], drive, axis=0) * math.sqrt(1.0 - memory**2)
+    z[1:, 0] += 0.3 * z[:-1, 1]
+    A, k = (1.0 + 2.0 / m) * np.linalg.lstsq(z[:-1], z[1:], rcond=None)[0].T, first or 3
+    power, total = np.eye(3), 0.0
+    for lag in range(1, m):
+        power = A @ power
+        total += (1.0 - lag / m) * min(np.sum(power[:k, :k] ** 2) / k, 1.0)
+    assert timeaverage.effective_samples(z, first) == pytest.approx(max(1.0, m / (1.0 + 2.0 * total)), rel=2e-4)
+
+
 def test_effective_samples_of_part_of_a_markov_process():
     """The first component is no Markov process: its correlation is known from the whole matrix."""
     A = np.array([[0.3, 0.5], [0.0, 0.98]])

@@ -22,6 +22,8 @@ MIN_EFFECTIVE = 50.0
 MARKOV = 0.6
 """Where the correlation of the NEES itself leaves less than this share of the samples that the vector autoregression does, it counts."""
 
+POWERS = 256
+"""Powers of the matrix that are made at once."""
 MAX_EPOCHS = 4000
 
 
@@ -127,10 +129,16 @@ def effective_samples(white: ArrayLike, first: int | None = None) -> float:
     A = np.linalg.lstsq(z[:-1], z[1:], rcond=None)[0].T
     # Least squares makes the memory of a series of known mean too short by 2/m of itself (Kendall 1954).
     A = A * (1.0 + 2.0 / m)
-    powers = A[None]  # A^τ from τ = 1 on, twice as many at a time until they have died out
-    while len(powers) < m - 1 and np.sum(powers[-1, :k, :k] ** 2) >= 1e-6 * k:
-        powers = np.concatenate([powers, powers[: m - 1 - len(powers)] @ powers[-1]])
-    share = np.minimum(np.sum(powers[: m - 1, :k, :k] ** 2, axis=(1, 2)) / k, 1.0)
-    share = share[: 1 + np.argmax(share < 1e-6)] if np.any(share < 1e-6) else share
-    total = float(np.sum((1.0 - np.arange(1, len(share) + 1) / m) * share))
+    powers, lags = A[None], np.arange(1, POWERS + 1)
+    while len(powers) < POWERS:
+        powers = np.concatenate([powers, powers @ powers[-1]])
+    last, total = powers[-1], 0.0
+    while lags[0] < m:
+        share = np.minimum(np.sum(powers[:, :k, :k] ** 2, axis=(1, 2)) / k, 1.0)
+        small = np.flatnonzero(share < 1e-6)
+        end = small[0] + 1 if len(small) else POWERS
+        total += float(np.sum((1.0 - lags / m).clip(0.0)[:end] * share[:end]))
+        if len(small):
+            break
+        powers, lags = powers @ last, lags + POWERS
     return float(max(1.0, m / (1.0 + 2.0 * total)))
