@@ -28,9 +28,9 @@ from strapdown.motion import (
     SpinCone,
     SpinRock,
     TorqueFree,
-    torque_free,
     harmonic,
     rest,
+    torque_free,
     waypoints,
 )
 from strapdown.motion.exact_phase import DIGITS
@@ -568,8 +568,8 @@ def test_torque_free_attitude_against_50_turns_of_integration(name):
 def test_jacobi_functions_against_mpmath(complement):
     """Of the separatrix too, whose 1 − m is 1e-300; K and Π to 45 digits."""
     with mpmath.workdps(330), localcontext(prec=DIGITS):
-        exact, characteristic = mpmath.mpf(complement), mpmath.mpf(-0.3)
-        first, third, means = torque_free.complete_integrals(Decimal(complement), Decimal(-0.3))
+        exact, characteristic = mpmath.mpf(complement), mpmath.mpf("-0.3")
+        first, third, means = torque_free.complete_integrals(Decimal(complement), Decimal("-0.3"))
         quarter = mpmath.ellipk(1 - exact)
         assert abs(mpmath.mpf(str(first)) / quarter - 1) < mpmath.mpf(10) ** -45
         assert abs(mpmath.mpf(str(third)) / mpmath.ellippi(characteristic, 1 - exact) - 1) < mpmath.mpf(10) ** -45
