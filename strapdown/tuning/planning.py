@@ -8,9 +8,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from strapdown import quaternion, setup
+from strapdown import setup
 from strapdown.checks import Array, InputError, count, instance
-from strapdown.randomness import generator
 from strapdown.records import cut
 from strapdown.scenarios import Scenario, simulate
 from strapdown.setup import FilterSetup
@@ -84,14 +83,7 @@ def plan(
 
     def one(number: int) -> Array:
         record = simulate(replace(scenario, duration=float(wanted[-1])), seed, number)
-        truth = record.truth
-        assert truth is not None
-        draw = generator(seed, number, "initial error").standard_normal(6)
-        initial = setup.initial_state(
-            chosen,
-            quaternion.multiply(truth.attitude[0], quaternion.exp(-chosen.attitude_sigma * draw[:3])),
-            truth.bias[0] - chosen.bias_sigma * draw[3:],
-        )
+        initial = setup.drawn_state(chosen, record, seed, number)
         rows = []
         for length in wanted:
             last = int(np.searchsorted(record.time, record.time[0] + length * (1.0 - 1e-9)))
