@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from strapdown import coning, gyro, kinematics, quaternion, scenarios, vectors
+from strapdown import coning, gyro, kinematics, quaternion, scenarios, units, vectors
 from strapdown.checks import Array, InputError, count, known_keys, non_negative
 from strapdown.estimation.states import covariance_matrices
 from strapdown.gyro import GyroSpec, flicker
@@ -33,7 +33,7 @@ from strapdown.records import ImuRecord
 from strapdown.results import ByValue, Listed, Listing, figure
 from strapdown.scenarios import Scenario
 from strapdown.setup import FilterSetup, matched, modelled_record, need_mekf
-from strapdown.units import ARCSECOND, DEGREE, DEGREE_PER_HOUR
+from strapdown.units import DEGREE
 from strapdown.vectors import VectorMeasurements
 
 __all__ = [
@@ -50,6 +50,8 @@ LARGEST_SIZE = 1e12
 """No considered or initial error is larger, in the units of :class:`Consider`: its square would leave the range of doubles."""
 LARGEST_LINEAR = 0.15
 """Errors of attitude or direction above this, rad, are reported as beyond linear: their squares are a tenth of them."""
+MIN_NEES, MAX_NEES = 0.9, 1.1
+"""Expected NEES per state of a filter that will be consistent."""
 
 
 def _size(name: str, value: float, *, unit: str = "") -> float:
@@ -152,18 +154,46 @@ class Analysis(Listed):
     beyond_linear: tuple[str, ...]
 
     def listing(self) -> Listing:
-        """Return the error budget at the last epoch, as a table."""
+        """Return the error budget at the last epoch, the largest attitude error first, and what follows from it, as a table."""
+        rms, sigma = self.rms[-1], self.filter_sigma[-1]
+        unit, size = units.angle_unit([*rms[:3], *sigma[:3]])
+        rate_name, rate = units.rate_unit([*rms[3:], *sigma[3:]])
+        sources = sorted(self.budget(), key=lambda row: -row[2])
+        for name, kind, six in (("actual error", "all", rms), ("the filter's own σ", "", sigma)):
+            parts = np.sqrt(np.mean(six.reshape(2, 3) ** 2, axis=1))
+            sources.append((name, kind, float(parts[0]), float(parts[1])))
         rows = [
-            (name, kind, figure(attitude / ARCSECOND), figure(bias / DEGREE_PER_HOUR))
-            for name, kind, attitude, bias in self.budget()
+            (name, kind, figure(attitude / size, 3), figure(bias / rate, 3)) for name, kind, attitude, bias in sources
         ]
-        for name, sigma in (("actual RMS error", self.rms[-1]), ("filter's σ", self.filter_sigma[-1])):
-            sizes = [float(np.sqrt(np.mean(sigma[part] ** 2))) for part in (slice(0, 3), slice(3, 6))]
-            rows.append((name, "total", figure(sizes[0] / ARCSECOND), figure(sizes[1] / DEGREE_PER_HOUR)))
-        notes = [f"Left out: {one}." for one in self.left_out]
-        notes += [f"Beyond a linear analysis: {one}; use a Monte Carlo." for one in self.beyond_linear]
-        columns = ("source", "kind", "attitude, arcsec", "bias, °/h")
+        state, attitude, bias = self.expected_nees[-1]
+        nis = ", ".join(f"{sensor} {value:.3g}" for sensor, value in self.expected_nis.items())
+        notes = [
+            "random: squares add. fixed: the same in every run, adds as an error. considered: 1σ of an error that neither the scenario nor "
+            "the filter has.",
+            f"Expected NEES per state: {state:.3g} (attitude {attitude:.3g}, bias {bias:.3g}); NIS: {nis or 'none'}.",
+            self.words,
+            *([f"Left out: {', '.join(self.left_out)}."] if self.left_out else []),
+            *(f"Beyond linear: {one}; take a Monte Carlo (`strapdown montecarlo`)." for one in self.beyond_linear),
+        ]
+        columns = ("source", "kind", f"attitude, {unit}", f"bias, {rate_name}")
         return Listing(f"Error budget an axis at {self.time[-1]:.6g} s", columns, rows, notes, left=2)
+
+    @property
+    def words(self) -> str:
+        """Whether the filter will be consistent at the last epoch."""
+        _, attitude, bias = self.expected_nees[-1]
+        largest = float(max(*self.rms[-1, :3], *self.filter_sigma[-1, :3]))
+        if largest > LARGEST_LINEAR:
+            return (
+                f"With an attitude error of {largest / DEGREE:.3g}° the analysis, linear about the truth, cannot tell whether the filter "
+                "will be consistent."
+            )
+        if (worst := max(attitude, bias)) > MAX_NEES:
+            of = "bias" if bias > attitude else "attitude"
+            return f"The filter will be optimistic in {of}: its errors will be {np.sqrt(worst):.3g} times its σ."
+        if min(attitude, bias) < MIN_NEES:
+            return "The filter will be pessimistic: its σ will be larger than its errors."
+        return "The filter will be consistent."
 
     @property
     def covariance(self) -> Array:
