@@ -478,7 +478,7 @@ def _integration_rate(scenario: Scenario, setup: FilterSetup, stamps: Array, att
     before = np.concatenate([np.zeros((1, 3)), error[:-1]])
     before[stamps[:-1] <= begins[step]] = 0.0
     carried = quaternion.rotate(quaternion.exp(-phi), before)
-    driven = np.einsum("sij,sj->si", kinematics.inverse_right_jacobian(phi), error - carried)
+    driven = np.linalg.solve(kinematics.right_jacobian(phi), (error - carried)[:, :, None])[:, :, 0]
     return np.asarray(-driven / np.diff(stamps)[:, None])
 
 
