@@ -7,12 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from strapdown.consistency.bounds import (
-    coverage_p_values,
-    log_mean_p_value,
-    mean_p_value,
-    tail,
-)
+from strapdown.consistency.bounds import coverage_p_values, log_mean_p_value, tail
 from strapdown.consistency.judgement import (
     LOG_NEES,
     STATES,
@@ -21,6 +16,7 @@ from strapdown.consistency.judgement import (
     concluded,
     error_words,
     innovation_words,
+    ratio,
     state_name,
 )
 from strapdown.consistency.manifold import SUBSETS
@@ -99,16 +95,7 @@ def judge_runs(
         if degrees < 1.0:
             continue
         mean = float(np.sum(statistics.sensor_nis_sum[row]) / degrees)
-        findings.append(
-            Finding(
-                name="NIS",
-                of=sensor,
-                value=mean,
-                p_value=mean_p_value(mean, 1, degrees),
-                samples=degrees,
-                means=innovation_words(sensor, mean),
-            )
-        )
+        findings.append(ratio("NIS", sensor, mean, 1, degrees, innovation_words(sensor, mean)))
     tested = [name for name in STATES if name in statistics.subsets]
     return concluded(findings, [], probability, states=tested, needed=tested, unmodelled=unmodelled)
 
