@@ -7,6 +7,7 @@ parabola does not: that zero may be as likely as the best value. Then only a bou
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
@@ -18,7 +19,7 @@ from strapdown.checks import Array, InputError, count, known_keys, positive
 from strapdown.results import Listed, Listing, figure
 from strapdown.setup import FilterSetup
 from strapdown.tuning.innovations import Derivatives
-from strapdown.tuning.parameters import RRW, SCALE, Prior, fixed_unit, with_values
+from strapdown.tuning.parameters import RRW, SCALE, Prior, Unit, fixed_unit, with_values
 
 LONGEST_STEP = 2.0
 """Largest change of a log parameter in one step of the search."""
@@ -192,6 +193,17 @@ class Estimated:
     """Whether zero is refuted at 95 %, and an upper end found."""
     note: str
     """Interpretation, in words."""
+    unit: Unit
+    """Unit that it is printed in."""
+
+    @property
+    def words(self) -> str:
+        """How well it is known, in its unit."""
+        if self.identified or "prior" in self.note:
+            return self.note
+        if not math.isfinite(self.upper):
+            return "not identified: these records say nothing of it"
+        return f"not identified: at most {figure(self.upper / self.unit.factor, 3)} {self.unit.name} (95 %)"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -241,18 +253,30 @@ class Tuning(Listed):
     composite: bool = False
 
     def listing(self) -> Listing:
-        """Return the parameters with their intervals, as a table; σ of sensors in rad or the unit of the vector."""
+        """Return the parameters with their intervals, as a table."""
         rows = []
         for one in self.parameters:
-            unit = fixed_unit(one.name)
-            values = [figure(x / unit.factor, 3) for x in (one.start, one.value, one.lower, one.upper)]
-            rows.append((one.name, unit.name, *values, "" if one.identified else "not identified"))
+            values = [figure(x / one.unit.factor, 3) for x in (one.start, one.value, one.lower, one.upper)]
+            rows.append((one.name, one.unit.name, *values, one.words))
         notes = [
-            f"{self.agreeing} of {len(self.starts)} searches ended at the best point; gain {self.before - self.after:.4g}"
+            f"{self.agreeing} of {len(self.starts)} searches ended at the best point; log-likelihood + "
+            f"{self.before - self.after:.4g}."
         ]
-        if self.misfit:
+        if not all(one.identified for one in self.parameters):
             notes.append(
-                "The innovations are not those of any such filter: disturbances last over many samples, or change."
+                "Of a parameter that is not identified these records give an upper bound alone; the filter uses the value in the column "
+                "“after”, the mean below that bound. --prior (priors= in Python) gives it a prior instead."
+            )
+        if self.misfit:
+            remedy = (
+                "A common scale leaves the estimates as they are; it makes σ right on the whole, not at each time."
+                if self.parameters[0].name == SCALE
+                else "The most likely filter may follow them and estimate worse. Tune filter.scale alone, or against a truth (--truth, "
+                "--rmse), or try --spacing."
+            )
+            notes.append(
+                "The innovations are not those of any such filter: disturbances last over many samples, or change. "
+                + remedy
             )
         columns = ("parameter", "unit", "before", "after", "from", "to", "")
         return Listing("Tuned parameters with 95 % intervals", columns, rows, notes, left=2)
@@ -425,6 +449,7 @@ def _estimated(
         standard_error=error,
         identified=found.identified,
         note=_note(name, found, error, best.local, j, priors, doubtful=doubtful),
+        unit=fixed_unit(name),
     )
 
 
