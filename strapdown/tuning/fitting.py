@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple, Protocol, TypeVar, runtime_checkable
+from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
@@ -43,7 +43,11 @@ T = TypeVar("T")
 
 
 class Objective(Protocol):
-    """Objective to minimise: minus a log likelihood, or a substitute."""
+    """Objective to minimise: minus a log likelihood, or a substitute.
+
+    It may have ``limits`` of its own, least and largest logarithm of each parameter (p,), (p,), and a ``curvature(point)`` (p, p), where
+    that of the search is not good enough for errors.
+    """
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -67,26 +71,10 @@ class Objective(Protocol):
         """Return the filter setup of a point."""
 
 
-@runtime_checkable
-class Curved(Protocol):
-    """An objective whose curvature at its best point is to be taken by itself, as the search's is not good enough for errors."""
-
-    def curvature(self, point: Array) -> Array:
-        """Return the second derivatives at a point (p, p)."""
-
-
-@runtime_checkable
-class Bounded(Protocol):
-    """An objective whose parameters have bounds of their own."""
-
-    @property
-    def limits(self) -> tuple[Array, Array]:
-        """Least and largest logarithm of each parameter (p,), (p,)."""
-
-
 def limits_of(objective: Objective) -> tuple[Array, Array]:
-    """Return the least and the largest logarithm of each parameter that a search looks at."""
-    return objective.limits if isinstance(objective, Bounded) else (objective.start - REACH, objective.start + REACH)
+    """Return the least and the largest logarithm of each parameter that a search looks at: the objective's own ``limits``, if any."""
+    wide: tuple[Array, Array] = objective.start - REACH, objective.start + REACH
+    return getattr(objective, "limits", wide)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -455,11 +443,10 @@ def _estimated(
 
 def _curved(objective: Objective, best: Optimum) -> Local:
     """Return the best point with the objective's own curvature, where it has one and the point is a minimum by it."""
-    if not isinstance(objective, Curved):
+    curvature = getattr(objective, "curvature", None)
+    if curvature is None:
         return best.local
-    own = (
-        objective.curvature(best.point) + best.local.information - best.local.derivatives.information
-    )  # and the priors'
+    own = curvature(best.point) + best.local.information - best.local.derivatives.information  # and the priors'
     return replace(best.local, information=own) if np.linalg.eigvalsh(own)[0] > 0.0 else best.local
 
 
