@@ -16,12 +16,15 @@ import pytest
 import typer.main
 from matplotlib.figure import Figure
 
+from strapdown import cli
+
 hypothesis.settings.register_profile("fixed", derandomize=True)
 hypothesis.settings.load_profile("fixed")  # the same examples in every run
 
 gc.set_threshold(50_000, 20, 20)
 """Objects of compiled kernels and of figures are many and live on: at Python's own 700, 10, 10 the collector takes 7 % of all time."""
 
+cli.register()
 typer.main.get_command = functools.cache(typer.main.get_command)
 """Each call of the program builds the parsers of all commands anew, 16 ms; that this is right once is enough."""
 
@@ -108,7 +111,6 @@ def run(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> Callable[..., tuple[int, str, str]]:
     """Run ``strapdown ARGUMENTS`` in an empty folder; return exit status, standard output and standard error."""
-    from strapdown import cli
     from strapdown.cli import progress
 
     monkeypatch.chdir(tmp_path)

@@ -418,6 +418,26 @@ def test_acceleration_that_lasts_is_a_vehicles_and_does_not_pass_for_tilt():
     assert own < 3.5 < 3.0 * own < hand
 
 
+def test_a_vibrating_machine_needs_no_set_of_its_own():
+    """Vibration has hardly a velocity, so the filter of a hand bounds it; that of any motion takes most of it for tilt noise."""
+    plain, random = (
+        recording(60.0, bias=(0.4 * DEGREE, -0.3 * DEGREE, 0.2 * DEGREE), noise=0.2),
+        np.random.default_rng(3),
+    )
+    t = (plain.time - plain.time[0])[:, None]
+    shaken = sum(np.sin(2.0 * np.pi * (f * t + random.random(3))) for f in (25.0, 31.0, 50.0, 62.0, 93.0))
+    force = plain.specific_force + np.where(t > 2.0, 3.0, 0.0) * quaternion.rotate(
+        quaternion.conjugate(plain.true_attitude), shaken
+    )
+    machine = dataclasses.replace(plain, specific_force=force)
+    assert motions.chosen(machine)[0] == "hand"
+    hand, white = (
+        worst(ahrs.estimate(machine, ahrs.MOTIONS[one], latency=0.0), after=5.0)["inclination"]
+        for one in ("hand", "any")
+    )
+    assert 0.05 < hand < 0.3 < white < 2.0
+
+
 @pytest.mark.parametrize("run", range(3))
 def test_a_hand_is_a_hand_however_it_was_recorded(run):
     """Clipped, with dropouts, without a magnetometer or rest, with a bias that nothing shows, and at rest alone."""

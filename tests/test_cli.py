@@ -47,7 +47,10 @@ def test_help_shows_options_in_groups_and_examples_that_parse(run):
     """Each example names options and arguments that its command takes; each heading stands over its options."""
     commands = typer.main.get_command(app).commands
     for examples in layout.COMMANDS.values():
-        for name, lines in examples.items():
+        for name, (module, *lines) in examples.items():
+            assert (
+                commands[name].callback.__module__ == f"strapdown.cli.{module}"
+            )  # the only one that is imported for it
             for line in lines:
                 program, command, *words = line.split()
                 assert (program, command) == ("strapdown", name)

@@ -378,7 +378,7 @@ def _score(misfit: float, kind: str = "reference") -> float:
 
 SPAN = 4.0
 """Length of the windows over which vectors are averaged, s: accelerations average out, a gyro's bias does not turn far."""
-MIN_INTERVAL = 0.01
+MIN_INTERVAL = 0.02
 """Vectors are taken at most so often, s."""
 
 

@@ -5,7 +5,7 @@ that they did not write; ``montecarlo``, whose result may have taken hours, need
 
 - ``terminal``: What every command shares.
 - ``progress``: Progress of what takes long.
-- ``layout``: Groups, order and examples of the commands.
+- ``layout``: Groups, order, modules and examples of the commands.
 - ``studies``: ``coning``
 - ``integration``: ``algorithms``, ``integrate``, ``coning-budget``
 - ``estimation``: ``estimate``
@@ -17,6 +17,7 @@ that they did not write; ``montecarlo``, whose result may have taken hours, need
 - ``reporting``: ``report``
 - ``sensors``: ``simulate``, ``scenarios``, ``allan``
 - ``tuning``: ``tune``
+- ``installation``: ``info``
 """
 
 from __future__ import annotations
@@ -32,21 +33,9 @@ from typing import Any
 import typer
 
 from strapdown.checks import InputError
-from strapdown.cli import (  # noqa: F401  (each registers its commands)
-    campaigns,
-    conversion,
-    estimation,
-    integration,
-    judgement,
-    planning,
-    reporting,
-    sensors,
-    studies,
-    tuning,
-)
-from strapdown.cli.layout import lay_out
+from strapdown.cli.layout import register as register
 from strapdown.cli.progress import be_quiet
-from strapdown.cli.terminal import app, command, console, errors
+from strapdown.cli.terminal import app, console, errors
 from strapdown.files.reading import NoDigestWarning
 
 
@@ -64,20 +53,6 @@ def _about(
 
         console.print(f"strapdown {strapdown.__version__}")
         raise typer.Exit
-
-
-@command
-def info() -> None:
-    """Show the versions and the processor features that compiled code uses here."""
-    import strapdown
-    from strapdown.kernels.machine import describe
-
-    console.print(f"strapdown {strapdown.__version__}")
-    for name, value in describe().items():
-        console.print(f"{name}: {value}")
-
-
-lay_out(app)
 
 
 def _say(usual: Callable[..., None], message: Warning | str, category: type[Warning], *place: Any) -> None:
@@ -102,6 +77,7 @@ def main() -> None:
     if "--quiet" in sys.argv[1:]:
         sys.argv = [sys.argv[0], "--quiet", *(argument for argument in sys.argv[1:] if argument != "--quiet")]
     try:
+        register(next((one for one in sys.argv[1:] if not one.startswith("-")), None))
         app(standalone_mode=True)
     except InputError as error:
         errors.print(f"error: {error}", soft_wrap=True)

@@ -45,11 +45,10 @@ class Samples:
         """Return the options of :func:`strapdown.recordings.read` that are given; a simulated record takes none of them."""
         from strapdown import recordings
 
-        if recordings.is_record(path):
-            for option in given(self):
-                what = {"--topic": "a bag or a flight log", "--axes": "a recording", "--invert": "a recording"}
-                own = "holds its units" if option.endswith("-unit") else "needs none"
-                raise InputError(f"{option} goes with {what.get(option, 'a table')}; the record {path} {own}")
+        if (options := given(self)) and recordings.is_record(path):
+            what = {"--topic": "a bag or a flight log", "--axes": "a recording", "--invert": "a recording"}
+            own = "holds its units" if options[0].endswith("-unit") else "needs none"
+            raise InputError(f"{options[0]} goes with {what.get(options[0], 'a table')}; the record {path} {own}")
         found: dict[str, Any] = {"units": self.units}
         if self.columns:
             found["columns"] = recordings.parse_mapping(self.columns)

@@ -23,7 +23,6 @@ from strapdown.checks import Array, InputError, count, known_keys
 from strapdown.files import reading, set_attributes, written_beside
 from strapdown.gyro import GyroSpec
 from strapdown.records import CONVENTIONS, ImuRecord, Origin, Truth, put, result_file
-from strapdown.scenarios import scenario_from_toml
 from strapdown.vectors import KINDS, VectorMeasurements
 
 KIND = "strapdown record"
@@ -67,6 +66,8 @@ class RecordFile:
         """Return the record with its origin, the scenario read from its TOML; ``place`` is named where that cannot be."""
         if self.gyro is None and not self.scenario:
             return self.record
+        from strapdown.scenarios import scenario_from_toml  # and every motion
+
         scenario = scenario_from_toml(self.scenario, f"{place}: scenario") if self.scenario else None
         spec = scenario.gyro if self.gyro is None and scenario is not None else self.gyro
         origin = Origin(gyro=spec, scenario=scenario, seed=self.seed, run=self.run)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -25,11 +25,13 @@ from strapdown.kernels.lane_values import WIDTH
 from strapdown.randomness import generator
 from strapdown.records import Estimate, ImuRecord, Origin, compress
 from strapdown.results import ByValue
-from strapdown.scenarios import Scenario, simulate
 from strapdown.setup import matching
 from strapdown.setup import states as optional
 from strapdown.setup.states import SensorStates, States
 from strapdown.vectors import VectorMeasurements
+
+if TYPE_CHECKING:
+    from strapdown.scenarios import Scenario
 
 __all__ = [
     "FilterSetup",
@@ -170,6 +172,8 @@ def matched(
     >>> from strapdown import scenarios, setup
     >>> print(setup.to_toml(setup.matched(scenarios.load_scenario("two-stars"))))  # doctest: +SKIP
     """
+    from strapdown.scenarios import simulate  # and every motion
+
     return matched_to_record(simulate(scenario), attitude_sigma=attitude_sigma, states=states)
 
 

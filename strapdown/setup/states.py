@@ -10,7 +10,7 @@ import numpy as np
 
 from strapdown import units
 from strapdown.checks import Array, InputError, array, known_keys, non_negative, one_of, positive
-from strapdown.estimation import forward, smoothing, together
+from strapdown.estimation import forward, smoothing
 from strapdown.estimation import model as modelling
 from strapdown.estimation.error_states import (
     BoundedVelocity,
@@ -418,6 +418,8 @@ def run_together(
 ) -> list[Estimate]:
     """Run the filter over several records, eight at once where it can (:mod:`strapdown.estimation.together`), with full covariance."""
     problems = [prepared(one, process_noise, start, states) for one, start in zip(records, initials, strict=True)]
+    from strapdown.estimation import together
+
     options = forward.Options(every=every, full_covariance=True, whole_bias=True, together=True)
     found = together.run(problems, every, lambda problem: forward.filtered(problem, options).estimate)
     return [_reported(one, states, start) for one, start in zip(found, initials, strict=True)]

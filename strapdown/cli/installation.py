@@ -1,0 +1,16 @@
+"""What is installed."""
+
+from __future__ import annotations
+
+from strapdown.cli.terminal import command, console
+
+
+@command
+def info() -> None:
+    """Show the versions and the processor features that compiled code uses here."""
+    import strapdown
+    from strapdown.kernels.machine import describe
+
+    console.print(f"strapdown {strapdown.__version__}")
+    for name, value in describe().items():
+        console.print(f"{name}: {value}")
