@@ -90,7 +90,8 @@ def draw(result, folder, objective):
     from strapdown import plots
     from strapdown.plots import tuning as drawing
 
-    shown = [tuning.unit_of(name, [result.record]) for name in FREE]
+    tuned = tuning.with_units(result.too_small, [result.record])
+    shown = [one.unit for one in tuned.parameters]
     figure, (left, right) = plots.new_figure(1, 2, size=(11.0, 4.6))
     for number, one in enumerate((result.too_large, result.too_small)):
         searches(one, shown, left, label=number == 0)
@@ -98,7 +99,7 @@ def draw(result, folder, objective):
     values(result, right)
     plots.save(figure, folder / "tune_filter.png")
     plots.save(
-        drawing.likelihood_slices(tuning.slices(objective, result.too_small), result.too_small, shown),
+        drawing.likelihood_slices(tuning.slices(objective, tuned), tuned),
         folder / "tune_filter-likelihood.png",
     )
     plots.save(

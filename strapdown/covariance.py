@@ -18,11 +18,11 @@ import dataclasses
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from strapdown import coning, gyro, kinematics, quaternion, scenarios, vectors
+from strapdown import coning, gyro, kinematics, quaternion, scenarios, units, vectors
 from strapdown.checks import Array, InputError, count, known_keys, non_negative
 from strapdown.estimation.states import covariance_matrices
 from strapdown.gyro import GyroSpec, flicker
@@ -33,7 +33,7 @@ from strapdown.records import ImuRecord
 from strapdown.results import ByValue, Listed, Listing, figure
 from strapdown.scenarios import Scenario
 from strapdown.setup import FilterSetup, matched, modelled_record, need_mekf
-from strapdown.units import ARCSECOND, DEGREE, DEGREE_PER_HOUR
+from strapdown.units import DEGREE
 from strapdown.vectors import VectorMeasurements
 
 __all__ = [
@@ -50,6 +50,8 @@ LARGEST_SIZE = 1e12
 """No considered or initial error is larger, in the units of :class:`Consider`: its square would leave the range of doubles."""
 LARGEST_LINEAR = 0.15
 """Errors of attitude or direction above this, rad, are reported as beyond linear: their squares are a tenth of them."""
+MIN_NEES, MAX_NEES = 0.9, 1.1
+"""Expected NEES per state of a filter that will be consistent."""
 
 
 def _size(name: str, value: float, *, unit: str = "") -> float:
@@ -152,18 +154,46 @@ class Analysis(Listed):
     beyond_linear: tuple[str, ...]
 
     def listing(self) -> Listing:
-        """Return the error budget at the last epoch, as a table."""
+        """Return the error budget at the last epoch, the largest attitude error first, and what follows from it, as a table."""
+        rms, sigma = self.rms[-1], self.filter_sigma[-1]
+        unit, size = units.angle_unit([*rms[:3], *sigma[:3]])
+        rate_name, rate = units.rate_unit([*rms[3:], *sigma[3:]])
+        sources = sorted(self.budget(), key=lambda row: -row[2])
+        for name, kind, six in (("actual error", "all", rms), ("the filter's own σ", "", sigma)):
+            parts = np.sqrt(np.mean(six.reshape(2, 3) ** 2, axis=1))
+            sources.append((name, kind, float(parts[0]), float(parts[1])))
         rows = [
-            (name, kind, figure(attitude / ARCSECOND), figure(bias / DEGREE_PER_HOUR))
-            for name, kind, attitude, bias in self.budget()
+            (name, kind, figure(attitude / size, 3), figure(bias / rate, 3)) for name, kind, attitude, bias in sources
         ]
-        for name, sigma in (("actual RMS error", self.rms[-1]), ("filter's σ", self.filter_sigma[-1])):
-            sizes = [float(np.sqrt(np.mean(sigma[part] ** 2))) for part in (slice(0, 3), slice(3, 6))]
-            rows.append((name, "total", figure(sizes[0] / ARCSECOND), figure(sizes[1] / DEGREE_PER_HOUR)))
-        notes = [f"Left out: {one}." for one in self.left_out]
-        notes += [f"Beyond a linear analysis: {one}; use a Monte Carlo." for one in self.beyond_linear]
-        columns = ("source", "kind", "attitude, arcsec", "bias, °/h")
+        state, attitude, bias = self.expected_nees[-1]
+        nis = ", ".join(f"{sensor} {value:.3g}" for sensor, value in self.expected_nis.items())
+        notes = [
+            "random: squares add. fixed: the same in every run, adds as an error. considered: 1σ of an error that neither the scenario nor "
+            "the filter has.",
+            f"Expected NEES per state: {state:.3g} (attitude {attitude:.3g}, bias {bias:.3g}); NIS: {nis or 'none'}.",
+            self.words,
+            *([f"Left out: {', '.join(self.left_out)}."] if self.left_out else []),
+            *(f"Beyond linear: {one}; take a Monte Carlo (`strapdown montecarlo`)." for one in self.beyond_linear),
+        ]
+        columns = ("source", "kind", f"attitude, {unit}", f"bias, {rate_name}")
         return Listing(f"Error budget an axis at {self.time[-1]:.6g} s", columns, rows, notes, left=2)
+
+    @property
+    def words(self) -> str:
+        """Whether the filter will be consistent at the last epoch."""
+        _, attitude, bias = self.expected_nees[-1]
+        largest = float(max(*self.rms[-1, :3], *self.filter_sigma[-1, :3]))
+        if largest > LARGEST_LINEAR:
+            return (
+                f"With an attitude error of {largest / DEGREE:.3g}° the analysis, linear about the truth, cannot tell whether the filter "
+                "will be consistent."
+            )
+        if (worst := max(attitude, bias)) > MAX_NEES:
+            of = "bias" if bias > attitude else "attitude"
+            return f"The filter will be optimistic in {of}: its errors will be {np.sqrt(worst):.3g} times its σ."
+        if min(attitude, bias) < MIN_NEES:
+            return "The filter will be pessimistic: its σ will be larger than its errors."
+        return "The filter will be consistent."
 
     @property
     def covariance(self) -> Array:
@@ -262,9 +292,8 @@ class Analysis(Listed):
 # ------------------------------------------------------------------------------------------------------------- the trajectory
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Rows:
-    """Scalar rows of one sensor's measurements, in the order of time."""
+class _Rows(NamedTuple):
+    """Scalar rows of measurements."""
 
     time: Array
     h: Array
@@ -277,6 +306,12 @@ class _Rows:
     """Innovation at the truth without noise (r,): what the sensor's fixed errors make."""
     moving: Array
     """Change of the row per second of delay, by the motion of the reference (r,)."""
+
+    @staticmethod
+    def of(time: Array, h: Array, noise: Array, *numbers: Array | float) -> _Rows:
+        """Return k rows of each measurement (m, k, 3) one after the other; numbers of each row are spread over them."""
+        each = (np.broadcast_to(one, h.shape[:2]).ravel() for one in numbers)
+        return _Rows(np.repeat(time, h.shape[1]), h.reshape(-1, 3), noise.reshape(-1, 3), *each)
 
 
 def _exact(sensor: Any) -> Any:
@@ -295,7 +330,6 @@ def _rows(
     attitude = np.asarray(motion.attitude(time)).reshape(m, 4)
     faults = sensor.faults
     more = 1.0 - faults.outlier_probability + faults.outlier_probability * faults.outlier_scale**2
-    moving = np.zeros((m, 1))
     if own.attitude is not None:
         if own.covariance is not None:
             raise InputError(
@@ -307,7 +341,7 @@ def _rows(
         h = noise = np.broadcast_to(np.eye(3), (m, 3, 3))
         variance, filter_variance = own.sigma_axes**2, held.sigma_axes**2
         error = quaternion.log(quaternion.multiply(quaternion.conjugate(attitude), exact.attitude)).reshape(m, 3)
-        return _flat(time, h, noise, filter_variance, variance * more, error, np.zeros((m, 3)))
+        return _Rows.of(time, h, noise, filter_variance, variance * more, error, 0.0)
     R = quaternion.to_matrix(attitude)
     reference = np.array(exact.references_f)
     length = np.linalg.norm(reference, axis=1) if own.kind == "vector" else np.ones(m)
@@ -324,36 +358,19 @@ def _rows(
         noise = own_axes[:, None]
         cosine = z_f[:, 0] * reference[:, 0] + z_f[:, 1] * reference[:, 1]
         error = np.arctan2(z_f[:, 0] * reference[:, 1] - z_f[:, 1] * reference[:, 0], cosine)[:, None]
-        noise, sigma, filter_sigma = noise * scale[:, None, None], sigma[:, None], filter_sigma[:, None]
-        return _flat(time, h, noise, filter_sigma**2, sigma**2 * more, error, moving)
+        noise = noise * scale[:, None, None]
+        return _Rows.of(time, h, noise, filter_sigma[:, None] ** 2, sigma[:, None] ** 2 * more, error, 0.0)
     frame = np.broadcast_to(vectors.triad(reference), (m, 3, 3))
     basis = frame @ R
     h = np.stack([-basis[:, 1], basis[:, 0]], axis=1)
     z = exact.vector_b / length[:, None]
     error = np.einsum("mij,mj->mi", basis[:, :2], z)
+    moving: Array | float = 0.0
     if m > 1 and exact.reference_f.ndim == 2:
         unit = reference / np.linalg.norm(reference, axis=1, keepdims=True)
         moving = np.einsum("mij,mj->mi", frame[:, :2], np.gradient(unit, time, axis=0))
-    else:
-        moving = np.zeros((m, 2))
-    two = np.ones((1, 2))
     noise = basis[:, :2] * scale[:, None, None]
-    return _flat(time, h, noise, filter_sigma[:, None] ** 2 * two, sigma[:, None] ** 2 * more * two, error, moving)
-
-
-def _flat(
-    time: Array, h: Array, noise: Array, filter_variance: Array, variance: Array, error: Array, moving: Array
-) -> _Rows:
-    rows = h.shape[1]
-    return _Rows(
-        time=np.repeat(time, rows),
-        h=h.reshape(-1, 3),
-        noise=noise.reshape(-1, 3),
-        filter_variance=filter_variance.ravel(),
-        variance=variance.ravel(),
-        error=error.ravel(),
-        moving=moving.ravel(),
-    )
+    return _Rows.of(time, h, noise, filter_sigma[:, None] ** 2, sigma[:, None] ** 2 * more, error, moving)
 
 
 def _all_rows(scenario: Scenario, setup: FilterSetup) -> list[_Rows]:
@@ -448,7 +465,7 @@ def _integration_rate(scenario: Scenario, setup: FilterSetup, stamps: Array, att
     before = np.concatenate([np.zeros((1, 3)), error[:-1]])
     before[stamps[:-1] <= begins[step]] = 0.0
     carried = quaternion.rotate(quaternion.exp(-phi), before)
-    driven = np.einsum("sij,sj->si", kinematics.inverse_right_jacobian(phi), error - carried)
+    driven = np.linalg.solve(kinematics.right_jacobian(phi), (error - carried)[:, :, None])[:, :, 0]
     return np.asarray(-driven / np.diff(stamps)[:, None])
 
 
@@ -498,8 +515,7 @@ def _diagonal(attitude_sigma: float, bias_sigma: float) -> Array:
     return block
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Path:
+class _Path(NamedTuple):
     """The trajectory cut at every gyro edge and every measurement, and the rows of all sensors in order."""
 
     stamps: Array
@@ -511,23 +527,11 @@ class _Path:
     """True turns (n, 3), rad."""
     interval: np.ndarray
     """Gyro interval that each lies in (n,)."""
-    rows: dict[str, Array]
-    """Fields of :class:`_Rows`, sensors together."""
+    rows: _Rows
     sensor: np.ndarray
     """Number of the sensor of each row."""
     kept: np.ndarray
     """Gyro edges at the epochs."""
-
-    @property
-    def new_sample(self) -> np.ndarray:
-        """Whether a segment is the first of its gyro interval (n,), but for the very first."""
-        return np.concatenate([[False], np.diff(self.interval) > 0])
-
-    @property
-    def row_bounds(self) -> np.ndarray:
-        """Rows of each station (n + 2,)."""
-        first = np.searchsorted(self.rows["time"], self.stamps, side="left")
-        return np.concatenate([first, [len(self.rows["time"])]])
 
 
 def _path(scenario: Scenario, setup: FilterSetup, epochs: int) -> _Path:
@@ -538,11 +542,11 @@ def _path(scenario: Scenario, setup: FilterSetup, epochs: int) -> _Path:
             f"{steps} filter steps are fewer than {epochs} epochs; take fewer epochs, or a longer scenario"
         )
     parts = _all_rows(scenario, setup)
-    fields = [entry.name for entry in dataclasses.fields(_Rows)]
-    empty = {name: np.empty((0, 3) if name in ("h", "noise") else 0) for name in fields}
-    joined = {name: np.concatenate([empty[name], *(getattr(part, name) for part in parts)]) for name in fields}
-    order = np.argsort(joined["time"], kind="stable")
-    stamps = np.union1d(edges, joined["time"])
+    none = _Rows(np.empty(0), *np.empty((2, 0, 3)), *np.empty((4, 0)))
+    joined = [np.concatenate(part) for part in zip(none, *parts, strict=True)]
+    order = np.argsort(joined[0], kind="stable")
+    rows = _Rows(*(np.ascontiguousarray(part[order]) for part in joined))
+    stamps = np.union1d(edges, rows.time)
     attitude = scenario.motion.attitude(stamps)
     every = steps // epochs * setup.integration.samples
     return _Path(
@@ -551,7 +555,7 @@ def _path(scenario: Scenario, setup: FilterSetup, epochs: int) -> _Path:
         dt=np.diff(stamps),
         phi=quaternion.log(quaternion.multiply(quaternion.conjugate(attitude[:-1]), attitude[1:])),
         interval=np.clip(np.searchsorted(edges, stamps[:-1], side="right") - 1, 0, len(edges) - 2),
-        rows={name: np.ascontiguousarray(value[order]) for name, value in joined.items()},
+        rows=rows,
         sensor=np.repeat(np.arange(len(parts)), [len(part.time) for part in parts])[order],
         kept=np.arange(0, steps * setup.integration.samples + 1, every),
     )
@@ -646,7 +650,7 @@ def _fixed_columns(scenario: Scenario, setup: FilterSetup, path: _Path) -> list[
     if np.any(_axes(scenario.gyro.rate_ramp) != 0.0):
         columns.append(_Column(name="rate ramp", ramp=_axes(scenario.gyro.rate_ramp)))
     for i, sensor in enumerate(scenario.sensors):
-        mine = np.where(path.sensor == i, path.rows["error"], 0.0)
+        mine = np.where(path.sensor == i, path.rows.error, 0.0)
         if np.abs(mine).max(initial=0.0) > MIN_ERROR:
             columns.append(_Column(name=f"{sensor.name} (fixed)", rows=mine))
     return columns
@@ -654,40 +658,38 @@ def _fixed_columns(scenario: Scenario, setup: FilterSetup, path: _Path) -> list[
 
 def _considered_columns(scenario: Scenario, consider: Consider, path: _Path) -> list[_Column]:
     """Return the considered errors at one standard deviation, one column an independent parameter."""
-    columns: list[_Column] = []
-    unit = np.eye(3)
+    unit, axes = np.eye(3), range(3)
     turn_rate = path.phi / path.dt[:, None]
-    if consider.scale_factor > 0.0:
-        for i in range(3):
-            rate = consider.scale_factor * turn_rate[:, [i]] * unit[i]
-            columns.append(_Column(name=f"scale factor, {AXES[i]}", rate=rate))
-    pairs = [(i, j) for i in range(3) for j in range(3)]
-    if consider.misalignment > 0.0:
-        for i, j in (pair for pair in pairs if pair[0] != pair[1]):
-            rate = consider.misalignment * turn_rate[:, [j]] * unit[i]
-            columns.append(_Column(name=f"misalignment, {AXES[i]} of {AXES[j]}", rate=rate))
+    force = turn_rate
     if consider.g_sensitivity > 0.0:
         middle = 0.5 * (path.stamps[1:] + path.stamps[:-1])
         force = vectors.specific_force(scenario.motion, middle, gravity_f=scenario.gravity_f)
-        for i, j in pairs:
-            rate = consider.g_sensitivity * force[:, [j]] * unit[i]
-            columns.append(_Column(name=f"g-sensitivity, {AXES[i]} of {AXES[j]}", rate=rate))
-    names = [sensor.name for sensor in scenario.sensors]
-    rows = path.rows
-    for what, of_axis, sizes in (
-        ("bias", rows["noise"], consider.sensor_bias),
-        ("mounting", rows["h"], consider.mounting),
-    ):
+    across = [(i, j) for i in axes for j in axes if i != j]
+    entries = (
+        *(("scale factor", consider.scale_factor, turn_rate, f"{AXES[i]}", i, i) for i in axes),
+        *(("misalignment", consider.misalignment, turn_rate, f"{AXES[i]} of {AXES[j]}", i, j) for i, j in across),
+        *(
+            ("g-sensitivity", consider.g_sensitivity, force, f"{AXES[i]} of {AXES[j]}", i, j)
+            for i in axes
+            for j in axes
+        ),
+    )
+    columns = [
+        _Column(name=f"{what}, {where}", rate=sigma * driver[:, [j]] * unit[i])
+        for what, sigma, driver, where, i, j in entries
+        if sigma > 0.0
+    ]
+    names, rows = [sensor.name for sensor in scenario.sensors], path.rows
+
+    def of_sensor(name: str, what: str, error: Array) -> _Column:
+        return _Column(name=f"{name} {what}", rows=np.where(path.sensor == names.index(name), error, 0.0))
+
+    for what, of_axis, sizes in (("bias", rows.noise, consider.sensor_bias), ("mounting", rows.h, consider.mounting)):
         for name, size in sizes.items():
-            mine = path.sensor == names.index(name)
-            columns += [
-                _Column(name=f"{name} {what}, {AXES[i]}", rows=np.where(mine, size * of_axis[:, i], 0.0))
-                for i in range(3)
-            ]
+            columns += [of_sensor(name, f"{what}, {AXES[i]}", size * of_axis[:, i]) for i in axes]
     for name, size in consider.time_offset.items():
-        late = np.einsum("ri,ri->r", rows["h"], scenario.motion.body_rate(rows["time"])) + rows["moving"]
-        mine = path.sensor == names.index(name)
-        columns.append(_Column(name=f"{name} time offset", rows=np.where(mine, size * late, 0.0)))
+        late = np.einsum("ri,ri->r", rows.h, scenario.motion.body_rate(rows.time)) + rows.moving
+        columns.append(of_sensor(name, "time offset", size * late))
     return columns
 
 
@@ -809,7 +811,7 @@ def _propagated(
     place = np.full(len(columns), -1)
     place[with_rate] = np.arange(len(with_rate))
     column_rate = np.zeros((len(path.dt), len(with_rate), 3))
-    row_error = np.zeros((len(rows["time"]), len(columns)))
+    row_error = np.zeros((len(rows.time), len(columns)))
     for k, column in enumerate(columns):
         if column.rate is not None:
             column_rate[:, place[k]] = column.rate
@@ -818,6 +820,8 @@ def _propagated(
 
     stations = np.searchsorted(path.stamps, edges[path.kept])
     shapes = random.shaping()  # before the blocks are read
+    new_sample = np.concatenate([[False], np.diff(path.interval) > 0])
+    row_bounds = np.append(np.searchsorted(rows.time, path.stamps, side="left"), len(rows.time))
     out = covariance_loop.Outputs(
         stations=stations,
         blocks=np.empty((len(stations), len(random.names), 21)),
@@ -825,15 +829,9 @@ def _propagated(
         nis=np.zeros((sensors, 2)),
     )
     compiled(covariance_loop.run_covariance)(
-        covariance_loop.Path(path.dt, np.ascontiguousarray(path.phi), path.new_sample, path.row_bounds),
+        covariance_loop.Path(path.dt, np.ascontiguousarray(path.phi), new_sample, row_bounds),
         covariance_loop.Rows(
-            h=rows["h"],
-            noise=rows["noise"],
-            filter_variance=rows["filter_variance"],
-            variance=rows["variance"],
-            sensor=path.sensor,
-            time=rows["time"],
-            error=row_error,
+            rows.h, rows.noise, rows.filter_variance, rows.variance, path.sensor, rows.time, row_error
         ),
         covariance_loop.White(*(np.array(of) for of in (random.angle, random.rate, random.sensor, random.blocks))),
         shapes,

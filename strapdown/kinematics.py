@@ -7,13 +7,12 @@ velocity in body axes and ``w_f`` the same vector in fixed axes, rad/s, shapes (
 from __future__ import annotations
 
 import math
-from fractions import Fraction
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from strapdown import quaternion
-from strapdown.checks import Array, InputError, array
+from strapdown.checks import Array, array
 
 __all__ = [
     "body_quaternion_derivative",
@@ -173,26 +172,9 @@ def skew(v: ArrayLike) -> Array:
     return result
 
 
-# Series and closed form meet at θ² = 4, where the closed forms below have lost no more than two bits and the series have converged.
+# Series and closed form meet at θ² = 4, where the closed form has lost no more than two bits and the series has converged.
 _JOIN = 4.0
 _THIRD = np.array([(-1.0) ** k / math.factorial(2 * k + 3) for k in range(15)])
-
-
-def _bernoulli_coefficients(terms: int) -> Array:
-    """Return the Taylor coefficients of (1 − (θ/2) cot(θ/2))/θ² in θ²: |B₂ₖ|/(2k)!, k = 1, 2, …, from exact rationals."""
-    numbers = [Fraction(1)]
-    for m in range(1, 2 * terms + 1):
-        numbers.append(-sum((math.comb(m + 1, k) * numbers[k] for k in range(m)), Fraction(0)) / (m + 1))
-    return np.array([float(abs(numbers[2 * k]) / math.factorial(2 * k)) for k in range(1, terms + 1)])
-
-
-_INVERSE = _bernoulli_coefficients(20)
-
-
-def _joined(x: Array, coefficients: Array, closed_form: Array) -> Array:
-    return np.asarray(
-        np.where(x < _JOIN, np.polynomial.polynomial.polyval(np.minimum(x, _JOIN), coefficients), closed_form)
-    )
 
 
 def right_jacobian(rotation_vector: ArrayLike) -> Array:
@@ -205,25 +187,9 @@ def right_jacobian(rotation_vector: ArrayLike) -> Array:
     theta = np.linalg.norm(phi, axis=-1)
     x, safe = theta * theta, np.maximum(theta, math.sqrt(_JOIN))
     sinc_half = np.sinc(theta / (2.0 * math.pi))  # (1 − cos θ)/θ² = ½ sinc²(θ/2) loses no digits at any θ
-    third = _joined(x, _THIRD, (safe - np.sin(safe)) / safe**3)
+    series = np.polynomial.polynomial.polyval(np.minimum(x, _JOIN), _THIRD)
+    third = np.where(x < _JOIN, series, (safe - np.sin(safe)) / safe**3)
     cross = skew(phi)
     return np.asarray(
         np.eye(3) - (0.5 * sinc_half**2)[..., None, None] * cross + third[..., None, None] * (cross @ cross)
     )
-
-
-def inverse_right_jacobian(rotation_vector: ArrayLike) -> Array:
-    """Return J_r(φ)⁻¹ (..., 3, 3) of the Bortz equation φ̇ = J_r(φ)⁻¹ w_b, φ (..., 3), rad, shorter than 2π, where J_r is singular.
-
-    ``J_r⁻¹ = I + ½ [φ] + (1 − (θ/2) cot(θ/2))/θ² [φ]²`` (Solà et al. 2018, eq. (144); Bortz 1971, eq. (12)).
-    """
-    phi = array("rotation_vector", rotation_vector, (..., 3))
-    theta = np.linalg.norm(phi, axis=-1)
-    if np.any(theta >= 2.0 * math.pi):
-        raise InputError(
-            f"rotation_vector has length {np.max(theta):.6g} rad; J_r is singular at 2π: take log(exp(φ)) first"
-        )
-    x, safe = theta * theta, np.maximum(theta, math.sqrt(_JOIN))
-    factor = _joined(x, _INVERSE, (1.0 - 0.5 * safe / np.tan(0.5 * safe)) / safe**2)
-    cross = skew(phi)
-    return np.asarray(np.eye(3) + 0.5 * cross + factor[..., None, None] * (cross @ cross))

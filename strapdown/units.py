@@ -1,8 +1,11 @@
-"""Factors from the named unit to SI and radians: multiply on input, divide on output."""
+"""Factors from the named unit to SI and radians: multiply on input, divide on output; and the unit that a size is read best in."""
 
 from __future__ import annotations
 
 import math
+
+import numpy as np
+from numpy.typing import ArrayLike
 
 __all__ = [
     "ARCSECOND",
@@ -25,3 +28,15 @@ DEGREE_PER_HOUR_PER_ROOT_HOUR = DEGREE / 3600.0 / 60.0
 """rad/s/√s, the usual unit of rate random walk"""
 STANDARD_GRAVITY = 9.80665
 """m/s²"""
+
+
+def angle_unit(value: ArrayLike) -> tuple[str, float]:
+    """Return the name and size of the unit in which angles of this size (rad) are read best."""
+    typical = float(np.nanmax(np.abs(value), initial=0.0))
+    return ("arcsec", ARCSECOND) if typical < 0.05 * DEGREE else ("°", DEGREE)
+
+
+def rate_unit(value: ArrayLike) -> tuple[str, float]:
+    """Return the name and size of the unit in which rates of this size (rad/s) are read best."""
+    typical = float(np.nanmax(np.abs(value), initial=0.0))
+    return ("°/h", DEGREE_PER_HOUR) if typical < 0.1 * DEGREE else ("°/s", DEGREE)

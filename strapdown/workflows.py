@@ -407,7 +407,7 @@ def _record_setup(
         return setup
     if not isinstance(noise, ProcessNoise):
         spec = None if noise is None else _specification(noise)
-        return for_record.matched_setup(record, spec, states=states)
+        return setups.matched_to_record(record, spec, states=states)
     if initial is None:
         raise InputError(
             "noise is a ProcessNoise, which says nothing of the initial gyro bias; give initial= too, or a GyroSpec as noise"
@@ -558,7 +558,7 @@ def plan(
     if setup is not None and (states is not None or gyro is not None):
         raise InputError("a filter setup has its own states and gyro noise; leave states and gyro out")
     assumed = scenario if gyro is None else dataclasses.replace(scenario, gyro=gyro)
-    chosen = for_record.matched_to_scenario(assumed, states=states) if setup is None else setup
+    chosen = setups.matched(assumed, states=states) if setup is None else setup
     names = chosen.states.names if setup is None and chosen.states is not None else ()
     return montecarlo.Plan(
         scenario=scenario,
@@ -685,7 +685,7 @@ def tune(
     cases = []
     for one in given:
         if isinstance(one, ImuRecord):
-            setup = setup or for_record.matched_setup(one)
+            setup = setup or setups.matched_to_record(one, states=None)
             cases.append(tuning.record_case(one, setup))
         else:
             setup = setup or tuning.recording_setup()

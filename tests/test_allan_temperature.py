@@ -30,9 +30,10 @@ def test_what_is_put_in_comes_out():
     quiet = 1e-9 * np.random.default_rng(1).standard_normal((4000, 2))
     x = np.stack([0.3 + 2e-3 * t - 4e-5 * t**2, -1.0 - 1e-3 * t], axis=1) + quiet
     found = allan_temperature.fit_temperature(x, T, DT, order=2)
-    np.testing.assert_allclose(found.coefficients, [[0.3, 2e-3, -4e-5], [-1.0, -1e-3, 0.0]], atol=1e-9)
-    np.testing.assert_allclose(found.bias([T[0], T[-1]]), (x - quiet)[[0, -1]], atol=1e-8)
-    assert found.span == (T.min(), T.max())
+    polynomial = found.polynomial
+    np.testing.assert_allclose(polynomial.coefficients.T, [[0.3, 2e-3, -4e-5], [-1.0, -1e-3, 0.0]], atol=1e-9)
+    np.testing.assert_allclose(polynomial.bias([T[0], T[-1]]), (x - quiet)[[0, -1]], atol=1e-8)
+    assert polynomial.span == (T.min(), T.max())
     np.testing.assert_allclose(found.left, np.broadcast_to(x.mean(axis=0), x.shape), atol=1e-7)
 
 
@@ -42,14 +43,14 @@ def test_its_intervals_cover_where_plain_least_squares_would_not():
     T = warm_up(samples)
     x = 1e-3 * (T - T.mean())[:, None] + records(samples, runs, 5)
     found = allan_temperature.fit_temperature(x, T, DT, order=1)
-    inside = (found.lower[:, 1] <= 1e-3) & (found.upper[:, 1] >= 1e-3)
+    inside = np.abs(found.polynomial.coefficients[1] - 1e-3) <= found.reach[1]
     assert 64 <= inside.sum() <= 75
     A = np.stack([np.ones(samples), T - T.mean()], axis=1)
     plain, rest, *_ = np.linalg.lstsq(A, x, rcond=None)
     sigma = np.sqrt(rest / (samples - 2) / np.sum((T - T.mean()) ** 2))
     assert np.sum(np.abs(plain[1] - 1e-3) < 1.96 * sigma) < runs / 2
     # and it is nearer, for it knows where the noise is
-    assert np.std(found.coefficients[:, 1]) < np.std(plain[1])
+    assert np.std(found.polynomial.coefficients[1]) < np.std(plain[1])
 
 
 def test_the_noise_that_the_polynomial_took_is_put_back():
@@ -57,7 +58,7 @@ def test_the_noise_that_the_polynomial_took_is_put_back():
     T = warm_up(1500)
     x = 1e-3 * (T - T.mean())[:, None] + records(1500, 60, 5)
     found = allan_temperature.fit_temperature(x, T, DT, order=3)
-    assert 50 <= np.sum((found.lower[:, 1] <= 1e-3) & (found.upper[:, 1] >= 1e-3)) <= 60
+    assert 50 <= np.sum(np.abs(found.polynomial.coefficients[1] - 1e-3) <= found.reach[1]) <= 60
 
 
 @pytest.mark.parametrize(

@@ -274,10 +274,8 @@ def test_the_running_product_is_renormalised():
 def test_the_first_steps_of_a_matched_algorithm_have_no_correction():
     # Near the record's ends the step has another place in the window, for which the correction is not made.
     matched = ALGORITHMS["matched-4-11"]
-    pairs = exact.taylor_pairs(4, 11)
-    order = next(2 * n for n, c in enumerate(exact.residuals(exact.lag_sums(pairs), 4, 0, 30)) if c)
     zero = ((Fraction(0),) * 15,) * 15
-    plain = dataclasses.replace(matched, name="plain", correction=zero, drift_order=order)
+    plain = dataclasses.replace(matched, name="plain", correction=zero)
     increments = motion.Coning(angle=0.5, frequency=0.15).increments(np.arange(61.0))
     with_correction, without = (coning.rotation_vectors(increments, a) for a in (matched, plain))
     np.testing.assert_array_equal(with_correction[:3], without[:3])  # 11 samples of history are missing
@@ -513,7 +511,7 @@ def two_speed(samples):
         for i in range(m)
     )
     return coning.Algorithm(
-        name=f"two-speed-{samples}", solver="pairs", samples=samples, previous=1, order=3, drift_order=4, pairs=pairs
+        name=f"two-speed-{samples}", solver="pairs", samples=samples, previous=1, order=3, pairs=pairs
     )
 
 
@@ -559,7 +557,6 @@ def test_a_pair_table_over_a_window_keeps_its_order_up_to_both_ends(previous, fo
         previous=previous,
         following=following,
         order=4,
-        drift_order=2 * ((n + previous + following + 2) // 2),
         pairs=exact.taylor_pairs(n, previous, following),
     )
     for length in (n, n + 1, table.window, table.window + 1, 4 * table.window + 1):
@@ -602,19 +599,10 @@ def windows():
     for n, p, f in itertools.product((1, 2, 3), (0, 1, 2, 5), (0, 1, 3)):
         if f == 0:
             yield coning.algorithms.compressed(n, p)
-        drift = 2 * ((n + p + f) // 2) + 2
         taylor = exact.taylor_pairs(n, p, f)
-        if exact.residuals(exact.lag_sums(taylor), n, 0, drift // 2 + 1)[-1]:
-            yield coning.Algorithm(
-                name=f"pairs-{n}-{p}-{f}",
-                solver="pairs",
-                samples=n,
-                previous=p,
-                following=f,
-                order=3,
-                drift_order=drift,
-                pairs=taylor,
-            )
+        yield coning.Algorithm(
+            name=f"pairs-{n}-{p}-{f}", solver="pairs", samples=n, previous=p, following=f, order=3, pairs=taylor
+        )
         yield coning.algorithms.matched(n, p, f)
     yield from (
         ALGORITHMS[name] for name in ("magnus-4", "magnus-6", "commutator-free-4", "runge-kutta-4", "quaternion-euler")

@@ -54,7 +54,7 @@ def test_textbook_order_is_that_of_the_increments():
     np.testing.assert_allclose(vectors[2], c + 0.5 * np.cross(c, b) + 0.25 * np.cross(b, d), rtol=0, atol=2e-17)
 
 
-def test_derived_orders_are_those_that_the_catalogue_claims_and_checks():
+def test_derived_orders_are_those_of_the_catalogue():
     compared = 0
     for one in ALGORITHMS.values():
         if one.solver in ("compressed", "pairs") and not one.rate_points:

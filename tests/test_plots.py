@@ -421,10 +421,10 @@ def test_angles_are_named_with_their_sense():
 
 
 def test_angle_units_are_those_that_are_read_best():
-    assert style.angle_unit(np.array([1e-5]))[0] == "arcsec"
-    assert style.angle_unit(np.array([0.1, np.nan]))[0] == "°"
-    assert style.rate_unit(np.array([1e-6]))[0] == "°/h"
-    assert style.rate_unit(np.array([0.1]))[0] == "°/s"
+    assert units.angle_unit(np.array([1e-5]))[0] == "arcsec"
+    assert units.angle_unit(np.array([0.1, np.nan]))[0] == "°"
+    assert units.rate_unit(np.array([1e-6]))[0] == "°/h"
+    assert units.rate_unit(np.array([0.1]))[0] == "°/s"
 
 
 def test_axes_beside_each_other_are_in_one_unit(statistics):

@@ -167,7 +167,7 @@ def test_tune_gives_the_filter_states_for_what_the_record_specifies(run, tmp_pat
 def test_a_filter_with_states_and_a_gate_is_tuned_against_the_truth(run, tmp_path, scaled):
     first, out = tmp_path / "first.toml", tmp_path / "states.toml"
     file = recordfiles.read_record_file(scaled)
-    gated = dataclasses.replace(setup.matched_to_record(file.gyro, file.record, states=True), gate=Gate())
+    gated = dataclasses.replace(setup.matched_to_record(file.record, file.gyro, states=True), gate=Gate())
     first.write_text(setup.to_toml(gated), encoding="utf-8")
     given = ("tune", scaled, "--filter", first, "--free", "gyro.arw", "--starts", 1, "-o", out)
     status, said, complaint = run(*given, "--truth")
@@ -190,7 +190,7 @@ def test_optional_states_are_tuned_by_likelihoods_alone(run, tmp_path, scaled, o
 
 def test_the_plain_likelihood_refuses_a_filter_with_states(scaled):
     file = recordfiles.read_record_file(scaled)
-    chosen = setup.matched_to_record(file.gyro, file.record, states=True)
+    chosen = setup.matched_to_record(file.record, file.gyro, states=True)
     with pytest.raises(InputError, match=r"extended\.likelihood"):
         tuning.likelihood([tuning.record_case(file.record, chosen)], chosen, ["gyro.arw"])
 

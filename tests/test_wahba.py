@@ -67,42 +67,6 @@ def optimum(b: np.ndarray, r: np.ndarray, sigmas: np.ndarray) -> tuple[np.ndarra
         return np.where(q[0] < 0.0, -q, q), float(values[0] / 2)
 
 
-# ----------------------------------------------------------------------------------------------------------------------
-# TRIAD
-
-
-@pytest.mark.parametrize("shape", BATCHES)
-def test_triad_is_exact_for_exact_data(shape: tuple[int, ...]) -> None:
-    rng = np.random.default_rng(1)
-    for q in attitudes(rng):
-        r = geometry(rng, *shape, 2)
-        b = measured(np.broadcast_to(q, (*shape, 4)), r, 0.0, rng)
-        found = wahba.triad(3.0 * b[..., 0, :], b[..., 1, :], r[..., 0, :], 1e-3 * r[..., 1, :], sigmas=[1e-9, 1e-9])
-        assert found.shape == (*shape, 4)
-        assert np.max(quaternion.angle_between(found, np.broadcast_to(q, found.shape))) < 5e-15
-
-
-def test_triad_takes_one_reference_for_many_measurements() -> None:
-    rng = np.random.default_rng(2)
-    r = geometry(rng, 2)
-    q = quaternion.normalize(rng.standard_normal((6, 4)))
-    b = measured(q, np.broadcast_to(r, (6, 2, 3)), 0.0, rng)
-    found = wahba.triad(b[:, 0], b[:, 1], r[0], r[1], sigmas=[1e-6, 1e-6])
-    assert np.max(quaternion.angle_between(found, q)) < 5e-15
-
-
-def test_triad_meets_the_first_exactly_and_keeps_the_second_in_the_plane() -> None:
-    rng = np.random.default_rng(3)
-    r = geometry(rng, 50, 2)
-    b = measured(quaternion.normalize(rng.standard_normal((50, 4))), r, 0.1, rng)
-    q = wahba.triad(b[:, 0], b[:, 1], r[:, 0], r[:, 1])
-    first, second = quaternion.rotate(q, b[:, 0]), quaternion.rotate(q, b[:, 1])
-    np.testing.assert_allclose(first, r[:, 0], atol=2e-15)
-    assert np.max(np.abs(np.sum(second * np.cross(r[:, 0], r[:, 1]), axis=-1))) < 2e-15
-    assert np.min(np.sum(np.cross(first, second) * np.cross(r[:, 0], r[:, 1]), axis=-1)) > 0.0
-    assert np.max(quaternion.angle_between(wahba.triad(b[:, 1], b[:, 0], r[:, 1], r[:, 0]), q)) > 0.01
-
-
 def whiteness(error: np.ndarray, covariance: np.ndarray) -> None:
     """Sample covariance over covariance is I and the NEES χ²₃, both two-sided at about 1e-5."""
     n = len(error)
@@ -112,24 +76,6 @@ def whiteness(error: np.ndarray, covariance: np.ndarray) -> None:
     np.testing.assert_allclose(sample - np.diag(np.diag(sample)), 0.0, atol=4.5 / math.sqrt(n))
     low, high = chi2.ppf([5e-6, 1.0 - 5e-6], 3 * n) / n
     assert low < np.mean(np.sum(white**2, axis=-1)) < high
-
-
-@pytest.mark.parametrize("sigmas", [(1e-4, 1e-4), (1e-5, 3e-4), (3e-4, 1e-5)])
-@pytest.mark.parametrize("angle", [0.2, math.pi / 2, 2.5])
-def test_triad_covariance_by_monte_carlo(sigmas: tuple[float, float], angle: float) -> None:
-    rng = np.random.default_rng(4)
-    n = 20000
-    r = np.broadcast_to([[0.0, 0.6, 0.8], [math.sin(angle), 0.6 * math.cos(angle), 0.8 * math.cos(angle)]], (n, 2, 3))
-    q = quaternion.normalize(rng.standard_normal((n, 4)))
-    b = measured(q, r, np.array(sigmas), rng)
-    found = wahba.triad(b[:, 0], b[:, 1], r[:, 0], r[:, 1])
-    error = quaternion.log(quaternion.multiply(quaternion.conjugate(found), q))
-    # TRIAD's covariance (Shuster & Oh 1981).
-    (w1, w2), (s1, s2) = (b[:, 0, :, None], b[:, 1, :, None]), sigmas
-    outer, across = w1 @ w2.mT, np.cross(b[:, 0], b[:, 1])
-    terms = (w1.mT @ w2) * (outer + outer.mT)
-    square = np.sum(across**2, axis=-1)[:, None, None]
-    whiteness(error, s1**2 * np.eye(3) + ((s2**2 - s1**2) * w1 @ w1.mT + s1**2 * terms) / square)
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -443,17 +389,6 @@ def test_noise_as_given_is_not_refused() -> None:
     r = np.broadcast_to(geometry(rng, 4), (5000, 4, 3))
     sigmas = np.array([1e-4, 1e-3, 3e-3, 1e-2])
     wahba.solve(measured(quaternion.normalize(rng.standard_normal((5000, 4))), r, sigmas, rng), r, sigmas)
-
-
-def test_triad_refuses_what_it_cannot_use() -> None:
-    with pytest.raises(InputError, match=r"primary_b and secondary_b are 180° apart"):
-        wahba.triad(EYE[0], -EYE[0], EYE[0], EYE[1])
-    with pytest.raises(InputError, match=r"primary_f\[1\] and secondary_f\[1\] are 0° apart"):
-        wahba.triad(EYE[0], EYE[1], EYE[[0, 1]], EYE[[1, 1]])
-    with pytest.raises(InputError, match=r"90° apart in the body frame but 45°"):
-        wahba.triad(EYE[0], EYE[1], EYE[0], EYE[0] + EYE[1], sigmas=[1e-2, 1e-2])
-    with pytest.raises(InputError, match=r"secondary_b is the zero vector"):
-        wahba.triad(EYE[0], 0.0 * EYE[0], EYE[0], EYE[1])
 
 
 def test_heading_refuses_a_vertical_field_and_free_fall() -> None:

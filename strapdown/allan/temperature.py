@@ -13,15 +13,16 @@ Source: IEEE Std 952-1997, 12.11 (temperature sensitivity); the weights: as in :
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from strapdown import checks
-from strapdown.allan.deviation import TERMS
+from strapdown.allan.deviation import TERMS, confidence
 from strapdown.allan.spectrum import bin_starts, mean_power
 from strapdown.checks import Array, InputError
+from strapdown.gyro.temperature import BiasOverTemperature
 
 __all__ = [
     "TemperatureFit",
@@ -36,55 +37,22 @@ SMALLEST_SPAN = 0.5
 """Range of temperature, K, below which no regression is made."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class TemperatureFit:
+class TemperatureFit(NamedTuple):
     """A sensor's bias over temperature.
 
     Parameters
     ----------
-    reference : float
-        T_0, °C: the mean temperature of the record.
-    span : (float, float)
-        Lowest and highest temperature of the record, °C; the polynomial holds between them only.
-    coefficients : ndarray (axes, order + 1)
-        c of ``bias = Σ c_k (T − T_0)^k``, SI per K to the power k.
-    sigma : ndarray (axes, order + 1)
-        Standard deviations; NaN of c_0.
-    lower : ndarray (axes, order + 1)
-        Lower ends of the intervals.
-    upper : ndarray (axes, order + 1)
-        Upper ends of the intervals.
-    level : float
-        Confidence of the intervals.
+    polynomial : BiasOverTemperature
+        ``bias = Σ c_k (T − T_0)^k`` of each axis with its σ; T_0 is the mean temperature of the record.
+    reach : ndarray (order + 1, axes)
+        Half-width of the intervals of the coefficients; 0 of c_0, which has none.
     left : ndarray (n, axes)
         The record without its dependence on temperature, the mean kept.
     """
 
-    reference: float
-    span: tuple[float, float]
-    coefficients: Array
-    sigma: Array
-    lower: Array
-    upper: Array
-    level: float
+    polynomial: BiasOverTemperature
+    reach: Array
     left: Array
-
-    def bias(self, temperature: ArrayLike) -> Array:
-        """Return the bias at given temperatures.
-
-        Parameters
-        ----------
-        temperature : array_like (...)
-            Temperatures, °C.
-
-        Returns
-        -------
-        ndarray (..., axes)
-            Bias, SI.
-        """
-        T = checks.array("temperature", temperature, (...,)) - self.reference
-        powers = T[..., None] ** np.arange(self.coefficients.shape[1])
-        return np.asarray(powers @ self.coefficients.T)
 
 
 def fit_temperature(
@@ -120,8 +88,7 @@ def fit_temperature(
     dt = checks.positive("sample_interval", sample_interval, unit="s")
     T = checks.array("temperature", temperature, (len(x),))
     checks.count("order", order)
-    if not 0.5 < level < 1.0:
-        raise InputError(f"level is {level:g}; a confidence lies between 0.5 and 1, for example 0.95")
+    level = confidence(level)
     span = (float(T.min()), float(T.max()))
     if span[1] - span[0] < SMALLEST_SPAN:
         raise InputError(
@@ -131,24 +98,14 @@ def fit_temperature(
     powers = (T[:, None] - reference) ** np.arange(1, order + 1)
     from scipy.stats import norm
 
-    coefficients, sigma = np.full((x.shape[1], order + 1), np.nan), np.full((x.shape[1], order + 1), np.nan)
+    coefficients, sigma = np.zeros((2, order + 1, x.shape[1]))
     left = np.empty_like(x)
     for axis in range(x.shape[1]):
-        found, errors = _regression(x[:, axis], powers, dt)
-        coefficients[axis, 1:], sigma[axis, 1:] = found, errors
+        found, sigma[1:, axis] = _regression(x[:, axis], powers, dt)
         left[:, axis] = x[:, axis] - (powers - powers.mean(axis=0)) @ found
-        coefficients[axis, 0] = float(np.mean(x[:, axis] - powers @ found))
-    reach = float(norm.ppf(0.5 + 0.5 * level)) * sigma
-    return TemperatureFit(
-        reference=reference,
-        span=span,
-        coefficients=coefficients,
-        sigma=sigma,
-        lower=coefficients - reach,
-        upper=coefficients + reach,
-        level=level,
-        left=left,
-    )
+        coefficients[:, axis] = float(np.mean(x[:, axis] - powers @ found)), *found
+    polynomial = BiasOverTemperature(reference=reference, span=span, coefficients=coefficients, sigma=sigma)
+    return TemperatureFit(polynomial, float(norm.ppf(0.5 + 0.5 * level)) * sigma, left)
 
 
 def _regression(x: Array, powers: Array, dt: float) -> tuple[Array, Array]:

@@ -33,7 +33,7 @@ def filter_for(
     """Return the filter, and what to say of it: of a file, or matched to the gyro's specification and the record's sensors."""
     from strapdown import setup
     from strapdown.gyro import read_spec
-    from strapdown.setup.for_record import matched_setup, unmodelled_errors
+    from strapdown.setup.for_record import unmodelled_errors
 
     with reading.from_file(path):
         record = held.with_origin(str(path))
@@ -48,7 +48,7 @@ def filter_for(
     spec = None if gyro is None else read_spec(gyro)
     if spec is None and held.gyro is None:
         raise InputError(f"{path} does not hold the gyro's specification; give --gyro or --filter, a TOML file")
-    chosen = matched_setup(record, spec, states=True if states == () else states)
+    chosen = setup.matched_to_record(record, spec, states=True if states == () else states)
     missing = unmodelled_errors(record, chosen)
     if states is False or (states is None and chosen.states is None):
         return chosen, no_state_words(missing, chosen)

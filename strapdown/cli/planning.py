@@ -19,8 +19,7 @@ from strapdown.cli.terminal import (
     console,
     progress_bar,
     scenario_named,
-    show,
-    table,
+    show_listing,
     tables_folder,
     tables_written,
     writable,
@@ -137,69 +136,21 @@ def covariance(
             epochs=epochs,
         )
     name = chosen.name or Path(scenario).stem
-    _print_result(name, found, modelled.integration.name, matched=filter_file is None)
+    what = "the filter given" if filter_file else "the filter that matches it"
+    console.print(f"{name}, {what}, integration {modelled.integration.name}.\n")
+    listing = found.listing()
+    show_listing(listing, f"{listing.title}, RMS")
+    for note in listing.notes:
+        console.print(note)
     missing = setup.unmodelled_errors(chosen.gyro, chosen.sensors, modelled.states, gravity_f=chosen.gravity_f)
     if missing and filter_file is None:
         console.print(
-            f"This is the filter of attitude and bias alone. `estimate` and `montecarlo` by default add states for {', '.join(missing)}.\n"
+            f"This is the filter of attitude and bias alone. `estimate` and `montecarlo` by default add states for {', '.join(missing)}."
         )
     write_json(out / "covariance.json", _summary(name, found))
     title = f"{name}: predicted errors, without a Monte Carlo"
     figures = save_as({out / "budget": plots.error_budget(found, title=title)}, form)
     written(out / "covariance.json", *figures, *tables_written(tables, "covariance", found.budget()))
-
-
-def _print_result(name: str, found: Any, integration: str, *, matched: bool) -> None:
-
-    from strapdown.covariance import LARGEST_LINEAR
-    from strapdown.plots.style import angle_unit, rate_unit
-
-    rms, sigma = found.rms[-1], found.filter_sigma[-1]
-    unit, size = angle_unit(np.concatenate([rms[:3], sigma[:3]]))
-    rate_name, rate = rate_unit(np.concatenate([rms[3:], sigma[3:]]))
-    what = "the filter that matches it" if matched else "the filter given"
-    console.print(f"{name}, {what}, integration {integration}; errors at {found.time[-1]:g} s, RMS of an axis.\n")
-    rows = table("Error budget", "source", "kind", f"attitude\n{unit}", f"bias\n{rate_name}", left=2)
-    budget = sorted(found.budget(), key=lambda row: -row[2])
-    for source, kind, attitude, bias in budget:
-        rows.add_row(source, kind, f"{attitude / size:.3g}", f"{bias / rate:.3g}")
-
-    def mean(values: Any) -> float:
-        return float(np.sqrt(np.mean(np.square(values))))
-
-    rows.add_section()
-    rows.add_row("actual error", "all", f"{mean(rms[:3]) / size:.3g}", f"{mean(rms[3:]) / rate:.3g}")
-    rows.add_row("the filter's own σ", "", f"{mean(sigma[:3]) / size:.3g}", f"{mean(sigma[3:]) / rate:.3g}")
-    show(rows)
-    console.print(
-        "random: squares add. fixed: the same in every run, adds as an error. considered: 1σ of an error that neither the scenario nor the "
-        "filter has.\n"
-    )
-    state, attitude, bias = found.expected_nees[-1]
-    nis = ", ".join(f"{sensor} {value:.3g}" for sensor, value in found.expected_nis.items())
-    console.print(
-        f"Expected NEES per state: {state:.3g} (attitude {attitude:.3g}, bias {bias:.3g}); NIS: {nis or 'none'}."
-    )
-    largest = float(np.max(np.concatenate([rms[:3], sigma[:3]])))
-    if largest > LARGEST_LINEAR:
-        console.print(
-            f"With an attitude error of {largest / DEGREE:.3g}° the analysis, linear about the truth, cannot tell whether the filter "
-            "will be consistent."
-        )
-    elif max(attitude, bias) > 1.1:
-        worst = "bias" if bias > attitude else "attitude"
-        console.print(
-            f"The filter will be optimistic in {worst}: its errors will be {np.sqrt(max(attitude, bias)):.3g} times its σ."
-        )
-    elif min(attitude, bias) < 0.9:
-        console.print("The filter will be pessimistic: its σ will be larger than its errors.")
-    else:
-        console.print("The filter will be consistent.")
-    if found.left_out:
-        console.print(f"Left out: {', '.join(found.left_out)}.")
-    for one in found.beyond_linear:
-        console.print(f"Beyond linear: {one}; take a Monte Carlo (`strapdown montecarlo`).")
-    console.print("")
 
 
 def _summary(name: str, found: Any) -> dict[str, Any]:

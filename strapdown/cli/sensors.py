@@ -295,7 +295,7 @@ def _regressed(recording: Path, sensor: str, source: GyroSamples, order: int, ou
     import tomli_w
 
     from strapdown.allan import temperature as allan_temperature
-    from strapdown.gyro.temperature import STEM, BiasOverTemperature, to_table
+    from strapdown.gyro.temperature import STEM, to_table
 
     if source.temperature is None:
         raise InputError("no temperature is recorded; leave --temperature out")
@@ -307,18 +307,22 @@ def _regressed(recording: Path, sensor: str, source: GyroSamples, order: int, ou
     )
     unit = {"gyro": "rad/s", "accelerometer": "m/s2", "magnetometer": "T"}[sensor]
     stem = {"gyro": STEM, "accelerometer": "m_per_s2", "magnetometer": "t"}[sensor]
+    found = fit.polynomial
     listing = table(
-        f"Bias over temperature, T − {fit.reference:.3f} °C", "axis", "power", "unit", "estimate", "from", "to", left=3
+        f"Bias over temperature, T − {found.reference:.3f} °C",
+        "axis",
+        "power",
+        "unit",
+        "estimate",
+        "from",
+        "to",
+        left=3,
     )
-    for k in range(order + 1):
-        for axis in range(len(fit.coefficients)):
-            ends = (f"{fit.lower[axis, k]:.4g}", f"{fit.upper[axis, k]:.4g}") if k else ("", "")
-            said = f"{unit}/K{k if k > 1 else ''}" if k else unit
-            listing.add_row("xyz"[axis], str(k), said, f"{fit.coefficients[axis, k]:.4g}", *ends)
+    for (k, axis), value in np.ndenumerate(found.coefficients):
+        ends = (value - fit.reach[k, axis], value + fit.reach[k, axis]) if k else ()
+        said = f"{unit}/K{k if k > 1 else ''}" if k else unit
+        listing.add_row("xyz"[axis], str(k), said, *(f"{one:.4g}" for one in (value, *ends)))
     show(listing)
-    found = BiasOverTemperature(
-        reference=fit.reference, span=fit.span, coefficients=fit.coefficients.T, sigma=fit.sigma.T
-    )
     paths.append(out / _names(sensor)[3])
     with written_beside(paths[-1]) as temporary:
         text = _commented(

@@ -23,6 +23,7 @@ from strapdown.cli.terminal import (
     need_own,
     progress_bar,
     show,
+    show_listing,
     table,
     tables_folder,
     tables_written,
@@ -30,6 +31,7 @@ from strapdown.cli.terminal import (
     written,
 )
 from strapdown.files import plain, write_json, written_beside
+from strapdown.results import figure
 from strapdown.units import DEGREE
 
 if TYPE_CHECKING:
@@ -37,11 +39,10 @@ if TYPE_CHECKING:
 
     from strapdown.gyro import GyroSpec
     from strapdown.records import ImuRecord
+    from strapdown.results import Listing
     from strapdown.scenarios import Scenario
     from strapdown.setup import FilterSetup
-    from strapdown.tuning import Case, Comparison, Performance, Plan, TunedGate, Tuning, Unmodelled
-    from strapdown.tuning.fitting import Estimated
-    from strapdown.tuning.parameters import Unit
+    from strapdown.tuning import Case, Comparison, Performance, TunedGate, Tuning, Unmodelled
 
 
 FIGURES = ("likelihood", "heldout")
@@ -234,15 +235,14 @@ def tune(
             "and --truth tunes the filter as it runs."
         )
     found = _tuned(cases, before, gyros, start, goal, search, workers)
-    records_used = [case.record for case in cases]
-    _print_result(found.result, records_used)
+    _print_listing(found.result.listing())
     if found.gate is not None:
         _print_gate(found.gate)
     for sentence in () if found.worst is None else found.worst.words:
         console.print(sentence)
     if found.comparison is not None:
         _print_comparison(found.comparison, truth=goal.truth or goal.rmse)
-    _write(found, records_used, records, goal.name, output)
+    _write(found, records, goal.name, output)
 
 
 def _tuned(
@@ -380,54 +380,10 @@ def _cases(
     return cases, chosen, gyros
 
 
-def _unit_of(name: str, records: Sequence[ImuRecord]) -> Unit:
-    """Return the unit that a parameter is printed in, of the filter or of its optional states."""
-    from strapdown import tuning
-    from strapdown.tuning import extended
-
-    plain = name in tuning.known_names(records) or tuning.axis_of(name) is not None
-    return tuning.unit_of(name, records) if plain else extended.unit_of(name)
-
-
-def _figure(value: float) -> str:
-    return f"{value:.3g}" if math.isfinite(value) else "∞"
-
-
-def _note(one: Estimated, unit: Unit) -> str:
-    """Return how well a parameter is known, in the unit that it is printed in."""
-    if one.identified or "prior" in one.note:
-        return one.note
-    if not math.isfinite(one.upper):
-        return "not identified: these records say nothing of it"
-    return f"not identified: at most {_figure(one.upper / unit.factor)} {unit.name} (95 %)"
-
-
-def _print_result(result: Tuning, records: Sequence[ImuRecord]) -> None:
-    rows = table("Tuned, with 95 % intervals", "parameter", "unit", "before", "after", "from", "to", "", left=2)
-    for one in result.parameters:
-        unit = _unit_of(one.name, records)
-        values = [value / unit.factor for value in (one.start, one.value, one.lower, one.upper)]
-        rows.add_row(one.name, unit.name, *(_figure(value) for value in values), _note(one, unit))
-    show(rows)
-    gain = result.before - result.after
-    console.print(
-        f"{result.agreeing} of {len(result.starts)} searches ended at the best point; log-likelihood + {gain:.4g}."
-    )
-    if not all(one.identified for one in result.parameters):
-        console.print(
-            "Of a parameter that is not identified these records give an upper bound alone; the filter uses the value in the column "
-            "“after”, the mean below that bound. --prior gives it a prior instead."
-        )
-    if result.misfit and result.parameters[0].name == "filter.scale":
-        console.print(
-            "The innovations are not those of any such filter: disturbances last over many samples, or change. A common scale leaves the "
-            "estimates as they are; it makes σ right on the whole, not at each time."
-        )
-    elif result.misfit:
-        console.print(
-            "The innovations are not those of any such filter: disturbances last over many samples, or change. The most likely filter may "
-            "follow them and estimate worse. Tune filter.scale alone, or against a truth (--truth, --rmse), or try --spacing."
-        )
+def _print_listing(listing: Listing) -> None:
+    show_listing(listing, listing.title)
+    for note in listing.notes:
+        console.print(note)
 
 
 def _print_gate(found: TunedGate) -> None:
@@ -445,8 +401,8 @@ def _print_gate(found: TunedGate) -> None:
 def _anees(one: Performance) -> str:
     """Return the ANEES as a table shows it: of attitude and bias, or where only the attitude is known of that."""
     if math.isfinite(one.anees):
-        return _figure(one.anees)
-    return f"{_figure(float(np.nanmean(one.nees[0].mean)))} (attitude)" if one.nees else "-"
+        return figure(one.anees, 3)
+    return f"{figure(float(np.nanmean(one.nees[0].mean)), 3)} (attitude)" if one.nees else "-"
 
 
 def _print_comparison(comparison: Comparison, *, truth: bool) -> None:
@@ -466,7 +422,7 @@ def _print_comparison(comparison: Comparison, *, truth: bool) -> None:
             f"{one.nis:.3f}",
             f"{one.nis_bounds[0]:.3f} to {one.nis_bounds[1]:.3f}",
             _anees(one),
-            _figure(one.attitude_rms / DEGREE) if math.isfinite(one.attitude_rms) else "-",
+            figure(one.attitude_rms / DEGREE, 3),
             answer,
         )
     show(listing)
@@ -480,7 +436,7 @@ def _print_comparison(comparison: Comparison, *, truth: bool) -> None:
         console.print("On the data held out the attitude error has grown: keep the filter before.")
 
 
-def _write(found: _Found, records: Sequence[ImuRecord], paths: Sequence[Path], of: str, output: _Output) -> None:
+def _write(found: _Found, paths: Sequence[Path], of: str, output: _Output) -> None:
     from strapdown import tuning
     from strapdown.plots import tuning as drawing
     from strapdown.plots.style import save_as
@@ -495,12 +451,11 @@ def _write(found: _Found, records: Sequence[ImuRecord], paths: Sequence[Path], o
         for other in FigureFormat:
             place.with_suffix(f".{other}").unlink(missing_ok=True)
     report = out.with_suffix(".json")
-    units = [_unit_of(name, records) for name in found.objective.names]
-    content = _report(found, [_unit_of(one.name, records) for one in result.parameters], paths, of)
+    content = _report(found, paths, of)
     write_json(report, content)
     answer, reason, _ = tunings.verdict(content)
     console.print(f"{answer}: {reason}.")
-    figures = {places["likelihood"]: drawing.likelihood_slices(tuning.slices(found.objective, result), result, units)}
+    figures = {places["likelihood"]: drawing.likelihood_slices(tuning.slices(found.objective, result), result)}
     if found.comparison is not None:
         figures[places["heldout"]] = drawing.before_and_after(
             found.comparison, title="The first record, on what was held out"
@@ -508,18 +463,13 @@ def _write(found: _Found, records: Sequence[ImuRecord], paths: Sequence[Path], o
     written(out, report, *save_as(figures, output.form), *tables_written(output.tables, "tuning", content))
 
 
-def _report(found: _Found, units: Sequence[Unit], paths: Sequence[Path], of: str) -> dict[str, Any]:
+def _report(found: _Found, paths: Sequence[Path], of: str) -> dict[str, Any]:
     result, gate, comparison = found.result, found.gate, found.comparison
     content: dict[str, Any] = {
         "records": [path.name for path in paths],
         "parameters": [
-            {
-                **vars(one),
-                "note": _note(one, unit),
-                "unit": unit.name,
-                "si_per_unit": unit.factor,
-            }
-            for one, unit in zip(result.parameters, units, strict=True)
+            {**vars(one), "note": one.words, "unit": one.unit.name, "si_per_unit": one.unit.factor}
+            for one in result.parameters
         ],
         "units": "SI: rad, s, and the units of whole vectors; pages and tables give each in its unit, si_per_unit of it",
         "objective": {"name": of, "before": result.before, "after": result.after},
@@ -567,7 +517,7 @@ def _plan(
         found = tuning.plan(
             scenario, modelled, wanted, lengths=lengths or [scenario.duration], threads=threads, progress=advance
         )
-    _print_plan(found, [example])
+    _print_listing(found.listing())
 
 
 def _scenario_of(path: Path) -> Scenario:
@@ -585,23 +535,3 @@ def _numbers(text: str) -> list[float]:
         return [float(part) for part in text.split(",")]
     except ValueError:
         raise InputError(f"--length is {text!r}; it must be seconds with commas, as in 600,1800") from None
-
-
-def _print_plan(found: Plan, records: Sequence[ImuRecord]) -> None:
-    columns = [f"{length:g} s" for length in found.lengths]
-    listing = table(
-        "Least standard error, as a factor (Cramér–Rao)", "parameter", "unit", "value", *columns, "10 % needs", left=2
-    )
-    for j, name in enumerate(found.names):
-        unit = _unit_of(name, records)
-        listing.add_row(
-            name,
-            unit.name,
-            _figure(found.values[j] / unit.factor),
-            *(f"× {math.exp(error):.3f}" if error < 2.0 else "nothing" for error in found.errors[:, j]),
-            f"{found.needed()[j]:.3g} s",
-        )
-    show(listing)
-    console.print(
-        "Above about × 1.5 a record gives a bound rather than a value. The last column lets information grow as at the end."
-    )

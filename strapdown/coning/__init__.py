@@ -1,4 +1,4 @@
-"""Strapdown integration of gyro samples: algorithms as frozen tables that check their own order conditions, one accumulator for all.
+"""Strapdown integration of gyro samples: algorithms as frozen tables whose drift is derived exactly, one accumulator for all.
 
 An increment Δθ is the integral of the body rate over one sample interval. A step combines N of them, and perhaps p before and f
 after, into its rotation δq; attitude advances by ``q ← q ⊗ δq``, the solution of equation (17) of *Quaternion differentiation*.

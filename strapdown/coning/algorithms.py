@@ -1,4 +1,4 @@
-"""The algorithms: frozen tables that are rejected on construction if their order conditions fail, and the catalogue of all of them."""
+"""The algorithms: frozen tables whose drift under small coning follows exactly, and the catalogue of all of them."""
 
 from __future__ import annotations
 
@@ -50,9 +50,7 @@ def pair_tables(samples: int, window: int, own: Mapping[int, Table]) -> Array:
 
 @dataclass(frozen=True, kw_only=True)
 class Algorithm:
-    """An integration algorithm as a table; refuses to be made if the drift order it claims is not the one its coefficients have.
-
-    The claim is checked exactly, in rationals: the power series of the drift under small coning must begin at λ^``drift_order``.
+    """An integration algorithm as a table; the drift under small coning follows from it in exact rationals.
 
     Parameters
     ----------
@@ -70,8 +68,6 @@ class Algorithm:
         Rate samples in the quadrature that forms one increment; 0 where the algorithm takes true increments.
     order : int
         Global order of convergence on any smooth motion, with all increments exact.
-    drift_order : int
-        Even power of λ with which the drift under small coning falls.
     coefficients : tuple of Fraction, default empty
         Of the compressed solver: k_1 … k_{N−1+p} in φ = Σ Δθ_i + (Σ_j k_j Δθ_{N−j}) × Δθ_N.
     pairs : tuple of tuples of Fraction, default empty
@@ -89,25 +85,22 @@ class Algorithm:
     following: int = 0
     rate_points: int = 0
     order: int
-    drift_order: int
     coefficients: Rationals = field(default=(), repr=False)
     pairs: Table = field(default=(), repr=False)
     correction: Table = field(default=(), repr=False)
     source: str = ""
 
     def __post_init__(self) -> None:
-        """Check shapes and order conditions."""
+        """Check shapes and solver."""
         checks.one_of(f"{self.name}: solver", self.solver, SOLVERS)
-        for what in ("samples", "order", "drift_order"):
+        for what in ("samples", "order"):
             checks.count(f"{self.name}: {what}", getattr(self, what))
         for what in ("previous", "following", "rate_points"):
             checks.count(f"{self.name}: {what}", getattr(self, what), least=0)
-        for what in ("drift_order", "rate_points"):
-            if getattr(self, what) % 2:
-                raise InputError(f"{self.name}: {what} is {getattr(self, what)}; it must be even")
+        if self.rate_points % 2:
+            raise InputError(f"{self.name}: rate_points is {self.rate_points}; it must be even")
         self._check_window()
         self._check_tables()
-        self._check_drift()
 
     def _check_window(self) -> None:
         if self.solver == "compressed" and self.following:
@@ -145,16 +138,6 @@ class Algorithm:
             raise InputError(
                 f"{self.name}: the table {own} is not antisymmetric; Δθ_i × Δθ_j changes sign with its order"
             )
-
-    def _check_drift(self) -> None:
-        series = self._drift_series(self.drift_order // 2 + 1)
-        bad = next((n for n, c in enumerate(series[:-1]) if c != 0), None)
-        if bad is not None:
-            raise InputError(
-                f"{self.name}: the drift begins at λ^{2 * bad}, not λ^{self.drift_order}; derive the table anew"
-            )
-        if series[-1] == 0:
-            raise InputError(f"{self.name}: the drift at λ^{self.drift_order} is zero; claim a higher drift_order")
 
     @classmethod
     def from_coefficients(
@@ -201,7 +184,7 @@ class Algorithm:
             previous=previous,
             coefficients=own,
             source=source,
-            **_derived(name, table, samples, previous),
+            order=exact.second_order(table, samples, previous),
         )
 
     @classmethod
@@ -264,7 +247,7 @@ class Algorithm:
             following=following,
             pairs=pairs,
             source=source,
-            **_derived(name, pairs, samples, previous),
+            order=exact.second_order(pairs, samples, previous),
         )
 
     @classmethod
@@ -397,9 +380,20 @@ class Algorithm:
         return exact.lag_sums(self.products)
 
     @functools.cached_property
+    def _leading_drift(self) -> tuple[int, Fraction]:
+        # M − 1 lag sums satisfy at most as many conditions, so the drift begins at λ^{2M} at the latest.
+        series = self._drift_series(self.window + 1)
+        return next((2 * n, c) for n, c in enumerate(series) if c)
+
+    @property
+    def drift_order(self) -> int:
+        """Even power of λ with which the drift under small coning falls."""
+        return self._leading_drift[0]
+
+    @property
     def drift_constant(self) -> Fraction:
         """C of the leading drift −C β² ω λ^``drift_order``; for N + p samples, compressed, (M!)²/(2(2M+1)!)."""
-        return -self._drift_series(self.drift_order // 2 + 1)[-1]
+        return -self._leading_drift[1]
 
     # The kernels' forms of the tables, kept with them: hashing hundreds of fractions for a cache costs more than a short record.
 
@@ -438,16 +432,6 @@ def _rationals(place: str, values: Iterable[Coefficient]) -> Rationals:
                 f'{place}[{k}] is {value!r}; give a number, a fraction in quotes such as "27/20", or fractions.Fraction'
             ) from None
     return tuple(found)
-
-
-def _derived(name: str, table: Table, samples: int, previous: int) -> dict[str, Any]:
-    """Return the orders of a pair table: of convergence, and of the drift under small coning."""
-    # M − 1 lag sums satisfy at most as many conditions, so the drift begins at λ^{2M} at the latest.
-    series = exact.residuals(exact.lag_sums(table), samples, 0, len(table) + 1)
-    first = next((n for n, c in enumerate(series) if c != 0), None)
-    if not first:
-        raise InputError(f"{name}: the drift has no order; check the coefficients")
-    return {"order": exact.second_order(table, samples, previous), "drift_order": 2 * first}
 
 
 def read_algorithms(path: str | os.PathLike[str]) -> tuple[Algorithm, ...]:
@@ -522,7 +506,6 @@ def compressed(samples: int, previous: int = 0, rate_points: int = 0) -> Algorit
         # One lag-symmetric cross product serves coning; for a general motion it is exact for linear rates only, and two samples alone
         # are symmetric enough to gain an order.
         order=2 if m == 1 or rate_points == 2 else 4 if (samples, previous) == (2, 0) else 3,
-        drift_order=2 * m,
         coefficients=table,
         source="this package, from rate samples" if rate_points else "Miller 1983; Ignagni 1996; Savage 2010",
     )
@@ -535,7 +518,6 @@ def uncompressed_taylor(samples: int) -> Algorithm:
         solver="pairs",
         samples=samples,
         order=4,
-        drift_order=_fitted_order(samples),
         pairs=exact.taylor_pairs(samples),
         source="Jordan 1969; Savage 1998; Song 2013",
     )
@@ -548,7 +530,6 @@ def uncompressed_optimal(samples: int) -> Algorithm:
         solver="pairs",
         samples=samples,
         order=4,
-        drift_order=2 * samples,
         pairs=exact.sum_of_tables(exact.taylor_pairs(samples), exact.matched_correction(samples)),
         source="Song 2013, with the freedom used as in matched_correction",
     )
@@ -561,7 +542,6 @@ def polynomial(samples: int) -> Algorithm:
         solver="polynomial",
         samples=samples,
         order=_fitted_order(samples),
-        drift_order=_fitted_order(samples),
         correction=((Fraction(0),) * samples,) * samples,
         source="Wu 2018 (RodFIter, QuatFIter); Yan 2017 (Picard)",
     )
@@ -577,7 +557,6 @@ def matched(samples: int, previous: int, following: int = 0) -> Algorithm:
         previous=previous,
         following=following,
         order=_fitted_order(m) if previous == following else m + 1,
-        drift_order=2 * m,
         correction=exact.matched_correction(samples, previous, following),
         source="this package",
     )
@@ -585,7 +564,7 @@ def matched(samples: int, previous: int, following: int = 0) -> Algorithm:
 
 def scheme(name: str, solver: str, samples: int, order: int, source: str) -> Algorithm:
     """Return an integrator of the quaternion equation for smooth rates, on the rate polynomial through the N increments of a step."""
-    return Algorithm(name=name, solver=solver, samples=samples, order=order, drift_order=order, source=source)
+    return Algorithm(name=name, solver=solver, samples=samples, order=order, source=source)
 
 
 _SCHEMES = {
@@ -599,7 +578,7 @@ _SCHEMES = {
     # q + ½ q ⊗ Δθ, normalised: that of many small projects.
     "quaternion-euler": ("euler", 1, 2, "Euler 1768"),
 }
-"""Solver, samples, order (of the drift too) and source of each."""
+"""Solver, samples, order and source of each."""
 
 
 def _fitted_order(samples: int) -> int:

@@ -14,12 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from strapdown.checks import Array, InputError, unit_quaternions
-from strapdown.consistency.bounds import (
-    log_mean_bounds,
-    mean_bounds,
-    mean_p_value,
-    tail,
-)
+from strapdown.consistency.bounds import log_mean_bounds, mean_bounds, mean_p_value, tail
 from strapdown.consistency.manifold import SUBSETS, errors, nees
 from strapdown.consistency.timeaverage import time_average
 from strapdown.consistency.whiteness import (
@@ -314,58 +309,44 @@ def _bounded(
     return replace(judged, verdict="consistent" if errors_judged else "cannot tell", reason=reason, power=())
 
 
+def ratio(name: str, of: str, mean: float, degrees: int, samples: float, means: str) -> Finding:
+    """Return the finding of a mean of χ² values per degree of freedom, of which ``samples`` are independent."""
+    p = mean_p_value(mean, degrees, max(samples, 1.0))
+    return Finding(name=name, of=of, value=mean, p_value=p, samples=samples, degrees=degrees, means=means)
+
+
 def _of_sensor(sensor: str, white: Array, nis: Array) -> list[Finding]:
     samples, degrees = white.shape
     if samples == 0:
         return []
     mean = float(nis.mean() / degrees)
-    findings = [
-        Finding(
-            name="NIS",
-            of=sensor,
-            value=mean,
-            p_value=mean_p_value(mean, degrees, samples),
-            samples=samples,
-            degrees=degrees,
-            means=innovation_words(sensor, mean),
-        )
-    ]
+    size = ratio("NIS", sensor, mean, degrees, samples, innovation_words(sensor, mean))
     if samples < MIN_SAMPLES:
-        return findings
-    statistic, number, p = ljung_box(white)
-    findings.append(
-        Finding(
-            name="whiteness",
-            of=sensor,
-            value=statistic / number,
-            p_value=p,
-            samples=samples,
-            means=f"innovations of {sensor} are correlated in time: they hold what the filter could have known",
-        )
+        return [size]
+    statistic, number, p_white = ljung_box(white)
+    square, p_normal = anderson_darling(white)
+    mean_vector, p_mean = mean_innovation_p_value(white)
+    off = float(np.linalg.norm(mean_vector))
+    which = f"innovations of {sensor} are"
+    shape = (
+        (
+            "whiteness",
+            statistic / number,
+            p_white,
+            f"{which} correlated in time: they hold what the filter could have known",
+        ),
+        (
+            "normality",
+            square,
+            p_normal,
+            f"{which} not normal: outliers, or noise that is not what the filter takes it for",
+        ),
+        ("mean innovation", off, p_mean, f"the mean innovation of {sensor} is not zero ({off:.3g} σ)"),
     )
-    statistic, p = anderson_darling(white)
-    findings.append(
-        Finding(
-            name="normality",
-            of=sensor,
-            value=statistic,
-            p_value=p,
-            samples=samples,
-            means=f"innovations of {sensor} are not normal: outliers, or noise that is not what the filter takes it for",
-        )
-    )
-    mean_vector, p = mean_innovation_p_value(white)
-    findings.append(
-        Finding(
-            name="mean innovation",
-            of=sensor,
-            value=float(np.linalg.norm(mean_vector)),
-            p_value=p,
-            samples=samples,
-            means=f"the mean innovation of {sensor} is not zero ({np.linalg.norm(mean_vector):.3g} σ)",
-        )
-    )
-    return findings
+    return [
+        size,
+        *(Finding(name=n, of=sensor, value=x, p_value=p, samples=samples, means=means) for n, x, p, means in shape),
+    ]
 
 
 def innovation_words(sensor: str, mean: float) -> str:
@@ -427,17 +408,8 @@ def _of_errors(estimate: Estimate, truth: Truth, limits: list[str], beside: Sequ
         if max(states) >= known:
             continue
         value = float(nees(e[-1], P[-1], states)) / len(states)
-        found.append(
-            Finding(
-                name="NEES at the end",
-                of=subset,
-                value=value,
-                p_value=mean_p_value(value, len(states), 1),
-                samples=1,
-                degrees=len(states),
-                means=error_words(f"the {subset} error at the end", value),
-            )
-        )
+        words = error_words(f"the {subset} error at the end", value)
+        found.append(ratio("NEES at the end", subset, value, len(states), 1, words))
         if len(e) < FEWEST_TO_AVERAGE:
             continue
         if _averages(subset, beside):
@@ -475,17 +447,8 @@ def _over_the_run(subset: str, e: Array, P: Array, states: tuple[int, ...], limi
             f"the {subset} error changes too slowly for this run to average over: {average.effective:.3g} effective samples"
         )
         return []
-    return [
-        Finding(
-            name="time-averaged NEES",
-            of=subset,
-            value=average.mean,
-            p_value=average.p_value,
-            samples=average.effective,
-            degrees=len(states),
-            means=error_words(f"the {subset} error over the run", average.mean),
-        )
-    ]
+    words = error_words(f"the {subset} error over the run", average.mean)
+    return [ratio("time-averaged NEES", subset, average.mean, len(states), average.effective, words)]
 
 
 def _averages(subset: str, beside: Sequence[str]) -> bool:

@@ -3,19 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
-from strapdown.checks import Array
-from strapdown.consistency.bounds import (
-    Verdict,
-    coverage_p_values,
-    log_mean_p_value,
-    mean_p_value,
-    tail,
-)
+from strapdown.consistency.bounds import coverage_p_values, log_mean_p_value, tail
 from strapdown.consistency.judgement import (
     LOG_NEES,
     STATES,
@@ -24,60 +16,13 @@ from strapdown.consistency.judgement import (
     concluded,
     error_words,
     innovation_words,
+    ratio,
     state_name,
 )
 from strapdown.consistency.manifold import SUBSETS
 
-
-class RunStatistics(Protocol):
-    """Statistics that :func:`judge_runs` needs: sums over independent runs at each epoch."""
-
-    @property
-    def runs(self) -> int:
-        """Number of independent runs."""
-
-    @property
-    def time(self) -> Array:
-        """Times of the epochs (m,), s."""
-
-    @property
-    def finite(self) -> NDArray[np.int64]:
-        """Runs whose errors and covariance are finite, by epoch (m,)."""
-
-    @property
-    def subsets(self) -> tuple[str, ...]:
-        """Subsets of the states that are estimated: "state", "attitude", "bias", or "attitude" alone."""
-
-    @property
-    def error_sum(self) -> Array:
-        """Σ e (m, 6)."""
-
-    @property
-    def error_product_sum(self) -> Array:
-        """Σ e eᵀ (m, 6, 6)."""
-
-    @property
-    def log_nees_sum(self) -> Array:
-        """Σ ln NEES of all six states, attitude, bias (m, 3)."""
-
-    @property
-    def coverage(self) -> NDArray[np.int64]:
-        """Runs with |e| within 1, 2, 3 σ (m, 6, 3)."""
-
-    @property
-    def sensors(self) -> tuple[str, ...]:
-        """Names of the sensors (s,)."""
-
-    @property
-    def sensor_nis_sum(self) -> Array:
-        """Σ NIS by sensor and span of time (s, k)."""
-
-    @property
-    def sensor_degrees(self) -> NDArray[np.int64]:
-        """Their degrees of freedom (s, k)."""
-
-    def verdict(self, epochs: NDArray[Any], subset: str = "state", probability: float = 0.99) -> Verdict:
-        """Return the verdict on the NEES of a subset at epochs of these indices."""
+if TYPE_CHECKING:
+    from strapdown.montecarlo import Statistics
 
 
 EPOCHS = 20
@@ -85,7 +30,7 @@ EPOCHS = 20
 
 
 def judge_runs(
-    statistics: RunStatistics,
+    statistics: Statistics,
     *,
     epochs: Iterable[int] | None = None,
     probability: float = 0.99,
@@ -150,25 +95,16 @@ def judge_runs(
         if degrees < 1.0:
             continue
         mean = float(np.sum(statistics.sensor_nis_sum[row]) / degrees)
-        findings.append(
-            Finding(
-                name="NIS",
-                of=sensor,
-                value=mean,
-                p_value=mean_p_value(mean, 1, degrees),
-                samples=degrees,
-                means=innovation_words(sensor, mean),
-            )
-        )
+        findings.append(ratio("NIS", sensor, mean, 1, degrees, innovation_words(sensor, mean)))
     tested = [name for name in STATES if name in statistics.subsets]
     return concluded(findings, [], probability, states=tested, needed=tested, unmodelled=unmodelled)
 
 
-def _at(statistics: RunStatistics, epochs: np.ndarray, worst: int) -> str:
+def _at(statistics: Statistics, epochs: np.ndarray, worst: int) -> str:
     return f"worst of {len(epochs)} epochs ({statistics.time[epochs[worst]]:g} s)"
 
 
-def _log_nees(statistics: RunStatistics, epochs: np.ndarray, column: int, subset: str) -> Finding:
+def _log_nees(statistics: Statistics, epochs: np.ndarray, column: int, subset: str) -> Finding:
     runs, degrees = statistics.runs, len(SUBSETS[subset])
     means = statistics.log_nees_sum[epochs, column] / runs
     p = np.array([log_mean_p_value(float(mean), degrees, runs) for mean in means])
@@ -186,12 +122,12 @@ def _log_nees(statistics: RunStatistics, epochs: np.ndarray, column: int, subset
     )
 
 
-def _estimated(statistics: RunStatistics) -> slice:
+def _estimated(statistics: Statistics) -> slice:
     """Return the states that are estimated: all, or those of the attitude."""
     return slice(None) if "bias" in statistics.subsets else slice(3)
 
 
-def _mean_error(statistics: RunStatistics, epochs: np.ndarray) -> Finding:
+def _mean_error(statistics: Statistics, epochs: np.ndarray) -> Finding:
     """Return whether any state's mean error over the runs is other than zero: Student's t, the worst of all epochs and states."""
     from scipy.special import stdtr
 
@@ -211,7 +147,7 @@ def _mean_error(statistics: RunStatistics, epochs: np.ndarray) -> Finding:
     )
 
 
-def _run_coverage(statistics: RunStatistics, epochs: np.ndarray) -> Finding:
+def _run_coverage(statistics: Statistics, epochs: np.ndarray) -> Finding:
     """Return whether the errors of any state lie within 1, 2 or 3 σ too often or too seldom, the worst of all epochs and states."""
     inside = statistics.coverage[epochs][:, _estimated(statistics)] / statistics.runs
     p = coverage_p_values(inside, statistics.runs)

@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from strapdown.checks import InputError, array
-from strapdown.consistency.bounds import mean_bounds, mean_p_value, tail
+from strapdown.consistency.bounds import mean_p_value
 from strapdown.consistency.manifold import whitened
 
 MIN_EFFECTIVE = 50.0
-"""Below this many effective samples the correlation is not known well enough from the run itself for bounds that hold."""
+"""Below this many effective samples the correlation is not known well enough from the run itself for a p-value that holds."""
 
 MARKOV = 0.6
 """Where the correlation of the NEES itself leaves less than this share of the samples that the vector autoregression does, it counts."""
@@ -37,17 +37,11 @@ class TimeAverage:
     epochs: int
     effective: float
     """Number of independent epochs with the same information."""
-    probability: float
 
     @property
     def reliable(self) -> bool:
-        """Whether the run is long against the correlation of its errors; if not, the bounds do not hold."""
+        """Whether the run is long against the correlation of its errors; if not, the p-value does not hold."""
         return self.effective >= MIN_EFFECTIVE
-
-    @property
-    def bounds(self) -> tuple[float, float]:
-        """Two-sided bounds of the mean."""
-        return mean_bounds(self.degrees, max(self.effective, 1.0), self.probability)
 
     @property
     def p_value(self) -> float:
@@ -55,15 +49,12 @@ class TimeAverage:
         return mean_p_value(self.mean, self.degrees, max(self.effective, 1.0))
 
 
-def time_average(
-    error: ArrayLike, covariance: ArrayLike, states: tuple[int, ...] | None = None, probability: float = 0.99
-) -> TimeAverage:
+def time_average(error: ArrayLike, covariance: ArrayLike, states: tuple[int, ...] | None = None) -> TimeAverage:
     """Return the NEES averaged over the even epochs of one run, with as many effective samples as its correlation leaves.
 
     Error (epochs, n) and covariance (epochs, n, n); ``states`` is the subset judged. All states are used to learn the correlation, because
     no subset is a Markov process by itself.
     """
-    tail(probability)
     e = array("error", error, ("epochs", "n"))
     P = array("covariance", covariance, (len(e), e.shape[1], e.shape[1]))
     n = e.shape[1]
@@ -79,7 +70,6 @@ def time_average(
         degrees=len(chosen),
         epochs=len(white),
         effective=_effective(white, len(chosen)),
-        probability=probability,
     )
 
 

@@ -10,11 +10,13 @@ import functools
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from strapdown.checks import Array, InputError, known_keys, one_of
+from strapdown.files import reading
 from strapdown.gyro.model import GyroSpec
 
 __all__ = [
@@ -156,122 +158,10 @@ class Preset:
         return from_datasheet(**{**self.assumed, **self.stated})
 
 
-SHEET = "against the sheet"
-QUOTED = "against others who quote the sheet, and agree"
-
-
-_SHEETS = (
-    Preset(
-        "mpu-9250",
-        "InvenSense MPU-9250, ±250 °/s",
-        "consumer MEMS",
-        "InvenSense PS-MPU-9250A-01 rev. 1.0, Product Specification, table 1",
-        SHEET,
-        200.0,
-        {"arw": "0.01 deg/s/sqrt(Hz)", "range": "250 deg/s"},
-        {
-            "bias_instability": "15 deg/h",
-            "rrw": "60 deg/h/sqrt(h)",
-            "turn_on_bias": "1 deg/s",
-            "rate_resolution": "0.0076293945 deg/s",
-        },
-    ),
-    Preset(
-        "bmi088",
-        "Bosch Sensortec BMI088, ±2000 °/s",
-        "consumer MEMS",
-        "Bosch Sensortec BST-BMI088-DS001, gyroscope specification",
-        QUOTED,
-        400.0,
-        {"arw": "0.014 deg/s/sqrt(Hz)", "range": "2000 deg/s"},
-        {"bias_instability": "4 deg/h", "rrw": "30 deg/h/sqrt(h)", "turn_on_bias": "0.5 deg/s"},
-    ),
-    Preset(
-        "adis16470",
-        "Analog Devices ADIS16470",
-        "industrial MEMS",
-        "Analog Devices ADIS16470 Data Sheet Rev. C, features and specifications",
-        SHEET,
-        500.0,
-        {"arw": "0.008 deg/s/sqrt(Hz)", "bias_instability": "8 deg/h", "range": "2000 deg/s"},
-        {"rrw": "30 deg/h/sqrt(h)", "turn_on_bias": "0.1 deg/s"},
-    ),
-    Preset(
-        "adis16467-1",
-        "Analog Devices ADIS16467-1",
-        "industrial MEMS",
-        "Analog Devices ADIS16467 Data Sheet, features",
-        SHEET,
-        500.0,
-        {
-            "arw": "0.15 deg/sqrt(h)",
-            "bias_instability": "2 deg/h",
-            "range": "125 deg/s",
-            "misalignment": "0.05 deg",
-        },
-        {"rrw": "10 deg/h/sqrt(h)", "turn_on_bias": "0.1 deg/s"},
-    ),
-    Preset(
-        "stim300",
-        "Sensonor STIM300",
-        "tactical MEMS",
-        "Sensonor TS1524 rev. 9, STIM300 Datasheet",
-        SHEET,
-        500.0,
-        {
-            "arw": "0.15 deg/sqrt(h)",
-            "bias_instability": "0.5 deg/h",
-            "range": "400 deg/s",
-            "scale_factor": "500 ppm",
-            "misalignment": "1 mrad",
-            "g_sensitivity": "1 deg/h/g",
-        },
-        {"rrw": "1 deg/h/sqrt(h)", "turn_on_bias": "10 deg/h"},
-    ),
-    Preset(
-        "hg4930",
-        "Honeywell HG4930CA51",
-        "tactical MEMS",
-        "Honeywell HG4930 Inertial Measurement Unit data sheet, model CA51",
-        QUOTED,
-        600.0,
-        {
-            "arw": "0.04 deg/sqrt(h)",
-            "bias_instability": "0.25 deg/h",
-            "turn_on_bias": "7 deg/h",
-            "range": "200 deg/s",
-        },
-        {"rrw": "0.5 deg/h/sqrt(h)"},
-    ),
-    Preset(
-        "dsp-1760",
-        "KVH DSP-1760",
-        "fibre-optic",
-        "KVH 54-0924 Rev. A, DSP-1760 Technical Manual, product specifications",
-        QUOTED,
-        1000.0,
-        {"arw": "0.012 deg/sqrt(h)", "bias_instability": "0.05 deg/h", "range": "490 deg/s"},
-        {"rrw": "0.05 deg/h/sqrt(h)", "turn_on_bias": "2 deg/h"},
-    ),
-    Preset(
-        "hg9900",
-        "Honeywell HG9900, ring laser gyros GG1320AN",
-        "navigation, ring laser",
-        "Honeywell N61-1638-000-000, HG9900 Inertial Measurement Unit brochure",
-        QUOTED,
-        300.0,
-        {"arw": "0.002 deg/sqrt(h)", "turn_on_bias": "0.0035 deg/h", "scale_factor": "5 ppm"},
-        {
-            "bias_instability": "0.002 deg/h",
-            "rrw": "0.001 deg/h/sqrt(h)",
-            "angle_resolution": "1 arcsec",
-            "range": "400 deg/s",
-        },
-    ),
-)
-PRESETS = {one.name: one for one in _SHEETS}
-"""Presets by name, from consumer MEMS to navigation grade. Where a sheet gives a turn-on bias by another word (offset, repeatability) or
-leaves the rate random walk out, as nearly all do, the figure is under ``assumed``."""
+PRESETS = {
+    name: Preset(name=name, **table) for name, table in reading.toml(Path(__file__).with_name("presets.toml")).items()
+}
+"""Presets by name, from consumer MEMS to navigation grade."""
 
 
 def preset(name: str) -> Preset:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from queue import SimpleQueue
 from threading import Thread
-from typing import Any, Protocol
+from typing import Any
 
 from strapdown.checks import InputError, count, one_of
 from strapdown.montecarlo import scalar
@@ -28,27 +28,10 @@ AHEAD = 4
 """Chunks a worker may be ahead of the first unfinished one: what bounds the memory where chunks finish out of order."""
 
 
-class Machine(Protocol):
-    """Interface of a machine, as :mod:`strapdown.montecarlo.statistics` uses it."""
-
-    NAME: str
-    CHUNK: int
-
-    def supports(self, plan: Plan) -> str | None:
-        """Return why it cannot compute a plan; None if it can."""
-
-    def run_chunk(self, plan: Plan, first_run: int, runs: int) -> Statistics:
-        """Return the statistics of ``runs`` runs."""
-
-    def replay(self, plan: Plan, run: int) -> Replay:
-        """Return one run in full detail."""
-
-
-def machine_named(name: str) -> Machine:
-    """Return a machine by name."""
+def machine_named(name: str) -> Any:
+    """Return a machine by name: a module as :mod:`strapdown.montecarlo.statistics` describes it."""
     one_of("machine", name, MACHINES)
-    module: Any = scalar if name == "scalar" else importlib.import_module("strapdown.montecarlo.lanes")
-    return module  # type: ignore[no-any-return]
+    return scalar if name == "scalar" else importlib.import_module("strapdown.montecarlo.lanes")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,7 +100,7 @@ def replay(plan: Plan, run: int, *, machine: str = "auto") -> Replay:
     Replay
         Record, initial state and estimate.
     """
-    found = machine_named(choose(plan, machine).machine).replay(plan, count("run", run, least=0))
+    found: Replay = machine_named(choose(plan, machine).machine).replay(plan, count("run", run, least=0))
     spec = scalar.dispersed(plan.scenario.gyro, plan.dispersions, plan.seed, run)
     of_this_run = plan.scenario
     if spec is not plan.scenario.gyro:  # dispersed, and so no preset any more

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from strapdown import consistency, estimation, quaternion, setup
+from strapdown import consistency, estimation, setup
 from strapdown.checks import Array, InputError, count
 from strapdown.estimation.filters.own import Own
 from strapdown.gyro import GyroSpec
@@ -56,17 +56,10 @@ def start(
     record: ImuRecord, filter_setup: FilterSetup, seed: int, run: int, dispersions: Dispersions | None = None
 ) -> estimation.State:
     """Return the initial state of one run: the truth, off by errors drawn from the filter's own prior, or as the dispersions say."""
-    if record.truth is None:
-        raise InputError("record has no truth to start from; simulate one, or give an initial state to estimation.run")
     given = Dispersions() if dispersions is None else dispersions
-    draw = generator(seed, run, "initial error").standard_normal(6)
-    attitude_sigma, bias_sigma = given.initial_sigmas(filter_setup)
-    # What is added is negated, not subtracted, so that an error of no fixed part is the same to the bit.
-    delta_theta = -attitude_sigma * draw[:3] - given.attitude_error
-    return setup.initial_state(
-        filter_setup,
-        quaternion.multiply(record.truth.attitude[0], quaternion.exp(delta_theta)),
-        record.truth.bias[0] - bias_sigma * draw[3:] - given.bias_error,
+    fixed = given.attitude_error, given.bias_error
+    return setup.drawn_state(
+        filter_setup, record, seed, run, sigmas=given.initial_sigmas(filter_setup), fixed_errors=fixed
     )
 
 

@@ -18,22 +18,7 @@ of a chunk are taken over its runs in the order of their numbers (or in any othe
 Both have to be free to run in several threads at a time.
 
 With m = epochs + 1 epochs at the filter steps 0, every, 2·every, … (``plan.every``; after the update with measurements at that very
-time), error e = (δθ, δb) of :func:`strapdown.consistency.errors` and the filter's P there, the fields of :class:`Statistics` are
-
-- ``time``, ``nis_edges``, ``sensors``: ``plan.time``, ``plan.nis_edges``, ``plan.sensors``; ``runs``: the number of runs asked for;
-- ``finite`` (m,): runs whose e, P and three NEES are finite there (P positive definite). Others add nothing to any sum of that epoch;
-- ``error_sum`` Σ e (m, 6), ``error_product_sum`` Σ e eᵀ (m, 6, 6), ``covariance_sum`` Σ P (m, 6, 6), symmetric;
-- ``nees_sum``, ``log_nees_sum`` (m, 3): Σ and Σ log of the NEES of all six states, of the attitude, of the bias (by the marginal blocks
-  of P); not divided by the degrees of freedom. A NEES of 0 (the start of a run without error) adds log of the smallest normal number;
-- ``coverage`` (m, 6, 3): runs with |e_i| ≤ k √P_ii, k = 1, 2, 3;
-- ``histogram`` (m, 9, BINS): columns 0–5 count |e_i| in bin ``bin_of(|e_i|, ERROR_EXPONENT)``, columns 6–8 the three NEES in bin
-  ``bin_of(nees, NEES_EXPONENT)``. :func:`bin_of` is a shift of the double's bits, so no machine needs a logarithm;
-- ``sensor_nis_sum`` (s, k), ``sensor_degrees`` (s, k), ``sensor_refused`` (s, k): by sensor and span of time, Σ of the NIS of the
-  measurements used, of their degrees of freedom, and the number that the filter's gate refused. The NIS of refused ones is left out;
-- ``worst_run``, ``worst_score`` (w,), w = min(WORST, runs): the runs of the largest score, the largest first, of equal ones the lower
-  number first. A run's score is the largest NEES of the state over the epochs; infinite where the run was not finite at some epoch;
-- ``example_run`` (x,), ``example_error``, ``example_sigma`` (x, m, 6): the runs of the chunk with numbers below EXAMPLES, in order; errors
-  as they are, finite or not.
+time), error e = (δθ, δb) of :func:`strapdown.consistency.errors` and the filter's P there, the result is a :class:`Statistics`.
 """
 
 from __future__ import annotations
@@ -106,32 +91,33 @@ class Replay:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Statistics(Listed):
-    """Sums over independent runs at each epoch. The head of this module defines each field.
+    """Sums over independent runs at each epoch.
 
-    Errors are e = (δθ, δb): rad in the body frame, rad/s.
+    Errors are e = (δθ, δb): rad in the body frame, rad/s. The sums of an epoch leave out runs whose numbers there are not finite.
 
     Parameters
     ----------
     time : ndarray (m,)
         Epochs, s.
     runs : int
-        Number of runs.
+        Number of runs asked for.
     finite : ndarray (m,) of int
-        Runs whose error, covariance P and NEES are finite; the others are left out of all sums of that epoch.
+        Runs whose error, covariance P and three NEES are finite there, P positive definite.
     error_sum : ndarray (m, 6)
         Σ e.
     error_product_sum : ndarray (m, 6, 6)
         Σ e eᵀ.
     covariance_sum : ndarray (m, 6, 6)
-        Σ P, the filter's own covariance.
+        Σ P, the filter's own covariance, symmetric.
     nees_sum : ndarray (m, 3)
-        Σ NEES of all six states, of the attitude, of the bias; not divided by the degrees of freedom.
+        Σ NEES of all six states, of the attitude, of the bias (by the marginal blocks of P); not divided by the degrees of freedom.
     log_nees_sum : ndarray (m, 3)
-        Σ ln NEES of the same.
+        Σ ln NEES of the same; a NEES of 0 (the start of a run without error) adds the logarithm of the smallest normal number.
     coverage : ndarray (m, 6, 3) of int
-        Runs with |e| within 1, 2, 3 σ.
-    histogram : ndarray (m, 9, bins) of int
-        Counts of |e| (columns 0–5) and of the three NEES (columns 6–8) by logarithmic bin.
+        Runs with |e_i| ≤ k √P_ii, k = 1, 2, 3.
+    histogram : ndarray (m, 9, BINS) of int
+        Counts of |e| (columns 0–5) in bin ``bin_of(|e|, ERROR_EXPONENT)``, of the three NEES (columns 6–8) in bin
+        ``bin_of(nees, NEES_EXPONENT)``. :func:`bin_of` is a shift of the double's bits, so no machine needs a logarithm.
     nis_edges : ndarray (k + 1,)
         Edges of the spans of time of the NIS, s.
     sensors : tuple of str
@@ -141,15 +127,15 @@ class Statistics(Listed):
     sensor_degrees : ndarray (s, k) of int
         Their degrees of freedom.
     sensor_refused : ndarray (s, k) of int
-        Measurements refused by the gate.
-    worst_run : ndarray (w,) of int
-        Numbers of the runs with the largest NEES of the state, the largest first.
+        Measurements refused by the gate; their NIS is left out.
+    worst_run : ndarray (w,) of int, w = min(WORST, runs)
+        Numbers of the runs of the largest score, the largest first, of equal ones the lower number first.
     worst_score : ndarray (w,)
-        Their largest NEES of the state; infinite where the filter failed.
+        Their scores: the largest NEES of the state over the epochs; infinite where the run was not finite at some epoch.
     example_run : ndarray (x,) of int
-        Numbers of the runs whose whole error histories are kept.
+        Numbers of the runs, below EXAMPLES, whose whole error histories are kept, in order.
     example_error : ndarray (x, m, 6)
-        Errors of these runs, rad and rad/s.
+        Errors of these runs, finite or not, rad and rad/s.
     example_sigma : ndarray (x, m, 6)
         The filter's own σ in these runs, rad and rad/s.
     """

@@ -12,7 +12,7 @@ Closed forms:
 - ``cones``: :class:`Coning`, equation (18) of *Quaternion differentiation*, and :class:`SpinCone`.
 - ``spin_rock``: :class:`SpinRock`: a spinning body whose axis rocks.
 - ``slew``: :class:`Slew`: a rotation about one axis from rest to rest.
-- ``torque_free``: :class:`TorqueFree`: the free rigid body, solved in ``euler_poinsot`` by the functions of ``elliptic``.
+- ``torque_free``: :class:`TorqueFree`: the free rigid body, in elliptic functions.
 
 From given rates, attitudes or motions:
 

@@ -9,7 +9,8 @@ from matplotlib.figure import Figure
 
 from strapdown.checks import Array
 from strapdown.covariance import Analysis
-from strapdown.plots.style import BLUE, CYCLE, VERMILION, YELLOW, angle_unit, legend_above, new_figure, rate_unit
+from strapdown.plots.style import BLUE, CYCLE, VERMILION, YELLOW, legend_above, new_figure
+from strapdown.units import angle_unit, rate_unit
 
 _SHADES = (*CYCLE, YELLOW, "#666666", "#8C564B", "#17BECF", "#AEC7E8", "#C5B0D5")
 _MIN_SHARE = 0.01  # sources below this part of the mean square at all times are drawn together

@@ -20,17 +20,15 @@ from strapdown.plots.style import (
     CYCLE,
     SKY,
     VERMILION,
-    angle_unit,
     axes_or_new,
     error_state_unit,
     ink,
     legend_above,
     legend_below,
     new_figure,
-    rate_unit,
 )
 from strapdown.records import Estimate, Truth
-from strapdown.units import DEGREE
+from strapdown.units import DEGREE, angle_unit, rate_unit
 
 THREE_SIGMA = "±3σ (99.7 %)"
 """Legend of a band of three standard deviations, with the share of normal errors of one axis that it holds."""

@@ -9,8 +9,9 @@ from matplotlib.ticker import MaxNLocator
 from strapdown.checks import Array
 from strapdown.consistency import Autocorrelation, Distribution, QuantilePairs
 from strapdown.plots.decimation import decimated
-from strapdown.plots.style import AXES, BLUE, CYCLE, ORANGE, SKY, VERMILION, angle_unit, axes_or_new, ink, legend_above
+from strapdown.plots.style import AXES, BLUE, CYCLE, ORANGE, SKY, VERMILION, axes_or_new, ink, legend_above
 from strapdown.records import Innovations
+from strapdown.units import angle_unit
 
 HISTOGRAM_REACH = 5.0
 """Histograms of whitened innovations go so many σ to both sides; what lies beyond is counted in the legend."""

@@ -20,15 +20,14 @@ from strapdown.plots.style import (
     CYCLE,
     SKY,
     VERMILION,
-    angle_unit,
     axes_or_new,
     ink,
     layered,
     legend_above,
     legend_below,
     new_figure,
-    rate_unit,
 )
+from strapdown.units import angle_unit, rate_unit
 
 BOUNDS = "bounds of a consistent filter"
 

@@ -15,9 +15,9 @@ from cycler import cycler
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from strapdown.checks import Array, one_of
+from strapdown.checks import one_of
 from strapdown.files import written_beside
-from strapdown.units import ARCSECOND, DEGREE, DEGREE_PER_HOUR, STANDARD_GRAVITY
+from strapdown.units import DEGREE_PER_HOUR, STANDARD_GRAVITY
 
 BLUE, ORANGE, GREEN, VERMILION, PURPLE, SKY, YELLOW = (
     "#0072B2",
@@ -176,18 +176,6 @@ def match_scales(axes: Sequence[Axes]) -> None:
         else:
             ratio = span / spans[alike].max()
             ax.set_title(f"vertical scale ×{ratio:.2g}", loc="right", fontsize="small", color=VERMILION)
-
-
-def angle_unit(value: Array) -> tuple[str, float]:
-    """Return the name and size of the unit in which angles of this size (rad) are read best."""
-    typical = float(np.nanmax(np.abs(value), initial=0.0))
-    return ("arcsec", ARCSECOND) if typical < 0.05 * DEGREE else ("°", DEGREE)
-
-
-def rate_unit(value: Array) -> tuple[str, float]:
-    """Return the name and size of the unit in which rates of this size (rad/s) are read best."""
-    typical = float(np.nanmax(np.abs(value), initial=0.0))
-    return ("°/h", DEGREE_PER_HOUR) if typical < 0.1 * DEGREE else ("°/s", DEGREE)
 
 
 _STATE_UNITS = {

@@ -12,16 +12,16 @@ from matplotlib.ticker import MaxNLocator, NullFormatter
 from strapdown.checks import Array
 from strapdown.plots.style import BLUE, SKY, VERMILION, axes_or_new, ink, legend_above, legend_below, new_figure
 from strapdown.tuning import Comparison, Slices, Tuning
-from strapdown.tuning.parameters import Unit
 
 TALLEST = 15.0
 """Slices are drawn up to this −2 Δ log likelihood."""
 
 
-def likelihood_slice(slices: Slices, tuning: Tuning, number: int, unit: Unit, ax: Axes | None = None) -> Axes:
+def likelihood_slice(slices: Slices, tuning: Tuning, number: int, ax: Axes | None = None) -> Axes:
     """Draw twice the fall of the log likelihood along one parameter, with its interval and its value before."""
     ax = axes_or_new(ax)
     one = tuning.parameters[number]
+    unit = one.unit
     values = slices.values[number] / unit.factor
     ax.semilogx(values, slices.fallen[number], color=BLUE, linewidth=1.4)
     if not tuning.composite:
@@ -59,7 +59,7 @@ def likelihood_slice(slices: Slices, tuning: Tuning, number: int, unit: Unit, ax
     return ax
 
 
-def likelihood_slices(slices: Slices, tuning: Tuning, units: Sequence[Unit]) -> Figure:
+def likelihood_slices(slices: Slices, tuning: Tuning) -> Figure:
     """Draw the slices of all parameters side by side."""
     number = len(tuning.parameters)
     columns = min(number, 4)
@@ -69,7 +69,7 @@ def likelihood_slices(slices: Slices, tuning: Tuning, units: Sequence[Unit]) -> 
         if k >= number:
             ax.set_visible(False)
             continue
-        likelihood_slice(slices, tuning, k, units[k], ax)
+        likelihood_slice(slices, tuning, k, ax)
         if k % columns == 0:
             ax.set_ylabel("2 Δ objective" if tuning.composite else "−2 Δ log likelihood")
     legend_below(figure, list(axes.ravel()), ncols=5)

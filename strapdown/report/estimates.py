@@ -10,10 +10,10 @@ from matplotlib.figure import Figure
 
 from strapdown import consistency, plots, quaternion, records
 from strapdown.plots.estimates import angle_labels
-from strapdown.plots.style import AXES, angle_unit, rate_unit
+from strapdown.plots.style import AXES
 from strapdown.records import Estimate, Innovations, Truth
 from strapdown.report import findings, page
-from strapdown.units import DEGREE
+from strapdown.units import DEGREE, angle_unit, rate_unit
 
 _COLOURS = ("--a", "--b", "--c")
 

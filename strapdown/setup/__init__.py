@@ -22,7 +22,8 @@ from strapdown.estimation.states import ProcessNoise, State
 from strapdown.files import reading, tables
 from strapdown.gyro import GyroSpec
 from strapdown.kernels.lane_values import WIDTH
-from strapdown.records import Estimate, ImuRecord, compress
+from strapdown.randomness import generator
+from strapdown.records import Estimate, ImuRecord, Origin, compress
 from strapdown.results import ByValue
 from strapdown.setup import matching
 from strapdown.setup import states as optional
@@ -144,17 +145,17 @@ class FilterSetup(ByValue):
         return self.estimator.name if isinstance(self.estimator, Own) else str(self.estimator)
 
 
-def matched(scenario: Scenario, *, attitude_sigma: float | None = None, states: bool = False) -> FilterSetup:
+def matched(
+    scenario: Scenario, *, attitude_sigma: float | None = None, states: bool | Sequence[str] | None = False
+) -> FilterSetup:
     """Return the filter setup that matches a scenario: the noise of its gyro, and the sensors' own σ.
 
     Parameters
     ----------
     scenario : Scenario
         Its gyro, its sensors and its motion determine the setup.
-    attitude_sigma : float, optional
+    attitude_sigma, states : optional
         As of :func:`matched_to_record`.
-    states : bool, default False
-        With an error state for each error that the scenario specifies, as :func:`matched_to_record` describes.
 
     Returns
     -------
@@ -173,26 +174,17 @@ def matched(scenario: Scenario, *, attitude_sigma: float | None = None, states: 
     """
     from strapdown.scenarios import simulate  # and every motion
 
-    return matched_to_record(
-        scenario.gyro,
-        simulate(scenario),
-        attitude_sigma=attitude_sigma,
-        states=states,
-        sensors=scenario.sensors,
-        gravity_f=scenario.gravity_f,
-    )
+    return matched_to_record(simulate(scenario), attitude_sigma=attitude_sigma, states=states)
 
 
 def matched_to_record(
-    spec: GyroSpec,
     record: ImuRecord,
+    spec: GyroSpec | None = None,
     *,
     attitude_sigma: float | None = None,
-    states: bool = False,
-    sensors: Sequence[Any] = (),
-    gravity_f: Sequence[float] = vectors.GRAVITY_F,
+    states: bool | Sequence[str] | None = False,
 ) -> FilterSetup:
-    """Return the filter setup that matches a record of a gyro of this specification.
+    """Return the filter setup that matches what a record's ``origin`` specifies of its gyro and sensors.
 
     Flicker noise, which is no random walk, is matched in the attitude at the record's rate and quality of measurements
     (:func:`strapdown.gyro.matched_process_noise`); without measurements it is bounded over the record's length. Errors without a state
@@ -200,22 +192,19 @@ def matched_to_record(
 
     Parameters
     ----------
-    spec : GyroSpec
-        Specification of the gyro.
     record : ImuRecord
         Its rate, its length and the σ of its measurements determine the noise that stands for flicker.
+    spec : GyroSpec, optional
+        Specification of the gyro. Default: that of the record's origin.
     attitude_sigma : float, optional
         σ of the initial attitude error, each axis, rad. Default: 1°, or less where the finest sensor is so fine that its first measurement
         would not be linear in the error; an extended filter's covariance does not hold beyond that.
-    states : bool, default False
-        With an error state for each error that ``spec`` or ``sensors`` specify: scale factor, misalignment, g-sensitivity, slope of the
-        bias over the record's temperature, flicker and Gauss–Markov drift, hard iron, a sensor's bias, correlated noise, lever arm. Each is
-        modelled as one draw of a normal distribution whose σ is the error's size. Where one-sample integration would leave a noticeable
-        commutation error, an integration algorithm of the same rate with less is chosen.
-    sensors : sequence, optional
-        Sensors of the scenario (:mod:`strapdown.vectors`), whose errors are specified.
-    gravity_f : sequence of float (3,)
-        Gravity in the fixed frame, m/s², for a g-sensitive gyro.
+    states : bool, None or sequence of str, default False
+        True: with an error state for each error that the gyro or the origin's sensors specify: scale factor, misalignment, g-sensitivity,
+        slope of the bias over the record's temperature, flicker and Gauss–Markov drift, hard iron, a sensor's bias, correlated noise,
+        lever arm. Each is modelled as one draw of a normal distribution whose σ is the error's size. Where one-sample integration would
+        leave a noticeable commutation error, an integration algorithm of the same rate with less is chosen. Names such as
+        ``"gyro.scale"``: with these of them alone. None: with all where an error is specified that the filter would have no state for.
 
     Returns
     -------
@@ -225,32 +214,48 @@ def matched_to_record(
     Raises
     ------
     InputError
-        If the gyro has no angle random walk.
+        If the gyro is not specified or has no angle random walk, or a name is of no error that is specified.
     """
+    origin = record.origin or Origin()
+    spec = spec or origin.gyro
+    if spec is None:
+        raise InputError(
+            "the record does not specify its gyro; give the gyro's noise (--gyro; noise= in Python) or a filter (--filter; setup=)"
+        )
     walk = np.max(np.square(spec.bias_instability) * np.log(1e3)) / np.pi  # flicker over three decades of time
-    stationary = np.where(
-        np.isfinite(spec.markov_correlation_time),
-        0.5
-        * np.square(spec.markov_noise)
-        * np.where(np.isfinite(spec.markov_correlation_time), spec.markov_correlation_time, 0.0),
-        0.0,
-    )
+    tau = spec.markov_correlation_time
+    stationary = 0.5 * np.square(spec.markov_noise) * tau if np.isfinite(tau) else 0.0
     spread = np.max(np.square(spec.turn_on_bias) + np.square(spec.turn_on_bias_sigma) + stationary) + walk
-    more: dict[str, Any] = {}
-    if states:
-        found = matching.matched(spec, record, sensors, np.asarray(gravity_f), measurement_density(record))
-        noise = _noise_beside_states(spec, found.white)
-        more["states"] = found.states
-        if _commutes_badly(record, noise["angle_random_walk"]):
-            more["integration"] = coning.ALGORITHMS[ACCURATE_ALGORITHM]
-    else:
-        noise = _noise(spec, record)
-    return FilterSetup(
-        process_noise=ProcessNoise(**noise),
+    plain = FilterSetup(
+        process_noise=ProcessNoise(**_noise(spec, record)),
         attitude_sigma=_linear_sigma(record) if attitude_sigma is None else attitude_sigma,
         bias_sigma=float(max(np.sqrt(spread), MIN_BIAS_SIGMA)),
-        **more,
     )
+    sensors, gravity_f = specified(origin)
+    if states is False or (
+        states is None and not (origin.gyro and unmodelled_errors(origin.gyro, sensors, gravity_f=gravity_f))
+    ):
+        return plain
+    found = matching.matched(spec, record, sensors, np.asarray(gravity_f), measurement_density(record))
+    noise = ProcessNoise(**_noise_beside_states(spec, found.white))
+    algorithm = ACCURATE_ALGORITHM if _commutes_badly(record, noise.angle_random_walk) else "one-sample"
+    kept = found.states
+    if not isinstance(states, bool) and states is not None:
+        kept = found.states.chosen(tuple(states)) if states else States()
+    return replace(
+        plain,
+        process_noise=noise
+        if "gyro.drift" in kept.names
+        else plain.process_noise,  # flicker is a state or in the noise
+        integration=coning.ALGORITHMS[algorithm],
+        states=kept if kept.names else None,
+    )
+
+
+def specified(origin: Origin) -> tuple[Sequence[Any], Sequence[float]]:
+    """Return the sensors, whose errors are specified, and gravity in the fixed frame, as far as they are known."""
+    scenario = origin.scenario
+    return ((), vectors.GRAVITY_F) if scenario is None else (scenario.sensors, scenario.gravity_f)
 
 
 def _noise_beside_states(spec: GyroSpec, white: float) -> dict[str, float]:
@@ -280,7 +285,7 @@ def _commutes_badly(record: ImuRecord, white: float) -> bool:
 
 def unmodelled_errors(
     spec: GyroSpec,
-    sensors: tuple[Any, ...] = (),
+    sensors: Sequence[Any] = (),
     states: States | None = None,
     *,
     gravity_f: Sequence[float] = vectors.GRAVITY_F,
@@ -563,6 +568,25 @@ def initial_state(
     return estimation.initial_state(
         attitude, bias=bias, attitude_sigma=setup.attitude_sigma, bias_sigma=setup.bias_sigma
     )
+
+
+def drawn_state(
+    setup: FilterSetup,
+    record: ImuRecord,
+    seed: int,
+    run: int = 0,
+    *,
+    sigmas: tuple[float, float] | None = None,
+    fixed_errors: tuple[Array, Array] = (np.zeros(3), np.zeros(3)),
+) -> State:
+    """Return the true initial state of a record, off by errors drawn from the setup's σ (or ``sigmas``) and by fixed ones."""
+    if record.truth is None:
+        raise InputError("record has no truth to start from; simulate one, or give an initial state")
+    attitude_sigma, bias_sigma = sigmas or (setup.attitude_sigma, setup.bias_sigma)
+    draw = generator(seed, run, "initial error").standard_normal(6)
+    turn = quaternion.exp(-attitude_sigma * draw[:3] - fixed_errors[0])
+    bias = record.truth.bias[0] - bias_sigma * draw[3:] - fixed_errors[1]
+    return initial_state(setup, quaternion.multiply(record.truth.attitude[0], turn), bias)
 
 
 _NOISE_FORM: tables.Form = {name: gyro.FORM[name] for name in ("angle_random_walk", "rate_random_walk")}

@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from strapdown import estimation, quaternion, setup
+from strapdown import estimation, setup
 from strapdown.checks import InputError
 from strapdown.estimation import multiple_model
 from strapdown.estimation.states import State
-from strapdown.gyro import GyroSpec
-from strapdown.randomness import generator
 from strapdown.records import ImuRecord, Origin
-from strapdown.scenarios import Scenario
 from strapdown.setup import FilterSetup
-from strapdown.setup.states import States
 from strapdown.units import DEGREE
 from strapdown.vectors.wahba import InconsistentError
 
@@ -27,62 +21,13 @@ UNEVEN = 2.0
 REMEDY = "give the initial attitude (--attitude, or --from-truth; initial= in Python)"
 
 
-def matched_setup(
-    record: ImuRecord,
-    gyro: GyroSpec | None = None,
-    *,
-    states: bool | Sequence[str] | None = None,
-) -> FilterSetup:
-    """Return the filter setup that matches what a record's ``origin`` specifies of its gyro (or ``gyro`` does) and sensors.
-
-    ``states``: True, with an error state for each error that is specified; names such as ``"gyro.scale"``, with these of them alone; False,
-    attitude and gyro bias only. By default with all of them where an error is specified that the filter would have no state for.
-    """
-    origin = record.origin or Origin()
-    spec = gyro or origin.gyro
-    if spec is None:
-        raise InputError(
-            "the record does not specify its gyro; give the gyro's noise (--gyro; noise= in Python) or a filter (--filter; setup=)"
-        )
-    plain = setup.matched_to_record(spec, record)
-    if states is False or (states is None and not unmodelled_errors(record, plain)):
-        return plain
-    if origin.scenario is None:
-        chosen = setup.matched_to_record(spec, record, states=True)
-    else:
-        scenario = origin.scenario
-        chosen = setup.matched_to_record(
-            spec, record, states=True, sensors=scenario.sensors, gravity_f=scenario.gravity_f
-        )
-    optional = chosen.states or States()
-    if states is not None and states is not True:
-        optional = optional.chosen(tuple(states)) if states else States()
-    if not optional.names:
-        return dataclasses.replace(chosen, states=None)
-    if "gyro.drift" not in optional.names:  # flicker without a state is matched by the two noises
-        chosen = dataclasses.replace(chosen, process_noise=plain.process_noise)
-    return dataclasses.replace(chosen, states=optional)
-
-
-def matched_to_scenario(scenario: Scenario, *, states: bool | None = None) -> FilterSetup:
-    """Return the filter setup that matches a scenario, by default with error states where the scenario specifies such errors."""
-    if states is None:
-        states = bool(setup.unmodelled_errors(scenario.gyro, scenario.sensors, gravity_f=scenario.gravity_f))
-    found = setup.matched(scenario, states=states)
-    if states and (found.states is None or not found.states.names):
-        return setup.matched(scenario)
-    return found
-
-
 def unmodelled_errors(record: ImuRecord, chosen: FilterSetup) -> tuple[str, ...]:
     """Return, in words, the specified errors of a record that a filter has no state for; empty where nothing is specified."""
     origin = record.origin or Origin()
     if origin.gyro is None:
         return ()
-    if origin.scenario is None:
-        return setup.unmodelled_errors(origin.gyro, (), chosen.states)
-    scenario = origin.scenario
-    return setup.unmodelled_errors(origin.gyro, scenario.sensors, chosen.states, gravity_f=scenario.gravity_f)
+    sensors, gravity_f = setup.specified(origin)
+    return setup.unmodelled_errors(origin.gyro, sensors, chosen.states, gravity_f=gravity_f)
 
 
 class Start(NamedTuple):
@@ -171,8 +116,5 @@ def drawn_start(record: ImuRecord, chosen: FilterSetup) -> Start:
             "a start drawn about the truth (--from-truth) needs a record with its truth; this one has none"
         )
     origin = record.origin or Origin()
-    draw = generator(origin.seed or 0, origin.run or 0, "initial error").standard_normal(6)
-    q = quaternion.multiply(record.truth.attitude[0], quaternion.exp(-chosen.attitude_sigma * draw[:3]))
-    bias = record.truth.bias[0] - chosen.bias_sigma * draw[3:]
     words = "Started from the truth, off by errors drawn from the filter's σ."
-    return Start(setup.initial_state(chosen, q, bias), words)
+    return Start(setup.drawn_state(chosen, record, origin.seed or 0, origin.run or 0), words)

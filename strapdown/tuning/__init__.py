@@ -50,6 +50,7 @@ from strapdown.tuning.planning import Plan as Plan
 from strapdown.tuning.planning import plan
 from strapdown.tuning.procedure import GATED as GATED
 from strapdown.tuning.procedure import tune
+from strapdown.tuning.procedure import with_units as with_units
 from strapdown.tuning.starting import by_innovations as by_innovations
 from strapdown.tuning.starting import one_gyro as one_gyro
 from strapdown.tuning.starting import record_case, recording_case

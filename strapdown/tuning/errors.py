@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 
@@ -37,6 +37,7 @@ class ErrorObjective:
     references: tuple[Reference, ...] = field(repr=False)
     """Truth at the edges judged, of each record."""
     parts: int = 20
+    composite: ClassVar[bool] = True
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -47,11 +48,6 @@ class ErrorObjective:
     def start(self) -> Array:
         """Logarithms of their first values."""
         return self.base.start
-
-    @property
-    def composite(self) -> bool:
-        """Whether the curvature is no information."""
-        return True
 
     def setup(self, point: Array) -> FilterSetup:
         """Return the setup of a point."""

@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -132,11 +132,7 @@ class ExtendedLikelihood:
     cases: tuple[Case, ...] = field(repr=False)
     parts: int = 20
     threads: int = 1
-
-    @property
-    def composite(self) -> bool:
-        """Whether the curvature is no information; that of innovations is."""
-        return False
+    composite: ClassVar[bool] = False
 
     def setup(self, point: Array) -> FilterSetup:
         """Return the setup of a point."""

@@ -7,10 +7,11 @@ parabola does not: that zero may be as likely as the best value. Then only a bou
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple, Protocol, TypeVar, runtime_checkable
+from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from strapdown.checks import Array, InputError, count, known_keys, positive
 from strapdown.results import Listed, Listing, figure
 from strapdown.setup import FilterSetup
 from strapdown.tuning.innovations import Derivatives
-from strapdown.tuning.parameters import RRW, SCALE, Prior, fixed_unit, with_values
+from strapdown.tuning.parameters import RRW, SCALE, Prior, Unit, fixed_unit, with_values
 
 LONGEST_STEP = 2.0
 """Largest change of a log parameter in one step of the search."""
@@ -42,7 +43,11 @@ T = TypeVar("T")
 
 
 class Objective(Protocol):
-    """Objective to minimise: minus a log likelihood, or a substitute."""
+    """Objective to minimise: minus a log likelihood, or a substitute.
+
+    It may have ``limits`` of its own, least and largest logarithm of each parameter (p,), (p,), and a ``curvature(point)`` (p, p), where
+    that of the search is not good enough for errors.
+    """
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -66,26 +71,10 @@ class Objective(Protocol):
         """Return the filter setup of a point."""
 
 
-@runtime_checkable
-class Curved(Protocol):
-    """An objective whose curvature at its best point is to be taken by itself, as the search's is not good enough for errors."""
-
-    def curvature(self, point: Array) -> Array:
-        """Return the second derivatives at a point (p, p)."""
-
-
-@runtime_checkable
-class Bounded(Protocol):
-    """An objective whose parameters have bounds of their own."""
-
-    @property
-    def limits(self) -> tuple[Array, Array]:
-        """Least and largest logarithm of each parameter (p,), (p,)."""
-
-
 def limits_of(objective: Objective) -> tuple[Array, Array]:
-    """Return the least and the largest logarithm of each parameter that a search looks at."""
-    return objective.limits if isinstance(objective, Bounded) else (objective.start - REACH, objective.start + REACH)
+    """Return the least and the largest logarithm of each parameter that a search looks at: the objective's own ``limits``, if any."""
+    wide: tuple[Array, Array] = objective.start - REACH, objective.start + REACH
+    return getattr(objective, "limits", wide)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -192,6 +181,17 @@ class Estimated:
     """Whether zero is refuted at 95 %, and an upper end found."""
     note: str
     """Interpretation, in words."""
+    unit: Unit
+    """Unit that it is printed in."""
+
+    @property
+    def words(self) -> str:
+        """How well it is known, in its unit."""
+        if self.identified or "prior" in self.note:
+            return self.note
+        if not math.isfinite(self.upper):
+            return "not identified: these records say nothing of it"
+        return f"not identified: at most {figure(self.upper / self.unit.factor, 3)} {self.unit.name} (95 %)"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -241,18 +241,30 @@ class Tuning(Listed):
     composite: bool = False
 
     def listing(self) -> Listing:
-        """Return the parameters with their intervals, as a table; σ of sensors in rad or the unit of the vector."""
+        """Return the parameters with their intervals, as a table."""
         rows = []
         for one in self.parameters:
-            unit = fixed_unit(one.name)
-            values = [figure(x / unit.factor, 3) for x in (one.start, one.value, one.lower, one.upper)]
-            rows.append((one.name, unit.name, *values, "" if one.identified else "not identified"))
+            values = [figure(x / one.unit.factor, 3) for x in (one.start, one.value, one.lower, one.upper)]
+            rows.append((one.name, one.unit.name, *values, one.words))
         notes = [
-            f"{self.agreeing} of {len(self.starts)} searches ended at the best point; gain {self.before - self.after:.4g}"
+            f"{self.agreeing} of {len(self.starts)} searches ended at the best point; log-likelihood + "
+            f"{self.before - self.after:.4g}."
         ]
-        if self.misfit:
+        if not all(one.identified for one in self.parameters):
             notes.append(
-                "The innovations are not those of any such filter: disturbances last over many samples, or change."
+                "Of a parameter that is not identified these records give an upper bound alone; the filter uses the value in the column "
+                "“after”, the mean below that bound. --prior (priors= in Python) gives it a prior instead."
+            )
+        if self.misfit:
+            remedy = (
+                "A common scale leaves the estimates as they are; it makes σ right on the whole, not at each time."
+                if self.parameters[0].name == SCALE
+                else "The most likely filter may follow them and estimate worse. Tune filter.scale alone, or against a truth (--truth, "
+                "--rmse), or try --spacing."
+            )
+            notes.append(
+                "The innovations are not those of any such filter: disturbances last over many samples, or change. "
+                + remedy
             )
         columns = ("parameter", "unit", "before", "after", "from", "to", "")
         return Listing("Tuned parameters with 95 % intervals", columns, rows, notes, left=2)
@@ -425,16 +437,16 @@ def _estimated(
         standard_error=error,
         identified=found.identified,
         note=_note(name, found, error, best.local, j, priors, doubtful=doubtful),
+        unit=fixed_unit(name),
     )
 
 
 def _curved(objective: Objective, best: Optimum) -> Local:
     """Return the best point with the objective's own curvature, where it has one and the point is a minimum by it."""
-    if not isinstance(objective, Curved):
+    curvature = getattr(objective, "curvature", None)
+    if curvature is None:
         return best.local
-    own = (
-        objective.curvature(best.point) + best.local.information - best.local.derivatives.information
-    )  # and the priors'
+    own = curvature(best.point) + best.local.information - best.local.derivatives.information  # and the priors'
     return replace(best.local, information=own) if np.linalg.eigvalsh(own)[0] > 0.0 else best.local
 
 

@@ -10,7 +10,7 @@ import itertools
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -117,26 +117,22 @@ class Likelihood:
     """Logarithms of the free parameters in that setup (p,)."""
     prepared: tuple[Prepared, ...] = field(repr=False)
     threads: int = 1
-
-    def point(self, values: Mapping[str, float]) -> Array:
-        """Return the point of these values by name."""
-        with np.errstate(divide="ignore"):
-            return np.log([values[name] for name in self.names])
-
-    def values(self, point: Array) -> dict[str, float]:
-        """Return the values of a point by name, SI."""
-        return {name: float(np.exp(x)) for name, x in zip(self.names, point, strict=True)}
+    composite: ClassVar[bool] = False
 
     def setup(self, point: Array) -> FilterSetup:
         """Return the setup of a point."""
-        return with_values(self.chosen, self.values(point))
+        return with_values(self.chosen, dict(zip(self.names, np.exp(point).tolist(), strict=True)))
 
     def minus_log(self, points: Array) -> Array:
         """Return minus the log likelihood, without its constant, at several points (k, p): (k,)."""
+        return self.totals(points, self._pass)
+
+    def totals(self, points: Array, run: Callable[[Prepared, Array], dict[str, Array]]) -> Array:
+        """Return the sum over the records of what ``run`` finds of each point, eight at once."""
         rows = np.atleast_2d(points)
         blocks = [rows[first : first + WIDTH] for first in range(0, len(rows), WIDTH)]
         jobs = [(case, block) for block in blocks for case in self.prepared]
-        results = self.each(lambda job: self._pass(*job)["minus_log"][job[0].used].sum(axis=0)[: len(job[1])], jobs)
+        results = self.each(lambda job: run(*job)["minus_log"][job[0].used].sum(axis=0)[: len(job[1])], jobs)
         sums = [np.sum(results[k : k + len(self.prepared)], axis=0) for k in range(0, len(jobs), len(self.prepared))]
         return np.concatenate(sums)
 
@@ -162,11 +158,6 @@ class Likelihood:
         return Derivatives(
             value=np.concatenate(values), score=np.concatenate(scores), information=information, outer=outer
         )
-
-    @property
-    def composite(self) -> bool:
-        """Whether the curvature is no information; that of innovations is."""
-        return False
 
     def each(self, work: Callable[[Any], Any], jobs: Sequence[Any]) -> list[Any]:
         """Return ``work`` of every job, spread over the threads."""

@@ -18,6 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -60,6 +61,7 @@ class ContaminatedLikelihood:
     base: Likelihood
     first: tuple[float, float]
     """Share and scale that the search starts from."""
+    composite: ClassVar[bool] = False
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -70,11 +72,6 @@ class ContaminatedLikelihood:
     def start(self) -> Array:
         """Logarithms of their first values."""
         return np.concatenate([self.base.start, np.log(self.first)])
-
-    @property
-    def composite(self) -> bool:
-        """Whether the curvature is no information; that of a mixture is."""
-        return False
 
     @property
     def limits(self) -> tuple[Array, Array]:
@@ -89,12 +86,7 @@ class ContaminatedLikelihood:
 
     def minus_log(self, points: Array) -> Array:
         """Return minus the log likelihood, without its constant, at several points (k, p): (k,)."""
-        rows = np.atleast_2d(points)
-        blocks = [rows[first : first + WIDTH] for first in range(0, len(rows), WIDTH)]
-        jobs = [(case, block) for block in blocks for case in self.base.prepared]
-        found = self.base.each(lambda job: self._pass(*job)["minus_log"][job[0].used].sum(axis=0)[: len(job[1])], jobs)
-        many = len(self.base.prepared)
-        return np.concatenate([np.sum(found[k : k + many], axis=0) for k in range(0, len(jobs), many)])
+        return self.base.totals(points, self._pass)
 
     def derivatives(self, point: Array) -> Derivatives:
         """Return the likelihood and its derivatives at a point."""

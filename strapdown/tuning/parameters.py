@@ -303,7 +303,7 @@ def priors_from_gyro(spec: GyroSpec, record: ImuRecord, *, factor: float = 3.0) 
     dict of str to Prior
         For ``"gyro.arw"`` (rad/√s) and ``"gyro.rrw"`` (rad/s/√s).
     """
-    noise = setup.matched_to_record(spec, record).process_noise if _flickers(spec) else None
+    noise = setup.matched_to_record(record, spec).process_noise if _flickers(spec) else None
     found = gyro.process_noise(spec) if noise is None else vars(noise)
     pairs = {ARW: found["angle_random_walk"], RRW: found["rate_random_walk"]}
     return {name: Prior(value=value, factor=factor) for name, value in pairs.items() if value > 0.0}

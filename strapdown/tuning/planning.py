@@ -2,35 +2,56 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from strapdown import quaternion, setup
+from strapdown import setup
 from strapdown.checks import Array, InputError, count, instance
-from strapdown.randomness import generator
 from strapdown.records import cut
+from strapdown.results import Listed, Listing, figure
 from strapdown.scenarios import Scenario, simulate
 from strapdown.setup import FilterSetup
 from strapdown.tuning.innovations import Case, likelihood
-from strapdown.tuning.parameters import values_of
+from strapdown.tuning.parameters import Unit, unit_of, values_of
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Plan:
+class Plan(Listed):
     """Standard errors that records of several lengths will give at best."""
 
     names: tuple[str, ...]
     values: Array
     """The parameters assumed (p,), SI."""
+    units: tuple[Unit, ...]
+    """Units that they are printed in."""
     lengths: Array
     """Lengths of a record (k,), s."""
     errors: Array
     """Least standard error of the logarithm of each parameter (k, p): 0.1 is 10 %."""
     scatter: float
     """Largest relative scatter of these over the simulated records, standard deviation of their mean."""
+
+    def listing(self) -> Listing:
+        """Return the least standard errors as factors, as a table."""
+        rows = [
+            (
+                name,
+                unit.name,
+                figure(value / unit.factor, 3),
+                *(f"× {math.exp(error):.3f}" if error < 2.0 else "nothing" for error in errors),
+                f"{needed:.3g} s",
+            )
+            for name, unit, value, errors, needed in zip(
+                self.names, self.units, self.values, self.errors.T, self.needed(), strict=True
+            )
+        ]
+        columns = ("parameter", "unit", "value", *(f"{length:g} s" for length in self.lengths), "10 % needs")
+        note = "Above about × 1.5 a record gives a bound rather than a value. The last column lets information grow as at the end."
+        return Listing("Least standard error, as a factor (Cramér–Rao)", columns, rows, [note], left=2)
 
     def needed(self, error: float = 0.1) -> Array:
         """Return the length (p,), s, at which each parameter is known to this relative error, if information grows as at the end."""
@@ -84,14 +105,7 @@ def plan(
 
     def one(number: int) -> Array:
         record = simulate(replace(scenario, duration=float(wanted[-1])), seed, number)
-        truth = record.truth
-        assert truth is not None
-        draw = generator(seed, number, "initial error").standard_normal(6)
-        initial = setup.initial_state(
-            chosen,
-            quaternion.multiply(truth.attitude[0], quaternion.exp(-chosen.attitude_sigma * draw[:3])),
-            truth.bias[0] - chosen.bias_sigma * draw[3:],
-        )
+        initial = setup.drawn_state(chosen, record, seed, number)
         rows = []
         for length in wanted:
             last = int(np.searchsorted(record.time, record.time[0] + length * (1.0 - 1e-9)))
@@ -110,6 +124,7 @@ def plan(
     return Plan(
         names=tuple(free),
         values=np.array(list(values.values())),
+        units=tuple(unit_of(name, [example]) for name in free),
         lengths=wanted,
         errors=bound(found.mean(axis=0)),
         scatter=float(0.5 * np.max(np.std(diagonal, axis=0) / np.mean(diagonal, axis=0)) / np.sqrt(records)),

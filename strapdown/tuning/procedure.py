@@ -7,13 +7,23 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from strapdown.checks import InputError, non_negative
+from strapdown.records import ImuRecord
 from strapdown.setup import FilterSetup
 from strapdown.tuning import extended
 from strapdown.tuning.errors import error_objective
 from strapdown.tuning.fitting import Objective, Tuning, fit, rescaled
 from strapdown.tuning.innovations import Case, likelihood
 from strapdown.tuning.outliers import TunedGate, contaminated_likelihood, tuned_gate
-from strapdown.tuning.parameters import Prior, axis_of, default_names
+from strapdown.tuning.parameters import (
+    OUTLIER_SCALE,
+    OUTLIER_SHARE,
+    Prior,
+    Unit,
+    axis_of,
+    default_names,
+    known_names,
+    unit_of,
+)
 
 GATED = ("gate.probability", "outliers.share", "outliers.scale")
 """Names of parameters that ask for a model of outliers."""
@@ -81,6 +91,17 @@ def objective_for(
     if truth or rmse:
         return error_objective(cases, setup, names, measure="rmse" if rmse else "likelihood", threads=threads)
     return likelihood(cases, setup, names, spacing=spacing)
+
+
+def with_units(found: Tuning, records: Sequence[ImuRecord]) -> Tuning:
+    """Return a tuning whose parameters are printed in units that suit the sensors of these records."""
+
+    def unit(name: str) -> Unit:
+        plain = name in (*known_names(records), OUTLIER_SHARE, OUTLIER_SCALE) or axis_of(name) is not None
+        return unit_of(name, records) if plain else extended.unit_of(name)
+
+    shown = tuple(dataclasses.replace(one, unit=unit(one.name)) for one in found.parameters)
+    return dataclasses.replace(found, parameters=shown)
 
 
 def tune(
@@ -154,6 +175,7 @@ def tune(
         # The size of the error leaves a common scale open; the innovations determine it.
         scaled = fit(likelihood(cases, result.setup, ["filter.scale"]), starts=2, threads=threads)
         result = rescaled(result, scaled["filter.scale"].value)
+    result = with_units(result, [case.record for case in cases])
     found = tuned_gate(made, result) if gate else None  # type: ignore[arg-type]
     if found is not None and found.gate is not None:
         result = dataclasses.replace(result, setup=dataclasses.replace(result.setup, gate=found.gate))

@@ -7,12 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from strapdown import ahrs, estimation, quaternion, setup
+from strapdown import ahrs, estimation, setup
 from strapdown.ahrs import AhrsParameters
 from strapdown.ahrs.starting import need_accelerometer
 from strapdown.checks import InputError
 from strapdown.gyro import GyroSpec
-from strapdown.randomness import generator
 from strapdown.recordings import Recording
 from strapdown.records import ImuRecord
 from strapdown.setup import FilterSetup
@@ -107,10 +106,7 @@ def record_case(record: ImuRecord, chosen: FilterSetup, *, name: str = "", seed:
         If the first measurements do not give the attitude.
     """
     if seed is not None and record.truth is not None:
-        draw = generator(seed, 0, "initial error").standard_normal(6)
-        attitude = quaternion.multiply(record.truth.attitude[0], quaternion.exp(-chosen.attitude_sigma * draw[:3]))
-        bias = record.truth.bias[0] - chosen.bias_sigma * draw[3:]
-        return Case(record=record, initial=setup.initial_state(chosen, attitude, bias), name=name)
+        return Case(record=record, initial=setup.drawn_state(chosen, record, seed), name=name)
     try:
         first = estimation.first_state(record, chosen.process_noise, bias_sigma=chosen.bias_sigma)
     except InputError as error:

@@ -1,4 +1,4 @@
-"""Attitude from vector observations at one instant: TRIAD, and the optimal solution of Wahba's problem with its covariance.
+"""Attitude from vector observations at one instant: from vertical and North, and the optimal solution of Wahba's problem.
 
 Directions ``b_i`` measured in the body frame are known as ``r_i`` in the fixed frame; wanted is the attitude ``q_fb``, matrix R,
 that minimises Wahba's loss ``½ Σ |b_i − Rᵀ r_i|² / σ_i²`` (Wahba 1965, SIAM Review 7). ``σ_i`` is the noise of each of the *two*
@@ -25,7 +25,6 @@ __all__ = [
     "Solution",
     "from_vertical_and_heading",
     "solve",
-    "triad",
 ]
 
 INCONSISTENT = 6.0
@@ -33,9 +32,6 @@ INCONSISTENT = 6.0
 
 LARGEST_UNCERTAINTY = 1.0
 """A 1σ of the attitude, rad, beyond which a direction of it counts as undetermined (a uniform angle has 1.8)."""
-
-MIN_ANGLE = 1e-6
-"""Smallest angle between two directions and one line, rad, where no σ is given to judge by."""
 
 MIN_HORIZONTAL_ANGLE = 1e-3
 """Angle between magnetic field and vertical, rad, below which there is no heading."""
@@ -45,55 +41,6 @@ MIN_WEIGHT = 1e-12
 
 ROUNDING = 1e-15
 """Rounding error of the direction of a unit vector, rad."""
-
-
-# ----------------------------------------------------------------------------------------------------------------------
-# Two directions
-
-
-def triad(
-    primary_b: ArrayLike,
-    secondary_b: ArrayLike,
-    primary_f: ArrayLike,
-    secondary_f: ArrayLike,
-    *,
-    sigmas: ArrayLike | None = None,
-) -> Array:
-    """Return the attitude from two directions: the first is met exactly, the second fixes the rotation about it.
-
-    Parameters
-    ----------
-    primary_b, secondary_b : array_like (..., 3)
-        Directions measured in the body frame; the more accurate one first.
-    primary_f, secondary_f : array_like (..., 3)
-        The same directions in the fixed frame.
-    sigmas : array_like (2,), optional
-        Noise of both, rad. If given, the angle between the two must agree in both frames within the noise; it is not checked
-        otherwise.
-
-    Returns
-    -------
-    ndarray (..., 4)
-        Unit quaternions q_fb (TRIAD; Black 1964).
-
-    Raises
-    ------
-    InputError
-        If two directions of one frame lie on one line, or their angles disagree beyond the noise.
-
-    Examples
-    --------
-    >>> triad([0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]).tolist()
-    [1.0, 0.0, 0.0, 0.0]
-    """
-    first_b, second_b = _directions("primary_b", primary_b), _directions("secondary_b", secondary_b)
-    first_f, second_f = _directions("primary_f", primary_f), _directions("secondary_f", secondary_f)
-    if sigmas is not None:
-        sigma = _sigmas(sigmas, (2,))
-        _refuse_inconsistent(_stacked(first_b, second_b), _stacked(first_f, second_f), sigma)
-    _refuse_parallel("primary_b", "secondary_b", first_b, second_b, MIN_ANGLE)
-    _refuse_parallel("primary_f", "secondary_f", first_f, second_f, MIN_ANGLE)
-    return _triad(first_b, second_b, first_f, second_f)
 
 
 def from_vertical_and_heading(up_b: ArrayLike, magnetic_b: ArrayLike) -> Array:
@@ -109,16 +56,20 @@ def from_vertical_and_heading(up_b: ArrayLike, magnetic_b: ArrayLike) -> Array:
     Returns
     -------
     ndarray (..., 4)
-        Unit quaternions q_fb. The vertical is met exactly; of the field only the horizontal part counts, which points North
-        whatever the dip.
+        Unit quaternions q_fb (TRIAD; Black 1964). The vertical is met exactly; of the field only the horizontal part counts, which
+        points North whatever the dip.
     """
     up, field = _directions("up_b", up_b), _directions("magnetic_b", magnetic_b)
-    _refuse_parallel("up_b", "magnetic_b", up, field, MIN_HORIZONTAL_ANGLE)
-    return _triad(up, field, np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0]))
-
-
-def _stacked(first: Array, second: Array) -> Array:
-    return np.stack(np.broadcast_arrays(first, second), axis=-2)
+    angle = np.asarray(_angle(up, field))
+    bad = np.minimum(angle, np.pi - angle) < MIN_HORIZONTAL_ANGLE
+    if np.any(bad):
+        index = np.argwhere(bad)[0]
+        raise InputError(
+            f"{_place('up_b', *index)} and {_place('magnetic_b', *index)} are {angle[tuple(index)] / DEGREE:.6g}° apart, less than "
+            f"{MIN_HORIZONTAL_ANGLE / DEGREE:.2g}° from one line: such a field shows no heading; check both"
+        )
+    north_up = _frame(np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0]))
+    return quaternion.from_matrix(north_up @ np.swapaxes(_frame(up, field), -1, -2))
 
 
 def _frame(first: Array, second: Array) -> Array:
@@ -126,10 +77,6 @@ def _frame(first: Array, second: Array) -> Array:
     normal = np.cross(first, second)
     normal = normal / np.linalg.norm(normal, axis=-1, keepdims=True)
     return np.stack(np.broadcast_arrays(first, np.cross(normal, first), normal), axis=-1)
-
-
-def _triad(first_b: Array, second_b: Array, first_f: Array, second_f: Array) -> Array:
-    return quaternion.from_matrix(_frame(first_f, second_f) @ np.swapaxes(_frame(first_b, second_b), -1, -2))
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -325,17 +272,6 @@ def _sigmas(value: ArrayLike, shape: tuple[int, ...]) -> Array:
 
 def _angle(u: Array, v: Array) -> Array:
     return np.asarray(np.arctan2(np.linalg.norm(np.cross(u, v), axis=-1), np.sum(u * v, axis=-1)))
-
-
-def _refuse_parallel(first_name: str, second_name: str, first: Array, second: Array, least: float) -> None:
-    angle = np.asarray(_angle(first, second))
-    bad = np.minimum(angle, np.pi - angle) < least
-    if np.any(bad):
-        index = np.argwhere(bad)[0]
-        raise InputError(
-            f"{_place(first_name, *index)} and {_place(second_name, *index)} are {angle[tuple(index)] / DEGREE:.6g}° apart, less than "
-            f"{least / DEGREE:.2g}° from one line: the rotation about it is not determined; give a second direction away from the first"
-        )
 
 
 def _refuse_inconsistent(b: Array, r: Array, sigma: Array) -> None:
