@@ -37,7 +37,6 @@ from strapdown.results import Listed, Listing, figure
 TERMS = ("quantization", "angle_random_walk", "bias_instability", "rate_random_walk", "rate_ramp")
 """The noise terms, in the order of every array over terms; also the names of the gyro specification."""
 
-
 NOISE_TYPES = {
     2: "quantization",
     1: "flicker angle",
@@ -47,7 +46,6 @@ NOISE_TYPES = {
 }
 """Name of each power law: the PSD of the rate goes as f to the key."""
 
-
 ESTIMATORS = {
     "overlapping": "overlapping Allan deviation, OADEV",
     "robust": "Allan deviation by the median of second differences",
@@ -56,26 +54,19 @@ ESTIMATORS = {
 }
 """Estimators of :func:`allan_deviation`."""
 
-
 _MEDIAN_OF_NORMAL = 0.6744897501960817  # Φ⁻¹(3/4): median of |z|, z standard normal
-
 
 _MEDIAN_EFFICIENCY = (
     0.3675  # of the median of |z| against the mean square, independent normal data: 8 (z φ(z))², z = Φ⁻¹(3/4)
 )
 
-
 _FEWEST_BLOCKS = 30  # below this the lag-1 autocorrelation says little (SP 1065, §5.5.6)
-
 
 _MANY_BLOCKS = 128  # its scatter is then well below what moves the power law by one half
 
-
 _MAX_BLOCKS = 1 << 17
 
-
 _STRETCH = 1 << 16
-
 
 _FLICKER_SUM_LIMIT = 4096
 

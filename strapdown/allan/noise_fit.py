@@ -81,7 +81,6 @@ NAMES: Mapping[str, Mapping[str, str]] = {
 }
 """Name of a term by sensor, where it differs from that of a gyro."""
 
-
 TERM_COST = 1.5
 """Log-likelihood by which a coefficient must raise that of a combination of terms to raise its weight (Akaike's: 1).
 
@@ -90,14 +89,11 @@ wide), at 1.5 96.6 %. Beside flicker that the record hardly shows, one axis's in
 86 % at 2.
 """
 
-
 SUPPORT_PROBABILITY = 1e-3
 """A term is supported if a record without it would show as much of it by chance with less than this probability."""
 
-
 MISFIT_PROBABILITY = 1e-3
 """Value of ``NoiseFit.misfit_probability`` below which the record contains more than the noises."""
-
 
 SHORTEST = 64
 """Samples of the shortest segment without a gap that a fit uses."""

@@ -14,7 +14,6 @@ from strapdown.checks import Array, positive
 
 BIN_GROWTH = 1.05
 
-
 LARGEST_EXACT = 1 << 16
 
 

@@ -51,7 +51,6 @@ STYLE: Any = {
 FORMATS = ("png", "pdf", "svg")
 """Formats that figures are written in."""
 
-
 _DARK, _LIGHT = "#16181d", "#e4e6eb"
 THEMES: dict[str, Any] = {
     "light": {},

@@ -41,7 +41,6 @@ _BUILTIN = Path(__file__).parent / "builtin"
 SCENARIOS: tuple[str, ...] = tuple(sorted(path.stem for path in _BUILTIN.glob("*.toml")))
 """Names of the built-in scenarios."""
 
-
 MAX_SAMPLES = 1e9
 """Gyro samples that a simulated record may have: beyond it none fits into memory."""
 
@@ -338,7 +337,6 @@ _ORBIT: Form = {
     "inclination": tables.DEGREES,
     "phase": tables.DEGREES,
 }
-
 
 _OF_SENSORS: dict[str, tables.Choice] = {
     "name": tables.TEXT,
