@@ -37,7 +37,6 @@ from strapdown.files import write_json
 if TYPE_CHECKING:
     from types import FrameType
 
-    from strapdown.consistency import Judgement
     from strapdown.estimation.filters.own import Own
     from strapdown.montecarlo import Plan
     from strapdown.montecarlo.campaign import Campaign
@@ -119,8 +118,6 @@ def montecarlo(
     output: _Output,
 ) -> None:
     """Run a scenario many times through a filter and judge the filter: exit status 0 consistent, 1 not, 2 cannot tell (or bad input)."""
-    from strapdown.montecarlo import summary
-
     source = Path(scenario)
     held, plan = _planned(source, scenario, model, computing.machine)
     machine = held.machine if held is not None and computing.machine == "auto" else computing.machine
@@ -134,13 +131,12 @@ def montecarlo(
         _replay(plan, output.replay, machine, target)
         return
     if held is not None and target == source and not (output.resume or output.overwrite):
-        status = _print_result(held)
-        if output.tables is not None and held.statistics is not None:
-            written(*tables_written(output.tables, "montecarlo", summary(held.statistics)))
+        status, content = _print_result(held)
+        if output.tables is not None:
+            written(*tables_written(output.tables, "montecarlo", content))
         raise typer.Exit(status)
     result = _computed(plan, target, source.stem, replace(computing, machine=machine), output)
-    status = _print_result(result)
-    content = _report(result)
+    status, content = _print_result(result)
     write_json(target.with_suffix(".json"), content)
     written(target, target.with_suffix(".json"), *tables_written(output.tables, "montecarlo", content))
     raise typer.Exit(status)
@@ -287,34 +283,9 @@ def _with_filter(held: Campaign, own: Own, source: Path) -> Campaign:
     return replace(held, plan=replace(held.plan, setup=replace(held.plan.setup, estimator=own)))
 
 
-def _report(campaign: Campaign) -> dict[str, Any]:
-    from strapdown.montecarlo import summary
-    from strapdown.montecarlo.verdicts import bound_of
-
-    assert campaign.statistics is not None
-    return {
-        "plan": campaign.plan.to_table(),
-        "digest": campaign.plan.digest,
-        "machine": campaign.machine,
-        "lanes_do_not_serve": campaign.reason or None,
-        "chunk": campaign.chunk,
-        "version": campaign.version,
-        "seconds": campaign.seconds,
-        "judgement": _judged(campaign).summary(),
-        **summary(campaign.statistics, bound=bound_of(campaign.plan)),
-    }
-
-
-def _judged(campaign: Campaign) -> Judgement:
-    """Return the verdict that `strapdown check` gives of the file."""
+def _print_result(campaign: Campaign) -> tuple[int, dict[str, Any]]:
+    """Show the statistics and the verdict, that of `strapdown check`; return the exit status, and all as it is written to JSON."""
     from strapdown import consistency
-
-    assert campaign.statistics is not None
-    return consistency.judge_runs(campaign.statistics, unmodelled=campaign.plan.unmodelled)
-
-
-def _print_result(campaign: Campaign) -> int:
-    """Show the statistics and the verdict; return the exit status."""
     from strapdown.cli.judgement import status_of
     from strapdown.montecarlo import summary
     from strapdown.montecarlo.verdicts import bound_of
@@ -326,7 +297,7 @@ def _print_result(campaign: Campaign) -> int:
         console.print(f"{campaign.statistics.runs} of {campaign.runs} runs are finished.")
     report = summary(campaign.statistics, bound=bound_of(campaign.plan))
     figure = lambda value: "-" if value is None else f"{value:.4g}" if value >= 1e3 else f"{value:.4f}"  # noqa: E731
-    judgement = _judged(campaign)
+    judgement = consistency.judge_runs(campaign.statistics, unmodelled=campaign.plan.unmodelled)
     rows = table(
         f"Per degree of freedom; 1 for a consistent filter. NEES over {report['epochs_judged']} epochs",
         *("", "mean", "least", "greatest", "from", "to", ""),
@@ -361,7 +332,17 @@ def _print_result(campaign: Campaign) -> int:
         console.print("More runs (--runs, with --resume) would show it.")
     if judgement.unmodelled and campaign.plan.setup.states is None and campaign.plan.setup.estimator == MEKF:
         console.print("--states gives the filter states for most of these errors.")
-    return status_of(judgement)
+    return status_of(judgement), {
+        "plan": campaign.plan.to_table(),
+        "digest": campaign.plan.digest,
+        "machine": campaign.machine,
+        "lanes_do_not_serve": campaign.reason or None,
+        "chunk": campaign.chunk,
+        "version": campaign.version,
+        "seconds": campaign.seconds,
+        "judgement": judgement.summary(),
+        **report,
+    }
 
 
 def _print_errors(report: dict[str, Any]) -> None:
@@ -398,8 +379,12 @@ def _print_errors(report: dict[str, Any]) -> None:
     expected = ", ".join(f"{100.0 * share:.2f}" for share in report["coverage"]["expected"])
     console.print(f"Of a right filter's errors {expected} % lie inside 1, 2, 3 σ.")
     if (efficiency := report.get("rms_over_root_cramer_rao_bound")) is not None:
-        low, high = efficiency.pop("bounds_of_an_efficient_filter")
-        ratios = "; ".join(f"{name} {', '.join(f'{x:.3f}' for x in axes)}" for name, axes in efficiency.items())
+        low, high = efficiency["bounds_of_an_efficient_filter"]
+        ratios = "; ".join(
+            f"{name} {', '.join(f'{x:.3f}' for x in efficiency[name])}"
+            for name in ("attitude", "bias")
+            if name in efficiency
+        )
         console.print(
             f"RMS error over the root of the Cramér–Rao bound, which no filter can beat, by axis: {ratios} "
             f"(at one epoch {low:.3f} to {high:.3f} for a filter that attains it)."
