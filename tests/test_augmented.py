@@ -428,8 +428,8 @@ def test_the_factor_keeps_its_digits_however_sharp_the_measurement(sharpness):
     prior = np.geomspace(1e-5, 1e5, n)[rng.permutation(n)]
     F = np.zeros((n + p, triangle.padded(n)))
     F[:n, :n] = np.diag(prior)
-    H, lines = np.zeros((1, F.shape[1])), np.zeros((5, F.shape[1]))
-    triangularise, take_row = called(triangle.triangularise), called(triangle.take_row)
+    H, lines = np.zeros((3, F.shape[1])), np.zeros((1 + triangle.TAKEN, F.shape[1]))
+    triangularise, take_rows = called(triangle.triangularise), called(triangle.take_rows)
     with mpmath.workdps(60):
         P = mpmath.diag([mpmath.mpf(s) ** 2 for s in prior])
         for _ in range(6):
@@ -441,20 +441,47 @@ def test_the_factor_keeps_its_digits_however_sharp_the_measurement(sharpness):
             F[n:, :n] = noise
             triangularise(F, noisy, 3, n, n + p, 0, 0, lines[0])
             P = mpmath.matrix(phi) * P * mpmath.matrix(phi).T + mpmath.matrix(noise).T * mpmath.matrix(noise)
-            for _ in range(4):
-                H[0, :n] = rng.standard_normal(n) / prior
-                s = take_row(F, n, 0, H, 0, sharpness**2, lines[0], lines[1:4])
-                h = mpmath.matrix(H[:, :n])
-                exact = (h * P * h.T)[0] + mpmath.mpf(sharpness) ** 2
-                K = P * h.T / exact
-                assert abs(s / exact - 1) < 1e-7
-                P = P - K * (h * P)
+            for rows in (1, 2, 3):
+                H[:] = 0.0
+                H[:rows, :n] = rng.standard_normal((rows, n)) / prior
+                y = rng.standard_normal(3)
+                e, s = take_rows(F, n, 0, H, rows, tuple(y), (sharpness**2,) * 3, lines[0], lines[1:])
+                x = mpmath.zeros(n, 1)
+                for r in range(rows):
+                    h = mpmath.matrix(H[r : r + 1, :n])
+                    exact = (h * P * h.T)[0] + mpmath.mpf(sharpness) ** 2
+                    assert abs(s[r] / exact - 1) < 1e-7
+                    assert abs(e[r] - y[r] + (h * x)[0]) < 1e-7 * mpmath.sqrt(exact)
+                    K = P * h.T / exact
+                    x = x + K * (y[r] - (h * x)[0])
+                    P = P - K * (h * P)
+                assert max(abs(lines[0, i] - x[i]) / mpmath.sqrt(P[i, i]) for i in range(n)) < 1e-7
         exact = np.array(P.tolist(), np.float64)
     assert np.array_equal(F[:n], np.tril(F[:n]))
     found = F[:n, :n].T @ F[:n, :n]
     sigma = np.sqrt(np.diag(exact))
     assert np.max(np.abs(scaled(found - exact, sigma))) < 1e-7
     assert np.all(np.diag(F[:n]) != 0.0)
+
+
+@pytest.mark.parametrize("rows", [1, 2, 3])
+def test_rows_update_a_factor_whose_first_rows_are_loose(rows):
+    """The textbook's update, of a factor whose attitude and carried states have been turned since it was a triangle."""
+    rng = np.random.default_rng(3)
+    n, loose = 17, 12
+    F = np.zeros((n, triangle.padded(n)))
+    F[:n, :n] = np.tril(rng.standard_normal((n, n))) + 3.0 * np.eye(n)
+    for own in (slice(3), slice(6, loose)):
+        F[own, own] = rng.standard_normal(F[own, own].shape)
+    H, scratch = np.zeros((3, F.shape[1])), np.zeros((1 + triangle.TAKEN, F.shape[1]))
+    H[:rows, :3], H[:rows, 5:15] = rng.standard_normal((rows, 3)), rng.standard_normal((rows, 10))
+    P, used = F[:, :n].T @ F[:, :n], H[:rows, :n]
+    variance = rng.uniform(0.5, 2.0, 3)
+    gain = P @ used.T @ np.linalg.inv(used @ P @ used.T + np.diag(variance[:rows]))
+    y = rng.standard_normal(3)
+    called(triangle.take_rows)(F, n, loose, H, rows, tuple(y), tuple(variance), scratch[0], scratch[1:])
+    np.testing.assert_allclose(F[:, :n].T @ F[:, :n], P - gain @ used @ P, rtol=0, atol=1e-12 * np.max(P))
+    np.testing.assert_allclose(scratch[0, :n], gain @ y[:rows], rtol=1e-11, atol=1e-12)
 
 
 @pytest.mark.parametrize("sharpness", [1e-9, 1.0, 1e3])

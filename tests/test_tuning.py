@@ -137,28 +137,22 @@ def test_a_lane_that_no_sub_steps_mend_cuts_no_step_of_the_others():
     body = likelihood.Body(*[None] * len(likelihood.Body._fields))._replace(room=np.empty(likelihood.ROOM))
     theta, b = (0.1, 0.2, 0.0), np.zeros((3, WIDTH))
 
-    def small(part):
-        return likelihood.is_small((None, tuple(b)), part, 0.5, body)
+    def longest(part=theta):
+        return likelihood.longest_step((None, tuple(b)), part, 0.5, body)
 
-    def longest():
-        return likelihood.longest_step((None, tuple(b)), theta, 0.5, body)
-
-    # Whole steps without a look at each lane: turns of half the range by the increment and half by the bias.
-    along = np.array([0.6, 0.0, 0.8])
-    assert small(tuple(0.5 * (1.0 - 1e-9) * LARGEST_ANGLE * along))
-    assert not small(tuple(0.5 * (1.0 + 1e-9) * LARGEST_ANGLE * along))
-    assert small(theta) == (np.hypot(0.1, 0.2) <= 0.5 * LARGEST_ANGLE)
     assert longest() == 0.5
-    b[1, 3] = 0.999 * LARGEST_ANGLE
-    assert small((0.0, 0.0, 0.0))
-    b[1, 3] = 1.001 * LARGEST_ANGLE
-    assert not small((0.0, 0.0, 0.0))
-    b[1, 3], b[1, 5], b[1, 6] = 4.0, 1e9, np.nan
-    assert not small((0.0, 0.0, 0.0))
+    # Of one lane increment and bias turn by half the range each, and by a little more.
+    along = 0.5 * LARGEST_ANGLE * np.array([0.6, 0.0, 0.8])
+    b[:, 3] = -along / 0.5
+    assert longest(tuple(along * (1.0 - 1e-9))) == 0.5
+    assert longest(tuple(along * (1.0 + 1e-9))) == pytest.approx(0.5 * (1.0 - 0.5e-9), rel=1e-12)
+    assert longest(tuple(3.0 * along)) == pytest.approx(0.25, rel=1e-12)
+    b[:, 3] *= 3.0
+    assert longest(tuple(along)) == pytest.approx(0.25, rel=1e-12)
     # The bias turns the fourth lane by 2 rad; two others are lost.
+    b[:, 3], b[1, 3], b[1, 5], b[1, 6] = 0.0, 4.0, 1e9, np.nan
     assert longest() == pytest.approx(0.5 * LARGEST_ANGLE / np.hypot(0.1, 0.2 - 2.0))
     b[1, 3] = 0.0
-    assert not small((0.0, 0.0, 0.0))
     assert longest() == 0.5
 
 

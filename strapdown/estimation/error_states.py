@@ -33,7 +33,7 @@ __all__ = [
 ]
 
 AXES = ("x", "y", "z")
-MAX_CHAIN_DECAY = 0.2
+MAX_CHAIN_DECAY = 0.5
 """Largest λ dt of a state in a chain in one step, where its series and Gauss's rule are exact."""
 ENTRIES = tuple(a if a == b else f"{a}{b}" for a in AXES for b in AXES)
 """Entries of a matrix by rows: x, xy, xz, yx, y, …"""

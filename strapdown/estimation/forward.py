@@ -36,6 +36,7 @@ from strapdown.estimation.states import (
 from strapdown.kernels import covariance_form, gate, gate_rules, iterated_update, root_form
 from strapdown.kernels.chains import LINKS
 from strapdown.kernels.error_state_step import OFFSET
+from strapdown.kernels.lane_values import WIDTH
 from strapdown.kernels.machine import compiled, read_only
 from strapdown.kernels.measurement import Measurements
 from strapdown.kernels.series import LARGEST_ANGLE
@@ -655,26 +656,28 @@ def _in_factor(problem: Problem, options: Options) -> Passed:
     whole_rows = rows if options.whole_bias else 0
     kept = size if options.error_state_covariance else 6
     stands = np.tri(size, dtype=bool)
-    stands[: model.loose, : model.loose] = True
-    (stored,) = side_by_side(((options.segments + 1 if options.segments else 0, 5 + size + int(np.sum(stands))), float))
-    out = root_form.Outputs(
-        attitude=np.empty((rows, 4)),
-        x=np.empty((rows, size - 3)),
-        variance=np.empty((rows, size)),
-        covariance=np.empty((rows if options.full_covariance and not options.whole_bias else 0, kept, kept)),
-        whole_variance=np.empty((whole_rows, 6)),
-        whole_covariance=np.empty((whole_rows if options.full_covariance else 0, 6, 6)),
-        innovation=np.empty(_innovations(events, judged=options.judged)),
-        segments=stored[: options.segments],
+    stands[:6, :6] = stands[6 : model.loose, : model.loose] = True
+    end = 5 + size + int(np.sum(stands))
+    (stored,) = side_by_side(((options.segments + 1 if options.segments else 0, end + WIDTH - 1), float))
+    shapes = (
+        (rows, 4),
+        (rows, size - 3),
+        (rows, size),
+        (rows if options.full_covariance and not options.whole_bias else 0, kept, kept),
+        (whole_rows, 6),
+        (whole_rows if options.full_covariance else 0, 6, 6),
+        _innovations(events, judged=options.judged),
     )
+    written = side_by_side(*((shape, float) for shape in shapes))
+    out = root_form.Outputs._make((*written, stored[: options.segments]))
     judge = Judge(problem, options)
     weight, happened = None, []
     arguments = *problem.gyro, events.measurements, every
     if options.judged:
         restart = restart_in_factor(judge)
-        written = judge.outputs(out)
-        number, recovered, locked = compiled(walk, gate, root_form)(*arguments, judge.body(body, restart), written)
-        weight, happened = written.weight, judge.events(written, recovered, locked)
+        judged = judge.outputs(out)
+        number, recovered, locked = compiled(walk, gate, root_form)(*arguments, judge.body(body, restart), judged)
+        weight, happened = judged.weight, judge.events(judged, recovered, locked)
     else:
         number = compiled(walk, root_form)(*arguments, body, out)
     if number < 0:  # rows from there on are not written
@@ -683,7 +686,7 @@ def _in_factor(problem: Problem, options: Options) -> Passed:
         stored[number, :4] = 0.0
         stored[number, 4:8] = body.attitude[0]
         stored[number, 8 : 5 + size] = body.x[0]
-        stored[number, 5 + size :] = body.F[0, :size, :size][stands]
+        stored[number, 5 + size : end] = body.F[0, :size, :size][stands]
     innovations = innovations_by_sensor(events, out.innovation, weight)
     estimate = replace(
         factor_estimate(
@@ -768,27 +771,35 @@ def factor_estimate(
     if P is not None and not model.states:
         P = _reported(P)
     back = np.argsort(model.whole_order)
-    values, spread = x[:, 3:][:, back[6:] - 6], variance[:, back]
-    whole = P if P is None or P.shape[1] == 6 else P[:, back[:, None], back]
-    found, first = {}, 0
+    whole = P
+    if P is not None and P.shape[1] > 6 and np.any(np.diff(back) != 1):
+        whole = P[:, back[:, None], back]
+    found, first = {}, 6
     for one in problem.error_states:
-        part = slice(first, first + one.size)
+        own = back[first : first + one.size]
         found[one.name] = ErrorStateEstimate(
             components=tuple(one.components),
             units=tuple(one.units),
-            values=values[:, part],
-            variance=spread[:, 6:][:, part],
+            values=_columns(x, own - 3),
+            variance=_columns(variance, own),
         )
         first += one.size
     return Estimate(
         time=problem.record.time[::every],
         attitude=attitude,
-        bias=x[:, :3].copy(),
-        variance=spread[:, :6],
+        bias=x[:, :3],
+        variance=variance[:, :6],
         covariance=None if whole is None else whole[:, :6, :6],
         error_states=found,
         whole_covariance=whole if whole is not None and whole.shape[1] > 6 else None,
     )
+
+
+def _columns(values: Array, which: np.ndarray) -> Array:
+    """Return columns of an array, without a copy where one follows the other."""
+    if np.all(np.diff(which) == 1):
+        return values[:, which[0] : which[0] + len(which)]
+    return values[:, which]
 
 
 def _reported(P: Array) -> Array:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from strapdown.checks import Array, InputError, array, one_of
-from strapdown.estimation.error_states import MAX_CHAIN_DECAY, Effect, ErrorStates, check
+from strapdown.estimation.error_states import Effect, ErrorStates, check
 from strapdown.estimation.states import Candidate, State, check_arguments
 from strapdown.kernels import error_state_step
 from strapdown.kernels.chains import CHAIN, chain_start
@@ -147,7 +147,7 @@ def assemble(blocks: tuple[ErrorStates, ...], kinds: Mapping[str, str]) -> Model
             "effect on the gyro"
         )
     chains = np.stack([feed, np.where(fed, density, 0.0), seen.stride], axis=1)
-    quickened = np.where(linked, MAX_DECAY / MAX_CHAIN_DECAY, np.where(gyro_use & OFFSET, 5.0, 1.0))
+    quickened = np.where(gyro_use & OFFSET, 5.0, 1.0)
     fastest = float(np.max(decay * quickened, initial=0.0))
     return Model(
         order=order,

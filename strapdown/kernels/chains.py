@@ -13,15 +13,20 @@ from __future__ import annotations
 
 import math
 
-from strapdown.kernels.error_state_step import NODES, WEIGHTS
+import numpy as np
+
+from strapdown.kernels.lane_values import WIDTH, load, spread, total
 
 CALLED = ("chain_step", "step_chains", "carry_chains_back")
 """Not inlined where other kernels use them: their work is far more than a call, and each copy would be compiled anew."""
 
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(WIDTH)
 CHAIN = 3
 """Most states of a chain."""
 TERMS = 14
-"""Of the series of a chain's transition: to rounding for λ dt ≤ 1/5."""
+"""Of the series of a chain's transition: to rounding for λ dt ≤ 1/2."""
+NODES = np.concatenate([0.5 * (1.0 + _NODES), 0.5 * _WEIGHTS])
+"""Nodes and weights of Gauss's rule of eight on [0, 1], a lane a node."""
 LINKS = 8
 """Width of the scratch that a step's shares and root of noise are kept in."""
 
@@ -34,28 +39,12 @@ def chain_start(chains, k):
     return first
 
 
-def products(x, y):
-    """Return the products of numbers at the nodes."""
-    return tuple(a * b for a, b in zip(x, y, strict=True))
-
-
-def plus_scaled(x, s, y):
-    """Return x + s y of numbers at the nodes."""
-    return tuple(a + b * s for a, b in zip(x, y, strict=True))
-
-
-def gauss_sum(dt, x, y):
-    """Return the integral of a product by Gauss's rule of five."""
-    p, w = products(x, y), tuple(dt * one for one in WEIGHTS)
-    return w[0] * (p[0] + p[4]) + w[1] * (p[1] + p[3]) + w[2] * p[2]
-
-
 def chain_step(decay, chains, k, first, dt):
     """Return what state k of a chain makes in dt of the states k − 2, k − 1 and k, and a root of what unit white noise on it makes of them.
 
     First its column of Φ, (φ_{k−2}, φ_{k−1}, φ_k), by the series of the exponential of the chain's matrix: equal poles, and those at zero,
     are no special case. Then N with ``Q = Nᵀ N`` as (n20, n21, n22, n10, n11, n00), by rows from that of state k up, what is not there 0:
-    the same series at the nodes of Gauss's rule of five, exact to 4e-11 for λ dt ≤ 1/5.
+    the same series at the nodes of Gauss's rule, exact to 3e-14 for λ dt ≤ 1/2.
     """
     own = -decay[k] * dt
     middle, to_middle, far, to_far = 0.0, 0.0, 0.0, 0.0
@@ -65,19 +54,20 @@ def chain_step(decay, chains, k, first, dt):
         far, to_far = -decay[k - 2] * dt, chains[k - 2, 0] * dt
     a, b, c = 0.0, 0.0, 1.0
     af, bf, cf = 0.0, 0.0, 1.0
-    # At Gauss's nodes.
-    zero, one = (0.0, 0.0, 0.0, 0.0, 0.0), (1.0, 1.0, 1.0, 1.0, 1.0)
-    A, B, C, powers = zero, zero, one, one
+    nodes, weights = load(NODES, 0), dt * load(NODES, WIDTH)
+    A = B = spread(0.0)
+    C = powers = spread(1.0)
     for i in range(1, TERMS + 1):
         share = 1.0 / i
         a = share * (to_far * b + far * a)
         b = share * (to_middle * c + middle * b)
         c = share * (own * c)
         af, bf, cf = af + a, bf + b, cf + c
-        powers = products(powers, NODES)
-        A, B, C = plus_scaled(A, a, powers), plus_scaled(B, b, powers), plus_scaled(C, c, powers)
-    q22, q12, q11 = gauss_sum(dt, C, C), gauss_sum(dt, B, C), gauss_sum(dt, B, B)
-    q02, q01, q00 = gauss_sum(dt, A, C), gauss_sum(dt, A, B), gauss_sum(dt, A, A)
+        powers = powers * nodes
+        A, B, C = A + a * powers, B + b * powers, C + c * powers
+    a, b, c = weights * A, weights * B, weights * C
+    q22, q12, q11 = total(c * C), total(c * B), total(b * B)
+    q02, q01, q00 = total(c * A), total(b * A), total(a * A)
     n22 = math.sqrt(q22)
     n21, n20 = q12 / n22, q02 / n22
     n11 = n10 = n00 = 0.0

@@ -57,7 +57,7 @@ from strapdown.kernels.measurement import (
 )
 from strapdown.kernels.rotation import quaternion_multiply, rotation_matrix
 from strapdown.kernels.state import SIZE, keep_state, load_state, store_state
-from strapdown.kernels.walk import SQUARED_RANGE, step_within, turn_squared
+from strapdown.kernels.walk import step_within, turn_squared
 
 CALLED = ("least_share",)
 
@@ -155,11 +155,6 @@ def begin(body):
     # From an array, and not the literal 0: numba would compile the body for that type too.
     segments = body.good[0]
     return q, b, A, B, C, segments, not least_share(body.states[0], body.work) >= body.least_share
-
-
-def is_small(state, part, dt, body):
-    """Return whether the turn is in the range of the polynomials."""
-    return turn_squared(part, dt, state[1]) <= SQUARED_RANGE
 
 
 def longest_step(state, part, dt, body):

@@ -63,11 +63,6 @@ FOUR = (0.0, 0.0, 0.0, 0.0)
 """So many lanes."""
 IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 
-# Gauss–Legendre on [0, 1], five and three nodes.
-_FIVE = (math.sqrt(5.0 - 2.0 * math.sqrt(10.0 / 7.0)) / 3.0, math.sqrt(5.0 + 2.0 * math.sqrt(10.0 / 7.0)) / 3.0)
-NODES = (0.5 - 0.5 * _FIVE[1], 0.5 - 0.5 * _FIVE[0], 0.5, 0.5 + 0.5 * _FIVE[0], 0.5 + 0.5 * _FIVE[1])
-_WEIGHT = ((322.0 - 13.0 * math.sqrt(70.0)) / 1800.0, (322.0 + 13.0 * math.sqrt(70.0)) / 1800.0)
-WEIGHTS = (_WEIGHT[0], _WEIGHT[1], 128.0 / 450.0, _WEIGHT[1], _WEIGHT[0])
 FACTORIALS = tuple(1.0 / math.factorial(k) for k in range(16, 1, -1))
 """1/16! to 1/2!."""
 THREE_NODES = (0.5 - 0.5 * math.sqrt(0.6), 0.5, 0.5 + 0.5 * math.sqrt(0.6))
@@ -326,29 +321,45 @@ def carry(F, size, loose, top, factor, changing):
     """Carry a factor, as many rows of it loose, over a step: each row is a column of S, so ``S ← Φ S``."""
     width = F.shape[1]
     four = lanes_of(FOUR)
-    for j in range(size):
-        t = four
-        for i in range(max(j + 1, loose)):
-            t = t + F[j, i] * load_like(top, 4 * i, four)
-        for k in range(min(max(j + 1, loose) - 6, changing)):
-            F[j, 6 + k] *= factor[k]
-        store_like(F, width * j, t)
+    for j in range(
+        0, size, 4
+    ):  # four rows at once, or each sum would wait for itself; below F there are as many rows of noise
+        a = b = c = d = four
+        for i in range(max(min(j + 4, size), loose)):
+            t = load_like(top, 4 * i, four)
+            a, b, c, d = a + F[j, i] * t, b + F[j + 1, i] * t, c + F[j + 2, i] * t, d + F[j + 3, i] * t
+        for r in range(max(j, 6), min(j + 4, size)):  # rows before have nothing there
+            for k in range(min(max(r + 1, loose) - 6, changing)):
+                F[r, 6 + k] *= factor[k]
+        store_like(F, width * j, a)
+        store_like(F, width * (j + 1), b)
+        store_like(F, width * (j + 2), c)
+        store_like(F, width * (j + 3), d)
 
 
 def carry_back(F, size, end, phi11, top, inverse, changing):
     """Undo :func:`carry` of full rows, to ``end``: rows by ``Φ⁻¹``. ``inverse`` has the reciprocals of ``factor``."""
     width = F.shape[1]
     four = lanes_of(FOUR)
-    for j in range(end):
-        for k in range(changing):
-            F[j, 6 + k] *= inverse[k]
-        t = load_like(F, width * j, four)
-        for i in range(3, size):
-            t = t - F[j, i] * load_like(top, 4 * i, four)
-        first = F[j, 3]
-        store_like(F, width * j, t)
-        F[j, 0], F[j, 1], F[j, 2] = transpose_times_vector(phi11, (F[j, 0], F[j, 1], F[j, 2]))
-        F[j, 3] = first
+    for j in range(0, end, 4):  # below the last there are rows to spare
+        for r in range(j, min(j + 4, end)):
+            for k in range(changing):
+                F[r, 6 + k] *= inverse[k]
+        a, b = load_like(F, width * j, four), load_like(F, width * (j + 1), four)
+        c, d = load_like(F, width * (j + 2), four), load_like(F, width * (j + 3), four)
+        first = F[j, 3], F[j + 1, 3], F[j + 2, 3], F[j + 3, 3]
+        for i in range(3, max(j + 4, 6 + changing) if j + 4 <= size else size):
+            t = load_like(top, 4 * i, four)
+            a, b, c, d = a - F[j, i] * t, b - F[j + 1, i] * t, c - F[j + 2, i] * t, d - F[j + 3, i] * t
+        store_like(F, width * j, a)
+        store_like(F, width * (j + 1), b)
+        store_like(F, width * (j + 2), c)
+        store_like(F, width * (j + 3), d)
+        for r in range(4):
+            F[j + r, 0], F[j + r, 1], F[j + r, 2] = transpose_times_vector(
+                phi11, (F[j + r, 0], F[j + r, 1], F[j + r, 2])
+            )
+            F[j + r, 3] = first[r]
 
 
 def turn_rows(F, end, G):

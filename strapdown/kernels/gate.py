@@ -76,7 +76,7 @@ from strapdown.kernels.measurement import (
     value_of,
 )
 from strapdown.kernels.rotation import moved, quaternion_multiply, rotation_matrix
-from strapdown.kernels.walk import SQUARED_RANGE, step_within, turn_squared
+from strapdown.kernels.walk import step_within, turn_squared
 
 OPEN = (
     "load",
@@ -179,11 +179,6 @@ def largest_turn(running, part, dt, body):
     for i in range(running):
         squared = max(squared, turn_squared(part, dt, bias_at(body.form, i)))
     return squared
-
-
-def is_small(state, part, dt, body):
-    """Return whether every state that runs takes the increment in one step."""
-    return largest_turn(state[0], part, dt, body) <= SQUARED_RANGE and dt <= step_limit(body.form)
 
 
 def longest_step(state, part, dt, body):

@@ -55,7 +55,7 @@ from strapdown.kernels.rotation import (
 )
 from strapdown.kernels.series import second, sinc
 from strapdown.kernels.state import load_state, store_row, store_state
-from strapdown.kernels.walk import SQUARED_RANGE, step_within, turn_squared
+from strapdown.kernels.walk import step_within, turn_squared
 
 CALLED = ("updated", "moment_match", "normalized_weights")
 
@@ -317,11 +317,6 @@ def largest_turn(part, dt, body):
         if body.weight[i] > 0.0:
             squared = max(squared, turn_squared(part, dt, vector_at(body.states[:, 4:], i)))
     return squared
-
-
-def is_small(state, part, dt, body):
-    """Return whether the turn of every hypothesis is in the range of the polynomials."""
-    return largest_turn(part, dt, body) <= SQUARED_RANGE
 
 
 def longest_step(state, part, dt, body):

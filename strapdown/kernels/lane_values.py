@@ -25,6 +25,10 @@ def load(array, start):
     return array.reshape(-1)[start : start + WIDTH].copy()
 
 
+def fetch(array, start):
+    """Have the machine bring ``array[start]`` from far memory, for it is read soon; it may lie outside."""
+
+
 def load_triples(array, start, stride):
     """Return the three components of eight 3-vectors, the i-th at ``array[start + i stride]``; ``stride`` is 3 or more."""
     rows = [array[start + i * stride : start + i * stride + 3] for i in range(WIDTH)]

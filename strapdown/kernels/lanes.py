@@ -233,6 +233,21 @@ def load(typingctx: Any, array: Any, start: Any) -> Any:
 
 
 @intrinsic  # type: ignore[untyped-decorator]
+def fetch(typingctx: Any, array: Any, start: Any) -> Any:
+    """Lower :func:`lane_values.fetch`."""
+
+    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
+        data = builder.gep(builder.extract_value(arguments[0], DATA), [arguments[1]])
+        place = builder.bitcast(data, ir.IntType(8).as_pointer())
+        function = ir.FunctionType(ir.VoidType(), [place.type, *[_INDEX] * 3])
+        name = cgutils.get_or_insert_function(builder.module, function, "llvm.prefetch.p0i8")
+        builder.call(name, [place, *(ir.Constant(_INDEX, k) for k in (0, 3, 1))])
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp), lower
+
+
+@intrinsic  # type: ignore[untyped-decorator]
 def load_triples(typingctx: Any, array: Any, start: Any, stride: Any) -> Any:
     """Lower :func:`lane_values.load_triples`: rows of four, the last from one element before it, so that none ends outside the array."""
     result = _tuple_of(array.dtype, 3)
@@ -576,6 +591,7 @@ INTRINSICS = {
     f.__name__: f
     for f in (
         load,
+        fetch,
         load_triples,
         load_quadruples,
         store,

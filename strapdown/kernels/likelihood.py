@@ -94,16 +94,13 @@ def begin(body):
     return q, b, A, B, C, none, none
 
 
-def is_small(state, part, dt, body):
-    """Return whether increment and bias of every lane turn by half the range of the polynomials at most."""
-    b = state[1]
-    # The sum over the lanes is no less than the largest, and NaN is not below anything.
-    return dot(part, part) <= HALF_RANGE and total(dot(b, b)) * (dt * dt) < HALF_RANGE
-
-
 def longest_step(state, part, dt, body):
     """Return the longest step, s, that turns no lane too far; a lane that is lost, of a turn above ``MAX_TURN``, is left out."""
-    turn = combine(1.0, part, -dt, state[1])
+    b = state[1]
+    # Nearly always short: the sum over the lanes is no less than the largest, and NaN is not below anything.
+    if dot(part, part) <= HALF_RANGE and total(dot(b, b)) * (dt * dt) < HALF_RANGE:
+        return dt
+    turn = combine(1.0, part, -dt, b)
     room = body.room
     store(room, WORK, dot(turn, turn))
     squared = SQUARED_RANGE

@@ -50,6 +50,8 @@ from strapdown.kernels.gate_rules import (
     start_undone,
 )
 from strapdown.kernels.iterated_update import arc_over_chord, seen_from
+from strapdown.kernels.lane_values import WIDTH, spread, store
+from strapdown.kernels.lane_values import load as read
 from strapdown.kernels.measurement import (
     ATTITUDE,
     DIRECTION,
@@ -63,13 +65,22 @@ from strapdown.kernels.measurement import (
 )
 from strapdown.kernels.rotation import far_turn, quaternion_multiply, right_jacobian, turned, unit
 from strapdown.kernels.sensor_rows import arm_noise, decorrelate, fill_rows
-from strapdown.kernels.triangle import covariances, dot_rows, take_row, triangularise, variances, whole_bias
+from strapdown.kernels.triangle import (
+    TAKEN,
+    covariances,
+    seen_by,
+    seen_columns,
+    take_rows,
+    triangularise,
+    variances,
+    whole_bias,
+)
 from strapdown.kernels.walk import step_within, turn_squared
 
 CALLED = ("store_segment", "age_chains", "aged_chain")
 """Not inlined. Only functions of few arrays are: each array of a NamedTuple is handed over by itself."""
 
-SHORT = 0.2
+SHORT = 0.5
 """Of λ dt of a state in a chain: its series is exact."""
 
 
@@ -100,7 +111,7 @@ class Scratch(NamedTuple):
     rows: np.ndarray
     """(3, 3, width of F): H of a measurement, H turned to the prior's tangent space, and F Hᵀ."""
     lines: np.ndarray
-    """(9, width of F): in the order of the constants below."""
+    """(``LINES``, width of F): in the order of the constants below."""
     steps: np.ndarray
     """(2, 2, n, 4): of the steps since the factor's, and of the next, Φ and Q as :func:`strapdown.kernels.error_state_step.move` and
     :func:`strapdown.kernels.error_state_step.step_noise` leave them."""
@@ -120,8 +131,8 @@ FACTOR = 3
 """What of each error state is left after those steps, and after the next (m,) each."""
 WORK = 5
 ROWS = 6
-"""From here on three lines of :func:`strapdown.kernels.triangle.take_row`."""
-LINES = 9
+"""From here on those of :func:`strapdown.kernels.triangle.take_rows`."""
+LINES = 6 + TAKEN
 
 
 class Body(NamedTuple):
@@ -180,19 +191,27 @@ class Outputs(NamedTuple):
 
 
 def store_segment(out, k, dt, part, q, x, F, loose):
-    """Write row k of the segments: dt, increment (3), attitude (4), x, and the rows of the factor, of which the first are loose."""
+    """Write row k of the segments: dt, increment (3), attitude (4), x, and the rows of the factor, of which the first are loose.
+
+    A row has room for ``WIDTH`` − 1 numbers more.
+    """
     out[k, 0] = dt
     out[k, 1], out[k, 2], out[k, 3] = part
     out[k, 4], out[k, 5], out[k, 6], out[k, 7] = q
     place = 8
     for i in range(len(x)):
         out[k, place + i] = x[i]
-    place += len(x)
+    place += len(x) + k * out.shape[1]
     for j in range(len(x) + 3):
-        end = max(j + 1, loose)
-        for i in range(end):
-            out[k, place + i] = F[j, i]
+        end = row_end(j, loose)
+        for c in range(0, end, WIDTH):  # the next row goes over what is too much
+            store(out, place + c, read(F, F.shape[1] * j + c))
         place += end
+
+
+def row_end(j, loose):
+    """Return how many columns of row j of a factor are stored: those of attitude and bias have nothing beyond."""
+    return 6 if j < 6 else max(j + 1, loose)
 
 
 def keep_row(form, q, row, out):
@@ -269,11 +288,6 @@ def begin(body):
     return load(body, 0), none, none
 
 
-def is_small(state, part, dt, body):
-    """Return whether an increment over dt can be propagated in one step."""
-    return longest_step(state, part, dt, body) >= dt
-
-
 def longest_step(state, part, dt, body):
     """Return the longest step, s."""
     return min(step_within(turn_squared(part, dt, bias_at(body, 0)), dt), body.model.limit)
@@ -298,38 +312,31 @@ def update(state, e, now, measured, body, out):
     """Update with a measurement."""
     q, segments, behind = state
     model, scratch, x, F = body.model, body.scratch, body.x[0], body.F[0]
-    H, step, work = scratch.rows[0], scratch.lines[STEP], scratch.lines[WORK]
+    H, step = scratch.rows[0], scratch.lines[STEP]
     size = len(x) + 3
     if behind > 0:
         absorb(model, scratch, x, F, 0.0)
     place = measured.place[e]
-    s = measured.sensor[e]
-    kind = measured.series[s, KIND]
-    z = value_of(measured, place, s)
+    sensor = measured.sensor[e]
+    kind = measured.series[sensor, KIND]
+    z = value_of(measured, place, sensor)
     arm = arm_variance(body, e)
-    rows, y, axes, shown = seen_rows(body, e, q, x, kind, z, frame_of(measured, place, s), s)
+    rows, y, axes, shown = seen_rows(body, e, q, x, kind, z, frame_of(measured, place, sensor), sensor)
     if arm[0] > 0.0 or len(measured.noise) > 0:
-        C = noise_of(measured, place, s, kind, z)
-        y, spread = independent(body, e, x, s, rows, y, axes, C, arm)
+        C = noise_of(measured, place, sensor, kind, z)
+        y, spread = independent(body, e, x, sensor, rows, y, axes, C, arm)
     elif kind == ATTITUDE:
         spread = z
     else:
-        variance = sigma_of(measured, place, s) * sigma_of(measured, place, s)
+        variance = sigma_of(measured, place, sensor) * sigma_of(measured, place, sensor)
         u, v = 1.0, 1.0
         if kind == DIRECTION:
             u, v = dot(axes[0], axes[0]), dot(axes[1], axes[1])
         spread = (variance * u, variance * v, variance)
-    for i in range(len(step)):
-        step[i] = 0.0
+    errors, s = take_rows(F, size, loose(model), H, rows, y, spread, step, scratch.lines[ROWS:])
     for r in range(rows):
-        error = y[r]
-        if r > 0:
-            error -= dot_rows(H, r, scratch.lines, STEP)  # what the rows before it have corrected
-        s2 = take_row(F, size, loose(model), H, r, spread[r], work, scratch.lines[ROWS:])
-        for i in range(size):
-            step[i] += error / s2 * work[i]
-        out.innovation[place, 2 * r] = error
-        out.innovation[place, 2 * r + 1] = s2
+        out.innovation[place, 2 * r] = errors[r]
+        out.innovation[place, 2 * r + 1] = s[r]
     if kind == HEADING and not shown:
         out.innovation[place, 0] = math.nan  # of a vertical vector, which shows none: skipped
     a = (step[0], step[1], step[2])
@@ -355,9 +362,8 @@ def seen_rows(form, e, q, x, kind, z, frame, sensor):
     if len(t) > 0:
         turn = (t[e, 0] - x[0], t[e, 1] - x[1], t[e, 2] - x[2])
         W = turning_matrix(turn, (t[e, 3], t[e, 4], t[e, 5]))
-    for r in range(3):
-        for j in range(H.shape[1]):
-            H[r, j] = 0.0
+    for j in range(0, 3 * H.shape[1], WIDTH):
+        store(H, j, spread(0.0))
     value = (z[0], z[1], z[2], 0.0)
     if kind == ATTITUDE:
         value = frame[:4]
@@ -521,12 +527,11 @@ def innovation_covariance(form, i, q, rows):
     """Return H P Hᵀ (6-tuple), rows that are not there as zeros; leave ``F Hᵀ`` in ``seen``."""
     F, H, seen = form.F[i], form.scratch.rows[1], form.scratch.rows[2]
     size = form.x.shape[1] + 3
-    for r in range(3):
-        for j in range(size):
-            seen[r, j] = dot_rows(F, j, H, r) if r < rows else 0.0
     S = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    first, end = seen_columns(H, size)
     for j in range(size):
-        S = plus_square(S, (seen[0, j], seen[1, j], seen[2, j]))
+        seen[0, j], seen[1, j], seen[2, j] = f = seen_by(F, j, H, first, end)
+        S = plus_square(S, f)
     return S
 
 
@@ -576,17 +581,9 @@ def relinearise(form, i, q, old_q, now_q, prior, fresh):
 def correct(form, i, q, rows, e, variance):
     """Update with independent rows of innovations e (3,), prior's tangent space; return q and the attitude's correction."""
     scratch, x, F = form.scratch, form.x[i], form.F[i]
-    H, step, work = scratch.rows[1], scratch.lines[STEP], scratch.lines[WORK]
+    step = scratch.lines[STEP]
     size = form.x.shape[1] + 3
-    for j in range(len(step)):
-        step[j] = 0.0
-    for r in range(rows):
-        left = e[0] if r == 0 else (e[1] if r == 1 else e[2])
-        noise = variance[0] if r == 0 else (variance[1] if r == 1 else variance[2])
-        left -= dot_rows(H, r, scratch.lines, STEP)  # what the rows before it have corrected
-        s2 = take_row(F, size, loose(form.model), H, r, noise, work, scratch.lines[ROWS:])
-        for j in range(size):
-            step[j] += left / s2 * work[j]
+    take_rows(F, size, loose(form.model), scratch.rows[1], rows, e, variance, step, scratch.lines[ROWS:])
     for j in range(len(x)):
         x[j] += step[3 + j]
     return q, (step[0], step[1], step[2])

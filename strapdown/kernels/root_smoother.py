@@ -29,12 +29,14 @@ from strapdown.kernels.error_state_step import (
     turn_rows,
     turn_values,
 )
-from strapdown.kernels.lane_values import WIDTH, load, spread, store
-from strapdown.kernels.root_form import loose
+from strapdown.kernels.lane_values import WIDTH, chosen, fetch, load, spread, store
+from strapdown.kernels.root_form import loose, row_end
 from strapdown.kernels.rotation import inverse_right_jacobian, logarithm, moved, quaternion_multiply
 from strapdown.kernels.triangle import covariances, padded, triangularise, variances
 
 CALLED = ("load_segment",)
+
+_FIRST = np.repeat([1.0, 0.0], WIDTH)
 
 
 class Passes(NamedTuple):
@@ -69,7 +71,7 @@ class Workspace(NamedTuple):
     factor: np.ndarray
     work: np.ndarray
     later_q: np.ndarray
-    """Of each pass, what is known at the end of the segment: attitude (4,), x (n − 3,), and the triangle (n + p + 1, columns for n)."""
+    """Of each pass, what is known at the end of the segment: attitude (4,), x (n − 3,), and the triangle (n + p + 4, columns for n)."""
     later_x: np.ndarray
     later_F: np.ndarray
 
@@ -101,7 +103,7 @@ def workspace(states, rows, chained, together):
         work=np.zeros(both),
         later_q=np.empty((together, 4)),
         later_x=np.empty((together, size - 3)),
-        later_F=np.zeros((together, size + rows + 1, width)),
+        later_F=np.zeros((together, size + rows + 4, width)),
     )
 
 
@@ -110,14 +112,15 @@ def load_segment(segments, k, x, F, loose):
     place = 8
     for i in range(len(x)):
         x[i] = segments[k, place + i]
-    place += len(x)
+    place += len(x) + k * segments.shape[1]
     size = len(x) + 3
     for j in range(size):
-        end = max(j + 1, loose)
-        for i in range(end):
-            F[j, i] = segments[k, place + i]
-        for i in range(end, size):
-            F[j, i] = 0.0
+        end = row_end(j, loose)
+        for c in range(0, size, WIDTH):
+            own = spread(0.0)
+            if c < end:
+                own = chosen(load(_FIRST, max(WIDTH + c - end, 0)) > 0.0, load(segments, place + c), own)
+            store(F, F.shape[1] * j + c, own)
         place += end
     return (segments[k, 4], segments[k, 5], segments[k, 6], segments[k, 7])
 
@@ -133,6 +136,8 @@ def prepare_step(segments, j, model, space):
     noisy = 6 + model.changing
     width, room = noise.shape[1], gain.shape[1]
     q = load_segment(segments, j, x, F, loose(model))
+    for c in range(0, segments.shape[1], WIDTH):  # for the next step back
+        fetch(segments, (j - 1) * segments.shape[1] + c)
     dt = segments[j, 0]
     part = (segments[j, 1], segments[j, 2], segments[j, 3])
     predicted, phi11, rate, D = move(q, x, dt, part, model, top, factor)
@@ -157,10 +162,10 @@ def prepare_step(segments, j, model, space):
     for i in range(size):
         inverse = 1.0 / F[i, i]
         for c in range(0, room, WIDTH):
-            g = inverse * load(gain, room * i + c)
-            store(gain, room * i + c, g)
-            for r in range(i + 1, size):
-                store(gain, room * r + c, load(gain, room * r + c) - F[r, i] * g)
+            g = load(gain, room * i + c)
+            for r in range(i):
+                g = g - F[i, r] * load(gain, room * r + c)
+            store(gain, room * i + c, inverse * g)
     for r in range(rows - size):
         for c in range(0, noisy, WIDTH):
             z = spread(0.0)
@@ -199,7 +204,7 @@ def step_back(segments, j, prepared, model, space, pass_, later_q):
             store(later_F, width * (size + r) + c, load(left, width * r + c))
     for r in range(rows + 1):
         if r < size or r == rows:
-            used = size if r == rows else max(r + 1, loose(model))
+            used = size if r == rows else row_end(r, loose(model))
             for c in range(0, room, WIDTH):
                 product = spread(0.0)
                 for i in range(used):

@@ -14,6 +14,7 @@ from strapdown.kernels.lane_values import (
     WIDTH,
     anywhere,
     chosen,
+    fetch,
     lanes_of,
     load,
     load_quadruples,
@@ -485,6 +486,8 @@ def smooth_back(
                     prepare_rows(work, place)
             for m in range(2):
                 i = w - 1 - 2 * part - m
+                for line in range(4):
+                    fetch(segments, start - ROW * (1 + i) + WIDTH * line)
                 if i < count:
                     carry_error(work, group, errors, i)
                 if i < count_before:

@@ -14,11 +14,13 @@ import math
 
 import numpy as np
 
-from strapdown.kernels.lane_values import WIDTH, anywhere, load, spread, store, total
+from strapdown.kernels.lane_values import WIDTH, load, spread, store
 
-CALLED = ("triangularise", "take_row", "dot_rows", "variances", "covariances", "whole_bias")
+CALLED = ("triangularise", "take_rows", "variances", "covariances", "whole_bias")
 """Not inlined where other kernels use them: their work is far more than a call, and each copy would be compiled anew."""
 
+TAKEN = 7
+"""Rows of the work space of :func:`take_rows`."""
 _UNIT = np.repeat([0.0, 1.0, 0.0], [WIDTH, 1, WIDTH])
 
 
@@ -41,8 +43,11 @@ def triangularise(F, last, loose, first_noise, end_noise, first_extra, end_extra
         first = first_noise
         while first < end_noise and F[first, i] == 0.0:
             first += 1
+        begin = 0
+        while begin < above and F[begin, i] == 0.0:
+            begin += 1
         own = i - i % WIDTH
-        seen = column_products(F, i, own, above, first, end_noise)
+        seen = column_products(F, i, own, begin, above, first, end_noise)
         store(work, own, seen)
         squared = work[i]
         if squared == 0.0:
@@ -52,87 +57,135 @@ def triangularise(F, last, loose, first_noise, end_noise, first_extra, end_extra
         v = a + math.copysign(norm, a)
         scale = 1.0 / (norm * (norm + abs(a)))
         for c in range(0, own, WIDTH):
-            w = scale * (column_products(F, i, c, above, first, end_noise) + v * load(F, width * i + c))
-            reflect(F, i, c, above, first, end_noise, v, w)
+            w = scale * (column_products(F, i, c, begin, above, first, end_noise) + v * load(F, width * i + c))
+            reflect(F, i, c, begin, above, first, end_noise, v, w)
         for c in range(first_extra, end_extra, WIDTH):
-            w = scale * (column_products(F, i, c, above, first, end_noise) + v * load(F, width * i + c))
-            reflect(F, i, c, above, first, end_noise, v, w)
+            w = scale * (column_products(F, i, c, begin, above, first, end_noise) + v * load(F, width * i + c))
+            reflect(F, i, c, begin, above, first, end_noise, v, w)
         # At last the eight with column i itself, which the others needed: its own share is 1, and then it ends as zeros to the bit.
         w = scale * (seen + v * load(F, width * i + own))
         there = load(_UNIT, WIDTH - i % WIDTH)
-        reflect(F, i, own, above, first, end_noise, v, (w - there * w) + there)
+        reflect(F, i, own, begin, above, first, end_noise, v, (w - there * w) + there)
 
 
-def column_products(F, i, c, above, first, end):
-    """Return the products of column i with the eight columns from c on, over the rows to ``above`` and from ``first`` to ``end``."""
+def column_products(F, i, c, begin, above, first, end):
+    """Return the products of column i with the eight columns from c on, over rows ``begin`` to ``above`` and ``first`` to ``end``."""
     width = F.shape[1]
     loose = spread(0.0)
     noise = spread(0.0)
-    for r in range(above):
+    for r in range(begin, above):
         loose = loose + F[r, i] * load(F, width * r + c)
     for r in range(first, end):
         noise = noise + F[r, i] * load(F, width * r + c)
     return loose + noise
 
 
-def reflect(F, i, c, above, first, end, v, w):
+def reflect(F, i, c, begin, above, first, end, v, w):
     """Subtract w times column i, of which row i is v, from the eight columns from c on."""
     width = F.shape[1]
-    for r in range(above):
+    for r in range(begin, above):
         store(F, width * r + c, load(F, width * r + c) - F[r, i] * w)
     for r in range(first, end):
         store(F, width * r + c, load(F, width * r + c) - F[r, i] * w)
     store(F, width * i + c, load(F, width * i + c) - v * w)
 
 
-def dot_rows(A, i, B, j):
-    """Return the scalar product of a row each of two padded arrays."""
-    width = A.shape[1]
-    products = spread(0.0)
-    for c in range(0, width, WIDTH):
-        products = products + load(A, width * i + c) * load(B, width * j + c)
-    return total(products)
+def first_row(c, loose):
+    """Return the first row that may have something in the eight columns from c on: the six of attitude and bias have nothing beyond."""
+    return min(c, 6) if c < loose else c
 
 
-def take_row(F, size, loose, H, row, variance, gain, scratch):
-    """Update with one scalar measurement ``H[row] · x + v``, Var v = ``variance``: Carlson (1973), triangle to triangle.
+def seen_columns(H, size):
+    """Return the columns, beyond the attitude's, between which three rows have something."""
+    first, end = 3, size
+    while end > first and H[0, end - 1] == 0.0 and H[1, end - 1] == 0.0 and H[2, end - 1] == 0.0:
+        end -= 1
+    while first < end and H[0, first] == 0.0 and H[1, first] == 0.0 and H[2, first] == 0.0:
+        first += 1
+    return first, end
 
-    Returns the innovation's variance s; ``gain`` is left at P h, so the correction is gain · innovation / s. No difference of squares is
-    formed, so the factor stays one however sharp the measurement (Bierman 1977, section V.3). Loose rows stay loose. ``scratch`` has
-    three rows as long as F's.
+
+def seen_by(F, j, H, first, end):
+    """Return the products of row j of F with three rows: columns of the attitude and from ``first`` to ``end``."""
+    a, b, c = F[j, 0], F[j, 1], F[j, 2]
+    f0 = a * H[0, 0] + b * H[0, 1] + c * H[0, 2]
+    f1 = a * H[1, 0] + b * H[1, 1] + c * H[1, 2]
+    f2 = a * H[2, 0] + b * H[2, 1] + c * H[2, 2]
+    for i in range(first, end):
+        f0 += F[j, i] * H[0, i]
+        f1 += F[j, i] * H[1, i]
+        f2 += F[j, i] * H[2, i]
+    return f0, f1, f2
+
+
+def take_rows(F, size, loose, H, rows, y, variance, step, scratch):
+    """Update with up to three independent measurements ``y[r] = H[r] · x + v``, Var v = ``variance[r]``: Carlson (1973), one after another.
+
+    Returns the innovations, each with what those before it corrected taken off, and their variances; ``step`` is left at the correction.
+    No difference of squares is formed, so the factor stays one however sharp the measurement (Bierman 1977, section V.3). Loose rows stay
+    loose. Rows of H (3, n or more) beyond ``rows`` are zero. ``scratch`` has ``TAKEN`` rows as long as F's.
+
+    A measurement makes ``√k_j (F_j − t_j Σ w_i F_i)``, i < j, of row j of F. All go through F together, and the roots of the k_j are taken
+    at the end: what a measurement sees of rows that those before it have changed follows from what it sees of them unchanged.
     """
     width = F.shape[1]
-    seen, share, shrink = scratch[0], scratch[1], scratch[2]
-    used = width
-    while used > WIDTH and not anywhere(load(H, width * row + used - WIDTH) != 0.0):
-        used -= WIDTH
-    s = variance
+    first, end = seen_columns(H, size)
+    s0, s1, s2 = variance
+    i0, i1, i2 = 1.0 / s0, 1.0 / s1, 1.0 / s2
+    p01 = p02 = p12 = 0.0
     for j in range(size):
-        products = load(F, width * j) * load(H, width * row)
-        for c in range(WIDTH, used, WIDTH):
-            products = products + load(F, width * j + c) * load(H, width * row + c)
-        f = total(products)
-        seen[j] = f
-        shrink[j] = s  # before this column of S, and after it
-        s += f * f
-        share[j] = s
-    for j in range(size, width):
-        seen[j] = 0.0
-        shrink[j] = s
-        share[j] = s
+        f0, f1, f2 = seen_by(F, j, H, first, min(max(j + 1, loose), end))
+        t0 = f0 * i0
+        kept = s0
+        s0 += f0 * f0
+        i0 = 1.0 / s0
+        kept *= i0
+        scratch[0, j], scratch[1, j] = t0, f0
+        if rows > 1:
+            f = f1 - t0 * p01
+            p01 += f0 * f1
+            t1 = f * i1
+            w1 = kept * f
+            kept *= s1
+            s1 += w1 * f
+            i1 = 1.0 / s1
+            kept *= i1
+            scratch[2, j], scratch[3, j] = t1, w1
+            if rows > 2:
+                f = f2 - t0 * p02
+                p02 += f0 * f2
+                f2 = f - t1 * p12
+                p12 += w1 * f
+                w2 = kept * f2
+                scratch[4, j], scratch[5, j] = f2 * i2, w2
+                kept *= s2
+                s2 += w2 * f2
+                i2 = 1.0 / s2
+                kept *= i2
+        scratch[6, j] = kept
+    for c in range(6 * width, 7 * width, WIDTH):
+        store(scratch, c, math.sqrt(load(scratch, c)))
+    e0 = y[0]
+    g0 = e0 * i0
+    e1 = y[1] - p01 * g0
+    g1 = e1 * i1 if rows > 1 else 0.0
+    e2 = y[2] - p02 * g0 - p12 * g1
+    g2 = e2 * i2 if rows > 2 else 0.0
     for c in range(0, width, WIDTH):
-        after = load(share, c)
-        factor = math.sqrt(load(shrink, c) / after)
-        store(share, c, load(seen, c) / (after * factor))
-        store(shrink, c, factor)
-    for c in range(0, width, WIDTH):
-        so_far = spread(0.0)
-        for j in range(0 if c < loose else c, size):
+        a0 = a1 = a2 = spread(0.0)
+        for j in range(first_row(c, loose), size):
             old = load(F, width * j + c)
-            store(F, width * j + c, shrink[j] * old - share[j] * so_far)
-            so_far = so_far + seen[j] * old
-        store(gain, c, so_far)
-    return s
+            new = old - scratch[0, j] * a0
+            a0 = a0 + scratch[1, j] * old
+            if rows > 1:
+                old, new = new, new - scratch[2, j] * a1
+                a1 = a1 + scratch[3, j] * old
+            if rows > 2:
+                old, new = new, new - scratch[4, j] * a2
+                a2 = a2 + scratch[5, j] * old
+            store(F, width * j + c, scratch[6, j] * new)
+        store(step, c, g0 * a0 + g1 * a1 + g2 * a2)
+    return (e0, e1, e2), (s0, s1, s2)
 
 
 def variances(F, size, out, row, work):

@@ -12,7 +12,7 @@ from strapdown.kernels.algebra import combine, dot, scale
 from strapdown.kernels.measurement import vector_at
 from strapdown.kernels.series import LARGEST_ANGLE
 
-OPEN = ("begin", "keep", "is_small", "longest_step", "predict", "update", "finish")
+OPEN = ("begin", "keep", "longest_step", "predict", "update", "finish")
 REPLACEABLE = ("stopped",)
 
 
@@ -37,10 +37,6 @@ def step_within(squared, dt):
 
 def begin(body):
     """Return the state before the first measurement."""
-
-
-def is_small(state, part, dt, body):
-    """Return whether an increment over dt can be propagated in one step."""
 
 
 def longest_step(state, part, dt, body):
@@ -95,15 +91,14 @@ def walk(edges, increments, measured, every, body, out):
         if dt > 0.0:
             part = theta
             # Most often a whole interval: a predicted branch costs less than a choice between values, which waits for both.
-            if dt != whole or not is_small(state, part, dt, body):
+            if dt != whole or longest_step(state, part, dt, body) < dt:
                 part = scale(dt / whole, theta)
-                if not is_small(state, part, dt, body):
-                    longest = longest_step(state, part, dt, body)
-                    if longest < dt:
-                        part = scale(longest / dt, part)
-                        dt = longest
-                        stop = now + dt
-                        due = False
+                longest = longest_step(state, part, dt, body)
+                if longest < dt:
+                    part = scale(longest / dt, part)
+                    dt = longest
+                    stop = now + dt
+                    due = False
             state = predict(state, part, dt, body, out)
             now = stop
         if due:

@@ -39,7 +39,7 @@ from strapdown.kernels.measurement import (
 )
 from strapdown.kernels.rotation import moved, quaternion_multiply, rotation_matrix, unit
 from strapdown.kernels.state import load_state, store_state
-from strapdown.kernels.walk import SQUARED_RANGE, step_within, turn_squared
+from strapdown.kernels.walk import step_within, turn_squared
 
 OPEN = ("from_body_side", "to_body_side", "propagated", "error_rows", "row_update", "closed")
 
@@ -98,11 +98,6 @@ def begin(body):
     q, b, A, B, C = load_state(body.state)
     A, B, C = from_body_side(q, A, B, C)
     return q, b, A, B, C
-
-
-def is_small(state, part, dt, body):
-    """Return whether the turn is in the range of the polynomials."""
-    return turn_squared(part, dt, state[1]) <= SQUARED_RANGE
 
 
 def longest_step(state, part, dt, body):
