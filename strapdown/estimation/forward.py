@@ -273,10 +273,13 @@ def prepared(
 
 
 def filtered(problem: Problem, options: Options) -> Passed:
-    """Run the filter over a prepared record, a bias driven by temperature in stretches of nearly one temperature."""
+    """Run the filter over a prepared record, in the form that it needs; a bias over temperature goes in stretches of nearly one."""
     slopes = temperature.slopes(problem.error_states)
     if slopes is None:
-        return _filtered(problem, options)
+        if problem.model.states or options.factor or options.whole_bias:
+            return _in_factor(problem, options)
+        judged = options.judged or problem.events.noise is not None
+        return _judged_in_blocks(problem, options) if judged else _in_blocks(problem, options)
     record, initial = problem.record, problem.initial
     T = temperature.of(record)
     state = replace(initial, unit_sigma=unit_sigmas(record, problem.model, initial.unit_sigma))
@@ -286,21 +289,13 @@ def filtered(problem: Problem, options: Options) -> Passed:
         state = temperature.shifted(state, slopes, mean - before)
         part, off = temperature.at_mean(cut(record, first, last), mean, state.values[slopes])
         declared = prepared(part, problem.process_noise, state, problem.error_states, driven=True)
-        passed = _filtered(declared, options)
+        passed = _in_factor(declared, options)
         parts.append(temperature.at_edges(passed.estimate, slopes, off[:: options.every]))
         state, before = passed.end, mean
     end = temperature.shifted(state, slopes, float(T[-1]) - before)
     estimate = joined(parts)
     skipped = skipped_too(problem.events, estimate.innovations)
     return Passed(estimate=replace(estimate, skipped=skipped), make_end=lambda: end, segments=np.empty((0, 0)))
-
-
-def _filtered(problem: Problem, options: Options) -> Passed:
-    """Run the filter over a prepared record, in the form that it needs."""
-    if problem.model.states or options.factor or options.whole_bias:
-        return _in_factor(problem, options)
-    judged = options.judged or problem.events.noise is not None
-    return _judged_in_blocks(problem, options) if judged else _in_blocks(problem, options)
 
 
 def watched(estimate: Estimate, monitor: Monitor | None, gate: Gate | None) -> Estimate:
