@@ -258,7 +258,7 @@ def tuned_and_held_out(name: str, train: int, test: int, seed: int, free=(), **c
     cases = [case_of(scenarios.drawn(scenario, seed, run), chosen, seed, run) for run in range(train)]
     values = tuning.values_of(chosen, plain, [case.record for case in cases])
     off = tuning.with_values(chosen, {part: value * 3.0 ** (-1) ** k for k, (part, value) in enumerate(values.items())})
-    off = wrong(off, {part: 1.0 / 3.0 for part in free if part not in plain})
+    off = wrong(off, {part: 1.0 / 3.0 for part in free if part not in plain}) if len(plain) < len(free) else off
     found = tuning.fit(extended.likelihood(cases, off, free), starts=1, intervals=False)
     nees: dict = {subset: [] for subset in consistency.SUBSETS}
     nis: dict = {}

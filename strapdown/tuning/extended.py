@@ -71,8 +71,10 @@ def _scaled(value: Entries, factor: float) -> Any:
     )
 
 
-def state_names(states: States) -> tuple[str, ...]:
-    """Return the names of the parameters that these states have."""
+def state_names(states: States | None) -> tuple[str, ...]:
+    """Return the names of the parameters that these states have; none where there are no states."""
+    if states is None:
+        return ()
     found = [name for name, part in GYRO.items() if _size(getattr(states, part)) > 0.0]
     for sensor, one in states.sensors.items():
         found += [f"{sensor}.{name}" for name, part in SENSOR.items() if _size(getattr(one, part)) > 0.0]
@@ -267,7 +269,7 @@ def likelihood(
         raise InputError("there is no record to tune on; give one")
     records = [case.record for case in cases]
     _check_axes(free, records)
-    own = () if chosen.states is None else state_names(chosen.states)
+    own = state_names(chosen.states)
     plain = [name for name in parameters.known_names(records) if name != SCALE] + list(parameters.axis_names(records))
     if not free:
         raise InputError(f"free names no parameter; give some of {', '.join([*plain, *own])}")
