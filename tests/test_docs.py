@@ -170,3 +170,13 @@ def test_the_comparison_shows_what_the_theory_says():
     assert verdicts["GTSAM"] == verdicts["AttiPy, heading's derivative mended"] == "consistent"
     wrong = ("smsfusion", "AttiPy", "smsfusion, noises of another sensor", "GTSAM, gyro with a bias")
     assert {verdicts[name] for name in wrong} == {"not consistent"}
+
+
+def test_tests_that_pages_name_exist():
+    """Each formula of the mathematics names the test that checks it."""
+    named = {
+        found for page in PAGES for found in re.findall(r"(test_\w+\.py)::(test_\w+)", page.read_text(encoding="utf-8"))
+    }
+    assert len(named) > 10
+    for file, name in sorted(named):
+        assert f"\ndef {name}(" in (ROOT / "tests" / file).read_text(encoding="utf-8"), f"{file}::{name}"
