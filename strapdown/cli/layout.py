@@ -24,51 +24,27 @@ COMMANDS: dict[str, dict[str, tuple[str, ...]]] = {
             "strapdown check estimate-results/estimate.h5",
             "strapdown check other.csv --truth flight.h5",
         ),
-        "report": (
-            "reporting",
-            "strapdown report estimate-results/estimate.h5",
-        ),
+        "report": ("reporting", "strapdown report estimate-results/estimate.h5"),
         "montecarlo": (
             "campaigns",
             "strapdown montecarlo satellite.toml --runs 400",
             "strapdown montecarlo satellite.toml --filter mine.py:run",
         ),
-        "covariance": (
-            "planning",
-            "strapdown covariance satellite.toml --scale-factor 300",
-        ),
+        "covariance": ("planning", "strapdown covariance satellite.toml --scale-factor 300"),
     },
     "Noise and tuning": {
-        "allan": (
-            "sensors",
-            "strapdown allan rest.csv --gyro-unit deg/s",
-        ),
-        "tune": (
-            "tuning",
-            "strapdown tune one.h5 two.h5 --filter guess.toml --holdout 0.4",
-        ),
+        "allan": ("sensors", "strapdown allan rest.csv --gyro-unit deg/s"),
+        "tune": ("tuning", "strapdown tune one.h5 two.h5 --filter guess.toml --holdout 0.4"),
     },
     "Recordings": {
-        "doctor": (
-            "judgement",
-            "strapdown doctor walk.csv --gyro-unit deg/s --accelerometer-unit g",
-        ),
-        "convert": (
-            "conversion",
-            "strapdown convert walk.bag walk.csv",
-        ),
+        "doctor": ("judgement", "strapdown doctor walk.csv --gyro-unit deg/s --accelerometer-unit g"),
+        "convert": ("conversion", "strapdown convert walk.bag walk.csv"),
     },
     "Integration of the gyro alone": {
         "coning": ("studies", "strapdown coning", "strapdown coning --algorithm mine.toml --runs 20"),
-        "integrate": (
-            "integration",
-            "strapdown integrate flight.h5 --algorithm three-sample",
-        ),
+        "integrate": ("integration", "strapdown integrate flight.h5 --algorithm three-sample"),
         "algorithms": ("integration",),
-        "coning-budget": (
-            "integration",
-            "strapdown coning-budget --psd psd.csv --rate 200",
-        ),
+        "coning-budget": ("integration", "strapdown coning-budget --psd psd.csv --rate 200"),
     },
     "This installation": {"info": ("installation",)},
 }

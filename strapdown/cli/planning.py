@@ -139,9 +139,7 @@ def covariance(
     what = "the filter given" if filter_file else "the filter that matches it"
     console.print(f"{name}, {what}, integration {modelled.integration.name}.\n")
     listing = found.listing()
-    show_listing(listing, f"{listing.title}, RMS")
-    for note in listing.notes:
-        console.print(note)
+    show_listing(listing, f"{listing.title}, RMS", notes=True)
     missing = setup.unmodelled_errors(chosen.gyro, chosen.sensors, modelled.states, gravity_f=chosen.gravity_f)
     if missing and filter_file is None:
         console.print(

@@ -149,13 +149,15 @@ def show(rows: Table) -> None:
         console.width = width
 
 
-def show_listing(listing: Listing, title: str) -> None:
-    """Show the table of a result under another title, without its notes."""
-    rows = table(title, *listing.columns, left=listing.left)
+def show_listing(listing: Listing, title: str | None = None, *, notes: bool = False) -> None:
+    """Show the table of a result, perhaps under another title, and its notes where they are asked for."""
+    rows = table(title or listing.title, *listing.columns, left=listing.left)
     styles = {"pass": "green", "FAIL": "red", "likely": "red"}
     for row in listing.rows:
         rows.add_row(*(Text(cell, style=styles.get(cell, "")) for cell in row))
     show(rows)
+    for note in listing.notes if notes else ():
+        console.print(note)
 
 
 def tables_written(folder: Path | None, study: str, *results: Any) -> list[Path]:

@@ -39,7 +39,6 @@ if TYPE_CHECKING:
 
     from strapdown.gyro import GyroSpec
     from strapdown.records import ImuRecord
-    from strapdown.results import Listing
     from strapdown.scenarios import Scenario
     from strapdown.setup import FilterSetup
     from strapdown.tuning import Case, Comparison, Performance, TunedGate, Tuning, Unmodelled
@@ -235,7 +234,7 @@ def tune(
             "and --truth tunes the filter as it runs."
         )
     found = _tuned(cases, before, gyros, start, goal, search, workers)
-    _print_listing(found.result.listing())
+    show_listing(found.result.listing(), notes=True)
     if found.gate is not None:
         _print_gate(found.gate)
     for sentence in () if found.worst is None else found.worst.words:
@@ -380,12 +379,6 @@ def _cases(
     return cases, chosen, gyros
 
 
-def _print_listing(listing: Listing) -> None:
-    show_listing(listing, listing.title)
-    for note in listing.notes:
-        console.print(note)
-
-
 def _print_gate(found: TunedGate) -> None:
     if found.gate is None:
         why = "no outliers" if not found.share.identified else "noise of two sizes rather than outliers"
@@ -517,7 +510,7 @@ def _plan(
         found = tuning.plan(
             scenario, modelled, wanted, lengths=lengths or [scenario.duration], threads=threads, progress=advance
         )
-    _print_listing(found.listing())
+    show_listing(found.listing(), notes=True)
 
 
 def _scenario_of(path: Path) -> Scenario:
