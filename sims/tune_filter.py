@@ -90,7 +90,7 @@ def draw(result, folder, objective):
     from strapdown import plots
     from strapdown.plots import tuning as drawing
 
-    tuned = tuning.with_units(result.too_small, [result.record])
+    tuned = result.too_small
     shown = [one.unit for one in tuned.parameters]
     figure, (left, right) = plots.new_figure(1, 2, size=(11.0, 4.6))
     for number, one in enumerate((result.too_large, result.too_small)):

@@ -179,20 +179,18 @@ def test_a_filter_with_states_and_a_gate_is_tuned_against_the_truth(run, tmp_pat
     assert run(*given)[1].count("--truth tunes the filter as it runs") == 1
 
 
-@pytest.mark.parametrize("option", [("--rmse",), ("--gate",), ("--spacing", 2.0), ("--plan",)])
-def test_optional_states_are_tuned_by_likelihoods_alone(run, tmp_path, scaled, option):
+def test_outliers_are_not_modelled_beside_optional_states(run, tmp_path, scaled):
     out = tmp_path / "states.toml"
-    status, _, complaint = run("tune", scaled, "--states", *option, "-o", out)
+    status, _, complaint = run("tune", scaled, "--states", "--gate", "-o", out)
     assert status != 0
     assert "optional states" in complaint
     assert not out.exists()
 
 
-def test_the_plain_likelihood_refuses_a_filter_with_states(scaled):
-    file = recordfiles.read_record_file(scaled)
-    chosen = setup.matched_to_record(file.record, file.gyro, states=True)
-    with pytest.raises(InputError, match=r"extended\.likelihood"):
-        tuning.likelihood([tuning.record_case(file.record, chosen)], chosen, ["gyro.arw"])
+def test_a_plan_of_a_filter_with_states_says_how_well_their_sizes_will_be_known(run, scaled):
+    status, said, complaint = run("tune", "--plan", scaled, "--states", "--free", "gyro.arw,gyro.scale_sigma")
+    assert status == 0, complaint
+    assert "gyro.scale_sigma  ppm" in said
 
 
 @pytest.mark.parametrize("option", ["--columns", "--topic"])

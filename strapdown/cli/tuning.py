@@ -80,17 +80,13 @@ class _Filter:
         """Parameters named, if any are."""
         return None if self.free is None else [name.strip() for name in self.free.split(",") if name.strip()]
 
-    def setup(self, *, plan: bool) -> FilterSetup | None:
-        """Return the filter of the file, if there is one; states that it or a plan cannot have are refused."""
+    def setup(self) -> FilterSetup | None:
+        """Return the filter of the file, if there is one."""
         from strapdown.setup import read_setup
 
         chosen = None if self.filter_file is None else read_setup(self.filter_file)
         if self.states and chosen is not None:
             raise InputError("--filter holds the filter's states itself, in [filter.states]; leave --states out")
-        if plan and (self.states or (chosen is not None and chosen.states is not None)):
-            raise InputError(
-                "--plan knows no optional states; leave --states away, and [filter.states] out of the filter"
-            )
         return chosen
 
     def wanted(self, cases: Sequence[Case], gyros: dict[str, GyroSpec]) -> list[str]:
@@ -216,9 +212,9 @@ def tune(
     from strapdown import recordings, tuning
 
     workers = count("threads", search.threads if search.threads is not None else os.cpu_count() or 1)
-    chosen = start.setup(plan=planning.plan)
+    chosen = start.setup()
     if planning.plan:
-        _plan(records, chosen, start.names, planning.length, workers)
+        _plan(records, chosen, start, planning.length, workers)
         return
     if planning.length is not None:
         raise InputError("--length is for --plan; the records' own length is taken")
@@ -494,7 +490,7 @@ def _report(found: _Found, paths: Sequence[Path], of: str) -> dict[str, Any]:
 
 
 def _plan(
-    sources: Sequence[Path], chosen: FilterSetup | None, names: list[str] | None, length: str | None, threads: int
+    sources: Sequence[Path], chosen: FilterSetup | None, start: _Filter, length: str | None, threads: int
 ) -> None:
     from strapdown import scenarios, setup, tuning
     from strapdown.recordings import recordfiles
@@ -503,9 +499,8 @@ def _plan(
         raise InputError(f"--plan takes one scenario; {len(sources)} are given")
     lengths = None if length is None else _numbers(length)
     scenario = _scenario_of(sources[0]) if recordfiles.is_record(sources[0]) else scenarios.load_scenario(sources[0])
-    modelled = chosen or setup.matched(scenario)
-    example = scenarios.simulate(scenario)
-    wanted = names or list(tuning.default_names([example]))
+    modelled = chosen or setup.matched(scenario, states=start.states)
+    wanted = start.names or list(tuning.default_names([scenarios.simulate(scenario)]))
     with progress_bar("simulated records", 4) as advance:
         found = tuning.plan(
             scenario, modelled, wanted, lengths=lengths or [scenario.duration], threads=threads, progress=advance

@@ -1,11 +1,12 @@
 """Tuning a filter from data: maximum likelihood, an interval for each parameter, and validation on held-out data.
 
 - ``procedure``: :func:`tune`: objective, search and what follows it in one call.
-- ``innovations``: Of the filter's innovations, with score and information, eight sets of parameters a pass.
+- ``objective``: What every objective is: a problem checked, setups of points, sums over records and threads.
+- ``innovations``: Of the filter's innovations, with score and information, eight sets of parameters a pass where the filter allows it.
 - ``errors``: Of the errors against a truth.
 - ``outliers``: Of innovations some of which are outliers, and the gate that suits them.
 - ``fitting``: The search from several starts, intervals, what is identified and what is not.
-- ``parameters``: Names, values in a filter setup, priors.
+- ``parameters``: One table of names, places in a filter setup and units; priors.
 - ``starting``: Where the filter starts on a record.
 - ``planning``: The Cramér–Rao bound before there is a record.
 - ``suspicion``: What the tuned filter leaves unexplained, such as a scale factor that the gyro's noise stands for.
@@ -31,8 +32,9 @@ from strapdown.tuning.fitting import slices as slices
 from strapdown.tuning.holding import Comparison as Comparison
 from strapdown.tuning.holding import Performance as Performance
 from strapdown.tuning.holding import compare, split
-from strapdown.tuning.innovations import Case, likelihood
-from strapdown.tuning.innovations import thinned as thinned
+from strapdown.tuning.innovations import likelihood
+from strapdown.tuning.objective import Case
+from strapdown.tuning.objective import thinned as thinned
 from strapdown.tuning.outliers import TunedGate as TunedGate
 from strapdown.tuning.outliers import contaminated_likelihood as contaminated_likelihood
 from strapdown.tuning.outliers import log_likelihood as log_likelihood
@@ -50,7 +52,6 @@ from strapdown.tuning.planning import Plan as Plan
 from strapdown.tuning.planning import plan
 from strapdown.tuning.procedure import GATED as GATED
 from strapdown.tuning.procedure import tune
-from strapdown.tuning.procedure import with_units as with_units
 from strapdown.tuning.starting import by_innovations as by_innovations
 from strapdown.tuning.starting import one_gyro as one_gyro
 from strapdown.tuning.starting import record_case, recording_case

@@ -11,20 +11,18 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple, Protocol, TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
 from strapdown.checks import Array, InputError, count, known_keys, positive
 from strapdown.results import Listed, Listing, figure
 from strapdown.setup import FilterSetup
-from strapdown.tuning.innovations import Derivatives
-from strapdown.tuning.parameters import RRW, SCALE, Prior, Unit, fixed_unit, with_values
+from strapdown.tuning.objective import REACH, Derivatives, Objective
+from strapdown.tuning.parameters import RRW, SCALE, Prior, Unit, with_values
 
 LONGEST_STEP = 2.0
 """Largest change of a log parameter in one step of the search."""
-REACH = 16.0
-"""How far a log parameter may go from where it starts."""
 WELL_KNOWN = 0.1
 """Standard error of a log parameter below which the likelihood is a parabola to much better than the error itself."""
 TWO_SIDED = 3.841458820694124
@@ -40,41 +38,6 @@ MISFIT = 1.6
 """Sandwich error over that of the information beyond which the innovations are not what the filter takes them for."""
 
 T = TypeVar("T")
-
-
-class Objective(Protocol):
-    """Objective to minimise: minus a log likelihood, or a substitute.
-
-    It may have ``limits`` of its own, least and largest logarithm of each parameter (p,), (p,), and a ``curvature(point)`` (p, p), where
-    that of the search is not good enough for errors.
-    """
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the free parameters."""
-
-    @property
-    def start(self) -> Array:
-        """Logarithms of their first values."""
-
-    @property
-    def composite(self) -> bool:
-        """Whether its curvature is no information, so that errors come from the scatter of its gradient."""
-
-    def derivatives(self, point: Array) -> Derivatives:
-        """Return value, gradient and information at a point."""
-
-    def minus_log(self, points: Array) -> Array:
-        """Return the value at several points (k, p)."""
-
-    def setup(self, point: Array) -> FilterSetup:
-        """Return the filter setup of a point."""
-
-
-def limits_of(objective: Objective) -> tuple[Array, Array]:
-    """Return the least and the largest logarithm of each parameter that a search looks at: the objective's own ``limits``, if any."""
-    wide: tuple[Array, Array] = objective.start - REACH, objective.start + REACH
-    return getattr(objective, "limits", wide)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -124,7 +87,7 @@ def search(
     known = dict(priors or {})
     x = np.array(start, float)
     moving = np.array([j not in fixed for j in range(len(x))], bool)
-    low, high = limits_of(objective)
+    low, high = objective.limits
     here = local_at(objective, x, known)
     damping, stretch = 1e-3, 1.0
     for number in range(steps):
@@ -343,7 +306,7 @@ def fit(
     if not factor > 1.0:
         raise InputError(f"factor is {factor}; random starts need one greater than 1")
     report = progress or (lambda done: None)
-    points = np.clip(random_starts(objective.start, starts, factor, np.random.default_rng(seed)), *limits_of(objective))
+    points = np.clip(random_starts(objective.start, starts, factor, np.random.default_rng(seed)), *objective.limits)
 
     with ThreadPoolExecutor(threads) as pool:
         optima = list(_reported(report, pool.map(lambda point: search(objective, point, known), points)))
@@ -437,16 +400,17 @@ def _estimated(
         standard_error=error,
         identified=found.identified,
         note=_note(name, found, error, best.local, j, priors, doubtful=doubtful),
-        unit=fixed_unit(name),
+        unit=objective.unit(name),
     )
 
 
 def _curved(objective: Objective, best: Optimum) -> Local:
     """Return the best point with the objective's own curvature, where it has one and the point is a minimum by it."""
-    curvature = getattr(objective, "curvature", None)
-    if curvature is None:
+    if objective.curvature is None:
         return best.local
-    own = curvature(best.point) + best.local.information - best.local.derivatives.information  # and the priors'
+    own = (
+        objective.curvature(best.point) + best.local.information - best.local.derivatives.information
+    )  # and the priors'
     return replace(best.local, information=own) if np.linalg.eigvalsh(own)[0] > 0.0 else best.local
 
 
@@ -454,13 +418,15 @@ def rescaled(tuning: Tuning, factor: float) -> Tuning:
     """Return a tuning with every σ of its filter scaled alike, which the size of the attitude error does not determine."""
     positive("factor", factor)
     names = ("value", "most_likely", "lower", "upper")
+    own = [1.0 if one.name.endswith("_time") else factor for one in tuning.parameters]
     return replace(
         tuning,
         parameters=tuple(
-            replace(one, **{name: factor * getattr(one, name) for name in names}) for one in tuning.parameters
+            replace(one, **{name: by * getattr(one, name) for name in names})
+            for one, by in zip(tuning.parameters, own, strict=True)
         ),
         setup=with_values(tuning.setup, {SCALE: factor}),
-        point=tuning.point + np.log(factor),
+        point=tuning.point + np.log(own),
     )
 
 

@@ -14,7 +14,7 @@ from strapdown.checks import Array, InputError, one_of
 from strapdown.consistency import Judgement, mean_bounds
 from strapdown.records import Estimate, Innovations, Truth
 from strapdown.setup import FilterSetup
-from strapdown.tuning.innovations import Case
+from strapdown.tuning.objective import Case, of_sensors
 
 By = Literal["time", "record"]
 MAX_ROWS = 20_000
@@ -52,7 +52,7 @@ def split(cases: Sequence[Case], share: float, by: By = "time") -> tuple[tuple[C
         return tuple(cases[:-held]), tuple(cases[-held:])
     train, test = [], []
     for case in cases:
-        first, last = max(case.first, case.record.time[0]), min(case.last, case.record.time[-1])
+        first, last = case.span
         border = float(last - share * (last - first))
         train.append(replace(case, last=border))
         test.append(replace(case, first=float(np.nextafter(border, np.inf))))
@@ -187,8 +187,7 @@ def performance(cases: Sequence[Case], chosen: FilterSetup, *, bins: int = 40) -
 
 def _judged(case: Case, chosen: FilterSetup) -> tuple[Estimate, Truth | None, Array | None]:
     """Return the part of the filter's estimate that is to be judged, with the truth, or the reference attitude, at its times."""
-    own = [series.sensor for series in case.record.vectors]
-    used = replace(chosen, sigma={name: value for name, value in chosen.sigma.items() if name in own})
+    used = of_sensors(chosen, case.record)
     record = setup.modelled_record(case.record, used)
     reference = case.true_attitude
     every = 1 if reference is not None else max(1, len(record.increments) // MAX_ROWS)

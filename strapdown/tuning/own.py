@@ -23,7 +23,7 @@ from strapdown.consistency import whitened
 from strapdown.estimation.filters.own import as_own
 from strapdown.records import Estimate
 from strapdown.tuning.errors import MAX_EPOCHS
-from strapdown.tuning.innovations import Case
+from strapdown.tuning.objective import Case
 
 OwnMeasure = Literal["innovations", "errors", "rmse"]
 OWN_MEASURES = ("innovations", "errors", "rmse")

@@ -13,9 +13,10 @@ from strapdown import setup
 from strapdown.checks import Array, InputError, count, instance
 from strapdown.records import cut
 from strapdown.results import Listed, Listing, figure
-from strapdown.scenarios import Scenario, simulate
+from strapdown.scenarios import Scenario, drawn, simulate
 from strapdown.setup import FilterSetup
-from strapdown.tuning.innovations import Case, likelihood
+from strapdown.tuning.innovations import likelihood
+from strapdown.tuning.objective import Case
 from strapdown.tuning.parameters import Unit, unit_of, values_of
 
 
@@ -71,7 +72,8 @@ def plan(
 ) -> Plan:
     """Return the Cramér–Rao bound of the logarithms of parameters, for records of given lengths.
 
-    Fisher's information is the mean of that of the sensitivities over ``records`` simulated records for which the setup is exact.
+    Fisher's information is the mean of that of the sensitivities over ``records`` simulated records for which the setup is exact. For a
+    filter with optional states each record has other individuals of the gyro and the sensors (:func:`strapdown.scenarios.drawn`).
 
     Parameters
     ----------
@@ -104,7 +106,8 @@ def plan(
     count("records", records)
 
     def one(number: int) -> Array:
-        record = simulate(replace(scenario, duration=float(wanted[-1])), seed, number)
+        one = scenario if chosen.states is None else drawn(scenario, seed, number)
+        record = simulate(replace(one, duration=float(wanted[-1])), seed, number)
         initial = setup.drawn_state(chosen, record, seed, number)
         rows = []
         for length in wanted:
