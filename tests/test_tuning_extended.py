@@ -82,7 +82,6 @@ def test_without_states_it_is_the_likelihood_of_the_plain_filter():
         np.testing.assert_allclose(two.value.sum(), one.value.sum(), rtol=1e-9)
         np.testing.assert_allclose(two.score.sum(axis=0), one.score.sum(axis=0), rtol=1e-5, atol=1e-4)
         np.testing.assert_allclose(two.information, one.information, rtol=1e-4, atol=1e-4)
-        np.testing.assert_allclose(two.outer, one.outer, rtol=1e-4, atol=1e-3)
 
 
 def test_score_and_curvature_are_the_derivatives():

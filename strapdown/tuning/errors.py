@@ -80,7 +80,7 @@ class ErrorObjective(Objective):
 
     def _by_part(self, value: Array, score: Array, information: Array) -> Derivatives:
         place = np.arange(len(value)) * self.parts // len(value)
-        return by_part(value, score, information, place, self.parts, score.T @ score)
+        return by_part(value, score, information, place, self.parts)
 
 
 def error_objective(

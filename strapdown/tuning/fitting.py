@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -34,6 +34,7 @@ MIN_INFORMATION = 1e-10
 """Least information on a log parameter; below it there is none."""
 NEGLIGIBLE = 1e-3
 """A gain of the log likelihood that is not distinguishable from none."""
+NOT_IDENTIFIED = "not identified"
 MISFIT = 1.6
 """Sandwich error over that of the information beyond which the innovations are not what the filter takes them for."""
 
@@ -49,12 +50,16 @@ class Local:
     information: Array
     derivatives: Derivatives
 
+    @property
+    def settled(self) -> np.ndarray:
+        """Parameters that fall towards zero (p,): they gain no more than half the gradient, and below some size are as good as there."""
+        return np.asarray((self.score > 0.0) & (self.score < NEGLIGIBLE) & (np.diag(self.information) < 0.1))
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Optimum:
     """Where one search ended."""
 
-    start: Array
     point: Array
     local: Local
     steps: int
@@ -90,12 +95,14 @@ def search(
     low, high = objective.limits
     here = local_at(objective, x, known)
     damping, stretch = 1e-3, 1.0
+
+    def ended(number: int, *, converged: bool = True) -> Optimum:
+        return Optimum(point=x, local=here, steps=number, converged=converged)
+
     for number in range(steps):
-        # What falls towards zero gains no more than half its gradient: below some size it is as good as there.
-        settled = (here.score > 0.0) & (here.score < NEGLIGIBLE) & (np.diag(here.information) < 0.1)
-        active = moving & ~settled & ~((x <= low) & (here.score > 0.0)) & ~((x >= high) & (here.score < 0.0))
+        active = moving & ~here.settled & ~((x <= low) & (here.score > 0.0)) & ~((x >= high) & (here.score < 0.0))
         if not active.any():
-            return Optimum(start=np.array(start), point=x, local=here, steps=number, converged=True)
+            return ended(number)
         g, F = here.score[active], here.information[np.ix_(active, active)]
         scale = np.sqrt(np.maximum(np.diag(F), 1e-12))
         unit = F / np.outer(scale, scale)
@@ -108,13 +115,13 @@ def search(
             trial[~moving] = x[~moving]
             gain = -float(here.score[active] @ delta[active])
             if gain < 1e-7 and np.abs(delta).max() < 0.05:
-                return Optimum(start=np.array(start), point=x, local=here, steps=number, converged=True)
+                return ended(number)
             there = local_at(objective, trial, known)
             if there.value <= here.value:
                 break
             damping, stretch = max(10.0 * damping, 1e-3), 1.0
             if damping > 1e12:
-                return Optimum(start=np.array(start), point=x, local=here, steps=number, converged=False)
+                return ended(number, converged=False)
         if shortened == 1.0 and not objective.composite:
             # Where the information is more than the curvature, as of innovations that no such filter has, steps are too short.
             bend = 2.0 * (gain - (here.value - there.value))
@@ -122,7 +129,7 @@ def search(
                 np.clip(stretch * (np.clip(gain / bend, 0.5, 4.0) if bend > 0.25 * gain else 4.0), 1.0, 64.0)
             )
         x, here, damping = trial, there, max(0.1 * damping, 1e-9)
-    return Optimum(start=np.array(start), point=x, local=here, steps=steps, converged=False)
+    return ended(steps, converged=False)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,18 +150,18 @@ class Estimated:
     identified: bool
     """Whether zero is refuted at 95 %, and an upper end found."""
     note: str
-    """Interpretation, in words."""
+    """Interpretation; :attr:`words` adds the bound."""
     unit: Unit
     """Unit that it is printed in."""
 
     @property
     def words(self) -> str:
         """How well it is known, in its unit."""
-        if self.identified or "prior" in self.note:
+        if self.note != NOT_IDENTIFIED:
             return self.note
         if not math.isfinite(self.upper):
-            return "not identified: these records say nothing of it"
-        return f"not identified: at most {figure(self.upper / self.unit.factor, 3)} {self.unit.name} (95 %)"
+            return f"{NOT_IDENTIFIED}: these records say nothing of it"
+        return f"{NOT_IDENTIFIED}: at most {figure(self.upper / self.unit.factor, 3)} {self.unit.name} (95 %)"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -244,7 +251,6 @@ class _Known:
     upper: float
     mean: float
     identified: bool
-    slices: tuple[Array, Array] | None = field(default=None)
 
 
 def random_starts(point: Array, number: int, factor: float, generator: np.random.Generator) -> Array:
@@ -329,16 +335,31 @@ def fit(
     if loose:
         point[loose] = np.log([ranges[j].mean for j in loose])
         point = search(objective, point, known, fixed=loose).point
+    misfit = errors.misfit and not objective.composite
+
+    def estimated(j: int, name: str) -> Estimated:
+        found, error = ranges[j], float(errors.standard[j])
+        return Estimated(
+            name=name,
+            start=float(np.exp(objective.start[j])),
+            value=float(np.exp(point[j])),
+            most_likely=float(np.exp(best.point[j])) if not best.local.settled[j] else 0.0,
+            lower=found.lower,
+            upper=found.upper,
+            standard_error=error,
+            identified=found.identified,
+            note=_note(name, found, error, best.local, j, known, doubtful=misfit),
+            unit=objective.unit(name),
+        )
+
     return Tuning(
-        parameters=tuple(
-            _estimated(objective, best, known, errors, j, one, float(np.exp(point[j]))) for j, one in enumerate(ranges)
-        ),
+        parameters=tuple(estimated(j, name) for j, name in enumerate(objective.names)),
         setup=objective.setup(point),
         point=point,
         before=local_at(objective, objective.start, known).value,
         after=best.local.value,
         covariance=errors.covariance,
-        misfit=errors.misfit and not objective.composite,
+        misfit=misfit,
         composite=objective.composite,
         starts=points,
         optima=np.array([optimum.point for optimum in optima]),
@@ -376,32 +397,6 @@ def _errors(objective: Objective, best: Optimum) -> _Errors:
     if misfit or objective.composite:
         swollen = np.maximum(sandwich / curvature, 0.0 if objective.composite else 1.0)
     return _Errors(covariance, swollen * curvature, swollen, misfit)
-
-
-def _estimated(
-    objective: Objective,
-    best: Optimum,
-    priors: Mapping[str, Prior],
-    errors: _Errors,
-    j: int,
-    found: _Known,
-    value: float,
-) -> Estimated:
-    """Return parameter j with its interval."""
-    name, error = objective.names[j], float(errors.standard[j])
-    doubtful = errors.misfit and not objective.composite
-    return Estimated(
-        name=name,
-        start=float(np.exp(objective.start[j])),
-        value=value,
-        most_likely=float(np.exp(best.point[j])) if _above_nothing(best, j) else 0.0,
-        lower=found.lower,
-        upper=found.upper,
-        standard_error=error,
-        identified=found.identified,
-        note=_note(name, found, error, best.local, j, priors, doubtful=doubtful),
-        unit=objective.unit(name),
-    )
 
 
 def _curved(objective: Objective, best: Optimum) -> Local:
@@ -470,10 +465,6 @@ def covariances(local: Local) -> tuple[Array, Array]:
     parts = local.derivatives.score
     scatter = (parts - parts.mean(axis=0)).T @ (parts - parts.mean(axis=0)) * (len(parts) / max(len(parts) - 1, 1))
     return inverse, inverse @ scatter @ inverse
-
-
-def _above_nothing(best: Optimum, j: int) -> bool:
-    return not (0.0 < best.local.score[j] < NEGLIGIBLE and best.local.information[j, j] < 0.1)
 
 
 def _wald(best: Optimum, j: int, error: float) -> _Known:
@@ -548,9 +539,7 @@ def _note(
         if share < 0.5:
             return "the prior says so, this record adds little"
     if not found.identified:
-        if not np.isfinite(found.upper):
-            return "not identified: these records say nothing of it"
-        return f"not identified: < {found.upper:.2g} at 95 %; these records are too short to say more"
+        return NOT_IDENTIFIED
     if doubtful and name != SCALE:
         return "in doubt: the innovations are not those of such a filter"
     if found.lower == 0.0 or found.upper > 4.0 * found.lower:

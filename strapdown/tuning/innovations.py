@@ -99,25 +99,21 @@ class LaneLikelihood(Objective):
         results = self.each(self._differences, jobs)
         found = []
         for k in range(0, len(results), len(blocks)):
-            score, matrices = np.zeros((len(results[k].value), p)), np.zeros((2, p, p))
+            score, information = np.zeros((len(results[k].value), p)), np.zeros((p, p))
             for block, part in zip(blocks, results[k : k + len(blocks)], strict=True):
                 score[:, block] = part.score
-                matrices[:, np.array(block)[:, None], block] = part.information, part.outer
-            found.append(replace(results[k], score=score, information=matrices[0], outer=matrices[1]))
+                information[np.ix_(block, block)] = part.information
+            found.append(replace(results[k], score=score, information=information))
         return joined(found)
 
     def _differences(self, case: Prepared, point: Array, block: tuple[int, ...]) -> Derivatives:
         rows = np.concatenate([point[None], point + STEP * np.eye(len(point))[list(block)]])
         found = self._pass(case, rows, free=len(block))
-        outer, information = (
-            (lower + np.tril(lower, -1).transpose(0, 2, 1))[case.used].sum(axis=0)
-            for lower in (found["outer"], found["information"])
-        )
+        lower = found["outer" if self.mixed else "information"]  # of the mixture there are no sensitivities
         return Derivatives(
             value=found["minus_log"][case.used, 0],
             score=found["score"][case.used],
-            information=outer if self.mixed else information,  # of the mixture there are no sensitivities
-            outer=outer,
+            information=(lower + np.tril(lower, -1).transpose(0, 2, 1))[case.used].sum(axis=0),
         )
 
     def estimates(self, number: int, points: Array, epochs: np.ndarray) -> tuple[Array, Array, Array]:
@@ -214,7 +210,7 @@ class RunLikelihood(Objective):
     def minus_log(self, points: Array) -> Array:
         """Return minus the log likelihood, without its constant, at several points (k, p): (k,)."""
         runs = self._runs(np.atleast_2d(points))
-        each = [[0.5 * float(np.sum(np.log(s) + e * e / s)) for e, s, _, _ in found] for found in runs]
+        each = [[0.5 * float(np.sum(np.log(s) + e * e / s)) for e, s, _ in found] for found in runs]
         return np.asarray(np.sum(np.array(each), axis=1))
 
     def derivatives(self, point: Array) -> Derivatives:
@@ -222,15 +218,13 @@ class RunLikelihood(Objective):
         runs = self._runs(np.concatenate([point[None], point + STEP * np.eye(len(point))]))
         return joined([self._differences(*one) for one in zip(*runs, strict=True)])
 
-    def _differences(self, *runs: tuple[Array, Array, np.ndarray, np.ndarray]) -> Derivatives:
-        e, s, part, measurement = runs[0]
+    def _differences(self, *runs: tuple[Array, Array, np.ndarray]) -> Derivatives:
+        e, s, part = runs[0]
         de, ds = (np.stack([(one[k] - runs[0][k]) / STEP for one in runs[1:]], axis=1) for k in (0, 1))
         score = e[:, None] * de / s[:, None] + 0.5 * ds * ((1.0 - e * e / s) / s)[:, None]
-        gradients = np.zeros((int(measurement[-1]) + 1, score.shape[1]))
-        np.add.at(gradients, measurement, score)
         information = (de / s[:, None]).T @ de + 0.5 * (ds / s[:, None] ** 2).T @ ds
         value = 0.5 * (np.log(s) + e * e / s)
-        return by_part(value, score, information, part, self.parts, gradients.T @ gradients)
+        return by_part(value, score, information, part, self.parts)
 
     def curvature(self, point: Array) -> Array:  # type: ignore[override]
         """Return the observed information at a point (p, p): the second derivatives of minus the log likelihood."""
@@ -239,13 +233,13 @@ class RunLikelihood(Objective):
         rows = np.array([(ahead - back) / (2.0 * CURVATURE_STEP) for ahead, back in ends])
         return np.asarray(0.5 * (rows + rows.T))
 
-    def _runs(self, points: Array) -> list[list[tuple[Array, Array, np.ndarray, np.ndarray]]]:
-        """Return innovations, their variances, and the parts and measurements they belong to, of every point and record."""
+    def _runs(self, points: Array) -> list[list[tuple[Array, Array, np.ndarray]]]:
+        """Return innovations, their variances, and the parts that they belong to, of every point and record."""
         setups = [self.setup(point) for point in points]
         found = self.each(self._run, [(chosen, case) for chosen in setups for case in self.cases])
         return [found[k : k + len(self.cases)] for k in range(0, len(found), len(self.cases))]
 
-    def _run(self, chosen: FilterSetup, case: Case) -> tuple[Array, Array, np.ndarray, np.ndarray]:
+    def _run(self, chosen: FilterSetup, case: Case) -> tuple[Array, Array, np.ndarray]:
         # The filter of optional states has the innovations of measurements whose noise differs by axis, with none too.
         used = replace(chosen, states=States() if chosen.states is None else chosen.states)
         ends = max(
@@ -253,17 +247,14 @@ class RunLikelihood(Objective):
         )  # of the states only the first and the last are kept
         estimate = self._estimate(used, case, every=ends, gate=None, robust=None)
         first, last = case.span
-        errors, variances, places, numbers, seen = [], [], [], [], 0
+        found = []
         for one in estimate.innovations.values():
             inside = (one.time >= first) & (one.time <= last)
-            errors.append(one.innovation[inside].ravel())
-            variances.append(one.variance[inside].ravel())
             place = ((one.time[inside] - first) / (last - first) * self.parts).astype(np.int64)
-            degrees = one.innovation.shape[1]
-            places.append(np.repeat(np.minimum(place, self.parts - 1), degrees))
-            numbers.append(np.repeat(seen + np.arange(len(place)), degrees))
-            seen += len(place)
-        return np.concatenate(errors), np.concatenate(variances), np.concatenate(places), np.concatenate(numbers)
+            places = np.repeat(np.minimum(place, self.parts - 1), one.innovation.shape[1])
+            found.append((one.innovation[inside].ravel(), one.variance[inside].ravel(), places))
+        e, s, part = (np.concatenate(column) for column in zip(*found, strict=True))
+        return e, s, part
 
     def estimates(self, number: int, points: Array, epochs: np.ndarray) -> tuple[Array, Array, Array]:
         """Return q_fb (m, k, 4), bias (m, k, 3) and P (m, k, 6, 6) on record ``number`` at edges (m,), at points (k, p)."""

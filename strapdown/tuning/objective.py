@@ -96,9 +96,7 @@ class Derivatives:
     score: Array
     """Its gradient (parts, p)."""
     information: Array
-    """Fisher's information from the sensitivities of the innovations (p, p), summed over the parts."""
-    outer: Array
-    """Σ g gᵀ over the measurements (p, p), g the gradient of each."""
+    """Fisher's information from the sensitivities of the innovations (p, p), or Σ g gᵀ over the measurements, g the gradient of each."""
 
 
 def joined(found: Sequence[Derivatives]) -> Derivatives:
@@ -107,16 +105,15 @@ def joined(found: Sequence[Derivatives]) -> Derivatives:
         value=np.concatenate([one.value for one in found]),
         score=np.concatenate([one.score for one in found]),
         information=np.sum([one.information for one in found], axis=0),
-        outer=np.sum([one.outer for one in found], axis=0),
     )
 
 
-def by_part(value: Array, score: Array, information: Array, place: np.ndarray, parts: int, outer: Array) -> Derivatives:
+def by_part(value: Array, score: Array, information: Array, place: np.ndarray, parts: int) -> Derivatives:
     """Return derivatives from the value (m,) and the gradient (m, p) of each term, which belongs to part ``place`` (m,)."""
     sums = np.zeros((parts, score.shape[1]))
     np.add.at(sums, place, score)
     summed = np.bincount(place, value, parts).astype(np.float64)
-    return Derivatives(value=summed, score=sums, information=information, outer=outer)
+    return Derivatives(value=summed, score=sums, information=information)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
