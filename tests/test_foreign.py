@@ -96,7 +96,7 @@ def test_a_factor_on_sigma_is_as_likely_as_its_likelihood_ratio(m, factor):
     error *= factor / np.sqrt(np.mean(error**2))
     time, attitude = np.arange(float(m)), quaternion.normalize(draw.standard_normal((m, 4)))
     truth, P = Truth(attitude=attitude, bias=np.zeros((m, 3))), np.tile(1e-6 * np.eye(6), (m, 1, 1))
-    known = foreign.explanations(1e-3 * error, {"body": P}, "body", truth, time, attitude)
+    known = foreign.explanations(1e-3 * error, {"body": P}, "body", {"body": 1.0}, truth, time, attitude)
     (found,) = (one for one in known if one.name == foreign.SCALE)
     assert float(found.value) == pytest.approx(factor, rel=1e-3)
     ratio = 3.0 * (m if m > 10 else 1) * (factor**2 - 1.0 - 2.0 * np.log(factor))
