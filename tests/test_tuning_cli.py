@@ -150,10 +150,11 @@ def scaled(tmp_path):
     return path
 
 
-def test_tune_gives_the_filter_states_for_what_the_record_specifies(run, tmp_path, scaled):
+@pytest.mark.parametrize("options", [(), ("--rmse",), ("--spacing", 2.0)], ids=["likelihood", "rmse", "spacing"])
+def test_tune_gives_the_filter_states_for_what_the_record_specifies(run, tmp_path, scaled, options):
     out = tmp_path / "states.toml"
     status, said, complaint = run(
-        "tune", scaled, "--states", "--free", "gyro.arw,gyro.scale_sigma", "--starts", 1, "-o", out
+        "tune", scaled, "--states", "--free", "gyro.arw,gyro.scale_sigma", "--starts", 1, "-o", out, *options
     )
     assert status == 0, complaint
     assert "Optional states: gyro.scale" in said

@@ -305,6 +305,9 @@ def test_a_plan_knows_that_one_record_has_three_draws_of_a_hard_iron():
     # Of a σ three numbers five times a second: 1/√(2 n).
     np.testing.assert_allclose(planned.errors[:, 1], 1.0 / np.sqrt(2.0 * 15.0 * planned.lengths), rtol=0.1)
     assert planned.units[0].name == "rad, or the vector's unit"
+    # A longer record tells no more of the iron.
+    assert planned.needed().tolist() == [np.inf, pytest.approx(20.0 * (planned.errors[1, 1] / 0.1) ** 2)]
+    assert "more records" in str(planned)
 
 
 # ------------------------------------------------------------------------------------------------------------------------- held out

@@ -83,6 +83,16 @@ SENSOR_STATES = {
     **{name: (name, Unit(name=unit, factor=1.0)) for name, unit in VELOCITY.items()},
 }
 """Those of a sensor's optional states by what follows its name and a dot: field of :class:`strapdown.setup.states.SensorStates`, unit."""
+CONSTANTS = (
+    "scale_sigma",
+    "misalignment_sigma",
+    "force_sigma",
+    "bias_sigma",
+    "lever_sigma",
+    INITIAL_ATTITUDE,
+    INITIAL_BIAS,
+)
+"""Ends of the names of σ of constants, of which a record has one draw an axis however long it is."""
 _WHOLE = {SCALE: _ONE, OUTLIER_SHARE: Unit(name="%", factor=0.01), OUTLIER_SCALE: _ONE}
 """Units of what is no field of a setup."""
 

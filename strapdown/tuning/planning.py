@@ -17,7 +17,7 @@ from strapdown.scenarios import Scenario, drawn, simulate
 from strapdown.setup import FilterSetup
 from strapdown.tuning.innovations import likelihood
 from strapdown.tuning.objective import Case
-from strapdown.tuning.parameters import Unit, unit_of, values_of
+from strapdown.tuning.parameters import CONSTANTS, Unit, unit_of, values_of
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -44,7 +44,7 @@ class Plan(Listed):
                 unit.name,
                 figure(value / unit.factor, 3),
                 *(f"× {math.exp(error):.3f}" if error < 2.0 else "nothing" for error in errors),
-                f"{needed:.3g} s",
+                f"{needed:.3g} s" if math.isfinite(needed) else "more records",
             )
             for name, unit, value, errors, needed in zip(
                 self.names, self.units, self.values, self.errors.T, self.needed(), strict=True
@@ -55,8 +55,13 @@ class Plan(Listed):
         return Listing("Least standard error, as a factor (Cramér–Rao)", columns, rows, [note], left=2)
 
     def needed(self, error: float = 0.1) -> Array:
-        """Return the length (p,), s, at which each parameter is known to this relative error, if information grows as at the end."""
-        return np.asarray(self.lengths[-1] * (self.errors[-1] / error) ** 2)
+        """Return the length (p,), s, at which each parameter is known to this relative error, if information grows as at the end.
+
+        Infinite for the σ of a constant error: more records tell more of it, a longer one does not.
+        """
+        drawn_once = np.array([name.endswith(CONSTANTS) for name in self.names])
+        longer = drawn_once & (self.errors[-1] > error)
+        return np.where(longer, np.inf, self.lengths[-1] * (self.errors[-1] / error) ** 2)
 
 
 def plan(
