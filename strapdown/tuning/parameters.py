@@ -127,10 +127,8 @@ def known_names(records: Sequence[ImuRecord]) -> tuple[str, ...]:
 
 def axis_of(name: str) -> tuple[str, int] | None:
     """Return the sensor and the axis that a name such as ``star.sigma.x`` is of; None of another name."""
-    for axis, ending in enumerate(AXES):
-        if name.endswith(ending) and name != ending:
-            return name.removesuffix(ending), axis
-    return None
+    sensor, _, axis = name.rpartition(f"{SIGMA}.")
+    return (sensor, "xyz".index(axis)) if sensor and axis in ("x", "y", "z") else None
 
 
 def axis_names(records: Sequence[ImuRecord]) -> tuple[str, ...]:
@@ -207,14 +205,8 @@ def own_sigma(sensor: str, records: Sequence[ImuRecord]) -> float:
 
 def own_axes(sensor: str, records: Sequence[ImuRecord]) -> Array:
     """Return the root mean square of a sensor's σ in the records about each body axis (3,), over all of its measurements."""
-    squares = []
-    for series in (one for record in records for one in record.vectors if one.sensor == sensor):
-        if series.sigma_axes is not None:
-            squares.append(np.square(series.sigma_axes))
-        elif series.covariance is not None:
-            squares.append(np.einsum("kii->ki", series.covariance))
-        else:
-            squares.append(np.repeat(np.square(series.sigma)[:, None], 3, axis=1))
+    series = [one for record in records for one in record.vectors if one.sensor == sensor]
+    squares = [np.einsum("kii->ki", one.covariances) for one in series]
     return np.asarray(np.sqrt(np.mean(np.concatenate(squares), axis=0))) if squares else np.zeros(3)
 
 
