@@ -182,6 +182,7 @@ def test_a_trajectory_without_covariance_is_not_judged(files, monkeypatch, capsy
     status, said, _ = command(monkeypatch, capsys, "check", files / "estimate.tum", "--truth", files / "record.h5")
     assert status == 2
     assert "has no covariance, so its errors are not judged (RMS attitude error" in said
+    assert "without a truth" not in said
     assert "cannot tell" in said
 
 

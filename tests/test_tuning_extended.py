@@ -71,16 +71,17 @@ def test_without_states_it_is_the_likelihood_of_the_plain_filter():
     chosen = setup.matched(scenario)
     cases = [case_of(scenario, chosen, 3, run) for run in range(2)]
     names = ["gyro.arw", "gyro.rrw", "star 1.sigma"]
-    plain = tuning.likelihood(cases, chosen, names)
-    other = tuning.likelihood(cases, dataclasses.replace(chosen, states=States()), names)
+    # Seven parts, whose edges are at no measurement.
+    plain = tuning.likelihood(cases, chosen, names, parts=7)
+    other = tuning.likelihood(cases, dataclasses.replace(chosen, states=States()), names, parts=7)
     assert other.names == plain.names
     np.testing.assert_allclose(other.start, plain.start, rtol=1e-15)
     points = plain.start + np.array([[0.0, 0.0, 0.0], [0.3, -0.5, 0.2]])
     np.testing.assert_allclose(other.minus_log(points), plain.minus_log(points), rtol=1e-9)
     for point in points:
         one, two = plain.derivatives(point), other.derivatives(point)
-        np.testing.assert_allclose(two.value.sum(), one.value.sum(), rtol=1e-9)
-        np.testing.assert_allclose(two.score.sum(axis=0), one.score.sum(axis=0), rtol=1e-5, atol=1e-4)
+        np.testing.assert_allclose(two.value, one.value, rtol=1e-9)
+        np.testing.assert_allclose(two.score, one.score, rtol=1e-5, atol=1e-4)
         np.testing.assert_allclose(two.information, one.information, rtol=1e-4, atol=1e-4)
 
 
@@ -138,6 +139,23 @@ def test_values_scale_all_axes_alike_and_the_rest_stays():
     assert (twice.gyro_drift_time, twice.gyro_fast_bias_sigma) == (states.gyro_drift_time, 8e-7)
     assert twice.sensors["mag"].bias_sigma == pytest.approx((2.0, 4.0, 4.0))
     assert twice.sensors["a.b"].lever_arm_sigma == 0.6
+
+
+def test_a_search_stays_where_a_state_makes_sense():
+    """Scale factors below a tenth, for the filter is linear in them; times from a part of the interval to many records."""
+    scenario = swaying(20.0)
+    chosen = filter_setup(scenario)
+    chosen = dataclasses.replace(chosen, states=dataclasses.replace(chosen.states, gyro_scale_sigma=1e-3))
+    free = ["gyro.scale_sigma", "acc.correlation_time", "acc.correlated_sigma"]
+    objective = tuning.likelihood([case_of(scenario, chosen, 1)], chosen, free)
+    far, near = (objective.setup(objective.start + step).states for step in (12.0, -12.0))
+    assert far.gyro_scale_sigma == pytest.approx(0.1)
+    assert far.sensors["acc"].correlation_time == pytest.approx(100.0 * 20.0)
+    assert near.sensors["acc"].correlation_time == pytest.approx(
+        0.05 * 20.0 / len(objective.cases[0].record.vectors[1].time)
+    )
+    assert far.sensors["acc"].correlated_sigma == pytest.approx(0.4 * np.exp(12.0))
+    assert near.gyro_scale_sigma == pytest.approx(1e-3 * np.exp(-12.0))
 
 
 @pytest.mark.parametrize(
