@@ -122,19 +122,19 @@ class Reference(NamedTuple):
         return Reference(self.epochs[rows], self.attitude[rows], None if self.bias is None else self.bias[rows])
 
 
-def _reference(case: Case, chosen: FilterSetup) -> Reference:
-    """Return the truth of a record where it is known and counts for tuning."""
-    every, time, truth = chosen.integration.samples, case.record.time, case.record.truth
-    edges = np.arange(0, len(time), every)
+def reference(case: Case, edges: np.ndarray) -> Reference:
+    """Return the truth of a record where it is known and counts for tuning, at some of these edges of its gyro samples."""
+    time, truth = case.record.time[edges], case.record.truth
     attitude = case.true_attitude if truth is None else truth.attitude
-    judged = (time[edges] >= case.first) & (time[edges] <= case.last)
+    judged = (time >= case.first) & (time <= case.last)
     if case.judged is not None:
         judged &= case.judged[edges]
     if attitude is not None:
         judged &= np.isfinite(attitude[edges]).all(axis=1)
     if attitude is None or not judged.any():
         raise InputError(
-            f"{case.name or 'record'} has no truth where it is to be judged; tune by the innovations instead (leave truth out)"
+            f"{case.name or 'record'} has no truth where it is to be judged; tune by the innovations instead (leave truth out), or give a "
+            "reference"
         )
     rows = edges[judged]
     return Reference(np.flatnonzero(judged), attitude[rows], None if truth is None else truth.bias[rows])
@@ -142,7 +142,8 @@ def _reference(case: Case, chosen: FilterSetup) -> Reference:
 
 def _spread(base: LaneLikelihood | RunLikelihood, number: int, measure: Measure) -> Reference:
     """Return the truth of a record at edges far enough apart that the attitude error of the starting filter has forgotten."""
-    known = _reference(base.cases[number], base.chosen)
+    case = base.cases[number]
+    known = reference(case, np.arange(0, len(case.record.time), base.chosen.integration.samples))
     picked = known.at(slice(None, None, max(1, len(known.epochs) // MAX_EPOCHS)))
     m = len(picked.epochs)
     if measure == "rmse" or m < 100:
