@@ -389,7 +389,11 @@ class _Errors(NamedTuple):
 
 def _errors(objective: Objective, best: Optimum) -> _Errors:
     """Return the errors of the best point: by the information, or by the sandwich where the objective is not the innovations' own."""
-    covariance, robust = covariances(_curved(objective, best))
+    local, information = best.local, best.local.information
+    if objective.curvature is not None:  # its own, and the priors', where the point is a minimum by it
+        own = objective.curvature(best.point) + information - local.derivatives.information
+        information = own if np.linalg.eigvalsh(own)[0] > 0.0 else information
+    covariance, robust = covariances(information, local.derivatives.score)
     curvature, sandwich = np.sqrt(np.diag(covariance)), np.sqrt(np.diag(robust))
     misfit = bool(np.any(sandwich > MISFIT * curvature))
     # A likelihood whose curvature promises too much falls too fast by the square of that.
@@ -397,16 +401,6 @@ def _errors(objective: Objective, best: Optimum) -> _Errors:
     if misfit or objective.composite:
         swollen = np.maximum(sandwich / curvature, 0.0 if objective.composite else 1.0)
     return _Errors(covariance, swollen * curvature, swollen, misfit)
-
-
-def _curved(objective: Objective, best: Optimum) -> Local:
-    """Return the best point with the objective's own curvature, where it has one and the point is a minimum by it."""
-    if objective.curvature is None:
-        return best.local
-    own = (
-        objective.curvature(best.point) + best.local.information - best.local.derivatives.information
-    )  # and the priors'
-    return replace(best.local, information=own) if np.linalg.eigvalsh(own)[0] > 0.0 else best.local
 
 
 def rescaled(tuning: Tuning, factor: float) -> Tuning:
@@ -452,17 +446,16 @@ def slices(objective: Objective, tuning: Tuning, *, number: int = 24) -> Slices:
     return Slices(names=objective.names, values=np.array(values), fallen=np.array(fallen))
 
 
-def covariances(local: Local) -> tuple[Array, Array]:
-    """Return the covariance of the log parameters by the information, and by the sandwich F⁻¹ J F⁻¹.
+def covariances(information: Array, parts: Array) -> tuple[Array, Array]:
+    """Return the covariance of the log parameters by the information (p, p), and by the sandwich F⁻¹ J F⁻¹.
 
-    J is the scatter of the gradient over parts of the records (White 1982; parts long against the innovations' correlation make it hold
-    for innovations that are not white). Where there is no information the variance is infinite, to a large number.
+    J is the scatter of the gradient over parts (m, p) of the records (White 1982; parts long against the innovations' correlation make it
+    hold for innovations that are not white). Where there is no information the variance is infinite, to a large number.
     """
     # A parameter that nothing depends on has no row to invert; a pseudo-inverse would make its variance zero.
-    F = local.information + np.diag(np.maximum(MIN_INFORMATION - np.diag(local.information), 0.0))
+    F = information + np.diag(np.maximum(MIN_INFORMATION - np.diag(information), 0.0))
     scale = np.sqrt(np.diag(F))
     inverse = np.linalg.pinv(F / np.outer(scale, scale), rcond=1e-10, hermitian=True) / np.outer(scale, scale)
-    parts = local.derivatives.score
     scatter = (parts - parts.mean(axis=0)).T @ (parts - parts.mean(axis=0)) * (len(parts) / max(len(parts) - 1, 1))
     return inverse, inverse @ scatter @ inverse
 
