@@ -31,9 +31,9 @@ from strapdown.files import plain
 from strapdown.records import Estimate, ImuRecord, cut
 from strapdown.setup import FilterSetup
 from strapdown.tuning.fitting import Tuning
-from strapdown.tuning.holding import performance
 from strapdown.tuning.objective import Case, of_sensors
 from strapdown.tuning.parameters import RRW
+from strapdown.tuning.validation import performance
 
 LEVELS = (1.0, 0.2, 0.04)
 """Multiples of the tuned walk of the bias beside which a scale factor is tried."""
