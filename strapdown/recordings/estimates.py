@@ -13,9 +13,9 @@ from strapdown.files import written_beside
 from strapdown.recordings.dataframes import write_parquet_columns
 from strapdown.recordings.delimited import write_columns
 from strapdown.recordings.extras import library
-from strapdown.recordings.recording import Recording
 from strapdown.records import Estimate, outputs
 from strapdown.records import write_estimate as write_result
+from strapdown.records.recording import Recording
 from strapdown.units import DEGREE
 
 

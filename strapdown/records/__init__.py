@@ -1,6 +1,7 @@
 """Records of an IMU with their truth, and estimates of a filter.
 
 - ``record``: :class:`ImuRecord`, :class:`Estimate` and their parts, and estimates in HDF5.
+- ``recording``: :class:`Recording`: point samples of a device, and their units.
 - ``outputs``: An estimate in other quantities: Euler angles, heading, NED, specific force, each with its covariance.
 """
 
@@ -27,6 +28,7 @@ from strapdown.records.record import read_truth as read_truth
 from strapdown.records.record import result_file as result_file
 from strapdown.records.record import write_attitude as write_attitude
 from strapdown.records.record import write_estimate as write_estimate
+from strapdown.records.recording import Recording as Recording
 
 __all__ = [
     "ErrorStateEstimate",

@@ -20,10 +20,10 @@ from numpy.typing import ArrayLike, NDArray
 from strapdown import quaternion
 from strapdown.checks import Array, InputError, array, one_of, unit_quaternions
 from strapdown.kinematics import skew
+from strapdown.records.recording import Recording
 from strapdown.units import DEGREE, DEGREE_PER_HOUR, STANDARD_GRAVITY
 
 if TYPE_CHECKING:
-    from strapdown.recordings import Recording
     from strapdown.records.record import Estimate
 
 __all__ = [

@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
     from strapdown.gyro import GyroSpec
-    from strapdown.scenarios import Scenario
-
 
 CONVENTIONS = (
     "quaternions Hamilton, scalar first, body to fixed frame: v_f = q v_b q^-1; error state (dtheta, db): "
@@ -69,7 +67,7 @@ class Origin:
     ----------
     gyro : GyroSpec, optional
         Specification of the gyro.
-    scenario : Scenario, optional
+    scenario : strapdown.scenarios.Scenario, optional
         Scenario.
     seed : int, optional
         Seed of the random streams.
@@ -78,7 +76,7 @@ class Origin:
     """
 
     gyro: GyroSpec | None = None
-    scenario: Scenario | None = None
+    scenario: Any = None
     seed: int | None = None
     run: int | None = None
 
