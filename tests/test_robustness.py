@@ -685,8 +685,6 @@ def test_the_smoother_leaves_out_what_the_filter_refused():
     assert gated.refused["a"] > 3
     assert np.allclose(one.attitude, other.attitude, rtol=0.0, atol=1e-12)
     assert np.allclose(one.covariance, other.covariance, rtol=1e-7, atol=1e-16)
-    lagged = estimation.smooth(record, NOISE, start, lag=record.time[-1], gate=Gate(), full_covariance=True)
-    assert np.array_equal(lagged.attitude, one.attitude)
 
 
 def test_robust_smoothing_is_better_and_consistent():

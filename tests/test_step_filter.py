@@ -519,7 +519,6 @@ WRONG = {
 FACES = {
     "estimation.run": estimation.run,
     "estimation.smooth": estimation.smooth,
-    "estimation.smooth, lag": lambda *given, **options: estimation.smooth(*given, lag=1.0, **options),
     "StepFilter": lambda record, *given, **options: GatedStepFilter(*given, **options),
     "estimation.observability": estimation.observability,
     "estimation.relinearized_start": estimation.relinearized_start,
