@@ -86,7 +86,6 @@ def smooth(
     all. A record without error states whose covariance would lose its digits is smoothed on its triangular factor, which takes a dozen
     times as long.
     """
-    check_arguments(record=record, gate=gate, robust=robust)
     problem = forward.prepared(record, process_noise, initial, error_states)
     options = Options(
         every=len(record.time),

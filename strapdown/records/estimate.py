@@ -64,7 +64,7 @@ class Innovations:
         return np.asarray(np.sum(self.innovation**2 / self.variance, axis=1))
 
 
-EVENT_KINDS = ("recovery", "hypotheses", "lock-out", "divergence", "gap")
+EVENT_KINDS = ("recovery", "hypotheses", "lock-out", "gap")
 """Kinds of :class:`Event`."""
 
 
@@ -74,20 +74,18 @@ class Event:
 
     Parameters
     ----------
-    kind : {"recovery", "hypotheses", "lock-out", "divergence", "gap"}
+    kind : {"recovery", "hypotheses", "lock-out", "gap"}
         What happened: a filter that rejected good measurements was restarted; a bank of hypotheses replaced it while a turn was
-        ambiguous; a gate rejected a sensor more often than it accepted it; the running NIS left its bounds; the gyro was silent for
-        much longer than its sample interval.
+        ambiguous; a gate rejected a sensor more often than it accepted it; the gyro was silent for much longer than its sample interval.
     start : float
         Time of its beginning, s.
     end : float
-        Time of its end, s: the recovery, the decision between the hypotheses, the last rejection, the return of the NIS (or the end
-        of the record), the next gyro sample.
+        Time of its end, s: the recovery, the decision between the hypotheses, the last rejection, the next gyro sample.
     sensor : str, default ""
         Sensor concerned, if there is one.
     value : float, default 0.0
-        Of a recovery the rejections in a row; of hypotheses the number left (0: decided); of a lock-out the rejections; of a
-        divergence the largest mean NIS per degree of freedom; of a gap its length over the usual interval.
+        Of a recovery the rejections in a row; of hypotheses the number left (0: decided); of a lock-out the rejections; of a gap its
+        length over the usual interval.
     """
 
     kind: str
@@ -115,11 +113,6 @@ class Event:
             return (
                 f"Locked out from {self.start:.6g} s to {self.end:.6g} s: {self.value:.0f} measurements of {self.sensor} were rejected, "
                 "more than were accepted, and no restart agreed with them: the sensor, its sigma or the filter is wrong there."
-            )
-        if self.kind == "divergence":
-            return (
-                f"The mean NIS left its bounds from {self.start:.6g} s to {self.end:.6g} s, up to {self.value:.3g} per degree of freedom: "
-                "the model does not hold there."
             )
         return f"Gap of {self.end - self.start:.3g} s after {self.start:.6g} s: the rotation across it is assumed to be at constant rate."
 
@@ -177,12 +170,6 @@ class Estimate(Listed):
         Error states c by name, in the order given.
     whole_covariance : ndarray (m, n, n), optional
         P of (δθ, δb, δc) of a filter with error states, if asked for; ``covariance`` is its part (m, 6, 6).
-    whole_bias : ndarray (m, 3), optional
-        Gyro bias with all that error states add to it, ``b + Σ c e``, rad/s, if asked for.
-    whole_bias_variance : ndarray (m, 6), optional
-        Diagonal of the covariance of attitude and whole bias.
-    whole_bias_covariance : ndarray (m, 6, 6), optional
-        Covariance of attitude and whole bias.
     """
 
     _drawn_by = "estimate_overview"
@@ -197,9 +184,6 @@ class Estimate(Listed):
     events: tuple[Event, ...] = ()
     error_states: Mapping[str, ErrorStateEstimate] = field(default_factory=dict)
     whole_covariance: Array | None = None
-    whole_bias: Array | None = None
-    whole_bias_variance: Array | None = None
-    whole_bias_covariance: Array | None = None
 
     def listing(self) -> Listing:
         """Return σ at the start and at the end, the estimate at the end, and the innovations, as a table."""
