@@ -298,7 +298,7 @@ def estimate(
     robust = Robust(kind=robust) if isinstance(robust, str) else robust  # type: ignore[arg-type]
     if isinstance(source, Recording):
         _refuse("a record", setup=setup, initial=initial, states=states or None)
-        for words in ahrs.doctor.at_rest(source):
+        for words in ahrs.check_conventions.at_rest(source):
             warnings.warn(f"{source.source}: {words}", stacklevel=2)
         begun: Recording | ahrs.Begun = ahrs.begin(source)
         parameters = _recording_parameters(begun, motion, noise)

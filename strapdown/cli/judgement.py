@@ -317,12 +317,12 @@ def doctor(
 ) -> None:
     """Find the conventions that a recording follows, by trying the others: exit status 0 as declared, 1 wrong, 2 cannot tell."""
     from strapdown import recordings
-    from strapdown.ahrs import doctor as conventions
+    from strapdown.ahrs import check_conventions
 
     json_target(json, recording)
     source = recordings.read(recording, **layout.options(recording))
     with progress_bar("trying conventions"):
-        found = conventions.examine(source)
+        found = check_conventions.examine(source)
     console.print(f"{found.source}: {found.words}")
     for words in found.doubts:
         console.print(f"warning: {words}.")
