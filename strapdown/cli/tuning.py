@@ -222,7 +222,7 @@ def tune(
         return
     if planning.length is not None:
         raise InputError("--length is for --plan; the records' own length is taken")
-    count("seed", search.seed, least=0)
+    count("seed", search.seed, minimum=0)
     _check_files(records, start.filter_file, output)
     cases, before, gyros = _cases(records, chosen, start, layout)
     if not (goal.truth or goal.rmse or all(recordings.is_record(path) for path in records)):

@@ -79,7 +79,7 @@ class Gate:
         """Check every field."""
         _probability("gate: probability", self.probability)
         if self.recovery is not None:
-            count("gate: recovery", self.recovery, least=2)
+            count("gate: recovery", self.recovery, minimum=2)
         positive("gate: restart_attitude_sigma", self.restart_attitude_sigma, unit="rad")
         if self.restart_bias_sigma is not None:
             positive("gate: restart_bias_sigma", self.restart_bias_sigma, unit="rad/s")

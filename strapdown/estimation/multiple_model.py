@@ -161,7 +161,7 @@ def run(
     """
     check_arguments(record=record, process_noise=process_noise, gate=gate, robust=robust)
     initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=1.0, bias_sigma=bias_sigma, bias=bias)  # refuses bad ones
-    count("hypotheses", hypotheses, least=8)
+    count("hypotheses", hypotheses, minimum=8)
     count("every", every)
     for name, value in (("least_weight", least_weight), ("largest_share", largest_share)):
         if not 0.0 < finite(name, value) < 1.0:

@@ -155,7 +155,7 @@ def origin_attributes(origin: Origin | None) -> dict[str, Any]:
 def _origin(attributes: Mapping[str, Any], path: str | os.PathLike[str]) -> Origin | None:
     """Return how a record was made, as its file states."""
     made: dict[str, Any] = {
-        name: count(name, attributes[name], least=0) for name in ("seed", "run") if name in attributes
+        name: count(name, attributes[name], minimum=0) for name in ("seed", "run") if name in attributes
     }
     if "scenario" in attributes:
         from strapdown.scenarios import scenario_from_toml

@@ -226,7 +226,8 @@ def read_estimate(path: str | os.PathLike[str]) -> Estimate:
             covariance=covariance,
             innovations={sensor: _innovations(part) for sensor, (_, part) in sensors.items()},
             skipped={
-                sensor: count("skipped", attributes["skipped"], least=0) for sensor, (attributes, _) in sensors.items()
+                sensor: count("skipped", attributes["skipped"], minimum=0)
+                for sensor, (attributes, _) in sensors.items()
             },
             events=tuple(
                 Event(

@@ -95,7 +95,7 @@ class ImuRecord(Listed):
 
     def __post_init__(self) -> None:
         """Check shapes, order and finiteness."""
-        time = increasing("time", self.time, least=2)
+        time = increasing("time", self.time, minimum=2)
         if self.temperature is not None:
             object.__setattr__(self, "temperature", array("temperature", self.temperature, (len(time),)))
         increments = array("increments", self.increments, (len(time) - 1, 3))

@@ -89,7 +89,7 @@ class Recording(Listed):
 
     def __post_init__(self) -> None:
         """Check shapes, order and values."""
-        time = increasing(f"{self.source}: time", self.time, least=2)
+        time = increasing(f"{self.source}: time", self.time, minimum=2)
         n = len(time)
         object.__setattr__(self, "time", time)
         object.__setattr__(self, "rate", array(f"{self.source}: rate", self.rate, (n, 3)))
