@@ -102,10 +102,6 @@ def measure(samples: int, seconds: float) -> dict:
         if "vqf" in best:
             figures["vqf_over_smoother"] = best["vqf"] / best["smoother"]
         result["cases"][name] = figures
-    one = record(*data, 10)
-    short = ImuRecord(time=one.time[:2001], increments=one.increments[:2000], vectors=one.vectors)
-    lagged = least_times({"lag": lambda: estimation.smooth(short, noise, initial, lag=1.0)}, seconds)["lag"]
-    result["fixed_lag_of_100_samples_ns"] = 1e9 * lagged / 2000
     return result
 
 
@@ -128,7 +124,6 @@ def main(arguments: list[str] | None = None) -> dict:
                 f"{'vqf.offlineVQF':30s} {figures['vqf_ns']:.1f} ns a sample: {figures['vqf_over_smoother']:.2f} times the "
                 f"smoother ({target})"
             )
-    print(f"fixed lag of 100 samples       {result['fixed_lag_of_100_samples_ns']:.0f} ns a sample")
     for name in result["absent"]:
         print(f"{name}: not installed, left out")
     if options.json:

@@ -45,7 +45,7 @@ from strapdown.motion import Harmonic, HarmonicRates
 from strapdown.plots import style
 from strapdown.randomness import generator
 from strapdown.recordings import Recording, hard_iron
-from strapdown.recordings.recording import with_gyro
+from strapdown.records.recording import with_gyro
 from strapdown.units import DEGREE
 
 QUIET = replace(ahrs.MOTIONS["any"], rest_bias_sigma=HAND_HELD.rest_bias_sigma)

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from strapdown import consistency, montecarlo, motion, quaternion, scenarios, setup, vectors
+from strapdown import montecarlo, motion, quaternion, scenarios, setup, vectors
 from strapdown.estimation import State, filters
 from strapdown.files import write_json
 from strapdown.gyro import GyroSpec
@@ -104,7 +104,7 @@ def main(*, runs: int = 200, duration: float = 60.0, seed: int = 1, out: Path | 
     base = setup.matched(flight)
     setups = [replace(base, estimator=one) for one in FILTERS.values()]
     found = montecarlo.run(flight, setups, runs=runs, seed=seed, epochs=20)
-    judgements = {name: consistency.judge_runs(one) for name, one in zip(FILTERS, found, strict=True)}
+    judgements = {name: one.judge() for name, one in zip(FILTERS, found, strict=True)}
     plan = montecarlo.Plan(scenario=flight, setup=base, seed=seed, epochs=20)
     one = montecarlo.replay(plan, 0, machine="scalar")
     table = filters.compare(one.record, base.process_noise, one.initial, filters=["mekf", textbook])

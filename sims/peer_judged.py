@@ -295,7 +295,7 @@ def main(*, runs: int = 200, duration: float = 40.0, seed: int = 1, out: Path | 
         plans[name] = montecarlo.Plan(scenario=scene, setup=chosen, seed=seed, epochs=10)
         found[name] = montecarlo.run_plan(plans[name], runs=runs)
     result = Result(
-        judgements={name: consistency.judge_runs(one) for name, one in found.items()},
+        judgements={name: one.judge() for name, one in found.items()},
         statistics=found,
         frame_probability=_frames(plans["smsfusion"], min(runs, 20)) if "smsfusion" in plans else {},
     )

@@ -142,17 +142,17 @@ MAX_COUNTED = 2.0**63
 """Whole numbers stay below it, so that they fit into any array."""
 
 
-def count(name: str, value: int, *, least: int = 1) -> int:
-    """Return ``value`` as a whole number of at least ``least``."""
+def count(name: str, value: int, *, minimum: int = 1) -> int:
+    """Return ``value`` as a whole number of at least ``minimum``."""
     whole = (
         isinstance(value, (int, float, np.integer, np.floating))
         and not isinstance(value, bool)
         and abs(value) < MAX_COUNTED  # NaN and infinity are not
     )
     if whole is False and isinstance(value, int) and not isinstance(value, bool):
-        raise InputError(f"{name} is {value}; it must be a whole number of {least} or more, and below 2^63")
-    if not whole or int(value) != value or value < least:
-        raise InputError(f"{name} is {value!r}; it must be a whole number of {least} or more")
+        raise InputError(f"{name} is {value}; it must be a whole number of {minimum} or more, and below 2^63")
+    if not whole or int(value) != value or value < minimum:
+        raise InputError(f"{name} is {value!r}; it must be a whole number of {minimum} or more")
     return int(value)
 
 
@@ -185,11 +185,11 @@ def lengths(vectors: Array) -> Array:
     return np.asarray(np.sqrt(total))
 
 
-def increasing(name: str, time: ArrayLike, *, least: int = 1) -> Array:
+def increasing(name: str, time: ArrayLike, *, minimum: int = 1) -> Array:
     """Return ``time`` as an array (n,) of strictly increasing stamps, s."""
     stamps = array(name, time, ("n",))
-    if len(stamps) < least:
-        raise InputError(f"{name} has {len(stamps)} stamps; at least {least} are needed")
+    if len(stamps) < minimum:
+        raise InputError(f"{name} has {len(stamps)} stamps; at least {minimum} are needed")
     steps = np.diff(stamps)
     if np.any(steps <= 0.0):
         k = int(np.argmax(steps <= 0.0))

@@ -113,7 +113,7 @@ class ConingParameters:
         if self.angle >= 0.5 * np.pi:
             raise InputError(f"angle is {self.angle:g} rad; a cone's half-angle is below a right angle")
         count("runs", self.runs)
-        count("seed", self.seed, least=0)
+        count("seed", self.seed, minimum=0)
         if not 0.0 < self.probability < 1.0:
             raise InputError(f"probability is {self.probability}; it must lie between 0 and 1")
         names = [one.name for one in self.algorithms]

@@ -20,5 +20,5 @@ def generator(seed: int, run: int, source: str) -> np.random.Generator:
     >>> bool(generator(1, 0, "gyro").random() == generator(1, 0, "gyro").random())
     True
     """
-    key = (count("run", run, least=0), zlib.crc32(source.encode()))
-    return np.random.default_rng(np.random.SeedSequence(count("seed", seed, least=0), spawn_key=key))
+    key = (count("run", run, minimum=0), zlib.crc32(source.encode()))
+    return np.random.default_rng(np.random.SeedSequence(count("seed", seed, minimum=0), spawn_key=key))

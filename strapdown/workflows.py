@@ -7,7 +7,6 @@ is the place for more options: :mod:`strapdown.estimation` and :mod:`strapdown.s
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import os
 import warnings
@@ -39,7 +38,7 @@ from strapdown.estimation.states import ProcessNoise, State
 from strapdown.files import written_beside
 from strapdown.gyro import GyroSpec
 from strapdown.recordings import Recording, recordfiles
-from strapdown.records import Estimate, ImuRecord, Origin, Truth
+from strapdown.records import Estimate, ImuRecord, Truth
 from strapdown.scenarios import Scenario, simulate
 from strapdown.setup import FilterSetup, for_record
 
@@ -120,7 +119,7 @@ def read(path: Any, **options: Any) -> ImuRecord | Recording | Estimate | Campai
             f"{file} is a {kind} of this package and declares its own layout; leave {', '.join(options)} out"
         )
     if kind == "record":
-        return recordfiles.read_record_file(file).with_origin(str(file))
+        return recordfiles.read_record(file)
     if kind == "estimate":
         return records.read_estimate(file)
     from strapdown.montecarlo import campaign
@@ -169,20 +168,12 @@ def write(
         text = setups.to_toml(content) if isinstance(content, FilterSetup) else scenarios.scenario_to_toml(content)
         with written_beside(path) as temporary:
             temporary.write_text(text, encoding="utf-8")
-    elif isinstance(content, ImuRecord) and Path(path).suffix.lower() in (".h5", ".hdf5", ".csv"):
-        _write_record(content, Path(path), options)
+    elif isinstance(content, ImuRecord) and Path(path).suffix.lower() == ".csv":
+        recordfiles.export_csv(path, content, **options)
+    elif isinstance(content, ImuRecord) and Path(path).suffix.lower() in (".h5", ".hdf5"):
+        recordfiles.write_record(path, content, **options)
     else:
         recordings.write(content, path, **options)
-
-
-def _write_record(record: ImuRecord, path: Path, options: Mapping[str, Any]) -> None:
-    origin = record.origin or Origin()
-    writer = recordfiles.export_csv if path.suffix.lower() == ".csv" else recordfiles.write_record
-    scenario = ""
-    if origin.scenario is not None:
-        with contextlib.suppress(InputError):  # a motion or a field of one's own has no form in a file
-            scenario = scenarios.scenario_to_toml(origin.scenario)
-    writer(path, record, gyro_spec=origin.gyro, scenario=scenario, seed=origin.seed, run=origin.run, **options)
 
 
 # ------------------------------------------------------------------------------------------------------------------- estimate
@@ -307,7 +298,7 @@ def estimate(
     robust = Robust(kind=robust) if isinstance(robust, str) else robust  # type: ignore[arg-type]
     if isinstance(source, Recording):
         _refuse("a record", setup=setup, initial=initial, states=states or None)
-        for words in ahrs.doctor.at_rest(source):
+        for words in ahrs.check_conventions.at_rest(source):
             warnings.warn(f"{source.source}: {words}", stacklevel=2)
         begun: Recording | ahrs.Begun = ahrs.begin(source)
         parameters = _recording_parameters(begun, motion, noise)
@@ -516,7 +507,8 @@ def check(
         raise InputError(f"result is {type(result).__name__}; give an Estimate, or what monte_carlo returned")
     if truth is not None:
         raise InputError("truth goes with an estimate; a Monte Carlo knows its own; leave it out")
-    return consistency.judge_runs(statistics, probability=probability)
+    judgement: Judgement = statistics.judge(probability=probability)
+    return judgement
 
 
 def _truth_at(result: Estimate, truth: Truth | ImuRecord | None) -> Truth | None:

@@ -1,9 +1,9 @@
-"""The step-by-step filter with gate, recovery, robust weights and monitor: what the compiled filter's are compared with.
+"""The step-by-step filter with gate, recovery and robust weights: what the compiled filter's are compared with.
 
 In matrices over any number of states.
 
 - :func:`linearize`: the measurement linearised at the estimate that its update leads to (iterated update), its NIS, and its robust weight.
-- :class:`Supervision`: the gate's counters, the restart candidate that it runs beside the filter, and the NIS that a monitor judges.
+- :class:`Supervision`: the gate's counters, and the restart candidate that it runs beside the filter.
 
 Methods, thresholds and their reasons are those of the kernels: :mod:`strapdown.kernels.iterated_update` and
 :mod:`strapdown.kernels.gate_rules`, whose counting runs here as plain Python.
@@ -24,7 +24,7 @@ from strapdown import kinematics, quaternion
 from strapdown.checks import Array, InputError
 from strapdown.estimation import model as modelling
 from strapdown.estimation.forward import gate_events, remembered, restart_states
-from strapdown.estimation.gating import Gate, Monitor, Robust
+from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.model import turning_matrix
 from strapdown.estimation.schedule import KIND_CODES
 from strapdown.estimation.states import GateMemory, State, check_arguments, restart_bias_variance
@@ -229,11 +229,11 @@ def tilt_unknown(attitude: Array, covariance: Array) -> bool:
     return float(np.trace(R @ covariance[:3, :3] @ R.T)) > UNKNOWN_TILT
 
 
-# -------------------------------------------------------------------------------------------------------------- gate and monitor
+# -------------------------------------------------------------------------------------------------------------- the gate
 
 
 class Events:
-    """Descriptor of a filter's ``events``: recoveries, lock-outs and divergence so far, in order of time.
+    """Descriptor of a filter's ``events``: recoveries and lock-outs so far, in order of time.
 
     Not a property: filterpy's ``Saver`` makes an array of every property, for which a growing tuple has no shape.
     """
@@ -244,13 +244,10 @@ class Events:
 
 
 class Supervision:
-    """A gate and a monitor beside a step-by-step filter: counters, restart candidate and the events reported so far."""
+    """A gate beside a step-by-step filter: counters, restart candidate and the events reported so far."""
 
-    def __init__(self, gate: Gate | None, memory: GateMemory | None, monitor: Monitor | None = None) -> None:
+    def __init__(self, gate: Gate | None, memory: GateMemory | None) -> None:
         self.gate = gate
-        self.monitor = monitor
-        self.nis_history: list[tuple[float, float, int]] = []
-        """Time, NIS and degrees of freedom of each measurement."""
         self.sensors: tuple[str, ...] = () if memory is None else tuple(memory.counters)
         self.memory, self.counters = remembered(gate, memory, self.sensors)
         self.candidate: GatedStepFilter | None = None
@@ -268,17 +265,12 @@ class Supervision:
 
     @property
     def events(self) -> tuple[Event, ...]:
-        """Recoveries, lock-outs and divergence so far, in order of time."""
+        """Recoveries and lock-outs so far, in order of time."""
         found = gate_events(self.recoveries, self.lock_outs, self.sensors)
-        if self.monitor is not None and self.nis_history:
-            time, nis, degrees = (np.array(column) for column in zip(*self.nis_history, strict=True))
-            found += self.monitor.watch(time, nis, degrees)
         return tuple(sorted(found, key=lambda event: event.start))
 
     def judge(self, filter: Any, sensor: str, outcome: int, update: Callable[[Any], int]) -> None:
         """Count the outcome of a measurement for a filter; ``update`` gives the same measurement to the restart candidate."""
-        if self.monitor is not None and outcome != iterated_update.PASSED_OVER:
-            self._record_nis(filter, outcome)
         if self.gate is None:
             return
         s, recovery, limit = self._row_of(sensor), self.gate.recovery or 0, self.gate.lock_out_limit
@@ -306,13 +298,6 @@ class Supervision:
             self.sensors = (*self.sensors, sensor)
             self.counters = np.vstack([self.counters, remembered(None, None, (sensor,))[1]])
         return self.sensors.index(sensor)
-
-    def _record_nis(self, filter: Any, outcome: int) -> None:
-        """Keep the NIS of the last measurement for the monitor; of a refused one the gate's threshold."""
-        degrees, nis = filter.dim_z, filter.nis
-        if self.gate is not None and outcome != iterated_update.ACCEPTED:
-            nis = float(self.gate.thresholds[degrees - 1])
-        self.nis_history.append((filter.time, nis, degrees))
 
     def _start_candidate(self, filter: Any, gate: Gate) -> None:
         sigma = gate_rules.restart_attitude(gate.restart_attitude_sigma, self.memory)
@@ -370,24 +355,24 @@ def arc_of(measurement: Any, y: Array, basis: Array) -> tuple[float, float]:
 
 
 class GatedStepFilter(StepFilter):
-    """:class:`strapdown.StepFilter` with a gate, robust weights and a monitor; ``weight`` is that of the last measurement."""
+    """:class:`strapdown.StepFilter` with a gate and robust weights; ``weight`` is that of the last measurement."""
 
-    def __init__(self, process_noise, initial, error_states=(), *, gate=None, robust=None, monitor=None, **options):
-        check_arguments(gate=gate, robust=robust, monitor=monitor)
+    def __init__(self, process_noise, initial, error_states=(), *, gate=None, robust=None, **options):
+        check_arguments(gate=gate, robust=robust)
         super().__init__(process_noise, initial, error_states, **options)
         self.gate, self.robust = gate, robust
         self.weight = 1.0
         self.refused: dict[str, int] = {}
         self._thresholds = np.full(3, np.inf) if gate is None else gate.thresholds
-        self._begin_gate(modelling.begin(initial, self.error_states), monitor)
+        self._begin_gate(modelling.begin(initial, self.error_states))
 
     events = Events()
 
-    def _begin_gate(self, state: State, monitor: Monitor | None) -> None:
-        """Set up gate and monitor; continue with the gate's memory and its restart candidate where the state has them."""
+    def _begin_gate(self, state: State) -> None:
+        """Set up the gate; continue with the gate's memory and its restart candidate where the state has them."""
         gate, memory = self.gate, state.gate
         self._restart_bias_variance = restart_bias_variance(gate, state)
-        self._supervision: Supervision = Supervision(gate, memory, monitor)
+        self._supervision: Supervision = Supervision(gate, memory)
         self._passes = self._supervision.passes
         values, P = restart_states(state, self.error_states)
         self._restart_prior = _Prior(time=self.time, values=values, covariance=P)

@@ -129,7 +129,7 @@ def test_counts():
     assert checks.count("runs", np.int64(3)) == 3
     assert checks.count("runs", 3.0) == 3
     assert isinstance(checks.count("runs", 3.0), int)
-    assert checks.count("seed", 0, least=0) == 0
+    assert checks.count("seed", 0, minimum=0) == 0
 
 
 @pytest.mark.parametrize("value", [0, -1, 2.5, True, np.bool_(True), np.array(True), "4", "many", None, np.nan, np.inf])
@@ -180,7 +180,7 @@ def test_stamps_out_of_order_are_refused(stamps, words):
 
 
 def test_too_few_stamps_are_refused():
-    refused(lambda: checks.increasing("time", [0.0], least=2), "time has 1 stamps", "at least 2")
+    refused(lambda: checks.increasing("time", [0.0], minimum=2), "time has 1 stamps", "at least 2")
 
 
 # ---------------------------------------------------------------------------------------------------- covariance

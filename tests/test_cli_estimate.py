@@ -28,7 +28,7 @@ from strapdown.cli.filters import filter_for
 from strapdown.estimation.states import ONCE, ProcessNoise
 from strapdown.gyro import GyroSpec
 from strapdown.recordings import unit_calibration
-from strapdown.recordings.recordfiles import read_record_file, write_record
+from strapdown.recordings.recordfiles import read_record, write_record
 from strapdown.records import ImuRecord, Truth, read_estimate, read_states
 from strapdown.report import findings
 from strapdown.scenarios import Scenario, simulate
@@ -65,10 +65,15 @@ def run(run, monkeypatch):
     return call
 
 
+def specified(record):
+    """The record with the gyro's specification, and without its scenario."""
+    return dataclasses.replace(record, origin=records.Origin(gyro=SPEC, seed=4, run=0))
+
+
 @pytest.fixture
 def record(tmp_path):
     path = tmp_path / "record.h5"
-    write_record(path, simulate(made(), 4), gyro_spec=SPEC, seed=4, run=0)
+    write_record(path, specified(simulate(made(), 4)))
     return path
 
 
@@ -142,7 +147,7 @@ def test_what_a_record_does_not_hold_is_asked_for(run, record, tmp_path):
         assert status == 2
         assert words in error
     alone = tmp_path / "alone.h5"
-    write_record(alone, whole, gyro_spec=SPEC)
+    write_record(alone, specified(whole))
     status, _, error = run("estimate", alone, "--out", tmp_path / "out")
     assert status == 2
     assert "two directions are needed" in error
@@ -196,8 +201,7 @@ def test_faults_do_not_hide_that_a_start_is_missing():
 def spinning(tmp_path):
     scenario = scenarios.load_scenario("spin")
     path = tmp_path / "spin.h5"
-    toml = scenarios.scenario_to_toml(scenario)
-    write_record(path, simulate(scenario, 3), gyro_spec=scenario.gyro, scenario=toml, seed=3, run=0)
+    write_record(path, simulate(scenario, 3))
     return path
 
 
@@ -254,11 +258,11 @@ def test_what_the_filter_has_no_state_for_is_reported(spinning, record, tmp_path
     scenario = scenarios.load_scenario("spin")
     toml = setup.to_toml(setup.matched(scenario))
     (tmp_path / "filter.toml").write_text(toml)
-    held = read_record_file(spinning)
+    held = read_record(spinning)
     for file, states in ((None, False), (tmp_path / "filter.toml", None)):
         (message,) = filter_for(spinning, held, None, file, states)[1]
         assert "no state for: the gyro's scale factor of 100 ppm; --states of `strapdown estimate`" in message
-    assert filter_for(record, read_record_file(record), None, None, None)[1] == []
+    assert filter_for(record, read_record(record), None, None, None)[1] == []
     chosen, (message,) = filter_for(spinning, held, None, None, None)
     assert chosen.states.names == ("gyro.scale",)
     assert message.startswith("The filter estimates errors that are specified, gyro.scale: without states")
@@ -391,7 +395,7 @@ def test_directions_that_contradict_each_other_start_nothing(run, tmp_path):
     first, *others = whole.vectors
     wrong = dataclasses.replace(first, reference_f=np.array([0.6, 0.8, 0.0]))
     path = tmp_path / "mixed.h5"
-    write_record(path, dataclasses.replace(whole, vectors=(wrong, *others)), gyro_spec=SPEC)
+    write_record(path, specified(dataclasses.replace(whole, vectors=(wrong, *others))))
     status, _, error = run("estimate", path, "--out", tmp_path / "out")
     assert status == 2
     assert "look for a mixed-up pair" in error
@@ -403,7 +407,7 @@ def test_one_direction_that_turns_starts_by_a_bank(run, tmp_path):
     scenario = dataclasses.replace(scenarios.load_scenario("magnetometer-only"), duration=2400.0)
     path = tmp_path / "alone.h5"
     whole = simulate(scenario, 1)
-    write_record(path, whole, gyro_spec=scenario.gyro, scenario=scenarios.scenario_to_toml(scenario), seed=1, run=0)
+    write_record(path, whole)
     status, said, error = run("estimate", path, "--out", tmp_path / "out")
     assert (status, error) == (0, "")
     assert "96 hypotheses about it became one at" in said
@@ -444,8 +448,7 @@ def test_hard_iron_and_a_start_are_reported_in_units_that_people_know(run, tmp_p
     iron = dataclasses.replace(HAND[1], kind="direction", hard_iron=np.array([2e-6, 0.0, 0.0]))
     scenario = made((HAND[0], iron))
     path = tmp_path / "iron.h5"
-    toml = scenarios.scenario_to_toml(scenario)
-    write_record(path, simulate(scenario, 4), gyro_spec=SPEC, scenario=toml, seed=4, run=0)
+    write_record(path, simulate(scenario, 4))
     _, said, _ = run("estimate", path, "--out", tmp_path / "out", "--states")
     assert re.search(r"north bias x % of the vector \S+ \S+ 4\.472 ", said)
     assert re.search(r"first measurements, σ \S+ to \S+° by direction\.", said)
@@ -456,7 +459,7 @@ def test_hard_iron_and_a_start_are_reported_in_units_that_people_know(run, tmp_p
 def test_smoothing_with_states_holds_them(run, tmp_path):
     path = tmp_path / "record.h5"
     scenario = dataclasses.replace(scenarios.load_scenario("spin"), duration=20.0)
-    write_record(path, simulate(scenario, 2), gyro_spec=scenario.gyro, scenario=scenarios.scenario_to_toml(scenario))
+    write_record(path, simulate(scenario, 2))
     status, _, error = run("estimate", path, "--out", tmp_path / "out", "--smooth", "--state", "gyro.scale")
     assert (status, error) == (0, "")
     assert "gyro scale" in json.loads((tmp_path / "out" / "states.json").read_text())

@@ -261,17 +261,17 @@ def statistics_of(plan, **changes):
 
 
 def test_right_runs_are_consistent_and_wrong_ones_are_reported(plan):
-    good = consistency.judge_runs(statistics_of(plan))
+    good = statistics_of(plan).judge()
     assert good.verdict == "consistent"
     assert {f.name for f in good.findings} == {"ANEES", "log-NEES", "mean error", "coverage", "NIS"}
     assert {f.of for f in good.findings if f.name == "NIS"} == {"star 1", "star 2"}
-    sure = consistency.judge_runs(statistics_of(plan, measurement_sigma_factor=0.8))
+    sure = statistics_of(plan, measurement_sigma_factor=0.8).judge()
     assert sure.verdict == "not consistent"
     assert "optimistic" in sure.reason
     names = {f.name for f in sure.findings if f.rejected}
     assert {"ANEES", "log-NEES", "NIS", "coverage"} <= names
     assert "mean error" not in names
-    modest = consistency.judge_runs(statistics_of(plan, measurement_sigma_factor=1.3))
+    modest = statistics_of(plan, measurement_sigma_factor=1.3).judge()
     assert "pessimistic" in modest.reason
 
 
@@ -281,7 +281,7 @@ def test_the_coverage_of_the_worst_epoch_and_state_stands_for_all(plan):
     usual = np.array([68, 95, 100])
     counts = np.tile(usual, (21, 6, 1))
     counts[20, 4, 0] = 82
-    judged = consistency.judge_runs(replace(few, coverage=counts), epochs=np.array([10, 20]))
+    judged = replace(few, coverage=counts).judge(epochs=np.array([10, 20]))
     (found,) = (one for one in judged.findings if one.name == "coverage")
     least = 2.0 * scipy.stats.binom.sf(81, 100, math.erf(math.sqrt(0.5)))
     assert (found.of, found.value) == ("bias y", 0.82)
@@ -292,7 +292,7 @@ def test_the_coverage_of_the_worst_epoch_and_state_stands_for_all(plan):
 def test_few_runs_cannot_tell(plan):
     few = montecarlo.run(plan.scenario, (plan.setup,), runs=2, seed=3, epochs=20, nis_bins=10)[0]
     starved = replace(few, sensor_degrees=0 * few.sensor_degrees)
-    assert consistency.judge_runs(starved).verdict == "cannot tell"
+    assert starved.judge().verdict == "cannot tell"
 
 
 def test_a_mean_error_is_reported(plan):
@@ -302,7 +302,7 @@ def test_a_mean_error_is_reported(plan):
     square[:, 5, 5] += good.runs * shift**2
     moved = good.error_sum.copy()
     moved[:, 5] += good.runs * shift
-    judged = consistency.judge_runs(replace(good, error_sum=moved, error_product_sum=square))
+    judged = replace(good, error_sum=moved, error_product_sum=square).judge()
     assert [(f.name, f.of) for f in judged.findings if f.rejected] == [("mean error", "bias z")]
 
 
@@ -310,7 +310,7 @@ def test_runs_that_failed_are_not_consistent(plan):
     good = statistics_of(plan)
     finite = good.finite.copy()
     finite[-1] -= 1
-    judged = consistency.judge_runs(replace(good, finite=finite))
+    judged = replace(good, finite=finite).judge()
     assert judged.verdict == "not consistent"
     assert "1 of 200 runs failed" in judged.words
 
@@ -326,7 +326,7 @@ def test_bounds_are_those_that_decide(plan):
     assert all(inside is not rejected for inside, rejected, _ in decided)
     assert any(inside and p < 0.01 for inside, _, p in decided)  # alone it would have been rejected
     for factor in (1.0, 0.97, 0.8):
-        judgement = consistency.judge_runs(statistics_of(plan, measurement_sigma_factor=factor))
+        judgement = statistics_of(plan, measurement_sigma_factor=factor).judge()
         bounded = [one for one in judgement.findings if math.isfinite(one.low)]
         assert {one.name for one in bounded} == {"ANEES", "log-NEES", "NIS"}
         assert all((one.low <= one.value <= one.high) is not one.rejected for one in bounded)

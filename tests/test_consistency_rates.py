@@ -203,7 +203,7 @@ def verdicts_of_campaigns(campaigns, runs):
     found = []
     for seed in range(campaigns):
         plan = montecarlo.Plan(scenario=scenario, setup=setup.matched(scenario), seed=seed, epochs=40)
-        found.append(consistency.judge_runs(montecarlo.run_plan(plan, runs=runs, threads=1)).verdict)
+        found.append(montecarlo.run_plan(plan, runs=runs, threads=1).judge().verdict)
     return found
 
 

@@ -424,7 +424,7 @@ def test_check_names_a_wrong_axis_on_the_command_line(run, tmp_path):
     made = scenario()
     record = scenarios.simulate(made, seed=1)
     record = replace(record, increments=record.increments[:, [1, 0, 2]])
-    recordfiles.write_record(tmp_path / "record.h5", record, gyro_spec=made.gyro, seed=1, run=0)
+    recordfiles.write_record(tmp_path / "record.h5", record)
     assert run("estimate", "record.h5", "--from-truth", "--out", "out")[::2] == (0, "")
     status, said, error = run("check", "out/estimate.h5", "--record", "record.h5", "--json", "check.json")
     assert (status, error) == (1, "")
@@ -439,13 +439,9 @@ def test_check_names_a_wrong_axis_on_the_command_line(run, tmp_path):
 
 def test_an_axis_that_is_flipped_while_the_rate_is_constant_may_be_a_bias(run):
     """Two stars' body turns at a constant rate: a flipped axis is a constant error there, and neither may be named alone."""
-    record_file = (
-        recordfiles.read_record_file("a.h5") if run("simulate", "two-stars", "--out", "a.h5")[0] == 0 else None
-    )
-    assert record_file is not None
-    increments = record_file.record.increments * [-1.0, 1.0, 1.0]
-    made = {"gyro_spec": record_file.gyro, "scenario": record_file.scenario, "seed": 1, "run": 0}
-    recordfiles.write_record("flip.h5", replace(record_file.record, increments=increments), **made)
+    assert run("simulate", "two-stars", "--out", "a.h5")[0] == 0
+    record = recordfiles.read_record("a.h5")
+    recordfiles.write_record("flip.h5", replace(record, increments=record.increments * [-1.0, 1.0, 1.0]))
     assert run("estimate", "flip.h5", "--out", "out")[0] == 0
     status, said, _ = run("check", "out/estimate.h5", "--record", "flip.h5", "--json", "check.json")
     assert status == 1
@@ -502,7 +498,7 @@ def test_of_one_sensor_it_is_undecided_whether_it_or_the_gyro_is_turned():
 def written(folder: Path, made: scenarios.Scenario, chosen: setup.FilterSetup, seed: int) -> None:
     """A record without its truth, and a filter, as files."""
     record = replace(scenarios.simulate(made, seed=seed), truth=None)
-    recordfiles.write_record(folder / "record.h5", record, gyro_spec=made.gyro, seed=seed, run=0)
+    recordfiles.write_record(folder / "record.h5", record)
     (folder / "filter.toml").write_text(setup.to_toml(chosen))
 
 

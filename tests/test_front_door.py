@@ -511,7 +511,7 @@ def test_dir_shows_the_names_and_the_public_submodules_alone():
 
 
 BELOW = (
-    "ahrs.doctor",
+    "ahrs.check_conventions",
     "allan.parameters",
     "allan.temperature",
     "estimation.error_states",

@@ -18,8 +18,6 @@ from strapdown.records import ImuRecord
 from strapdown.scenarios import Scenario, simulate
 from strapdown.vectors import AttitudeSensor, VectorMeasurements, VectorSensor
 
-OPTIONS = {name: given for name, given in OPTIONS.items() if "monitor" not in given}
-
 
 def sample(series, k):
     return (series.vector_b if series.attitude is None else series.attitude)[k]

@@ -134,7 +134,7 @@ def case():
 
 def test_a_table_says_all_in_its_names(case):
     estimate, recording = case
-    found = outputs.table(estimate, recording=recording)
+    found = estimate.table(recording=recording)
     assert found["time_ns"][3] == 1_700_000_000_130_000_001
     np.testing.assert_array_equal(found["qw"], estimate.attitude[:, 0])
     yaw = Rotation.from_quat(estimate.attitude[:, [1, 2, 3, 0]]).as_euler("ZYX", degrees=True)
@@ -144,13 +144,13 @@ def test_a_table_says_all_in_its_names(case):
     np.testing.assert_allclose(
         found["bias_x_sigma_deg_per_h"], np.degrees(np.sqrt(estimate.variance[:, 3])) * 3600.0, rtol=1e-12
     )
-    ned = outputs.table(estimate, recording=recording, frame="NED", sequence="ZXZ")
+    ned = estimate.table(recording=recording, frame="NED", sequence="ZXZ")
     np.testing.assert_allclose(ned["free_acceleration_x_m_per_s2"], found["free_acceleration_y_m_per_s2"], rtol=1e-15)
     np.testing.assert_allclose(ned["free_acceleration_z_m_per_s2"], -found["free_acceleration_z_m_per_s2"], rtol=1e-15)
     assert "angle_1_z_deg" in ned
     np.testing.assert_array_equal(ned["heading_deg"], found["heading_deg"])
     with pytest.raises(InputError, match=r"walk has no stamp 0.1 s"):
-        outputs.table(estimate, recording=recording.since(20))
+        estimate.table(recording=recording.since(20))
 
 
 def test_an_estimate_has_methods_for_all_of_it(case):
@@ -169,7 +169,7 @@ def test_tables_in_files_hold_the_same_numbers(case, tmp_path, ending):
     if ending == "parquet":
         pytest.importorskip("pyarrow", reason="pyarrow is not installed: pip install 'strapdown[formats]'")
     recordings.write(estimate, path, recording=recording, sequence="XYZ")
-    wanted = outputs.table(estimate, recording=recording, sequence="XYZ")
+    wanted = estimate.table(recording=recording, sequence="XYZ")
     if ending == "parquet":
         import pyarrow.parquet
 
@@ -204,7 +204,7 @@ def test_a_data_frame(case):
     estimate, recording = case
     frame = estimate.to_dataframe(recording=recording)
     assert isinstance(frame, pandas.DataFrame)
-    assert list(frame) == list(outputs.table(estimate, recording=recording))
+    assert list(frame) == list(estimate.table(recording=recording))
     assert len(frame) == 20
 
 
@@ -266,7 +266,7 @@ def test_a_rerun_recording_holds_curves_and_turns(case, tmp_path):
                 or "quaternion" in name
             ):
                 found.setdefault(str(chunk.entity_path), []).extend(batch.column(name).to_pylist())
-    yaw = outputs.table(estimate)["yaw_deg"]
+    yaw = estimate.table()["yaw_deg"]
     np.testing.assert_allclose(np.ravel(found["/angles/yaw/value"]), yaw, rtol=1e-12)
     np.testing.assert_allclose(np.ravel(found["/innovations/accelerometer/0/plus_3_sigma"]), 6.0, rtol=1e-12)
     np.testing.assert_allclose(

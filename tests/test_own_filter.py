@@ -123,7 +123,7 @@ def test_without_a_bias_the_attitude_alone_is_judged(own, tmp_path, capsys):
     np.testing.assert_array_equal(statistics.rms_error[:, :3], own.rms_error[:, :3])
     assert np.isnan(statistics.rms_error[:, 3:]).all()
     assert np.isnan(statistics.anees[:, [0, 2]]).all()
-    judgement = consistency.judge_runs(statistics)
+    judgement = statistics.judge()
     assert {one.of for one in judgement.findings if "NEES" in one.name} == {"attitude"}
     assert list(montecarlo.summary(statistics)["nees"]) == ["attitude"]
     campaign.run(with_filter(attitude_only), tmp_path / "own.h5", runs=12)
@@ -137,7 +137,7 @@ def test_without_a_bias_the_attitude_alone_is_judged(own, tmp_path, capsys):
 
 
 def test_without_a_bias_it_is_consistent_where_the_attitude_shows_it():
-    judgement = consistency.judge_runs(montecarlo.run_plan(with_filter(attitude_only), runs=250))
+    judgement = montecarlo.run_plan(with_filter(attitude_only), runs=250).judge()
     assert judgement.verdict == "consistent"
     assert [one.of for one in judgement.power] == ["attitude"]
     assert "bias" not in judgement.words
@@ -151,7 +151,7 @@ def test_a_filter_that_fails_in_a_run_is_counted(own):
 
     statistics = montecarlo.run_plan(with_filter(failing), runs=3)
     assert statistics.failed == 3
-    assert consistency.judge_runs(statistics).verdict == "not consistent"
+    assert statistics.judge().verdict == "not consistent"
 
 
 def test_a_too_modest_filter_is_found_out():
@@ -159,7 +159,7 @@ def test_a_too_modest_filter_is_found_out():
     np.testing.assert_allclose(
         statistics.anees, 0.25 * montecarlo.run_plan(with_filter(wrapped), runs=40).anees, rtol=1e-9
     )
-    assert consistency.judge_runs(statistics).verdict == "not consistent"
+    assert statistics.judge().verdict == "not consistent"
 
 
 MINE = """

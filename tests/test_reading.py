@@ -91,19 +91,17 @@ def test_a_path_that_is_not_utf8_is_read_and_named(known, tmp_path):
     path = tmp_path / os.fsdecode(b"w\xff.csv")
     path.write_bytes(known["walk.csv"].content)
     assert len(recordings.read(path).time) == 20
-    held = dataclasses.replace(
-        recordfiles.read_record_file(_written(tmp_path / "record.h5")), attributes={"source": str(path)}
-    )
-    recordfiles.write_record(tmp_path / "again.h5", held.record, attributes=held.attributes)
-    assert recordfiles.read_record_file(tmp_path / "again.h5").attributes == {"source": str(tmp_path / "w\\udcff.csv")}
+    _written(tmp_path / "again.h5", attributes={"source": str(path)})
+    assert records.read_attributes(tmp_path / "again.h5")["source"] == str(tmp_path / "w\\udcff.csv")
     tuning = tmp_path / os.fsdecode(b"t\xff.json")
     tuning.write_bytes(known["tuning.json"].content)
     assert report.write(tuning).page.stat().st_size > 1000
 
 
 def _written(path, **more) -> Path:
-    record = ImuRecord(time=np.arange(2001.0), increments=np.random.default_rng(2).standard_normal((2000, 3)))
-    recordfiles.write_record(path, record, scenario="# a text\n" * 20, seed=3, **more)
+    increments = np.random.default_rng(2).standard_normal((2000, 3))
+    origin = records.Origin(scenario=scenarios.load_scenario("two-stars"), seed=3)
+    recordfiles.write_record(path, ImuRecord(time=np.arange(2001.0), increments=increments, origin=origin), **more)
     return path
 
 
@@ -371,11 +369,8 @@ def test_a_written_file_is_hdf5_to_others_with_its_digest_in_front(tmp_path):
         assert file.attrs["kind"].decode() == "strapdown record"
     long = "é" * 100_000
     _written(tmp_path / "long.h5", attributes={"text": long, "empty": "", "list": ["a", "é", ""]})
-    assert recordfiles.read_record_file(tmp_path / "long.h5").attributes == {
-        "text": long,
-        "empty": "",
-        "list": ["a", "é", ""],
-    }
+    held = records.read_attributes(tmp_path / "long.h5")
+    assert [held[name] for name in ("text", "empty", "list")] == [long, "", ["a", "é", ""]]
 
 
 @pytest.mark.parametrize("name", ["record.h5", "estimate.h5", "campaign.h5"])
@@ -418,9 +413,9 @@ def test_a_file_changed_on_purpose_gets_a_new_digest(tmp_path):
     with h5py.File(path, "r+") as file:
         file.attrs["place"] = 5.0
     with pytest.raises(InputError, match=r"if you changed it on purpose, strapdown\.files\.seal"):
-        recordfiles.read_record_file(path)
+        recordfiles.read_record(path)
     files.seal(path)
-    assert recordfiles.read_record_file(path).attributes == {"place": 5.0}
+    assert records.read_attributes(path)["place"] == 5.0
     _old(path)
     with pytest.raises(InputError, match=r"record\.h5 has no digest; only a file that this version wrote has one"):
         files.seal(path)
@@ -428,13 +423,13 @@ def test_a_file_changed_on_purpose_gets_a_new_digest(tmp_path):
 
 def test_an_old_file_is_read_and_said_to_have_no_digest(tmp_path, run):
     path = _written(tmp_path / "record.h5")
-    new = recordfiles.read_record_file(path)
+    new = recordfiles.read_record(path)
     _old(path)
     assert b"GCOL" in path.read_bytes()
     with pytest.warns(reading.NoDigestWarning, match=r"record\.h5 has no digest, so damage to it may pass unseen"):
-        old = recordfiles.read_record_file(path)
-    assert np.array_equal(old.record.increments, new.record.increments)
-    assert (old.scenario, old.seed) == (new.scenario, new.seed)
+        old = recordfiles.read_record(path)
+    assert np.array_equal(old.increments, new.increments)
+    assert (old.origin.scenario, old.origin.seed) == (new.origin.scenario, new.origin.seed)
     status, _, errors = run("integrate", path)
     assert status == 0
     assert errors.count("warning:") == 1

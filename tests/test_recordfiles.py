@@ -12,8 +12,8 @@ from strapdown import scenarios, vectors
 from strapdown.checks import InputError
 from strapdown.files import reading
 from strapdown.recordings import recordfiles
-from strapdown.recordings.recordfiles import export_csv, read_record, read_record_file, write_record
-from strapdown.records import ImuRecord
+from strapdown.recordings.recordfiles import export_csv, read_record, write_record
+from strapdown.records import ImuRecord, read_attributes
 
 FAULTS = vectors.Faults(latency=0.05, outages=[(0.5, 0.7)])
 
@@ -50,29 +50,20 @@ def assert_equal(a, b):
 def test_hdf5_reads_back_equal_with_all_that_it_holds(made, tmp_path):
     scenario, record = made
     path = tmp_path / "deep" / "record.h5"
-    text = scenarios.scenario_to_toml(scenario)
-    write_record(
-        path,
-        record,
-        gyro_spec=scenario.gyro,
-        scenario=text,
-        seed=3,
-        run=1,
-        attributes={"place": "bench", "weight": 2.5},
-    )
-    back = read_record_file(path)
-    assert_equal(back.record, record)
-    assert_equal(read_record(path), record)
-    assert back.gyro == scenario.gyro
-    assert (back.seed, back.run, back.version) == (3, 1, strapdown.__version__)
-    assert back.attributes == {"place": "bench", "weight": 2.5}
-    again = scenarios.simulate(scenarios.scenario_from_toml(back.scenario), back.seed, back.run)
-    assert_equal(again, record)
+    write_record(path, record, attributes={"place": "bench", "weight": 2.5})
+    back = read_record(path)
+    assert_equal(back, record)
+    assert back.origin.gyro == scenario.gyro
+    assert scenarios.scenario_to_toml(back.origin.scenario) == scenarios.scenario_to_toml(scenario)
+    assert (back.origin.seed, back.origin.run) == (3, 1)
+    held = read_attributes(path)
+    assert (held["version"], held["place"], held["weight"]) == (strapdown.__version__, "bench", 2.5)
+    assert_equal(scenarios.simulate(back.origin.scenario, back.origin.seed, back.origin.run), record)
 
 
 def test_hdf5_describes_itself(made, tmp_path):
     path = tmp_path / "record.h5"
-    write_record(path, made[1], gyro_spec=made[0].gyro)
+    write_record(path, made[1])
     with reading.hdf5(path) as file:
         assert "scalar first" in reading.attributes(file)["conventions"]
         datasets = []
@@ -84,10 +75,9 @@ def test_hdf5_describes_itself(made, tmp_path):
 def test_a_bare_record_needs_no_extras(tmp_path):
     bare = ImuRecord(time=[0.0, 1.0, 3.0], increments=[[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
     write_record(tmp_path / "bare.h5", bare)
-    back = read_record_file(tmp_path / "bare.h5")
-    assert_equal(back.record, bare)
-    assert back.gyro is None
-    assert back.seed is None
+    back = read_record(tmp_path / "bare.h5")
+    assert_equal(back, bare)
+    assert back.origin is None
     export_csv(tmp_path / "bare.csv", bare)
     assert_equal(read_record(tmp_path / "bare.csv"), bare)
 
@@ -269,18 +259,17 @@ def test_csv_leaves_no_series_of_an_earlier_record(made, tmp_path):
 
 def test_csv_says_how_it_was_made_as_hdf5_does(made, tmp_path):
     scenario, record = made
-    making = {"gyro_spec": scenario.gyro, "scenario": scenarios.scenario_to_toml(scenario), "seed": 3, "run": 1}
-    path = export_csv(tmp_path / "record.csv", record, **making)[0]
-    back = read_record_file(path)
+    path = export_csv(tmp_path / "record.csv", record)[0]
+    back = read_record(path).origin
     assert recordfiles.is_record(path)
-    assert (back.gyro, back.scenario, back.seed, back.run) == tuple(making.values())
+    assert (back.gyro, back.seed, back.run) == (scenario.gyro, 3, 1)
+    assert scenarios.scenario_to_toml(back.scenario) == scenarios.scenario_to_toml(scenario)
     first, rest = path.read_text().split("\n", 1)
     path.write_text(first.replace('"seed"', '"sead"') + "\n" + rest)
     with pytest.raises(InputError, match="line 1: how it was made cannot be read"):
-        read_record_file(path)
-    export_csv(path, record)
-    bare = read_record_file(path)
-    assert (bare.gyro, bare.scenario, bare.seed, bare.run) == (None, "", None, None)
+        read_record(path)
+    export_csv(path, dataclasses.replace(record, origin=None))
+    assert read_record(path).origin is None
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from strapdown import recordings
-from strapdown.ahrs import doctor
+from strapdown.ahrs import check_conventions
 from strapdown.checks import InputError
 from strapdown.recordings import Recording
 
@@ -142,26 +142,26 @@ def test_the_doctor_says_it_at_the_top(run, tmp_path):
 
 def test_without_a_field_both_explanations_are_named():
     down = with_samples(walk(field=False), specific_force=-np.eye(3))
-    (words,) = doctor.at_rest(down)
+    (words,) = check_conventions.at_rest(down)
     assert "--invert accelerometer" in words
     assert "--axes x,-y,-z" in words
 
 
 def test_an_inverted_magnetometer_shows_in_its_dip():
-    (words,) = doctor.at_rest(with_samples(walk(), magnetic_field=-np.eye(3)))
+    (words,) = check_conventions.at_rest(with_samples(walk(), magnetic_field=-np.eye(3)))
     assert "--invert magnetometer" in words
 
 
 @pytest.mark.parametrize("mounting", [(0.0, 0.0, 0.0), (30.0, 40.0, -30.0), (0.0, 0.0, 90.0), (10.0, -80.0, 0.0)])
 def test_a_right_recording_is_not_warned_of(mounting):
     turn = Rotation.from_euler("ZYX", mounting, degrees=True).as_matrix()
-    assert doctor.at_rest(with_samples(walk(), rate=turn, specific_force=turn, magnetic_field=turn)) == []
+    assert check_conventions.at_rest(with_samples(walk(), rate=turn, specific_force=turn, magnetic_field=turn)) == []
 
 
 def test_a_unit_that_does_not_rest_says_nothing():
     shaken = iphone()
     force = np.asarray(shaken.specific_force) + 3.0 * np.random.default_rng(0).standard_normal((len(shaken.time), 3))
-    assert doctor.at_rest(Recording(**{**vars(shaken), "specific_force": force})) == []
+    assert check_conventions.at_rest(Recording(**{**vars(shaken), "specific_force": force})) == []
 
 
 def test_axes_of_one_sensor_and_of_the_whole_unit():

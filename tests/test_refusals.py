@@ -168,13 +168,9 @@ def test_no_cause_is_named_of_a_filter_that_the_search_does_not_know(folder, sho
     scenario = dataclasses.replace(
         short, gyro=dataclasses.replace(short.gyro, scale_factor=np.full(3, 1e-3), asymmetry=np.full(3, 2e-3))
     )
-    held = recordfiles.read_record_file(folder / "record.h5")
-    recordfiles.write_record(
-        tmp_path / "record.h5",
-        held.record,
-        gyro_spec=scenario.gyro,
-        scenario=scenarios.scenario_to_toml(scenario),
-    )
+    held = recordfiles.read_record(folder / "record.h5")
+    origin = records.Origin(gyro=scenario.gyro, scenario=scenario)
+    recordfiles.write_record(tmp_path / "record.h5", dataclasses.replace(held, origin=origin))
     shutil.copy(folder / "run" / "estimate.h5", tmp_path / "estimate.h5")
     with changed(tmp_path / "estimate.h5") as file:
         chosen = setup.from_toml(reading.attributes(file)["filter"])
@@ -198,9 +194,9 @@ def test_what_the_record_specifies_and_the_filter_has_no_state_for_is_reported_b
     folder, short, tmp_path
 ):
     spec = dataclasses.replace(short.gyro, scale_factor=np.full(3, 1e-3))
-    held = recordfiles.read_record_file(folder / "record.h5")
-    toml = scenarios.scenario_to_toml(dataclasses.replace(short, gyro=spec))
-    recordfiles.write_record(tmp_path / "record.h5", held.record, gyro_spec=spec, scenario=toml)
+    held = recordfiles.read_record(folder / "record.h5")
+    origin = records.Origin(gyro=spec, scenario=dataclasses.replace(short, gyro=spec))
+    recordfiles.write_record(tmp_path / "record.h5", dataclasses.replace(held, origin=origin))
     command = ["check", str(folder / "run" / "estimate.h5"), "--record", str(tmp_path / "record.h5")]
     result = CliRunner().invoke(cli.app, command)
     assert "errors that this filter has no state for: the gyro's scale factor of 1e+03 ppm" in result.output

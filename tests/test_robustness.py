@@ -1,4 +1,4 @@
-"""Gate, recovery, robust updates and the monitor: false alarms, lock-in, contaminated noise, divergence, each with its two sides."""
+"""Gate, recovery, robust updates: false alarms, lock-in, contaminated noise, each with its two sides."""
 
 from dataclasses import replace
 
@@ -9,7 +9,7 @@ from scipy.stats import binom, chi2
 from strapdown import consistency, estimation, motion, quaternion, records
 from strapdown.checks import InputError
 from strapdown.estimation import gating
-from strapdown.estimation.gating import Gate, Monitor, Robust
+from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.states import ProcessNoise, initial_state
 from strapdown.gyro import GyroSpec
 from strapdown.kernels import covariance_form, gate_rules
@@ -563,11 +563,11 @@ def test_a_sensor_that_contradicts_two_others_is_refused_and_not_followed():
 def test_a_recovery_is_reported_in_the_file(tmp_path):
     record = simulate(scenario(duration=3.0), 3)
     lost = replace(started(record, 0), attitude=quaternion.multiply(record.truth.attitude[0], [0.0, 0.6, 0.8, 0.0]))
-    estimate = estimation.run(record, NOISE, lost, gate=Gate(), robust=Robust(), monitor=Monitor(window=20))
+    estimate = estimation.run(record, NOISE, lost, gate=Gate(), robust=Robust())
     records.write_estimate(tmp_path / "e.h5", estimate)
     back = records.read_estimate(tmp_path / "e.h5")
     assert back.events == estimate.events
-    assert {event.kind for event in back.events} == {"recovery", "divergence"}
+    assert {event.kind for event in back.events} == {"recovery"}
     for sensor, innovations in estimate.innovations.items():
         assert np.array_equal(back.innovations[sensor].weight, innovations.weight)
         assert back.refused[sensor] == innovations.refused > 0
@@ -685,8 +685,6 @@ def test_the_smoother_leaves_out_what_the_filter_refused():
     assert gated.refused["a"] > 3
     assert np.allclose(one.attitude, other.attitude, rtol=0.0, atol=1e-12)
     assert np.allclose(one.covariance, other.covariance, rtol=1e-7, atol=1e-16)
-    lagged = estimation.smooth(record, NOISE, start, lag=record.time[-1], gate=Gate(), full_covariance=True)
-    assert np.array_equal(lagged.attitude, one.attitude)
 
 
 def test_robust_smoothing_is_better_and_consistent():
@@ -716,48 +714,6 @@ def test_the_smoother_does_not_smooth_across_a_recovery():
     assert np.all(np.abs(errors(smoothed, record)[first:]) < 5.0 * smoothed.sigma[first:])
 
 
-# ------------------------------------------------------------------------------------------------------------------------ the monitor
-
-
-def test_the_monitor_is_silent_on_a_right_filter_and_keeps_its_false_alarm_rate():
-    record = simulate(scenario(duration=160.0, rate=25.0), 5)
-    estimate = estimation.run(record, NOISE, started(record, 0), monitor=Monitor())
-    assert not estimate.events
-    draw = generator(1, 0, "nis").chisquare(2, 400_000)
-    monitor = Monitor(window=50, probability=0.95)
-    mean, low, high = monitor.means(draw, np.full(400_000, 2))
-    outside = np.mean((mean < low) | (mean > high))
-    # The weighted sum is χ² to second order (Satterthwaite): its tails are right to a tenth at this window.
-    assert 0.045 < outside < 0.055
-    assert np.var(mean[1000:]) == pytest.approx(2.0 / (2 * 50), rel=0.05)
-
-
-@pytest.mark.parametrize("factor", [0.5, 2.0], ids=["pessimistic", "optimistic"])
-def test_a_filter_that_models_the_wrong_noise_is_reported(factor):
-    record = simulate(scenario(duration=30.0), 5)
-    modelled = replace(record, vectors=tuple(s.noise_scaled(1.0 / factor) for s in record.vectors))
-    estimate = estimation.run(modelled, NOISE, started(record, 0), monitor=Monitor())
-    assert [event.kind for event in estimate.events] == ["divergence"]
-    (event,) = estimate.events
-    assert event.start < 8.0
-    assert event.end == record.vectors[0].time[-1]
-    assert event.value == pytest.approx(factor**2, rel=0.5)
-
-
-def test_the_times_of_a_passing_divergence_are_reported():
-    record = simulate(scenario(duration=60.0), 5)
-    a, b = record.vectors
-    ill = (a.time > 20.0) & (a.time < 30.0)
-    draw = 3e-3 * generator(2, 0, "ill").standard_normal((len(a.time), 3))
-    value = np.where(ill[:, None], a.vector_b + draw, a.vector_b)
-    value /= np.linalg.norm(value, axis=1, keepdims=True)
-    record = replace(record, vectors=(replace(a, vector_b=value), b))
-    estimate = estimation.run(record, NOISE, started(record, 0), monitor=Monitor(window=50))
-    first, last = estimate.events[0], estimate.events[-1]
-    assert 20.0 < first.start < 22.0
-    assert 30.0 < last.end < 40.0
-
-
 BAD = {
     "certain": (lambda: Gate(probability=1.0), "between 0 and 1"),
     "one refusal": (lambda: Gate(recovery=1), "recovery"),
@@ -766,7 +722,6 @@ BAD = {
     "unknown": (lambda: Robust(kind="hubert"), "did you mean 'huber'"),
     "no degrees": (lambda: Robust(degrees_of_freedom=0.0), "degrees_of_freedom"),
     "no passes": (lambda: Robust(iterations=0), "iterations"),
-    "no window": (lambda: Monitor(window=1), "window"),
 }
 
 

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from strapdown import ahrs, quaternion
 from strapdown.recordings import Recording, sensor_faults
-from strapdown.recordings.recording import sampled
+from strapdown.records.recording import sampled
 from strapdown.units import DEGREE
 
 RATE = 200.0

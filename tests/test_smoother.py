@@ -15,7 +15,7 @@ from scipy.optimize import least_squares
 
 from strapdown import coning, consistency, estimation, kinematics, motion, quaternion, records
 from strapdown.checks import InputError
-from strapdown.estimation import forward, recovery_segments, smoothing
+from strapdown.estimation import forward, recovery_segments
 from strapdown.estimation.gating import Gate
 from strapdown.estimation.states import ProcessNoise, covariance_matrices
 from strapdown.kernels import rotation, smoother_step
@@ -448,100 +448,11 @@ def test_a_start_half_way_round_is_survived() -> None:
             assert np.all(np.abs(errors(estimate, record)[late]) < 8.0 * estimate.sigma[late])
 
 
-# ---------------------------------------------------------------------------------------------------------------------- fixed lag
-
-
-@pytest.mark.parametrize("lag", [20.0, 1e6])
-def test_a_lag_as_long_as_the_record_is_the_fixed_interval(lag: float) -> None:
-    case = CASES["asynchronous"]
-    record, initial = simulated(case, np.random.default_rng(9))
-    whole = estimation.smooth(record, case.noise, initial, full_covariance=True)
-    lagged = estimation.smooth(record, case.noise, initial, lag=lag, full_covariance=True)
-    for name in ("attitude", "bias", "variance", "covariance"):
-        np.testing.assert_array_equal(getattr(lagged, name), getattr(whole, name))
-
-
-def test_no_lag_is_the_filter() -> None:
-    case = CASES["asynchronous"]
-    record, initial = simulated(case, np.random.default_rng(9))
-    filtered = estimation.run(record, case.noise, initial, full_covariance=True)
-    lagged = estimation.smooth(record, case.noise, initial, lag=0.0, full_covariance=True)
-    for name in ("attitude", "bias", "variance", "covariance"):
-        np.testing.assert_array_equal(getattr(lagged, name), getattr(filtered, name))
-
-
-@pytest.mark.parametrize("lag", [0.02, 0.3, 1.999, 2.0])
-def test_fixed_lag_is_the_smoother_of_what_was_known(lag: float) -> None:
-    case = CASES["asynchronous"]
-    record, initial = simulated(case, np.random.default_rng(9))
-    lagged = estimation.smooth(record, case.noise, initial, lag=lag, full_covariance=True)
-    steps = math.floor(lag * case.rate + 1e-6)
-    # Among them edges where t + lag falls short of an edge by rounding only.
-    short = (
-        np.flatnonzero(record.time[:-steps] + lag < record.time[steps:]) if steps == round(lag * case.rate, 6) else []
-    )
-    for k in (0, 1, 250, 901, len(record.time) - 1, *short[:2]):
-        last = min(k + steps, len(record.time) - 1)
-        known = (
-            estimation.smooth(records.cut(record, 0, last), case.noise, initial, full_covariance=True) if last else None
-        )
-        if known is not None:
-            np.testing.assert_allclose(lagged.attitude[k], known.attitude[k], rtol=0, atol=1e-15)
-            # To rounding in units of σ: entries that are zero but for rounding differ by the order of operations.
-            sigma = np.sqrt(np.diagonal(known.covariance[k]))
-            difference = (lagged.covariance[k] - known.covariance[k]) / np.outer(sigma, sigma)
-            np.testing.assert_allclose(difference, 0.0, rtol=0, atol=1e-13)
-
-
 def filtered_segments(record, noise, initial):
     """Return the segment that starts at each edge, and the filter's segments with the end state."""
     problem = forward.prepared(record, noise, initial, ())
     _, segments = recovery_segments.filtered_whole(problem, forward.Options(every=len(record.time)))
     return recovery_segments.starts(record.time, problem.events.time, segments), segments
-
-
-def test_gains_kept_or_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    case = CASES["asynchronous"]
-    record, initial = simulated(case, np.random.default_rng(10))
-    kept = estimation.smooth(record, case.noise, initial, lag=0.7, full_covariance=True)
-    for groups in range(3, 10):  # too few for each pass, for some, for none
-        monkeypatch.setattr(smoothing, "MAX_GROUPS", groups)
-        anew = estimation.smooth(record, case.noise, initial, lag=0.7, full_covariance=True)
-        for name in ("attitude", "bias", "variance", "covariance"):
-            np.testing.assert_array_equal(getattr(kept, name), getattr(anew, name))
-
-
-@pytest.mark.parametrize("edges", [2, 3, 9, 10, 17, 18, 40])
-def test_any_number_of_passes_at_once(edges: int) -> None:
-    """Passes are taken eight at a time: fewer, one over, and more passes than the lag has edges."""
-    case = dataclasses.replace(CASES["directions"], duration=4.0)
-    record, initial = simulated(case, np.random.default_rng(12))
-    part = records.cut(record, 0, edges)
-    for steps in (1, 3, 11):
-        lagged = estimation.smooth(part, case.noise, initial, lag=steps / case.rate, full_covariance=True)
-        for k in range(edges):
-            last = min(k + steps, edges)
-            known = estimation.smooth(records.cut(part, 0, last), case.noise, initial, full_covariance=True)
-            np.testing.assert_allclose(lagged.attitude[k], known.attitude[k], rtol=0, atol=1e-14)
-            np.testing.assert_allclose(lagged.bias[k], known.bias[k], rtol=0, atol=1e-14)
-            np.testing.assert_allclose(lagged.variance[k], known.variance[k], rtol=1e-12)
-
-
-@pytest.mark.parametrize("angle", [0.02, 0.3, 1.0, 3.0])
-def test_fixed_lag_where_corrections_are_large(angle: float) -> None:
-    """Beyond the range of the series a pass's rotations are taken one by one, whatever its neighbours want."""
-    case = CASES["asynchronous"]
-    record, _ = simulated(case, np.random.default_rng(21))
-    q = quaternion.multiply(record.truth.attitude[0], quaternion.exp(angle * np.array([0.6, 0.0, -0.8])))
-    initial = estimation.initial_state(q, attitude_sigma=2.0 * angle, bias_sigma=0.01)
-    part = records.cut(record, 0, 60)
-    lagged = estimation.smooth(part, case.noise, initial, lag=20.0 / case.rate, full_covariance=True)
-    for k in (0, 1, 7, 8, 20, 35):
-        known = estimation.smooth(records.cut(part, 0, k + 20), case.noise, initial, full_covariance=True)
-        assert quaternion.angle_between(lagged.attitude[k], known.attitude[k]) < 1e-12
-        sigma = np.sqrt(np.diagonal(known.covariance[k]))
-        difference = (lagged.covariance[k] - known.covariance[k]) / np.outer(sigma, sigma)
-        np.testing.assert_allclose(difference, 0.0, rtol=0, atol=1e-11)
 
 
 def test_a_bias_that_turns_more_than_the_increments_say() -> None:
@@ -568,13 +479,6 @@ def test_a_bias_that_turns_more_than_the_increments_say() -> None:
         np.testing.assert_allclose(whole.variance, cut.variance[::10], rtol=1e-8)
     with pytest.raises(InputError, match="many times round in each gyro interval"):
         smoothed(1, 1e4)
-
-
-def test_a_negative_lag_is_refused() -> None:
-    case = CASES["rest"]
-    record, initial = simulated(case, np.random.default_rng(9))
-    with pytest.raises(InputError, match="lag is -1 s; it must not be negative"):
-        estimation.smooth(record, case.noise, initial, lag=-1.0)
 
 
 # ------------------------------------------------------------------------------------------------- recoveries, and lost digits
@@ -730,29 +634,6 @@ def test_several_recoveries_and_a_record_in_parts() -> None:
     assert part.events == whole.events
 
 
-ON_EDGES = tuple(
-    (kind, reference, sigma, np.arange(first, 250, 5) / 50.0)
-    for first, (kind, reference, sigma, _) in zip((2, 4), WELL_SEEN.sensors, strict=True)
-)
-
-
-@pytest.mark.parametrize(("lag", "sensors"), [(0.1, WELL_SEEN.sensors), (0.7, WELL_SEEN.sensors), (0.1, ON_EDGES)])
-def test_a_fixed_lag_knows_of_a_recovery_when_it_has_happened(lag: float, sensors: tuple) -> None:
-    record, initial = far_off(1, sensors)
-    lagged = estimation.smooth(record, NOISE, initial, lag=lag, gate=GATE, full_covariance=True)
-    event = recovery_of(lagged)
-    first, last = np.searchsorted(record.time, [event.start, event.end])
-    steps = round(50 * lag)
-    for k in {0, 1, first, first + 5, last - steps - 1, last - steps, last - steps + 1, last - 1, last, last + 3, 240}:
-        if k < 0:
-            continue
-        part = records.cut(record, 0, min(k + steps, len(record.time) - 1))
-        known = estimation.smooth(part, NOISE, initial, gate=GATE, full_covariance=True)
-        assert (len(known.events) > 0) == (part.time[-1] >= event.end)
-        np.testing.assert_allclose(lagged.attitude[k], known.attitude[k], rtol=0, atol=1e-12)
-        np.testing.assert_allclose(lagged.variance[k], known.variance[k], rtol=1e-9)
-
-
 def nees_of_recoveries(runs: int) -> np.ndarray:
     """In the middle of the lost stretch, at the recovery, and later (runs, 3)."""
     nees = []
@@ -829,9 +710,6 @@ def test_a_measurement_that_leaves_no_digits_is_smoothed_on_the_square_root() ->
     assert both.innovations["s0"].nis.max() < 1e-6
     ahead = estimation.run(record, noise, initial, full_covariance=True)
     np.testing.assert_allclose(both.sigma[-1], ahead.sigma[-1], rtol=1e-6)
-    lagged = estimation.smooth(record, noise, initial, lag=1.0)
-    known = estimation.smooth(records.cut(record, 0, 6), noise, initial)
-    np.testing.assert_allclose(lagged.sigma[2], known.sigma[2], rtol=1e-9)
 
 
 # ------------------------------------------------------------------------------------------------------------------------ kernels

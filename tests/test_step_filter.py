@@ -13,7 +13,7 @@ from gated_steps import GatedStepFilter
 from strapdown import estimation, motion, quaternion, records
 from strapdown.checks import InputError
 from strapdown.estimation import error_states, filters, multiple_model
-from strapdown.estimation.gating import Gate, Monitor, Robust
+from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.states import ProcessNoise, initial_state
 from strapdown.estimation.step_filter import StepFilter
 from strapdown.gyro import GyroSpec
@@ -65,7 +65,7 @@ def record_of(duration=2.0):
 def handed_over(record, initial, states=(), **options):
     """Run the filter over a record."""
     names = {"sensors": [s.sensor for s in record.vectors]} if states else {}
-    face = GatedStepFilter if options.keys() & {"gate", "robust", "monitor"} else StepFilter
+    face = GatedStepFilter if options.keys() & {"gate", "robust"} else StepFilter
     f = face(NOISE, initial, states, time=record.time[0], **{**names, **options})
     queue = sorted((t, i, k) for i, s in enumerate(record.vectors) for k, t in enumerate(s.time))
     for n, delta in enumerate(record.increments):
@@ -85,11 +85,6 @@ def handed_over(record, initial, states=(), **options):
 OPTIONS = {
     "plain": {},
     "gate, Student": {"gate": Gate(probability=0.9999), "robust": Robust(degrees_of_freedom=3.0)},
-    "gate, Student, monitor": {
-        "gate": Gate(probability=0.9999),
-        "robust": Robust(degrees_of_freedom=3.0),
-        "monitor": Monitor(window=5, probability=0.9),
-    },
     "lost": {"gate": Gate(recovery=4)},
 }
 
@@ -110,68 +105,10 @@ def test_measurements_at_common_stamps_are_processed_as_the_record_s(states, opt
     estimate = estimation.run(record, NOISE, initial, blocks, **given)
     assert quaternion.angle_between(estimate.attitude[-1], face.attitude) < (1e-9 if blocks else 1e-10)
     if blocks:
-        assert bool(getattr(face, "events", ())) == (option in ("gate, Student, monitor", "lost"))
-
-
-WATCH = Monitor(window=8, probability=0.99)
-
-
-@pytest.mark.parametrize(
-    "options",
-    [{}, {"gate": Gate(recovery=None)}, {"gate": Gate(recovery=4)}, {"robust": Robust(degrees_of_freedom=3.0)}],
-    ids=["plain", "gate", "recovery", "Student"],
-)
-def test_a_monitor_reports_what_it_reports_of_the_record(options):
-    """Of sensors that are far off now and then."""
-    record, begin = record_of(2.0), start(1e-2)
-    whole = estimation.run(record, NOISE, begin, monitor=WATCH, **options)
-    expected = [event for event in whole.events if event.kind == "divergence"]
-    assert expected
-    face = handed_over(record, begin, monitor=WATCH, **options)
-    without = handed_over(record, begin, **{"gate": None, **options})
-    assert np.array_equal(face.attitude, without.attitude)
-    assert [event for event in face.events if event.kind != "divergence"] == list(without.events)
-    found = [event for event in face.events if event.kind == "divergence"]
-    for one, other in zip(expected, found, strict=True):
-        assert (one.start, one.end) == pytest.approx((other.start, other.end))
-        assert one.value == pytest.approx(other.value, rel=1e-6)
+        assert bool(getattr(face, "events", ())) == (option == "lost")
 
 
 IRON, DRIFT, SWAY = STATES["bias, drift and sway"]
-
-
-def divergences(events):
-    return [event for event in events if event.kind == "divergence"]
-
-
-@pytest.mark.parametrize("gate", [None, Gate(recovery=None)], ids=["none", "gate"])
-@pytest.mark.parametrize("states", ["bias, drift and sway"])
-def test_a_monitor_watches_both_faces_alike(states, gate):
-    """Of sensors that are far off now and then."""
-    record, blocks = record_of(4.0), STATES[states]
-    initial = begun(record, "plain")
-    whole = estimation.run(record, NOISE, initial, blocks, gate=gate, monitor=WATCH)
-    without = estimation.run(record, NOISE, initial, blocks, gate=gate)
-    face = handed_over(record, initial, blocks, gate=gate, monitor=WATCH)
-    expected = divergences(whole.events)
-    assert expected
-    assert bool(sum(whole.refused.values())) == (gate is not None)
-    assert np.array_equal(whole.attitude, without.attitude)
-    assert [event for event in whole.events if event not in expected] == list(without.events)
-    assert len(divergences(face.events)) == len(expected)
-    for one, other in zip(expected, divergences(face.events), strict=True):
-        assert (one.start, one.end) == pytest.approx((other.start, other.end))
-        assert one.value == pytest.approx(other.value, rel=1e-6)
-    # All innovations in order of time, of refused ones the threshold.
-    rows = []
-    for place, (name, found) in enumerate(whole.innovations.items()):
-        degrees = {"north": 1, "tracker": 3}.get(name, 2)
-        for k, time in enumerate(found.time):
-            nis = np.sum(found.innovation[k] ** 2 / found.variance[k])
-            refused = gate is not None and found.weight[k] == 0.0
-            rows.append((time, place, gate.thresholds[degrees - 1] if refused else nis, degrees))
-    time, _, nis, degrees = (np.array(column) for column in zip(*sorted(rows), strict=True))
-    assert WATCH.watch(time, nis, degrees) == expected
 
 
 def test_names_of_sensors_are_a_sequence():
@@ -354,10 +291,7 @@ def test_both_faces_skip_a_vertical_heading_alike(options):
     up = VectorMeasurements(sensor="up", kind="direction", time=time, vector_b=[UP] * 8, reference_f=UP, sigma=0.1)
     edges = ImuRecord(time=np.linspace(0.0, 1.0, 11), increments=np.zeros((10, 3)), vectors=(north, up))
     rest = replace(edges, vectors=(north.taken(~vertical), up))
-    both, without = (
-        estimation.run(r, NOISE, start(), full_covariance=True, monitor=Monitor(window=2), **options)
-        for r in (edges, rest)
-    )
+    both, without = (estimation.run(r, NOISE, start(), full_covariance=True, **options) for r in (edges, rest))
     assert both.skipped == {"north": 4, "up": 0}
     assert both.refused == {"north": 0, "up": 0}
     assert both.events == without.events
@@ -453,7 +387,7 @@ def test_the_step_face_goes_on_from_a_part_as_the_record_does():
 def test_saver_and_pickle(states):
     """Before the first measurement too, and with events that come meanwhile."""
     record, initial = lost_record()
-    options = {"gate": Gate(recovery=4), "monitor": Monitor(window=5, probability=0.9)}
+    options = {"gate": Gate(recovery=4)}
     f = GatedStepFilter(NOISE, initial, STATES[states], sensors=("a", "b"), **options)
     history = Saver(f, save_current=True)
     for k, t in enumerate(record.vectors[0].time):
@@ -463,7 +397,7 @@ def test_saver_and_pickle(states):
         for series in record.vectors:
             f.update_direction(series.vector_b[k], series.references_f[k], 2e-3, series.sensor)
         history.save()
-    assert {event.kind for event in f.events} >= {"divergence", "recovery"}
+    assert {event.kind for event in f.events} >= {"recovery"}
     assert f.refused
     history.to_array()
     n, m = len(record.vectors[0].time) + 1, len(f.values)
@@ -491,13 +425,10 @@ WRONG = {
         lambda: estimation.run(RECORD, NOISE, start(), robust="huber"),
         "robust is 'huber', .*Robust",
     ),
-    "monitor switched on": (lambda: estimation.run(RECORD, NOISE, start(), monitor=True), "monitor is True, .*Monitor"),
     "no start": (lambda: estimation.run(RECORD, NOISE, None), "initial is None, .*initial_state"),
     "noise as a number": (lambda: estimation.run(RECORD, 1e-4, start()), "process_noise is 0.0001, .*ProcessNoise"),
     "gate, stepping": (lambda: GatedStepFilter(NOISE, start(), gate=0.999), "gate is 0.999"),
     "robust, stepping": (lambda: GatedStepFilter(NOISE, start(), robust="huber"), "robust is 'huber'"),
-    "monitor, stepping": (lambda: GatedStepFilter(NOISE, start(), monitor=True), "monitor is True"),
-    "monitor with error states": (lambda: estimation.run(RECORD, NOISE, start(), monitor=True), "monitor is True"),
     "no start, stepping": (lambda: StepFilter(NOISE, None), "initial is None"),
     "two sigmas": (
         lambda: initial_state(IDENTITY, attitude_sigma=[1.0, 2.0], bias_sigma=1.0),
@@ -519,7 +450,6 @@ WRONG = {
 FACES = {
     "estimation.run": estimation.run,
     "estimation.smooth": estimation.smooth,
-    "estimation.smooth, lag": lambda *given, **options: estimation.smooth(*given, lag=1.0, **options),
     "StepFilter": lambda record, *given, **options: GatedStepFilter(*given, **options),
     "estimation.observability": estimation.observability,
     "estimation.relinearized_start": estimation.relinearized_start,
@@ -560,7 +490,6 @@ def test_every_face_refuses_what_is_no_argument(face, name):
         ({"bias_sigma": -1.0}, "bias_sigma"),
         ({"bias": [0.0, 1.0]}, "bias has shape"),
         ({"least_weight": "a"}, "least_weight"),
-        ({"monitor": True}, "monitor is True"),
     ],
 )
 def test_the_bank_names_what_it_cannot_start_with(option, words):
@@ -582,7 +511,3 @@ def test_an_algorithm_goes_by_its_name():
     one = records.compress(record, "two-sample")
     other = records.compress(record, coning.ALGORITHMS["two-sample"])
     assert np.array_equal(one.increments, other.increments)
-
-
-def test_a_monitor_is_taken():
-    assert estimation.run(RECORD, NOISE, start(), monitor=Monitor()).events == ()

@@ -250,7 +250,7 @@ def test_a_magnetometer_is_recovered_though_its_axes_mix_in_every_innovation(kin
 def test_the_command_tunes_the_axes_of_a_record(run, tmp_path):
     path, out, first = tmp_path / "star.h5", tmp_path / "tuned.toml", tmp_path / "first.toml"
     scenario = tracked(60.0)
-    recordfiles.write_record(path, scenarios.simulate(scenario, 4), gyro_spec=scenario.gyro)
+    recordfiles.write_record(path, scenarios.simulate(scenario, 4))
     off = dataclasses.replace(setup.matched(scenario), sigma={"star": tuple(3.0 * STAR)})
     first.write_text(setup.to_toml(off), encoding="utf-8")
     command = ("tune", path, "--filter", first, "--free", ",".join(AXES), "--starts", 1, "-o", out)

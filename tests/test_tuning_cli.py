@@ -32,7 +32,7 @@ SCENARIO = scenarios.Scenario(
 @pytest.fixture
 def record(tmp_path):
     path = tmp_path / "sat.h5"
-    recordfiles.write_record(path, scenarios.simulate(SCENARIO, 1), gyro_spec=SCENARIO.gyro)
+    recordfiles.write_record(path, scenarios.simulate(SCENARIO, 1))
     return path
 
 
@@ -134,7 +134,7 @@ def test_mistakes_are_reported_in_one_line(run, tmp_path, record, arguments, com
 
 def test_a_record_that_does_not_specify_its_gyro_needs_a_filter(run, tmp_path):
     bare = tmp_path / "bare.h5"
-    recordfiles.write_record(bare, scenarios.simulate(SCENARIO, 1))
+    recordfiles.write_record(bare, dataclasses.replace(scenarios.simulate(SCENARIO, 1), origin=None))
     status, _, said = run("tune", bare, "-o", tmp_path / "f.toml")
     assert status == 2
     assert "--filter" in said
@@ -146,7 +146,7 @@ def scaled(tmp_path):
     scenario = dataclasses.replace(SCENARIO, gyro=dataclasses.replace(SCENARIO.gyro, scale_factor=np.full(3, 2e-3)))
     path = tmp_path / "scaled.h5"
     record = scenarios.simulate(scenario, 2)
-    recordfiles.write_record(path, record, gyro_spec=scenario.gyro, scenario=scenarios.scenario_to_toml(scenario))
+    recordfiles.write_record(path, record)
     return path
 
 
@@ -167,8 +167,8 @@ def test_tune_gives_the_filter_states_for_what_the_record_specifies(run, tmp_pat
 
 def test_a_filter_with_states_and_a_gate_is_tuned_against_the_truth(run, tmp_path, scaled):
     first, out = tmp_path / "first.toml", tmp_path / "states.toml"
-    file = recordfiles.read_record_file(scaled)
-    gated = dataclasses.replace(setup.matched_to_record(file.record, file.gyro, states=True), gate=Gate())
+    record = recordfiles.read_record(scaled)
+    gated = dataclasses.replace(setup.matched_to_record(record, states=True), gate=Gate())
     first.write_text(setup.to_toml(gated), encoding="utf-8")
     given = ("tune", scaled, "--filter", first, "--free", "gyro.arw", "--starts", 1, "-o", out)
     status, said, complaint = run(*given, "--truth")

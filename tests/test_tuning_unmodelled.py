@@ -15,6 +15,7 @@ from strapdown.diagnosis import Cause, turning
 from strapdown.estimation.gating import Gate
 from strapdown.gyro import GyroSpec
 from strapdown.recordings import recordfiles
+from strapdown.records import Origin
 from strapdown.report import tunings
 from strapdown.tuning import residual_checks
 
@@ -226,7 +227,7 @@ def test_records_of_two_kinds_are_refused(change, complaint):
 def test_the_command_reports_it_and_refuses_two_kinds(run, tmp_path):
     first, second, out = tmp_path / "a.h5", tmp_path / "b.h5", tmp_path / "tuned.toml"
     chosen = scenario(1e-3)
-    recordfiles.write_record(first, scenarios.simulate(chosen, 2), gyro_spec=chosen.gyro)
+    recordfiles.write_record(first, scenarios.simulate(chosen, 2))
     status, said, complaint = run("tune", first, "--starts", 1, "-o", out)
     assert status == 0, complaint
     assert "scale factor of the gyro" in said
@@ -238,7 +239,8 @@ def test_the_command_reports_it_and_refuses_two_kinds(run, tmp_path):
     assert "A scale factor of the gyro" in page
     other = dataclasses.replace(chosen.gyro, angle_random_walk=6e-5)
     brief = dataclasses.replace(chosen, gyro=other, duration=60.0)
-    recordfiles.write_record(second, scenarios.simulate(brief, 1), gyro_spec=other)
+    record = dataclasses.replace(scenarios.simulate(brief, 1), origin=Origin(gyro=other))
+    recordfiles.write_record(second, record)
     status, _, complaint = run("tune", first, second, "-o", tmp_path / "none.toml")
     assert status == 2
     assert "recorded with another gyro" in complaint.replace("\n", " ")

@@ -32,6 +32,6 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     """Load a submodule when it is first used (PEP 562)."""
-    if name in ("doctor", "motions"):
+    if name in ("check_conventions", "motions"):
         return import_module(f"{__name__}.{name}")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -22,11 +22,11 @@ from strapdown.kernels import recording_steps
 from strapdown.kernels.machine import compiled, read_only
 from strapdown.recordings import Recording, sensor_delays, unit_calibration
 from strapdown.recordings.hard_iron import low_pass
-from strapdown.recordings.recording import sampled
 from strapdown.recordings.sensor_delays import Delays
 from strapdown.recordings.sensor_faults import Faults
 from strapdown.recordings.unit_calibration import UnitCalibration
 from strapdown.records import ErrorStateEstimate, Estimate, ImuRecord, Innovations, cut
+from strapdown.records.recording import sampled
 
 LEVEL_TIME = 5.0
 """Time constant over which the level of the acceleration is found, s."""

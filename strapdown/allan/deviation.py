@@ -253,7 +253,7 @@ def equivalent_degrees_of_freedom(alpha: int, samples: int, m: int, estimator: s
     if alpha not in NOISE_TYPES:
         raise InputError(f"alpha is {alpha!r}; it must be one of {', '.join(map(str, NOISE_TYPES))}")
     checks.one_of("estimator", estimator, ESTIMATORS)
-    checks.count("samples", samples, least=2)
+    checks.count("samples", samples, minimum=2)
     order = _order(estimator)
     if not 1 <= m <= samples // order:
         raise InputError(f"m is {m!r}; with {samples} samples it must lie between 1 and {samples // order}")

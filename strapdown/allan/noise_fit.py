@@ -274,7 +274,7 @@ def expected_errors(parameters: Mapping[str, float], samples: int, sample_interv
     """
     checks.known_keys("parameters", parameters, TERMS)
     dt = checks.positive("sample_interval", sample_interval, unit="s")
-    last = checks.count("samples", samples, least=64) - 1
+    last = checks.count("samples", samples, minimum=64) - 1
     starts = bin_starts(last)
     random_terms = TERMS[:4]
     basis = np.stack([mean_power(term, samples, dt, starts, last) for term in random_terms])

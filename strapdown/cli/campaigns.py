@@ -285,7 +285,6 @@ def _with_filter(held: Campaign, own: Own, source: Path) -> Campaign:
 
 def _print_result(campaign: Campaign) -> tuple[int, dict[str, Any]]:
     """Show the statistics and the verdict, that of `strapdown check`; return the exit status, and all as it is written to JSON."""
-    from strapdown import consistency
     from strapdown.cli.judgement import status_of
     from strapdown.montecarlo import summary
     from strapdown.montecarlo.verdicts import bound_of
@@ -297,7 +296,7 @@ def _print_result(campaign: Campaign) -> tuple[int, dict[str, Any]]:
         console.print(f"{campaign.statistics.runs} of {campaign.runs} runs are finished.")
     report = summary(campaign.statistics, bound=bound_of(campaign.plan))
     figure = lambda value: "-" if value is None else f"{value:.4g}" if value >= 1e3 else f"{value:.4f}"  # noqa: E731
-    judgement = consistency.judge_runs(campaign.statistics, unmodelled=campaign.plan.unmodelled)
+    judgement = campaign.statistics.judge(unmodelled=campaign.plan.unmodelled)
     rows = table(
         f"Per degree of freedom; 1 for a consistent filter. NEES over {report['epochs_judged']} epochs",
         *("", "mean", "least", "greatest", "from", "to", ""),
@@ -406,7 +405,7 @@ def _replay(plan: Plan, run: int, machine: str, target: Path) -> None:
     from strapdown import consistency, setup
     from strapdown import montecarlo as engine
     from strapdown.recordings import recordfiles
-    from strapdown.records import Truth, write_estimate
+    from strapdown.records import Origin, Truth, write_estimate
     from strapdown.scenarios import scenario_to_toml
 
     choice = engine.choose(plan, machine)
@@ -425,13 +424,10 @@ def _replay(plan: Plan, run: int, machine: str, target: Path) -> None:
         "dispersions": json.dumps(plan.to_table()["dispersions"]),
     }
     paths = _replayed(target, run)
+    origin = Origin(gyro=plan.scenario.gyro, scenario=plan.scenario, seed=plan.seed, run=run)
     recordfiles.write_record(
         paths[0],
-        again.record,
-        gyro_spec=None if plan.dispersions.of_the_gyro else plan.scenario.gyro,
-        scenario=attributes["scenario"],
-        seed=plan.seed,
-        run=run,
+        replace(again.record, origin=origin),
         attributes={name: attributes[name] for name in ("machine", "dispersions")},
     )
     write_estimate(paths[1], again.estimate, attributes, truth=true)

@@ -27,15 +27,14 @@ from strapdown.cli.terminal import (
     writable,
     written,
 )
-from strapdown.files import reading, usable_folder, write_json
+from strapdown.files import usable_folder, write_json
 from strapdown.units import DEGREE, DEGREE_PER_HOUR, DEGREE_PER_HOUR_PER_ROOT_HOUR, DEGREE_PER_ROOT_HOUR
 
 if TYPE_CHECKING:
     from strapdown.ahrs import AhrsEstimate, AhrsParameters, Begun
     from strapdown.estimation.states import State
     from strapdown.recordings import Recording
-    from strapdown.recordings.recordfiles import RecordFile
-    from strapdown.records import Estimate, ImuRecord
+    from strapdown.records import Estimate, ImuRecord, Origin
     from strapdown.setup import FilterSetup
     from strapdown.setup.for_record import Start
     from strapdown.workflows import RecordRun
@@ -258,18 +257,16 @@ def _export(exports: Exports, estimate: Estimate, recording: Recording | None) -
 def _estimate_specified(path: Path, shared: _Shared, options: _Specified, output: _Output, exports: Exports) -> None:
     """Run the filter over a recording that holds its specification, report and write its estimate."""
     from strapdown import workflows
-    from strapdown.recordings.recordfiles import read_record_file
+    from strapdown.recordings.recordfiles import read_record
 
     every = count("every", options.every)
     if shared.smooth and every > 1:
         raise InputError("--every stores some filter steps, and the smoother gives all; leave one of them out")
     if shared.gyro is not None and options.filter_file is not None:
         raise InputError("--gyro and --filter both give the filter's gyro noise; give one of them")
-    held = read_record_file(path)
-    chosen, remarks = filter_for(path, held, shared.gyro, options.filter_file, options.chosen_states)
+    record = read_record(path)
+    chosen, remarks = filter_for(path, record, shared.gyro, options.filter_file, options.chosen_states)
     chosen = replace(chosen, **shared.robustness)
-    with reading.from_file(path):
-        record = held.with_origin(str(path))
     start = _start(record, chosen, options.attitude, options.from_truth)
     with progress_bar("smoothing" if shared.smooth else "filtering"):
         run = workflows.estimate_record(
@@ -280,15 +277,15 @@ def _estimate_specified(path: Path, shared: _Shared, options: _Specified, output
             full_covariance=shared.full_covariance is not False,
             smooth=shared.smooth,
         )
-    length = held.record.time[-1] - held.record.time[0]
+    length = record.time[-1] - record.time[0]
     console.print(
-        f"{path.name}: {len(held.record.increments)} gyro samples over {length:.6g} s, "
-        f"{', '.join(f'{len(s.time)} of {s.sensor}' for s in held.record.vectors) or 'no measurements'}. {run.start}"
+        f"{path.name}: {len(record.increments)} gyro samples over {length:.6g} s, "
+        f"{', '.join(f'{len(s.time)} of {s.sensor}' for s in record.vectors) or 'no measurements'}. {run.start}"
     )
     for remark in remarks:
         console.print(remark)
     _print_result(run.estimate)
-    paths = _write_specified(path, held, chosen, run, shared, output.out)
+    paths = _write_specified(path, record.origin, chosen, run, shared, output.out)
     paths += _export(exports, run.estimate, None)
     _say_nis(run.estimate, paths[0])
     if output.drawn_as is not None:
@@ -297,19 +294,18 @@ def _estimate_specified(path: Path, shared: _Shared, options: _Specified, output
 
 
 def _write_specified(
-    path: Path, held: RecordFile, chosen: FilterSetup, run: RecordRun, shared: _Shared, out: Path
+    path: Path, origin: Origin | None, chosen: FilterSetup, run: RecordRun, shared: _Shared, out: Path
 ) -> list[Path]:
     """Write the estimate and what is known of it, and print its errors; return the files."""
     from strapdown import setup
+    from strapdown.recordings.recordfiles import origin_attributes
     from strapdown.records import write_estimate
 
     result, truth = run.estimate, run.truth
     paths = [out / "estimate.h5"]
     attributes: dict[str, Any] = {"source": str(path), "filter": setup.to_toml(chosen), "start": run.start}
     attributes["smoothed"] = shared.smooth
-    if held.scenario:
-        attributes["scenario"] = held.scenario
-    attributes |= {name: value for name, value in (("seed", held.seed), ("run", held.run)) if value is not None}
+    attributes |= {name: value for name, value in origin_attributes(origin).items() if name != "gyro"}
     _clear(out)
     write_estimate(paths[0], result, attributes, truth=truth)
     if result.error_states:

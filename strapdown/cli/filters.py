@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from strapdown.checks import InputError
-from strapdown.files import reading
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from strapdown.estimation.filters.own import Own
-    from strapdown.recordings.recordfiles import RecordFile
+    from strapdown.records import ImuRecord
     from strapdown.scenarios import Scenario
     from strapdown.setup import FilterSetup
 
@@ -25,7 +24,7 @@ ChosenStates = tuple[str, ...] | Literal[False] | None
 
 def filter_for(
     path: Path,
-    held: RecordFile,
+    record: ImuRecord,
     gyro: Path | None,
     filter_file: Path | None,
     states: ChosenStates,
@@ -35,25 +34,23 @@ def filter_for(
     from strapdown.gyro import read_spec
     from strapdown.setup.for_record import unmodelled_errors
 
-    with reading.from_file(path):
-        record = held.with_origin(str(path))
     if filter_file is not None:
         if states is not None:
             raise InputError(
                 "--filter holds the filter's states itself, in [filter.states]; leave --states, --no-states and --state out"
             )
         chosen = setup.read_setup(filter_file)
-        need_angles(filter_file, chosen, held)
+        need_angles(filter_file, chosen, record)
         return chosen, no_state_words(unmodelled_errors(record, chosen), chosen)
     spec = None if gyro is None else read_spec(gyro)
-    if spec is None and held.gyro is None:
+    if spec is None and (record.origin is None or record.origin.gyro is None):
         raise InputError(f"{path} does not hold the gyro's specification; give --gyro or --filter, a TOML file")
     chosen = setup.matched_to_record(record, spec, states=True if states == () else states)
     missing = unmodelled_errors(record, chosen)
     if states is False or (states is None and chosen.states is None):
         return chosen, no_state_words(missing, chosen)
     remarks = []
-    if not held.scenario:
+    if record.origin is None or record.origin.scenario is None:
         remarks.append(
             f"{path.name} does not hold its scenario, so the errors of its sensors are not known: no state for them."
         )
@@ -74,11 +71,11 @@ def default_words(names: Sequence[str]) -> str:
     )
 
 
-def need_angles(filter_file: Path, chosen: FilterSetup, held: RecordFile) -> None:
+def need_angles(filter_file: Path, chosen: FilterSetup, record: ImuRecord) -> None:
     """Refuse σ of the record's sensors that cannot be in rad, but where the record's own are as wide."""
     from strapdown import setup
 
-    fine = {one.sensor: one.kind for one in held.record.vectors if len(one.time) and np.max(one.sigma) <= np.pi}
+    fine = {one.sensor: one.kind for one in record.vectors if len(one.time) and np.max(one.sigma) <= np.pi}
     setup.need_angles(chosen, fine, f"{filter_file}: filter")
 
 

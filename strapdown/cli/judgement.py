@@ -127,7 +127,7 @@ def check(
 
 def _judged_own(result: Path, probability: float, *, with_record: bool) -> tuple[Judgement, dict[str, Any]]:
     """Judge a result of this package; return the verdict and what the JSON says of it."""
-    from strapdown import consistency, records
+    from strapdown import records
     from strapdown.report import findings
 
     attributes = records.read_attributes(result)
@@ -141,7 +141,7 @@ def _judged_own(result: Path, probability: float, *, with_record: bool) -> tuple
         if held.statistics is None:
             raise InputError(f"{result} holds no finished run yet; resume it with `strapdown montecarlo --resume`")
         console.print(f"{result.name}: {held.statistics.runs} of {counted(held.runs, 'run')}, machine {held.machine}.")
-        judgement = consistency.judge_runs(held.statistics, probability=probability, unmodelled=held.plan.unmodelled)
+        judgement = held.statistics.judge(probability=probability, unmodelled=held.plan.unmodelled)
     elif kind == "strapdown estimate":
         estimate = records.read_estimate(result)
         truth = records.read_truth(result)
@@ -252,9 +252,9 @@ def _diagnosed(
 
     chosen = _filter_of(result, filter_file)
     estimate = records.read_estimate(result)
-    held = recordfiles.read_record_file(record)
-    _need_same(result, estimate, record, held.record)
-    missing = unmodelled_errors(held.with_origin(str(record)), chosen)
+    held = recordfiles.read_record(record)
+    _need_same(result, estimate, record, held)
+    missing = unmodelled_errors(held, chosen)
     for sentence in no_state_words(missing, chosen):
         console.print(sentence)
     if chosen.states is not None and chosen.states.names:
@@ -266,7 +266,7 @@ def _diagnosed(
     # The verdict is on the filter with its gate, so what that refused is left out.
     with progress_bar("looking for causes"):
         found = diagnosis.diagnose(
-            accepted(held.record, estimate), chosen, initial, probability=judgement.probability, judgement=judgement
+            accepted(held, estimate), chosen, initial, probability=judgement.probability, judgement=judgement
         )
     show_listing(found.listing(), "Causes by what they would explain")
     content = {**found.summary(), "without_a_state": list(missing)}
@@ -317,12 +317,12 @@ def doctor(
 ) -> None:
     """Find the conventions that a recording follows, by trying the others: exit status 0 as declared, 1 wrong, 2 cannot tell."""
     from strapdown import recordings
-    from strapdown.ahrs import doctor as conventions
+    from strapdown.ahrs import check_conventions
 
     json_target(json, recording)
     source = recordings.read(recording, **layout.options(recording))
     with progress_bar("trying conventions"):
-        found = conventions.examine(source)
+        found = check_conventions.examine(source)
     console.print(f"{found.source}: {found.words}")
     for words in found.doubts:
         console.print(f"warning: {words}.")

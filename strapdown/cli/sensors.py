@@ -78,9 +78,9 @@ def simulate(
         record = catalogue.simulate(chosen, used, run)
         advance(1)
         if target.suffix.lower() == ".csv":
-            paths = recordfiles.export_csv(target, record, gyro_spec=chosen.gyro, scenario=toml, seed=used, run=run)
+            paths = recordfiles.export_csv(target, record)
         else:
-            recordfiles.write_record(target, record, gyro_spec=chosen.gyro, scenario=toml, seed=used, run=run)
+            recordfiles.write_record(target, record)
             paths = (target,)
         advance(1)
     console.print(

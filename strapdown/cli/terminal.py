@@ -241,10 +241,10 @@ def need_own(target: Path, command: str, own: Callable[[Path], bool]) -> None:
 
 def doubt(source: Recording, path: Path) -> None:
     """Say where a recording seems not to be what it says: of all that is made of it, a wrong unit is the likeliest to be missed."""
-    from strapdown.ahrs import doctor
+    from strapdown.ahrs import check_conventions
 
     with progress_bar("trying conventions"):
-        found = doctor.examine(source)
+        found = check_conventions.examine(source)
     doubts = found.doubts
     if found.verdict == "wrong convention":
         doubts = (f"as it seems, {found.reason}",)

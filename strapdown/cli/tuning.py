@@ -218,7 +218,7 @@ def tune(
         return
     if planning.length is not None:
         raise InputError("--length is for --plan; the records' own length is taken")
-    count("seed", search.seed, least=0)
+    count("seed", search.seed, minimum=0)
     _check_files(records, start.filter_file, output)
     cases, before, gyros = _cases(records, chosen, start, layout)
     if not (goal.truth or goal.rmse or all(recordings.is_record(path) for path in records)):
@@ -348,20 +348,21 @@ def _cases(
     gyros: dict[str, GyroSpec] = {}
     for path in paths:
         if recordfiles.is_record(path):
-            file = recordfiles.read_record_file(path)
+            record = recordfiles.read_record(path)
+            gyro = None if record.origin is None else record.origin.gyro
             if chosen is None:
-                if file.gyro is None:
+                if gyro is None:
                     raise InputError(
                         f"{path} does not hold its gyro's specification; give a filter to start from, --filter filter.toml"
                     )
-                chosen, remarks = filter_for(path, file, None, None, () if start.states else False)
+                chosen, remarks = filter_for(path, record, None, None, () if start.states else False)
                 for remark in remarks:
                     console.print(remark)
             elif start.filter_file is not None:
-                need_angles(start.filter_file, chosen, file)
-            if file.gyro is not None:
-                gyros[str(path)] = file.gyro
-            cases.append(tuning.record_case(file.record, chosen, name=path.name))
+                need_angles(start.filter_file, chosen, record)
+            if gyro is not None:
+                gyros[str(path)] = gyro
+            cases.append(tuning.record_case(record, chosen, name=path.name))
         else:
             if start.states:
                 raise InputError(f"{path} is a recording, which specifies no errors; --states is for simulated records")
@@ -512,10 +513,11 @@ def _scenario_of(path: Path) -> Scenario:
     """Return the scenario that a record was simulated from."""
     from strapdown.recordings import recordfiles
 
-    origin = recordfiles.read_record_file(path).with_origin(str(path)).origin
+    origin = recordfiles.read_record(path).origin
     if origin is None or origin.scenario is None:
         raise InputError(f"{path} does not hold its scenario; give the scenario's name or TOML file to --plan")
-    return origin.scenario
+    scenario: Scenario = origin.scenario
+    return scenario
 
 
 def _numbers(text: str) -> list[float]:

@@ -96,7 +96,7 @@ class Algorithm:
         for what in ("samples", "order"):
             checks.count(f"{self.name}: {what}", getattr(self, what))
         for what in ("previous", "following", "rate_points"):
-            checks.count(f"{self.name}: {what}", getattr(self, what), least=0)
+            checks.count(f"{self.name}: {what}", getattr(self, what), minimum=0)
         if self.rate_points % 2:
             raise InputError(f"{self.name}: rate_points is {self.rate_points}; it must be even")
         self._check_window()
@@ -169,7 +169,7 @@ class Algorithm:
         (3, 3, 6, '1/280')
         """
         given = _rationals(f"{name}: coefficients", coefficients)
-        checks.count(f"{name}: previous", previous, least=0)
+        checks.count(f"{name}: previous", previous, minimum=0)
         samples = len(given) + 1 - previous
         if samples < 1:
             raise InputError(
@@ -225,7 +225,7 @@ class Algorithm:
         (4, 6, '1/280')
         """
         for what, number, least in (("samples", samples, 1), ("previous", previous, 0), ("following", following, 0)):
-            checks.count(f"{name}: {what}", number, least=least)
+            checks.count(f"{name}: {what}", number, minimum=least)
         window = samples + previous + following
         table = [[Fraction(0)] * window for _ in range(window)]
         for k, entry in enumerate(products):

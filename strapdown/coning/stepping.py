@@ -126,7 +126,7 @@ def increments_from_rates(rates: ArrayLike, sample_interval: float, points: int 
     """
     samples = checks.array("rates", rates, ("n", 3))
     interval = checks.positive("sample_interval", sample_interval, unit="s")
-    checks.count("points", points, least=2)
+    checks.count("points", points, minimum=2)
     if points % 2:
         raise InputError(
             f"points is {points}; it must be even, so that as many samples lie before an interval as after"
@@ -187,7 +187,7 @@ def rotation_vectors(
 def time_per_sample(algorithm: str | Algorithm, samples: int = 20_160, repeats: int = 5) -> float:
     """Return the least time per sample, s, that :func:`integrate` needs here, compilation excluded."""
     table = named(algorithm)
-    checks.count("samples", samples, least=table.window)
+    checks.count("samples", samples, minimum=table.window)
     increments = 1e-3 * np.random.default_rng(0).standard_normal((samples, 3))
     best = math.inf
     for _ in range(checks.count("repeats", repeats) + 1):
@@ -264,7 +264,7 @@ def _uneven(increments: Array, edges: ArrayLike | None, table: Algorithm) -> tup
     none = np.empty(0, np.intp), np.empty((0, 4))
     if edges is None:
         return none
-    stamps = np.ascontiguousarray(checks.increasing("edges", edges, least=2))
+    stamps = np.ascontiguousarray(checks.increasing("edges", edges, minimum=2))
     if len(stamps) != len(increments) + 1:
         raise InputError(
             f"edges holds {len(stamps)} times and increments {len(increments)} rows; give the {len(increments) + 1} edges of the intervals"

@@ -6,8 +6,8 @@
 - ``timeaverage``: Averages over the time of one run, whose errors are correlated: the effective sample size.
 - ``accuracy``: How large errors are: against a reference, against the Cramér–Rao bound, when they have settled, how they are distributed.
 - ``foreign``: The verdict on an estimate from elsewhere: clocks, frames and the reading of its covariance.
-- ``judgement``, ``runs``: The verdict in words, with its evidence, at one stated probability of a false alarm: on one run, and on
-  independent ones.
+- ``judgement``: The verdict in words, with its evidence, at one stated probability of a false alarm. That on independent runs is
+  :meth:`strapdown.montecarlo.Statistics.judge`.
 """
 
 from strapdown.consistency.accuracy import Distribution as Distribution
@@ -27,7 +27,6 @@ from strapdown.consistency.judgement import concluded as concluded
 from strapdown.consistency.manifold import SUBSETS as SUBSETS
 from strapdown.consistency.manifold import errors, nees
 from strapdown.consistency.manifold import whitened as whitened
-from strapdown.consistency.runs import judge_runs
 from strapdown.consistency.timeaverage import time_average as time_average
 from strapdown.consistency.whiteness import Autocorrelation as Autocorrelation
 from strapdown.consistency.whiteness import QuantilePairs as QuantilePairs
@@ -45,7 +44,6 @@ __all__ = [
     "check_arrays",
     "errors",
     "judge",
-    "judge_runs",
     "mean_bounds",
     "nees",
     "reference_errors",

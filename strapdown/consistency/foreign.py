@@ -289,7 +289,7 @@ def _series(
     prefix: str, time: ArrayLike, attitude: ArrayLike, covariance: ArrayLike | None, bias: ArrayLike | None
 ) -> _Series:
     """Return a history, checked; ``prefix`` is that of its names in messages."""
-    stamps = increasing(f"{prefix}time", time, least=2)
+    stamps = increasing(f"{prefix}time", time, minimum=2)
     m = len(stamps)
     q = unit_quaternions(f"{prefix}attitude", array(f"{prefix}attitude", attitude, (m, 4)))
     P = None if covariance is None else np.array(covariance, np.float64)

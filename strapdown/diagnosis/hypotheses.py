@@ -10,7 +10,7 @@ from typing import cast
 import numpy as np
 
 from strapdown import estimation, quaternion
-from strapdown.ahrs.doctor import ATTITUDE_READINGS, AXES, axes_words
+from strapdown.ahrs.check_conventions import ATTITUDE_READINGS, AXES, axes_words
 from strapdown.checks import Array
 from strapdown.diagnosis.causes import Cause
 from strapdown.diagnosis.likelihood import Hypothesis, Model, Run, log_p, run

@@ -6,7 +6,7 @@ tangent space.
 
 - ``states``: Process noise, state, where the filter starts.
 - ``error_states``: Declarations of states beside attitude and gyro bias; ``model`` turns them into arrays.
-- ``gating``: Gate, robust weights and monitor.
+- ``gating``: Gate and robust weights.
 - ``schedule``: Measurements in order of time.
 - ``forward``: The filter over whole records.
 - ``smoothing``: The smoothers; ``recovery_segments`` what they make of recoveries.
@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 from strapdown.estimation.forward import gaps as gaps
 from strapdown.estimation.forward import run
 from strapdown.estimation.forward import run_part as run_part
-from strapdown.estimation.gating import Gate, Monitor, Robust
+from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.live import LiveFilter
 from strapdown.estimation.model import with_error_states as with_error_states
 from strapdown.estimation.observability import Observability, observability
@@ -34,7 +34,6 @@ from strapdown.estimation.states import ProcessNoise, State, first_state, initia
 __all__ = [
     "Gate",
     "LiveFilter",
-    "Monitor",
     "Observability",
     "ProcessNoise",
     "Robust",

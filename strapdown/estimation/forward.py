@@ -17,7 +17,7 @@ from strapdown.estimation import model as modelling
 from strapdown.estimation import temperature
 from strapdown.estimation.angular_acceleration import turning
 from strapdown.estimation.error_states import ErrorStates
-from strapdown.estimation.gating import LOCK_OUT, Gate, Monitor, Robust
+from strapdown.estimation.gating import LOCK_OUT, Gate, Robust
 from strapdown.estimation.memory import side_by_side
 from strapdown.estimation.model import Model
 from strapdown.estimation.schedule import Schedule, innovations_by_sensor, joined, schedule, skipped_too
@@ -82,9 +82,14 @@ class Options:
     segments: int = 0
     """How many predictions to keep for a smoother."""
     whole_bias: bool = False
-    """Report the whole gyro bias, and by ``full_covariance`` its covariance instead of that of all states."""
+    """Report the whole gyro bias, with what the error states add to it, and by ``full_covariance`` its covariance instead of that of all
+    states."""
     factor: bool = False
     """Carry the triangular factor even without error states."""
+
+    def __post_init__(self) -> None:
+        """Check the classes of gate and robust."""
+        check_arguments(gate=self.gate, robust=self.robust)
 
     @property
     def judged(self) -> bool:
@@ -139,7 +144,6 @@ def run(
     full_covariance: bool = False,
     gate: Gate | None = None,
     robust: Robust | None = None,
-    monitor: Monitor | None = None,
 ) -> Estimate:
     """Run the multiplicative EKF over a whole record.
 
@@ -166,8 +170,6 @@ def run(
         Default: use all.
     robust : Robust, optional
         Weigh measurements by their distance from the estimate. Default: all alike.
-    monitor : Monitor, optional
-        Report when the running NIS leaves its bounds. Default: do not watch it.
 
     Returns
     -------
@@ -182,7 +184,7 @@ def run(
     options = Options(
         every=count("every", every), full_covariance=full_covariance, gate=gate, robust=robust, together=every > 1
     )
-    return _passed(record, process_noise, initial, error_states, options, monitor).estimate
+    return filtered(prepared(record, process_noise, initial, error_states, driven=True), options).estimate
 
 
 def run_part(
@@ -196,12 +198,11 @@ def run_part(
     error_state_covariance: bool = True,
     gate: Gate | None = None,
     robust: Robust | None = None,
-    monitor: Monitor | None = None,
 ) -> tuple[Estimate, State]:
     """Run the filter and return the end state too, from which the next part of a record goes on, bit for bit.
 
     The end state holds what a gate remembers as well: its counts, its candidate, and how wide a restart is. A lock-out that goes on is
-    reported by both parts, by the second as a whole. A monitor starts anew in each part. Where the covariance is carried as its factor for
+    reported by both parts, by the second as a whole. Where the covariance is carried as its factor for
     want of digits, parts agree to its rounding.
 
     Effects that are fixed in a sensor's own unit (``varying``) keep in all parts the unit of the first in which the sensor is, the strength
@@ -218,29 +219,8 @@ def run_part(
         gate=gate,
         robust=robust,
     )
-    passed = _passed(record, process_noise, initial, error_states, options, monitor)
-    return passed.estimate, passed.end
-
-
-def _passed(
-    record: ImuRecord,
-    process_noise: ProcessNoise,
-    initial: State,
-    error_states: Sequence[ErrorStates],
-    options: Options,
-    monitor: Monitor | None,
-) -> Passed:
-    """Return the filter's pass over a record; arguments of the wrong kind, and a filter that diverges, are refused."""
-    check_arguments(record=record, gate=options.gate, robust=options.robust, monitor=monitor)
     passed = filtered(prepared(record, process_noise, initial, error_states, driven=True), options)
-    attitude = passed.estimate.attitude
-    if not np.isfinite(attitude[-1]).all():  # what is no number once remains so
-        end = record.time[options.every * int(np.argmin(np.isfinite(attitude).all(axis=1)))]
-        raise InputError(
-            f"the filter diverged before {end:g} s: its attitude is no number; the errors of the start or of the measurements are many "
-            "times their sigmas"
-        )
-    return replace(passed, estimate=watched(passed.estimate, monitor, options.gate))
+    return passed.estimate, passed.end
 
 
 def prepared(
@@ -255,7 +235,7 @@ def prepared(
 
     ``driven``: a bias driven by temperature may be among them, for :func:`filtered`.
     """
-    check_arguments(process_noise=process_noise)
+    check_arguments(record=record, process_noise=process_noise)
     declared = modelling.as_blocks(error_states)
     if not driven:
         temperature.need_none(declared, "this estimator")
@@ -273,13 +253,28 @@ def prepared(
 
 
 def filtered(problem: Problem, options: Options) -> Passed:
-    """Run the filter over a prepared record, in the form that it needs; a bias over temperature goes in stretches of nearly one."""
+    """Run the filter over a prepared record, in the form that it needs; one that diverges is refused."""
     slopes = temperature.slopes(problem.error_states)
-    if slopes is None:
-        if problem.model.states or options.factor or options.whole_bias:
-            return _in_factor(problem, options)
-        judged = options.judged or problem.events.noise is not None
-        return _judged_in_blocks(problem, options) if judged else _in_blocks(problem, options)
+    if slopes is not None:
+        passed = _over_temperature(problem, options, slopes)
+    elif problem.model.states or options.factor or options.whole_bias:
+        passed = _in_factor(problem, options)
+    elif options.judged or problem.events.noise is not None:
+        passed = _judged_in_blocks(problem, options)
+    else:
+        passed = _in_blocks(problem, options)
+    attitude = passed.estimate.attitude
+    if not np.isfinite(attitude[-1]).all():  # what is no number once remains so
+        end = problem.record.time[options.every * int(np.argmin(np.isfinite(attitude).all(axis=1)))]
+        raise InputError(
+            f"the filter diverged before {end:g} s: its attitude is no number; the errors of the start or of the measurements are many "
+            "times their sigmas"
+        )
+    return passed
+
+
+def _over_temperature(problem: Problem, options: Options, slopes: slice) -> Passed:
+    """Run the filter with a bias over temperature, in stretches of nearly one temperature."""
     record, initial = problem.record, problem.initial
     T = temperature.of(record)
     state = replace(initial, unit_sigma=unit_sigmas(record, problem.model, initial.unit_sigma))
@@ -296,21 +291,6 @@ def filtered(problem: Problem, options: Options) -> Passed:
     estimate = joined(parts)
     skipped = skipped_too(problem.events, estimate.innovations)
     return Passed(estimate=replace(estimate, skipped=skipped), make_end=lambda: end, segments=np.empty((0, 0)))
-
-
-def watched(estimate: Estimate, monitor: Monitor | None, gate: Gate | None) -> Estimate:
-    """Return an estimate with the monitor's events; of refused measurements the gate's threshold counts."""
-    parts = [one for one in estimate.innovations.values() if len(one.time)]
-    if monitor is None or not parts:
-        return estimate
-    time = np.concatenate([one.time for one in parts])
-    degrees = np.concatenate([np.full(len(one.time), one.innovation.shape[1]) for one in parts])
-    nis = np.concatenate([one.nis for one in parts])
-    if gate is not None:
-        nis = np.where(np.concatenate([one.used for one in parts]), nis, gate.thresholds[degrees - 1])
-    order = np.argsort(time, kind="stable")
-    events = [*estimate.events, *monitor.watch(time[order], nis[order], degrees[order])]
-    return replace(estimate, events=in_order(events))
 
 
 def gaps(time: Array, factor: float = GAP_FACTOR) -> list[Event]:
@@ -694,9 +674,9 @@ def _in_factor(problem: Problem, options: Options) -> Passed:
     if options.whole_bias:
         estimate = replace(
             estimate,
-            whole_bias=whole_bias(model, out.x),
-            whole_bias_variance=out.whole_variance,
-            whole_bias_covariance=out.whole_covariance if options.full_covariance else None,
+            bias=whole_bias(model, out.x),
+            variance=out.whole_variance,
+            covariance=out.whole_covariance if options.full_covariance else None,
         )
     candidate = candidate_in_factor(body, model) if judge.memory[gate_rules.CANDIDATE] else None
     memory = judge.remembered(candidate)

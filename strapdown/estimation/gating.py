@@ -1,4 +1,4 @@
-"""Protection of a filter against wrong measurements: a gate with recovery, robust updates, and a monitor of divergence.
+"""Protection of a filter against wrong measurements: a gate with recovery, and robust updates.
 
 :class:`Gate`
     A χ² test of each measurement, with as many degrees of freedom as it has. A filter that is wrong itself would refuse good measurements
@@ -6,8 +6,6 @@
     other.
 :class:`Robust`
     Updates that weigh a measurement the less the larger its innovation, for noise with heavier tails than the normal distribution.
-:class:`Monitor`
-    A running mean of the normalised innovation squared, whose excursions are reported with their times.
 
 They are options of :func:`strapdown.estimation.run`, of :class:`strapdown.estimation.LiveFilter` and of the other estimators there.
 """
@@ -15,7 +13,6 @@ They are options of :func:`strapdown.estimation.run`, of :class:`strapdown.estim
 from __future__ import annotations
 
 import functools
-import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -23,7 +20,6 @@ import numpy as np
 
 from strapdown.checks import Array, InputError, count, finite, one_of, positive
 from strapdown.kernels import gate_rules
-from strapdown.records import Event
 
 UNIFORM_SIGMA = gate_rules.UNIFORM_SIGMA
 """Standard deviation of an angle that is uniform over the whole turn, rad."""
@@ -83,7 +79,7 @@ class Gate:
         """Check every field."""
         _probability("gate: probability", self.probability)
         if self.recovery is not None:
-            count("gate: recovery", self.recovery, least=2)
+            count("gate: recovery", self.recovery, minimum=2)
         positive("gate: restart_attitude_sigma", self.restart_attitude_sigma, unit="rad")
         if self.restart_bias_sigma is not None:
             positive("gate: restart_bias_sigma", self.restart_bias_sigma, unit="rad/s")
@@ -190,94 +186,3 @@ def student_scale(degrees_of_freedom: float, rows: int) -> float:
         return float(np.mean(w) * actual - 1.0)
 
     return float(brentq(excess, 0.2, 10.0, xtol=1e-12))
-
-
-@dataclass(frozen=True, kw_only=True)
-class Monitor:
-    """Watch the running mean of the NIS per degree of freedom; 1 for a consistent filter.
-
-    ``M ← a M + NIS``, ``D ← a D + d`` with d the degrees of freedom of each measurement, mean M/D. An event begins when the mean leaves the
-    bounds that a consistent filter keeps with ``probability`` at one measurement, and ends when it is back inside. A refused measurement
-    counts with the gate's threshold in place of its NIS. The first ``window`` measurements are not judged.
-
-    The mean is a sum of χ² values with weights aᵏ; its variance is 2/n with ``n = (Σ aᵏ d)²/Σ a²ᵏ d``, after a while
-    ``d (1 + a)/(1 − a) = d · window``, and its bounds are those of χ²_n/n (Satterthwaite 1946).
-
-    Parameters
-    ----------
-    window : int, default 100
-        Measurements that count in effect: a = (window − 1)/(window + 1).
-    probability : float, default 0.9999
-        Probability that the mean of a consistent filter is inside its two-sided bounds at one measurement.
-    """
-
-    window: int = 100
-    probability: float = 0.9999
-
-    def __post_init__(self) -> None:
-        """Check both."""
-        count("monitor: window", self.window, least=2)
-        _probability("monitor: probability", self.probability)
-
-    @property
-    def decay(self) -> float:
-        """The factor a by which a measurement counts less with each that follows."""
-        return (self.window - 1.0) / (self.window + 1.0)
-
-    def means(self, nis: Array, degrees: np.ndarray) -> tuple[Array, Array, Array]:
-        """Return the running mean of NIS per degree of freedom, and its bounds.
-
-        Parameters
-        ----------
-        nis : ndarray (n,)
-            NIS of each measurement, in order of time.
-        degrees : ndarray (n,)
-            Degrees of freedom of each.
-
-        Returns
-        -------
-        mean, low, high : ndarray (n,)
-            Running mean after each measurement, and its two-sided bounds, per degree of freedom.
-        """
-        from scipy.signal import lfilter
-        from scipy.special import chdtri
-
-        a = self.decay
-        total, weight = (lfilter([1.0], [1.0, -a], np.asarray(x, np.float64)) for x in (nis, degrees))
-        squares = lfilter([1.0], [1.0, -a * a], np.asarray(degrees, np.float64))
-        effective = weight**2 / squares
-        tail = 0.5 * (1.0 - self.probability)
-        return total / weight, chdtri(effective, 1.0 - tail) / effective, chdtri(effective, tail) / effective
-
-    def watch(self, time: Array, nis: Array, degrees: np.ndarray) -> list[Event]:
-        """Return an event for each stretch of measurements in which the running mean is outside its bounds.
-
-        Parameters
-        ----------
-        time : ndarray (n,)
-            s.
-        nis : ndarray (n,)
-            NIS of each measurement.
-        degrees : ndarray (n,)
-            Degrees of freedom of each.
-
-        Returns
-        -------
-        list of Event
-            Events of kind ``"divergence"``, each with the largest mean in its stretch.
-        """
-        if len(time) <= self.window:
-            return []
-        mean, low, high = self.means(nis, degrees)
-        outside = ~((mean >= low) & (mean <= high))
-        outside[: self.window] = False
-        edges = np.flatnonzero(np.diff(outside.astype(np.int8), prepend=0, append=0))
-        return [
-            Event(
-                kind="divergence",
-                start=float(time[first]),
-                end=float(time[min(last, len(time) - 1)]),
-                value=float(max(mean[first:last], key=lambda m: abs(math.log(m)) if m > 0.0 else math.inf)),
-            )
-            for first, last in edges.reshape(-1, 2)
-        ]

@@ -114,17 +114,11 @@ class Model:
 
 
 def _stack(blocks: Sequence[ErrorStates], name: str, shape: tuple[int, ...]) -> Array:
-    parts = [np.empty((0, *shape))]
-    for block in blocks:
-        if isinstance(block, ErrorStates):
-            parts.append(array(f"{block.name}: {name}", getattr(block, name), (block.size, *shape)))
-        else:
-            parts.append(np.zeros((block.size, *shape)))
-    return np.concatenate(parts)
+    return np.concatenate([array(f"{one.name}: {name}", getattr(one, name), (one.size, *shape)) for one in blocks])
 
 
 def assemble(blocks: tuple[ErrorStates, ...], kinds: Mapping[str, str]) -> Model:
-    """Return the model of blocks for the sensors named, whose kinds are given; general blocks stand there without effect."""
+    """Return the model of blocks for the sensors named, whose kinds are given."""
     if not blocks:
         return _empty(len(kinds))
     decay, density = _stack(blocks, "decay", ()), _stack(blocks, "density", ())
@@ -185,8 +179,7 @@ def _on_sensors(blocks: Sequence[ErrorStates], kinds: Mapping[str, str], states:
     names = list(kinds)
     first = 0
     for block in blocks:
-        effects = block.effects if isinstance(block, ErrorStates) else {}
-        for sensor, effect in effects.items():
+        for sensor, effect in block.effects.items():
             one_of(f"{block.name}: sensor", sensor, names)
             if kinds[sensor] == "attitude" and (effect.offset_f is not None or effect.scale is not None):
                 raise InputError(
@@ -197,7 +190,7 @@ def _on_sensors(blocks: Sequence[ErrorStates], kinds: Mapping[str, str], states:
             place = names.index(sensor), slice(first, first + block.size)
             sensors[place] = _numbers(block, effect)
             carried[place] = effect.carried
-            if effect.carried and effect.offset_f is not None and isinstance(block, ErrorStates):
+            if effect.carried and effect.offset_f is not None:
                 _check_carried(block, effect)
                 stride[first : first + block.size // 3] = block.size // 3
                 bound[place[1]] = True
@@ -251,7 +244,7 @@ def _force(blocks: tuple[ErrorStates, ...], both: np.ndarray) -> Array:
     """Return the specific force that the blocks are about, one for all."""
     if both.any():
         raise InputError(f"block state {int(np.argmax(both))} has a gyro_scale and a gyro_force; make two states of it")
-    known = [np.asarray(b.force_f, np.float64) for b in blocks if isinstance(b, ErrorStates) and np.any(b.force_f)]
+    known = [np.asarray(b.force_f, np.float64) for b in blocks if np.any(b.force_f)]
     for one in known[1:]:
         if not np.array_equal(one, known[0]):
             raise InputError(

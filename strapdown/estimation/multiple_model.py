@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 from strapdown import estimation, quaternion, records, vectors
 from strapdown.checks import Array, InputError, array, count, finite, positive
 from strapdown.estimation.forward import after, gaps, gate_options, in_order
-from strapdown.estimation.gating import Gate, Monitor, Robust
+from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.schedule import Schedule, innovations_by_sensor, joined, schedule
 from strapdown.estimation.states import (
     ProcessNoise,
@@ -110,7 +110,6 @@ def run(
     largest_share: float = LARGEST_SHARE,
     gate: Gate | None = None,
     robust: Robust | None = None,
-    monitor: Monitor | None = None,
 ) -> BankEstimate:
     """Estimate attitude and gyro bias from an unknown initial attitude.
 
@@ -145,8 +144,6 @@ def run(
     robust : Robust, optional
         Each hypothesis weighs measurements by the size of their innovations, and hypotheses are weighed by likelihoods with heavier tails.
         By itself it cannot recover where the first measurements mislead it: give a gate too.
-    monitor : Monitor, optional
-        Report when the running NIS leaves its bounds, once one hypothesis is left.
 
     Returns
     -------
@@ -162,9 +159,9 @@ def run(
     ----------
     Y. Bar-Shalom, X. R. Li, T. Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, section 11.6 (multiple models).
     """
-    check_arguments(record=record, process_noise=process_noise, gate=gate, robust=robust, monitor=monitor)
+    check_arguments(record=record, process_noise=process_noise, gate=gate, robust=robust)
     initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=1.0, bias_sigma=bias_sigma, bias=bias)  # refuses bad ones
-    count("hypotheses", hypotheses, least=8)
+    count("hypotheses", hypotheses, minimum=8)
     count("every", every)
     for name, value in (("least_weight", least_weight), ("largest_share", largest_share)):
         if not 0.0 < finite(name, value) < 1.0:
@@ -186,9 +183,7 @@ def run(
     if gate is not None and gate.restart_bias_sigma is None:
         # A restart is from as little as this one was, not from what the bank has learnt.
         gate = replace(gate, restart_bias_sigma=float(np.max(bias_sigma)))
-    after = estimation.run(
-        rest, process_noise, one, every=every, full_covariance=True, gate=gate, robust=robust, monitor=monitor
-    )
+    after = estimation.run(rest, process_noise, one, every=every, full_covariance=True, gate=gate, robust=robust)
     own = tuple(event for event in after.events if event.kind != "gap")  # those of the whole record are there already
     return replace(found, estimate=joined([found.estimate, replace(after, events=own)]))
 

@@ -8,7 +8,6 @@ filter: from the candidate's start the filter is run again up to the recovery, s
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -22,10 +21,6 @@ from strapdown.kernels.gate_rules import CANDIDATE, FIRST_BIAS, PASSES, SINCE, W
 from strapdown.kernels.machine import compiled, read_only
 from strapdown.kernels.smoother_loop import locate_edges
 from strapdown.records import Estimate, Event, ImuRecord
-
-STAMP_TOLERANCE = 1e-6
-"""Part of the mean gyro interval by which an edge may lie beyond t + lag and still count as one at t + lag."""
-
 
 MAX_CUT = 64
 """Times the segments that a record takes by its increments: a filter that takes more is lost."""
@@ -46,14 +41,6 @@ def filtered_whole(problem: Problem, options: Options) -> tuple[Estimate, Array]
                 "the filter lost its way: by the bias that it found the body turns many times round in each gyro interval; "
                 "look at the record and the start with estimation.run first"
             )
-
-
-def last_seen(time: Array, lag: float) -> np.ndarray:
-    """Return for each edge the number of the last one at or before it and ``lag``, s."""
-    slack = STAMP_TOLERANCE * (time[-1] - time[0]) / (len(time) - 1)
-    if time[0] + lag + slack >= time[-1]:
-        return np.full(len(time), len(time) - 1)
-    return np.asarray(np.searchsorted(time, time + (lag + slack), side="right") - 1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,8 +109,8 @@ class Trajectory:
     """Number of the row that starts at each stop, −1 where there is none."""
     edge: np.ndarray
     """Stops to write, in order."""
-    last: np.ndarray
-    """Stop of each from which on nothing is known."""
+    last: int
+    """Stop from which a smoother goes back; what lies after it is the filter's own."""
     row: np.ndarray
     """Edge of the record of each."""
 
@@ -148,26 +135,21 @@ Rerun = tuple[Array, np.ndarray] | None
 
 def trajectories(
     time: Array,
-    until: np.ndarray,
     breaks: Sequence[Break],
     first: np.ndarray,
     segments: np.ndarray,
     reruns: Sequence[Rerun],
 ) -> list[Trajectory]:
-    """Return the trajectories of a record with these edges, each of which sees the record up to the edge ``until``.
+    """Return the trajectories of a record with these edges.
 
     ``segments`` are the filter's, ``first`` says which of them starts at each stop, and ``reruns`` those of each break.
     """
     if not breaks:
         every = np.arange(len(time))
-        return [Trajectory(segments=segments, starts=first, edge=every, last=until, row=every)]
+        return [Trajectory(segments=segments, starts=first, edge=every, last=len(time) - 1, row=every)]
     stop = stops(time, breaks)
     place = np.searchsorted(stop, time)
-    since, end = ([-np.inf, *(getattr(one, name) for one in breaks)] for name in ("since", "end"))
-    newest = np.searchsorted(end, time[until], side="right") - 1
-    own = np.minimum(np.searchsorted(since, time, side="right") - 1, newest)
-    lost = np.array([*(one.start for one in breaks), np.inf])[own]
-    last = np.where(own == newest, place[until], np.where(time <= lost, np.searchsorted(stop, lost), place))
+    own = np.searchsorted([one.since for one in breaks], time, side="right")
     found = []
     for k in range(len(breaks) + 1):
         mine = np.flatnonzero(own == k)
@@ -181,11 +163,6 @@ def trajectories(
             at[begin:] += len(before) - 1
             at[begin - len(early) + 1 : begin] = early[:-1]
             rows = np.concatenate([before[:-1], rows])
-        found.append(Trajectory(segments=rows, starts=at, edge=place[mine], last=last[mine], row=mine))
+        last = int(np.searchsorted(stop, breaks[k].start)) if k < len(breaks) else len(stop) - 1
+        found.append(Trajectory(segments=rows, starts=at, edge=place[mine], last=last, row=mine))
     return found
-
-
-def climbing(last: np.ndarray) -> list[slice]:
-    """Return the stretches in which numbers do not fall."""
-    bounds = [0, *(np.flatnonzero(np.diff(last) < 0) + 1), len(last)]
-    return [slice(a, b) for a, b in itertools.pairwise(bounds) if b > a]

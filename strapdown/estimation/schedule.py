@@ -312,8 +312,7 @@ def joined(parts: Sequence[Estimate]) -> Estimate:
             None if values[0] is None else np.concatenate([v[k > 0 :] for k, v in enumerate(values) if v is not None])
         )
 
-    names = ["time", "attitude", "bias", "variance", "covariance"]
-    names += ["whole_covariance", "whole_bias", "whole_bias_variance", "whole_bias_covariance"]
+    names = ("time", "attitude", "bias", "variance", "covariance", "whole_covariance")
     innovations = {}
     for sensor in dict.fromkeys(name for part in parts for name in part.innovations):
         own = [part.innovations[sensor] for part in parts if sensor in part.innovations]

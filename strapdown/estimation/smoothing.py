@@ -26,7 +26,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from strapdown import kinematics, quaternion
-from strapdown.checks import Array, InputError, count, non_negative
+from strapdown.checks import Array, InputError, count
 from strapdown.estimation import forward, recovery_segments
 from strapdown.estimation import model as modelling
 from strapdown.estimation.error_states import ErrorStates
@@ -35,17 +35,12 @@ from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.memory import side_by_side
 from strapdown.estimation.recovery_segments import Break, Rerun, Trajectory
 from strapdown.estimation.states import GateMemory, ProcessNoise, State, check_arguments, covariance_matrices
-from strapdown.kernels import root_smoother, smoother_lag, smoother_loop
-from strapdown.kernels.lane_values import WIDTH
+from strapdown.kernels import root_smoother, smoother_loop
 from strapdown.kernels.machine import compiled
 from strapdown.records import Estimate, Event, ImuRecord
 
-PASSES = 16
-"""Backward passes of a fixed-lag smoother that go together and share what depends on the filter alone."""
 MIN_SMOOTHED = {"blocks": 1e-9, "factor": 1e-25}
 """Smallest smoothed variance, as a part of what one interval adds, at which backward passes in either form keep enough digits."""
-MAX_GROUPS = 3600
-"""Groups of segments of which the fixed-lag smoother keeps the gains, 5.7 kB each; where a lag takes more, it computes them anew."""
 
 
 def smooth(
@@ -54,16 +49,12 @@ def smooth(
     initial: State,
     error_states: Sequence[ErrorStates] = (),
     *,
-    lag: float = np.inf,
     full_covariance: bool = False,
     error_state_covariance: bool = True,
     gate: Gate | None = None,
     robust: Robust | None = None,
 ) -> Estimate:
     """Return the smoother's estimate at every edge of a record.
-
-    With a ``lag`` it is the fixed-lag smoother: at each edge t the estimate from the measurements up to the last edge at or before
-    t + lag, equal to the fixed-interval smoother on the record cut there. Its work grows with the number of gyro intervals in the lag.
 
     Parameters
     ----------
@@ -75,8 +66,6 @@ def smooth(
         State at the first edge before any measurement, as for :func:`strapdown.estimation.run`.
     error_states : sequence of ErrorStates
         As for :func:`strapdown.estimation.run`.
-    lag : float
-        s; 0 is the filter. Default: the whole record.
     full_covariance : bool
         Keep whole covariance matrices too.
     error_state_covariance : bool
@@ -97,8 +86,6 @@ def smooth(
     all. A record without error states whose covariance would lose its digits is smoothed on its triangular factor, which takes a dozen
     times as long.
     """
-    check_arguments(record=record, gate=gate, robust=robust)
-    lag = lag if lag == np.inf else non_negative("lag", lag, unit="s")
     problem = forward.prepared(record, process_noise, initial, error_states)
     options = Options(
         every=len(record.time),
@@ -109,11 +96,11 @@ def smooth(
     )
     if not problem.model.states:
         with contextlib.suppress(LostDigitsError):
-            estimate = _Smoother(problem, options, _BlockForm(problem)).smoothed(lag)
+            estimate = _Smoother(problem, options, _BlockForm(problem)).smoothed()
             if _digits_lost(problem, estimate, MIN_SMOOTHED["blocks"]) is None:
                 return estimate
         options = replace(options, factor=True)
-    estimate = _Smoother(problem, options, _FactorForm(problem)).smoothed(lag)
+    estimate = _Smoother(problem, options, _FactorForm(problem)).smoothed()
     lost = _digits_lost(problem, estimate, MIN_SMOOTHED["factor"])
     if lost is not None:
         raise InputError(
@@ -187,8 +174,8 @@ class _Smoother:
     options: Options
     form: _BlockForm | _FactorForm
 
-    def smoothed(self, lag: float) -> Estimate:
-        """Return the estimate with a lag, s."""
+    def smoothed(self) -> Estimate:
+        """Return the estimate at every edge."""
         record = self.problem.record
         estimate, segments = recovery_segments.filtered_whole(self.problem, self.options)
         event_time = self.problem.events.time
@@ -196,17 +183,19 @@ class _Smoother:
         breaks, reruns = self._reruns(recovered, event_time, segments) if recovered else ([], [])
         edges = len(record.time)
         outputs = self.form.outputs(edges, self.options)
-        until = recovery_segments.last_seen(record.time, lag)
         if len(segments) == edges and not breaks:  # each interval in one segment
             first = np.arange(edges)
         else:
             first = recovery_segments.starts(recovery_segments.stops(record.time, breaks), event_time, segments)
-        for one in recovery_segments.trajectories(record.time, until, breaks, first, segments, reruns):
+        for one in recovery_segments.trajectories(record.time, breaks, first, segments, reruns):
             written = outputs
             if breaks:
                 written = [np.empty((len(first) if len(out) else 0, *out.shape[1:])) for out in outputs]
-            for part in recovery_segments.climbing(one.last):
-                self.form.go_back(one, part, written)
+            smoothed = one.edge <= one.last
+            if smoothed.any():
+                self.form.go_back(one, one.edge[0], one.last, written)
+            for edge in one.edge[~smoothed]:  # the filter's own
+                self.form.go_back(one, edge, edge, written)
             if breaks:
                 for out, there in zip(outputs, written, strict=True):
                     if len(out):
@@ -294,26 +283,16 @@ class _BlockForm:
             covariance=covariance_matrices(blocks) if options.full_covariance else None,
         )
 
-    def go_back(self, one: Trajectory, part: slice, outputs: Sequence[Array]) -> None:
-        """Write the estimates of a part of a trajectory's edges, each from the last edge that it sees."""
-        segments, starts, edge, last = one.segments, one.starts, one.edge[part], one.last[part]
+    def go_back(self, one: Trajectory, first: int, last: int, outputs: Sequence[Array]) -> None:
+        """Go back from the filtered state at a stop of a trajectory to the first, and write all between."""
+        segments = one.segments
         if len(segments) < smoother_loop.FEWEST_ROWS:
             short = smoother_loop.FEWEST_ROWS - len(segments)
             segments = np.concatenate([segments, np.tile(segments[-1], (short, 1))])
-        rows = segments.reshape(-1)
-        # All that see the same edge as the last of them does are written by one pass.
-        lagged = int(np.searchsorted(last, last[-1]))
-        if lagged:
-            first, seen = edge[:lagged], last[:lagged]
-            # Eight passes at a time, which share nearly all groups with the next eight.
-            ahead = np.minimum(np.arange(lagged) + WIDTH - 1, lagged - 1)
-            groups = int(np.max(starts[seen[ahead]] - starts[first])) // WIDTH + 2
-            work = np.empty(smoother_lag.lag_work_size(min(groups, MAX_GROUPS)))
-            compiled(smoother_lag.smooth_lagged)(rows, starts, first, seen, *self.problem.variances, work, *outputs)
         compiled(smoother_loop.smooth_back)(
-            rows,
-            starts[: last[-1] + 1],
-            edge[lagged],
+            segments.reshape(-1),
+            one.starts[: last + 1],
+            first,
             *self.problem.variances,
             np.empty(smoother_loop.WORK_SIZE),
             *outputs,
@@ -339,23 +318,14 @@ class _FactorForm:
         attitude, x, variance, P = outputs
         return forward.factor_estimate(self.problem, 1, attitude, x, variance, P if options.full_covariance else None)
 
-    def go_back(self, one: Trajectory, part: slice, outputs: Sequence[Array]) -> None:
-        """Write the estimates of a part of a trajectory's edges, each from the last edge that it sees."""
+    def go_back(self, one: Trajectory, first: int, last: int, outputs: Sequence[Array]) -> None:
+        """Go back from the filtered state at a stop of a trajectory to the first, and write all between."""
         model = self.problem.model
-        edge, last = one.edge[part], one.last[part]
-        # One pass for all that see the same.
-        ends = np.append(np.flatnonzero(np.diff(last)), len(last) - 1)
-        begins = np.append(0, ends[:-1] + 1)
-        together = min(PASSES, len(ends))
         compiled(root_smoother.smooth_augmented)(
-            root_smoother.Passes(
-                segments=one.segments,
-                starts=one.starts,
-                first=edge[begins],
-                upto=edge[ends],
-                last=last[ends],
-            ),
+            one.segments,
+            one.starts[: last + 1],
+            first,
             forward.model_arrays(model, self.problem.variances),
-            root_smoother.workspace(model.states, model.noise_rows, len(model.chains), together),
+            root_smoother.workspace(model.states, model.noise_rows, len(model.chains)),
             root_smoother.Outputs(*outputs),
         )

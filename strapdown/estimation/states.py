@@ -21,7 +21,7 @@ from strapdown.checks import (
     positive,
     unit_quaternions,
 )
-from strapdown.estimation.gating import Gate, Monitor, Robust
+from strapdown.estimation.gating import Gate, Robust
 from strapdown.kernels.measurement import heading_row
 from strapdown.records import ImuRecord
 from strapdown.vectors import wahba
@@ -216,7 +216,6 @@ NEEDED = {
 OPTIONAL = {
     "gate": (Gate, "give estimation.Gate(probability=0.999), or None"),
     "robust": (Robust, "give estimation.Robust(kind='huber'), or None"),
-    "monitor": (Monitor, "give estimation.Monitor(), or None"),
 }
 """Optional arguments."""
 

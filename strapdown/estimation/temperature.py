@@ -98,5 +98,4 @@ def at_edges(estimate: Estimate, own: slice, off: Array) -> Estimate:
     """Return an estimate of a stretch with the bias at the temperatures of its edges, ``off`` K from the mean."""
     values = np.concatenate([one.values for one in estimate.error_states.values()], axis=1)[:, own]
     change = values * off[:, None]
-    whole = None if estimate.whole_bias is None else estimate.whole_bias + change
-    return replace(estimate, bias=estimate.bias + change, whole_bias=whole)
+    return replace(estimate, bias=estimate.bias + change)

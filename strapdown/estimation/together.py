@@ -186,7 +186,7 @@ def _estimate(problem: Problem, every: int, kept: Array, innovation: Array) -> E
         innovations=innovations,
         skipped=skipped_too(problem.events, innovations),
         events=tuple(gaps(problem.record.time)),
-        whole_bias=whole_bias(model, x),
-        whole_bias_variance=np.diagonal(covariance, axis1=1, axis2=2).copy(),
-        whole_bias_covariance=covariance,
+        bias=whole_bias(model, x),
+        variance=np.diagonal(covariance, axis1=1, axis2=2).copy(),
+        covariance=covariance,
     )

@@ -105,12 +105,12 @@ def existing_file(path: Name) -> None:
 
 
 @contextlib.contextmanager
-def opened(path: Name, *, link: bool = True, most: int | None = None) -> Iterator[io.BufferedReader]:
-    """Yield a regular file of at most ``most`` bytes (by default :func:`limit`), open for reading.
+def opened(path: Name, *, link: bool = True, maximum: int | None = None) -> Iterator[io.BufferedReader]:
+    """Yield a regular file of at most ``maximum`` bytes (by default :func:`limit`), open for reading.
 
     ``link`` False refuses a symbolic link: of a file that the user did not name, it could expose another file in the result.
     """
-    most = limit() if most is None else most
+    maximum = limit() if maximum is None else maximum
     if not link and Path(path).is_symlink():
         raise InputError(f"{path} is a symbolic link, which is not followed here; put the file itself there")
     try:
@@ -130,30 +130,30 @@ def opened(path: Name, *, link: bool = True, most: int | None = None) -> Iterato
             raise InputError(f"{path} is a folder; name the file in it")
         if not stat.S_ISREG(status.st_mode):
             raise InputError(f"{path} is no regular file but a pipe or a device; write its content to a file first")
-        _need_size(path, status.st_size, most)
+        _need_size(path, status.st_size, maximum)
         yield handle
 
 
-def _need_size(path: Name, size: float, most: int) -> None:
-    if size > most:
+def _need_size(path: Name, size: float, maximum: int) -> None:
+    if size > maximum:
         raise InputError(
-            f"{path} holds {size / 1e6:.4g} MB, more than the {most / 1e6:.4g} MB that may be read; if it is meant, raise the limit with "
-            f"the environment variable {LIMIT} ({limit() // 1_000_000} now)"
+            f"{path} holds {size / 1e6:.4g} MB, more than the {maximum / 1e6:.4g} MB that may be read; if it is meant, raise the limit "
+            f"with the environment variable {LIMIT} ({limit() // 1_000_000} now)"
         )
 
 
-def content(path: Name, *, link: bool = True, most: int | None = None) -> bytes:
+def content(path: Name, *, link: bool = True, maximum: int | None = None) -> bytes:
     """Return the bytes of a regular file."""
-    with from_file(path), opened(path, link=link, most=most) as handle:
-        most = limit() if most is None else most
-        found = handle.read(most + 1)
-        _need_size(path, len(found), most)  # one without a stated size (/proc), or that grows
+    with from_file(path), opened(path, link=link, maximum=maximum) as handle:
+        maximum = limit() if maximum is None else maximum
+        found = handle.read(maximum + 1)
+        _need_size(path, len(found), maximum)  # one without a stated size (/proc), or that grows
         return found
 
 
-def text(path: Name, *, link: bool = True, most: int | None = None) -> str:
+def text(path: Name, *, link: bool = True, maximum: int | None = None) -> str:
     """Return the text of a file in UTF-8."""
-    found = content(path, link=link, most=most)
+    found = content(path, link=link, maximum=maximum)
     if b"\0" in found:
         raise InputError(f"{path} cannot be read as text (it holds zero bytes); the file is damaged or of another kind")
     try:
@@ -182,7 +182,7 @@ def from_toml(content: str, place: str) -> dict[str, Any]:
 
 def toml(path: Name) -> dict[str, Any]:
     """Return the table of a TOML file."""
-    return from_toml(text(path, most=limit() // TABLE_SHARE), str(path))
+    return from_toml(text(path, maximum=limit() // TABLE_SHARE), str(path))
 
 
 def from_json(content: str, place: str) -> Any:
@@ -199,7 +199,7 @@ def from_json(content: str, place: str) -> Any:
 
 def json_file(path: Name) -> Any:
     """Return what a JSON file holds."""
-    return from_json(text(path, most=limit() // TABLE_SHARE), str(path))
+    return from_json(text(path, maximum=limit() // TABLE_SHARE), str(path))
 
 
 def npy(path: Name) -> np.ndarray[Any, Any]:

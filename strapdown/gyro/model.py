@@ -263,7 +263,7 @@ def simulate(
     ``(I + M) Δθ + ½ (b_k + b_{k+1}) dt + √(σ_v² dt + σ_u² dt³/12) n₂``: exact for any dt. A Gauss–Markov bias has its own exact
     step and bridge (:func:`strapdown.kernels.gyro_errors.markov_step`). Low-pass, saturation and rounding follow.
     """
-    stamps = increasing("edges", edges, least=2)
+    stamps = increasing("edges", edges, minimum=2)
     exact = np.ascontiguousarray(array("true_increments", true_increments, (len(stamps) - 1, 3)))
     n = len(exact)
     key = generator.integers(0, 2**64, size=2, dtype=np.uint64)
@@ -452,7 +452,7 @@ def low_pass_step(natural: float, damping: float, dt: float) -> tuple[Array, Arr
 
 def sampling(spec: GyroSpec, edges: ArrayLike, generator: np.random.Generator) -> tuple[Array, Array]:
     """Return the true sampling instants (n + 1,) and the reported stamps (n + 1,), s, for nominal edges."""
-    nominal = increasing("edges", edges, least=2)
+    nominal = increasing("edges", edges, minimum=2)
     most = 0.4 * float(np.diff(nominal).min())
     draws = generator.standard_normal((2, len(nominal)))
     true = nominal + np.clip(spec.sampling_jitter * draws[0], -most, most)
@@ -470,7 +470,7 @@ def bridge_dropped(increments: ArrayLike, edges: ArrayLike, lost: np.ndarray) ->
 
     A gap is joined to the sample after it, whose rate is held throughout; lost samples at the end are cut off.
     """
-    stamps = increasing("edges", edges, least=2)
+    stamps = increasing("edges", edges, minimum=2)
     turns = array("increments", increments, (len(stamps) - 1, 3))
     if np.all(lost):
         raise InputError("all samples are lost; lower drop_probability")

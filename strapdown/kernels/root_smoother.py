@@ -7,7 +7,7 @@ squares: no difference is formed, and what has no noise is not touched. As in :m
 carried to the tangent space at the predicted attitude before the step, and the result to that at the smoothed one after it; so are
 states that go along with the attitude.
 
-What depends on the filter alone, Φ, N, ``Y S⁻⁻¹`` and ``Z N``, is prepared once for all passes that meet a segment (:func:`prepare_step`).
+What depends on the filter alone is Φ, N, ``Y S⁻⁻¹`` and ``Z N`` (:func:`prepare_step`).
 Compiled by :func:`strapdown.kernels.machine.compiled`.
 """
 
@@ -39,21 +39,8 @@ CALLED = ("load_segment",)
 _FIRST = np.repeat([1.0, 0.0], WIDTH)
 
 
-class Passes(NamedTuple):
-    """Backward passes: pass p goes from the filtered state at edge ``last[p]`` down and writes edges ``upto[p]`` to ``first[p]``."""
-
-    segments: np.ndarray
-    """The filter's rows, the last one the end state."""
-    starts: np.ndarray
-    """Row that starts at each edge."""
-    first: np.ndarray
-    upto: np.ndarray
-    last: np.ndarray
-    """From pass to pass ``last`` does not fall and ``upto`` stays below the next ``first``."""
-
-
 class Workspace(NamedTuple):
-    """Scratch of n states, p rows of noise and several passes that go together; columns are :func:`strapdown.kernels.triangle.padded`."""
+    """Scratch of n states and p rows of noise; columns are :func:`strapdown.kernels.triangle.padded`."""
 
     links: np.ndarray
     x: np.ndarray
@@ -70,10 +57,10 @@ class Workspace(NamedTuple):
     """(2, n, 4): Φ and Q of a segment, as in :class:`strapdown.kernels.root_form.Scratch`."""
     factor: np.ndarray
     work: np.ndarray
-    later_q: np.ndarray
-    """Of each pass, what is known at the end of the segment: attitude (4,), x (n − 3,), and the triangle (n + p + 4, columns for n)."""
     later_x: np.ndarray
+    """(n − 3,), as it is known at the end of the segment."""
     later_F: np.ndarray
+    """(n + p + 4, columns for n), the triangle of the covariance there."""
 
 
 class Outputs(NamedTuple):
@@ -86,8 +73,8 @@ class Outputs(NamedTuple):
     """(edges, m, m), of the first m states, or (0, m, m)."""
 
 
-def workspace(states, rows, chained, together):
-    """Return room for so many error states, rows of noise and passes at once."""
+def workspace(states, rows, chained):
+    """Return room for so many error states, rows of noise and links of chains."""
     size = 6 + states
     width = padded(size)
     both = width + padded(rows)
@@ -101,9 +88,8 @@ def workspace(states, rows, chained, together):
         step=np.zeros((2, size, 4)),
         factor=np.empty(states),
         work=np.zeros(both),
-        later_q=np.empty((together, 4)),
-        later_x=np.empty((together, size - 3)),
-        later_F=np.zeros((together, size + rows + 4, width)),
+        later_x=np.empty(size - 3),
+        later_F=np.zeros((size + rows + 4, width)),
     )
 
 
@@ -126,7 +112,7 @@ def load_segment(segments, k, x, F, loose):
 
 
 def prepare_step(segments, j, model, space):
-    """Prepare what segment j makes of any later knowledge; return the predicted attitude, Φ11 and the rows of F in use.
+    """Prepare what segment j makes of any later estimate; return the predicted attitude, Φ11 and the rows of F in use.
 
     Leaves ``noise``, ``gain``, ``left`` and ``x`` of the work space, and Φ's own numbers there.
     """
@@ -175,14 +161,11 @@ def prepare_step(segments, j, model, space):
     return predicted, phi11, rows
 
 
-def step_back(segments, j, prepared, model, space, pass_, later_q):
-    """Take what a pass knows at the end of segment j, ``prepared`` by :func:`prepare_step`, to its start; return the attitude.
-
-    The pass's ``later_x`` and ``later_F`` are left there.
-    """
-    predicted, phi11, rows = prepared
+def step_back(segments, j, model, space, later_q):
+    """Take what is known at the end of segment j to its start; return the attitude. ``later_x`` and ``later_F`` are left there."""
+    predicted, phi11, rows = prepare_step(segments, j, model, space)
     x, noise, gain, left, work = space.x, space.noise, space.gain, space.left, space.work
-    later_x, later_F = space.later_x[pass_], space.later_F[pass_]
+    later_x, later_F = space.later_x, space.later_F
     chains, changing = model.chains, model.changing
     size = len(x) + 3
     noisy = 6 + changing
@@ -231,38 +214,32 @@ def step_back(segments, j, prepared, model, space, pass_, later_q):
     return q
 
 
-def smooth_augmented(passes, model, space, out):
-    """Run backward passes. As many go together as the work space has room for, and share what is prepared of a segment."""
-    segments, starts, first, upto, last = passes
-    later_q, later_x, later_F = space.later_q, space.later_x, space.later_F
+def smooth_augmented(segments, starts, first, model, space, out):
+    """Go back from the filtered state at the last edge to edge ``first``, and write all between.
+
+    Parameters
+    ----------
+    segments : array (rows, 5 + n + numbers of the factor)
+        The filter's rows, the last one the end state.
+    starts : array (edges,)
+        Row that starts at each edge.
+    first : int
+    model : strapdown.kernels.root_form.Model
+    space : Workspace
+    out : Outputs
+    """
     size = len(space.x) + 3
-    together = len(later_q)
-    for begin in range(0, len(first), together):
-        number = min(together, len(first) - begin)
-        joining = number - 1
-        leaving = number - 1
-        edge = upto[begin + leaving]
-        s = starts[last[begin + joining]]
-        while True:
-            while joining >= 0 and starts[last[begin + joining]] == s:
-                q = load_segment(segments, s, later_x[joining], later_F[joining], loose(model))
-                later_q[joining, 0], later_q[joining, 1], later_q[joining, 2], later_q[joining, 3] = q
-                joining -= 1
-            while leaving >= 0 and starts[edge] == s:
-                write_smoothed(out, edge, later_q[leaving], later_x[leaving], later_F[leaving], size, space.work)
-                if edge > first[begin + leaving]:
-                    edge -= 1
-                else:
-                    leaving -= 1
-                    edge = upto[begin + max(leaving, 0)]
-            if leaving < 0:
-                break
-            s -= 1
-            prepared = prepare_step(segments, s, model, space)
-            for i in range(joining + 1, leaving + 1):
-                q = (later_q[i, 0], later_q[i, 1], later_q[i, 2], later_q[i, 3])
-                q = step_back(segments, s, prepared, model, space, i, q)
-                later_q[i, 0], later_q[i, 1], later_q[i, 2], later_q[i, 3] = q
+    edge = len(starts) - 1
+    s = starts[edge]
+    q = load_segment(segments, s, space.later_x, space.later_F, loose(model))
+    while True:
+        while edge >= first and starts[edge] == s:
+            write_smoothed(out, edge, q, space.later_x, space.later_F, size, space.work)
+            edge -= 1
+        if edge < first:
+            break
+        s -= 1
+        q = step_back(segments, s, model, space, q)
 
 
 def write_smoothed(out, edge, q, x, F, size, work):

@@ -100,7 +100,7 @@ def replay(plan: Plan, run: int, *, machine: str = "auto") -> Replay:
     Replay
         Record, initial state and estimate.
     """
-    found: Replay = machine_named(choose(plan, machine).machine).replay(plan, count("run", run, least=0))
+    found: Replay = machine_named(choose(plan, machine).machine).replay(plan, count("run", run, minimum=0))
     spec = scalar.dispersed(plan.scenario.gyro, plan.dispersions, plan.seed, run)
     of_this_run = plan.scenario
     if spec is not plan.scenario.gyro:  # dispersed, and so no preset any more

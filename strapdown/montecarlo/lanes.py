@@ -497,7 +497,7 @@ def _example(kept: Array, truth: Array) -> tuple[Array, Array]:
 
 def replay(plan: Plan, run: int, *, width: int = 1) -> Replay:
     """Return one run in full detail, bitwise what it is among the others."""
-    number = count("run", run, least=0)
+    number = count("run", run, minimum=0)
     group = _Group(plan, width, every=1, detail=True)
     group.advance(number)
     prepared = group.prepared

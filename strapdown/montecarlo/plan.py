@@ -151,7 +151,7 @@ class Plan:
     def __post_init__(self) -> None:
         """Check every field."""
         for name, least in (("seed", 0), ("epochs", 1), ("nis_bins", 1)):
-            object.__setattr__(self, name, count(name, getattr(self, name), least=least))
+            object.__setattr__(self, name, count(name, getattr(self, name), minimum=least))
         one_of("precision", self.precision, PRECISIONS)
         if self.samples % (self.epochs * self.setup.integration.samples):
             raise InputError(

@@ -124,7 +124,7 @@ _SCENARIOS: weakref.WeakKeyDictionary[Plan, Scenario] = weakref.WeakKeyDictionar
 
 def replay(plan: Plan, run: int) -> Replay:
     """Return one run of a plan in full detail."""
-    number = count("run", run, least=0)
+    number = count("run", run, minimum=0)
     record = record_of(plan, number)
     initial = start(record, plan.setup, plan.seed, number, plan.dispersions)
     (estimate,) = _estimates(plan, [record], [initial], every=1)

@@ -44,7 +44,7 @@ def summary(
 ) -> dict[str, Any]:
     """Return verdict and numbers: ANEES and NIS per degree of freedom, coverage, errors, worst runs; units in the names.
 
-    The bounds are those that decide (:func:`strapdown.consistency.judge_runs`): all its tests together reject a consistent filter with at
+    The bounds are those that decide (:meth:`Statistics.judge`): all its tests together reject a consistent filter with at
     most 1 − ``probability``.
 
     Parameters
@@ -65,7 +65,7 @@ def summary(
     """
     chosen = judged_epochs(len(statistics.time) - 1) if epochs is None else epochs
     seen = [i for i in range(len(statistics.sensors)) if statistics.sensor_degrees[i].sum() > 0]
-    judgement = consistency.judge_runs(statistics, epochs=chosen, probability=probability)
+    judgement = statistics.judge(epochs=chosen, probability=probability)
     found = {(one.name, one.of): one for one in judgement.findings}
     nees = {}
     for subset in statistics.subsets:

@@ -19,7 +19,7 @@ def times(time: ArrayLike) -> Array:
 
 def edge_stamps(edges: ArrayLike) -> Array:
     """Return the edges (n + 1,) of n ≥ 1 intervals, s, increasing."""
-    return checks.increasing("edges", edges, least=2)
+    return checks.increasing("edges", edges, minimum=2)
 
 
 def store_number(motion: object, name: str, unit: str) -> float:

@@ -48,7 +48,7 @@ class SampledAttitude:
             raise checks.InputError(f"degree is {self.degree!r}; it must be 3 or 5")
         checks.one_of("ends", self.ends, ("free", "rest"))
         least = self.degree + 1 if self.ends == "free" else 2
-        time = checks.increasing("time", self.time, least=least).copy()
+        time = checks.increasing("time", self.time, minimum=least).copy()
         samples = checks.unit_quaternions("attitudes", checks.array("attitudes", self.attitudes, ("n", 4)))
         if len(samples) != len(time):
             raise checks.InputError(f"attitudes has {len(samples)} rows for {len(time)} stamps; give one a stamp")

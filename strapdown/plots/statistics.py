@@ -12,7 +12,7 @@ from matplotlib.patches import Ellipse
 from matplotlib.ticker import LogFormatter
 
 from strapdown.checks import Array
-from strapdown.consistency import judge_runs, mean_bounds
+from strapdown.consistency import mean_bounds
 from strapdown.montecarlo import Statistics
 from strapdown.montecarlo.statistics import COVERED, judged_epochs
 from strapdown.plots.style import (
@@ -121,7 +121,7 @@ def runs_overview(statistics: Statistics, probability: float = 0.99) -> Figure:
     """Draw ANEES of attitude and bias, and the NIS, over time, with the bounds of a consistent filter; dots are the epochs judged."""
     figure, axes = new_figure(1, 3, size=(12.0, 4.2))
     axes[1].set_visible(statistics.has_bias)
-    findings = judge_runs(statistics, probability=probability).findings
+    findings = statistics.judge(probability=probability).findings
     judged = judged_epochs(len(statistics.time) - 1)
     label = f"{100 * probability:g} % bounds, all tests together"
     low, high = np.nanmin(statistics.anees), np.nanmax(statistics.anees)

@@ -4,7 +4,6 @@ A recording holds point samples of rate, specific force and magnetic field of a 
 estimates attitude from it.
 
 - ``formats``: The table of formats, :func:`read` by content, :func:`write` by ending.
-- ``recording``: :class:`Recording` and its units.
 - ``body_axes``: Axes and signs that are not the package's: :func:`with_axes`.
 - ``columns``, ``delimited``, ``dataframes``: Tables: roles of columns; CSV and TSV; Parquet, pandas and xarray.
 - ``ros``: ROS bags.
@@ -33,16 +32,16 @@ from strapdown.recordings.formats import is_estimate as is_estimate
 from strapdown.recordings.formats import is_record as is_record
 from strapdown.recordings.formats import not_held as not_held
 from strapdown.recordings.formats import writers as writers
-from strapdown.recordings.recording import FORCE_UNITS as FORCE_UNITS
-from strapdown.recordings.recording import RATE_UNITS as RATE_UNITS
-from strapdown.recordings.recording import TIME_UNITS as TIME_UNITS
-from strapdown.recordings.recording import Recording
-from strapdown.recordings.recording import gaps as gaps
-from strapdown.recordings.recording import increments as increments
 from strapdown.recordings.samples import GyroSamples, read_samples
 from strapdown.recordings.samples import samples_of as samples_of
 from strapdown.recordings.trajectories import read_tum as read_tum
 from strapdown.recordings.trajectories import with_reference as with_reference
+from strapdown.records.recording import FORCE_UNITS as FORCE_UNITS
+from strapdown.records.recording import RATE_UNITS as RATE_UNITS
+from strapdown.records.recording import TIME_UNITS as TIME_UNITS
+from strapdown.records.recording import Recording
+from strapdown.records.recording import gaps as gaps
+from strapdown.records.recording import increments as increments
 
 __all__ = [
     "FORMATS",

@@ -13,7 +13,7 @@ import numpy as np
 
 from strapdown import quaternion
 from strapdown.checks import Array, InputError, one_of
-from strapdown.recordings.recording import Recording
+from strapdown.records.recording import Recording
 
 SENSORS = {"gyro": "rate", "accelerometer": "specific_force", "magnetometer": "magnetic_field"}
 """Sensors of a recording, and their columns."""

@@ -15,7 +15,7 @@ import numpy as np
 from strapdown.checks import InputError, positive
 from strapdown.files import reading, whole_hdf5, written_beside
 from strapdown.recordings import recordfiles
-from strapdown.recordings.recording import MAGNETIC_UNITS, Recording, with_gyro
+from strapdown.records.recording import MAGNETIC_UNITS, Recording, with_gyro
 
 
 def read_broad(path: str | os.PathLike[str]) -> Recording:

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from strapdown.checks import Array, InputError, known_keys, one_of
-from strapdown.recordings.recording import (
+from strapdown.records.recording import (
     CLOCK_OFFSET,
     FORCE_UNITS,
     MAGNETIC_UNITS,

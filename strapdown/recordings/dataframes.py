@@ -20,7 +20,7 @@ from strapdown.files import written_beside
 from strapdown.recordings import columns as naming
 from strapdown.recordings.delimited import recording_columns
 from strapdown.recordings.extras import library
-from strapdown.recordings.recording import CLOCK_OFFSET, Recording, relative_time
+from strapdown.records.recording import CLOCK_OFFSET, Recording, relative_time
 
 
 def from_table(

@@ -29,7 +29,7 @@ from strapdown.checks import Array, InputError
 from strapdown.files import reading, written_beside
 from strapdown.recordings import columns as naming
 from strapdown.recordings import recordfiles
-from strapdown.recordings.recording import CLOCK_OFFSET, Recording
+from strapdown.records.recording import CLOCK_OFFSET, Recording
 
 SEPARATORS = ",;\t|"
 _LARGE = 10**15

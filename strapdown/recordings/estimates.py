@@ -1,4 +1,4 @@
-"""Estimates in files: CSV and TSV, Parquet, TUM, HDF5, Rerun. What the columns are: :func:`strapdown.records.outputs.table`."""
+"""Estimates in files: CSV and TSV, Parquet, TUM, HDF5, Rerun. What the columns are: :meth:`strapdown.records.Estimate.table`."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from strapdown.files import written_beside
 from strapdown.recordings.dataframes import write_parquet_columns
 from strapdown.recordings.delimited import write_columns
 from strapdown.recordings.extras import library
-from strapdown.recordings.recording import Recording
-from strapdown.records import Estimate, outputs
+from strapdown.records import Estimate
 from strapdown.records import write_estimate as write_result
+from strapdown.records.recording import Recording
 from strapdown.units import DEGREE
 
 
 def write_csv(
     estimate: Estimate, path: str | os.PathLike[str], *, recording: Recording | None = None, **options: Any
 ) -> None:
-    """Write an estimate as a table of text; ``sequence`` and ``frame`` as :func:`strapdown.records.outputs.table` takes them."""
-    write_columns(path, outputs.table(estimate, recording=recording, **options))
+    """Write an estimate as a table of text; ``sequence`` and ``frame`` as :meth:`strapdown.records.Estimate.table` takes them."""
+    write_columns(path, estimate.table(recording=recording, **options))
 
 
 def write_parquet(
     estimate: Estimate, path: str | os.PathLike[str], *, recording: Recording | None = None, **options: Any
 ) -> None:
-    """Write an estimate as Parquet; ``sequence`` and ``frame`` as :func:`strapdown.records.outputs.table` takes them."""
-    write_parquet_columns(path, outputs.table(estimate, recording=recording, **options))
+    """Write an estimate as Parquet; ``sequence`` and ``frame`` as :meth:`strapdown.records.Estimate.table` takes them."""
+    write_parquet_columns(path, estimate.table(recording=recording, **options))
 
 
 def write_hdf5(estimate: Estimate, path: str | os.PathLike[str], *, recording: Recording | None = None) -> None:
@@ -42,7 +42,7 @@ def write_tum(
     estimate: Estimate, path: str | os.PathLike[str], *, recording: Recording | None = None, frame: str = "ENU"
 ) -> None:
     """Write attitudes as a TUM trajectory: ``time tx ty tz qx qy qz qw``, s of the recording's clock, positions zero."""
-    found = outputs.table(estimate, frame=frame)
+    found = estimate.table(frame=frame)
     q = np.stack([found[name] for name in ("qx", "qy", "qz", "qw")], axis=1)
     stamps = np.rint(estimate.time * 1e9).astype(np.int64) + (0 if recording is None else recording.epoch_ns)
     with written_beside(path) as temporary, open(temporary, "w", encoding="utf-8") as file:
@@ -59,7 +59,7 @@ def write_rerun(estimate: Estimate, path: str | os.PathLike[str], *, recording: 
     ``angles``, ``bias`` (°/h) with ±3σ, ``innovations/SENSOR`` with ±3σ of their own, and ``rate`` without the bias, °/s, are curves.
     """
     rr = library("rerun", f"writing {Path(path).name}", "rerun")
-    found = outputs.table(estimate)
+    found = estimate.table()
     with written_beside(path) as temporary:
         stream = rr.RecordingStream("strapdown")
         stream.save(str(temporary))
@@ -100,7 +100,7 @@ def write_rerun(estimate: Estimate, path: str | os.PathLike[str], *, recording: 
 
 def _log_samples(rr: Any, stream: Any, time: Any, recording: Recording, estimate: Estimate) -> None:
     """Log what a recording holds at the estimate's times."""
-    rows = outputs.rows_of(estimate, recording)
+    rows = recording.rows_of(estimate.time)
     rate = (recording.rate[rows] - estimate.bias) / DEGREE
     for k, axis in enumerate("xyz"):
         stream.send_columns(f"rate/{axis}", indexes=time, columns=rr.Scalars.columns(scalars=rate[:, k]))

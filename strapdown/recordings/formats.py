@@ -19,8 +19,8 @@ from strapdown.checks import InputError
 from strapdown.files import reading
 from strapdown.recordings import recordfiles, ros, telemetry, trajectories
 from strapdown.recordings.body_axes import with_axes
-from strapdown.recordings.recording import Recording, with_gyro
 from strapdown.records import Estimate, ImuRecord
+from strapdown.records.recording import Recording, with_gyro
 
 HEAD = 4096
 """Bytes of a file that its format is recognised by."""

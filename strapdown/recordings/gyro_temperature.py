@@ -8,7 +8,7 @@ import numpy as np
 
 from strapdown.checks import Array, InputError
 from strapdown.gyro.temperature import BiasOverTemperature
-from strapdown.recordings.recording import Recording
+from strapdown.records.recording import Recording
 
 
 def temperature_at_samples(recording: Recording) -> Array:

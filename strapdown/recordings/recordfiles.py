@@ -6,12 +6,13 @@ seed, units, conventions and version. CSV holds the gyro in one file, and each v
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import json
 import os
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,6 @@ import strapdown
 from strapdown import gyro
 from strapdown.checks import Array, InputError, count, known_keys
 from strapdown.files import reading, set_attributes, written_beside
-from strapdown.gyro import GyroSpec
 from strapdown.records import CONVENTIONS, ImuRecord, Origin, Truth, put, result_file
 from strapdown.vectors import KINDS, VectorMeasurements
 
@@ -30,50 +30,6 @@ KIND = "strapdown record"
 
 FORMAT = 1
 """Version of the layout; a reader refuses a newer one."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class RecordFile:
-    """A record and how it was made, as its file states.
-
-    Parameters
-    ----------
-    record : ImuRecord
-        The record.
-    gyro : GyroSpec, optional
-        Specification of the gyro that it was simulated with.
-    scenario : str, default ""
-        The scenario, as TOML.
-    seed : int, optional
-        Seed of the random streams.
-    run : int, optional
-        Run of the random streams.
-    version : str, default that of the running package
-        Version of the package that wrote it.
-    attributes : mapping of str, default empty
-        Further attributes, numbers and texts.
-    """
-
-    record: ImuRecord
-    gyro: GyroSpec | None = None
-    scenario: str = ""
-    seed: int | None = None
-    run: int | None = None
-    version: str = strapdown.__version__
-    attributes: Mapping[str, Any] = field(default_factory=dict)
-
-    def with_origin(self, place: str = "record") -> ImuRecord:
-        """Return the record with its origin, the scenario read from its TOML; ``place`` is named where that cannot be."""
-        if self.gyro is None and not self.scenario:
-            return self.record
-        from strapdown.scenarios import scenario_from_toml  # and every motion
-
-        scenario = scenario_from_toml(self.scenario, f"{place}: scenario") if self.scenario else None
-        spec = scenario.gyro if self.gyro is None and scenario is not None else self.gyro
-        origin = Origin(gyro=spec, scenario=scenario, seed=self.seed, run=self.run)
-        return replace(self.record, origin=origin)
-
-
 _SERIES = {
     "time": "s",
     "vector_b": "1 (kind vector: the unit of sigma)",
@@ -88,31 +44,22 @@ _RESERVED = ("kind", "format", "version", "conventions", "gyro", "scenario", "se
 
 
 def write_record(
-    path: str | os.PathLike[str],
-    record: ImuRecord,
-    *,
-    gyro_spec: GyroSpec | None = None,
-    scenario: str = "",
-    seed: int | None = None,
-    run: int | None = None,
-    attributes: Mapping[str, Any] | None = None,
+    path: str | os.PathLike[str], record: ImuRecord, *, attributes: Mapping[str, Any] | None = None
 ) -> None:
-    """Write a record to HDF5, with how it was made; the file appears whole or not at all.
+    """Write a record to HDF5, with its origin; the file appears whole or not at all.
 
-    ``scenario`` is TOML (:func:`strapdown.scenarios.scenario_to_toml`), ``attributes`` are further ones of the file.
+    A scenario of which a part is a Python function or class of your own has no form in a file and is left out. ``attributes`` are further
+    ones of the file.
     """
     for name in attributes or {}:
         if name in _RESERVED:
             raise InputError(f"attributes holds {name!r}, which the file has already; choose another name")
     with result_file(path, "record", {"format": FORMAT}) as file:
         made = {
-            "gyro": None if gyro_spec is None else json.dumps(gyro.to_table(gyro_spec)),
-            "scenario": scenario or None,
-            "seed": seed,
-            "run": run,
-            **(attributes or {}),
+            name: json.dumps(value) if name == "gyro" else value
+            for name, value in origin_attributes(record.origin).items()
         }
-        set_attributes(file, {name: value for name, value in made.items() if value is not None})
+        set_attributes(file, {**made, **(attributes or {})})
         put(file, "time", record.time, "s", "edges of the sample intervals, one more than there are increments")
         put(
             file,
@@ -152,12 +99,7 @@ def _begins(path: str | os.PathLike[str], mark: bytes) -> bool:
 
 
 def read_record(path: str | os.PathLike[str]) -> ImuRecord:
-    """Read the record of a file written by :func:`write_record` or :func:`export_csv`."""
-    return read_record_file(path).record
-
-
-def read_record_file(path: str | os.PathLike[str]) -> RecordFile:
-    """Read a file written by :func:`write_record` or :func:`export_csv` with all that it holds.
+    """Read the record of a file written by :func:`write_record` or :func:`export_csv`, with its origin.
 
     Measurements of NaN are missing. An increment must not be NaN: the rotation over an interval without one is unknown. If a row of a CSV
     is left out, the next one must hold the rotation over both intervals.
@@ -185,33 +127,48 @@ def read_record_file(path: str | os.PathLike[str]) -> RecordFile:
         truth = None
         if "truth" in file:
             truth = Truth(attitude=_values(file, "truth/attitude", "1"), bias=_values(file, "truth/bias", "rad/s"))
-        record = ImuRecord(
+        return ImuRecord(
             time=_values(file, "time", "s"),
             increments=_values(file, "increments", "rad"),
             vectors=series,
             truth=truth,
+            origin=_origin(attributes, path),
             temperature=_values(file, "temperature", "degC") if "temperature" in file else None,
         )
-        more = {name: value for name, value in attributes.items() if name not in _RESERVED}
-        return RecordFile(
-            record=record, version=str(attributes["version"]), attributes=more, **_making(attributes, path)
-        )
 
 
-def _making(attributes: Mapping[str, Any], path: str | os.PathLike[str]) -> dict[str, Any]:
+def origin_attributes(origin: Origin | None) -> dict[str, Any]:
+    """Return the origin of a record as values for a file, as far as it is known."""
+    if origin is None:
+        return {}
+    scenario = None
+    if origin.scenario is not None:
+        from strapdown.scenarios import scenario_to_toml  # and every motion
+
+        with contextlib.suppress(InputError):
+            scenario = scenario_to_toml(origin.scenario)
+    spec = None if origin.gyro is None else gyro.to_table(origin.gyro)
+    made = {"gyro": spec, "scenario": scenario, "seed": origin.seed, "run": origin.run}
+    return {name: value for name, value in made.items() if value is not None}
+
+
+def _origin(attributes: Mapping[str, Any], path: str | os.PathLike[str]) -> Origin | None:
     """Return how a record was made, as its file states."""
     made: dict[str, Any] = {
-        name: count(name, attributes[name], least=0) for name in ("seed", "run") if name in attributes
+        name: count(name, attributes[name], minimum=0) for name in ("seed", "run") if name in attributes
     }
+    if "scenario" in attributes:
+        from strapdown.scenarios import scenario_from_toml
+
+        if not isinstance(attributes["scenario"], str):
+            raise InputError(f"{path}: scenario is {attributes['scenario']!r}; it must be TOML text")
+        made["scenario"] = scenario_from_toml(attributes["scenario"], f"{path}: scenario")
+        made["gyro"] = made["scenario"].gyro
     if "gyro" in attributes:
         table = attributes["gyro"]
         table = reading.from_json(table, f"{path}: gyro") if isinstance(table, str) else table
         made["gyro"] = gyro.from_table(table, f"{path}: gyro")
-    if "scenario" in attributes:
-        if not isinstance(attributes["scenario"], str):
-            raise InputError(f"{path}: scenario is {attributes['scenario']!r}; it must be TOML text")
-        made["scenario"] = attributes["scenario"]
-    return made
+    return Origin(**made) if made else None
 
 
 def _values(group: Any, name: str, unit: str) -> Array:
@@ -248,15 +205,7 @@ _MARK = "# strapdown"
 _COUNTED, _MADE = " vector series", "; made by "
 
 
-def export_csv(
-    path: str | os.PathLike[str],
-    record: ImuRecord,
-    *,
-    gyro_spec: GyroSpec | None = None,
-    scenario: str = "",
-    seed: int | None = None,
-    run: int | None = None,
-) -> tuple[Path, ...]:
+def export_csv(path: str | os.PathLike[str], record: ImuRecord) -> tuple[Path, ...]:
     """Write a record as CSV, 17 digits per number; return the files written, the record first.
 
     ``path`` holds one row per edge: its time, the increment of the interval that ends there (NaN in the first row), and the truth if there
@@ -283,11 +232,7 @@ def export_csv(
         f"{_MARK} record, version {strapdown.__version__}, to {record.time[-1]:.17g} s, {len(record.vectors)}{_COUNTED}; "
         f"{CONVENTIONS}"
     )
-    made: dict[str, Any] = {
-        "gyro": None if gyro_spec is None else gyro.to_table(gyro_spec),
-        "scenario": scenario or None,
-    }
-    made = {name: value for name, value in {**made, "seed": seed, "run": run}.items() if value is not None}
+    made = origin_attributes(record.origin)
     if made:
         comment += f"{_MADE}{json.dumps(made)}"
     written = [target]
@@ -332,7 +277,7 @@ def _write_csv(path: Path, comment: str, names: tuple[str, ...], rows: Array) ->
         np.savetxt(file, rows, delimiter=",", fmt="%.17g")
 
 
-def _read_csv_record(target: Path) -> RecordFile:
+def _read_csv_record(target: Path) -> ImuRecord:
     comment, names, rows = _read_csv(target)
     if not comment.startswith(f"{_MARK} record"):
         raise InputError(f"{target} does not begin with '{_MARK} record'; it is not a record written by export_csv")
@@ -356,11 +301,11 @@ def _read_csv_record(target: Path) -> RecordFile:
     end = re.search(r", to (\S+) s,", comment)
     _need_end(target, rows, float(end[1]) if end else rows[-1, 0])
     if not made:
-        return RecordFile(record=record)
+        return record
     try:
         own = reading.from_json(made, f"{target}, line 1")
         known_keys(f"{target}, line 1", own, ("gyro", "scenario", "seed", "run"))
-        return RecordFile(record=record, **_making(own, target))
+        return replace(record, origin=_origin(own, target))
     except (InputError, TypeError) as error:
         raise InputError(
             f"{target}, line 1: how it was made cannot be read ({error}); take '{_MADE.strip()} …' away"

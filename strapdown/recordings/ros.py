@@ -35,8 +35,8 @@ from strapdown import quaternion
 from strapdown.checks import Array, InputError, one_of
 from strapdown.files import reading
 from strapdown.recordings.extras import library, with_ending
-from strapdown.recordings.recording import MAGNETIC_UNITS, Recording, at_nearest, relative_time, with_gyro
 from strapdown.records import Estimate
+from strapdown.records.recording import MAGNETIC_UNITS, Recording, at_nearest, relative_time, with_gyro
 
 IMU, FIELD, TEMPERATURE, REFERENCE = (
     "sensor_msgs/msg/Imu",

@@ -15,8 +15,8 @@ from strapdown.recordings import formats, recordfiles
 from strapdown.recordings.broad import sample_interval
 from strapdown.recordings.columns import SENSORS, UNITS
 from strapdown.recordings.gyro_temperature import temperature_at_samples
-from strapdown.recordings.recording import GAP, Recording
 from strapdown.records import ImuRecord
+from strapdown.records.recording import GAP, Recording
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

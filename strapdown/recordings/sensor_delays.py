@@ -14,7 +14,7 @@ from strapdown import coning, quaternion
 from strapdown.checks import Array, InputError, non_negative
 from strapdown.kernels import recording_steps
 from strapdown.kernels.machine import compiled, read_only
-from strapdown.recordings.recording import Recording, increments, sampled
+from strapdown.records.recording import Recording, increments, sampled
 
 FIELD_SPAN = 0.2
 """Span over which the change of the field, turned back by the gyro, shows the magnetometer's delay, s."""

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from strapdown.checks import Array
-from strapdown.recordings.recording import Recording
+from strapdown.records.recording import Recording
 from strapdown.units import DEGREE
 
 SLOW_RATE = 0.03

@@ -18,7 +18,7 @@ import numpy as np
 from strapdown.checks import Array, InputError
 from strapdown.files import reading
 from strapdown.recordings.extras import library, with_ending
-from strapdown.recordings.recording import Recording, with_gyro
+from strapdown.records.recording import Recording, with_gyro
 from strapdown.units import DEGREE
 
 ENDINGS = (".gcsv", ".bbl", ".bfl", ".bin", ".mp4", ".mov", ".insv", ".braw", ".r3d")

@@ -26,7 +26,7 @@ from strapdown import quaternion
 from strapdown.checks import Array, InputError
 from strapdown.files import reading
 from strapdown.recordings.delimited import read_csv
-from strapdown.recordings.recording import Recording
+from strapdown.records.recording import Recording
 
 TRUTHS = ("state_groundtruth_estimate0", "mocap0")
 BRIDGED = 0.1

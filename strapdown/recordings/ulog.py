@@ -25,9 +25,9 @@ from strapdown import quaternion
 from strapdown.checks import Array, InputError, one_of
 from strapdown.files import reading, written_beside
 from strapdown.recordings.extras import library
-from strapdown.recordings.recording import MAGNETIC_UNITS, Recording, at_nearest, relative_time, with_gyro
 from strapdown.recordings.trajectories import interpolated
 from strapdown.records import outputs
+from strapdown.records.recording import MAGNETIC_UNITS, Recording, at_nearest, relative_time, with_gyro
 
 UNIT, FIELD, ATTITUDE = "sensor_combined", "vehicle_magnetometer", "vehicle_attitude"
 NO_SAMPLE = 0x7FFFFFFF

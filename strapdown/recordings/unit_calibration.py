@@ -14,8 +14,8 @@ import numpy as np
 
 from strapdown.checks import Array, InputError, array, finite, known_keys, non_negative
 from strapdown.files import tables
-from strapdown.recordings.recording import Recording
 from strapdown.records import ErrorStateEstimate
+from strapdown.records.recording import Recording
 
 __all__ = [
     "UnitCalibration",

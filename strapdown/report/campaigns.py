@@ -25,7 +25,7 @@ def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
     statistics = held.statistics
     if statistics is None:
         raise InputError(f"{path} holds no finished run yet; let the campaign go on (--resume) and report then")
-    judgement = consistency.judge_runs(statistics, probability=probability, unmodelled=held.plan.unmodelled)
+    judgement = statistics.judge(probability=probability, unmodelled=held.plan.unmodelled)
     bound = verdicts.bound_of(held.plan)
     name = held.plan.scenario.name or "a scenario"
     unfinished = "" if held.finished else f"; not finished: {statistics.runs} of {held.runs} runs"

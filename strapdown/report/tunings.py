@@ -246,7 +246,7 @@ def _image(stem: Path, caption: str) -> str:
     for suffix, (kind, first) in _KINDS.items():
         path = stem.with_name(f"{stem.name}.{suffix}")
         if path.exists():
-            found = reading.content(path, link=False, most=LARGEST_FIGURE)
+            found = reading.content(path, link=False, maximum=LARGEST_FIGURE)
             if not found.startswith(first):
                 raise InputError(f"{path} is no {suffix.upper()}; take it away, or tune again")
             data = base64.b64encode(found).decode()

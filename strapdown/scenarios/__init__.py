@@ -152,7 +152,7 @@ class Scenario:
                 f"{self.duration:g} s at {self.rate:g} Hz are {self.duration * self.rate:.3g} gyro samples, more than {MAX_SAMPLES:.0e}; "
                 "shorten the run or lower the rate"
             )
-        count("seed", self.seed, least=0)
+        count("seed", self.seed, minimum=0)
         if any(mark in self.name for mark in "/\\\0\n") or self.name.startswith("."):
             raise InputError(
                 f"name is {self.name!r}; files are called after it: leave out slashes, line breaks and leading dots"

@@ -24,7 +24,7 @@ from strapdown.estimation.error_states import (
     SensorMounting,
     VectorBias,
 )
-from strapdown.estimation.gating import Gate, Monitor, Robust
+from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.states import ProcessNoise, State
 from strapdown.files import tables
 from strapdown.records import Estimate, ImuRecord
@@ -402,7 +402,6 @@ def run(
     full_covariance: bool = False,
     gate: Gate | None = None,
     robust: Robust | None = None,
-    monitor: Monitor | None = None,
 ) -> Estimate:
     """Run the filter with these states; it estimates the attitude, the whole gyro bias, drifts included, and the error states."""
     problem = prepared(record, process_noise, initial, states)
@@ -410,7 +409,7 @@ def run(
         every=every, full_covariance=full_covariance, gate=gate, robust=robust, whole_bias=True, together=True
     )
     found = forward.filtered(problem, options).estimate
-    return _reported(forward.watched(found, monitor, gate), states, initial)
+    return _reported(found, states, initial)
 
 
 def run_together(
@@ -468,18 +467,13 @@ def prepared(record: ImuRecord, process_noise: ProcessNoise, initial: State, sta
 
 
 def _reported(found: Estimate, states: States, initial: State) -> Estimate:
-    """Return an estimate whose bias is the whole one, the part too fast for a state in its variance."""
-    assert found.whole_bias is not None
-    assert found.whole_bias_variance is not None
+    """Return an estimate of the whole bias with the part too fast for a state in its variance."""
     fast = np.outer(np.ones(len(found.time)), _BIAS * states.gyro_fast_bias_sigma**2)
     if not len(initial.values):
         fast[0] *= -1.0  # the initial bias has this part, so its error has not
-    covariance = found.whole_bias_covariance
+    P = found.covariance
     return replace(
-        found,
-        bias=found.whole_bias,
-        variance=found.whole_bias_variance + fast,
-        covariance=None if covariance is None else covariance + fast[:, :, None] * np.eye(6),
+        found, variance=found.variance + fast, covariance=None if P is None else P + fast[:, :, None] * np.eye(6)
     )
 
 

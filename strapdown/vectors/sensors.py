@@ -145,7 +145,7 @@ class VectorMeasurements:
         """Check every field."""
         instance("sensor", self.sensor, str, "give the series the name of its sensor")
         one_of(f"{self.sensor}: kind", self.kind, KINDS)
-        time = increasing(f"{self.sensor}: time", self.time, least=0)
+        time = increasing(f"{self.sensor}: time", self.time, minimum=0)
         m = len(time)
         store: dict[str, Any] = {"time": time}
         if self.kind == "attitude":

@@ -39,13 +39,16 @@ def targets(folder: Path) -> list[Target]:
     """Write one file of every kind to a folder; return them."""
     low = dataclasses.replace(scenarios.load_scenario("low-orbit"), duration=3.0, gyro_preset="")
     record = scenarios.simulate(low, 3, 1)
-    recordfiles.write_record(
-        folder / "record.h5", record, gyro_spec=low.gyro, scenario=scenarios.scenario_to_toml(low), seed=3, run=1
-    )
+    recordfiles.write_record(folder / "record.h5", record)
     short = dataclasses.replace(
-        record, time=record.time[:20], increments=record.increments[:19], vectors=(), truth=None
+        record,
+        time=record.time[:20],
+        increments=record.increments[:19],
+        vectors=(),
+        truth=None,
+        origin=records.Origin(gyro=low.gyro, seed=3, run=1),
     )
-    recordfiles.export_csv(folder / "alone.csv", short, gyro_spec=low.gyro, seed=3, run=1)
+    recordfiles.export_csv(folder / "alone.csv", short)
     _write_estimate(folder / "estimate.h5")
     _write_campaign(folder / "campaign.h5", low)
     with h5py.File(folder / "broad.hdf5", "w") as file:
@@ -77,10 +80,10 @@ def targets(folder: Path) -> list[Target]:
     bytewise, structure = damage.BYTES, (damage.change_hdf5,)
     units = {"gyro": "rad/s"}
     return [
-        target("record.h5", recordfiles.read_record_file, bytewise, 0.06),
+        target("record.h5", recordfiles.read_record, bytewise, 0.06),
         target("estimate.h5", records.read_estimate, bytewise, 0.03),
         target("campaign.h5", campaign.read, bytewise, 0.06),
-        target("record.h5", recordfiles.read_record_file, structure, 0.015),
+        target("record.h5", recordfiles.read_record, structure, 0.015),
         target("estimate.h5", _whole_estimate, structure, 0.015),
         target("campaign.h5", campaign.read, structure, 0.015),
         target("broad.hdf5", recordings.read, (*bytewise, damage.change_hdf5), 0.001),

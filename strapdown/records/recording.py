@@ -89,7 +89,7 @@ class Recording(Listed):
 
     def __post_init__(self) -> None:
         """Check shapes, order and values."""
-        time = increasing(f"{self.source}: time", self.time, least=2)
+        time = increasing(f"{self.source}: time", self.time, minimum=2)
         n = len(time)
         object.__setattr__(self, "time", time)
         object.__setattr__(self, "rate", array(f"{self.source}: rate", self.rate, (n, 3)))
@@ -152,6 +152,33 @@ class Recording(Listed):
         begin = parts["time"][0]
         missing, repeated = (stamps[stamps > begin] for stamps in (self.missing_gyro, self.repeated))
         return replace(self, missing_gyro=missing, repeated=repeated, **parts)
+
+    def rows_of(self, time: Array) -> NDArray[np.int64]:
+        """Return the row of each time of an estimate, all of which must be stamps of the recording.
+
+        Parameters
+        ----------
+        time : ndarray (m,)
+            Times, s.
+
+        Returns
+        -------
+        ndarray (m,) of int
+            Rows.
+
+        Raises
+        ------
+        InputError
+            If a time is not a stamp of the recording.
+        """
+        rows = np.clip(np.searchsorted(self.time, time - 1e-7), 0, len(self.time) - 1)
+        off = np.abs(self.time[rows] - time)
+        if off.max() > 1e-6:
+            k = int(np.argmax(off))
+            raise InputError(
+                f"{self.source} has no stamp {time[k]:.6g} s, which the estimate has; give the recording that it was made from"
+            )
+        return np.asarray(rows)
 
     @property
     def clock_ns(self) -> NDArray[np.int64]:

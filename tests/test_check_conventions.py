@@ -1,4 +1,4 @@
-"""Recordings with one convention broken: the doctor names it; whole ones it finds as declared; poor ones it does not call wrong."""
+"""Recordings with one convention broken: the check names it; whole ones it finds as declared; poor ones it does not call wrong."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from strapdown import cli, motion, quaternion, recordings, vectors
-from strapdown.ahrs import doctor
-from strapdown.ahrs.doctor import AXES, FRAMES
+from strapdown.ahrs import check_conventions
+from strapdown.ahrs.check_conventions import AXES, FRAMES
 from strapdown.checks import InputError
 from strapdown.recordings import Recording
 
@@ -48,10 +48,10 @@ def simulated(seed: int = 0, *, duration: float = 60.0, amplitude: float = 1.0, 
 
 
 def read_as(matrix: np.ndarray) -> str:
-    """What the doctor says of a sensor whose axes were changed by ``matrix``: the inverse brings them back."""
+    """What the check says of a sensor whose axes were changed by ``matrix``: the inverse brings them back."""
     if np.array_equal(matrix, -np.eye(3)):
         return "are inverted"
-    return f"should be read as ({doctor.axes_words(matrix.T)})"
+    return f"should be read as ({check_conventions.axes_words(matrix.T)})"
 
 
 def conjugated(q: np.ndarray) -> np.ndarray:
@@ -103,9 +103,9 @@ def broken(recording: Recording, seed: int) -> dict[str, tuple[Recording, str]]:
 @pytest.mark.parametrize("reference", [True, False], ids=["reference", "sensors alone"])
 def test_one_mistake_in_a_simulated_recording_is_named(seed, reference):
     recording = simulated(seed, reference=reference)
-    assert doctor.examine(recording).verdict == "as declared"
+    assert check_conventions.examine(recording).verdict == "as declared"
     for name, (wrong, words) in broken(recording, seed).items():
-        found = doctor.examine(wrong)
+        found = check_conventions.examine(wrong)
         assert found.verdict == "wrong convention", name
         # Without a reference a sensor inverted as a whole fits as well, and is reported beside.
         assert words in " ".join([found.reason, *(() if reference else found.notes)]), (name, found.reason)
@@ -114,9 +114,9 @@ def test_one_mistake_in_a_simulated_recording_is_named(seed, reference):
 def test_one_mistake_in_a_broad_trial_is_named(broad):
     for k, path in enumerate(sorted(broad.glob("*.hdf5"))[:1]):
         recording = recordings.read(path)
-        assert doctor.examine(recording).verdict == "as declared", path.name
+        assert check_conventions.examine(recording).verdict == "as declared", path.name
         for name, (wrong, words) in broken(recording, k).items():
-            found = doctor.examine(wrong)
+            found = check_conventions.examine(wrong)
             assert words in found.reason, (path.name, name, found.reason)
 
 
@@ -125,10 +125,10 @@ def test_one_mistake_in_all_broad_trials_with_reference_and_without(broad):
     for k, path in enumerate(sorted(broad.glob("*.hdf5"))):
         whole = recordings.read(path)
         for recording in (whole, replace(whole, true_attitude=None)):
-            plain = doctor.examine(recording)
+            plain = check_conventions.examine(recording)
             assert plain.verdict == "as declared" or (recording is not whole and plain.verdict == "cannot tell")
             for name, (wrong, words) in broken(recording, k).items():
-                found = doctor.examine(wrong)
+                found = check_conventions.examine(wrong)
                 if recording is not whole and found.verdict == "cannot tell":
                     continue  # the unit is hardly turned there
                 assert words in " ".join([found.reason, *found.notes]), (path.name, name, found.reason)
@@ -137,18 +137,18 @@ def test_one_mistake_in_all_broad_trials_with_reference_and_without(broad):
 def test_two_mistakes_are_named_together():
     recording = simulated(4)
     wrong = replace(recording, true_attitude=conjugated(recording.true_attitude), rate=recording.rate * 180.0 / np.pi)
-    found = doctor.examine(wrong)
+    found = check_conventions.examine(wrong)
     assert "conjugated" in found.reason
     assert "57.3 times too large" in found.reason
 
 
 def test_the_gyro_and_the_accelerometer_alone():
     recording = replace(simulated(5, reference=False), magnetic_field=None)
-    assert doctor.examine(recording).verdict == "as declared"
-    found = doctor.examine(replace(recording, rate=-recording.rate))
+    assert check_conventions.examine(recording).verdict == "as declared"
+    found = check_conventions.examine(replace(recording, rate=-recording.rate))
     assert found.reason.startswith("axes of the gyro are inverted")
     swapped = replace(recording, rate=recording.rate[:, [1, 0, 2]])
-    found = doctor.examine(swapped)
+    found = check_conventions.examine(swapped)
     assert found.verdict == "wrong convention"
     assert "should be read as (y, x, z)" in " ".join([found.reason, *found.notes])
     assert any("which of the two" in note for note in found.notes)
@@ -156,7 +156,7 @@ def test_the_gyro_and_the_accelerometer_alone():
 
 def test_a_recording_that_does_not_turn_cannot_tell():
     for reference in (True, False):
-        found = doctor.examine(simulated(6, amplitude=1e-4, reference=reference))
+        found = check_conventions.examine(simulated(6, amplitude=1e-4, reference=reference))
         assert found.verdict == "cannot tell"
 
 
@@ -164,7 +164,7 @@ def test_noise_is_no_convention():
     recording = simulated(7)
     random = np.random.default_rng(0)
     other = quaternion.normalize(random.standard_normal(recording.true_attitude.shape))
-    found = doctor.examine(replace(recording, true_attitude=other))
+    found = check_conventions.examine(replace(recording, true_attitude=other))
     assert found.verdict == "cannot tell"
     assert "no explanation tried fits" in found.reason
 
@@ -176,27 +176,27 @@ def test_missing_rows_are_left_out():
         for k, name in enumerate(("specific_force", "magnetic_field", "true_attitude"))
     }
     for name, (wrong, words) in broken(replace(recording, **holes), 8).items():
-        assert words in doctor.examine(wrong).reason, name
+        assert words in check_conventions.examine(wrong).reason, name
 
 
 def test_a_gyro_alone_is_refused():
     bare = replace(simulated(0, duration=2.0, reference=False), specific_force=None, magnetic_field=None)
     with pytest.raises(InputError, match="gyro alone"):
-        doctor.examine(bare)
+        check_conventions.examine(bare)
 
 
 def test_a_force_in_no_unit_is_noted():
     recording = simulated(9)
-    found = doctor.examine(replace(recording, specific_force=recording.specific_force / 3.0))
+    found = check_conventions.examine(replace(recording, specific_force=recording.specific_force / 3.0))
     assert any("fits neither" in doubt for doubt in found.doubts)
 
 
 def test_rates_beyond_any_gyro_are_doubted():
     recording = simulated(9)
-    assert doctor.examine(recording).doubts == ()
+    assert check_conventions.examine(recording).doubts == ()
     rate = recording.rate.copy()
     rate[700, 1] = -1.5e3
-    (doubt,) = doctor.examine(replace(recording, rate=rate)).doubts
+    (doubt,) = check_conventions.examine(replace(recording, rate=rate)).doubts
     assert "8.59e+04 °/s at 7 s and in 0.02% of its samples" in doubt
 
 
@@ -204,7 +204,7 @@ def test_all_axes_are_signed_permutations_the_identity_first():
     assert np.array_equal(AXES[0], np.eye(3))
     assert len({matrix.tobytes() for matrix in AXES}) == 48
     assert all(np.array_equal(matrix @ matrix.T, np.eye(3)) for matrix in AXES)
-    assert doctor.axes_words(np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])) == "y, −x, z"
+    assert check_conventions.axes_words(np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])) == "y, −x, z"
 
 
 # ---------------------------------------------------------------------------------------------------------------- the command
@@ -249,10 +249,12 @@ def test_misfits_have_their_closed_forms(angle):
             magnetic_field=quaternion.rotate(back, EAST_NORTH_UP_FIELD),
             true_attitude=quaternion.multiply(quaternion.exp(angle * np.array(axis)), right),
         )
-        best = doctor.examine(recording).candidates[0]
+        best = check_conventions.examine(recording).candidates[0]
         assert best.changes == ()
-        logs = [math.log(value + doctor.FLOORS["reference"]) for value in best.misfit.values()]
-        assert best.score == pytest.approx(-1.5 * doctor.INDEPENDENT * sum(logs))  # of 20 vectors of unknown variance
+        logs = [math.log(value + check_conventions.FLOORS["reference"]) for value in best.misfit.values()]
+        assert best.score == pytest.approx(
+            -1.5 * check_conventions.INDEPENDENT * sum(logs)
+        )  # of 20 vectors of unknown variance
         return [best.misfit[name] for name in ("gyro", "accelerometer", "magnetometer")]
 
     _, north, up = EAST_NORTH_UP_FIELD / np.linalg.norm(EAST_NORTH_UP_FIELD)

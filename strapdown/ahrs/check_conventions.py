@@ -28,7 +28,7 @@ import numpy as np
 from strapdown import coning, quaternion
 from strapdown.ahrs.starting import quiet_span
 from strapdown.checks import Array, InputError, lengths
-from strapdown.recordings.recording import Recording, increments
+from strapdown.records.recording import Recording, increments
 from strapdown.units import DEGREE, STANDARD_GRAVITY
 
 __all__ = [

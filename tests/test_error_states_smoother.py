@@ -10,8 +10,7 @@ import pytest
 import scipy.linalg
 
 from strapdown import consistency, estimation, kinematics, motion, quaternion, records
-from strapdown.checks import InputError
-from strapdown.estimation import error_states, forward, recovery_segments, smoothing
+from strapdown.estimation import error_states, forward, recovery_segments
 from strapdown.estimation.angular_acceleration import turning
 from strapdown.estimation.gating import Gate
 from strapdown.estimation.model import aged_prior
@@ -362,44 +361,6 @@ def difference(one, other, k=slice(None), j=slice(None)):
     return max(np.max(np.abs(np.concatenate(parts, axis=-1)) / sigma), np.max(np.abs(P)))
 
 
-@pytest.mark.parametrize("blocks", BLOCKS.values(), ids=BLOCKS)
-@pytest.mark.parametrize("lag", [0.0, 0.1, 0.5])
-def test_a_fixed_lag_is_the_smoother_of_what_was_known(blocks, lag):
-    record, initial = swaying()
-    lagged = estimation.smooth(record, NOISE, initial, blocks, lag=lag, full_covariance=True)
-    for k in (0, 1, 4, 5, 6, 31, 62, 99, 100):
-        last = min(k + round(50 * lag), len(record.time) - 1)
-        if last:
-            known = estimation.smooth(records.cut(record, 0, last), NOISE, initial, blocks, full_covariance=True)
-            assert difference(lagged, known, k, k) < 1e-10
-
-
-def test_no_lag_is_the_filter_and_a_long_one_the_fixed_interval():
-    record, initial = swaying()
-    blocks = BLOCKS["iron, scale and sway"]
-    ahead = estimation.run(record, NOISE, initial, blocks, full_covariance=True)
-    none = estimation.smooth(record, NOISE, initial, blocks, lag=0.0, full_covariance=True)
-    both = estimation.smooth(record, NOISE, initial, blocks, full_covariance=True)
-    long = estimation.smooth(record, NOISE, initial, blocks, lag=2.0, full_covariance=True)
-    assert difference(none, ahead) < 1e-12
-    assert difference(long, both) < 1e-12
-    half = estimation.smooth(record, NOISE, initial, blocks, lag=0.5)
-    for name in ("acc disturbance", "mag bias"):
-        assert np.all(half.error_states[name].sigma <= ahead.error_states[name].sigma * (1.0 + 1e-3))
-        assert np.all(half.error_states[name].sigma >= both.error_states[name].sigma * (1.0 - 1e-3))
-    with pytest.raises(InputError, match="lag is -1 s; it must not be negative"):
-        estimation.smooth(record, NOISE, initial, blocks, lag=-1.0)
-
-
-@pytest.mark.parametrize("passes", [1, 3, 7, 200])
-def test_any_number_of_passes_go_together(passes, monkeypatch):
-    record, initial = swaying()
-    whole = estimation.smooth(record, NOISE, initial, (IRON,), lag=0.3, full_covariance=True)
-    monkeypatch.setattr(smoothing, "PASSES", passes)
-    other = estimation.smooth(record, NOISE, initial, (IRON,), lag=0.3, full_covariance=True)
-    assert difference(whole, other) < 1e-12
-
-
 def test_a_bias_that_turns_more_than_the_increments_say_loses_no_segments():
     """A still gyro with a large bias: steps are cut by the turn without the bias, and are more than the increments suggest."""
     rng = np.random.default_rng(5)
@@ -514,27 +475,6 @@ def test_the_prior_of_the_blocks_ages_as_the_filter_has_it():
     np.testing.assert_allclose(aged / sigma, found / sigma, rtol=0, atol=1e-8)
     scale = np.outer(sigma, sigma)
     np.testing.assert_allclose(covariance / scale, ahead.whole_covariance[-1][6:, 6:] / scale, rtol=0, atol=1e-8)
-
-
-@pytest.mark.parametrize("lag", [0.1, 0.6])
-def test_a_fixed_lag_knows_of_a_recovery_when_it_has_happened(lag):
-    record, _, initial = lost_start(1)
-    lagged = estimation.smooth(record, NOISE, initial, (STILL,), lag=lag, gate=GATE, full_covariance=True)
-    event = recovery_of(lagged)
-    first, last = np.searchsorted(record.time, [event.start, event.end])
-    steps = round(50 * lag)
-    for k in {0, 1, first, first + 5, last - steps - 1, last - steps, last - steps + 1, last - 1, last, last + 3}:
-        if k < 0:
-            continue
-        known = estimation.smooth(
-            records.cut(record, 0, min(k + steps, len(record.time) - 1)),
-            NOISE,
-            initial,
-            (STILL,),
-            gate=GATE,
-            full_covariance=True,
-        )
-        assert difference(lagged, known, k, k) < 1e-8, (k, first, last)
 
 
 def recovered(runs: int) -> np.ndarray:

@@ -1,0 +1,466 @@
+"""The estimate of a filter, its parts, and its columns as a table."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from strapdown import quaternion
+from strapdown.checks import Array, InputError, array, increasing, one_of, unit_quaternions
+from strapdown.records import outputs
+from strapdown.records.recording import Recording
+from strapdown.results import Listed, Listing, figure
+from strapdown.units import DEGREE, DEGREE_PER_HOUR
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Innovations:
+    """Innovations of one sensor, in the order of its measurements.
+
+    Parameters
+    ----------
+    time : ndarray (m,)
+        Times of the measurements used, s.
+    innovation : ndarray (m, dof)
+        Independent innovations, each less its prediction from those before it in the row; rad, or the sensor's unit over the length
+        of its reference.
+    variance : ndarray (m, dof)
+        Variances of the innovations that the filter predicts, the square of their unit.
+    weight : ndarray (m,), optional
+        Weight of each measurement in the update: 1 whole, 0 rejected by a gate, between them a robust update; None: all 1.
+    """
+
+    time: Array
+    innovation: Array
+    variance: Array
+    weight: Array | None = None
+
+    @property
+    def used(self) -> np.ndarray:
+        """Mask (m,) of the measurements that were not rejected."""
+        return np.ones(len(self.time), bool) if self.weight is None else np.asarray(self.weight > 0.0)
+
+    @property
+    def refused(self) -> int:
+        """Number of measurements rejected."""
+        return int(np.sum(~self.used))
+
+    @property
+    def whitened(self) -> Array:
+        """Innovations over their own standard deviations (m, dof): independent standard normals if the filter is right."""
+        return np.asarray(self.innovation / np.sqrt(self.variance))
+
+    @property
+    def nis(self) -> Array:
+        """Normalised innovation squared (m,), χ² with as many degrees of freedom as columns if the filter is right."""
+        return np.asarray(np.sum(self.innovation**2 / self.variance, axis=1))
+
+
+EVENT_KINDS = ("recovery", "hypotheses", "lock-out", "gap")
+"""Kinds of :class:`Event`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Event:
+    """An event in a run that a user of the estimate must know.
+
+    Parameters
+    ----------
+    kind : {"recovery", "hypotheses", "lock-out", "gap"}
+        What happened: a filter that rejected good measurements was restarted; a bank of hypotheses replaced it while a turn was
+        ambiguous; a gate rejected a sensor more often than it accepted it; the gyro was silent for much longer than its sample interval.
+    start : float
+        Time of its beginning, s.
+    end : float
+        Time of its end, s: the recovery, the decision between the hypotheses, the last rejection, the next gyro sample.
+    sensor : str, default ""
+        Sensor concerned, if there is one.
+    value : float, default 0.0
+        Of a recovery the rejections in a row; of hypotheses the number left (0: decided); of a lock-out the rejections; of a gap its
+        length over the usual interval.
+    """
+
+    kind: str
+    start: float
+    end: float
+    sensor: str = ""
+    value: float = 0.0
+
+    def __str__(self) -> str:
+        """Describe the event in one line."""
+        if self.kind == "recovery":
+            return (
+                f"Recovered at {self.end:.6g} s: {self.value:.0f} measurements of {self.sensor} in a row were rejected and agreed with "
+                f"each other from {self.start:.6g} s on; the estimate in between is wrong."
+            )
+        if self.kind == "hypotheses":
+            end = (
+                f"{self.value:.0f} of them were left at the end of the record" if self.value else "then one was chosen"
+            )
+            return (
+                f"From {self.start:.6g} s to {self.end:.6g} s hypotheses replaced the filter, because {self.sensor} left a rotation "
+                f"ambiguous: {end}."
+            )
+        if self.kind == "lock-out":
+            return (
+                f"Locked out from {self.start:.6g} s to {self.end:.6g} s: {self.value:.0f} measurements of {self.sensor} were rejected, "
+                "more than were accepted, and no restart agreed with them: the sensor, its sigma or the filter is wrong there."
+            )
+        return f"Gap of {self.end - self.start:.3g} s after {self.start:.6g} s: the rotation across it is assumed to be at constant rate."
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ErrorStateEstimate:
+    """Estimate of one declaration of error states (:mod:`strapdown.estimation.error_states`) at the kept edges.
+
+    Parameters
+    ----------
+    components : tuple of str
+        Name of each component.
+    units : tuple of str
+        Unit of each component.
+    values : ndarray (m, size)
+        Estimates in ``units``.
+    variance : ndarray (m, size)
+        Variances, the square of the units.
+    """
+
+    components: tuple[str, ...]
+    units: tuple[str, ...]
+    values: Array
+    variance: Array
+
+    @property
+    def sigma(self) -> Array:
+        """Standard deviations (m, size)."""
+        return np.sqrt(self.variance)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Estimate(Listed):
+    """Attitude and gyro bias with their covariance, at the stored epochs of a filter's run.
+
+    Parameters
+    ----------
+    time : ndarray (m,)
+        Times of the stored edges, s.
+    attitude : ndarray (m, 4)
+        Unit quaternions q_fb.
+    bias : ndarray (m, 3)
+        Gyro bias, rad/s, body axes.
+    variance : ndarray (m, 6)
+        Diagonal of P: attitude error, rad², body axes; bias error, (rad/s)².
+    covariance : ndarray (m, 6, 6), optional
+        Whole P of (δθ, δb), if asked for.
+    innovations : mapping of str to Innovations, default empty
+        Innovations by sensor.
+    skipped : mapping of str to int, default empty
+        Measurements not used, by sensor: missing (NaN) ones and those outside the record's time.
+    events : tuple of Event, default empty
+        Events of the run that a user of the estimate must know, in order of time.
+    error_states : mapping of str to ErrorStateEstimate, default empty
+        Error states c by name, in the order given.
+    whole_covariance : ndarray (m, n, n), optional
+        P of (δθ, δb, δc) of a filter with error states, if asked for; ``covariance`` is its part (m, 6, 6).
+    """
+
+    _drawn_by = "estimate_overview"
+
+    time: Array
+    attitude: Array
+    bias: Array
+    variance: Array
+    covariance: Array | None = None
+    innovations: Mapping[str, Innovations] = field(default_factory=dict)
+    skipped: Mapping[str, int] = field(default_factory=dict)
+    events: tuple[Event, ...] = ()
+    error_states: Mapping[str, ErrorStateEstimate] = field(default_factory=dict)
+    whole_covariance: Array | None = None
+
+    def listing(self) -> Listing:
+        """Return σ at the start and at the end, the estimate at the end, and the innovations, as a table."""
+        rows: list[tuple[str, ...]] = []
+        for k in range(6):
+            name, unit, size = ("attitude", "°", DEGREE) if k < 3 else ("gyro bias", "°/h", DEGREE_PER_HOUR)
+            value = "" if k < 3 else figure(self.bias[-1, k - 3] / size)
+            first, last = (figure(self.sigma[row, k] / size, 3) for row in (0, -1))
+            rows.append((f"{name} {'xyz'[k % 3]}", unit, value, last, first))
+        for name, states in self.error_states.items():
+            for k, (component, unit) in enumerate(zip(states.components, states.units, strict=True)):
+                ends = (figure(states.sigma[row, k], 3) for row in (-1, 0))
+                label = f"{name} {component.removeprefix(name.split()[-1]).strip()}".strip()
+                rows.append((label, unit, figure(states.values[-1, k]), *ends))
+        notes = [f"Attitude at the end, q_fb (w, x, y, z): {', '.join(f'{q:.6f}' for q in self.attitude[-1])}"]
+        for sensor, one in self.innovations.items():
+            if np.any(one.used):
+                nis = np.mean(one.nis[one.used]) / one.innovation.shape[1]
+                gate = f", {one.refused} refused by the gate" if one.refused else ""
+                notes.append(
+                    f"{sensor}: {len(one.time)} measurements{gate}, mean NIS per degree of freedom {figure(nis, 3)}"
+                )
+        return Listing(
+            f"Estimate at {len(self.time)} epochs over {self.time[-1] - self.time[0]:.6g} s",
+            ("state", "unit", "at the end", "σ", "σ at the start"),
+            rows,
+            [*notes, *map(str, self.events)],
+            left=2,
+        )
+
+    @classmethod
+    def from_arrays(
+        cls,
+        time: ArrayLike,
+        attitude: ArrayLike,
+        covariance: ArrayLike,
+        *,
+        bias: ArrayLike | None = None,
+        innovations: Mapping[str, Innovations] | None = None,
+    ) -> Estimate:
+        """Return an estimate made of the arrays of any filter.
+
+        Parameters
+        ----------
+        time : array_like (m,)
+            Times, s, strictly increasing.
+        attitude : array_like (m, 4)
+            Unit quaternions q_fb, scalar first. NaN where the filter has none.
+        covariance : array_like (m, 3, 3) or (m, 6, 6)
+            Covariance of δθ, rad², with ``q_true = q_est ⊗ exp(δθ)`` (body axes), or of (δθ, δb), δb = b_true − b_est, rad/s. NaN where
+            the filter has none.
+        bias : array_like (m, 3), optional
+            Gyro bias, rad/s, body axes. Without one it is NaN, as is its covariance: only the attitude is judged.
+        innovations : mapping of str to Innovations, optional
+            Innovations by sensor; without them there is no NIS.
+
+        Returns
+        -------
+        Estimate
+            The estimate.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> Estimate.from_arrays([0.0, 1.0], [[1, 0, 0, 0]] * 2, [1e-4 * np.eye(3)] * 2).sigma[0, :3]
+        array([0.01, 0.01, 0.01])
+        """
+        stamps = increasing("time", time)
+        m = len(stamps)
+        q = array("attitude", attitude, (m, 4), allow_nan=True)
+        known = np.isfinite(q).all(axis=1)
+        unit_quaternions("attitude", q[known])
+        P = np.asarray(covariance, np.float64)
+        if P.shape not in ((m, 3, 3), (m, 6, 6)):
+            raise InputError(
+                f"covariance has shape {P.shape}, wanted ({m}, 3, 3) or ({m}, 6, 6), a matrix for each time"
+            )
+        if bias is not None and P.shape[1] == 3:
+            raise InputError("bias is given, but covariance is of the attitude alone; give that of (δθ, δb), (m, 6, 6)")
+        whole = np.full((m, 6, 6), np.nan)
+        size = 3 if bias is None else 6
+        whole[:, :size, :size] = P[:, :size, :size]
+        return cls(
+            time=stamps,
+            attitude=q,
+            bias=np.full((m, 3), np.nan) if bias is None else array("bias", bias, (m, 3), allow_nan=True),
+            variance=np.diagonal(whole, axis1=1, axis2=2).copy(),
+            covariance=whole,
+            innovations=dict(innovations or {}),
+        )
+
+    @property
+    def has_bias(self) -> bool:
+        """Whether a gyro bias is estimated at all."""
+        return bool(np.isfinite(self.bias).any())
+
+    def errors(
+        self, true_attitude: ArrayLike, true_bias: ArrayLike, true_values: Mapping[str, ArrayLike] | None = None
+    ) -> Array:
+        """Return the error of all states: Log(q_est⁻¹ ⊗ q_true), then true less estimated.
+
+        Parameters
+        ----------
+        true_attitude : array_like (m, 4)
+            True q_fb at the times of the estimate.
+        true_bias : array_like (m, 3)
+            True gyro bias, rad/s, body axes.
+        true_values : mapping of str to array_like (size,) or (m, size), optional
+            True error states by name, in the axes of the estimated attitude where they are carried so
+            (:attr:`strapdown.estimation.error_states.Effect.carried`). Required for a filter with error states.
+
+        Returns
+        -------
+        ndarray (m, n)
+            δθ, rad, body axes; δb, rad/s; error states in their units.
+        """
+        given = dict(true_values or {})
+        if set(given) != set(self.error_states):
+            raise InputError(
+                f"true_values has {sorted(given)}, and the error states are {sorted(self.error_states)}; give each of them"
+            )
+        turn = quaternion.log(quaternion.multiply(quaternion.conjugate(self.attitude), true_attitude))
+        parts = [turn, np.asarray(true_bias) - self.bias]
+        parts += [np.asarray(given[name]) - states.values for name, states in self.error_states.items()]
+        return np.concatenate(parts, axis=-1)
+
+    @property
+    def refused(self) -> dict[str, int]:
+        """Number of measurements rejected by a gate, by sensor."""
+        return {sensor: innovations.refused for sensor, innovations in self.innovations.items()}
+
+    @property
+    def sigma(self) -> Array:
+        """Standard deviations (m, 6): rad, rad/s."""
+        return np.sqrt(self.variance)
+
+    @property
+    def attitude_covariance(self) -> Array:
+        """Covariance (m, 3, 3) of the attitude error, rad², body axes; diagonal where only variances were kept."""
+        if self.covariance is not None:
+            return np.asarray(self.covariance[:, :3, :3])
+        return np.asarray(self.variance[:, :3, None] * np.eye(3))
+
+    @property
+    def matrix(self) -> Array:
+        """Rotation matrices R_fb (m, 3, 3)."""
+        return quaternion.to_matrix(self.attitude)
+
+    @property
+    def rotation(self) -> Rotation:
+        """Attitudes as a ``scipy.spatial.transform.Rotation`` that takes body vectors to the fixed frame."""
+        return quaternion.to_rotation(self.attitude)
+
+    def euler(self, sequence: str = "ZYX") -> outputs.Angles:
+        """Return Euler angles and their standard deviations, as :func:`strapdown.records.outputs.euler`.
+
+        Parameters
+        ----------
+        sequence : str, default "ZYX"
+            Axes of the three rotations.
+
+        Returns
+        -------
+        Angles
+            Angles (m, 3) and their σ, rad.
+        """
+        return outputs.euler(self.attitude, sequence, self.attitude_covariance)
+
+    def heading(self, axis: str = "x") -> outputs.Angles:
+        """Return the heading of a body axis, as :func:`strapdown.records.outputs.heading`.
+
+        Parameters
+        ----------
+        axis : {"x", "y", "z", "-x", "-y", "-z"}, default "x"
+            Body axis that points forward.
+
+        Returns
+        -------
+        Angles
+            Heading (m,) from North towards East and its σ, rad.
+        """
+        return outputs.heading(self.attitude, self.attitude_covariance, axis=axis)
+
+    def table(
+        self, *, recording: Recording | None = None, sequence: str = "ZYX", frame: str = "ENU"
+    ) -> dict[str, NDArray[np.generic]]:
+        """Return the estimate as columns, the unit in each name.
+
+        Parameters
+        ----------
+        recording : Recording, optional
+            Recording that the estimate was made from: adds its clock, its rate without the bias, and its acceleration without gravity.
+        sequence : str, default "ZYX"
+            Sequence of the Euler angles, as of :meth:`euler`.
+        frame : {"ENU", "NED"}, default "ENU"
+            Fixed frame of quaternion, angles and acceleration; body axes stay as they are.
+
+        Returns
+        -------
+        dict of str to ndarray (m,)
+            ``time_s`` (or ``time_ns`` of a clock that counts from 1970), ``qw qx qy qz``, the angles and their σ in degrees,
+            ``heading_deg`` of the body x axis from North towards East, bias and σ in °/h, ``rate_*_rad_per_s``,
+            ``free_acceleration_*_m_per_s2``. Where whole covariances were kept, ``cov_body_xx_rad2`` … of the body-side error,
+            ``b`` before an axis for the bias.
+
+        Raises
+        ------
+        InputError
+            If a time of the estimate is not a stamp of the recording.
+        """
+        one_of("frame", frame, outputs.FRAMES)
+        P = self.attitude_covariance
+        q = self.attitude if frame == "ENU" else outputs.to_ned(self.attitude)
+        found: dict[str, NDArray[np.generic]] = _clock(self.time, recording)
+        found |= {f"q{name}": q[:, k] for k, name in enumerate("wxyz")}
+        angles = outputs.euler(q, sequence, P)
+        assert angles.sigma is not None
+        for k, name in enumerate(_angle_names(sequence)):
+            found[f"{name}_deg"] = angles.angles[:, k] / DEGREE
+            found[f"{name}_sigma_deg"] = angles.sigma[:, k] / DEGREE
+        north = outputs.heading(self.attitude, P)
+        assert north.sigma is not None
+        found |= {"heading_deg": north.angles / DEGREE, "heading_sigma_deg": north.sigma / DEGREE}
+        sigma = self.sigma
+        for k, axis in enumerate("xyz"):
+            found[f"bias_{axis}_deg_per_h"] = self.bias[:, k] / DEGREE_PER_HOUR
+            found[f"bias_{axis}_sigma_deg_per_h"] = sigma[:, 3 + k] / DEGREE_PER_HOUR
+        if self.covariance is not None:
+            size = 6 if np.isfinite(self.covariance[:, 3:, 3:]).any() else 3
+            for i, j in itertools.combinations_with_replacement(range(size), 2):
+                unit = ("rad2", "rad2_per_s", "rad2_per_s2")[(i > 2) + (j > 2)]
+                found[f"cov_body_{_STATES[i]}{_STATES[j]}_{unit}"] = self.covariance[:, i, j]
+        if recording is not None:
+            rows = recording.rows_of(self.time)
+            rate = recording.rate[rows] - self.bias
+            found |= {f"rate_{axis}_rad_per_s": rate[:, k] for k, axis in enumerate("xyz")}
+            if recording.specific_force is not None:
+                free = outputs.free_acceleration(self.attitude, recording.specific_force[rows])
+                free = free if frame == "ENU" else free[:, [1, 0, 2]] * [1.0, 1.0, -1.0]
+                found |= {f"free_acceleration_{axis}_m_per_s2": free[:, k] for k, axis in enumerate("xyz")}
+        return found
+
+    def to_dataframe(self, **options: Any) -> Any:
+        """Return the estimate as a pandas ``DataFrame``, the columns of :meth:`table`.
+
+        Parameters
+        ----------
+        **options : dict
+            Options of :meth:`table`.
+
+        Returns
+        -------
+        pandas.DataFrame
+            One row per time.
+        """
+        try:
+            import pandas
+        except ImportError:
+            raise InputError("a DataFrame needs pandas; pip install 'strapdown[formats]'") from None
+        return pandas.DataFrame(self.table(**options))
+
+
+_NAMES = {"Z": "yaw", "Y": "pitch", "X": "roll"}
+"""Names of the angles of a sequence of three different axes."""
+_STATES = ("x", "y", "z", "bx", "by", "bz")
+
+
+def _angle_names(sequence: str) -> list[str]:
+    axes = sequence.upper()
+    return (
+        [_NAMES[axis] for axis in axes]
+        if len(set(axes)) == 3
+        else [f"angle_{k + 1}_{axis.lower()}" for k, axis in enumerate(axes)]
+    )
+
+
+def _clock(time: Array, recording: Recording | None) -> dict[str, NDArray[np.generic]]:
+    if recording is None or not recording.epoch_ns:
+        return {"time_s": time}
+    return {"time_ns": np.rint(time * 1e9).astype(np.int64) + recording.epoch_ns}
