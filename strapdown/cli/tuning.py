@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,17 +21,13 @@ from strapdown.cli.terminal import (
     doubt,
     need_own,
     progress_bar,
-    show,
     show_listing,
-    table,
     tables_folder,
     tables_written,
     writable,
     written,
 )
 from strapdown.files import plain, write_json, written_beside
-from strapdown.results import figure
-from strapdown.units import DEGREE
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -41,7 +36,7 @@ if TYPE_CHECKING:
     from strapdown.records import ImuRecord
     from strapdown.scenarios import Scenario
     from strapdown.setup import FilterSetup
-    from strapdown.tuning import Case, Comparison, Performance, TunedGate, Tuning, Unmodelled
+    from strapdown.tuning import Case, Comparison, TunedGate, Tuning, Unmodelled
 
 
 FIGURES = ("likelihood", "heldout")
@@ -388,34 +383,10 @@ def _print_gate(found: TunedGate) -> None:
     )
 
 
-def _anees(one: Performance) -> str:
-    """Return the ANEES as a table shows it: of attitude and bias, or where only the attitude is known of that."""
-    if math.isfinite(one.anees):
-        return figure(one.anees, 3)
-    return f"{figure(float(np.nanmean(one.nees[0].mean)), 3)} (attitude)" if one.nees else "-"
-
-
 def _print_comparison(comparison: Comparison, *, truth: bool) -> None:
     from strapdown.report import tunings
 
-    listing = table(
-        "On the data held out", "filter", "log likelihood", "NIS", "99 % bounds", "ANEES", "attitude RMS, °", "verdict"
-    )
-    for name, one in (("before", comparison.before), ("after", comparison.after)):
-        verdicts = [judgement.verdict for judgement in one.judgements]
-        answer = (
-            verdicts[0] if len(set(verdicts)) == 1 else f"{verdicts.count('consistent')} of {len(verdicts)} consistent"
-        )
-        listing.add_row(
-            name,
-            f"{one.log_likelihood:.4f}",
-            f"{one.nis:.3f}",
-            f"{one.nis_bounds[0]:.3f} to {one.nis_bounds[1]:.3f}",
-            _anees(one),
-            figure(one.attitude_rms / DEGREE, 3),
-            answer,
-        )
-    show(listing)
+    show_listing(comparison.listing())
     console.print(f"{tunings.BOUNDS}.")
     for judgement in comparison.after.judgements[:1]:
         for line in judgement.words.splitlines()[1:]:
@@ -468,12 +439,7 @@ def _report(found: _Found, paths: Sequence[Path], of: str) -> dict[str, Any]:
         "unmodelled": [one.summary() for one in found.examined],
     }
     if gate is not None:
-        content["gate"] = {
-            "probability": gate.probability,
-            "lower": gate.lower,
-            "upper": gate.upper,
-            "thresholds": gate.thresholds,
-        }
+        content["gate"] = {name: getattr(gate, name) for name in ("probability", "lower", "upper", "thresholds")}
     if comparison is not None:
         content["held_out"] = {
             name: {

@@ -13,8 +13,10 @@ from strapdown import consistency, setup
 from strapdown.checks import Array, InputError, one_of
 from strapdown.consistency import Judgement, mean_bounds
 from strapdown.records import Estimate, Innovations, Truth
+from strapdown.results import Listed, Listing, figure
 from strapdown.setup import FilterSetup
 from strapdown.tuning.objective import Case, of_sensors
+from strapdown.units import DEGREE
 
 By = Literal["time", "record"]
 MAX_ROWS = 20_000
@@ -103,13 +105,34 @@ class Performance:
     nees: tuple[NeesCourse, ...] = ()
     """NEES over the time of the first record, of the attitude and of the bias as far as their truth is known."""
 
+    @property
+    def row(self) -> tuple[str, ...]:
+        """What :meth:`Comparison.listing` shows of it."""
+        verdicts = [judgement.verdict for judgement in self.judgements]
+        anees = figure(self.anees, 3) if np.isfinite(self.anees) else "-"
+        if self.nees and not np.isfinite(self.anees):  # of the attitude alone the reference is known
+            anees = f"{figure(float(np.nanmean(self.nees[0].mean)), 3)} (attitude)"
+        return (
+            f"{self.log_likelihood:.4f}",
+            f"{self.nis:.3f}",
+            f"{self.nis_bounds[0]:.3f} to {self.nis_bounds[1]:.3f}",
+            anees,
+            figure(self.attitude_rms / DEGREE, 3),
+            verdicts[0] if len(set(verdicts)) == 1 else f"{verdicts.count('consistent')} of {len(verdicts)} consistent",
+        )
+
 
 @dataclass(frozen=True, kw_only=True)
-class Comparison:
+class Comparison(Listed):
     """The filter before and after tuning on the same held-out data."""
 
     before: Performance
     after: Performance
+
+    def listing(self) -> Listing:
+        """Return likelihood, NIS, ANEES, attitude error and verdict of both, as a table."""
+        columns = ("filter", "log likelihood", "NIS", "99 % bounds", "ANEES", "attitude RMS, °", "verdict")
+        return Listing("On the data held out", columns, [("before", *self.before.row), ("after", *self.after.row)])
 
     @property
     def better(self) -> bool:
