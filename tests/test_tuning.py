@@ -615,6 +615,18 @@ def test_the_smallest_error_then_the_scale_of_the_innovations_make_a_filter():
     assert compared.after.nis == pytest.approx(1.0, abs=0.1)
 
 
+def test_slices_of_a_filter_scaled_afterwards_have_their_least_at_its_values():
+    """The stars' σ ten times too large: what is tuned beside them comes down by ten with them."""
+    cases = [case(seed, 100.0) for seed in range(2)]
+    off = tuning.with_values(BELIEVED, {"star 1.sigma": 1e-3, "star 2.sigma": 2e-3})
+    found, objective, _ = tuning.tune(cases, off, ["gyro.arw"], rmse=True, starts=1)
+    assert found.setup.measurement_sigma_factor < 0.2
+    slices = tuning.slices(objective, found, number=25)
+    least = slices.values[0][np.argmin(slices.fallen[0])]
+    assert least == pytest.approx(found["gyro.arw"].most_likely, rel=slices.values[0][1] / slices.values[0][0] - 1.0)
+    assert slices.fallen[0].max() > 1.0
+
+
 def test_against_a_truth_wrong_parameters_come_back():
     cases = [case(seed) for seed in range(4)]
     off = tuning.with_values(BELIEVED, {"gyro.arw": 10.0 * ARW, "star 1.sigma": 3e-5})

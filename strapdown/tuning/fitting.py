@@ -195,6 +195,8 @@ class Tuning(Listed):
         Searches that ended within a thousandth of a log likelihood of the best.
     composite : bool, default False
         Whether what was minimised is no likelihood, so that intervals come from the scatter of its gradient (sandwich).
+    scale : ndarray (p,) or float, default 1.0
+        Factor on the parameters since the minimum (:func:`rescaled`).
     """
 
     parameters: tuple[Estimated, ...]
@@ -209,6 +211,7 @@ class Tuning(Listed):
     misfit: bool
     agreeing: int
     composite: bool = False
+    scale: Array | float = 1.0
 
     def listing(self) -> Listing:
         """Return the parameters with their intervals, as a table."""
@@ -416,6 +419,7 @@ def rescaled(tuning: Tuning, factor: float) -> Tuning:
         ),
         setup=with_values(tuning.setup, {SCALE: factor}),
         point=tuning.point + np.log(own),
+        scale=tuning.scale * np.array(own),
     )
 
 
@@ -440,7 +444,7 @@ def slices(objective: Objective, tuning: Tuning, *, number: int = 24) -> Slices:
         ends += np.array([-0.3, 0.3]) * max(float(np.ptp(ends)), 1e-3)
         points = np.tile(tuning.point, (number, 1))
         points[:, j] = np.linspace(ends[0], ends[1], number)
-        found = objective.minus_log(np.concatenate([tuning.point[None], points]))
+        found = objective.minus_log(np.concatenate([tuning.point[None], points]) - np.log(tuning.scale))
         values.append(np.exp(points[:, j]))
         fallen.append(2.0 * (found[1:] - min(found[0], found[1:].min())))
     return Slices(names=objective.names, values=np.array(values), fallen=np.array(fallen))
