@@ -242,10 +242,9 @@ class RunLikelihood(Objective):
     def _run(self, chosen: FilterSetup, case: Case) -> tuple[Array, Array, np.ndarray]:
         # The filter of optional states has the innovations of measurements whose noise differs by axis, with none too.
         used = replace(chosen, states=States() if chosen.states is None else chosen.states)
-        ends = max(
-            1, len(case.record.increments) // used.integration.samples
-        )  # of the states only the first and the last are kept
-        estimate = self._estimate(used, case, every=ends, gate=None, robust=None)
+        # Of the states only the first and the last are kept.
+        every = max(1, len(case.record.increments) // used.integration.samples)
+        estimate = self._estimate(used, case, every=every, gate=None, robust=None)
         first, last = case.span
         found = []
         for one in estimate.innovations.values():
