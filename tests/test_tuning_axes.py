@@ -163,7 +163,9 @@ def test_parts_of_a_parameter_and_what_cannot_have_axes_are_refused():
     scenario = swaying(duration=5.0)
     chosen = setup.matched(scenario)
     case = case_of(scenario, chosen, 1)
-    with pytest.raises(InputError, match=r"outliers are modelled .* sensors with one sigma for all axes: leave gate out"):
+    with pytest.raises(
+        InputError, match=r"outliers are modelled .* sensors with one sigma for all axes: leave gate out"
+    ):
         tuning.contaminated_likelihood([case], chosen, ["acc.sigma.x"])
     with pytest.raises(InputError, match=r"acc.sigma.y is part of acc.sigma; give that, or the axes"):
         tuning.likelihood([case], chosen, ["acc.sigma", "acc.sigma.y"])
