@@ -40,7 +40,7 @@ def record(tmp_path):
 def wrong(tmp_path):
     """A filter wrong by ten."""
     path = tmp_path / "wrong.toml"
-    filter_setup = setup.matched(SCENARIO)
+    filter_setup = setup.FilterSetup.for_scenario(SCENARIO)
     values = {"gyro.arw": 1e-3, "gyro.rrw": 3e-7, "sun.sigma": 1e-5, "star.sigma": 2e-3}
     path.write_text(setup.to_toml(tuning.with_values(filter_setup, values)), encoding="utf-8")
     return path
@@ -168,7 +168,7 @@ def test_tune_gives_the_filter_states_for_what_the_record_specifies(run, tmp_pat
 def test_a_filter_with_states_and_a_gate_is_tuned_against_the_truth(run, tmp_path, scaled):
     first, out = tmp_path / "first.toml", tmp_path / "states.toml"
     record = recordfiles.read_record(scaled)
-    gated = dataclasses.replace(setup.matched_to_record(record, states=True), gate=Gate())
+    gated = dataclasses.replace(setup.FilterSetup.for_record(record, states=True), gate=Gate())
     first.write_text(setup.to_toml(gated), encoding="utf-8")
     given = ("tune", scaled, "--filter", first, "--free", "gyro.arw", "--starts", 1, "-o", out)
     status, said, complaint = run(*given, "--truth")

@@ -50,7 +50,9 @@ def swaying(duration=60.0, **changes) -> Scenario:
 
 def filter_setup(scenario) -> setup.FilterSetup:
     """Return the filter that matches, without a better integration: the motion is slow, and this is quicker."""
-    return dataclasses.replace(setup.matched(scenario, states=True), integration=coning.ALGORITHMS["one-sample"])
+    return dataclasses.replace(
+        setup.FilterSetup.for_scenario(scenario, states=True), integration=coning.ALGORITHMS["one-sample"]
+    )
 
 
 def case_of(scenario, chosen, seed, run=0) -> tuning.Case:
@@ -68,7 +70,7 @@ def wrong(chosen, factors) -> setup.FilterSetup:
 
 def test_without_states_it_is_the_likelihood_of_the_plain_filter():
     scenario = dataclasses.replace(scenarios.load_scenario("two-stars"), duration=60.0)
-    chosen = setup.matched(scenario)
+    chosen = setup.FilterSetup.for_scenario(scenario)
     cases = [case_of(scenario, chosen, 3, run) for run in range(2)]
     names = ["gyro.arw", "gyro.rrw", "star 1.sigma"]
     # Seven parts, whose edges are at no measurement.
@@ -122,7 +124,7 @@ def test_values_scale_all_axes_alike_and_the_rest_stays():
         "mag.bias_sigma",
         "a.b.lever_sigma",
     )
-    chosen = dataclasses.replace(setup.matched(swaying(5.0)), states=states)
+    chosen = dataclasses.replace(setup.FilterSetup.for_scenario(swaying(5.0)), states=states)
     values = tuning.values_of(chosen, ["mag.bias_sigma", "gyro.scale_sigma"], [])
     assert list(values.values()) == pytest.approx([np.sqrt(3.0), 1e-3 * np.sqrt(2.5)])
     changed = tuning.with_values(
@@ -301,7 +303,9 @@ def test_the_smallest_error_of_a_filter_with_states_then_the_scale_of_its_innova
 
 def test_a_filter_with_states_is_thinned_as_one_without():
     scenario = dataclasses.replace(scenarios.load_scenario("two-stars"), duration=60.0)
-    chosen = dataclasses.replace(setup.matched(scenario), sigma={"star 1": 2e-4}, measurement_sigma_factor=1.5)
+    chosen = dataclasses.replace(
+        setup.FilterSetup.for_scenario(scenario), sigma={"star 1": 2e-4}, measurement_sigma_factor=1.5
+    )
     cases = [case_of(scenario, chosen, 3)]
     names = ["gyro.arw", "star 1.sigma", "star 2.sigma"]
     plain = tuning.likelihood(cases, chosen, names, spacing=3.0)
@@ -346,7 +350,7 @@ FREE = {
 def tuned_and_held_out(name: str, train: int, test: int, seed: int, free=(), **changes) -> list[str]:
     """Return what is outside its bounds on records not used, after tuning from σ wrong by a factor of three either way."""
     scenario = dataclasses.replace(scenarios.load_scenario(name), **changes)
-    chosen = setup.matched(scenario, states=True)
+    chosen = setup.FilterSetup.for_scenario(scenario, states=True)
     free = free or FREE[name]
     plain = [part for part in free if part not in parameters.state_names(chosen.states)]
     cases = [case_of(scenarios.drawn(scenario, seed, run), chosen, seed, run) for run in range(train)]
@@ -401,7 +405,7 @@ def test_after_tuning_held_out_statistics_pass_in_every_built_in_scenario(name):
 
 def test_a_case_of_first_measurements_is_taken_too():
     scenario = dataclasses.replace(scenarios.load_scenario("spin"), duration=60.0)
-    chosen = setup.matched(scenario, states=True)
+    chosen = setup.FilterSetup.for_scenario(scenario, states=True)
     case = tuning.record_case(scenarios.simulate(scenario, 1), chosen)
     assert isinstance(case.initial, estimation.State)
     objective = tuning.likelihood([case], chosen, ["gyro.arw", "initial.bias", "star.sigma"])

@@ -466,7 +466,7 @@ def _plan(
         raise InputError(f"--plan takes one scenario; {len(sources)} are given")
     lengths = None if length is None else _numbers(length)
     scenario = _scenario_of(sources[0]) if recordfiles.is_record(sources[0]) else scenarios.load_scenario(sources[0])
-    modelled = chosen or setup.matched(scenario, states=start.states)
+    modelled = chosen or setup.FilterSetup.for_scenario(scenario, states=start.states)
     wanted = start.names or list(tuning.default_names([scenarios.simulate(scenario)]))
     with progress_bar("simulated records", 4) as advance:
         found = tuning.plan(

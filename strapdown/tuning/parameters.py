@@ -353,7 +353,7 @@ class Prior:
 def priors_from_gyro(spec: GyroSpec, record: ImuRecord, *, factor: float = 3.0) -> dict[str, Prior]:
     """Return priors of the gyro's two noise parameters from a specification: of a datasheet, or of an Allan deviation.
 
-    Flicker noise is matched as by :func:`strapdown.setup.matched_to_record`; a noise that the specification does not have gets no prior.
+    Flicker noise is matched as by :meth:`strapdown.setup.FilterSetup.for_record`; a noise that is not specified gets no prior.
 
     Parameters
     ----------
@@ -369,7 +369,7 @@ def priors_from_gyro(spec: GyroSpec, record: ImuRecord, *, factor: float = 3.0) 
     dict of str to Prior
         For ``"gyro.arw"`` (rad/√s) and ``"gyro.rrw"`` (rad/s/√s).
     """
-    noise = setup.matched_to_record(record, spec).process_noise if _flickers(spec) else None
+    noise = setup.FilterSetup.for_record(record, spec).process_noise if _flickers(spec) else None
     found = gyro.process_noise(spec) if noise is None else vars(noise)
     pairs = {ARW: found["angle_random_walk"], RRW: found["rate_random_walk"]}
     return {name: Prior(value=value, factor=factor) for name, value in pairs.items() if value > 0.0}
