@@ -244,7 +244,7 @@ def test_every_body_of_the_walk_is_listed_here():
         ("root_form",),
         ("gate", "covariance_form"),
         ("gate", "root_form"),
-        ("*parts",),
+        ("*bodies",),
         ("hypotheses_kernel",),
         ("definition", "kernel", "body_side"),
     }

@@ -192,8 +192,8 @@ class LaneLikelihood(Objective):
         )
         flat = ("minus_log", "squares", "states", "innovations")
         out = kernel.Outputs(**{name: value.reshape(-1) if name in flat else value for name, value in room.items()})
-        parts = (likelihood_outliers, kernel) if self.mixed else (kernel,)
-        run = compiled(walk, *parts)
+        bodies = (likelihood_outliers, kernel) if self.mixed else (kernel,)
+        run = compiled(walk, *bodies)
         run(read_only(case.time), read_only(case.increments), case.events.measurements, 1, body, out)
         return room
 
