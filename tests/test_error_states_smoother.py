@@ -1,4 +1,4 @@
-"""The smoother with error states: one least-squares problem for each kind of block, fixed lag, recoveries, states given by functions."""
+"""The smoother with error states: one least-squares problem for each kind of block, and recoveries."""
 
 from __future__ import annotations
 
@@ -307,16 +307,12 @@ def test_what_is_carried_is_consistent(kind):
     assert np.all((low < found.mean(axis=0)) & (found.mean(axis=0) < high)), found.mean(axis=0)
 
 
-# ---------------------------------------------------------------------------------------------------------------------- fixed lag
-
 NOISE = ProcessNoise(angle_random_walk=1e-3, rate_random_walk=1e-4)
 IRON = error_states.VectorBias(sensor="mag", bias_sigma=0.05, rate_random_walk=1e-3)
 SWAY = error_states.GaussMarkov(sensor="acc", noise_sigma=0.3, correlation_time=0.4, frame="fixed")
-SCALE = error_states.GyroScale(scale_sigma=0.01, misalignment_sigma=0.01)
 MOVED = error_states.BoundedVelocity(
     sensor="acc", velocity_time=0.3, velocity_sigma=0.1, acceleration_time=0.1, strength=1.0
 )
-BLOCKS = {"none": (), "iron, scale and sway": (IRON, SCALE, SWAY), "velocity": (MOVED, IRON)}
 BODY = motion.HarmonicRates(
     harmonics=(
         motion.Harmonic(amplitude=(0.9, 0.4, -0.6), frequency=0.21),
@@ -465,8 +461,7 @@ def test_the_prior_of_the_blocks_ages_as_the_filter_has_it():
     P = begun.covariance + np.diag(np.append(np.zeros(6), np.diag(begun.covariance)[6:]))
     begun = dataclasses.replace(begun, values=values, covariance=P)
     bare = dataclasses.replace(
-        record,
-        vectors=tuple(dataclasses.replace(s, vector_b=np.full_like(s.vector_b, np.nan)) for s in record.vectors),
+        record, vectors=tuple(dataclasses.replace(s, vector_b=np.full_like(s.vector_b, np.nan)) for s in record.vectors)
     )
     ahead = estimation.run(bare, NOISE, begun, blocks, full_covariance=True)
     aged, covariance = aged_prior(blocks, *forward.restart_states(begun, blocks), 2.0)
