@@ -31,6 +31,12 @@ def edges_of(intervals):
     return np.concatenate([[0.0], np.cumsum(intervals)])
 
 
+def warming(slope):
+    """A bias that grows evenly with temperature."""
+    coefficients = np.stack([np.zeros(3), np.broadcast_to(slope, 3)])
+    return BiasOverTemperature(reference=0.0, span=(-1e3, 1e3), coefficients=coefficients, sigma=np.zeros((2, 3)))
+
+
 # ------------------------------------------------------------------------------------------------------------- deterministic
 
 
@@ -44,9 +50,6 @@ def test_a_perfect_gyro_measures_the_truth():
 def test_rate_form_with_every_deterministic_term():
     rate, force = np.array([0.3, -0.2, 0.1]), np.array([1.0, 2.0, 9.0])
     slope = np.array([1e-5, 2e-5, -1e-5])
-    warm = BiasOverTemperature(
-        reference=0.0, span=(-1e3, 1e3), coefficients=np.stack([np.zeros(3), slope]), sigma=np.zeros((2, 3))
-    )
     spec = GyroSpec(
         turn_on_bias=[1e-3, 2e-3, 3e-3],
         rate_ramp=[1e-4, 0.0, -2e-4],
@@ -54,7 +57,7 @@ def test_rate_form_with_every_deterministic_term():
         asymmetry=[1e-4, -2e-4, 3e-4],
         misalignment=[[0.0, 1e-3, 2e-3], [3e-3, 0.0, 4e-3], [5e-3, 6e-3, 0.0]],
         g_sensitivity=RNG.normal(size=(3, 3)) * 1e-5,
-        temperature=warm,
+        temperature=warming(slope),
     )
     dt = RNG.uniform(0.01, 0.5, 600)
     edges = edges_of(dt)
@@ -73,13 +76,7 @@ def test_missing_specific_force_or_temperature_is_refused():
     with pytest.raises(InputError, match="specific_force"):
         simulate(GyroSpec(g_sensitivity=np.eye(3)))
     with pytest.raises(InputError, match="temperature"):
-        simulate(
-            GyroSpec(
-                temperature=BiasOverTemperature(
-                    reference=0.0, span=(0.0, 1.0), coefficients=np.ones((2, 3)), sigma=np.zeros((2, 3))
-                )
-            )
-        )
+        simulate(GyroSpec(temperature=warming(1.0)))
 
 
 def test_saturation_clips_the_rate():
@@ -490,14 +487,6 @@ def test_units_convert(name, unit, factor):
     for number in (1.0, 0.15, 3e-4):
         value = getattr(datasheets.from_datasheet(**{name: f"{number} {unit}"}), field)
         assert value == pytest.approx(number * factor, rel=4e-16)
-
-
-def test_one_degree_a_second_a_root_hertz_is_sixty_degrees_a_root_hour():
-    assert (
-        datasheets.from_datasheet(arw="1 °/s/√Hz").angle_random_walk
-        == datasheets.from_datasheet(arw="60 °/√h").angle_random_walk
-    )
-    assert datasheets.from_datasheet(arw="1 °/√h").angle_random_walk == units.DEGREE_PER_ROOT_HOUR
 
 
 @pytest.mark.parametrize(
