@@ -35,8 +35,19 @@ def turning(t):
     return 4e-5 * np.stack([np.cos(0.01 * t), np.sin(0.01 * t), 0.5 * np.ones_like(t)], axis=-1)
 
 
+def plain_sensors():
+    return (
+        vectors.VectorSensor(name="sun", reference_f=np.array([1.0, 0.0, 0.2]), sigma=2e-4, rate=1.0, phase=0.13),
+        vectors.Magnetometer(name="mag", field_f=turning, sigma=1e-8, rate=2.0, phase=0.31),
+        vectors.Magnetometer(name="compass", field_f=FIELD, sigma=1e-8, rate=1.0, kind="heading", phase=0.71),
+        vectors.AttitudeSensor(name="tracker", sigma_across=1e-4, sigma_about=1e-3, rate=0.25),
+    )
+
+
 def everything(duration=120.0):
     """Every source of error that the analysis knows, all kinds of sensors."""
+    sun, mag, compass, tracker = plain_sensors()
+    gnss = vectors.HeadingPair(name="gnss", baseline_b=np.array([1.0, 0.2, 0.0]), sigma=1e-3, rate=1.0, phase=0.5)
     return Scenario(
         motion=TUMBLE,
         gyro=GyroSpec(
@@ -49,47 +60,13 @@ def everything(duration=120.0):
             asymmetry=np.array([1e-4, 0.0, 0.0]),
         ),
         sensors=(
-            vectors.AttitudeSensor(
-                name="tracker",
-                sigma_across=1e-4,
-                sigma_about=1e-3,
-                rate=0.5,
-                faults=Faults(outlier_probability=0.05, outlier_scale=4.0),
+            dataclasses.replace(tracker, rate=0.5, faults=Faults(outlier_probability=0.05, outlier_scale=4.0)),
+            dataclasses.replace(
+                sun, faults=Faults(correlated_sigma=3e-4, correlation_time=15.0, outages=((40.0, 60.0),))
             ),
-            vectors.VectorSensor(
-                name="sun",
-                reference_f=np.array([1.0, 0.0, 0.2]),
-                sigma=2e-4,
-                rate=1.0,
-                phase=0.13,
-                faults=Faults(correlated_sigma=3e-4, correlation_time=15.0, outages=((40.0, 60.0),)),
-            ),
-            vectors.Magnetometer(
-                name="mag",
-                field_f=turning,
-                sigma=1e-8,
-                rate=2.0,
-                kind="vector",
-                phase=0.31,
-                hard_iron=np.array([1e-8, 0.0, -5e-9]),
-            ),
-            vectors.Magnetometer(
-                name="compass",
-                field_f=FIELD,
-                sigma=1e-8,
-                rate=1.0,
-                kind="heading",
-                phase=0.71,
-                faults=Faults(correlated_sigma=1e-8, correlation_time=5.0),
-            ),
-            vectors.HeadingPair(
-                name="gnss",
-                baseline_b=np.array([1.0, 0.2, 0.0]),
-                sigma=1e-3,
-                rate=1.0,
-                phase=0.5,
-                faults=Faults(correlated_sigma=1e-3, correlation_time=5.0),
-            ),
+            dataclasses.replace(mag, kind="vector", hard_iron=np.array([1e-8, 0.0, -5e-9])),
+            dataclasses.replace(compass, faults=Faults(correlated_sigma=1e-8, correlation_time=5.0)),
+            dataclasses.replace(gnss, faults=Faults(correlated_sigma=1e-3, correlation_time=5.0)),
         ),
         rate=10.0,
         duration=duration,
@@ -166,15 +143,6 @@ def run_quiet(record, belief, every):
     estimate = setup.run(record, belief, initial, every=every, full_covariance=True)
     truth = setup.modelled_record(record, belief).truth
     return estimate, consistency.errors(estimate.attitude, estimate.bias, truth.attitude[::every], truth.bias[::every])
-
-
-def plain_sensors():
-    return (
-        vectors.VectorSensor(name="sun", reference_f=np.array([1.0, 0.0, 0.2]), sigma=2e-4, rate=1.0, phase=0.13),
-        vectors.Magnetometer(name="mag", field_f=turning, sigma=1e-8, rate=2.0, phase=0.31),
-        vectors.Magnetometer(name="compass", field_f=FIELD, sigma=1e-8, rate=1.0, kind="heading", phase=0.71),
-        vectors.AttitudeSensor(name="tracker", sigma_across=1e-4, sigma_about=1e-3, rate=0.25),
-    )
 
 
 SIGMA = {"sun": 3e-4, "mag": 5e-4, "compass": 1e-3, "tracker": 1e-3}
