@@ -173,6 +173,10 @@ def test_angle_between(rotation_vectors):
 # ---------------------------------------------------------------------------------------------------- bad input
 
 
+THREE, TWO = np.tile(quaternion.IDENTITY, (3, 1)), np.tile(quaternion.IDENTITY, (2, 1))
+
+
+@pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize(
     ("call", "words"),
     [
@@ -190,6 +194,10 @@ def test_angle_between(rotation_vectors):
         (lambda: quaternion.from_matrix(np.diag([1.0, 1.0, -1.0])), ("reflection", "signs of its axes")),
         (lambda: quaternion.from_matrix(np.eye(4)), ("matrix has shape (4, 4)",)),
         (lambda: quaternion.angle_between([2.0, 0.0, 0.0, 0.0], quaternion.IDENTITY), ("p has norm 2",)),
+        (lambda: quaternion.multiply(THREE, TWO), ("p has shape (3, 4) and q has shape (2, 4); their leading axes",)),
+        (lambda: quaternion.rotate(THREE, np.zeros((2, 3))), ("q has shape (3, 4) and v has shape (2, 3)",)),
+        (lambda: quaternion.angle_between(THREE, TWO), ("their leading axes",)),
+        (lambda: quaternion.exp([1e300, 0.0, 0.0]), ("rotation_vector holds 1e+300 rad",)),
     ],
 )
 def test_bad_input_is_named(call, words):
@@ -214,16 +222,6 @@ def test_single_precision_quaternions_are_normalised():
     close(np.linalg.det(quaternion.to_matrix(q)), np.ones(20))
 
 
-def test_shapes_that_do_not_go_together_are_named():
-    three, two = np.tile(quaternion.IDENTITY, (3, 1)), np.tile(quaternion.IDENTITY, (2, 1))
-    with pytest.raises(InputError, match=r"p has shape \(3, 4\) and q has shape \(2, 4\); their leading axes"):
-        quaternion.multiply(three, two)
-    with pytest.raises(InputError, match=r"q has shape \(3, 4\) and v has shape \(2, 3\)"):
-        quaternion.rotate(three, np.zeros((2, 3)))
-    with pytest.raises(InputError, match="their leading axes"):
-        quaternion.angle_between(three, two)
-
-
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("size", [1e-300, 1e-200, 1.0, 1e200, 1e300])
 def test_quaternions_of_any_size_are_normalised_and_inverted(size):
@@ -235,9 +233,7 @@ def test_quaternions_of_any_size_are_normalised_and_inverted(size):
 
 
 @pytest.mark.filterwarnings("error")
-def test_a_turn_without_a_norm_is_refused():
-    with pytest.raises(InputError, match=r"rotation_vector holds 1e\+300 rad"):
-        quaternion.exp([1e300, 0.0, 0.0])
+def test_a_turn_of_any_norm_is_one():
     assert np.isfinite(quaternion.exp([-1e149, 1e149, 0.0])).all()
 
 
