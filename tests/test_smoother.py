@@ -1,4 +1,4 @@
-"""Smoother: equal to the linear one, to its fixed-side twin and to least squares; consistent; never worse than the filter."""
+"""Smoother: equal to its fixed-side twin; consistent; never worse than the filter. Least squares: test_error_states_smoother.py."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ import mpmath
 import numpy as np
 import pytest
 from in_steps import transition_and_noise
-from scipy.optimize import least_squares
 
 from strapdown import coning, consistency, estimation, kinematics, motion, quaternion, records
 from strapdown.checks import InputError
@@ -46,14 +45,18 @@ class Case:
     integration: str | None = None
 
 
+def exact(name, kind, time, reference, sigma, attitude=quaternion.IDENTITY) -> VectorMeasurements:
+    """A sensor without errors that is modelled with some."""
+    z = np.broadcast_to(quaternion.rotate(quaternion.conjugate(attitude), reference), (len(time), 3))
+    return VectorMeasurements(sensor=name, kind=kind, time=time, vector_b=z, reference_f=reference, sigma=sigma)
+
+
 def measure(name, kind, reference, sigma, time, attitude, rng) -> VectorMeasurements:
-    exact = quaternion.rotate(quaternion.conjugate(attitude), reference)
-    z = exact + sigma * rng.standard_normal((len(time), 3))
+    one = exact(name, kind, time, reference, sigma, attitude)
+    z = one.vector_b + sigma * rng.standard_normal((len(time), 3))
     if kind != "vector":
         z /= np.linalg.norm(z, axis=1, keepdims=True)
-    return VectorMeasurements(
-        sensor=name, kind=kind, time=time, vector_b=z, reference_f=reference, sigma=np.full(len(time), sigma)
-    )
+    return dataclasses.replace(one, vector_b=z)
 
 
 def simulate(case: Case, rng: np.random.Generator, edges: np.ndarray | None = None) -> ImuRecord:
@@ -253,75 +256,6 @@ def test_equals_the_fixed_side_reference(name: str) -> None:
     record, initial = simulated(case, np.random.default_rng(11))
     one = estimation.smooth(record, case.noise, initial, full_covariance=True)
     assert_same(one, fixed_side_smoother(record, case.noise, initial), 1e-8)
-
-
-# --------------------------------------------------------------------------------------------------------------- linear and oracles
-
-
-def least_squares_estimate(
-    record: ImuRecord, noise: ProcessNoise, initial: estimation.State, guess: Estimate
-) -> np.ndarray:
-    """The whole trajectory that minimises prior, gyro and measurement residuals: its error state (n + 1, 6) from ``guess``."""
-    edges = len(record.time)
-    prior = np.linalg.inv(np.linalg.cholesky(initial.covariance))
-    dt = np.diff(record.time)
-    whitening = []
-    for increment, step in zip(record.increments, dt, strict=True):
-        _, Q = transition(increment / step - initial.bias, step, noise)
-        whitening.append(np.linalg.inv(np.linalg.cholesky(Q)))
-    rows = [(s, np.searchsorted(record.time, s.time), triad(s.reference_f)[:2]) for s in record.vectors]
-
-    def residuals(x: np.ndarray) -> np.ndarray:
-        x = x.reshape(edges, 6)
-        q, b = quaternion.multiply(guess.attitude, quaternion.exp(x[:, :3])), guess.bias + x[:, 3:]
-        start = np.concatenate(
-            [quaternion.log(quaternion.multiply(quaternion.conjugate(initial.attitude), q[0])), b[0] - initial.bias]
-        )
-        predicted = quaternion.multiply(q[:-1], quaternion.exp(record.increments - b[:-1] * dt[:, None]))
-        step = np.concatenate(
-            [quaternion.log(quaternion.multiply(quaternion.conjugate(predicted), q[1:])), np.diff(b, axis=0)], axis=1
-        )
-        parts = [prior @ start, np.einsum("kij,kj->ki", whitening, step).ravel()]
-        for series, at, across in rows:
-            parts.append(((quaternion.rotate(q[at], series.vector_b) @ across.T) / series.sigma[:, None]).ravel())
-        return np.concatenate(parts)
-
-    scale = np.tile(np.sqrt(np.diag(initial.covariance)), edges)
-    solution = least_squares(
-        residuals, np.zeros(6 * edges), x_scale=scale, xtol=1e-15, ftol=1e-15, gtol=1e-15, jac="3-point"
-    )
-    return solution.x.reshape(edges, 6)
-
-
-def test_equals_least_squares_to_first_order() -> None:
-    # All errors scaled down by ten: the distance to the optimum, in units of σ, falls by ten. So the difference is of second order.
-    distances = []
-    for scale in (1.0, 0.1):
-        case = Case(
-            motion=TURN,
-            sensors=(("direction", DOWN, 0.05 * scale, (0.2, 0.2)), ("direction", STAR, 0.05 * scale, (0.4, 0.4))),
-            duration=1.6,
-            rate=5.0,
-            noise=ProcessNoise(angle_random_walk=0.05 * scale, rate_random_walk=0.05 * scale),
-            attitude_sigma=0.1 * scale,
-            bias_sigma=0.1 * scale,
-        )
-        edges = np.arange(9) * 0.2
-        times = {0.2: edges[1:-1], 0.4: edges[2:-1:2]}
-        case = dataclasses.replace(case, sensors=tuple((*s[:3], times[s[3][0]]) for s in case.sensors))
-        rng = np.random.default_rng(8)
-        record = simulate(case, rng, edges)
-        error = rng.standard_normal(6) * 0.1 * scale
-        initial = estimation.initial_state(
-            quaternion.multiply(record.truth.attitude[0], quaternion.exp(-error[:3])),
-            attitude_sigma=case.attitude_sigma,
-            bias_sigma=case.bias_sigma,
-            bias=record.truth.bias[0] - error[3:],
-        )
-        estimate = estimation.smooth(record, case.noise, initial)
-        distances.append(np.max(np.abs(least_squares_estimate(record, case.noise, initial, estimate)) / estimate.sigma))
-    assert distances[0] < 0.2
-    assert 5.0 < distances[0] / distances[1] < 20.0
 
 
 # --------------------------------------------------------------------------------------------------------------------- consistency
@@ -625,17 +559,7 @@ def test_a_measurement_that_leaves_no_digits_is_smoothed_on_the_square_root() ->
     sharp, first = 1e-9, (1.0, 0.1)
     time = np.arange(13) * 0.25
     references = np.array([[1.0, 0.0, 0.0], [0.0, 0.6, 0.8], [0.6, -0.8, 0.0]])
-    series = tuple(
-        VectorMeasurements(
-            sensor=f"s{k}",
-            kind="direction",
-            time=time[1 + k :: 3],
-            vector_b=np.tile(r, (4, 1)),
-            reference_f=r,
-            sigma=np.full(4, sharp),
-        )
-        for k, r in enumerate(references)
-    )
+    series = tuple(exact(f"s{k}", "direction", time[1 + k :: 3], r, sharp) for k, r in enumerate(references))
     record = ImuRecord(time=time, increments=np.zeros((12, 3)), vectors=series)
     initial = estimation.initial_state(quaternion.IDENTITY, attitude_sigma=first[0], bias_sigma=first[1])
     noise = ProcessNoise(angle_random_walk=1e-18, rate_random_walk=0.0)
@@ -847,17 +771,8 @@ def test_sigmas_of_any_magnitude_are_smoothed_right() -> None:
         attitude_sigma, bias_sigma = 10.0 ** rng.uniform([-14, -22], [0, 0.5])
         time, measured = np.arange(n + 1) * dt, rng.random(n + 1) < 0.5
         at = time[measured]
-        series = tuple(
-            VectorMeasurements(
-                sensor=str(k),
-                kind="vector",
-                time=at,
-                vector_b=np.tile(axis, (len(at), 1)),
-                reference_f=axis,
-                sigma=np.full(len(at), np.sqrt(2.0) * sigma),  # each shows two of three axes
-            )
-            for k, axis in enumerate(np.eye(3))
-        )
+        # Each shows two of three axes.
+        series = tuple(exact(str(k), "vector", at, axis, np.sqrt(2.0) * sigma) for k, axis in enumerate(np.eye(3)))
         record = ImuRecord(time=time, increments=np.zeros((n, 3)), vectors=series if len(at) else ())
         noise = ProcessNoise(angle_random_walk=arw, rate_random_walk=rrw)
         start = estimation.initial_state(quaternion.IDENTITY, attitude_sigma=attitude_sigma, bias_sigma=bias_sigma)
@@ -881,14 +796,7 @@ def test_a_filter_that_diverges_is_an_error() -> None:
     time, rate = np.arange(41) * 1e-3, np.array([0.1, -0.2, 0.3])
     at = time[3::4]
     attitude = quaternion.exp(at[:, None] * rate)
-    series = VectorMeasurements(
-        sensor="field",
-        kind="vector",
-        time=at,
-        vector_b=quaternion.rotate(quaternion.conjugate(attitude), DOWN),
-        reference_f=DOWN,
-        sigma=np.full(len(at), 1e-12),
-    )
+    series = exact("field", "vector", at, DOWN, 1e-12, attitude)
     record = ImuRecord(time=time, increments=np.tile(1e-3 * rate, (40, 1)), vectors=(series,))
     start = quaternion.exp(0.6 * np.random.default_rng(21).standard_normal(3))
     initial = estimation.initial_state(start, attitude_sigma=1.7, bias_sigma=0.04)
