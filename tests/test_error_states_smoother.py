@@ -197,13 +197,9 @@ def small_record(blocks, scale, *, seed=3, steps=8, dt=0.1, late=False, off=(1.0
         ("acc", UP, 0.2 * scale, np.arange(1, steps + 1)),
         ("mag", FIELD, 0.02 * scale, np.array([steps]) if late else np.arange(2, steps + 1, 2)),
     ):
+        nothing = np.zeros((len(at), 3))
         one = VectorMeasurements(
-            sensor=name,
-            kind="vector",
-            time=time[at],
-            vector_b=np.zeros((len(at), 3)),
-            reference_f=reference,
-            sigma=np.full(len(at), sigma),
+            sensor=name, kind="vector", time=time[at], vector_b=nothing, reference_f=reference, sigma=sigma
         )
         z = predicted_vectors(blocks, one, q[at], c[at], turning_matrices(blocks, bare, one))
         series.append(dataclasses.replace(one, vector_b=z + sigma * rng.standard_normal(z.shape)))
@@ -330,9 +326,7 @@ def swaying(duration=2.0, seed=1, start_error=(0.05, -0.02, 0.03)):
         seen = quaternion.rotate(quaternion.conjugate(BODY.attitude(at)), reference)
         seen = seen + sigma * rng.standard_normal(seen.shape)
         series.append(
-            VectorMeasurements(
-                sensor=name, kind="vector", time=at, vector_b=seen, reference_f=reference, sigma=np.full(len(at), sigma)
-            )
+            VectorMeasurements(sensor=name, kind="vector", time=at, vector_b=seen, reference_f=reference, sigma=sigma)
         )
     attitude = quaternion.multiply(BODY.attitude(np.array(0.0)), quaternion.exp(start_error))
     truth = records.Truth(attitude=BODY.attitude(time), bias=np.zeros((len(time), 3)))
@@ -358,9 +352,8 @@ def test_a_bias_that_turns_more_than_the_increments_say_loses_no_segments():
     rng = np.random.default_rng(5)
     time = np.arange(21.0)
     z = np.tile([0.0, 0.0, 1.0], (20, 1)) + 0.02 * rng.standard_normal((20, 3))
-    series = VectorMeasurements(
-        sensor="mag", kind="vector", time=time[1:], vector_b=z, reference_f=[0.0, 0.0, 1.0], sigma=np.full(20, 0.02)
-    )
+    up = [0.0, 0.0, 1.0]
+    series = VectorMeasurements(sensor="mag", kind="vector", time=time[1:], vector_b=z, reference_f=up, sigma=0.02)
     start = estimation.State(
         attitude=quaternion.IDENTITY, bias=np.array([0.0, 0.0, 3.0]), covariance=np.diag([1e-4] * 3 + [1e-12] * 3)
     )

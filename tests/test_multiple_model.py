@@ -31,7 +31,7 @@ QUIET = ProcessNoise(angle_random_walk=1e-7, rate_random_walk=1e-10)
 
 def series(name, time, vector_b, reference_f, sigma, kind="direction"):
     return VectorMeasurements(
-        sensor=name, kind=kind, time=time, vector_b=vector_b, reference_f=reference_f, sigma=np.full(len(time), sigma)
+        sensor=name, kind=kind, time=time, vector_b=vector_b, reference_f=reference_f, sigma=sigma
     )
 
 
