@@ -59,18 +59,8 @@ def ours(rate: list[Any], force: list[Any], field: list[Any]) -> dict[str, tuple
         "the same, gate": (live(gate=Gate()), n),
         "the same, look-back of 0.5 s": (live(look_back=0.5), n),
         "the same, nine error states": (live(error_states=(GyroScale(scale_sigma=1e-3, misalignment_sigma=1e-3),)), n),
-        "numba: a call of nothing with the kernel's arguments": (unpacking(), n),
         "strapdown StepFilter on filterpy, two vectors": (steps, 500),
     }
-
-
-def unpacking() -> Call:
-    """Return a call of a compiled function that does nothing, with the arguments of a step."""
-    import numba
-
-    arguments = LiveFilter(NOISE, START, sensors=SENSORS)._arguments(2, 1)
-    nothing = numba.njit(lambda edges, increments, measured, every, body, out: 0)
-    return lambda k: nothing(*arguments)
 
 
 def peers(rate: np.ndarray, force: np.ndarray, field: np.ndarray) -> dict[str, tuple[Call, int]]:

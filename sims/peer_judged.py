@@ -291,7 +291,9 @@ def main(*, runs: int = 200, duration: float = 40.0, seed: int = 1, out: Path | 
     given = cases(duration)
     found, plans = {}, {}
     for name, (_, scene, estimator) in given.items():
-        chosen = replace(setup.matched(scene), attitude_sigma=1.0 * DEGREE, bias_sigma=BIAS, estimator=estimator)
+        chosen = replace(
+            setup.FilterSetup.for_scenario(scene), attitude_sigma=1.0 * DEGREE, bias_sigma=BIAS, estimator=estimator
+        )
         plans[name] = montecarlo.Plan(scenario=scene, setup=chosen, seed=seed, epochs=10)
         found[name] = montecarlo.run_plan(plans[name], runs=runs)
     result = Result(

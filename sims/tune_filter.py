@@ -61,7 +61,7 @@ def main(*, duration=1800.0, rate=20.0, wrong=30.0, starts=20, seed=1, out=None)
         rate=rate,
         duration=duration,
     )
-    right = setup.matched(scenario, attitude_sigma=0.1 * units.DEGREE)
+    right = setup.FilterSetup.for_scenario(scenario, attitude_sigma=0.1 * units.DEGREE)
     predicted = tuning.plan(scenario, right, FREE, lengths=[0.7 * duration], seed=seed)
     record = scenarios.simulate(scenario, seed)
     whole = tuning.record_case(record, right, seed=seed)
@@ -90,7 +90,7 @@ def draw(result, folder, objective):
     from strapdown import plots
     from strapdown.plots import tuning as drawing
 
-    tuned = tuning.with_units(result.too_small, [result.record])
+    tuned = result.too_small
     shown = [one.unit for one in tuned.parameters]
     figure, (left, right) = plots.new_figure(1, 2, size=(11.0, 4.6))
     for number, one in enumerate((result.too_large, result.too_small)):

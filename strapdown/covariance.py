@@ -32,7 +32,7 @@ from strapdown.randomness import generator
 from strapdown.records import ImuRecord
 from strapdown.results import ByValue, Listed, Listing, figure
 from strapdown.scenarios import Scenario
-from strapdown.setup import FilterSetup, matched, modelled_record, need_mekf
+from strapdown.setup import FilterSetup, modelled_record, need_mekf
 from strapdown.units import DEGREE
 from strapdown.vectors import VectorMeasurements
 
@@ -712,7 +712,7 @@ def analyse(
     scenario : Scenario, str or path
         As of :func:`strapdown.scenarios.simulate`.
     setup : FilterSetup, optional
-        The filter. Default: matched to the scenario (:func:`strapdown.setup.matched`).
+        The filter. Default: matched to the scenario (:meth:`strapdown.setup.FilterSetup.for_scenario`).
     consider : Consider, optional
         Errors besides those of the scenario.
     initial_attitude_sigma, initial_bias_sigma : float, optional
@@ -742,7 +742,7 @@ def analyse(
     >>> print(found)  # doctest: +SKIP
     """
     scenario = scenarios.chosen(scenario)
-    setup = matched(scenario) if setup is None else setup
+    setup = FilterSetup.for_scenario(scenario) if setup is None else setup
     consider = Consider() if consider is None else consider
     _check_considered(scenario, consider)
     edges = scenario.edges

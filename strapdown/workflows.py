@@ -393,12 +393,14 @@ def _record_setup(
     states: bool | Sequence[str] | None,
 ) -> FilterSetup:
     if setup is not None:
-        instance("setup", setup, FilterSetup, "give a FilterSetup, as setup.matched or tune returns it")
+        instance(
+            "setup", setup, FilterSetup, "give a FilterSetup, as setup.FilterSetup.for_scenario or tune returns it"
+        )
         _refuse("the scenario's own filter, and setup is a whole one", noise=noise, states=states or None)
         return setup
     if not isinstance(noise, ProcessNoise):
         spec = None if noise is None else _specification(noise)
-        return setups.matched_to_record(record, spec, states=states)
+        return setups.FilterSetup.for_record(record, spec, states=states)
     if initial is None:
         raise InputError(
             "noise is a ProcessNoise, which says nothing of the initial gyro bias; give initial= too, or a GyroSpec as noise"
@@ -550,7 +552,7 @@ def plan(
     if setup is not None and (states is not None or gyro is not None):
         raise InputError("a filter setup has its own states and gyro noise; leave states and gyro out")
     assumed = scenario if gyro is None else dataclasses.replace(scenario, gyro=gyro)
-    chosen = setups.matched(assumed, states=states) if setup is None else setup
+    chosen = setups.FilterSetup.for_scenario(assumed, states=states) if setup is None else setup
     names = chosen.states.names if setup is None and chosen.states is not None else ()
     return montecarlo.Plan(
         scenario=scenario,
@@ -677,7 +679,7 @@ def tune(
     cases = []
     for one in given:
         if isinstance(one, ImuRecord):
-            setup = setup or setups.matched_to_record(one, states=None)
+            setup = setup or setups.FilterSetup.for_record(one, states=None)
             cases.append(tuning.record_case(one, setup))
         else:
             setup = setup or tuning.recording_setup()

@@ -227,7 +227,7 @@ def test_states_that_the_errors_call_for(run, spinning, tmp_path, monkeypatch, b
     )
     assert (tmp_path / "out" / "states.png").stat().st_size > 10_000
     saved = setup.from_toml(records.read_attributes(tmp_path / "out" / "estimate.h5")["filter"])
-    assert saved == setup.matched_to_record(simulate(scenarios.load_scenario("spin"), 3), states=True)
+    assert saved == setup.FilterSetup.for_record(simulate(scenarios.load_scenario("spin"), 3), states=True)
     status, _, _ = run("check", tmp_path / "out" / "estimate.h5")
     assert status == 0
     monkeypatch.setattr(Figure, "savefig", blank)
@@ -256,7 +256,7 @@ def test_what_a_record_shows_of_each_state(run, spinning, tmp_path):
 
 def test_what_the_filter_has_no_state_for_is_reported(spinning, record, tmp_path):
     scenario = scenarios.load_scenario("spin")
-    toml = setup.to_toml(setup.matched(scenario))
+    toml = setup.to_toml(setup.FilterSetup.for_scenario(scenario))
     (tmp_path / "filter.toml").write_text(toml)
     held = read_record(spinning)
     for file, states in ((None, False), (tmp_path / "filter.toml", None)):
@@ -357,7 +357,9 @@ def test_a_lost_filter_with_states_recovers(run, spinning, tmp_path):
 
 
 def test_states_are_refused_where_they_make_no_sense(run, spinning, tmp_path):
-    (tmp_path / "filter.toml").write_text(setup.to_toml(setup.matched(scenarios.load_scenario("spin"))))
+    (tmp_path / "filter.toml").write_text(
+        setup.to_toml(setup.FilterSetup.for_scenario(scenarios.load_scenario("spin")))
+    )
     (tmp_path / "rec.csv").write_text("")
     cases = (
         ((spinning, "--state", "gyro.scael"), "did you mean 'gyro.scale'"),

@@ -12,7 +12,7 @@ import scipy.stats
 
 from strapdown import consistency, montecarlo, motion, records, scenarios, setup, vectors
 from strapdown.checks import InputError
-from strapdown.consistency.judgement import Finding, holm, resolution
+from strapdown.consistency.judgement import Finding, holm
 from strapdown.gyro import GyroSpec
 from strapdown.montecarlo import campaign
 from strapdown.records import Estimate, Innovations, Truth
@@ -208,11 +208,16 @@ def test_upper_bounds_are_contradicted_by_what_exceeds_them_alone():
     assert consistency.judge(*estimate(0.1, bias_error=10.0), upper_bounds=True).verdict == "not consistent"
 
 
-def test_resolution_is_the_factor_that_bounds_leave():
-    finding = Finding(name="NIS", of="star", value=1.0, p_value=0.5, samples=200, degrees=2)
-    low, high = consistency.mean_bounds(2, 200, 0.99)
-    assert resolution([finding], 0.99) == pytest.approx(math.sqrt(high / low))
-    assert resolution([], 0.99) == math.inf
+@pytest.mark.parametrize("samples", [200, 20, 1])
+def test_resolution_is_the_factor_that_bounds_leave(samples):
+    finding = Finding(name="NIS", of="star", value=1.0, p_value=0.5, samples=samples, degrees=2)
+    low, high = consistency.mean_bounds(2, samples, 0.99)
+    judged = consistency.concluded([finding], [], 0.99, states=())
+    assert judged.power[0].factor == pytest.approx(math.sqrt(high / low))
+    assert judged.verdict == ("consistent" if samples == 200 else "cannot tell")
+    # One sample distinguishes nothing.
+    unseen = {200: "", 20: f"a factor of {math.sqrt(high / low):.2g} would not be seen", 1: "a factor of inf would not"}
+    assert unseen[samples] in judged.reason
 
 
 def test_the_summary_is_plain():

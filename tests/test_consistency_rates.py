@@ -162,7 +162,7 @@ def satellite(duration=300.0):
         duration=duration,
         gravity_f=(0.0, 0.0, 0.0),
     )
-    chosen = setup.matched(scenario, states=True)
+    chosen = setup.FilterSetup.for_scenario(scenario, states=True)
     return montecarlo.Plan(scenario=scenario, setup=chosen, epochs=50, individuals=True)
 
 
@@ -184,7 +184,7 @@ def coloured(correlation_time):
         sensors=(replace(base.sensors[0], faults=faults),),
         gyro=GyroSpec(angle_random_walk=0.15 * units.DEGREE_PER_ROOT_HOUR, rate_random_walk=2.4e-8),
     )
-    chosen = setup.matched(scenario, states=True)
+    chosen = setup.FilterSetup.for_scenario(scenario, states=True)
     return montecarlo.Plan(scenario=scenario, setup=chosen, epochs=50, individuals=True)
 
 
@@ -202,7 +202,7 @@ def verdicts_of_campaigns(campaigns, runs):
     scenario = replace(scenarios.load_scenario("two-stars"), duration=20.0)
     found = []
     for seed in range(campaigns):
-        plan = montecarlo.Plan(scenario=scenario, setup=setup.matched(scenario), seed=seed, epochs=40)
+        plan = montecarlo.Plan(scenario=scenario, setup=setup.FilterSetup.for_scenario(scenario), seed=seed, epochs=40)
         found.append(montecarlo.run_plan(plan, runs=runs, threads=1).judge().verdict)
     return found
 

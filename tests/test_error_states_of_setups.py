@@ -102,8 +102,8 @@ def test_states_go_through_their_file_to_the_last_bit(tmp_path):
         )
         assert optional.from_table(optional.to_table(states)) == states
     assert setup.from_toml(
-        setup.to_toml(setup.matched(scenarios.load_scenario("hand-held"), states=True))
-    ) == setup.matched(scenarios.load_scenario("hand-held"), states=True)
+        setup.to_toml(setup.FilterSetup.for_scenario(scenarios.load_scenario("hand-held"), states=True))
+    ) == setup.FilterSetup.for_scenario(scenarios.load_scenario("hand-held"), states=True)
 
 
 @pytest.mark.parametrize(
@@ -416,7 +416,7 @@ def test_a_lever_arm_is_found(kind):
         rate=200.0,
         duration=20.0,
     )
-    filter_setup = setup.matched(scenario, states=True)
+    filter_setup = setup.FilterSetup.for_scenario(scenario, states=True)
     ratios = []
     for seed in range(6):
         record = scenarios.simulate(scenario, seed)
@@ -436,7 +436,7 @@ def test_hard_iron_in_a_field_that_changes_is_found_in_its_own_unit():
     iron = np.array([2e-6, -1.5e-6, 1e-6])
     sensors = tuple(dataclasses.replace(s, hard_iron=iron) if s.name == "magnetometer" else s for s in scenario.sensors)
     scenario = dataclasses.replace(scenario, sensors=sensors)
-    filter_setup = setup.matched(scenario, states=True)
+    filter_setup = setup.FilterSetup.for_scenario(scenario, states=True)
     own = filter_setup.states.sensors["magnetometer"]
     assert own.varying
     record = scenarios.simulate(scenario, 5)
@@ -509,22 +509,25 @@ def test_drifts_a_decade_apart_are_flicker():
 
 def test_what_a_specification_gives_is_matched_entry_by_entry():
     scenario = scenarios.load_scenario("spin")
-    chosen = setup.matched(scenario, states=True)
+    chosen = setup.FilterSetup.for_scenario(scenario, states=True)
     assert chosen.states == States(gyro_scale_sigma=tuple(scenario.gyro.scale_factor))
     assert chosen.states.gyro_scale_sigma[2] == pytest.approx(1e-4)
-    assert chosen.process_noise == setup.matched(scenario).process_noise
+    assert chosen.process_noise == setup.FilterSetup.for_scenario(scenario).process_noise
     markov = GyroSpec(angle_random_walk=1e-5, markov_noise=1e-6, markov_correlation_time=50.0)
-    found = setup.matched(dataclasses.replace(scenario, gyro=markov), states=True)
+    found = setup.FilterSetup.for_scenario(dataclasses.replace(scenario, gyro=markov), states=True)
     assert found.states.gyro_drift_time == (50.0,)
     assert found.states.gyro_drift_sigma[0] == pytest.approx(1e-6 * 5.0)
     assert found.process_noise.rate_random_walk == 0.0
-    falling = setup.matched(scenarios.load_scenario("tumbling-satellite"), states=True)
+    falling = setup.FilterSetup.for_scenario(scenarios.load_scenario("tumbling-satellite"), states=True)
     assert "gyro.force" not in falling.states.names
 
 
 def test_a_motion_that_commutes_badly_gets_a_better_integration():
-    assert setup.matched(scenarios.load_scenario("coning"), states=True).integration.name == setup.ACCURATE_ALGORITHM
-    assert setup.matched(scenarios.load_scenario("spin"), states=True).integration.name == "one-sample"
+    assert (
+        setup.FilterSetup.for_scenario(scenarios.load_scenario("coning"), states=True).integration.name
+        == setup.ACCURATE_ALGORITHM
+    )
+    assert setup.FilterSetup.for_scenario(scenarios.load_scenario("spin"), states=True).integration.name == "one-sample"
 
 
 def test_individuals_are_drawn_with_the_reported_errors_for_sigma():
@@ -553,7 +556,7 @@ def test_an_estimate_with_states_is_judged_like_any_other(tmp_path):
     from strapdown.records import read_estimate, write_estimate
 
     scenario = scenarios.load_scenario("spin")
-    filter_setup = setup.matched(scenario, states=True)
+    filter_setup = setup.FilterSetup.for_scenario(scenario, states=True)
     record = scenarios.simulate(scenarios.drawn(scenario, 2), 2)
     draw = generator(2, 0, "start").standard_normal(6)
     initial = setup.initial_state(

@@ -35,7 +35,7 @@ and its mean scatters by 0.7 % from study to study where independent ones would 
 
 @cache
 def matched(name: str, states: bool = True) -> setup.FilterSetup:
-    return setup.matched(scenarios.load_scenario(name), states=states)
+    return setup.FilterSetup.for_scenario(scenarios.load_scenario(name), states=states)
 
 
 @dataclasses.dataclass

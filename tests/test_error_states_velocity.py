@@ -721,7 +721,7 @@ def test_the_command_line_takes_it_from_a_filter_file(run):
     Path("hand.toml").write_text(scenarios.scenario_to_toml(scenario), encoding="utf-8")
     assert run("simulate", "hand.toml", "--out", "record.h5")[0] == 0
     (acc,) = (sensor.name for sensor in scenario.sensors if "acc" in sensor.name)
-    chosen = setup.matched(scenario, states=True)
+    chosen = setup.FilterSetup.for_scenario(scenario, states=True)
     held = dataclasses.replace(chosen.states.sensors.get(acc, SensorStates()), **dataclasses.asdict(TOLD))
     chosen = dataclasses.replace(chosen, states=dataclasses.replace(chosen.states, sensors={acc: held}))
     Path("filter.toml").write_text(setup.to_toml(chosen), encoding="utf-8")

@@ -46,7 +46,7 @@ FLIGHT = scenarios.Scenario(
 
 @pytest.fixture(scope="module")
 def run():
-    plan = montecarlo.Plan(scenario=FLIGHT, setup=setup.matched(FLIGHT), seed=5, epochs=20)
+    plan = montecarlo.Plan(scenario=FLIGHT, setup=setup.FilterSetup.for_scenario(FLIGHT), seed=5, epochs=20)
     return montecarlo.replay(plan, 0, machine="scalar")
 
 
@@ -96,7 +96,7 @@ def test_a_factor_on_sigma_is_as_likely_as_its_likelihood_ratio(m, factor):
     error *= factor / np.sqrt(np.mean(error**2))
     time, attitude = np.arange(float(m)), quaternion.normalize(draw.standard_normal((m, 4)))
     truth, P = Truth(attitude=attitude, bias=np.zeros((m, 3))), np.tile(1e-6 * np.eye(6), (m, 1, 1))
-    known = foreign.explanations(1e-3 * error, {"body": P}, "body", truth, time, attitude)
+    known = foreign.explanations(1e-3 * error, {"body": P}, "body", {"body": 1.0}, truth, time, attitude)
     (found,) = (one for one in known if one.name == foreign.SCALE)
     assert float(found.value) == pytest.approx(factor, rel=1e-3)
     ratio = 3.0 * (m if m > 10 else 1) * (factor**2 - 1.0 - 2.0 * np.log(factor))
@@ -182,6 +182,7 @@ def test_a_trajectory_without_covariance_is_not_judged(files, monkeypatch, capsy
     status, said, _ = command(monkeypatch, capsys, "check", files / "estimate.tum", "--truth", files / "record.h5")
     assert status == 2
     assert "has no covariance, so its errors are not judged (RMS attitude error" in said
+    assert "without a truth" not in said
     assert "cannot tell" in said
 
 

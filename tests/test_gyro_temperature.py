@@ -250,7 +250,7 @@ def test_the_matched_filter_has_the_slope_and_a_plain_one_is_named_for_lacking_i
         scenario.gyro.temperature, coefficients=np.array([[0.0] * 3, [1e-5, -2e-5, 0.0]]), sigma=np.zeros((2, 3))
     )
     linear = replace(scenario, gyro=replace(scenario.gyro, temperature=warm))
-    states = setup.matched(linear, states=True).states
+    states = setup.FilterSetup.for_scenario(linear, states=True).states
     np.testing.assert_allclose(states.gyro_temperature_sigma, [1e-5, 2e-5, 0.0], rtol=1e-12)
     assert "gyro.temperature" in states.names
     assert states.chosen(("gyro.temperature",)).gyro_temperature_sigma == states.gyro_temperature_sigma
@@ -264,13 +264,15 @@ def test_the_matched_filter_has_the_slope_and_a_plain_one_is_named_for_lacking_i
     bent = replace(warm, coefficients=np.array([[0.0] * 3, [0.0] * 3, [1e-6] * 3]), sigma=np.zeros((3, 3)))
     course = scenarios.Temperature(start=20.0, end=40.0)
     curved = replace(scenario, gyro=replace(scenario.gyro, temperature=bent), temperature=course)
-    found = setup.matched(curved, states=True).states.gyro_temperature_sigma
+    found = setup.FilterSetup.for_scenario(curved, states=True).states.gyro_temperature_sigma
     np.testing.assert_allclose(found, 2e-6 * 10.0 / np.sqrt(3.0), rtol=1e-3)
-    plan = montecarlo.Plan(scenario=linear, setup=setup.matched(linear, states=True))
+    plan = montecarlo.Plan(scenario=linear, setup=setup.FilterSetup.for_scenario(linear, states=True))
     assert "bias over temperature" in lanes.supports(plan)
     drawn_only = replace(warm, coefficients=np.zeros((2, 3)), sigma=np.array([[0.0] * 3, [SLOPE] * 3]))
     of_units = replace(scenario, gyro=replace(scenario.gyro, temperature=drawn_only))
-    np.testing.assert_allclose(setup.matched(of_units, states=True).states.gyro_temperature_sigma, SLOPE, rtol=1e-12)
+    np.testing.assert_allclose(
+        setup.FilterSetup.for_scenario(of_units, states=True).states.gyro_temperature_sigma, SLOPE, rtol=1e-12
+    )
 
 
 def test_lost_samples_and_locked_out_sensors():

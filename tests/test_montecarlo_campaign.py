@@ -27,7 +27,7 @@ from strapdown.montecarlo import campaign, engine, scalar, statistics
 from strapdown.recordings import recordfiles
 
 SCENARIO = replace(scenarios.load_scenario("spin"), duration=2.4)
-SETUP = setups.matched(SCENARIO)
+SETUP = setups.FilterSetup.for_scenario(SCENARIO)
 PLAN = montecarlo.Plan(scenario=SCENARIO, setup=SETUP, seed=4, epochs=6, nis_bins=5)
 CHUNK = 8
 

@@ -266,7 +266,7 @@ def test_the_filter_with_states_is_as_good_as_it_says():
     scenario = replace(plan("heading").scenario, duration=10.0)
     verdicts = []
     for states in (True, False):
-        chosen = setup.matched(scenario, states=states)
+        chosen = setup.FilterSetup.for_scenario(scenario, states=states)
         one = montecarlo.Plan(scenario=scenario, setup=chosen, seed=8, epochs=10, nis_bins=5, individuals=True)
         verdicts.append(montecarlo.run_plan(one, runs=96, machine="scalar").verdict(np.arange(2, 11, 2), "state"))
     assert verdicts[0].consistent, verdicts[0].mean

@@ -20,7 +20,7 @@ from strapdown.montecarlo import campaign, engine, plan, scalar, statistics
 from strapdown.montecarlo.statistics import BINS, ERROR_EXPONENT, NEES_EXPONENT, bin_edges, bin_of
 
 SCENARIO = replace(scenarios.load_scenario("spin"), duration=2.4)
-SETUP = setups.matched(SCENARIO)
+SETUP = setups.FilterSetup.for_scenario(SCENARIO)
 
 
 def planned(**changes):

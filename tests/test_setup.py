@@ -53,7 +53,7 @@ def test_the_gate_of_a_setup_is_that_of_its_filter():
     vector = first.vector_b.copy()
     vector[-3] = -vector[-3]
     record = dataclasses.replace(record, vectors=(dataclasses.replace(first, vector_b=vector), *rest))
-    filter_setup = setup.matched(scenario())
+    filter_setup = setup.FilterSetup.for_scenario(scenario())
     start = setup.initial_state(filter_setup, record.truth.attitude[0], record.truth.bias[0])
     gated = dataclasses.replace(filter_setup, gate=Gate())
     assert setup.run(record, gated, start).refused[first.sensor] == 1
@@ -110,22 +110,22 @@ def test_a_file_without_the_table_says_what_writes_one(tmp_path):
 
 def test_matched_takes_the_gyro_at_its_word():
     spec = GyroSpec(angle_random_walk=2e-5, rate_random_walk=1e-8, turn_on_bias_sigma=3e-5)
-    chosen = setup.matched(scenario(gyro=spec))
+    chosen = setup.FilterSetup.for_scenario(scenario(gyro=spec))
     assert chosen.process_noise == estimation.ProcessNoise(angle_random_walk=2e-5, rate_random_walk=1e-8)
     assert chosen.bias_sigma == pytest.approx(3e-5)
 
 
 def test_a_gauss_markov_bias_starts_from_its_stationary_spread():
     spec = GyroSpec(angle_random_walk=2e-5, markov_noise=1e-6, markov_correlation_time=800.0)
-    assert setup.matched(scenario(gyro=spec)).bias_sigma == pytest.approx(1e-6 * np.sqrt(400.0))
+    assert setup.FilterSetup.for_scenario(scenario(gyro=spec)).bias_sigma == pytest.approx(1e-6 * np.sqrt(400.0))
 
 
 def test_flicker_raises_both_noises():
     spec = GyroSpec(angle_random_walk=2e-5, bias_instability=5.0 * units.DEGREE_PER_HOUR)
-    noise = setup.matched(scenario(gyro=spec)).process_noise
+    noise = setup.FilterSetup.for_scenario(scenario(gyro=spec)).process_noise
     assert noise.angle_random_walk > 2e-5
     assert noise.rate_random_walk > 0.0
-    blind = setup.matched(scenario(gyro=spec, sensors=())).process_noise
+    blind = setup.FilterSetup.for_scenario(scenario(gyro=spec, sensors=())).process_noise
     assert blind.rate_random_walk < noise.rate_random_walk  # bounded over the whole record
 
 
@@ -134,14 +134,14 @@ def test_beside_states_the_rate_random_walk_is_that_of_the_worst_axis_alone():
     walks = {"angle_random_walk": 2e-5, "rate_random_walk": (1e-8, 3e-8, 2e-8), "markov_noise": 4e-8}
     for time, sigma in ((800.0, 3e-8), (np.inf, 5e-8)):
         spec = GyroSpec(**walks, markov_correlation_time=time)
-        noise = setup.matched(scenario(gyro=spec), states=True).process_noise
+        noise = setup.FilterSetup.for_scenario(scenario(gyro=spec), states=True).process_noise
         assert noise.rate_random_walk == pytest.approx(sigma, rel=1e-12)
         assert noise.angle_random_walk == pytest.approx(2e-5, rel=1e-12)
 
 
 def test_a_gyro_without_noise_is_refused():
     with pytest.raises(InputError, match="angle random walk"):
-        setup.matched(scenario(gyro=GyroSpec()))
+        setup.FilterSetup.for_scenario(scenario(gyro=GyroSpec()))
 
 
 def test_measurement_density_counts_what_each_kind_measures():
@@ -171,7 +171,7 @@ def test_the_matched_filter_of_a_scenario_is_consistent():
     # A gyro of noise alone: the errors of shape that presets have too are nothing that the filter has states for.
     noise = GyroSpec(angle_random_walk=5e-5, rate_random_walk=1e-6, turn_on_bias_sigma=1e-4)
     chosen = scenario(gyro=noise, gyro_preset="", duration=30.0)
-    filter_setup = setup.matched(chosen)
+    filter_setup = setup.FilterSetup.for_scenario(chosen)
     filter_setup = dataclasses.replace(filter_setup, integration=coning.ALGORITHMS["four-sample"])
     runs, last = 60, []
     for run in range(runs):
@@ -193,7 +193,7 @@ def test_the_matched_filter_of_a_scenario_is_consistent():
 
 def test_truth_travels_in_the_estimate_file(tmp_path):
     record = scenarios.simulate(scenario(duration=5.0))
-    filter_setup = setup.matched(scenario())
+    filter_setup = setup.FilterSetup.for_scenario(scenario())
     estimate = setup.run(record, filter_setup, setup.initial_state(filter_setup, record.truth.attitude[0]))
     records.write_estimate(tmp_path / "with.h5", estimate, truth=record.truth)
     records.write_estimate(tmp_path / "without.h5", estimate)
@@ -224,13 +224,13 @@ def test_what_the_filter_has_no_state_for_is_reported_in_words():
 def test_with_states_there_is_less_that_is_not_covered():
     for name in ("spin", "low-orbit", "coning", "tumbling-satellite"):
         chosen = scenarios.load_scenario(name)
-        filter_setup = setup.matched(chosen, states=True)
+        filter_setup = setup.FilterSetup.for_scenario(chosen, states=True)
         assert setup.unmodelled_errors(chosen.gyro, chosen.sensors)
         assert (
             setup.unmodelled_errors(chosen.gyro, chosen.sensors, filter_setup.states, gravity_f=chosen.gravity_f) == ()
         )
     held = scenarios.load_scenario("hand-held")
-    part = setup.matched(held, states=True).states.chosen(("gyro.drift", "accelerometer.lever"))
+    part = setup.FilterSetup.for_scenario(held, states=True).states.chosen(("gyro.drift", "accelerometer.lever"))
     words = " and ".join(setup.unmodelled_errors(held.gyro, held.sensors, part))
     assert "correlated noise of the magnetometer" in words
     assert "lever arm" not in words
@@ -239,7 +239,7 @@ def test_with_states_there_is_less_that_is_not_covered():
 
 def test_an_estimate_of_a_setup_with_states_holds_them():
     chosen = dataclasses.replace(scenarios.load_scenario("spin"), duration=30.0)
-    filter_setup = setup.matched(chosen, states=True)
+    filter_setup = setup.FilterSetup.for_scenario(chosen, states=True)
     record = scenarios.simulate(chosen)
     start = setup.initial_state(filter_setup, record.truth.attitude[0], record.truth.bias[0])
     estimate = setup.run(record, filter_setup, start, every=10, full_covariance=True)
@@ -257,7 +257,7 @@ def test_smoothing_by_a_setup_is_that_of_the_smoother(states):
     chosen = scenarios.load_scenario("spin") if states else scenario(duration=10.0)
     chosen = dataclasses.replace(chosen, duration=10.0)
     record = scenarios.simulate(chosen, 3)
-    filter_setup = setup.matched(chosen, states=states)
+    filter_setup = setup.FilterSetup.for_scenario(chosen, states=states)
     start = setup.initial_state(filter_setup, record.truth.attitude[0])
     found = setup.smooth(record, filter_setup, start, full_covariance=True)
     modelled = setup.modelled_record(record, filter_setup)
@@ -276,7 +276,7 @@ def test_smoothing_by_a_setup_is_that_of_the_smoother(states):
 def test_what_cannot_be_smoothed_is_refused(monkeypatch):
     chosen = scenario(duration=10.0)
     record = scenarios.simulate(chosen, 3)
-    filter_setup = setup.matched(chosen)
+    filter_setup = setup.FilterSetup.for_scenario(chosen)
     start = setup.initial_state(filter_setup, record.truth.attitude[0])
     monkeypatch.setattr(setup, "MAX_MEMORY", 1e5)
     with pytest.raises(InputError, match=r"with 6 states takes .* GB, more than 0.0001; cut the record"):

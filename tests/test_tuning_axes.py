@@ -14,7 +14,7 @@ from strapdown.montecarlo import lanes
 from strapdown.montecarlo.scalar import start
 from strapdown.recordings import recordfiles
 from strapdown.scenarios import Scenario
-from strapdown.tuning import extended, parameters
+from strapdown.tuning import parameters
 
 ARCSEC = units.ARCSECOND
 STAR = np.array([10.0, 10.0, 60.0]) * ARCSEC
@@ -66,7 +66,9 @@ def test_modelled_record_gives_a_series_three_and_keeps_its_course():
     varying = dataclasses.replace(record.vectors[0], sigma=course * 1e-7)
     record = dataclasses.replace(record, vectors=(varying, record.vectors[1]))
     chosen = dataclasses.replace(
-        setup.matched(swaying(duration=2.0)), sigma={"mag": (1e-7, 2e-7, 3e-7)}, measurement_sigma_factor=2.0
+        setup.FilterSetup.for_scenario(swaying(duration=2.0)),
+        sigma={"mag": (1e-7, 2e-7, 3e-7)},
+        measurement_sigma_factor=2.0,
     )
     mag, acc = setup.modelled_record(record, chosen).vectors
     np.testing.assert_allclose(np.sqrt(np.mean(mag.sigma_axes**2, axis=0)), [2e-7, 4e-7, 6e-7], rtol=1e-14)
@@ -80,7 +82,7 @@ def test_modelled_record_gives_a_series_three_and_keeps_its_course():
 def test_modelled_record_replaces_the_axes_of_an_attitude_and_any_covariance():
     record = scenarios.simulate(tracked(5.0), 1)
     whole = dataclasses.replace(record.vectors[0], sigma_axes=None, covariance=np.diag(STAR**2) + 1e-10)
-    chosen = dataclasses.replace(setup.matched(tracked(5.0)), sigma={"star": (3e-5, 1e-5, 2e-5)})
+    chosen = dataclasses.replace(setup.FilterSetup.for_scenario(tracked(5.0)), sigma={"star": (3e-5, 1e-5, 2e-5)})
     for series in (record.vectors[0], whole):
         (star,) = setup.modelled_record(dataclasses.replace(record, vectors=(series,)), chosen).vectors
         np.testing.assert_allclose(star.sigma_axes, np.tile([3e-5, 1e-5, 2e-5], (len(star.time), 1)))
@@ -90,7 +92,7 @@ def test_modelled_record_replaces_the_axes_of_an_attitude_and_any_covariance():
 def test_of_a_record_without_sigma_it_is_what_is_given():
     record = scenarios.simulate(tracked(5.0), 1)
     silent = dataclasses.replace(record.vectors[0], sigma_axes=np.zeros(3))
-    chosen = dataclasses.replace(setup.matched(tracked(5.0)), sigma={"star": (3e-5, 1e-5, 2e-5)})
+    chosen = dataclasses.replace(setup.FilterSetup.for_scenario(tracked(5.0)), sigma={"star": (3e-5, 1e-5, 2e-5)})
     (star,) = setup.modelled_record(dataclasses.replace(record, vectors=(silent,)), chosen).vectors
     np.testing.assert_array_equal(star.sigma_axes[0], [3e-5, 1e-5, 2e-5])
 
@@ -98,7 +100,7 @@ def test_of_a_record_without_sigma_it_is_what_is_given():
 def test_three_equal_ones_are_one():
     scenario = swaying(duration=5.0)
     record = scenarios.simulate(scenario, 2)
-    chosen = setup.matched(scenario)
+    chosen = setup.FilterSetup.for_scenario(scenario)
     initial = setup.initial_state(chosen, record.truth.attitude[0], record.truth.bias[0])
     one = setup.run(record, dataclasses.replace(chosen, sigma={"mag": 6e-7}), initial)
     three = setup.run(record, dataclasses.replace(chosen, sigma={"mag": (6e-7,) * 3}), initial)
@@ -109,23 +111,23 @@ def test_three_equal_ones_are_one():
 def test_a_heading_has_one():
     scenario = swaying("heading", 5.0)
     record = scenarios.simulate(scenario, 1)
-    chosen = setup.matched(scenario)
+    chosen = setup.FilterSetup.for_scenario(scenario)
     with pytest.raises(InputError, match=r"mag is .*three numbers, and a heading has one degree of freedom; give one"):
         setup.modelled_record(record, dataclasses.replace(chosen, sigma={"mag": (0.1, 0.1, 0.1)}))
     case = case_of(scenario, chosen, 1)
     with pytest.raises(InputError, match=r"mag\.sigma\.x: a heading has one degree of freedom; give mag\.sigma"):
-        extended.likelihood([case], chosen, ["mag.sigma.x"])
+        tuning.likelihood([case], chosen, ["mag.sigma.x"])
     assert not any(name.startswith("mag") for name in tuning.axis_names([record]))
 
 
 def test_the_monte_carlo_takes_three_of_an_attitude_in_lanes_and_others_on_the_scalar_machine():
     sigma = {"star": (3e-5, 6e-5, 1.5e-4)}
-    chosen = dataclasses.replace(setup.matched(tracked(20.0)), sigma=sigma)
+    chosen = dataclasses.replace(setup.FilterSetup.for_scenario(tracked(20.0)), sigma=sigma)
     plan = montecarlo.Plan(scenario=tracked(20.0), setup=chosen, epochs=4)
     assert lanes.supports(plan) is None
     by_lanes, scalar = (montecarlo.run_plan(plan, runs=8, machine=name) for name in ("lanes", "scalar"))
     np.testing.assert_allclose(by_lanes.sigma, scalar.sigma, rtol=1e-3)
-    chosen = dataclasses.replace(setup.matched(swaying()), sigma={"mag": (5e-7, 1e-6, 5e-7)})
+    chosen = dataclasses.replace(setup.FilterSetup.for_scenario(swaying()), sigma={"mag": (5e-7, 1e-6, 5e-7)})
     reason = lanes.supports(montecarlo.Plan(scenario=swaying(), setup=chosen, epochs=4))
     assert reason == "mag: a sigma of its own for each axis"
 
@@ -135,7 +137,7 @@ def test_the_monte_carlo_takes_three_of_an_attitude_in_lanes_and_others_on_the_s
 
 def test_names_start_from_the_present_sigma():
     record = scenarios.simulate(tracked(5.0), 1)
-    chosen = setup.matched(tracked(5.0))
+    chosen = setup.FilterSetup.for_scenario(tracked(5.0))
     assert tuning.axis_names([record]) == AXES
     assert tuning.default_names([record]) == ("gyro.arw", "gyro.rrw", "star.sigma")
     values = tuning.values_of(chosen, AXES, [record])
@@ -159,29 +161,31 @@ def test_names_start_from_the_present_sigma():
     assert setup.from_toml(setup.to_toml(filled)) == filled
 
 
-def test_the_plain_likelihood_and_the_analysis_refuse_what_they_cannot_take():
+def test_parts_of_a_parameter_and_what_cannot_have_axes_are_refused():
     scenario = swaying(duration=5.0)
-    chosen = setup.matched(scenario)
+    chosen = setup.FilterSetup.for_scenario(scenario)
     case = case_of(scenario, chosen, 1)
-    with pytest.raises(InputError, match=r"acc.sigma.x is a sigma of one axis.*use tuning.extended.likelihood"):
-        tuning.likelihood([case], chosen, ["acc.sigma.x"])
+    with pytest.raises(
+        InputError, match=r"outliers are modelled .* sensors with one sigma for all axes: leave gate out"
+    ):
+        tuning.contaminated_likelihood([case], chosen, ["acc.sigma.x"])
     with pytest.raises(InputError, match=r"acc.sigma.y is part of acc.sigma; give that, or the axes"):
-        extended.likelihood([case], chosen, ["acc.sigma", "acc.sigma.y"])
+        tuning.likelihood([case], chosen, ["acc.sigma", "acc.sigma.y"])
     with pytest.raises(InputError, match=r"did you mean 'acc.sigma.x'"):
-        extended.likelihood([case], chosen, ["axc.sigma.x"])
+        tuning.likelihood([case], chosen, ["axc.sigma.x"])
     three = dataclasses.replace(chosen, sigma={"acc": (0.05, 0.05, 0.1)})
-    with pytest.raises(InputError, match=r"acc: this likelihood takes one sigma a sample.*free acc\.sigma\.x"):
-        tuning.likelihood([case], three, ["gyro.arw"])
+    with pytest.raises(InputError, match="outliers are modelled"):
+        tuning.contaminated_likelihood([case], three, ["gyro.arw"])
     with pytest.raises(InputError, match="acc: the analysis takes one sigma of a vector, not one an axis"):
         covariance.analyse(scenario, three)
 
 
 def test_of_an_attitude_one_factor_on_three_is_the_same_in_both_likelihoods():
-    chosen = setup.matched(tracked(20.0))
+    chosen = setup.FilterSetup.for_scenario(tracked(20.0))
     three = dataclasses.replace(chosen, sigma={"star": (5e-5, 1e-4, 2e-4)})
     case = case_of(tracked(20.0), chosen, 1)
     plain = tuning.likelihood([case], three, ["gyro.arw", "star.sigma"])
-    other = extended.likelihood([case], three, ["gyro.arw", *AXES])
+    other = tuning.likelihood([case], three, ["gyro.arw", *AXES])
     for log_factor in (0.0, 0.4):
         one = plain.minus_log(plain.start + np.array([0.3, log_factor]))
         two = other.minus_log(other.start + np.array([0.3, log_factor, log_factor, log_factor]))
@@ -193,14 +197,14 @@ def test_of_an_attitude_one_factor_on_three_is_the_same_in_both_likelihoods():
 
 def recovered(scenario, truth, free, seed, **measured) -> np.ndarray:
     """Return the errors of the log σ over their standard errors, from a start wrong by 3 either way."""
-    chosen = setup.matched(scenario)
+    chosen = setup.FilterSetup.for_scenario(scenario)
     case = case_of(scenario, chosen, seed)
     if measured:
         record = dataclasses.replace(case.record, **measured)
         case = dataclasses.replace(case, record=record)
     sensor = parameters.axis_of(free[-1])[0]
     off = dataclasses.replace(chosen, sigma={sensor: tuple(truth * np.array([3.0, 1.0 / 3.0, 3.0]))})
-    objective = extended.likelihood([case], off, free)
+    objective = tuning.likelihood([case], off, free)
     found = tuning.fit(objective, starts=1, intervals=False)
     assert found.setup.states is None
     assert isinstance(found.setup.sigma[sensor], tuple)
@@ -251,7 +255,7 @@ def test_the_command_tunes_the_axes_of_a_record(run, tmp_path):
     path, out, first = tmp_path / "star.h5", tmp_path / "tuned.toml", tmp_path / "first.toml"
     scenario = tracked(60.0)
     recordfiles.write_record(path, scenarios.simulate(scenario, 4))
-    off = dataclasses.replace(setup.matched(scenario), sigma={"star": tuple(3.0 * STAR)})
+    off = dataclasses.replace(setup.FilterSetup.for_scenario(scenario), sigma={"star": tuple(3.0 * STAR)})
     first.write_text(setup.to_toml(off), encoding="utf-8")
     command = ("tune", path, "--filter", first, "--free", ",".join(AXES), "--starts", 1, "-o", out)
     status, said, complaint = run(*command, "--holdout", 0.3)
@@ -261,6 +265,6 @@ def test_the_command_tunes_the_axes_of_a_record(run, tmp_path):
     assert found.states is None
     np.testing.assert_allclose(found.sigma["star"], STAR, rtol=0.4)
     assert [one["name"] for one in json.loads(out.with_suffix(".json").read_text())["parameters"]] == list(AXES)
-    status, _, complaint = run(*command, "--rmse")
+    status, _, complaint = run(*command, "--gate")
     assert status == 2
-    assert "leave gate, rmse" in " ".join(complaint.split())
+    assert "one sigma for all axes" in " ".join(complaint.split())

@@ -40,7 +40,7 @@ def record(tmp_path):
 def wrong(tmp_path):
     """A filter wrong by ten."""
     path = tmp_path / "wrong.toml"
-    filter_setup = setup.matched(SCENARIO)
+    filter_setup = setup.FilterSetup.for_scenario(SCENARIO)
     values = {"gyro.arw": 1e-3, "gyro.rrw": 3e-7, "sun.sigma": 1e-5, "star.sigma": 2e-3}
     path.write_text(setup.to_toml(tuning.with_values(filter_setup, values)), encoding="utf-8")
     return path
@@ -150,10 +150,11 @@ def scaled(tmp_path):
     return path
 
 
-def test_tune_gives_the_filter_states_for_what_the_record_specifies(run, tmp_path, scaled):
+@pytest.mark.parametrize("options", [(), ("--rmse",), ("--spacing", 2.0)], ids=["likelihood", "rmse", "spacing"])
+def test_tune_gives_the_filter_states_for_what_the_record_specifies(run, tmp_path, scaled, options):
     out = tmp_path / "states.toml"
     status, said, complaint = run(
-        "tune", scaled, "--states", "--free", "gyro.arw,gyro.scale_sigma", "--starts", 1, "-o", out
+        "tune", scaled, "--states", "--free", "gyro.arw,gyro.scale_sigma", "--starts", 1, "-o", out, *options
     )
     assert status == 0, complaint
     assert "Optional states: gyro.scale" in said
@@ -167,7 +168,7 @@ def test_tune_gives_the_filter_states_for_what_the_record_specifies(run, tmp_pat
 def test_a_filter_with_states_and_a_gate_is_tuned_against_the_truth(run, tmp_path, scaled):
     first, out = tmp_path / "first.toml", tmp_path / "states.toml"
     record = recordfiles.read_record(scaled)
-    gated = dataclasses.replace(setup.matched_to_record(record, states=True), gate=Gate())
+    gated = dataclasses.replace(setup.FilterSetup.for_record(record, states=True), gate=Gate())
     first.write_text(setup.to_toml(gated), encoding="utf-8")
     given = ("tune", scaled, "--filter", first, "--free", "gyro.arw", "--starts", 1, "-o", out)
     status, said, complaint = run(*given, "--truth")
@@ -179,20 +180,18 @@ def test_a_filter_with_states_and_a_gate_is_tuned_against_the_truth(run, tmp_pat
     assert run(*given)[1].count("--truth tunes the filter as it runs") == 1
 
 
-@pytest.mark.parametrize("option", [("--rmse",), ("--gate",), ("--spacing", 2.0), ("--plan",)])
-def test_optional_states_are_tuned_by_likelihoods_alone(run, tmp_path, scaled, option):
+def test_outliers_are_not_modelled_beside_optional_states(run, tmp_path, scaled):
     out = tmp_path / "states.toml"
-    status, _, complaint = run("tune", scaled, "--states", *option, "-o", out)
+    status, _, complaint = run("tune", scaled, "--states", "--gate", "-o", out)
     assert status != 0
     assert "optional states" in complaint
     assert not out.exists()
 
 
-def test_the_plain_likelihood_refuses_a_filter_with_states(scaled):
-    record = recordfiles.read_record(scaled)
-    chosen = setup.matched_to_record(record, states=True)
-    with pytest.raises(InputError, match=r"extended\.likelihood"):
-        tuning.likelihood([tuning.record_case(record, chosen)], chosen, ["gyro.arw"])
+def test_a_plan_of_a_filter_with_states_says_how_well_their_sizes_will_be_known(run, scaled):
+    status, said, complaint = run("tune", "--plan", scaled, "--states", "--free", "gyro.arw,gyro.scale_sigma")
+    assert status == 0, complaint
+    assert "gyro.scale_sigma  ppm" in said
 
 
 @pytest.mark.parametrize("option", ["--columns", "--topic"])

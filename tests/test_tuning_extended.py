@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy import optimize
 
 from strapdown import coning, consistency, estimation, gyro, motion, scenarios, setup, tuning, vectors
 from strapdown.checks import InputError
@@ -13,7 +14,7 @@ from strapdown.montecarlo.scalar import start
 from strapdown.randomness import generator
 from strapdown.scenarios import Scenario
 from strapdown.setup.states import SensorStates, States
-from strapdown.tuning import extended, parameters
+from strapdown.tuning import parameters
 
 SWAY = motion.HarmonicRates(
     harmonics=(
@@ -49,7 +50,9 @@ def swaying(duration=60.0, **changes) -> Scenario:
 
 def filter_setup(scenario) -> setup.FilterSetup:
     """Return the filter that matches, without a better integration: the motion is slow, and this is quicker."""
-    return dataclasses.replace(setup.matched(scenario, states=True), integration=coning.ALGORITHMS["one-sample"])
+    return dataclasses.replace(
+        setup.FilterSetup.for_scenario(scenario, states=True), integration=coning.ALGORITHMS["one-sample"]
+    )
 
 
 def case_of(scenario, chosen, seed, run=0) -> tuning.Case:
@@ -58,8 +61,8 @@ def case_of(scenario, chosen, seed, run=0) -> tuning.Case:
 
 
 def wrong(chosen, factors) -> setup.FilterSetup:
-    values = {name: factor * extended.value_of(chosen.states, name) for name, factor in factors.items()}
-    return dataclasses.replace(chosen, states=extended.with_state_values(chosen.states, values))
+    values = tuning.values_of(chosen, list(factors), [])
+    return tuning.with_values(chosen, {name: factor * values[name] for name, factor in factors.items()})
 
 
 # ------------------------------------------------------------------------------------------------------------------- the likelihood
@@ -67,27 +70,27 @@ def wrong(chosen, factors) -> setup.FilterSetup:
 
 def test_without_states_it_is_the_likelihood_of_the_plain_filter():
     scenario = dataclasses.replace(scenarios.load_scenario("two-stars"), duration=60.0)
-    chosen = setup.matched(scenario)
+    chosen = setup.FilterSetup.for_scenario(scenario)
     cases = [case_of(scenario, chosen, 3, run) for run in range(2)]
     names = ["gyro.arw", "gyro.rrw", "star 1.sigma"]
-    plain = tuning.likelihood(cases, chosen, names)
-    other = extended.likelihood(cases, dataclasses.replace(chosen, states=States()), names)
+    # Seven parts, whose edges are at no measurement.
+    plain = tuning.likelihood(cases, chosen, names, parts=7)
+    other = tuning.likelihood(cases, dataclasses.replace(chosen, states=States()), names, parts=7)
     assert other.names == plain.names
     np.testing.assert_allclose(other.start, plain.start, rtol=1e-15)
     points = plain.start + np.array([[0.0, 0.0, 0.0], [0.3, -0.5, 0.2]])
     np.testing.assert_allclose(other.minus_log(points), plain.minus_log(points), rtol=1e-9)
     for point in points:
         one, two = plain.derivatives(point), other.derivatives(point)
-        np.testing.assert_allclose(two.value.sum(), one.value.sum(), rtol=1e-9)
-        np.testing.assert_allclose(two.score.sum(axis=0), one.score.sum(axis=0), rtol=1e-5, atol=1e-4)
+        np.testing.assert_allclose(two.value, one.value, rtol=1e-9)
+        np.testing.assert_allclose(two.score, one.score, rtol=1e-5, atol=1e-4)
         np.testing.assert_allclose(two.information, one.information, rtol=1e-4, atol=1e-4)
-        np.testing.assert_allclose(two.outer, one.outer, rtol=1e-4, atol=1e-3)
 
 
 def test_score_and_curvature_are_the_derivatives():
     scenario = swaying(20.0)
     chosen = filter_setup(scenario)
-    objective = extended.likelihood([case_of(scenario, chosen, 5)], chosen, [*COLOURED, "gyro.arw"])
+    objective = tuning.likelihood([case_of(scenario, chosen, 5)], chosen, [*COLOURED, "gyro.arw"])
     point = objective.start + 0.2
     found = objective.derivatives(point)
     h = 1e-3
@@ -114,25 +117,47 @@ def test_values_scale_all_axes_alike_and_the_rest_stays():
         gyro_fast_bias_sigma=4e-7,
         sensors={"mag": SensorStates(bias_sigma=(1.0, 2.0, 2.0)), "a.b": SensorStates(lever_arm_sigma=0.3)},
     )
-    assert extended.state_names(states) == (
+    assert parameters.state_names(states) == (
         "gyro.scale_sigma",
         "gyro.drift_sigma",
         "gyro.drift_time",
         "mag.bias_sigma",
         "a.b.lever_sigma",
     )
-    assert extended.value_of(states, "mag.bias_sigma") == pytest.approx(np.sqrt(3.0))
-    assert extended.value_of(states, "gyro.scale_sigma") == pytest.approx(1e-3 * np.sqrt(2.5))
-    changed = extended.with_state_values(
-        states, {"mag.bias_sigma": 2.0 * np.sqrt(3.0), "gyro.drift_sigma": 3e-6, "a.b.lever_sigma": 0.1}
-    )
+    chosen = dataclasses.replace(setup.FilterSetup.for_scenario(swaying(5.0)), states=states)
+    values = tuning.values_of(chosen, ["mag.bias_sigma", "gyro.scale_sigma"], [])
+    assert list(values.values()) == pytest.approx([np.sqrt(3.0), 1e-3 * np.sqrt(2.5)])
+    changed = tuning.with_values(
+        chosen, {"mag.bias_sigma": 2.0 * np.sqrt(3.0), "gyro.drift_sigma": 3e-6, "a.b.lever_sigma": 0.1}
+    ).states
     assert changed.sensors["mag"].bias_sigma == pytest.approx((2.0, 4.0, 4.0))
     assert changed.gyro_drift_sigma == pytest.approx((3e-6, 3e-6))
     assert changed.gyro_fast_bias_sigma == pytest.approx(12e-7)
     assert changed.sensors["a.b"].lever_arm_sigma == pytest.approx(0.1)
     assert changed.gyro_scale_sigma == states.gyro_scale_sigma
-    for name in extended.state_names(states):
-        assert extended.unit_of(name).factor > 0.0
+    twice = tuning.with_values(chosen, {"filter.scale": 2.0}).states
+    assert twice.gyro_scale_sigma == pytest.approx((2e-3, 0.0, 4e-3))
+    assert twice.gyro_drift_sigma == pytest.approx((2e-6, 2e-6))
+    assert (twice.gyro_drift_time, twice.gyro_fast_bias_sigma) == (states.gyro_drift_time, 8e-7)
+    assert twice.sensors["mag"].bias_sigma == pytest.approx((2.0, 4.0, 4.0))
+    assert twice.sensors["a.b"].lever_arm_sigma == 0.6
+
+
+def test_a_search_stays_where_a_state_makes_sense():
+    """Scale factors below a tenth, for the filter is linear in them; times from a part of the interval to many records."""
+    scenario = swaying(20.0)
+    chosen = filter_setup(scenario)
+    chosen = dataclasses.replace(chosen, states=dataclasses.replace(chosen.states, gyro_scale_sigma=1e-3))
+    free = ["gyro.scale_sigma", "acc.correlation_time", "acc.correlated_sigma"]
+    objective = tuning.likelihood([case_of(scenario, chosen, 1)], chosen, free)
+    far, near = (objective.setup(objective.start + step).states for step in (12.0, -12.0))
+    assert far.gyro_scale_sigma == pytest.approx(0.1)
+    assert far.sensors["acc"].correlation_time == pytest.approx(100.0 * 20.0)
+    assert near.sensors["acc"].correlation_time == pytest.approx(
+        0.05 * 20.0 / len(objective.cases[0].record.vectors[1].time)
+    )
+    assert far.sensors["acc"].correlated_sigma == pytest.approx(0.4 * np.exp(12.0))
+    assert near.gyro_scale_sigma == pytest.approx(1e-3 * np.exp(-12.0))
 
 
 @pytest.mark.parametrize(
@@ -141,7 +166,7 @@ def test_values_scale_all_axes_alike_and_the_rest_stays():
         ({}, ["acc.correlated_time"], "did you mean 'acc.correlation_time'"),
         ({}, [], "free names no parameter"),
         ({}, ["acc.correlated_sigma"] * 2, "twice"),
-        ({}, ["filter.scale"], "is not known"),
+        ({}, ["filter.scale", "gyro.arw"], "tune it alone"),
         ({"states": States(sensors={"acd": SensorStates(bias_sigma=1.0)})}, ["acd.bias_sigma"], "did you mean 'acc'"),
     ],
 )
@@ -150,7 +175,7 @@ def test_bad_input_is_refused_with_the_remedy(change, free, words):
     chosen = filter_setup(scenario)
     case = case_of(scenario, chosen, 1)
     with pytest.raises(InputError, match=words):
-        extended.likelihood([case], dataclasses.replace(chosen, **change), free)
+        tuning.likelihood([case], dataclasses.replace(chosen, **change), free)
 
 
 def test_no_record_and_no_measurement_are_refused():
@@ -158,9 +183,9 @@ def test_no_record_and_no_measurement_are_refused():
     chosen = filter_setup(scenario)
     case = case_of(scenario, chosen, 1)
     with pytest.raises(InputError, match="there is no record"):
-        extended.likelihood([], chosen, ["gyro.arw"])
+        tuning.likelihood([], chosen, ["gyro.arw"])
     with pytest.raises(InputError, match="no measurement between 7"):
-        extended.likelihood([dataclasses.replace(case, first=7.0)], chosen, ["gyro.arw"])
+        tuning.likelihood([dataclasses.replace(case, first=7.0)], chosen, ["gyro.arw"])
 
 
 # ---------------------------------------------------------------------------------------------------------------------- what is found
@@ -174,7 +199,7 @@ def recovered(seeds, duration) -> tuple[np.ndarray, np.ndarray]:
     off = dataclasses.replace(off, sigma={"acc": 0.12})
     ratios, inside = [], []
     for seed in seeds:
-        objective = extended.likelihood([case_of(scenario, chosen, seed)], off, list(COLOURED))
+        objective = tuning.likelihood([case_of(scenario, chosen, seed)], off, list(COLOURED))
         found = tuning.fit(objective, starts=1, intervals=False)
         ratios.append(
             [np.log(found[name].value / value) / found[name].standard_error for name, value in COLOURED.items()]
@@ -203,9 +228,7 @@ def test_a_state_that_nothing_shows_is_not_identified():
     scenario = dataclasses.replace(swaying(20.0), motion=motion.rest(), gyro=quiet)
     chosen = filter_setup(scenario)
     chosen = dataclasses.replace(chosen, states=dataclasses.replace(chosen.states, gyro_scale_sigma=1e-3))
-    objective = extended.likelihood(
-        [case_of(scenario, chosen, 2)], chosen, ["gyro.scale_sigma", "acc.correlated_sigma"]
-    )
+    objective = tuning.likelihood([case_of(scenario, chosen, 2)], chosen, ["gyro.scale_sigma", "acc.correlated_sigma"])
     found = tuning.fit(objective, starts=1)
     assert not found.composite  # the curvature of innovations is their information
     assert not found["gyro.scale_sigma"].identified
@@ -228,10 +251,85 @@ def test_hard_iron_is_tuned_from_several_records():
         ),
     )
     cases = [case_of(one, off, 9, k) for k, one in enumerate(records)]
-    found = tuning.fit(extended.likelihood(cases, off, ["mag.bias_sigma"]), starts=1, intervals=False)
+    found = tuning.fit(tuning.likelihood(cases, off, ["mag.bias_sigma"]), starts=1, intervals=False)
     one = found["mag.bias_sigma"]
     assert 0.1 < one.standard_error < 0.25
     assert abs(np.log(one.value / sigma)) < 2.6 * one.standard_error
+
+
+def attitude_rms(cases, chosen: setup.FilterSetup) -> float:
+    """RMS attitude error of one axis by ordinary runs of the filter, at every edge."""
+    squares = []
+    for one in cases:
+        initial = setup.initial_state(chosen, one.initial.attitude, one.initial.bias)
+        estimate, truth = setup.run(one.record, chosen, initial), one.record.truth
+        error = consistency.errors(estimate.attitude, estimate.bias, truth.attitude, truth.bias)
+        squares.append(np.mean(error[:, :3] ** 2))
+    return float(np.sqrt(np.mean(squares)))
+
+
+def test_the_smallest_error_of_a_filter_with_states_then_the_scale_of_its_innovations():
+    """The least of the RMS error by a search over ordinary runs; the scale by the closed form, the root of the mean of e²/s."""
+    scenario = swaying(15.0)
+    chosen = filter_setup(scenario)
+    cases = [case_of(scenario, chosen, 5, run) for run in range(2)]
+    off = wrong(chosen, {"acc.correlated_sigma": 3.0})
+    names = ["acc.correlated_sigma", "acc.correlation_time"]
+    found, objective, _ = tuning.tune(cases, off, names, rmse=True, starts=1)
+    assert objective.composite
+
+    def at(logs: np.ndarray) -> setup.FilterSetup:
+        return tuning.with_values(off, dict(zip(names, np.exp(logs), strict=True)))
+
+    least = optimize.minimize(
+        lambda logs: attitude_rms(cases, at(logs)),
+        objective.start,
+        method="Nelder-Mead",
+        options={"xatol": 1e-4, "fatol": 1e-12},
+    )
+    assert least.fun < 0.7 * attitude_rms(cases, off)
+    np.testing.assert_allclose(found.optima[0], least.x, atol=1e-3)
+    scale = found.setup.measurement_sigma_factor
+    used = at(found.point - np.log([scale, 1.0]))  # a time is not scaled
+    np.testing.assert_allclose(found.point - np.log([scale, 1.0]), least.x, atol=0.01)
+    innovations = [i for one in cases for i in setup.run(one.record, used, one.initial).innovations.values()]
+    nis = sum(i.nis.sum() for i in innovations) / sum(i.innovation.size for i in innovations)
+    assert scale == pytest.approx(np.sqrt(nis), rel=1e-5)
+    assert scale > 1.1
+    # It leaves the estimates, and so their errors, as they are.
+    assert attitude_rms(cases, found.setup) == pytest.approx(attitude_rms(cases, used), rel=1e-9)
+    assert list(tuning.values_of(found.setup, names, []).values()) == pytest.approx([found[n].value for n in names])
+
+
+def test_a_filter_with_states_is_thinned_as_one_without():
+    scenario = dataclasses.replace(scenarios.load_scenario("two-stars"), duration=60.0)
+    chosen = dataclasses.replace(
+        setup.FilterSetup.for_scenario(scenario), sigma={"star 1": 2e-4}, measurement_sigma_factor=1.5
+    )
+    cases = [case_of(scenario, chosen, 3)]
+    names = ["gyro.arw", "star 1.sigma", "star 2.sigma"]
+    plain = tuning.likelihood(cases, chosen, names, spacing=3.0)
+    other = tuning.likelihood(cases, dataclasses.replace(chosen, states=States()), names, spacing=3.0)
+    points = plain.start + np.array([[0.0, 0.0, 0.0], [0.3, -0.5, 0.2]])
+    np.testing.assert_allclose(other.minus_log(points), plain.minus_log(points), rtol=1e-9)
+    assert other.minus_log(points[0])[0] != pytest.approx(
+        tuning.likelihood(cases, chosen, names).minus_log(points[0])[0]
+    )
+
+
+def test_a_plan_knows_that_one_record_has_three_draws_of_a_hard_iron():
+    """Standard error of ln σ from three numbers of a normal distribution of mean zero: 1/√6, however long the record is."""
+    scenario = swaying(20.0, hard_iron=np.full(3, 3e-6))
+    chosen = filter_setup(scenario)
+    planned = tuning.plan(scenario, chosen, ["mag.bias_sigma", "mag.sigma"], lengths=[10.0, 20.0], records=16)
+    np.testing.assert_allclose(planned.errors[:, 0], 1.0 / np.sqrt(6.0), rtol=0.05)
+    assert 0.006 < planned.scatter < 0.1  # of the draws; 0.003 of noise alone
+    # Of a σ three numbers five times a second: 1/√(2 n).
+    np.testing.assert_allclose(planned.errors[:, 1], 1.0 / np.sqrt(2.0 * 15.0 * planned.lengths), rtol=0.1)
+    assert planned.units[0].name == "rad, or the vector's unit"
+    # A longer record tells no more of the iron.
+    assert planned.needed().tolist() == [np.inf, pytest.approx(20.0 * (planned.errors[1, 1] / 0.1) ** 2)]
+    assert "more records" in str(planned)
 
 
 # ------------------------------------------------------------------------------------------------------------------------- held out
@@ -252,14 +350,14 @@ FREE = {
 def tuned_and_held_out(name: str, train: int, test: int, seed: int, free=(), **changes) -> list[str]:
     """Return what is outside its bounds on records not used, after tuning from σ wrong by a factor of three either way."""
     scenario = dataclasses.replace(scenarios.load_scenario(name), **changes)
-    chosen = setup.matched(scenario, states=True)
+    chosen = setup.FilterSetup.for_scenario(scenario, states=True)
     free = free or FREE[name]
-    plain = [part for part in free if part not in extended.state_names(chosen.states)]
+    plain = [part for part in free if part not in parameters.state_names(chosen.states)]
     cases = [case_of(scenarios.drawn(scenario, seed, run), chosen, seed, run) for run in range(train)]
     values = tuning.values_of(chosen, plain, [case.record for case in cases])
     off = tuning.with_values(chosen, {part: value * 3.0 ** (-1) ** k for k, (part, value) in enumerate(values.items())})
     off = wrong(off, {part: 1.0 / 3.0 for part in free if part not in plain}) if len(plain) < len(free) else off
-    found = tuning.fit(extended.likelihood(cases, off, free), starts=1, intervals=False)
+    found = tuning.fit(tuning.likelihood(cases, off, free), starts=1, intervals=False)
     nees: dict = {subset: [] for subset in consistency.SUBSETS}
     nis: dict = {}
     for run in range(train, train + test):
@@ -307,20 +405,19 @@ def test_after_tuning_held_out_statistics_pass_in_every_built_in_scenario(name):
 
 def test_a_case_of_first_measurements_is_taken_too():
     scenario = dataclasses.replace(scenarios.load_scenario("spin"), duration=60.0)
-    chosen = setup.matched(scenario, states=True)
+    chosen = setup.FilterSetup.for_scenario(scenario, states=True)
     case = tuning.record_case(scenarios.simulate(scenario, 1), chosen)
     assert isinstance(case.initial, estimation.State)
-    objective = extended.likelihood([case], chosen, ["gyro.arw", "initial.bias", "star.sigma"])
+    objective = tuning.likelihood([case], chosen, ["gyro.arw", "initial.bias", "star.sigma"])
     assert np.all(np.isfinite(objective.derivatives(objective.start).information))
     assert objective.setup(objective.start + np.log(2.0)).bias_sigma == pytest.approx(2.0 * chosen.bias_sigma)
 
 
 def test_a_parameter_is_printed_in_the_unit_by_whose_factor_it_is_divided():
     degree, g = np.pi / 180.0, 9.80665
-    size = {"s": 1.0, "1": 1.0, "m": 1.0, "m/s": 1.0, "m/s²": 1.0, "rad or SI": 1.0, "rad, or the vector's unit": 1.0}
+    size = {"s": 1.0, "1": 1.0, "m": 1.0, "m/s": 1.0, "m/s²": 1.0, "rad, or the vector's unit": 1.0}
     size |= {"%": 0.01, "ppm": 1e-6, "mrad": 1e-3, "°": degree, "°/h": degree / 3600.0, "°/h/g": degree / 3600.0 / g}
     size |= {"°/√h": degree / 60.0, "°/h/√h": degree / 3600.0 / 60.0}
-    for name in (*parameters.OWN, *parameters._UNITS, "star.sigma"):
-        assert parameters.fixed_unit(name).factor == pytest.approx(size[parameters.fixed_unit(name).name], rel=1e-12)
-    for name in (*extended.GYRO, *(f"mag.{one}" for one in extended.SENSOR)):
-        assert extended.unit_of(name).factor == pytest.approx(size[extended.unit_of(name).name], rel=1e-12), name
+    names = (*parameters.PLAIN, *parameters.GYRO_STATES, *parameters._WHOLE)
+    for name in (*names, *(f"mag.{one}" for one in parameters.SENSOR_STATES)):
+        assert parameters.unit_of(name).factor == pytest.approx(size[parameters.unit_of(name).name], rel=1e-12), name

@@ -122,7 +122,7 @@ def without_unmodelled(chosen: scenarios.Scenario) -> scenarios.Scenario:
 
 def tuned_and_judged(chosen: scenarios.Scenario, records: int, held: int) -> tuple[float, tuple, np.ndarray, tuple]:
     """Tune on some records from a filter wrong by 3 and 1/3; return NIS and ANEES over others, with their bounds."""
-    filter_setup = setup.matched(chosen)
+    filter_setup = setup.FilterSetup.for_scenario(chosen)
     if chosen.name in INTEGRATION:
         filter_setup = dataclasses.replace(filter_setup, integration=coning.ALGORITHMS[INTEGRATION[chosen.name]])
     train = [tuning.record_case(scenarios.simulate(chosen, 5, k), filter_setup, seed=k) for k in range(records)]
@@ -172,7 +172,7 @@ def efficiencies(chosen: scenarios.Scenario, tuned: FilterSetup) -> tuple[np.nda
 
     The posterior Cramér–Rao bound is the Riccati recursion along the truth with the true noise; the RMSE that of the tuned filter's gains.
     """
-    right = dataclasses.replace(setup.matched(chosen), integration=tuned.integration)
+    right = dataclasses.replace(setup.FilterSetup.for_scenario(chosen), integration=tuned.integration)
     bound = covariance.analyse(chosen, right, epochs=20).filter_covariance[1:]
     actual = covariance.analyse(chosen, tuned, epochs=20).covariance[1:]
     found = [
@@ -184,7 +184,7 @@ def efficiencies(chosen: scenarios.Scenario, tuned: FilterSetup) -> tuple[np.nda
 
 def tuned_from_thirty_times_wrong(chosen: scenarios.Scenario, records: int) -> tuple[FilterSetup, FilterSetup]:
     """Return the filter wrong by 30, one parameter up and the next down, and what tuning makes of it."""
-    filter_setup = setup.matched(chosen)
+    filter_setup = setup.FilterSetup.for_scenario(chosen)
     if chosen.name in INTEGRATION:
         filter_setup = dataclasses.replace(filter_setup, integration=coning.ALGORITHMS[INTEGRATION[chosen.name]])
     train = [tuning.record_case(scenarios.simulate(chosen, 5, k), filter_setup, seed=k) for k in range(records)]

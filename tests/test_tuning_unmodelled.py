@@ -17,7 +17,7 @@ from strapdown.gyro import GyroSpec
 from strapdown.recordings import recordfiles
 from strapdown.records import Origin
 from strapdown.report import tunings
-from strapdown.tuning import suspicion
+from strapdown.tuning import residual_checks
 
 SPEC = GyroSpec(angle_random_walk=3e-5, rate_random_walk=2e-7, turn_on_bias_sigma=1e-5)
 
@@ -38,7 +38,7 @@ def scenario(scale_factor: float = 0.0, duration: float = 900.0) -> scenarios.Sc
 
 def tuned(seed: int, scale_factor: float = 0.0) -> tuple[tuning.Case, tuning.Tuning]:
     chosen = scenario(scale_factor)
-    filter_setup = setup.matched(chosen)
+    filter_setup = setup.FilterSetup.for_scenario(chosen)
     one = tuning.record_case(scenarios.simulate(chosen, seed), filter_setup, name=f"record {seed}", seed=seed)
     names = tuning.default_names([one.record])
     return one, tuning.fit(tuning.likelihood([one], filter_setup, names), starts=1)
@@ -78,7 +78,7 @@ def test_of_right_filters_hardly_one_is_suspected():
 
 def test_the_p_value_is_that_of_three_degrees_of_freedom_at_each_level():
     one, result = tuned(1, 1e-3)
-    found = suspicion.scale_factor(
+    found = residual_checks.scale_factor(
         setup.modelled_record(one.record, result.setup), result.setup.process_noise, one.initial
     )
     assert found.p_value == pytest.approx(3.0 * chi2.sf(found.gain, 3), rel=1e-9)
@@ -97,7 +97,7 @@ def test_the_turns_are_those_of_the_body_without_its_bias():
 
 def test_the_turns_leave_out_a_large_bias():
     chosen = dataclasses.replace(scenario(), gyro=dataclasses.replace(SPEC, turn_on_bias=np.full(3, 1e-2)))
-    filter_setup = dataclasses.replace(setup.matched(chosen), bias_sigma=1e-2)
+    filter_setup = dataclasses.replace(setup.FilterSetup.for_scenario(chosen), bias_sigma=1e-2)
     one = tuning.record_case(scenarios.simulate(chosen, 1), filter_setup, seed=1)
     found = turning.turns(one.record, filter_setup.process_noise, one.initial)
     excess = (found - chosen.motion.increments(one.record.time))[2000:-100] * 10.0
@@ -111,10 +111,10 @@ def test_the_noise_of_a_body_at_rest_explains_nothing():
         motion=motion.ConstantRate(rate=np.zeros(3)),
         gyro=dataclasses.replace(SPEC, angle_random_walk=1e-4, rate_random_walk=2e-5),
     )
-    filter_setup = setup.matched(still)
+    filter_setup = setup.FilterSetup.for_scenario(still)
     for seed in range(3):
         one = tuning.record_case(scenarios.simulate(still, seed), filter_setup, seed=seed)
-        found = suspicion.scale_factor(one.record, filter_setup.process_noise, one.initial)
+        found = residual_checks.scale_factor(one.record, filter_setup.process_noise, one.initial)
         assert found.p_value > 0.05
         assert np.abs(found.value).max() < 5.0 * turning.PLAUSIBLE
 
@@ -128,9 +128,9 @@ def test_noise_over_a_long_time_explains_nothing():
         sensors=tuple(dataclasses.replace(sensor, sigma=2e-3) for sensor in scenario().sensors),
         rate=4.0,
     )
-    filter_setup = setup.matched(long)
+    filter_setup = setup.FilterSetup.for_scenario(long)
     one = tuning.record_case(scenarios.simulate(long, 1), filter_setup, seed=1)
-    found = suspicion.scale_factor(one.record, filter_setup.process_noise, one.initial)
+    found = residual_checks.scale_factor(one.record, filter_setup.process_noise, one.initial)
     assert found.p_value > 0.05
     assert np.all(np.abs(found.value) < 3.0 * found.standard_error)
 
@@ -138,7 +138,7 @@ def test_noise_over_a_long_time_explains_nothing():
 def test_a_walk_that_was_left_too_large_is_no_scale_factor():
     one, result = tuned(4)
     large = tuning.with_values(result.setup, {"gyro.rrw": 2e-6})
-    found = suspicion.scale_factor(one.record, large.process_noise, one.initial)
+    found = residual_checks.scale_factor(one.record, large.process_noise, one.initial)
     assert found.p_value > 0.05
 
 
@@ -147,7 +147,7 @@ def test_what_the_gate_refuses_is_left_out():
     chosen = dataclasses.replace(
         scenario(), sensors=tuple(dataclasses.replace(sensor, faults=faults) for sensor in scenario().sensors)
     )
-    filter_setup = dataclasses.replace(setup.matched(chosen), gate=Gate(probability=0.999))
+    filter_setup = dataclasses.replace(setup.FilterSetup.for_scenario(chosen), gate=Gate(probability=0.999))
     suspected = 0
     for seed in range(2):
         one = tuning.record_case(scenarios.simulate(chosen, seed), filter_setup, seed=seed)
@@ -156,7 +156,7 @@ def test_what_the_gate_refuses_is_left_out():
         suspected += found.suspected
     assert suspected <= 1  # of two
     estimate = setup.run(one.record, filter_setup, one.initial)
-    left = suspicion.accepted(one.record, estimate)
+    left = residual_checks.accepted(one.record, estimate)
     for series, before in zip(left.vectors, one.record.vectors, strict=True):
         assert len(series.time) == len(before.time) - estimate.innovations[series.sensor].refused
         assert 0.02 < estimate.innovations[series.sensor].refused / len(before.time) < 0.06
@@ -183,13 +183,13 @@ def test_a_cause_that_explains_more_goes_first():
 def test_what_is_held_out_is_left_out():
     one, _ = tuned(1)
     (train,), _ = tuning.split([one], 0.4)
-    assert suspicion.seen(train).time[-1] == pytest.approx(540.0)
-    assert suspicion.seen(one) is one.record
+    assert residual_checks.seen(train).time[-1] == pytest.approx(540.0)
+    assert residual_checks.seen(one) is one.record
 
 
 def test_a_hard_iron_is_named_where_the_innovations_are_not_white():
     chosen = scenarios.load_scenario("low-orbit")
-    filter_setup = setup.matched(chosen)
+    filter_setup = setup.FilterSetup.for_scenario(chosen)
     one = tuning.record_case(scenarios.simulate(dataclasses.replace(chosen, duration=1200.0), 5), filter_setup, seed=5)
     found = tuning.unmodelled(one, filter_setup)
     assert found.causes

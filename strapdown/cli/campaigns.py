@@ -244,7 +244,7 @@ def _plan(scenario: str, model: _Model) -> Plan:
     from strapdown import montecarlo as engine
     from strapdown import workflows
     from strapdown.gyro import read_spec
-    from strapdown.setup import matched
+    from strapdown.setup import FilterSetup
 
     if model.states is not None and model.filter_file is not None:
         raise InputError("--filter names the whole filter, its states too; leave --states and --no-states out")
@@ -255,7 +255,9 @@ def _plan(scenario: str, model: _Model) -> Plan:
     if model.filter_file is not None:
         own = own_filter(model.filter_file)
         chosen = (
-            filter_of_scenario(model.filter_file, loaded) if own is None else replace(matched(loaded), estimator=own)
+            filter_of_scenario(model.filter_file, loaded)
+            if own is None
+            else replace(FilterSetup.for_scenario(loaded), estimator=own)
         )
     plan = workflows.plan(
         loaded,

@@ -45,7 +45,7 @@ def filter_for(
     spec = None if gyro is None else read_spec(gyro)
     if spec is None and (record.origin is None or record.origin.gyro is None):
         raise InputError(f"{path} does not hold the gyro's specification; give --gyro or --filter, a TOML file")
-    chosen = setup.matched_to_record(record, spec, states=True if states == () else states)
+    chosen = setup.FilterSetup.for_record(record, spec, states=True if states == () else states)
     missing = unmodelled_errors(record, chosen)
     if states is False or (states is None and chosen.states is None):
         return chosen, no_state_words(missing, chosen)

@@ -248,7 +248,7 @@ def _diagnosed(
     from strapdown import diagnosis, estimation, records
     from strapdown.recordings import recordfiles
     from strapdown.setup.for_record import unmodelled_errors
-    from strapdown.tuning.suspicion import accepted
+    from strapdown.tuning.residual_checks import accepted
 
     chosen = _filter_of(result, filter_file)
     estimate = records.read_estimate(result)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,17 +21,13 @@ from strapdown.cli.terminal import (
     doubt,
     need_own,
     progress_bar,
-    show,
     show_listing,
-    table,
     tables_folder,
     tables_written,
     writable,
     written,
 )
 from strapdown.files import plain, write_json, written_beside
-from strapdown.results import figure
-from strapdown.units import DEGREE
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -41,7 +36,7 @@ if TYPE_CHECKING:
     from strapdown.records import ImuRecord
     from strapdown.scenarios import Scenario
     from strapdown.setup import FilterSetup
-    from strapdown.tuning import Case, Comparison, Performance, TunedGate, Tuning, Unmodelled
+    from strapdown.tuning import Case, Comparison, TunedGate, Tuning, Unmodelled
 
 
 FIGURES = ("likelihood", "heldout")
@@ -80,17 +75,13 @@ class _Filter:
         """Parameters named, if any are."""
         return None if self.free is None else [name.strip() for name in self.free.split(",") if name.strip()]
 
-    def setup(self, *, plan: bool) -> FilterSetup | None:
-        """Return the filter of the file, if there is one; states that it or a plan cannot have are refused."""
+    def setup(self) -> FilterSetup | None:
+        """Return the filter of the file, if there is one."""
         from strapdown.setup import read_setup
 
         chosen = None if self.filter_file is None else read_setup(self.filter_file)
         if self.states and chosen is not None:
             raise InputError("--filter holds the filter's states itself, in [filter.states]; leave --states out")
-        if plan and (self.states or (chosen is not None and chosen.states is not None)):
-            raise InputError(
-                "--plan knows no optional states; leave --states away, and [filter.states] out of the filter"
-            )
         return chosen
 
     def wanted(self, cases: Sequence[Case], gyros: dict[str, GyroSpec]) -> list[str]:
@@ -216,9 +207,9 @@ def tune(
     from strapdown import recordings, tuning
 
     workers = count("threads", search.threads if search.threads is not None else os.cpu_count() or 1)
-    chosen = start.setup(plan=planning.plan)
+    chosen = start.setup()
     if planning.plan:
-        _plan(records, chosen, start.names, planning.length, workers)
+        _plan(records, chosen, start, planning.length, workers)
         return
     if planning.length is not None:
         raise InputError("--length is for --plan; the records' own length is taken")
@@ -392,34 +383,10 @@ def _print_gate(found: TunedGate) -> None:
     )
 
 
-def _anees(one: Performance) -> str:
-    """Return the ANEES as a table shows it: of attitude and bias, or where only the attitude is known of that."""
-    if math.isfinite(one.anees):
-        return figure(one.anees, 3)
-    return f"{figure(float(np.nanmean(one.nees[0].mean)), 3)} (attitude)" if one.nees else "-"
-
-
 def _print_comparison(comparison: Comparison, *, truth: bool) -> None:
     from strapdown.report import tunings
 
-    listing = table(
-        "On the data held out", "filter", "log likelihood", "NIS", "99 % bounds", "ANEES", "attitude RMS, °", "verdict"
-    )
-    for name, one in (("before", comparison.before), ("after", comparison.after)):
-        verdicts = [judgement.verdict for judgement in one.judgements]
-        answer = (
-            verdicts[0] if len(set(verdicts)) == 1 else f"{verdicts.count('consistent')} of {len(verdicts)} consistent"
-        )
-        listing.add_row(
-            name,
-            f"{one.log_likelihood:.4f}",
-            f"{one.nis:.3f}",
-            f"{one.nis_bounds[0]:.3f} to {one.nis_bounds[1]:.3f}",
-            _anees(one),
-            figure(one.attitude_rms / DEGREE, 3),
-            answer,
-        )
-    show(listing)
+    show_listing(comparison.listing())
     console.print(f"{tunings.BOUNDS}.")
     for judgement in comparison.after.judgements[:1]:
         for line in judgement.words.splitlines()[1:]:
@@ -472,12 +439,7 @@ def _report(found: _Found, paths: Sequence[Path], of: str) -> dict[str, Any]:
         "unmodelled": [one.summary() for one in found.examined],
     }
     if gate is not None:
-        content["gate"] = {
-            "probability": gate.probability,
-            "lower": gate.lower,
-            "upper": gate.upper,
-            "thresholds": gate.thresholds,
-        }
+        content["gate"] = {name: getattr(gate, name) for name in ("probability", "lower", "upper", "thresholds")}
     if comparison is not None:
         content["held_out"] = {
             name: {
@@ -495,7 +457,7 @@ def _report(found: _Found, paths: Sequence[Path], of: str) -> dict[str, Any]:
 
 
 def _plan(
-    sources: Sequence[Path], chosen: FilterSetup | None, names: list[str] | None, length: str | None, threads: int
+    sources: Sequence[Path], chosen: FilterSetup | None, start: _Filter, length: str | None, threads: int
 ) -> None:
     from strapdown import scenarios, setup, tuning
     from strapdown.recordings import recordfiles
@@ -504,9 +466,8 @@ def _plan(
         raise InputError(f"--plan takes one scenario; {len(sources)} are given")
     lengths = None if length is None else _numbers(length)
     scenario = _scenario_of(sources[0]) if recordfiles.is_record(sources[0]) else scenarios.load_scenario(sources[0])
-    modelled = chosen or setup.matched(scenario)
-    example = scenarios.simulate(scenario)
-    wanted = names or list(tuning.default_names([example]))
+    modelled = chosen or setup.FilterSetup.for_scenario(scenario, states=start.states)
+    wanted = start.names or list(tuning.default_names([scenarios.simulate(scenario)]))
     with progress_bar("simulated records", 4) as advance:
         found = tuning.plan(
             scenario, modelled, wanted, lengths=lengths or [scenario.duration], threads=threads, progress=advance

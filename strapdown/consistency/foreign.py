@@ -232,29 +232,31 @@ def check_arrays(
     remarks += alignment.words
     aligned = replace_attitude(own.attitude, alignment)
     if own.covariance is None:
-        return _without_covariance(own.time, aligned, truth, alignment, innovations or {}, remarks, probability)
-    readings = {name: read_as(name, own.covariance, own.attitude) for name in ERROR_FRAMES}
-    readings = {name: _in_truth_axes(P, own, truth, alignment) for name, P in readings.items()}
-    error = quaternion.log(quaternion.multiply(quaternion.conjugate(aligned), truth.attitude))
-    found = frame_probabilities(error, {name: P[:, :3, :3] for name, P in readings.items()})
-    chosen, words = _chosen_frame(error_frame, found)
-    remarks += words
-    body = quaternion.conjugate(quaternion.exp(alignment.body))
-    estimate = Estimate.from_arrays(
-        own.time,
-        aligned,
-        readings[chosen],
-        bias=None if own.bias is None else quaternion.rotate(body, own.bias),
-        innovations=innovations,
-    )
+        size = f"RMS attitude error {alignment.residual / DEGREE:.4g}°"
+        judged = judge(estimate := without_truth(own.time, aligned, innovations or {}), probability=probability)
+        judgement = replace(judged, limits=tuple(limit for limit in judged.limits if limit != WITHOUT_TRUTH))
+        remarks.append(f"the estimate has no covariance, so its errors are not judged ({size})")
+        chosen, found, explained = "", dict[str, float](), tuple[Explanation, ...]()
+    else:
+        readings = {name: read_as(name, own.covariance, own.attitude) for name in ERROR_FRAMES}
+        readings = {name: _in_truth_axes(P, own, truth, alignment) for name, P in readings.items()}
+        error = _turns(aligned, truth.attitude)
+        found = frame_probabilities(error, {name: P[:, :3, :3] for name, P in readings.items()})
+        chosen, words = _chosen_frame(error_frame, found)
+        remarks += words
+        body = quaternion.conjugate(quaternion.exp(alignment.body))
+        turned = None if own.bias is None else quaternion.rotate(body, own.bias)
+        estimate = Estimate.from_arrays(own.time, aligned, readings[chosen], bias=turned, innovations=innovations)
+        judgement = judge(estimate, truth, probability=probability)
+        explained = explanations(error, readings, chosen, found, truth, own.time, aligned)
     return Checked(
-        judgement=judge(estimate, truth, probability=probability),
+        judgement=judgement,
         estimate=estimate,
         truth=truth,
         alignment=alignment,
         error_frame=chosen,
         frame_probability=found if error_frame == "find" else {},
-        explanations=explanations(error, readings, chosen, truth, own.time, aligned),
+        explanations=explained,
         remarks=tuple(remarks),
     )
 
@@ -268,31 +270,6 @@ def _chosen_frame(given: str, found: Mapping[str, float]) -> tuple[str, list[str
     if found[given] < 0.01:
         return given, [f"the covariance is read as {given}, as given; as {best} the errors would fit it better by far"]
     return given, []
-
-
-def _without_covariance(
-    time: Array,
-    attitude: Array,
-    truth: Truth,
-    alignment: Alignment,
-    innovations: Mapping[str, Innovations],
-    remarks: list[str],
-    probability: float,
-) -> Checked:
-    """Return the verdict on the innovations alone, and the errors against the truth in words."""
-    sigma = f"RMS attitude error {alignment.residual / DEGREE:.4g}°"
-    estimate = without_truth(time, attitude, innovations)
-    judged = judge(estimate, None, probability=probability)
-    return Checked(
-        judgement=replace(judged, limits=tuple(limit for limit in judged.limits if limit != WITHOUT_TRUTH)),
-        estimate=estimate,
-        truth=truth,
-        alignment=alignment,
-        error_frame="",
-        frame_probability={},
-        explanations=(),
-        remarks=(*remarks, f"the estimate has no covariance, so its errors are not judged ({sigma})"),
-    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -393,13 +370,18 @@ def replace_attitude(attitude: Array, alignment: Alignment) -> Array:
     )
 
 
+def _turns(one: Array, other: Array) -> Array:
+    """Return the rotation vectors (m, 3), rad, body axes, from attitudes (m, 4) to others."""
+    return quaternion.log(quaternion.multiply(quaternion.conjugate(one), other))
+
+
 def interpolated(time: Array, stamps: Array, attitude: Array, bridged: float) -> Array:
     """Return attitudes (n, 4) at ``time`` along the shortest turn; NaN outside, and in gaps longer than ``bridged``, s."""
     k = np.clip(np.searchsorted(stamps, time, side="right") - 1, 0, len(stamps) - 2)
     width = stamps[k + 1] - stamps[k]
     share = (time - stamps[k]) / width
     usable = (share >= -1e-9 / width) & (share <= 1.0 + 1e-9 / width) & (width <= bridged)
-    turn = quaternion.log(quaternion.multiply(quaternion.conjugate(attitude[k]), attitude[k + 1]))
+    turn = _turns(attitude[k], attitude[k + 1])
     result = quaternion.multiply(attitude[k], quaternion.exp(share[:, None] * turn))
     for end in (0, 1):  # what is no interpolation keeps its digits
         exact = time == stamps[k + end]
@@ -443,7 +425,7 @@ def _at_common_times(own: _Series, theirs: _Series, offset: float) -> tuple[_Ser
 
 def _rates(series: _Series) -> tuple[Array, Array]:
     """Return middles of the intervals (m − 1,) and the mean body rate over each (m − 1, 3)."""
-    turn = quaternion.log(quaternion.multiply(quaternion.conjugate(series.attitude[:-1]), series.attitude[1:]))
+    turn = _turns(series.attitude[:-1], series.attitude[1:])
     return 0.5 * (series.time[1:] + series.time[:-1]), turn / np.diff(series.time)[:, None]
 
 
@@ -515,7 +497,7 @@ def _descended(
     for _ in range(20):
         matched, truth = _at_common_times(own, theirs, offset)
         aligned = quaternion.multiply(quaternion.multiply(fixed, matched.attitude), body)
-        r = quaternion.log(quaternion.multiply(quaternion.conjugate(aligned), truth.attitude))
+        r = _turns(aligned, truth.attitude)
         now = float(np.sqrt(np.mean(np.sum(r * r, axis=1))))
         if not free.any():
             residual = now
@@ -529,8 +511,7 @@ def _descended(
         step = np.zeros(7)
         step[free] = inverse @ np.einsum("mij,mi->j", J, r)
         left = r - np.einsum("mij,j->mi", J, step[free])
-        spread = left / max(float(np.sqrt(np.mean(left**2))), 1e-300)
-        share = len(r) / effective_samples(spread) if len(r) > 10 else 1.0
+        share = len(r) / effective_samples(left / max(float(np.sqrt(np.mean(left**2))), 1e-300)) if len(r) > 10 else 1.0
         covariance = np.zeros((7, 7))
         covariance[np.ix_(free, free)] = inverse * float(np.mean(left**2)) * share
         fixed = quaternion.normalize(quaternion.multiply(quaternion.exp(step[:3]), fixed))
@@ -619,9 +600,15 @@ def _in_truth_axes(P: Array, own: _Series, truth: Truth, alignment: Alignment) -
 
 
 def explanations(
-    error: Array, readings: Mapping[str, Array], chosen: str, truth: Truth, time: Array, attitude: Array
+    error: Array,
+    readings: Mapping[str, Array],
+    chosen: str,
+    probabilities: Mapping[str, float],
+    truth: Truth,
+    time: Array,
+    attitude: Array,
 ) -> tuple[Explanation, ...]:
-    """Return what would explain the attitude errors (m, 3) better than the covariance alone, the likeliest first."""
+    """Return what would explain the attitude errors (m, 3) better than the covariance as it is read, the likeliest first."""
     from scipy.special import chdtrc
 
     P = readings[chosen][:, :3, :3]
@@ -653,7 +640,6 @@ def explanations(
     scale_gain = 3.0 * effective * (before - 1.0 - math.log(max(before, 1e-300)))
     p_value = float(chdtrc(1, max(scale_gain, 0.0)))
     found.append(Explanation(name=SCALE, value=f"{math.sqrt(before):.3g}", nees=1.0, p_value=p_value))
-    probabilities = frame_probabilities(error, {name: P[:, :3, :3] for name, P in readings.items()})
     for name, P_other in readings.items():
         if name == chosen or probabilities[name] <= probabilities[chosen]:
             continue

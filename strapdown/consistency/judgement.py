@@ -6,8 +6,9 @@ probability that a right filter is called wrong by any of them is at most 1 − 
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -47,10 +48,13 @@ WITHOUT_TRUTH = (
 )
 """A limit of a judgement."""
 
-_OPTIMISTIC, _PESSIMISTIC = (
-    "the filter is optimistic (its σ are too small)",
-    "the filter is pessimistic (its σ are too large)",
-)
+_LEANINGS = {
+    frozenset[bool](): "the filter's model does not hold",
+    frozenset({True}): "the filter is optimistic (its σ are too small)",
+    frozenset({False}): "the filter is pessimistic (its σ are too large)",
+    frozenset({True, False}): "the filter's σ are too small in part and too large in part",
+}
+"""What it means whether the ratios that contradict the filter are greater than 1."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -328,25 +332,14 @@ def _of_sensor(sensor: str, white: Array, nis: Array) -> list[Finding]:
     mean_vector, p_mean = mean_innovation_p_value(white)
     off = float(np.linalg.norm(mean_vector))
     which = f"innovations of {sensor} are"
+    late = f"{which} correlated in time: they hold what the filter could have known"
+    odd = f"{which} not normal: outliers, or noise that is not what the filter takes it for"
     shape = (
-        (
-            "whiteness",
-            statistic / number,
-            p_white,
-            f"{which} correlated in time: they hold what the filter could have known",
-        ),
-        (
-            "normality",
-            square,
-            p_normal,
-            f"{which} not normal: outliers, or noise that is not what the filter takes it for",
-        ),
+        ("whiteness", statistic / number, p_white, late),
+        ("normality", square, p_normal, odd),
         ("mean innovation", off, p_mean, f"the mean innovation of {sensor} is not zero ({off:.3g} σ)"),
     )
-    return [
-        size,
-        *(Finding(name=n, of=sensor, value=x, p_value=p, samples=samples, means=means) for n, x, p, means in shape),
-    ]
+    return [size, *(Finding(name=n, of=sensor, value=x, p_value=p, samples=samples, means=w) for n, x, p, w in shape)]
 
 
 def innovation_words(sensor: str, mean: float) -> str:
@@ -356,27 +349,17 @@ def innovation_words(sensor: str, mean: float) -> str:
 
 def _of_pairs(estimate: Estimate) -> list[Finding]:
     found = []
-    names = list(estimate.innovations)
-    for i, one in enumerate(names):
-        for other in names[i + 1 :]:
-            a, b = estimate.innovations[one], estimate.innovations[other]
-            if min(int(a.used.sum()), int(b.used.sum())) < MIN_SAMPLES:
-                continue
-            correlation, pairs, p = cross_correlation_p_value(
-                a.time[a.used], a.whitened[a.used], b.time[b.used], b.whitened[b.used]
-            )
-            if math.isnan(p):
-                continue
-            found.append(
-                Finding(
-                    name="cross-correlation",
-                    of=f"{one} and {other}",
-                    value=float(np.max(np.abs(correlation))),
-                    p_value=p,
-                    samples=pairs,
-                    means=f"innovations of {one} and {other} are correlated: they share an error that the filter does not know of",
-                )
-            )
+    for (one, a), (other, b) in itertools.combinations(estimate.innovations.items(), 2):
+        if min(int(a.used.sum()), int(b.used.sum())) < MIN_SAMPLES:
+            continue
+        series = (a.time[a.used], a.whitened[a.used], b.time[b.used], b.whitened[b.used])
+        correlation, pairs, p = cross_correlation_p_value(*series)
+        if math.isnan(p):
+            continue
+        largest = float(np.max(np.abs(correlation)))
+        means = f"innovations of {one} and {other} are correlated: they share an error that the filter does not know of"
+        of = f"{one} and {other}"
+        found.append(Finding(name="cross-correlation", of=of, value=largest, p_value=p, samples=pairs, means=means))
     return found
 
 
@@ -482,29 +465,19 @@ def concluded(
     """
     marked = holm(findings, 1.0 - probability)
     kept = sum(not one.rejected for one in marked)
-    marked = [
-        one._with_bounds((1.0 - probability) / max(kept, 1)) for one in marked
-    ]  # where Holm's procedure has stopped
+    # Bounds where Holm's procedure has stopped.
+    marked = [one._with_bounds((1.0 - probability) / max(kept, 1)) for one in marked]
     power = powers(marked, probability, states)
     rejected = [finding for finding in marked if finding.rejected]
     verdict: Answer
     if rejected:
         verdict = "not consistent"
-        ratios = [finding.value > 1.0 for finding in rejected if finding.is_ratio]
-        leaning = (
-            "the filter's model does not hold"
-            if not ratios
-            else _OPTIMISTIC
-            if all(ratios)
-            else _PESSIMISTIC
-            if not any(ratios)
-            else "the filter's σ are too small in part and too large in part"
-        )
+        leaning = _LEANINGS[frozenset(finding.value > 1.0 for finding in rejected if finding.is_ratio)]
         reason = f"{leaning}; {len(rejected)} of {len(marked)} tests contradict it"
     elif not marked:
         verdict, reason = "cannot tell", "there is nothing to judge: no innovation, and no truth"
     else:
-        sharpest = resolution(marked, probability)
+        sharpest = min((x for one, x in _factors(marked, probability) if one.samples > 1), default=math.inf)
         unseen = [one.of for one in power if one.of in needed and not one.seen]
         outcome = f"none of {len(marked)} tests contradicts the filter"
         if sharpest > RESOLUTION:
@@ -528,17 +501,22 @@ def concluded(
 
 def powers(findings: Sequence[Finding], probability: float, states: Sequence[str]) -> tuple[Power, ...]:
     """Return what the tests would have shown of a wrong σ: of the innovations of each sensor, and of each state."""
-    within = (1.0 - probability) / max(len(findings), 1)
-    best = {
-        **{f"{_INNOVATIONS}{one.of}": math.inf for one in findings if one.name == "NIS"},
-        **dict.fromkeys(states, math.inf),
-    }
-    for one in findings:
+    best = {f"{_INNOVATIONS}{one.of}": math.inf for one in findings if one.name == "NIS"}
+    best |= dict.fromkeys(states, math.inf)
+    for one, factor in _factors(findings, probability):
         of = f"{_INNOVATIONS}{one.of}" if one.name == "NIS" else one.of
-        if one.is_ratio and of in best:
-            low, high = mean_bounds(one.degrees, one.samples, 1.0 - within / one.epochs)
-            best[of] = min(best[of], math.sqrt(high / low))
+        if of in best:
+            best[of] = min(best[of], factor)
     return tuple(Power(of=of, factor=factor) for of, factor in best.items())
+
+
+def _factors(findings: Sequence[Finding], probability: float) -> Iterator[tuple[Finding, float]]:
+    """Yield the ratios with the factor on σ that each distinguishes from 1: the root of the ratio of its bounds, Bonferroni included."""
+    within = (1.0 - probability) / max(len(findings), 1)
+    for one in findings:
+        if one.is_ratio:
+            low, high = mean_bounds(one.degrees, one.samples, 1.0 - within / one.epochs)
+            yield one, math.sqrt(high / low)
 
 
 def power_words(power: Sequence[Power]) -> str:
@@ -562,18 +540,6 @@ def power_words(power: Sequence[Power]) -> str:
             f"the σ of {', '.join(untested)} {'is' if len(untested) == 1 else 'are'} not tested: no truth for it"
         )
     return "; ".join(words)
-
-
-def resolution(findings: Iterable[Finding], probability: float) -> float:
-    """Return the factor on σ that the sharpest finding distinguishes from 1: the root of the ratio of its bounds, Bonferroni included."""
-    marked = list(findings)
-    within = (1.0 - probability) / max(len(marked), 1)
-    factors = [math.inf]
-    for finding in marked:
-        if finding.is_ratio and finding.samples > 1:
-            low, high = mean_bounds(finding.degrees, finding.samples, 1.0 - within / finding.epochs)
-            factors.append(math.sqrt(high / low))
-    return min(factors)
 
 
 def holm(findings: Iterable[Finding], error: float) -> list[Finding]:

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from strapdown.checks import InputError, array
-from strapdown.consistency.bounds import mean_p_value
 from strapdown.consistency.manifold import whitened
 
 MIN_EFFECTIVE = 50.0
@@ -33,8 +32,6 @@ class TimeAverage:
 
     mean: float
     """1 for a consistent filter."""
-    degrees: int
-    epochs: int
     effective: float
     """Number of independent epochs with the same information."""
 
@@ -42,11 +39,6 @@ class TimeAverage:
     def reliable(self) -> bool:
         """Whether the run is long against the correlation of its errors; if not, the p-value does not hold."""
         return self.effective >= MIN_EFFECTIVE
-
-    @property
-    def p_value(self) -> float:
-        """Two-sided p-value of the mean."""
-        return mean_p_value(self.mean, self.degrees, max(self.effective, 1.0))
 
 
 def time_average(error: ArrayLike, covariance: ArrayLike, states: tuple[int, ...] | None = None) -> TimeAverage:
@@ -67,8 +59,6 @@ def time_average(error: ArrayLike, covariance: ArrayLike, states: tuple[int, ...
     mine = white[:, : len(chosen)]
     return TimeAverage(
         mean=float(np.mean(np.sum(mine * mine, axis=1)) / len(chosen)),
-        degrees=len(chosen),
-        epochs=len(white),
         effective=_effective(white, len(chosen)),
     )
 

@@ -114,7 +114,7 @@ _FORM: tables.Form = {
 class Plan:
     """Definition of a campaign: everything that run number k depends on, and the epochs of the statistics.
 
-    Filter and truth are separate: a ``setup`` that differs from :func:`strapdown.setup.matched` of the scenario is a mismatched filter.
+    Filter and truth are separate: a ``setup`` that differs from :meth:`strapdown.setup.FilterSetup.for_scenario` is a mismatched filter.
     Outages, outliers and correlated noise are the scenario's sensors'. A plan is compared and hashed by identity, so a machine may keep
     what it derives from one in a ``weakref.WeakKeyDictionary``.
 

@@ -12,7 +12,7 @@ from strapdown.checks import Array, InputError
 from strapdown.files import plain
 from strapdown.montecarlo.plan import Plan
 from strapdown.montecarlo.statistics import COVERED, Counts, Statistics, judged_epochs
-from strapdown.setup import MEKF, matched
+from strapdown.setup import MEKF, FilterSetup
 
 QUANTILES = (0.5, 0.95, 0.997)
 """Quantiles of the last epoch's errors in the summary."""
@@ -27,7 +27,7 @@ def bound_of(plan: Plan) -> Array | None:
     if plan.setup.estimator == MEKF or np.any(given.attitude_error) or np.any(given.bias_error):
         return None
     attitude_sigma, bias_sigma = given.initial_sigmas(plan.setup)
-    chosen = replace(matched(plan.scenario), attitude_sigma=attitude_sigma, bias_sigma=bias_sigma)
+    chosen = replace(FilterSetup.for_scenario(plan.scenario), attitude_sigma=attitude_sigma, bias_sigma=bias_sigma)
     try:
         return covariance.analyse(plan.scenario, chosen, epochs=plan.epochs).cramer_rao
     except InputError:

@@ -249,8 +249,8 @@ def drawn(scenario: Scenario, seed: int, run: int = 0) -> Scenario:
 
     The fixed errors (scale factor, misalignment, sensitivity to acceleration, hard iron, a sensor's bias, lever arm) are taken as standard
     deviations, entry by entry, as in a datasheet; to the coefficients of a bias over temperature errors of their own σ are added. A filter
-    with a state for each (``setup.matched(scenario, states=True)``) is consistent on average over such individuals, and only nearly so on
-    one whose errors all have one size and sign.
+    with a state for each (``FilterSetup.for_scenario(scenario, states=True)``) is consistent on average over such individuals, and only
+    nearly so on one whose errors all have one size and sign.
 
     Parameters
     ----------

@@ -38,8 +38,6 @@ __all__ = [
     "SensorStates",
     "States",
     "initial_state",
-    "matched",
-    "matched_to_record",
     "read_setup",
     "run",
     "smooth",
@@ -144,112 +142,114 @@ class FilterSetup(ByValue):
         """Name of the estimator."""
         return self.estimator.name if isinstance(self.estimator, Own) else str(self.estimator)
 
+    @classmethod
+    def for_scenario(
+        cls, scenario: Scenario, *, attitude_sigma: float | None = None, states: bool | Sequence[str] | None = False
+    ) -> FilterSetup:
+        """Return the filter setup that matches a scenario: the noise of its gyro, and the sensors' own σ.
 
-def matched(
-    scenario: Scenario, *, attitude_sigma: float | None = None, states: bool | Sequence[str] | None = False
-) -> FilterSetup:
-    """Return the filter setup that matches a scenario: the noise of its gyro, and the sensors' own σ.
+        Parameters
+        ----------
+        scenario : Scenario
+            Its gyro, its sensors and its motion determine the setup.
+        attitude_sigma, states : optional
+            As of :meth:`for_record`.
 
-    Parameters
-    ----------
-    scenario : Scenario
-        Its gyro, its sensors and its motion determine the setup.
-    attitude_sigma, states : optional
-        As of :func:`matched_to_record`.
+        Returns
+        -------
+        FilterSetup
+            Setup whose noise model is that of the scenario.
 
-    Returns
-    -------
-    FilterSetup
-        Setup whose noise model is that of the scenario.
+        Raises
+        ------
+        InputError
+            If the gyro has no angle random walk.
 
-    Raises
-    ------
-    InputError
-        If the gyro has no angle random walk.
+        Examples
+        --------
+        >>> from strapdown import scenarios, setup
+        >>> print(setup.to_toml(setup.FilterSetup.for_scenario(scenarios.load_scenario("two-stars"))))  # doctest: +SKIP
+        """
+        from strapdown.scenarios import simulate  # and every motion
 
-    Examples
-    --------
-    >>> from strapdown import scenarios, setup
-    >>> print(setup.to_toml(setup.matched(scenarios.load_scenario("two-stars"))))  # doctest: +SKIP
-    """
-    from strapdown.scenarios import simulate  # and every motion
+        return cls.for_record(simulate(scenario), attitude_sigma=attitude_sigma, states=states)
 
-    return matched_to_record(simulate(scenario), attitude_sigma=attitude_sigma, states=states)
+    @classmethod
+    def for_record(
+        cls,
+        record: ImuRecord,
+        spec: GyroSpec | None = None,
+        *,
+        attitude_sigma: float | None = None,
+        states: bool | Sequence[str] | None = False,
+    ) -> FilterSetup:
+        """Return the filter setup that matches what a record's ``origin`` specifies of its gyro and sensors.
 
+        Flicker noise, which is no random walk, is matched in the attitude at the record's rate and quality of measurements
+        (:func:`strapdown.gyro.matched_process_noise`); without measurements it is bounded over the record's length. Errors without a state
+        (scale factor, misalignment, quantisation, hard iron) are not covered: :func:`unmodelled_errors` names them.
 
-def matched_to_record(
-    record: ImuRecord,
-    spec: GyroSpec | None = None,
-    *,
-    attitude_sigma: float | None = None,
-    states: bool | Sequence[str] | None = False,
-) -> FilterSetup:
-    """Return the filter setup that matches what a record's ``origin`` specifies of its gyro and sensors.
+        Parameters
+        ----------
+        record : ImuRecord
+            Its rate, its length and the σ of its measurements determine the noise that stands for flicker.
+        spec : GyroSpec, optional
+            Specification of the gyro. Default: that of the record's origin.
+        attitude_sigma : float, optional
+            σ of the initial attitude error, each axis, rad. Default: 1°, or less where the finest sensor is so fine that its first
+            measurement would not be linear in the error; an extended filter's covariance does not hold beyond that.
+        states : bool, None or sequence of str, default False
+            True: with an error state for each error that the gyro or the origin's sensors specify: scale factor, misalignment,
+            g-sensitivity, slope of the bias over the record's temperature, flicker and Gauss–Markov drift, hard iron, a sensor's bias,
+            correlated noise, lever arm. Each is modelled as one draw of a normal distribution whose σ is the error's size. Where
+            one-sample integration would leave a noticeable commutation error, an integration algorithm of the same rate with less is
+            chosen. Names such as ``"gyro.scale"``: with these of them alone. None: with all where an error is specified that the filter
+            would have no state for.
 
-    Flicker noise, which is no random walk, is matched in the attitude at the record's rate and quality of measurements
-    (:func:`strapdown.gyro.matched_process_noise`); without measurements it is bounded over the record's length. Errors without a state
-    (scale factor, misalignment, quantisation, hard iron) are not covered: :func:`unmodelled_errors` names them.
+        Returns
+        -------
+        FilterSetup
+            Setup with the noise of the gyro, and with error states if asked for.
 
-    Parameters
-    ----------
-    record : ImuRecord
-        Its rate, its length and the σ of its measurements determine the noise that stands for flicker.
-    spec : GyroSpec, optional
-        Specification of the gyro. Default: that of the record's origin.
-    attitude_sigma : float, optional
-        σ of the initial attitude error, each axis, rad. Default: 1°, or less where the finest sensor is so fine that its first measurement
-        would not be linear in the error; an extended filter's covariance does not hold beyond that.
-    states : bool, None or sequence of str, default False
-        True: with an error state for each error that the gyro or the origin's sensors specify: scale factor, misalignment, g-sensitivity,
-        slope of the bias over the record's temperature, flicker and Gauss–Markov drift, hard iron, a sensor's bias, correlated noise,
-        lever arm. Each is modelled as one draw of a normal distribution whose σ is the error's size. Where one-sample integration would
-        leave a noticeable commutation error, an integration algorithm of the same rate with less is chosen. Names such as
-        ``"gyro.scale"``: with these of them alone. None: with all where an error is specified that the filter would have no state for.
-
-    Returns
-    -------
-    FilterSetup
-        Setup with the noise of the gyro, and with error states if asked for.
-
-    Raises
-    ------
-    InputError
-        If the gyro is not specified or has no angle random walk, or a name is of no error that is specified.
-    """
-    origin = record.origin or Origin()
-    spec = spec or origin.gyro
-    if spec is None:
-        raise InputError(
-            "the record does not specify its gyro; give the gyro's noise (--gyro; noise= in Python) or a filter (--filter; setup=)"
+        Raises
+        ------
+        InputError
+            If the gyro is not specified or has no angle random walk, or a name is of no error that is specified.
+        """
+        origin = record.origin or Origin()
+        spec = spec or origin.gyro
+        if spec is None:
+            raise InputError(
+                "the record does not specify its gyro; give the gyro's noise (--gyro; noise= in Python) or a filter (--filter; setup=)"
+            )
+        walk = np.max(np.square(spec.bias_instability) * np.log(1e3)) / np.pi  # flicker over three decades of time
+        tau = spec.markov_correlation_time
+        stationary = 0.5 * np.square(spec.markov_noise) * tau if np.isfinite(tau) else 0.0
+        spread = np.max(np.square(spec.turn_on_bias) + np.square(spec.turn_on_bias_sigma) + stationary) + walk
+        plain = cls(
+            process_noise=ProcessNoise(**_noise(spec, record)),
+            attitude_sigma=_linear_sigma(record) if attitude_sigma is None else attitude_sigma,
+            bias_sigma=float(max(np.sqrt(spread), MIN_BIAS_SIGMA)),
         )
-    walk = np.max(np.square(spec.bias_instability) * np.log(1e3)) / np.pi  # flicker over three decades of time
-    tau = spec.markov_correlation_time
-    stationary = 0.5 * np.square(spec.markov_noise) * tau if np.isfinite(tau) else 0.0
-    spread = np.max(np.square(spec.turn_on_bias) + np.square(spec.turn_on_bias_sigma) + stationary) + walk
-    plain = FilterSetup(
-        process_noise=ProcessNoise(**_noise(spec, record)),
-        attitude_sigma=_linear_sigma(record) if attitude_sigma is None else attitude_sigma,
-        bias_sigma=float(max(np.sqrt(spread), MIN_BIAS_SIGMA)),
-    )
-    sensors, gravity_f = specified(origin)
-    if states is False or (
-        states is None and not (origin.gyro and unmodelled_errors(origin.gyro, sensors, gravity_f=gravity_f))
-    ):
-        return plain
-    found = matching.matched(spec, record, sensors, np.asarray(gravity_f), measurement_density(record))
-    noise = ProcessNoise(**_noise_beside_states(spec, found.white))
-    algorithm = ACCURATE_ALGORITHM if _commutes_badly(record, noise.angle_random_walk) else "one-sample"
-    kept = found.states
-    if not isinstance(states, bool) and states is not None:
-        kept = found.states.chosen(tuple(states)) if states else States()
-    return replace(
-        plain,
-        process_noise=noise
-        if "gyro.drift" in kept.names
-        else plain.process_noise,  # flicker is a state or in the noise
-        integration=coning.ALGORITHMS[algorithm],
-        states=kept if kept.names else None,
-    )
+        sensors, gravity_f = specified(origin)
+        if states is False or (
+            states is None and not (origin.gyro and unmodelled_errors(origin.gyro, sensors, gravity_f=gravity_f))
+        ):
+            return plain
+        found = matching.matched(spec, record, sensors, np.asarray(gravity_f), measurement_density(record))
+        noise = ProcessNoise(**_noise_beside_states(spec, found.white))
+        algorithm = ACCURATE_ALGORITHM if _commutes_badly(record, noise.angle_random_walk) else "one-sample"
+        kept = found.states
+        if not isinstance(states, bool) and states is not None:
+            kept = found.states.chosen(tuple(states)) if states else States()
+        return replace(
+            plain,
+            process_noise=noise
+            if "gyro.drift" in kept.names
+            else plain.process_noise,  # flicker is a state or in the noise
+            integration=coning.ALGORITHMS[algorithm],
+            states=kept if kept.names else None,
+        )
 
 
 def specified(origin: Origin) -> tuple[Sequence[Any], Sequence[float]]:

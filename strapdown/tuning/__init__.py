@@ -1,16 +1,17 @@
 """Tuning a filter from data: maximum likelihood, an interval for each parameter, and validation on held-out data.
 
 - ``procedure``: :func:`tune`: objective, search and what follows it in one call.
-- ``innovations``: Of the filter's innovations, with score and information, eight sets of parameters a pass.
+- ``objective``: What every objective is: a problem checked, setups of points, sums over records and threads.
+- ``innovations``: Of the filter's innovations, with score and information, eight sets of parameters a pass where the filter allows it.
 - ``errors``: Of the errors against a truth.
 - ``outliers``: Of innovations some of which are outliers, and the gate that suits them.
 - ``fitting``: The search from several starts, intervals, what is identified and what is not.
-- ``parameters``: Names, values in a filter setup, priors.
-- ``starting``: Where the filter starts on a record.
+- ``parameters``: One table of names, places in a filter setup and units; priors.
+- ``initialization``: Where the filter starts on a record.
 - ``planning``: The Cramér–Rao bound before there is a record.
-- ``suspicion``: What the tuned filter leaves unexplained, such as a scale factor that the gyro's noise stands for.
+- ``residual_checks``: What the tuned filter leaves unexplained, such as a scale factor that the gyro's noise stands for.
 - ``own``: Parameters of a filter of one's own, by the same objectives.
-- ``holding``: What is held out, and the filter before and after on it.
+- ``validation``: What is held out, and the filter before and after on it.
 
 >>> objective = tuning.likelihood([tuning.record_case(record, chosen)], chosen, ["gyro.arw", "star.sigma"])  # doctest: +SKIP
 >>> result = tuning.fit(objective)  # doctest: +SKIP
@@ -28,11 +29,13 @@ from strapdown.tuning.fitting import Tuning, fit
 from strapdown.tuning.fitting import rescaled as rescaled
 from strapdown.tuning.fitting import search as search
 from strapdown.tuning.fitting import slices as slices
-from strapdown.tuning.holding import Comparison as Comparison
-from strapdown.tuning.holding import Performance as Performance
-from strapdown.tuning.holding import compare, split
-from strapdown.tuning.innovations import Case, likelihood
-from strapdown.tuning.innovations import thinned as thinned
+from strapdown.tuning.initialization import by_innovations as by_innovations
+from strapdown.tuning.initialization import one_gyro as one_gyro
+from strapdown.tuning.initialization import record_case, recording_case
+from strapdown.tuning.initialization import recording_setup as recording_setup
+from strapdown.tuning.innovations import likelihood
+from strapdown.tuning.objective import Case
+from strapdown.tuning.objective import thinned as thinned
 from strapdown.tuning.outliers import TunedGate as TunedGate
 from strapdown.tuning.outliers import contaminated_likelihood as contaminated_likelihood
 from strapdown.tuning.outliers import log_likelihood as log_likelihood
@@ -50,14 +53,12 @@ from strapdown.tuning.planning import Plan as Plan
 from strapdown.tuning.planning import plan
 from strapdown.tuning.procedure import GATED as GATED
 from strapdown.tuning.procedure import tune
-from strapdown.tuning.procedure import with_units as with_units
-from strapdown.tuning.starting import by_innovations as by_innovations
-from strapdown.tuning.starting import one_gyro as one_gyro
-from strapdown.tuning.starting import record_case, recording_case
-from strapdown.tuning.starting import recording_setup as recording_setup
-from strapdown.tuning.suspicion import Unmodelled as Unmodelled
-from strapdown.tuning.suspicion import doubted as doubted
-from strapdown.tuning.suspicion import unmodelled as unmodelled
+from strapdown.tuning.residual_checks import Unmodelled as Unmodelled
+from strapdown.tuning.residual_checks import doubted as doubted
+from strapdown.tuning.residual_checks import unmodelled as unmodelled
+from strapdown.tuning.validation import Comparison as Comparison
+from strapdown.tuning.validation import Performance as Performance
+from strapdown.tuning.validation import compare, split
 
 __all__ = [
     "Case",

@@ -1,7 +1,7 @@
 """Tuning against a truth: the likelihood of the state errors under the filter's covariance, or the size of the attitude error.
 
-The likelihood is that of the filter as it runs, with its error states, its gate and its robust weights; where it has none of them, eight
-points are computed at once.
+The likelihood is that of the filter as it runs, with its error states, its gate and its robust weights; where it has none of them, and no
+more than seven parameters are free, eight points are computed at once.
 
 Errors at neighbouring times are alike, so epochs are taken as far apart as the attitude error remembers, and the likelihood of all of them
 is a composite one (Lindsay 1988): its maximum is right, its curvature is not an information, and standard errors come from the sandwich.
@@ -10,7 +10,7 @@ is a composite one (Lindsay 1988): its maximum is right, its curvature is not an
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
@@ -18,10 +18,8 @@ import numpy as np
 from strapdown import consistency
 from strapdown.checks import Array, InputError, one_of
 from strapdown.setup import FilterSetup
-from strapdown.tuning import extended
-from strapdown.tuning.extended import ExtendedLikelihood
-from strapdown.tuning.innovations import MOST, STEP, Case, Derivatives, Likelihood, likelihood
-from strapdown.tuning.parameters import axis_of
+from strapdown.tuning.innovations import MOST, LaneLikelihood, RunLikelihood, made, with_engine
+from strapdown.tuning.objective import STEP, Case, Derivatives, Objective, by_part, posed
 
 Measure = Literal["likelihood", "rmse"]
 MAX_EPOCHS = 1000
@@ -29,38 +27,20 @@ MAX_EPOCHS = 1000
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class ErrorObjective:
+class ErrorObjective(Objective):
     """Objective of the parameters, from the errors of the state; built by :func:`error_objective`."""
 
-    base: Likelihood | ExtendedLikelihood
+    base: LaneLikelihood | RunLikelihood
+    """The filter that makes the errors."""
     measure: Measure
     references: tuple[Reference, ...] = field(repr=False)
     """Truth at the edges judged, of each record."""
-    parts: int = 20
     composite: ClassVar[bool] = True
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the free parameters."""
-        return self.base.names
-
-    @property
-    def start(self) -> Array:
-        """Logarithms of their first values."""
-        return self.base.start
-
-    def setup(self, point: Array) -> FilterSetup:
-        """Return the setup of a point."""
-        return self.base.setup(point)
-
-    def minus_log(self, points: Array) -> Array:
-        """Return the value at several points (k, p): (k,)."""
-        return np.array([self.derivatives(point).value.sum() for point in np.atleast_2d(points)])
 
     def derivatives(self, point: Array) -> Derivatives:
         """Return value, gradient and curvature at a point."""
         rows = np.concatenate([point[None], point + STEP * np.eye(len(point))])
-        found = self.base.each(lambda number: self.errors_of(number, rows), range(len(self.references)))
+        found = self.each(self.errors_of, [(number, rows) for number in range(len(self.references))])
         error = np.concatenate([e for e, _ in found])
         P = np.concatenate([covariance for _, covariance in found])
         return self._squares(error) if self.measure == "rmse" else self._likelihood(error, P)
@@ -100,14 +80,7 @@ class ErrorObjective:
 
     def _by_part(self, value: Array, score: Array, information: Array) -> Derivatives:
         place = np.arange(len(value)) * self.parts // len(value)
-        sums = np.zeros((self.parts, score.shape[1]))
-        np.add.at(sums, place, score)
-        return Derivatives(
-            value=np.bincount(place, value, self.parts).astype(np.float64),
-            score=sums,
-            information=information,
-            outer=score.T @ score,
-        )
+        return by_part(value, score, information, place, self.parts)
 
 
 def error_objective(
@@ -120,22 +93,18 @@ def error_objective(
 ) -> ErrorObjective:
     """Return the objective that judges the filter by its errors on records with a truth, or a reference attitude: then only the attitude.
 
-    The likelihood of the errors under the filter's covariance asks that they be small and that the filter know how small; the root mean
-    square of the attitude error asks for the first alone, and does not determine a common scale of all parameters; it is that of a filter
-    of attitude and bias without gate and robust weights.
+    The likelihood of the errors under the filter's covariance asks that they be small and that the filter know how small. The root mean
+    square of the attitude error asks for the first alone, and does not determine a common scale of all σ; it is that of the filter without
+    gate and robust weights.
     """
     one_of("measure", measure, ("likelihood", "rmse"))
-    plain = measure == "rmse" or (chosen.states is None and chosen.gate is None and chosen.robust is None)
-    base: Likelihood | ExtendedLikelihood
-    if plain and not any(axis_of(name) for name in free):
-        base = likelihood(cases, chosen, free, threads=threads)
-        if len(base.names) > MOST:
-            raise InputError(f"{len(base.names)} parameters are free; against a truth at most {MOST} can be")
-    else:
-        base = extended.likelihood(cases, chosen, free, threads=threads)
-    known = [_reference(case, base.chosen) for case in cases]
-    references = tuple(_spread(base, number, one, measure) for number, one in enumerate(known))
-    return ErrorObjective(base=base, measure=measure, references=references)
+    applied = replace(chosen, gate=None, robust=None) if measure == "rmse" else chosen
+    problem = posed(cases, applied, free, threads=threads)
+    plain = applied.gate is None and applied.robust is None and len(problem.names) <= MOST
+    base = with_engine(problem, lanes=plain)
+    references = tuple(_spread(base, number, measure) for number in range(len(base.cases)))
+    objective = made(ErrorObjective, problem, base=base, measure=measure, references=references)
+    return replace(objective, chosen=replace(problem.chosen, gate=chosen.gate, robust=chosen.robust))
 
 
 class Reference(NamedTuple):
@@ -153,26 +122,28 @@ class Reference(NamedTuple):
         return Reference(self.epochs[rows], self.attitude[rows], None if self.bias is None else self.bias[rows])
 
 
-def _reference(case: Case, chosen: FilterSetup) -> Reference:
-    """Return the truth of a record where it is known and counts for tuning."""
-    every, time, truth = chosen.integration.samples, case.record.time, case.record.truth
-    edges = np.arange(0, len(time), every)
+def reference(case: Case, edges: np.ndarray) -> Reference:
+    """Return the truth of a record where it is known and counts for tuning, at some of these edges of its gyro samples."""
+    time, truth = case.record.time[edges], case.record.truth
     attitude = case.true_attitude if truth is None else truth.attitude
-    judged = (time[edges] >= case.first) & (time[edges] <= case.last)
+    judged = (time >= case.first) & (time <= case.last)
     if case.judged is not None:
         judged &= case.judged[edges]
     if attitude is not None:
         judged &= np.isfinite(attitude[edges]).all(axis=1)
     if attitude is None or not judged.any():
         raise InputError(
-            f"{case.name or 'record'} has no truth where it is to be judged; tune by the innovations instead (leave truth out)"
+            f"{case.name or 'record'} has no truth where it is to be judged; tune by the innovations instead (leave truth out), or give a "
+            "reference"
         )
     rows = edges[judged]
     return Reference(np.flatnonzero(judged), attitude[rows], None if truth is None else truth.bias[rows])
 
 
-def _spread(base: Likelihood | ExtendedLikelihood, number: int, known: Reference, measure: Measure) -> Reference:
-    """Return edges far enough apart that the attitude error of the starting filter has forgotten."""
+def _spread(base: LaneLikelihood | RunLikelihood, number: int, measure: Measure) -> Reference:
+    """Return the truth of a record at edges far enough apart that the attitude error of the starting filter has forgotten."""
+    case = base.cases[number]
+    known = reference(case, np.arange(0, len(case.record.time), base.chosen.integration.samples))
     picked = known.at(slice(None, None, max(1, len(known.epochs) // MAX_EPOCHS)))
     m = len(picked.epochs)
     if measure == "rmse" or m < 100:

@@ -10,21 +10,19 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
-from typing import NamedTuple, Protocol, TypeVar
+from dataclasses import dataclass, replace
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
 from strapdown.checks import Array, InputError, count, known_keys, positive
 from strapdown.results import Listed, Listing, figure
 from strapdown.setup import FilterSetup
-from strapdown.tuning.innovations import Derivatives
-from strapdown.tuning.parameters import RRW, SCALE, Prior, Unit, fixed_unit, with_values
+from strapdown.tuning.objective import REACH, Derivatives, Objective
+from strapdown.tuning.parameters import RRW, SCALE, Prior, Unit, with_values
 
 LONGEST_STEP = 2.0
 """Largest change of a log parameter in one step of the search."""
-REACH = 16.0
-"""How far a log parameter may go from where it starts."""
 WELL_KNOWN = 0.1
 """Standard error of a log parameter below which the likelihood is a parabola to much better than the error itself."""
 TWO_SIDED = 3.841458820694124
@@ -36,45 +34,11 @@ MIN_INFORMATION = 1e-10
 """Least information on a log parameter; below it there is none."""
 NEGLIGIBLE = 1e-3
 """A gain of the log likelihood that is not distinguishable from none."""
+NOT_IDENTIFIED = "not identified"
 MISFIT = 1.6
 """Sandwich error over that of the information beyond which the innovations are not what the filter takes them for."""
 
 T = TypeVar("T")
-
-
-class Objective(Protocol):
-    """Objective to minimise: minus a log likelihood, or a substitute.
-
-    It may have ``limits`` of its own, least and largest logarithm of each parameter (p,), (p,), and a ``curvature(point)`` (p, p), where
-    that of the search is not good enough for errors.
-    """
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the free parameters."""
-
-    @property
-    def start(self) -> Array:
-        """Logarithms of their first values."""
-
-    @property
-    def composite(self) -> bool:
-        """Whether its curvature is no information, so that errors come from the scatter of its gradient."""
-
-    def derivatives(self, point: Array) -> Derivatives:
-        """Return value, gradient and information at a point."""
-
-    def minus_log(self, points: Array) -> Array:
-        """Return the value at several points (k, p)."""
-
-    def setup(self, point: Array) -> FilterSetup:
-        """Return the filter setup of a point."""
-
-
-def limits_of(objective: Objective) -> tuple[Array, Array]:
-    """Return the least and the largest logarithm of each parameter that a search looks at: the objective's own ``limits``, if any."""
-    wide: tuple[Array, Array] = objective.start - REACH, objective.start + REACH
-    return getattr(objective, "limits", wide)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -86,12 +50,16 @@ class Local:
     information: Array
     derivatives: Derivatives
 
+    @property
+    def settled(self) -> np.ndarray:
+        """Parameters that fall towards zero (p,): they gain no more than half the gradient, and below some size are as good as there."""
+        return np.asarray((self.score > 0.0) & (self.score < NEGLIGIBLE) & (np.diag(self.information) < 0.1))
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Optimum:
     """Where one search ended."""
 
-    start: Array
     point: Array
     local: Local
     steps: int
@@ -124,15 +92,17 @@ def search(
     known = dict(priors or {})
     x = np.array(start, float)
     moving = np.array([j not in fixed for j in range(len(x))], bool)
-    low, high = limits_of(objective)
+    low, high = objective.limits
     here = local_at(objective, x, known)
     damping, stretch = 1e-3, 1.0
+
+    def ended(number: int, *, converged: bool = True) -> Optimum:
+        return Optimum(point=x, local=here, steps=number, converged=converged)
+
     for number in range(steps):
-        # What falls towards zero gains no more than half its gradient: below some size it is as good as there.
-        settled = (here.score > 0.0) & (here.score < NEGLIGIBLE) & (np.diag(here.information) < 0.1)
-        active = moving & ~settled & ~((x <= low) & (here.score > 0.0)) & ~((x >= high) & (here.score < 0.0))
+        active = moving & ~here.settled & ~((x <= low) & (here.score > 0.0)) & ~((x >= high) & (here.score < 0.0))
         if not active.any():
-            return Optimum(start=np.array(start), point=x, local=here, steps=number, converged=True)
+            return ended(number)
         g, F = here.score[active], here.information[np.ix_(active, active)]
         scale = np.sqrt(np.maximum(np.diag(F), 1e-12))
         unit = F / np.outer(scale, scale)
@@ -145,13 +115,13 @@ def search(
             trial[~moving] = x[~moving]
             gain = -float(here.score[active] @ delta[active])
             if gain < 1e-7 and np.abs(delta).max() < 0.05:
-                return Optimum(start=np.array(start), point=x, local=here, steps=number, converged=True)
+                return ended(number)
             there = local_at(objective, trial, known)
             if there.value <= here.value:
                 break
             damping, stretch = max(10.0 * damping, 1e-3), 1.0
             if damping > 1e12:
-                return Optimum(start=np.array(start), point=x, local=here, steps=number, converged=False)
+                return ended(number, converged=False)
         if shortened == 1.0 and not objective.composite:
             # Where the information is more than the curvature, as of innovations that no such filter has, steps are too short.
             bend = 2.0 * (gain - (here.value - there.value))
@@ -159,7 +129,7 @@ def search(
                 np.clip(stretch * (np.clip(gain / bend, 0.5, 4.0) if bend > 0.25 * gain else 4.0), 1.0, 64.0)
             )
         x, here, damping = trial, there, max(0.1 * damping, 1e-9)
-    return Optimum(start=np.array(start), point=x, local=here, steps=steps, converged=False)
+    return ended(steps, converged=False)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -180,18 +150,18 @@ class Estimated:
     identified: bool
     """Whether zero is refuted at 95 %, and an upper end found."""
     note: str
-    """Interpretation, in words."""
+    """Interpretation; :attr:`words` adds the bound."""
     unit: Unit
     """Unit that it is printed in."""
 
     @property
     def words(self) -> str:
         """How well it is known, in its unit."""
-        if self.identified or "prior" in self.note:
+        if self.note != NOT_IDENTIFIED:
             return self.note
         if not math.isfinite(self.upper):
-            return "not identified: these records say nothing of it"
-        return f"not identified: at most {figure(self.upper / self.unit.factor, 3)} {self.unit.name} (95 %)"
+            return f"{NOT_IDENTIFIED}: these records say nothing of it"
+        return f"{NOT_IDENTIFIED}: at most {figure(self.upper / self.unit.factor, 3)} {self.unit.name} (95 %)"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -225,6 +195,8 @@ class Tuning(Listed):
         Searches that ended within a thousandth of a log likelihood of the best.
     composite : bool, default False
         Whether what was minimised is no likelihood, so that intervals come from the scatter of its gradient (sandwich).
+    scale : ndarray (p,) or float, default 1.0
+        Factor on the parameters since the minimum (:func:`rescaled`).
     """
 
     parameters: tuple[Estimated, ...]
@@ -239,6 +211,7 @@ class Tuning(Listed):
     misfit: bool
     agreeing: int
     composite: bool = False
+    scale: Array | float = 1.0
 
     def listing(self) -> Listing:
         """Return the parameters with their intervals, as a table."""
@@ -281,7 +254,6 @@ class _Known:
     upper: float
     mean: float
     identified: bool
-    slices: tuple[Array, Array] | None = field(default=None)
 
 
 def random_starts(point: Array, number: int, factor: float, generator: np.random.Generator) -> Array:
@@ -343,7 +315,7 @@ def fit(
     if not factor > 1.0:
         raise InputError(f"factor is {factor}; random starts need one greater than 1")
     report = progress or (lambda done: None)
-    points = np.clip(random_starts(objective.start, starts, factor, np.random.default_rng(seed)), *limits_of(objective))
+    points = np.clip(random_starts(objective.start, starts, factor, np.random.default_rng(seed)), *objective.limits)
 
     with ThreadPoolExecutor(threads) as pool:
         optima = list(_reported(report, pool.map(lambda point: search(objective, point, known), points)))
@@ -366,16 +338,31 @@ def fit(
     if loose:
         point[loose] = np.log([ranges[j].mean for j in loose])
         point = search(objective, point, known, fixed=loose).point
+    misfit = errors.misfit and not objective.composite
+
+    def estimated(j: int, name: str) -> Estimated:
+        found, error = ranges[j], float(errors.standard[j])
+        return Estimated(
+            name=name,
+            start=float(np.exp(objective.start[j])),
+            value=float(np.exp(point[j])),
+            most_likely=float(np.exp(best.point[j])) if not best.local.settled[j] else 0.0,
+            lower=found.lower,
+            upper=found.upper,
+            standard_error=error,
+            identified=found.identified,
+            note=_note(name, found, error, best.local, j, known, doubtful=misfit),
+            unit=objective.unit(name),
+        )
+
     return Tuning(
-        parameters=tuple(
-            _estimated(objective, best, known, errors, j, one, float(np.exp(point[j]))) for j, one in enumerate(ranges)
-        ),
+        parameters=tuple(estimated(j, name) for j, name in enumerate(objective.names)),
         setup=objective.setup(point),
         point=point,
         before=local_at(objective, objective.start, known).value,
         after=best.local.value,
         covariance=errors.covariance,
-        misfit=errors.misfit and not objective.composite,
+        misfit=misfit,
         composite=objective.composite,
         starts=points,
         optima=np.array([optimum.point for optimum in optima]),
@@ -405,7 +392,11 @@ class _Errors(NamedTuple):
 
 def _errors(objective: Objective, best: Optimum) -> _Errors:
     """Return the errors of the best point: by the information, or by the sandwich where the objective is not the innovations' own."""
-    covariance, robust = covariances(_curved(objective, best))
+    local, information = best.local, best.local.information
+    if objective.curvature is not None:  # its own, and the priors', where the point is a minimum by it
+        own = objective.curvature(best.point) + information - local.derivatives.information
+        information = own if np.linalg.eigvalsh(own)[0] > 0.0 else information
+    covariance, robust = covariances(information, local.derivatives.score)
     curvature, sandwich = np.sqrt(np.diag(covariance)), np.sqrt(np.diag(robust))
     misfit = bool(np.any(sandwich > MISFIT * curvature))
     # A likelihood whose curvature promises too much falls too fast by the square of that.
@@ -415,52 +406,20 @@ def _errors(objective: Objective, best: Optimum) -> _Errors:
     return _Errors(covariance, swollen * curvature, swollen, misfit)
 
 
-def _estimated(
-    objective: Objective,
-    best: Optimum,
-    priors: Mapping[str, Prior],
-    errors: _Errors,
-    j: int,
-    found: _Known,
-    value: float,
-) -> Estimated:
-    """Return parameter j with its interval."""
-    name, error = objective.names[j], float(errors.standard[j])
-    doubtful = errors.misfit and not objective.composite
-    return Estimated(
-        name=name,
-        start=float(np.exp(objective.start[j])),
-        value=value,
-        most_likely=float(np.exp(best.point[j])) if _above_nothing(best, j) else 0.0,
-        lower=found.lower,
-        upper=found.upper,
-        standard_error=error,
-        identified=found.identified,
-        note=_note(name, found, error, best.local, j, priors, doubtful=doubtful),
-        unit=fixed_unit(name),
-    )
-
-
-def _curved(objective: Objective, best: Optimum) -> Local:
-    """Return the best point with the objective's own curvature, where it has one and the point is a minimum by it."""
-    curvature = getattr(objective, "curvature", None)
-    if curvature is None:
-        return best.local
-    own = curvature(best.point) + best.local.information - best.local.derivatives.information  # and the priors'
-    return replace(best.local, information=own) if np.linalg.eigvalsh(own)[0] > 0.0 else best.local
-
-
 def rescaled(tuning: Tuning, factor: float) -> Tuning:
     """Return a tuning with every σ of its filter scaled alike, which the size of the attitude error does not determine."""
     positive("factor", factor)
     names = ("value", "most_likely", "lower", "upper")
+    own = [1.0 if one.name.endswith("_time") else factor for one in tuning.parameters]
     return replace(
         tuning,
         parameters=tuple(
-            replace(one, **{name: factor * getattr(one, name) for name in names}) for one in tuning.parameters
+            replace(one, **{name: by * getattr(one, name) for name in names})
+            for one, by in zip(tuning.parameters, own, strict=True)
         ),
         setup=with_values(tuning.setup, {SCALE: factor}),
-        point=tuning.point + np.log(factor),
+        point=tuning.point + np.log(own),
+        scale=tuning.scale * np.array(own),
     )
 
 
@@ -485,29 +444,24 @@ def slices(objective: Objective, tuning: Tuning, *, number: int = 24) -> Slices:
         ends += np.array([-0.3, 0.3]) * max(float(np.ptp(ends)), 1e-3)
         points = np.tile(tuning.point, (number, 1))
         points[:, j] = np.linspace(ends[0], ends[1], number)
-        found = objective.minus_log(np.concatenate([tuning.point[None], points]))
+        found = objective.minus_log(np.concatenate([tuning.point[None], points]) - np.log(tuning.scale))
         values.append(np.exp(points[:, j]))
         fallen.append(2.0 * (found[1:] - min(found[0], found[1:].min())))
     return Slices(names=objective.names, values=np.array(values), fallen=np.array(fallen))
 
 
-def covariances(local: Local) -> tuple[Array, Array]:
-    """Return the covariance of the log parameters by the information, and by the sandwich F⁻¹ J F⁻¹.
+def covariances(information: Array, parts: Array) -> tuple[Array, Array]:
+    """Return the covariance of the log parameters by the information (p, p), and by the sandwich F⁻¹ J F⁻¹.
 
-    J is the scatter of the gradient over parts of the records (White 1982; parts long against the innovations' correlation make it hold
-    for innovations that are not white). Where there is no information the variance is infinite, to a large number.
+    J is the scatter of the gradient over parts (m, p) of the records (White 1982; parts long against the innovations' correlation make it
+    hold for innovations that are not white). Where there is no information the variance is infinite, to a large number.
     """
     # A parameter that nothing depends on has no row to invert; a pseudo-inverse would make its variance zero.
-    F = local.information + np.diag(np.maximum(MIN_INFORMATION - np.diag(local.information), 0.0))
+    F = information + np.diag(np.maximum(MIN_INFORMATION - np.diag(information), 0.0))
     scale = np.sqrt(np.diag(F))
     inverse = np.linalg.pinv(F / np.outer(scale, scale), rcond=1e-10, hermitian=True) / np.outer(scale, scale)
-    parts = local.derivatives.score
     scatter = (parts - parts.mean(axis=0)).T @ (parts - parts.mean(axis=0)) * (len(parts) / max(len(parts) - 1, 1))
     return inverse, inverse @ scatter @ inverse
-
-
-def _above_nothing(best: Optimum, j: int) -> bool:
-    return not (0.0 < best.local.score[j] < NEGLIGIBLE and best.local.information[j, j] < 0.1)
 
 
 def _wald(best: Optimum, j: int, error: float) -> _Known:
@@ -582,9 +536,7 @@ def _note(
         if share < 0.5:
             return "the prior says so, this record adds little"
     if not found.identified:
-        if not np.isfinite(found.upper):
-            return "not identified: these records say nothing of it"
-        return f"not identified: < {found.upper:.2g} at 95 %; these records are too short to say more"
+        return NOT_IDENTIFIED
     if doubtful and name != SCALE:
         return "in doubt: the innovations are not those of such a filter"
     if found.lower == 0.0 or found.upper > 4.0 * found.lower:

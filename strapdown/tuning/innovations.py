@@ -1,92 +1,45 @@
 """The likelihood of filter parameters from the filter's own innovations, with its score and information.
 
 The filter turns a record into independent innovations e with variances s, so its likelihood is ``Π N(e; 0, s)`` (prediction-error
-decomposition; Schweppe 1965, Harvey 1989 section 3.4). Parameters are the logarithms of their values.
+decomposition; Schweppe 1965, Harvey 1989 section 3.4). A filter of attitude and bias runs at eight points at once, the derivatives in the
+same pass (:class:`LaneLikelihood`). One with optional states, or with noise that differs by axis, runs once more a parameter, off by
+:data:`STEP` (:class:`RunLikelihood`); the curvature at its best point, from which standard errors come, is the observed one, by central
+differences of the score. The σ of a constant state is known from as many draws as there are such states and records: of a scale factor on
+three axes, one record determines it within a factor of 1.5 at best.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, TypeVar
 
 import numpy as np
 
-from strapdown import setup
-from strapdown.checks import Array, InputError, count
+from strapdown import coning, setup
+from strapdown.checks import Array
 from strapdown.estimation.schedule import Schedule, schedule
-from strapdown.estimation.states import State, covariance_matrices, pack
+from strapdown.estimation.states import covariance_matrices, pack
 from strapdown.kernels import likelihood as kernel
 from strapdown.kernels import likelihood_outliers
 from strapdown.kernels.lane_values import WIDTH
 from strapdown.kernels.machine import compiled, read_only
 from strapdown.kernels.walk import walk
-from strapdown.records import ImuRecord
+from strapdown.records import Estimate, ImuRecord
 from strapdown.setup import FilterSetup
-from strapdown.tuning.parameters import (
-    ARW,
-    INITIAL_ATTITUDE,
-    INITIAL_BIAS,
-    RRW,
-    SCALE,
-    SIGMA,
-    checked_names,
-    values_of,
-    with_values,
-)
-from strapdown.vectors import VectorMeasurements
+from strapdown.setup.states import States
+from strapdown.tuning.objective import OUTLIERS, STEP, Case, Derivatives, Objective, by_part, joined, of_sensors, posed
+from strapdown.tuning.parameters import ARW, INITIAL_ATTITUDE, INITIAL_BIAS, RRW, SCALE, SIGMA, axis_of
 
-STEP = 2.0**-15
-"""Step of a log-parameter for derivatives: the difference is wrong by half of it relative to the curvature, 1.5e-5."""
 MOST = WIDTH - 1
 """Derivatives that one pass over a record gives."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Case:
-    """A record to tune on, with the filter's initial state.
-
-    Parameters
-    ----------
-    record : ImuRecord
-        Gyro increments and measurements, at the gyro's rate.
-    initial : State
-        State at the first edge; its covariance is the setup's where the initial σ are tuned.
-    name : str, default ""
-        What errors and reports call the record.
-    first : float, default -inf
-        Innovations from this time on count for tuning, s.
-    last : float, default inf
-        Innovations up to this time count for tuning, s; what comes later is held out.
-    true_attitude : ndarray (n + 1, 4), optional
-        q_fb at the edges from a reference system, where the record itself has no truth; rows of NaN are unknown.
-    judged : ndarray (n + 1,) of bool, optional
-        Edges at which errors against ``true_attitude`` count. Default: all.
-    """
-
-    record: ImuRecord
-    initial: State
-    name: str = ""
-    first: float = -np.inf
-    last: float = np.inf
-    true_attitude: Array | None = None
-    judged: np.ndarray | None = None
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Derivatives:
-    """Minus the log likelihood, without its constant, and its derivatives by the log parameters, part by part."""
-
-    value: Array
-    """(parts,)"""
-    score: Array
-    """Its gradient (parts, p)."""
-    information: Array
-    """Fisher's information from the sensitivities of the innovations (p, p), summed over the parts."""
-    outer: Array
-    """Σ g gᵀ over the measurements (p, p), g the gradient of each."""
+SHARES = (1e-4, 0.4)
+"""Shares of outliers that are searched: what is more frequent is no outlier."""
+SCALES = (2.0, 100.0)
+"""Scales of outliers that are searched: what is hardly wider is none either."""
+CURVATURE_STEP = 0.02
+"""Step of a log parameter for the differences of the score that are the curvature."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -100,80 +53,68 @@ class Prepared:
     cuts: Array
     used: np.ndarray
     """Which parts count (parts,), bool."""
-    sensors: tuple[str, ...]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Likelihood:
-    """Minus the log likelihood of the innovations of several records under one set of parameters.
+class LaneLikelihood(Objective):
+    """Minus the log likelihood of the innovations, eight points at once; with outliers where their parameters are among the names."""
 
-    Built by :func:`likelihood`. A *point* is the vector of the logarithms of the free parameters; −∞ is a value of zero.
-    """
-
-    names: tuple[str, ...]
-    chosen: FilterSetup
-    """The setup that the fixed parameters are taken from."""
-    start: Array
-    """Logarithms of the free parameters in that setup (p,)."""
     prepared: tuple[Prepared, ...] = field(repr=False)
-    threads: int = 1
-    composite: ClassVar[bool] = False
 
-    def setup(self, point: Array) -> FilterSetup:
-        """Return the setup of a point."""
-        return with_values(self.chosen, dict(zip(self.names, np.exp(point).tolist(), strict=True)))
+    @property
+    def base(self) -> LaneLikelihood:
+        """The same without outliers."""
+        return replace(self, names=self.names[:-2], start=self.start[:-2]) if self.mixed else self
+
+    @property
+    def mixed(self) -> bool:
+        """Whether some measurements are outliers (:mod:`strapdown.tuning.outliers`)."""
+        return self.names[-2:] == OUTLIERS
+
+    @property
+    def limits(self) -> tuple[Array, Array]:
+        """Least and largest logarithm of each parameter (p,), (p,)."""
+        low, high = super().limits
+        if self.mixed:
+            low[-2:], high[-2:] = np.log([SHARES, SCALES]).T
+        return low, high
 
     def minus_log(self, points: Array) -> Array:
         """Return minus the log likelihood, without its constant, at several points (k, p): (k,)."""
-        return self.totals(points, self._pass)
-
-    def totals(self, points: Array, run: Callable[[Prepared, Array], dict[str, Array]]) -> Array:
-        """Return the sum over the records of what ``run`` finds of each point, eight at once."""
         rows = np.atleast_2d(points)
         blocks = [rows[first : first + WIDTH] for first in range(0, len(rows), WIDTH)]
         jobs = [(case, block) for block in blocks for case in self.prepared]
-        results = self.each(lambda job: run(*job)["minus_log"][job[0].used].sum(axis=0)[: len(job[1])], jobs)
+        results = self.each(self._total, jobs)
         sums = [np.sum(results[k : k + len(self.prepared)], axis=0) for k in range(0, len(jobs), len(self.prepared))]
         return np.concatenate(sums)
+
+    def _total(self, case: Prepared, points: Array) -> Array:
+        return np.asarray(self._pass(case, points)["minus_log"][case.used].sum(axis=0)[: len(points)])
 
     def derivatives(self, point: Array) -> Derivatives:
         """Return the likelihood and its derivatives at a point; one pass over each record for up to seven parameters."""
         p = len(self.names)
         blocks = [tuple(range(p))] if p <= MOST else _pairs_of_groups(p)
-        jobs = [(case, block) for case in self.prepared for block in blocks]
-        results = self.each(lambda job: self._differences(job[0], point, job[1]), jobs)
-        values, scores = [], []
-        information, outer = np.zeros((p, p)), np.zeros((p, p))
-        for k, case in enumerate(self.prepared):
-            score, matrices = np.zeros((int(case.used.sum()), p)), np.zeros((2, p, p))
-            for block, (_, part_score, part_information, part_outer) in zip(
-                blocks, results[k * len(blocks) : (k + 1) * len(blocks)], strict=True
-            ):
-                score[:, block] = part_score
-                matrices[:, np.array(block)[:, None], block] = part_information, part_outer
-            values.append(results[k * len(blocks)][0])
-            scores.append(score)
-            information += matrices[0]
-            outer += matrices[1]
-        return Derivatives(
-            value=np.concatenate(values), score=np.concatenate(scores), information=information, outer=outer
-        )
+        jobs = [(case, point, block) for case in self.prepared for block in blocks]
+        results = self.each(self._differences, jobs)
+        found = []
+        for k in range(0, len(results), len(blocks)):
+            score, information = np.zeros((len(results[k].value), p)), np.zeros((p, p))
+            for block, part in zip(blocks, results[k : k + len(blocks)], strict=True):
+                score[:, block] = part.score
+                information[np.ix_(block, block)] = part.information
+            found.append(replace(results[k], score=score, information=information))
+        return joined(found)
 
-    def each(self, work: Callable[[Any], Any], jobs: Sequence[Any]) -> list[Any]:
-        """Return ``work`` of every job, spread over the threads."""
-        if self.threads == 1 or len(jobs) == 1:
-            return [work(job) for job in jobs]
-        with ThreadPoolExecutor(self.threads) as pool:
-            return list(pool.map(work, jobs))
-
-    def _differences(self, case: Prepared, point: Array, block: tuple[int, ...]) -> tuple[Array, ...]:
-        rows = np.tile(point, (1 + len(block), 1))
-        for row, j in enumerate(block):
-            rows[row + 1, j] += STEP
+    def _differences(self, case: Prepared, point: Array, block: tuple[int, ...]) -> Derivatives:
+        rows = np.concatenate([point[None], point + STEP * np.eye(len(point))[list(block)]])
         found = self._pass(case, rows, free=len(block))
-        whole = [lower + np.tril(lower, -1).transpose(0, 2, 1) for lower in (found["information"], found["outer"])]
-        used = case.used
-        return found["minus_log"][used, 0], found["score"][used], *(part[used].sum(axis=0) for part in whole)
+        lower = found["outer" if self.mixed else "information"]  # of the mixture there are no sensitivities
+        return Derivatives(
+            value=found["minus_log"][case.used, 0],
+            score=found["score"][case.used],
+            information=(lower + np.tril(lower, -1).transpose(0, 2, 1))[case.used].sum(axis=0),
+        )
 
     def estimates(self, number: int, points: Array, epochs: np.ndarray) -> tuple[Array, Array, Array]:
         """Return q_fb (m, k, 4), bias (m, k, 3) and P (m, k, 6, 6) on record ``number`` at edges (m,), at up to eight points (k, p)."""
@@ -186,28 +127,38 @@ class Likelihood:
         found = self._pass(self.prepared[number], points, innovations=True)["innovations"]
         return found[:, :, 0, : len(points)], found[:, :, 1, : len(points)]
 
+    def probabilities(self, point: Array) -> tuple[Array, ...]:
+        """Return for each record, in order of its measurements, the probability that each is an outlier (events,)."""
+        return tuple(self._pass(case, point[None])["probability"][:, 0] for case in self.prepared)
+
     def lanes(self, case: Prepared, points: Array) -> dict[str, Array]:
-        """Return what a kernel takes of up to eight points (k, p), flat: ``noise``, ``factors`` of the sensors' variances, ``state``."""
+        """Return what up to eight points (k, p) give a kernel, flat: gyro noise, factors of sensors' variances, state, outliers."""
         rows = np.concatenate([points, np.repeat(points[:1], WIDTH - len(points), axis=0)])
         lane = {name: np.exp(rows[:, j]) for j, name in enumerate(self.names)}
         base = dict(zip(self.names, np.exp(self.start), strict=True))
         noise = self.chosen.process_noise
         all_of = lane.get(SCALE, np.ones(WIDTH))
+
+        def factor(name: str) -> Array:
+            return np.asarray(lane[name] / base[name]) if name in lane else all_of
+
         white = lane.get(ARW, np.full(WIDTH, noise.angle_random_walk) * all_of) ** 2
         walk = lane.get(RRW, np.full(WIDTH, noise.rate_random_walk) * all_of) ** 2
-        factors = np.array(
-            [
-                (lane[f"{sensor}{SIGMA}"] / base[f"{sensor}{SIGMA}"]) ** 2 if f"{sensor}{SIGMA}" in lane else all_of**2
-                for sensor in case.sensors
-            ]
-        )
+        factors = np.array([factor(f"{sensor}{SIGMA}") ** 2 for sensor in case.events.sensors])
         state = np.repeat(case.state[:, None], WIDTH, axis=1)
-        angle = lane[INITIAL_ATTITUDE] / base[INITIAL_ATTITUDE] if INITIAL_ATTITUDE in lane else all_of
-        bias = lane[INITIAL_BIAS] / base[INITIAL_BIAS] if INITIAL_BIAS in lane else all_of
+        angle, bias = factor(INITIAL_ATTITUDE), factor(INITIAL_BIAS)
         state[7:13] *= angle**2
         state[13:22] *= angle * bias
         state[22:] *= bias**2
-        return {"noise": np.concatenate([white, walk]), "factors": factors.ravel(), "state": state.ravel()}
+        outliers = np.empty(0)
+        if self.mixed:  # shares beyond the search for its differences and profiles
+            outliers = np.concatenate([np.minimum(np.exp(rows[:, -2]), 0.9), np.exp(2.0 * rows[:, -1])])
+        return {
+            "noise": np.concatenate([white, walk]),
+            "factors": factors.ravel(),
+            "state": state.ravel(),
+            "outliers": outliers,
+        }
 
     def _pass(
         self,
@@ -218,58 +169,113 @@ class Likelihood:
         epochs: np.ndarray | None = None,
         innovations: bool = False,
     ) -> dict[str, Array]:
-        """Run up to eight points over one record."""
+        """Run up to eight points over one record; return what it writes, by names of :class:`strapdown.kernels.likelihood.Outputs`."""
         kept = np.empty(0, np.int64) if epochs is None else np.ascontiguousarray(epochs, np.int64)
-        room = pass_arrays(case, free, epochs=len(kept), innovations=innovations)
-        run_lanes(case, self.lanes(case, points), room, free, kept)
+        parts, events = len(case.cuts) + 1, len(case.events.time)
+        room = {
+            "minus_log": np.zeros((parts, WIDTH)),
+            "squares": np.zeros((parts, WIDTH)),
+            "score": np.zeros((parts, free)),
+            "information": np.zeros((parts, free, free)),
+            "outer": np.zeros((parts, free, free)),
+            "states": np.empty((len(kept), 28, WIDTH)),
+            "innovations": np.zeros((events if innovations else 0, 3, 2, WIDTH)),
+            "probability": np.empty((events if self.mixed else 0, 2)),
+        }
+        body = kernel.Body(
+            **self.lanes(case, points),
+            cuts=read_only(case.cuts),
+            epochs=kept,
+            free=free,
+            step=STEP,
+            room=np.empty(kernel.ROOM),
+        )
+        flat = ("minus_log", "squares", "states", "innovations")
+        out = kernel.Outputs(**{name: value.reshape(-1) if name in flat else value for name, value in room.items()})
+        run = compiled(walk, *((likelihood_outliers, kernel) if self.mixed else (kernel,)))
+        run(read_only(case.time), read_only(case.increments), case.events.measurements, 1, body, out)
         return room
-
-
-def pass_arrays(
-    case: Prepared, free: int, *, epochs: int = 0, innovations: bool = False, outliers: bool = False
-) -> dict[str, Array]:
-    """Return room for what one pass over a record writes, by its name in :class:`strapdown.kernels.likelihood.Outputs`."""
-    parts, events = len(case.cuts) + 1, len(case.events.time)
-    return {
-        "minus_log": np.zeros((parts, WIDTH)),
-        "squares": np.zeros((parts, WIDTH)),
-        "score": np.zeros((parts, free)),
-        "information": np.zeros((parts, free, free)),
-        "outer": np.zeros((parts, free, free)),
-        "states": np.empty((epochs, 28, WIDTH)),
-        "innovations": np.zeros((events if innovations else 0, 3, 2, WIDTH)),
-        "probability": np.empty((events if outliers else 0, 2)),
-    }
-
-
-def run_lanes(
-    case: Prepared,
-    lane: Mapping[str, Array],
-    room: Mapping[str, Array],
-    free: int,
-    epochs: np.ndarray,
-    outliers: Array | None = None,
-) -> None:
-    """Run the filter over a record at the parameters of each lane; with ``outliers`` by the mixture."""
-    flat = ("minus_log", "squares", "states", "innovations")
-    body = kernel.Body(
-        **lane,
-        outliers=np.empty(0) if outliers is None else outliers,
-        cuts=read_only(case.cuts),
-        epochs=epochs,
-        free=free,
-        step=STEP,
-        room=np.empty(kernel.ROOM),
-    )
-    out = kernel.Outputs(**{name: value.reshape(-1) if name in flat else value for name, value in room.items()})
-    parts = (kernel,) if outliers is None else (likelihood_outliers, kernel)
-    compiled(walk, *parts)(read_only(case.time), read_only(case.increments), case.events.measurements, 1, body, out)
 
 
 def _pairs_of_groups(p: int) -> list[tuple[int, ...]]:
     """Return blocks of at most six parameters such that every two share one: each pair of groups of three."""
     groups = [range(first, min(first + 3, p)) for first in range(0, p, 3)]
     return [(*a, *b) for a, b in itertools.combinations(groups, 2)]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RunLikelihood(Objective):
+    """The same of a filter with optional states, or with noise that differs by axis, one run of it a point."""
+
+    def minus_log(self, points: Array) -> Array:
+        """Return minus the log likelihood, without its constant, at several points (k, p): (k,)."""
+        runs = self._runs(np.atleast_2d(points))
+        each = [[0.5 * float(np.sum(np.log(s) + e * e / s)) for e, s, _ in found] for found in runs]
+        return np.asarray(np.sum(np.array(each), axis=1))
+
+    def derivatives(self, point: Array) -> Derivatives:
+        """Return the likelihood and its derivatives at a point: p + 1 runs over each record."""
+        runs = self._runs(np.concatenate([point[None], point + STEP * np.eye(len(point))]))
+        return joined([self._differences(*one) for one in zip(*runs, strict=True)])
+
+    def _differences(self, *runs: tuple[Array, Array, np.ndarray]) -> Derivatives:
+        e, s, part = runs[0]
+        de, ds = (np.stack([(one[k] - runs[0][k]) / STEP for one in runs[1:]], axis=1) for k in (0, 1))
+        score = e[:, None] * de / s[:, None] + 0.5 * ds * ((1.0 - e * e / s) / s)[:, None]
+        information = (de / s[:, None]).T @ de + 0.5 * (ds / s[:, None] ** 2).T @ ds
+        value = 0.5 * (np.log(s) + e * e / s)
+        return by_part(value, score, information, part, self.parts)
+
+    def curvature(self, point: Array) -> Array:  # type: ignore[override]
+        """Return the observed information at a point (p, p): the second derivatives of minus the log likelihood."""
+        steps = CURVATURE_STEP * np.eye(len(point))
+        ends = [[self.derivatives(point + sign * step).score.sum(axis=0) for sign in (1.0, -1.0)] for step in steps]
+        rows = np.array([(ahead - back) / (2.0 * CURVATURE_STEP) for ahead, back in ends])
+        return np.asarray(0.5 * (rows + rows.T))
+
+    def _runs(self, points: Array) -> list[list[tuple[Array, Array, np.ndarray]]]:
+        """Return innovations, their variances, and the parts that they belong to, of every point and record."""
+        setups = [self.setup(point) for point in points]
+        found = self.each(self._run, [(chosen, case) for chosen in setups for case in self.cases])
+        return [found[k : k + len(self.cases)] for k in range(0, len(found), len(self.cases))]
+
+    def _run(self, chosen: FilterSetup, case: Case) -> tuple[Array, Array, np.ndarray]:
+        # The filter of optional states has the innovations of measurements whose noise differs by axis, with none too.
+        used = replace(chosen, states=States() if chosen.states is None else chosen.states)
+        # Of the states only the first and the last are kept.
+        every = max(1, len(case.record.increments) // used.integration.samples)
+        estimate = self._estimate(used, case, every=every, gate=None, robust=None)
+        first, last = case.span
+        found = []
+        for one in estimate.innovations.values():
+            inside = (one.time >= first) & (one.time <= last)
+            place = ((one.time[inside] - first) / (last - first) * self.parts).astype(np.int64)
+            places = np.repeat(np.minimum(place, self.parts - 1), one.innovation.shape[1])
+            found.append((one.innovation[inside].ravel(), one.variance[inside].ravel(), places))
+        e, s, part = (np.concatenate(column) for column in zip(*found, strict=True))
+        return e, s, part
+
+    def estimates(self, number: int, points: Array, epochs: np.ndarray) -> tuple[Array, Array, Array]:
+        """Return q_fb (m, k, 4), bias (m, k, 3) and P (m, k, 6, 6) on record ``number`` at edges (m,), at points (k, p)."""
+        found = [self._estimate(self.setup(point), self.cases[number], full_covariance=True) for point in points]
+        rows = [(one.attitude[epochs], one.bias[epochs], one.covariance[epochs]) for one in found]  # type: ignore[index]
+        attitude, bias, P = (np.stack(parts, axis=1) for parts in zip(*rows, strict=True))
+        return attitude, bias, P
+
+    def _estimate(self, chosen: FilterSetup, case: Case, **options: Any) -> Estimate:
+        initial = self.initial(case, chosen)
+        if self.spacing == 0.0:
+            return setup.run(case.record, of_sensors(chosen, case.record), initial, **options)
+        applied = replace(chosen, sigma={}, measurement_sigma_factor=1.0, integration=coning.ALGORITHMS["one-sample"])
+        return setup.run(self.modelled(case, chosen), applied, initial, **options)
+
+
+Made = TypeVar("Made", bound=Objective)
+
+
+def made(kind: type[Made], problem: Objective, **more: Any) -> Made:
+    """Return an objective of this kind on a problem."""
+    return kind(**{one.name: getattr(problem, one.name) for one in fields(Objective)} | more)
 
 
 def likelihood(
@@ -280,7 +286,7 @@ def likelihood(
     spacing: float = 0.0,
     parts: int = 20,
     threads: int = 1,
-) -> Likelihood:
+) -> LaneLikelihood | RunLikelihood:
     """Return the likelihood of the free parameters, by the innovations of the filter on some records.
 
     Parameters
@@ -290,8 +296,9 @@ def likelihood(
     chosen : FilterSetup
         Starting values of the free parameters, and values of the fixed ones; its gate and robust weights are not applied.
     free : sequence of str
-        Names of parameters: ``"gyro.arw"``, ``"gyro.rrw"``, ``"SENSOR.sigma"``, ``"initial.attitude"``, ``"initial.bias"``, or
-        ``"filter.scale"`` alone.
+        Names of parameters: ``"gyro.arw"``, ``"gyro.rrw"``, ``"SENSOR.sigma"``, ``"SENSOR.sigma.x"`` (about one body axis),
+        ``"initial.attitude"``, ``"initial.bias"``, those of the filter's optional states such as ``"gyro.scale_sigma"`` and
+        ``"SENSOR.correlation_time"``, or ``"filter.scale"`` alone.
     spacing : float, default 0
         Least time between the measurements of a sensor that are used, s; those kept have the weight of all. For disturbances that last:
         only white innovations have this likelihood.
@@ -302,86 +309,36 @@ def likelihood(
 
     Returns
     -------
-    Likelihood
+    Objective
         For :func:`fit`.
     """
-    setup.need_mekf(chosen, "tuning by name")
-    if not cases:
-        raise InputError("there is no record to tune on; give one")
-    records = [case.record for case in cases]
-    if chosen.states is not None:
-        raise InputError(
-            "the setup has optional states, which this likelihood knows nothing of; use tuning.extended.likelihood"
-        )
-    names = checked_names(free, records)
-    values = values_of(chosen, names, records)
-    for name, value in values.items():
-        if value <= 0.0:
-            raise InputError(f"{name} starts from {value:g}; it must start from a number greater than zero")
-    started = with_values(chosen, values)
-    prepared = tuple(_prepare(case, started, names, count("parts", parts), spacing) for case in cases)
-    return Likelihood(
-        names=names, chosen=started, start=np.log(list(values.values())), prepared=prepared, threads=threads
+    return with_engine(posed(cases, chosen, free, spacing=spacing, parts=parts, threads=threads))
+
+
+def with_engine(problem: Objective, *, lanes: bool = True) -> LaneLikelihood | RunLikelihood:
+    """Return the likelihood of a problem, eight points at once where the filter can be run so and ``lanes`` allows it."""
+    records = [problem.modelled(case, problem.chosen) for case in problem.cases]
+    by_axis = any(axis_of(name) for name in problem.names) or any(
+        one.anisotropic for record in records for one in record.vectors
     )
+    if by_axis or problem.chosen.states is not None or not lanes:
+        return made(RunLikelihood, problem)
+    prepared = [_prepared(problem, *one) for one in zip(problem.cases, records, strict=True)]
+    return made(LaneLikelihood, problem, prepared=tuple(prepared))
 
 
-def thinned(series: VectorMeasurements, spacing: float) -> VectorMeasurements:
-    """Return the measurements of a series that lie at least ``spacing`` s apart, their σ lowered so that they weigh as much as all did.
-
-    A disturbance that lasts over n samples makes them worth one; a filter that takes them for independent needs a σ larger by √n. Thinned
-    to where disturbances are independent, that σ can be estimated; the filter then uses it on every sample.
-    """
-    usable = np.flatnonzero(
-        np.isfinite(series.attitude if series.attitude is not None else series.vector_b).all(axis=1)
-    )
-    # A hair less, so that stamps on a grid of the very spacing are kept.
-    kept, due = [], -np.inf
-    for k in usable:
-        if series.time[k] >= due:
-            kept.append(k)
-            due = series.time[k] + spacing * (1.0 - 1e-6)
-    if len(kept) == len(series.time):
-        return series
-    return series.taken(np.array(kept, np.int64)).noise_scaled(float(np.sqrt(len(kept) / max(len(usable), 1))))
-
-
-def _prepare(case: Case, chosen: FilterSetup, names: tuple[str, ...], parts: int, spacing: float) -> Prepared:
-    sensors = [series.sensor for series in case.record.vectors]
-    own = {name: value for name, value in chosen.sigma.items() if name in sensors}
-    record = setup.modelled_record(case.record, replace(chosen, sigma=own))
-    for series in record.vectors:
-        if series.anisotropic:
-            raise InputError(
-                f"{series.sensor}: this likelihood takes one sigma a sample, not sigma_axes or covariance; free {series.sensor}.sigma.x, "
-                ".y and .z in tuning.extended.likelihood, or give one number in [filter.sigma]"
-            )
-    if spacing > 0.0:
-        record = replace(record, vectors=tuple(thinned(series, spacing) for series in record.vectors))
+def _prepared(problem: Objective, case: Case, record: ImuRecord) -> Prepared:
     start, end = float(record.time[0]), float(record.time[-1])
-    events = schedule(record.vectors, start, end)
     first, last = max(case.first, start), min(case.last, end)
-    inside = (events.time >= first) & (events.time <= last)
-    if not inside.any():
-        raise InputError(
-            f"{case.name or 'record'} has no measurement between {first:g} and {last:g} s; tuning needs vector measurements"
-        )
-    inner = list(np.linspace(first, last, parts + 1)[1:-1])
+    inner = list(np.linspace(first, last, problem.parts + 1)[1:-1])
     before = [np.nextafter(case.first, -np.inf)] if case.first > start else []
     after = [case.last] if case.last < end else []
-    used = np.ones(len(inner) + 1 + len(before) + len(after), bool)
-    if before:
-        used[0] = False
-    if after:
-        used[-1] = False
-    covariance = case.initial.covariance
-    if {INITIAL_ATTITUDE, INITIAL_BIAS} & set(names):
-        covariance = np.diag(np.repeat([chosen.attitude_sigma**2, chosen.bias_sigma**2], 3))
+    initial = problem.initial(case, problem.chosen)
     return Prepared(
         time=record.time,
         increments=np.ascontiguousarray(record.increments),
-        events=events,
-        state=pack(case.initial.attitude, case.initial.bias, covariance),
+        events=schedule(record.vectors, start, end),
+        state=pack(initial.attitude, initial.bias, initial.covariance),
         cuts=np.array([*before, *inner, *after]),
-        used=used,
-        sensors=events.sensors,
+        used=np.array([False] * len(before) + [True] * problem.parts + [False] * len(after)),
     )

@@ -18,7 +18,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 
@@ -26,94 +25,18 @@ from strapdown.checks import Array, InputError, positive
 from strapdown.estimation.gating import Gate
 from strapdown.kernels.lane_values import WIDTH
 from strapdown.setup import FilterSetup
-from strapdown.tuning.fitting import REACH, Estimated, Tuning
-from strapdown.tuning.innovations import (
-    MOST,
-    STEP,
-    Case,
-    Derivatives,
-    Likelihood,
-    Prepared,
-    likelihood,
-    pass_arrays,
-    run_lanes,
-)
+from strapdown.tuning.fitting import Estimated, Tuning
+from strapdown.tuning.innovations import MOST, SCALES, SHARES, LaneLikelihood, likelihood
+from strapdown.tuning.objective import OUTLIERS, Case
 from strapdown.tuning.parameters import OUTLIER_SCALE, OUTLIER_SHARE
 from strapdown.vectors import KINDS
 
 SHARE, SCALE = 0.02, 5.0
 """Where the search for share and scale starts."""
-SHARES = (1e-4, 0.4)
-"""Shares that are searched: what is more frequent is no outlier."""
-SCALES = (2.0, 100.0)
-"""Scales that are searched: what is hardly wider is none either."""
 MAX_REFUSED = 0.25
 """A share above which what is called outliers is a second size of the noise, and nothing to refuse."""
 MIN_REFUSED = 1e-9
 """Share of right measurements that any gate refuses."""
-OWN = (OUTLIER_SHARE, OUTLIER_SCALE)
-
-
-@dataclass(frozen=True, kw_only=True)
-class ContaminatedLikelihood:
-    """Minus the log likelihood of records of which some measurements are outliers; built by :func:`contaminated_likelihood`."""
-
-    base: Likelihood
-    first: tuple[float, float]
-    """Share and scale that the search starts from."""
-    composite: ClassVar[bool] = False
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the free parameters."""
-        return (*self.base.names, *OWN)
-
-    @property
-    def start(self) -> Array:
-        """Logarithms of their first values."""
-        return np.concatenate([self.base.start, np.log(self.first)])
-
-    @property
-    def limits(self) -> tuple[Array, Array]:
-        """Least and largest logarithm of each parameter (p,), (p,)."""
-        low, high = self.base.start - REACH, self.base.start + REACH
-        own = np.log([SHARES, SCALES])
-        return np.concatenate([low, own[:, 0]]), np.concatenate([high, own[:, 1]])
-
-    def setup(self, point: Array) -> FilterSetup:
-        """Return the setup of a point, its gate as it was."""
-        return self.base.setup(point[:-2])
-
-    def minus_log(self, points: Array) -> Array:
-        """Return minus the log likelihood, without its constant, at several points (k, p): (k,)."""
-        return self.base.totals(points, self._pass)
-
-    def derivatives(self, point: Array) -> Derivatives:
-        """Return the likelihood and its derivatives at a point."""
-        p = len(point)
-        rows = np.concatenate([point[None], point + STEP * np.eye(p)])
-        found = self.base.each(lambda case: (case.used, self._pass(case, rows, free=p)), self.base.prepared)
-        outer = sum((one["outer"][used].sum(axis=0) for used, one in found), np.zeros((p, p)))
-        outer = outer + np.tril(outer, -1).T
-        return Derivatives(
-            value=np.concatenate([one["minus_log"][used, 0] for used, one in found]),
-            score=np.concatenate([one["score"][used] for used, one in found]),
-            information=outer,
-            outer=outer,
-        )
-
-    def probabilities(self, point: Array) -> tuple[Array, ...]:
-        """Return for each record, in order of its measurements, the probability that each is an outlier (events,)."""
-        return tuple(self._pass(case, point[None])["probability"][:, 0] for case in self.base.prepared)
-
-    def _pass(self, case: Prepared, points: Array, *, free: int = 0) -> dict[str, Array]:
-        lane = self.base.lanes(case, points[:, :-2])
-        rows = np.concatenate([points, np.repeat(points[:1], WIDTH - len(points), axis=0)])
-        share = np.minimum(np.exp(rows[:, -2]), 0.9)  # beyond the search, for its differences and profiles
-        spread = np.exp(2.0 * rows[:, -1])
-        out = pass_arrays(case, free, outliers=True)
-        run_lanes(case, lane, out, free, np.empty(0, np.int64), outliers=np.concatenate([share, spread]))
-        return out
 
 
 def contaminated_likelihood(
@@ -124,15 +47,23 @@ def contaminated_likelihood(
     share: float = SHARE,
     scale: float = SCALE,
     threads: int = 1,
-) -> ContaminatedLikelihood:
-    """Return the likelihood of the free parameters, at most five, and of the outliers' share and scale, which are always free."""
+) -> LaneLikelihood:
+    """Return the likelihood of the free parameters, at most five, and of the outliers' share and scale, which are always free.
+
+    Its ``base`` is the likelihood without outliers, and its ``probabilities`` those that each measurement is one.
+    """
     for name, value, (least, most) in (("share", share, SHARES), ("scale", scale, SCALES)):
         if not least <= positive(name, value) <= most:
             raise InputError(f"{name} of the outliers is {value:g}; it must lie between {least:g} and {most:g}")
     base = likelihood(cases, chosen, free, threads=threads)
-    if len(base.names) + 2 > MOST:
+    if not isinstance(base, LaneLikelihood):
+        raise InputError(
+            "outliers are modelled of a filter without optional states, and of sensors with one sigma for all axes: leave gate out, or "
+            "those states and axes"
+        )
+    if len(base.names) + len(OUTLIERS) > MOST:
         raise InputError(f"{len(base.names)} parameters are free; beside outliers at most {MOST - 2} can be")
-    return ContaminatedLikelihood(base=base, first=(share, scale))
+    return replace(base, names=(*base.names, *OUTLIERS), start=np.concatenate([base.start, np.log([share, scale])]))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -153,7 +84,7 @@ class TunedGate:
     scale: Estimated
 
 
-def tuned_gate(objective: ContaminatedLikelihood, tuning: Tuning, *, draws: int = 2000) -> TunedGate:
+def tuned_gate(objective: LaneLikelihood, tuning: Tuning, *, draws: int = 2000) -> TunedGate:
     """Return the gate at the Bayes threshold, its interval from that of share and scale."""
     share, scale = tuning[OUTLIER_SHARE], tuning[OUTLIER_SCALE]
     seen = _seen(objective, tuning.point[:-2])
@@ -181,7 +112,7 @@ def tuned_gate(objective: ContaminatedLikelihood, tuning: Tuning, *, draws: int 
     )
 
 
-def log_likelihood(cases: Sequence[Case], tuned: ContaminatedLikelihood, result: Tuning) -> float:
+def log_likelihood(cases: Sequence[Case], tuned: LaneLikelihood, result: Tuning) -> float:
     """Return the log likelihood of cases under the tuned filter and its outliers, in nats an innovation, as on data held out."""
     share, scale = result[OUTLIER_SHARE].value, result[OUTLIER_SCALE].value
     other = contaminated_likelihood(
@@ -192,7 +123,7 @@ def log_likelihood(cases: Sequence[Case], tuned: ContaminatedLikelihood, result:
         scale=float(np.clip(scale, *SCALES)),
     )
     number = 0
-    for case in other.base.prepared:
+    for case in other.prepared:
         counted = case.used[np.searchsorted(case.cuts, case.events.time, side="left")]
         degrees = np.array([KINDS[kind] for kind in case.events.kinds])[case.events.sensor]
         number += int(degrees[counted].sum())
@@ -209,7 +140,7 @@ class _Seen:
     """Mean share of the measurement's own noise in the variance of its innovation."""
 
 
-def _seen(objective: ContaminatedLikelihood, point: Array) -> dict[str, _Seen]:
+def _seen(objective: LaneLikelihood, point: Array) -> dict[str, _Seen]:
     base = objective.base
     sums: dict[str, tuple[int, int, float]] = {}
     for number, case in enumerate(base.prepared):

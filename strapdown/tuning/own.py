@@ -17,13 +17,13 @@ from typing import Any, Literal
 
 import numpy as np
 
-from strapdown import consistency, quaternion
+from strapdown import consistency
 from strapdown.checks import Array, InputError, one_of, positive
 from strapdown.consistency import whitened
 from strapdown.estimation.filters.own import as_own
 from strapdown.records import Estimate
-from strapdown.tuning.errors import MAX_EPOCHS
-from strapdown.tuning.innovations import Case
+from strapdown.tuning.errors import MAX_EPOCHS, reference
+from strapdown.tuning.objective import Case
 
 OwnMeasure = Literal["innovations", "errors", "rmse"]
 OWN_MEASURES = ("innovations", "errors", "rmse")
@@ -151,25 +151,13 @@ def _measured(estimate: Estimate, case: Case, measure: OwnMeasure) -> Array:
 
 def _errors(estimate: Estimate, case: Case) -> tuple[Array, Array]:
     """Return errors and covariances at up to so many epochs with a truth, the start left out."""
-    truth = case.record.truth
-    attitude = case.true_attitude if truth is None else truth.attitude
-    if attitude is None:
-        raise InputError("the record has no truth; tune by innovations, or give a reference")
-    edges = np.searchsorted(case.record.time, estimate.time)
-    known = np.isfinite(attitude[edges]).all(axis=1) & (estimate.time > max(case.first, estimate.time[0]))
-    known &= estimate.time <= case.last
-    if case.judged is not None:
-        known &= case.judged[edges]
-    rows = np.flatnonzero(known)[:: -(-int(known.sum()) // MAX_EPOCHS) or 1]
-    turn = quaternion.multiply(quaternion.conjugate(estimate.attitude[rows]), attitude[edges[rows]])
-    error, size = quaternion.log(turn), 3
-    if truth is not None and estimate.has_bias:
-        error, size = (
-            consistency.errors(
-                estimate.attitude[rows], estimate.bias[rows], truth.attitude[edges[rows]], truth.bias[edges[rows]]
-            ),
-            6,
-        )
+    known = reference(case, np.searchsorted(case.record.time, estimate.time))
+    known = known.at(known.epochs > 0)
+    known = known.at(slice(None, None, -(-len(known.epochs) // MAX_EPOCHS) or 1))
+    rows = known.epochs
+    size = 6 if known.bias is not None and estimate.has_bias else 3
+    bias = estimate.bias[rows] if known.bias is None else known.bias
+    error = consistency.errors(estimate.attitude[rows], estimate.bias[rows], known.attitude, bias)[:, :size]
     assert estimate.covariance is not None
     return error, estimate.covariance[rows, :size, :size]
 

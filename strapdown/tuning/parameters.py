@@ -1,26 +1,28 @@
-"""Tunable parameters: their names, their values in a filter setup, and setups with other values.
+"""Tunable parameters: one table of their places in a filter setup and their units, their values, and setups with other values.
 
 The gyro's two noises are shared by its axes, as the filter has one σ_v and one σ_u: only isotropic noise is the same seen from a body
 that turns within a step, and has the closed form of :func:`strapdown.kernels.filter_step.process_noise`.
 
 ``SENSOR.sigma`` is one factor on the σ of all axes, as their root mean square; their ratios are the setup's or the record's.
-``SENSOR.sigma.x``, ``.y`` and ``.z`` are the σ about (of whole vectors along) each body axis on its own, of any sensor but a heading; the
-likelihood of :mod:`strapdown.tuning.extended` has them. There are no such names of the gyro, for the reason above.
+``SENSOR.sigma.x``, ``.y`` and ``.z`` are the σ about (of whole vectors along) each body axis on its own, of any sensor but a heading. There
+are no such names of the gyro, for the reason above. The σ and times of a filter's optional states (:data:`GYRO_STATES`,
+:data:`SENSOR_STATES`) scale all axes or drifts of a state alike; their value is the root mean square.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from typing import Any, TypeVar
 
 import numpy as np
 
 from strapdown import gyro, setup, units
 from strapdown.checks import Array, InputError, one_of, positive
-from strapdown.estimation.states import ProcessNoise
 from strapdown.gyro import GyroSpec
 from strapdown.records import ImuRecord
 from strapdown.setup import FilterSetup, Sigma
+from strapdown.setup.states import VELOCITY, SensorStates, States
 
 ARW = "gyro.arw"
 """σ_v, rad/√s."""
@@ -31,21 +33,17 @@ INITIAL_ATTITUDE = "initial.attitude"
 INITIAL_BIAS = "initial.bias"
 """Standard deviation of the initial bias error, rad/s."""
 SCALE = "filter.scale"
-"""A factor on every σ of the filter, gyro, sensors and initial state alike; to be tuned alone. It leaves the estimates as they
+"""A factor on every σ of the filter, gyro, sensors, states and initial state alike; to be tuned alone. It leaves the estimates as they
 are and sets their covariance."""
 OUTLIER_SHARE = "outliers.share"
 """Share of the measurements that are outliers (:mod:`strapdown.tuning.outliers`)."""
 OUTLIER_SCALE = "outliers.scale"
 """Their noise over that of the others."""
-GATE = "gate.probability"
-"""Probability that the gate lets a right measurement pass: what share and scale of the outliers make it."""
 SIGMA = ".sigma"
 """Suffix of a sensor's σ."""
 
 AXES = tuple(f"{SIGMA}.{axis}" for axis in "xyz")
 """Suffixes of a sensor's σ of one body axis."""
-
-OWN = (ARW, RRW, INITIAL_ATTITUDE, INITIAL_BIAS, SCALE)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,37 +54,101 @@ class Unit:
     factor: float
 
 
-_UNITS = {
-    ARW: Unit(name="°/√h", factor=units.DEGREE_PER_ROOT_HOUR),
-    RRW: Unit(name="°/h/√h", factor=units.DEGREE_PER_HOUR_PER_ROOT_HOUR),
-    INITIAL_ATTITUDE: Unit(name="°", factor=units.DEGREE),
-    INITIAL_BIAS: Unit(name="°/h", factor=units.DEGREE_PER_HOUR),
-    SCALE: Unit(name="1", factor=1.0),
-    OUTLIER_SHARE: Unit(name="%", factor=0.01),
-    OUTLIER_SCALE: Unit(name="1", factor=1.0),
+_ONE, _SECOND = Unit(name="1", factor=1.0), Unit(name="s", factor=1.0)
+_PER_HOUR = Unit(name="°/h", factor=units.DEGREE_PER_HOUR)
+_PER_G = Unit(name="°/h/g", factor=units.DEGREE_PER_HOUR / units.STANDARD_GRAVITY)
+_OF_SENSOR = Unit(name="rad, or the vector's unit", factor=1.0)
+
+PLAIN = {
+    ARW: (("process_noise", "angle_random_walk"), Unit(name="°/√h", factor=units.DEGREE_PER_ROOT_HOUR)),
+    RRW: (("process_noise", "rate_random_walk"), Unit(name="°/h/√h", factor=units.DEGREE_PER_HOUR_PER_ROOT_HOUR)),
+    INITIAL_ATTITUDE: (("attitude_sigma",), Unit(name="°", factor=units.DEGREE)),
+    INITIAL_BIAS: (("bias_sigma",), _PER_HOUR),
 }
+"""Parameters of attitude and bias: place in a setup, and unit."""
+GYRO_STATES = {
+    "gyro.scale_sigma": (("states", "gyro_scale_sigma"), Unit(name="ppm", factor=1e-6)),
+    "gyro.misalignment_sigma": (("states", "gyro_misalignment_sigma"), Unit(name="mrad", factor=1e-3)),
+    "gyro.force_sigma": (("states", "gyro_force_sigma"), _PER_G),
+    "gyro.cross_force_sigma": (("states", "gyro_cross_force_sigma"), _PER_G),
+    "gyro.drift_sigma": (("states", "gyro_drift_sigma"), _PER_HOUR),
+    "gyro.drift_time": (("states", "gyro_drift_time"), _SECOND),
+}
+"""Those of the gyro's optional states."""
+SENSOR_STATES = {
+    "bias_sigma": ("bias_sigma", _OF_SENSOR),
+    "correlated_sigma": ("correlated_sigma", _OF_SENSOR),
+    "correlation_time": ("correlation_time", _SECOND),
+    "lever_sigma": ("lever_arm_sigma", Unit(name="m", factor=1.0)),
+    **{name: (name, Unit(name=unit, factor=1.0)) for name, unit in VELOCITY.items()},
+}
+"""Those of a sensor's optional states by what follows its name and a dot: field of :class:`strapdown.setup.states.SensorStates`, unit."""
+CONSTANTS = (
+    "scale_sigma",
+    "misalignment_sigma",
+    "force_sigma",
+    "bias_sigma",
+    "lever_sigma",
+    INITIAL_ATTITUDE,
+    INITIAL_BIAS,
+)
+"""Ends of the names of σ of constants, of which a record has one draw an axis however long it is."""
+_WHOLE = {SCALE: _ONE, OUTLIER_SHARE: Unit(name="%", factor=0.01), OUTLIER_SCALE: _ONE}
+"""Units of what is no field of a setup."""
+
+
+def _place(name: str) -> tuple[tuple[str, ...], Unit] | None:
+    """Return where a setup has a parameter, and its unit; None of a sensor's σ."""
+    sensor, _, last = name.rpartition(".")
+    if last in SENSOR_STATES and name not in PLAIN:
+        field, unit = SENSOR_STATES[last]
+        return ("states", "sensors", sensor, field), unit
+    return PLAIN.get(name) or GYRO_STATES.get(name)
+
+
+def _at(owner: Any, path: Sequence[str]) -> Any:
+    for part in path:
+        owner = owner[part] if isinstance(owner, Mapping) else getattr(owner, part)
+    return owner
+
+
+def _put(owner: Any, path: Sequence[str], value: Any) -> Any:
+    """Return a dataclass, or mapping, with another value at the end of a path through its fields."""
+    head, *rest = path
+    inner = _put(_at(owner, [head]), rest, value) if rest else value
+    return {**owner, head: inner} if isinstance(owner, Mapping) else replace(owner, **{head: inner})
 
 
 def known_names(records: Sequence[ImuRecord]) -> tuple[str, ...]:
-    """Return the names of all parameters that a filter on these records has."""
+    """Return the names of all parameters that a filter on these records has, but those of single axes and of optional states."""
     sensors = dict.fromkeys(series.sensor for record in records for series in record.vectors if len(series.time))
-    return (*OWN, *(f"{sensor}{SIGMA}" for sensor in sensors))
+    return (*PLAIN, SCALE, *(f"{sensor}{SIGMA}" for sensor in sensors))
 
 
 def axis_of(name: str) -> tuple[str, int] | None:
     """Return the sensor and the axis that a name such as ``star.sigma.x`` is of; None of another name."""
-    for axis, ending in enumerate(AXES):
-        if name.endswith(ending) and name != ending:
-            return name.removesuffix(ending), axis
-    return None
+    sensor, _, axis = name.rpartition(f"{SIGMA}.")
+    return (sensor, "xyz".index(axis)) if sensor and axis in ("x", "y", "z") else None
 
 
 def axis_names(records: Sequence[ImuRecord]) -> tuple[str, ...]:
     """Return the names of the σ of single body axes: of every sensor but headings, which have one degree of freedom."""
     series = [one for record in records for one in record.vectors if len(one.time)]
-    headings = {one.sensor for one in series if one.kind == "heading"}
-    sensors = dict.fromkeys(one.sensor for one in series if one.sensor not in headings)
+    sensors = dict.fromkeys(one.sensor for one in series if one.sensor not in _headings(records))
     return tuple(f"{sensor}{axis}" for sensor in sensors for axis in AXES)
+
+
+def _headings(records: Sequence[ImuRecord]) -> set[str]:
+    return {series.sensor for record in records for series in record.vectors if series.kind == "heading"}
+
+
+def state_names(states: States | None) -> tuple[str, ...]:
+    """Return the names of the parameters that these states have; none where there are no states."""
+    if states is None:
+        return ()
+    names = [*GYRO_STATES, *(f"{sensor}.{last}" for sensor in states.sensors for last in SENSOR_STATES)]
+    places = {name: place[0][1:] for name in names if (place := _place(name)) is not None}
+    return tuple(name for name, path in places.items() if _size(_at(states, path)) > 0.0)
 
 
 def default_names(records: Sequence[ImuRecord]) -> tuple[str, ...]:
@@ -94,61 +156,57 @@ def default_names(records: Sequence[ImuRecord]) -> tuple[str, ...]:
     return tuple(name for name in known_names(records) if not name.startswith("initial.") and name != SCALE)
 
 
-def checked_names(free: Sequence[str], records: Sequence[ImuRecord]) -> tuple[str, ...]:
-    """Return the names given if each is known and none comes twice."""
+def checked_names(free: Sequence[str], chosen: FilterSetup, records: Sequence[ImuRecord]) -> tuple[str, ...]:
+    """Return the names given if this filter has each on these records, none comes twice and none is a part of another."""
+    known = [*known_names(records), *axis_names(records), *state_names(chosen.states)]
     if not free:
-        raise InputError("free names no parameter; give some of " + ", ".join(known_names(records)))
+        raise InputError(f"free names no parameter; give some of {', '.join(known)}")
     for name in free:
-        if axis_of(name) is not None and name not in known_names(records):
-            raise InputError(
-                f"free: {name} is a sigma of one axis, which this objective does not tune; use tuning.extended.likelihood"
-            )
-        one_of("free: parameter", name, known_names(records))
+        part = axis_of(name)
+        if part is not None and part[0] in _headings(records):
+            raise InputError(f"free: {name}: a heading has one degree of freedom; give {part[0]}{SIGMA}")
+        one_of("free: parameter", name, known)
         if list(free).count(name) > 1:
             raise InputError(f"free names {name} twice; once is enough")
+        if part is not None and f"{part[0]}{SIGMA}" in free:
+            raise InputError(f"free: {name} is part of {part[0]}{SIGMA}; give that, or the axes")
     if SCALE in free and len(free) > 1:
         raise InputError(f"{SCALE} scales all noise of the filter, other parameters included; tune it alone")
     return tuple(free)
 
 
-def unit_of(name: str, records: Sequence[ImuRecord]) -> Unit:
-    """Return the unit that a parameter is printed in."""
-    if name in _UNITS:
-        return _UNITS[name]
-    part = axis_of(name)
-    if part is not None:
-        name = f"{part[0]}{SIGMA}"
-    sensor = name.removesuffix(SIGMA)
+def unit_of(name: str, records: Sequence[ImuRecord] = ()) -> Unit:
+    """Return the unit that a parameter is printed in: of a sensor's σ the one that suits its size in the records."""
+    place = _place(name)
+    if place is not None:
+        return place[1]
+    if name in _WHOLE:
+        return _WHOLE[name]
+    sensor = _sensor(name)
     kinds = [series.kind for record in records for series in record.vectors if series.sensor == sensor]
     if kinds and kinds[0] == "vector":
         return Unit(name="unit of the vector", factor=1.0)
-    if own_sigma(name, records) > 0.1 * units.DEGREE:
+    if own_sigma(sensor, records) > 0.1 * units.DEGREE:
         return Unit(name="°", factor=units.DEGREE)
     return Unit(name="arcsec", factor=units.ARCSECOND)
 
 
-def fixed_unit(name: str) -> Unit:
-    """Return the unit that a parameter is printed in where its records are not known: SI of a sensor's σ."""
-    return _UNITS.get(name, Unit(name="rad or SI", factor=1.0))
+def _sensor(name: str) -> str:
+    """Return the sensor of ``SENSOR.sigma`` or of ``SENSOR.sigma.x``."""
+    part = axis_of(name)
+    return name.removesuffix(SIGMA) if part is None else part[0]
 
 
-def own_sigma(name: str, records: Sequence[ImuRecord]) -> float:
+def own_sigma(sensor: str, records: Sequence[ImuRecord]) -> float:
     """Return the root mean square of a sensor's σ in the records, over all of its measurements."""
-    sensor = name.removesuffix(SIGMA)
     squares = [np.square(series.sigma) for record in records for series in record.vectors if series.sensor == sensor]
     return float(np.sqrt(np.mean(np.concatenate(squares)))) if squares else 0.0
 
 
 def own_axes(sensor: str, records: Sequence[ImuRecord]) -> Array:
     """Return the root mean square of a sensor's σ in the records about each body axis (3,), over all of its measurements."""
-    squares = []
-    for series in (one for record in records for one in record.vectors if one.sensor == sensor):
-        if series.sigma_axes is not None:
-            squares.append(np.square(series.sigma_axes))
-        elif series.covariance is not None:
-            squares.append(np.einsum("kii->ki", series.covariance))
-        else:
-            squares.append(np.repeat(np.square(series.sigma)[:, None], 3, axis=1))
+    series = [one for record in records for one in record.vectors if one.sensor == sensor]
+    squares = [np.einsum("kii->ki", one.covariances) for one in series]
     return np.asarray(np.sqrt(np.mean(np.concatenate(squares), axis=0))) if squares else np.zeros(3)
 
 
@@ -162,98 +220,106 @@ def by_axis(chosen: FilterSetup, names: Sequence[str], records: Sequence[ImuReco
         own = own_axes(sensor, records)
         size = float(np.sqrt(np.mean(own**2)))
         if given is None and size == 0.0:
-            raise InputError(f"{sensor}: the records say that its sigma is 0; give one to start from in [filter.sigma]")
+            raise _silent(sensor)
         x, y, z = (own if given is None else given * (own / size if size > 0.0 else np.ones(3))).tolist()
         sigma[sensor] = x, y, z
     return replace(chosen, sigma=sigma)
 
 
-def _size(sigma: Sigma) -> float:
-    """Return one σ, or the root mean square of three."""
-    return float(np.sqrt(np.mean(np.square(sigma)))) if isinstance(sigma, tuple) else sigma
+def _silent(sensor: str) -> InputError:
+    return InputError(f"{sensor}: the records say that its sigma is 0; give one to start from in [filter.sigma]")
+
+
+def _size(value: Any) -> float:
+    """Return a number itself, of several their root mean square, those that are zero left out."""
+    entries = np.asarray(value, np.float64)
+    if entries.ndim == 0:
+        return float(value)
+    return float(np.sqrt(np.mean(np.square(entries[entries > 0.0])))) if np.any(entries > 0.0) else 0.0
+
+
+def _times(value: Any, factor: float) -> Any:
+    """Return a number, or nested tuples of them, times a factor."""
+    return tuple(_times(one, factor) for one in value) if isinstance(value, tuple) else factor * value
 
 
 def values_of(chosen: FilterSetup, names: Sequence[str], records: Sequence[ImuRecord]) -> dict[str, float]:
     """Return the values that a setup gives the parameters."""
-    found = {
-        ARW: chosen.process_noise.angle_random_walk,
-        RRW: chosen.process_noise.rate_random_walk,
-        INITIAL_ATTITUDE: chosen.attitude_sigma,
-        INITIAL_BIAS: chosen.bias_sigma,
-        SCALE: 1.0,
-    }
-    for name in names:
-        if name in found:
-            continue
-        part = axis_of(name)
-        if part is not None:
-            axes = by_axis(chosen, [name], records).sigma[part[0]]
-            assert isinstance(axes, tuple)
-            found[name] = axes[part[1]] * chosen.measurement_sigma_factor
-            continue
-        sensor = name.removesuffix(SIGMA)
-        own = _size(chosen.sigma.get(sensor, own_sigma(name, records))) * chosen.measurement_sigma_factor
-        if own == 0.0:
-            raise InputError(f"{sensor}: the records say that its sigma is 0; give one to start from in [filter.sigma]")
-        found[name] = own
-    return {name: found[name] for name in names}
+    return {name: _value_of(chosen, name, records) for name in names}
+
+
+def _value_of(chosen: FilterSetup, name: str, records: Sequence[ImuRecord]) -> float:
+    place = _place(name)
+    if name == SCALE:
+        return 1.0
+    if place is not None:
+        return _size(_at(chosen, place[0]))
+    part, sensor = axis_of(name), _sensor(name)
+    if part is not None:
+        axes = by_axis(chosen, [name], records).sigma[sensor]
+        assert isinstance(axes, tuple)
+        return axes[part[1]] * chosen.measurement_sigma_factor
+    own = _size(chosen.sigma.get(sensor, own_sigma(sensor, records))) * chosen.measurement_sigma_factor
+    if own == 0.0:
+        raise _silent(sensor)
+    return own
 
 
 def with_values(chosen: FilterSetup, values: Mapping[str, float]) -> FilterSetup:
     """Return the setup with other values of these parameters; a σ is set with the setup's factor taken off.
 
-    ``SENSOR.sigma`` keeps the ratios of three; ``SENSOR.sigma.x`` and the like need three in the setup (:func:`by_axis`).
+    ``SENSOR.sigma`` and the σ of states keep the ratios of several; ``SENSOR.sigma.x`` and the like need three in the setup
+    (:func:`by_axis`).
     """
     if SCALE in values:
         return _scaled(chosen, values[SCALE])
-    noise = ProcessNoise(
-        angle_random_walk=values.get(ARW, chosen.process_noise.angle_random_walk),
-        rate_random_walk=values.get(RRW, chosen.process_noise.rate_random_walk),
-    )
     sigma = dict(chosen.sigma)
     for name, value in values.items():
-        if name not in OWN:
+        place = _place(name)
+        if place is None:
             _set(sigma, name, value / chosen.measurement_sigma_factor)
-    return replace(
-        chosen,
-        process_noise=noise,
-        attitude_sigma=values.get(INITIAL_ATTITUDE, chosen.attitude_sigma),
-        bias_sigma=values.get(INITIAL_BIAS, chosen.bias_sigma),
-        sigma=sigma,
-    )
+            continue
+        given = _at(chosen, place[0])
+        if name == "gyro.drift_sigma":  # the part too fast for a state goes with the others
+            fast = ("states", "gyro_fast_bias_sigma")
+            chosen = _put(chosen, fast, value / _size(given) * _at(chosen, fast))
+        several = place[0][0] == "states"
+        chosen = _put(chosen, place[0], _times(given, value / _size(given)) if several else value)
+    return replace(chosen, sigma=sigma)
 
 
 def _set(sigma: dict[str, Sigma], name: str, value: float) -> None:
     """Set one σ, all three in their ratios, or that of one axis."""
-    part = axis_of(name)
-    if part is None:
-        sensor = name.removesuffix(SIGMA)
-        given = sigma.get(sensor)
-        if isinstance(given, tuple):
-            x, y, z = (value * one / _size(given) for one in given)
-            sigma[sensor] = x, y, z
-        else:
-            sigma[sensor] = value
-        return
-    sensor, axis = part
+    part, sensor = axis_of(name), _sensor(name)
     given = sigma.get(sensor)
+    if part is None:
+        sigma[sensor] = tuple(value * one / _size(given) for one in given) if isinstance(given, tuple) else value  # type: ignore[assignment]
+        return
     if not isinstance(given, tuple):
         raise InputError(f"{name}: the setup has no three sigmas of {sensor}; make them with tuning.parameters.by_axis")
-    x, y, z = (value if k == axis else one for k, one in enumerate(given))
+    x, y, z = (value if k == part[1] else one for k, one in enumerate(given))
     sigma[sensor] = x, y, z
 
 
+Owner = TypeVar("Owner", FilterSetup, States, SensorStates)
+
+
+def _sigmas_times(owner: Owner, factor: float) -> Owner:
+    """Return a setup, or states, with every field that is a standard deviation times a factor."""
+    names = [field.name for field in fields(owner) if field.name.endswith("_sigma")]
+    return replace(owner, **{name: _times(getattr(owner, name), factor) for name in names})
+
+
 def _scaled(chosen: FilterSetup, factor: float) -> FilterSetup:
-    noise = ProcessNoise(
-        angle_random_walk=factor * chosen.process_noise.angle_random_walk,
-        rate_random_walk=factor * chosen.process_noise.rate_random_walk,
-    )
+    noise, states = chosen.process_noise, chosen.states
+    if states is not None:
+        sensors = {name: _sigmas_times(one, factor) for name, one in states.sensors.items()}
+        states = replace(_sigmas_times(states, factor), sensors=sensors)
     return replace(
-        chosen,
-        process_noise=noise,
-        attitude_sigma=factor * chosen.attitude_sigma,
-        bias_sigma=factor * chosen.bias_sigma,
+        _sigmas_times(chosen, factor),
+        process_noise=replace(noise, **{name: factor * value for name, value in vars(noise).items()}),
         measurement_sigma_factor=factor * chosen.measurement_sigma_factor,
+        states=states,
     )
 
 
@@ -287,7 +353,7 @@ class Prior:
 def priors_from_gyro(spec: GyroSpec, record: ImuRecord, *, factor: float = 3.0) -> dict[str, Prior]:
     """Return priors of the gyro's two noise parameters from a specification: of a datasheet, or of an Allan deviation.
 
-    Flicker noise is matched as by :func:`strapdown.setup.matched_to_record`; a noise that the specification does not have gets no prior.
+    Flicker noise is matched as by :meth:`strapdown.setup.FilterSetup.for_record`; a noise that is not specified gets no prior.
 
     Parameters
     ----------
@@ -303,7 +369,7 @@ def priors_from_gyro(spec: GyroSpec, record: ImuRecord, *, factor: float = 3.0) 
     dict of str to Prior
         For ``"gyro.arw"`` (rad/√s) and ``"gyro.rrw"`` (rad/s/√s).
     """
-    noise = setup.matched_to_record(record, spec).process_noise if _flickers(spec) else None
+    noise = setup.FilterSetup.for_record(record, spec).process_noise if _flickers(spec) else None
     found = gyro.process_noise(spec) if noise is None else vars(noise)
     pairs = {ARW: found["angle_random_walk"], RRW: found["rate_random_walk"]}
     return {name: Prior(value=value, factor=factor) for name, value in pairs.items() if value > 0.0}

@@ -13,10 +13,11 @@ from strapdown import setup
 from strapdown.checks import Array, InputError, count, instance
 from strapdown.records import cut
 from strapdown.results import Listed, Listing, figure
-from strapdown.scenarios import Scenario, simulate
+from strapdown.scenarios import Scenario, drawn, simulate
 from strapdown.setup import FilterSetup
-from strapdown.tuning.innovations import Case, likelihood
-from strapdown.tuning.parameters import Unit, unit_of, values_of
+from strapdown.tuning.innovations import likelihood
+from strapdown.tuning.objective import Case
+from strapdown.tuning.parameters import CONSTANTS, Unit, unit_of, values_of
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -43,7 +44,7 @@ class Plan(Listed):
                 unit.name,
                 figure(value / unit.factor, 3),
                 *(f"× {math.exp(error):.3f}" if error < 2.0 else "nothing" for error in errors),
-                f"{needed:.3g} s",
+                f"{needed:.3g} s" if math.isfinite(needed) else "more records",
             )
             for name, unit, value, errors, needed in zip(
                 self.names, self.units, self.values, self.errors.T, self.needed(), strict=True
@@ -54,8 +55,13 @@ class Plan(Listed):
         return Listing("Least standard error, as a factor (Cramér–Rao)", columns, rows, [note], left=2)
 
     def needed(self, error: float = 0.1) -> Array:
-        """Return the length (p,), s, at which each parameter is known to this relative error, if information grows as at the end."""
-        return np.asarray(self.lengths[-1] * (self.errors[-1] / error) ** 2)
+        """Return the length (p,), s, at which each parameter is known to this relative error, if information grows as at the end.
+
+        Infinite for the σ of a constant error: more records tell more of it, a longer one does not.
+        """
+        drawn_once = np.array([name.endswith(CONSTANTS) for name in self.names])
+        longer = drawn_once & (self.errors[-1] > error)
+        return np.where(longer, np.inf, self.lengths[-1] * (self.errors[-1] / error) ** 2)
 
 
 def plan(
@@ -71,7 +77,8 @@ def plan(
 ) -> Plan:
     """Return the Cramér–Rao bound of the logarithms of parameters, for records of given lengths.
 
-    Fisher's information is the mean of that of the sensitivities over ``records`` simulated records for which the setup is exact.
+    Fisher's information is the mean of that of the sensitivities over ``records`` simulated records for which the setup is exact. For a
+    filter with optional states each record has other individuals of the gyro and the sensors (:func:`strapdown.scenarios.drawn`).
 
     Parameters
     ----------
@@ -104,7 +111,8 @@ def plan(
     count("records", records)
 
     def one(number: int) -> Array:
-        record = simulate(replace(scenario, duration=float(wanted[-1])), seed, number)
+        one = scenario if chosen.states is None else drawn(scenario, seed, number)
+        record = simulate(replace(one, duration=float(wanted[-1])), seed, number)
         initial = setup.drawn_state(chosen, record, seed, number)
         rows = []
         for length in wanted:

@@ -6,26 +6,16 @@ import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from strapdown.checks import InputError, non_negative
-from strapdown.records import ImuRecord
+from strapdown.checks import InputError
 from strapdown.setup import FilterSetup
-from strapdown.tuning import extended
 from strapdown.tuning.errors import error_objective
-from strapdown.tuning.fitting import Objective, Tuning, fit, rescaled
-from strapdown.tuning.innovations import Case, likelihood
+from strapdown.tuning.fitting import Tuning, fit, rescaled
+from strapdown.tuning.innovations import LaneLikelihood, likelihood
+from strapdown.tuning.objective import OUTLIERS, Case, Objective
 from strapdown.tuning.outliers import TunedGate, contaminated_likelihood, tuned_gate
-from strapdown.tuning.parameters import (
-    OUTLIER_SCALE,
-    OUTLIER_SHARE,
-    Prior,
-    Unit,
-    axis_of,
-    default_names,
-    known_names,
-    unit_of,
-)
+from strapdown.tuning.parameters import Prior, default_names
 
-GATED = ("gate.probability", "outliers.share", "outliers.scale")
+GATED = ("gate.probability", *OUTLIERS)
 """Names of parameters that ask for a model of outliers."""
 
 
@@ -60,12 +50,10 @@ def objective_for(
 ) -> Objective:
     """Return the objective of a tuning, for :func:`fit`: by default the likelihood of the innovations.
 
-    With error states, or with a σ of one axis in ``names``, it is that of :mod:`strapdown.tuning.extended`; ``truth`` that of the errors
-    against the truth, of the filter as it runs, its gate included; ``rmse`` the RMS attitude error. Innovations are those of the filter
-    without its gate, because what passes one is the likelier the narrower it is; ``gate`` models outliers. ``spacing`` is the least time
-    between the samples of a sensor that are used, s.
+    ``truth`` is that of the errors against the truth, of the filter as it runs, its gate included; ``rmse`` the RMS attitude error.
+    Innovations are those of the filter without its gate, because what passes one is the likelier the narrower it is; ``gate`` models
+    outliers. ``spacing`` is the least time between the samples of a sensor that are used, s.
     """
-    non_negative("spacing", spacing, unit="s")
     if rmse and truth:
         raise InputError("rmse and truth both say which errors against the truth count; give one of them")
     other = truth or rmse
@@ -75,33 +63,13 @@ def objective_for(
         )
     if gate and (other or spacing > 0.0):
         raise InputError("gate needs the likelihood of all innovations: leave truth, rmse and spacing out")
-    by_axis = any(axis_of(name) for name in names)
-    for whole, what in (
-        (setup.states is None, "a filter with optional states"),
-        (not by_axis, "a sigma of one axis"),
-    ):
-        if not whole and (gate or rmse or spacing > 0.0):
-            raise InputError(
-                f"{what} is tuned by the likelihood of all innovations, or of the errors (truth): leave gate, rmse and spacing out"
-            )
-    if not other and (setup.states is not None or by_axis):
-        return extended.likelihood(cases, setup, names, threads=threads)
     if gate:
         return contaminated_likelihood(cases, setup, names)
-    if truth or rmse:
+    if other:
         return error_objective(cases, setup, names, measure="rmse" if rmse else "likelihood", threads=threads)
-    return likelihood(cases, setup, names, spacing=spacing)
-
-
-def with_units(found: Tuning, records: Sequence[ImuRecord]) -> Tuning:
-    """Return a tuning whose parameters are printed in units that suit the sensors of these records."""
-
-    def unit(name: str) -> Unit:
-        plain = name in (*known_names(records), OUTLIER_SHARE, OUTLIER_SCALE) or axis_of(name) is not None
-        return unit_of(name, records) if plain else extended.unit_of(name)
-
-    shown = tuple(dataclasses.replace(one, unit=unit(one.name)) for one in found.parameters)
-    return dataclasses.replace(found, parameters=shown)
+    made = likelihood(cases, setup, names, spacing=spacing, threads=threads)
+    # Where eight points run at once, searches run in the threads; else records and points do.
+    return dataclasses.replace(made, threads=1) if isinstance(made, LaneLikelihood) else made
 
 
 def tune(
@@ -158,25 +126,20 @@ def tune(
     gate = gate or any(name in GATED for name in names or ())
     wanted = [name for name in names or () if name not in GATED] or list(default_names([case.record for case in cases]))
     made = objective_for(cases, setup, wanted, gate=gate, threads=threads, **objective)
-    # Objectives that filter the records in threads of their own are searched one start at a time.
-    plain = gate or not (
-        any(objective.get(name) for name in ("truth", "rmse")) or isinstance(made, extended.ExtendedLikelihood)
-    )
     result = fit(
         made,
         priors=priors,
         starts=starts,
         factor=factor,
         seed=seed,
-        threads=threads if plain else 1,
+        threads=threads if isinstance(made, LaneLikelihood) else 1,
         progress=progress,
     )
     if objective.get("rmse"):
         # The size of the error leaves a common scale open; the innovations determine it.
         scaled = fit(likelihood(cases, result.setup, ["filter.scale"]), starts=2, threads=threads)
         result = rescaled(result, scaled["filter.scale"].value)
-    result = with_units(result, [case.record for case in cases])
-    found = tuned_gate(made, result) if gate else None  # type: ignore[arg-type]
+    found = tuned_gate(made, result) if gate and isinstance(made, LaneLikelihood) else None
     if found is not None and found.gate is not None:
         result = dataclasses.replace(result, setup=dataclasses.replace(result.setup, gate=found.gate))
     return Tuned(result, made, found)

@@ -61,7 +61,7 @@ def targets(folder: Path) -> list[Target]:
     (folder / "scenario.toml").write_text(scenarios.scenario_to_toml(scenarios.load_scenario("tumbling-satellite")))
     attitude = scenarios.scenario_to_toml(scenarios.load_scenario("slew-vibration")).split("[[sensors]]")[0] + _TRACKER
     (folder / "attitude.toml").write_text(attitude)
-    chosen = setup.matched(scenarios.load_scenario("hand-held"), states=True)
+    chosen = setup.FilterSetup.for_scenario(scenarios.load_scenario("hand-held"), states=True)
     (folder / "filter.toml").write_text(setup.to_toml(chosen) + _GATE)
     (folder / "gyro.toml").write_text(
         '[gyro]\nangle_random_walk_deg_per_sqrt_hour = 0.1\n"scale_factor_ppm" = [1, 2, 3]\n'
@@ -131,7 +131,7 @@ def _write_estimate(path: Path) -> None:
 
 
 def _write_campaign(path: Path, scenario: scenarios.Scenario) -> None:
-    plan = montecarlo.Plan(scenario=scenario, setup=setup.matched(scenario), epochs=2, nis_bins=2)
+    plan = montecarlo.Plan(scenario=scenario, setup=setup.FilterSetup.for_scenario(scenario), epochs=2, nis_bins=2)
     m, s, runs = 3, len(plan.sensors), 4
     zeros: dict[str, Any] = {
         "error_sum": (m, 6), "error_product_sum": (m, 6, 6), "covariance_sum": (m, 6, 6), "nees_sum": (m, 3), "log_nees_sum": (m, 3),

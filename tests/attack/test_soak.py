@@ -40,7 +40,7 @@ def test_covariances_stay_positive_definite_for_ever(request, states):
     )
     if states:
         scenario = dataclasses.replace(scenario, gyro=dataclasses.replace(scenario.gyro, scale_factor=np.full(3, 1e-4)))
-    chosen = setup.matched(scenario, states=states)
+    chosen = setup.FilterSetup.for_scenario(scenario, states=states)
     record = scenarios.simulate(scenario, 5)
     state = setup.initial_state(chosen, record.truth.attitude[0], record.truth.bias[0])
     ends = record.truth.attitude[0], record.truth.attitude[-1]

@@ -15,7 +15,7 @@ from strapdown.gyro import GyroSpec
 from strapdown.recordings import Recording
 from strapdown.records import ImuRecord
 from strapdown.setup import FilterSetup
-from strapdown.tuning.innovations import Case
+from strapdown.tuning.objective import Case
 from strapdown.tuning.parameters import SCALE
 
 

@@ -31,9 +31,9 @@ from strapdown.files import plain
 from strapdown.records import Estimate, ImuRecord, cut
 from strapdown.setup import FilterSetup
 from strapdown.tuning.fitting import Tuning
-from strapdown.tuning.holding import performance
-from strapdown.tuning.innovations import Case
+from strapdown.tuning.objective import Case, of_sensors
 from strapdown.tuning.parameters import RRW
+from strapdown.tuning.validation import performance
 
 LEVELS = (1.0, 0.2, 0.04)
 """Multiples of the tuned walk of the bias beside which a scale factor is tried."""
@@ -134,8 +134,7 @@ def unmodelled(case: Case, chosen: FilterSetup, *, probability: float = 0.99) ->
     tail(probability)
     judgement = performance([case], chosen).judgements[0]
     record = seen(case)
-    own = [series.sensor for series in record.vectors]
-    used = replace(chosen, sigma={name: value for name, value in chosen.sigma.items() if name in own})
+    used = of_sensors(chosen, record)
     initial = setup.initial_state(used, case.initial.attitude, case.initial.bias)
     if used.gate is not None:
         # What passes a gate has lost its tails, and keeps the outliers that are like the rest: neither is news.

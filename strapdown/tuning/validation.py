@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -13,8 +13,10 @@ from strapdown import consistency, setup
 from strapdown.checks import Array, InputError, one_of
 from strapdown.consistency import Judgement, mean_bounds
 from strapdown.records import Estimate, Innovations, Truth
+from strapdown.results import Listed, Listing, figure
 from strapdown.setup import FilterSetup
-from strapdown.tuning.innovations import Case
+from strapdown.tuning.objective import Case, of_sensors
+from strapdown.units import DEGREE
 
 By = Literal["time", "record"]
 MAX_ROWS = 20_000
@@ -52,7 +54,7 @@ def split(cases: Sequence[Case], share: float, by: By = "time") -> tuple[tuple[C
         return tuple(cases[:-held]), tuple(cases[-held:])
     train, test = [], []
     for case in cases:
-        first, last = max(case.first, case.record.time[0]), min(case.last, case.record.time[-1])
+        first, last = case.span
         border = float(last - share * (last - first))
         train.append(replace(case, last=border))
         test.append(replace(case, first=float(np.nextafter(border, np.inf))))
@@ -103,13 +105,34 @@ class Performance:
     nees: tuple[NeesCourse, ...] = ()
     """NEES over the time of the first record, of the attitude and of the bias as far as their truth is known."""
 
+    @property
+    def row(self) -> tuple[str, ...]:
+        """What :meth:`Comparison.listing` shows of it."""
+        verdicts = [judgement.verdict for judgement in self.judgements]
+        anees = figure(self.anees, 3) if np.isfinite(self.anees) else "-"
+        if self.nees and not np.isfinite(self.anees):  # of the attitude alone the reference is known
+            anees = f"{figure(float(np.nanmean(self.nees[0].mean)), 3)} (attitude)"
+        return (
+            f"{self.log_likelihood:.4f}",
+            f"{self.nis:.3f}",
+            f"{self.nis_bounds[0]:.3f} to {self.nis_bounds[1]:.3f}",
+            anees,
+            figure(self.attitude_rms / DEGREE, 3),
+            verdicts[0] if len(set(verdicts)) == 1 else f"{verdicts.count('consistent')} of {len(verdicts)} consistent",
+        )
+
 
 @dataclass(frozen=True, kw_only=True)
-class Comparison:
+class Comparison(Listed):
     """The filter before and after tuning on the same held-out data."""
 
     before: Performance
     after: Performance
+
+    def listing(self) -> Listing:
+        """Return likelihood, NIS, ANEES, attitude error and verdict of both, as a table."""
+        columns = ("filter", "log likelihood", "NIS", "99 % bounds", "ANEES", "attitude RMS, °", "verdict")
+        return Listing("On the data held out", columns, [("before", *self.before.row), ("after", *self.after.row)])
 
     @property
     def better(self) -> bool:
@@ -147,127 +170,115 @@ def compare(
 
 def performance(cases: Sequence[Case], chosen: FilterSetup, *, bins: int = 40) -> Performance:
     """Return how one filter does on what is to be judged of these cases."""
+    judged = [_judged(case, chosen) for case in cases]
     total, number, squares = 0.0, 0, 0.0
-    nees, error_squares, judgements = [], [], []
-    course = (np.empty(0), np.empty(0), np.empty(0))
-    nees_courses: tuple[NeesCourse, ...] = ()
-    for place, case in enumerate(cases):
-        estimate, truth, attitude = _judged(case, chosen)
-        innovations = estimate.innovations.values()
-        for one in innovations:
-            e, s = one.innovation[one.used], one.variance[one.used]
-            total -= 0.5 * float(np.sum(np.log(2.0 * np.pi * s) + e**2 / s))
-            number += e.size
-            squares += float(one.nis[one.used].sum())
-        if truth is not None:
+    for one in (one for estimate, _ in judged for one in estimate.innovations.values()):
+        e, s = one.innovation[one.used], one.variance[one.used]
+        total -= 0.5 * float(np.sum(np.log(2.0 * np.pi * s) + e**2 / s))
+        number += e.size
+        squares += float(one.nis[one.used].sum())
+    nees, error_squares = [], []
+    for estimate, truth in judged:
+        if truth is not None and _knows_bias(truth):
             error = consistency.errors(estimate.attitude, estimate.bias, truth.attitude, truth.bias)
             assert estimate.covariance is not None
             nees.append(consistency.nees(error, estimate.covariance))
             error_squares.append(np.sum(error[:, :3] ** 2, axis=1))
-        elif attitude is not None:
-            found = consistency.reference_errors(estimate.attitude, attitude).total
+        elif truth is not None:
+            found = consistency.reference_errors(estimate.attitude, truth.attitude).total
             error_squares.append(found[np.isfinite(found)] ** 2)
-        judgements.append(consistency.judge(estimate, truth))
-        if place == 0:
-            course = _course(list(innovations), bins)
-            nees_courses = _nees_courses(estimate, truth, attitude, bins)
+    time, course, degrees = _nis_course(list(judged[0][0].innovations.values()), bins)
     return Performance(
         log_likelihood=total / number,
         nis=squares / number,
         nis_bounds=mean_bounds(1, number, 0.99),
         anees=float(np.mean(np.concatenate(nees)) / 6.0) if nees else float("nan"),
         attitude_rms=float(np.sqrt(np.mean(np.concatenate(error_squares)))) if error_squares else float("nan"),
-        judgements=tuple(judgements),
-        nis_time=course[0],
-        nis_course=course[1],
-        nis_degrees=course[2],
-        nees=nees_courses,
+        judgements=tuple(
+            consistency.judge(one, truth if truth is not None and _knows_bias(truth) else None) for one, truth in judged
+        ),
+        nis_time=time,
+        nis_course=course,
+        nis_degrees=degrees,
+        nees=_nees_courses(*judged[0], bins),
     )
 
 
-def _judged(case: Case, chosen: FilterSetup) -> tuple[Estimate, Truth | None, Array | None]:
-    """Return the part of the filter's estimate that is to be judged, with the truth, or the reference attitude, at its times."""
-    own = [series.sensor for series in case.record.vectors]
-    used = replace(chosen, sigma={name: value for name, value in chosen.sigma.items() if name in own})
+def _knows_bias(truth: Truth) -> bool:
+    return bool(np.isfinite(truth.bias).any())
+
+
+def _judged(case: Case, chosen: FilterSetup) -> tuple[Estimate, Truth | None]:
+    """Return the part of the filter's estimate that is to be judged, with the truth at its times; of a reference without the bias."""
+    used = of_sensors(chosen, case.record)
     record = setup.modelled_record(case.record, used)
-    reference = case.true_attitude
+    truth, reference = record.truth, case.true_attitude
     every = 1 if reference is not None else max(1, len(record.increments) // MAX_ROWS)
-    initial = setup.initial_state(used, case.initial.attitude, case.initial.bias)
-    estimate = setup.run(
-        case.record, used, initial, every=every, full_covariance=record.truth is not None or reference is not None
-    )
-    inside = (estimate.time >= case.first) & (estimate.time <= case.last)
-    covariance = None if estimate.covariance is None else estimate.covariance[inside]
-    part = replace(
-        estimate,
-        time=estimate.time[inside],
-        attitude=estimate.attitude[inside],
-        bias=estimate.bias[inside],
-        variance=estimate.variance[inside],
-        covariance=covariance,
-        innovations={name: _within(one, case) for name, one in estimate.innovations.items()},
-    )
-    truth = None
-    if record.truth is not None:
-        truth = Truth(attitude=record.truth.attitude[::every][inside], bias=record.truth.bias[::every][inside])
-    attitude = None
     if truth is None and reference is not None:
-        attitude = reference[:: chosen.integration.samples][: len(record.time)].copy()
+        edges = slice(None, None, chosen.integration.samples)
+        attitude = reference[edges][: len(record.time)].copy()
         if case.judged is not None:
-            attitude[~case.judged[:: chosen.integration.samples][: len(record.time)]] = np.nan
-        attitude = attitude[inside]
-    return part, truth, attitude
+            attitude[~case.judged[edges][: len(record.time)]] = np.nan
+        truth = Truth(attitude=attitude, bias=np.full((len(attitude), 3), np.nan))
+    initial = setup.initial_state(used, case.initial.attitude, case.initial.bias)
+    estimate = setup.run(case.record, used, initial, every=every, full_covariance=truth is not None)
+
+    def within(of: Any, *names: str) -> dict[str, Any]:
+        inside = (of.time >= case.first) & (of.time <= case.last)
+        values = {name: getattr(of, name) for name in names}
+        return {name: None if value is None else value[inside] for name, value in values.items()}
+
+    innovations = {
+        name: Innovations(**within(one, "time", "innovation", "variance", "weight"))
+        for name, one in estimate.innovations.items()
+    }
+    part = within(estimate, "time", "attitude", "bias", "variance", "covariance")
+    if truth is not None:
+        inside = (estimate.time >= case.first) & (estimate.time <= case.last)
+        truth = Truth(attitude=truth.attitude[::every][inside], bias=truth.bias[::every][inside])
+    return replace(estimate, innovations=innovations, **part), truth
 
 
-def _within(innovations: Innovations, case: Case) -> Innovations:
-    inside = (innovations.time >= case.first) & (innovations.time <= case.last)
-    return Innovations(
-        time=innovations.time[inside],
-        innovation=innovations.innovation[inside],
-        variance=innovations.variance[inside],
-        weight=None if innovations.weight is None else innovations.weight[inside],
-    )
+def _spans(time: Array, first: float, last: float, bins: int) -> tuple[Array, np.ndarray]:
+    """Return the middles of equal spans of time (bins,), and the span that each time lies in."""
+    edges = np.linspace(first, last + 1e-9, bins + 1)
+    place = np.clip(np.searchsorted(edges, time, side="right") - 1, 0, bins - 1)
+    return 0.5 * (edges[1:] + edges[:-1]), place
 
 
-def _course(innovations: Sequence[Innovations], bins: int) -> tuple[Array, Array, Array]:
+def _nis_course(innovations: Sequence[Innovations], bins: int) -> tuple[Array, Array, Array]:
     time = np.concatenate([one.time[one.used] for one in innovations])
-    edges = np.linspace(time.min(), time.max() + 1e-9, bins + 1)
+    middles, places = _spans(time, time.min(), time.max(), bins)
     sums, degrees = np.zeros(bins), np.zeros(bins)
     for one in innovations:
-        place = np.clip(np.searchsorted(edges, one.time[one.used], side="right") - 1, 0, bins - 1)
+        place, places = places[: one.used.sum()], places[one.used.sum() :]
         sums += np.bincount(place, one.nis[one.used], bins)
         degrees += np.bincount(place, minlength=bins) * float(one.innovation.shape[1])
     with np.errstate(invalid="ignore", divide="ignore"):
-        return 0.5 * (edges[1:] + edges[:-1]), sums / degrees, degrees
+        return middles, sums / degrees, degrees
 
 
-def _nees_courses(
-    estimate: Estimate, truth: Truth | None, reference: Array | None, bins: int
-) -> tuple[NeesCourse, ...]:
-    if truth is None and reference is None:
+def _nees_courses(estimate: Estimate, truth: Truth | None, bins: int) -> tuple[NeesCourse, ...]:
+    known = None if truth is None else np.isfinite(truth.attitude).all(axis=1)
+    if truth is None or known is None or int(known.sum()) < MIN_ERRORS:
         return ()
-    attitude = truth.attitude if truth is not None else reference
-    assert attitude is not None
     assert estimate.covariance is not None
-    known = np.isfinite(attitude).all(axis=1)
-    if int(known.sum()) < MIN_ERRORS:
-        return ()
-    bias = estimate.bias if truth is None else truth.bias
-    error = consistency.errors(estimate.attitude[known], estimate.bias[known], attitude[known], bias[known])
+    whole = _knows_bias(truth)
+    bias = truth.bias if whole else estimate.bias
+    error = consistency.errors(estimate.attitude[known], estimate.bias[known], truth.attitude[known], bias[known])
     time, P = estimate.time[known], estimate.covariance[known]
-    edges = np.linspace(time[0], time[-1] + 1e-9, bins + 1)
-    place = np.clip(np.searchsorted(edges, time, side="right") - 1, 0, bins - 1)
+    middles, place = _spans(time, time[0], time[-1], bins)
     number = np.bincount(place, minlength=bins)
     found = []
-    for name in ("attitude", "bias") if truth is not None else ("attitude",):
+    for name in ("attitude", "bias") if whole else ("attitude",):
         states = consistency.SUBSETS[name]
         # The memory of all states is learnt together where the bias is known too.
-        whole = slice(0, 6 if truth is not None else 3)
-        own = states if truth is not None else None
-        average = consistency.time_average(error[:, whole], P[:, whole, whole], own)
+        average = (
+            consistency.time_average(error, P, states)
+            if whole
+            else consistency.time_average(error[:, :3], P[:, :3, :3])
+        )
         with np.errstate(invalid="ignore", divide="ignore"):
             mean = np.bincount(place, consistency.nees(error, P, states), bins) / (len(states) * number)
-        found.append(
-            NeesCourse(of=name, time=0.5 * (edges[1:] + edges[:-1]), mean=mean, effective=average.effective / bins)
-        )
+        found.append(NeesCourse(of=name, time=middles, mean=mean, effective=average.effective / bins))
     return tuple(found)

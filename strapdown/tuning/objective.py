@@ -1,0 +1,267 @@
+"""What a tuning minimises: a problem checked once, its setups, and the sum of an objective over records and threads.
+
+A *point* is the vector of the logarithms of the free parameters; −∞ is a value of zero. What differs between objectives is their value on a
+record: the likelihood of the innovations (:mod:`strapdown.tuning.innovations`), or of the errors against a truth
+(:mod:`strapdown.tuning.errors`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar
+
+import numpy as np
+
+from strapdown import setup
+from strapdown.checks import Array, InputError, count, non_negative, one_of
+from strapdown.estimation.states import State
+from strapdown.records import ImuRecord
+from strapdown.setup import FilterSetup
+from strapdown.tuning.parameters import (
+    INITIAL_ATTITUDE,
+    INITIAL_BIAS,
+    OUTLIER_SCALE,
+    OUTLIER_SHARE,
+    Unit,
+    by_axis,
+    checked_names,
+    unit_of,
+    values_of,
+    with_values,
+)
+from strapdown.vectors import VectorMeasurements
+
+STEP = 2.0**-15
+"""Step of a log-parameter for derivatives: the difference is wrong by half of it relative to the curvature, 1.5e-5."""
+REACH = 16.0
+"""How far a log parameter may go from where it starts."""
+OUTLIERS = (OUTLIER_SHARE, OUTLIER_SCALE)
+"""Parameters of the outliers, the last two of a likelihood that has them."""
+LARGEST_SCALE = 0.1
+"""σ of scale factors and misalignments from which on a filter that is linear in them makes no sense: noise would pass for a turn."""
+QUICKEST, SLOWEST = 0.05, 100.0
+"""Range of a time constant that makes a difference: from this part of the interval between measurements to this multiple of the record."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Case:
+    """A record to tune on, with the filter's initial state.
+
+    Parameters
+    ----------
+    record : ImuRecord
+        Gyro increments and measurements, at the gyro's rate.
+    initial : State
+        State at the first edge, of the whole bias; its covariance is the setup's where the initial σ are tuned.
+    name : str, default ""
+        What errors and reports call the record.
+    first : float, default -inf
+        Innovations from this time on count for tuning, s.
+    last : float, default inf
+        Innovations up to this time count for tuning, s; what comes later is held out.
+    true_attitude : ndarray (n + 1, 4), optional
+        q_fb at the edges from a reference system, where the record itself has no truth; rows of NaN are unknown.
+    judged : ndarray (n + 1,) of bool, optional
+        Edges at which errors against ``true_attitude`` count. Default: all.
+    """
+
+    record: ImuRecord
+    initial: State
+    name: str = ""
+    first: float = -np.inf
+    last: float = np.inf
+    true_attitude: Array | None = None
+    judged: np.ndarray | None = None
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """First and last time that count, s."""
+        return max(self.first, float(self.record.time[0])), min(self.last, float(self.record.time[-1]))
+
+
+def of_sensors(chosen: FilterSetup, record: ImuRecord) -> FilterSetup:
+    """Return a setup without the σ of sensors that a record lacks."""
+    own = {series.sensor for series in record.vectors}
+    return replace(chosen, sigma={name: value for name, value in chosen.sigma.items() if name in own})
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Derivatives:
+    """Minus the log likelihood, without its constant, and its derivatives by the log parameters, part by part."""
+
+    value: Array
+    """(parts,)"""
+    score: Array
+    """Its gradient (parts, p)."""
+    information: Array
+    """Fisher's information from the sensitivities of the innovations (p, p), or Σ g gᵀ over the measurements, g the gradient of each."""
+
+
+def joined(found: Sequence[Derivatives]) -> Derivatives:
+    """Return the derivatives of several records together."""
+    return Derivatives(
+        value=np.concatenate([one.value for one in found]),
+        score=np.concatenate([one.score for one in found]),
+        information=np.sum([one.information for one in found], axis=0),
+    )
+
+
+def by_part(value: Array, score: Array, information: Array, place: np.ndarray, parts: int) -> Derivatives:
+    """Return derivatives from the value (m,) and the gradient (m, p) of each term, which belongs to part ``place`` (m,)."""
+    sums = np.zeros((parts, score.shape[1]))
+    np.add.at(sums, place, score)
+    summed = np.bincount(place, value, parts).astype(np.float64)
+    return Derivatives(value=summed, score=sums, information=information)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Objective:
+    """Objective to minimise: minus a log likelihood, or a substitute; a subclass gives its value on the records.
+
+    Built by :func:`strapdown.tuning.likelihood`, :func:`contaminated_likelihood` and :func:`error_objective` of the same package.
+    """
+
+    names: tuple[str, ...]
+    """Names of the free parameters."""
+    chosen: FilterSetup
+    """The setup that the fixed parameters are taken from."""
+    start: Array
+    """Logarithms of the free parameters in that setup (p,)."""
+    cases: tuple[Case, ...] = field(repr=False)
+    parts: int = 20
+    """Spans of time of each record whose gradients are kept apart."""
+    threads: int = 1
+    spacing: float = 0.0
+    composite: ClassVar[bool] = False
+    """Whether its curvature is no information, so that errors come from the scatter of its gradient."""
+    curvature: ClassVar[Callable[[Any, Array], Array] | None] = None
+    """Second derivatives at a point (p, p), where the information of the search is not good enough for errors."""
+
+    @property
+    def limits(self) -> tuple[Array, Array]:
+        """Least and largest logarithm of each parameter that a search looks at (p,), (p,)."""
+        return self.start - REACH, self.start + REACH
+
+    def unit(self, name: str) -> Unit:
+        """Return the unit that a parameter is printed in."""
+        return unit_of(name, [case.record for case in self.cases])
+
+    def derivatives(self, point: Array) -> Derivatives:
+        """Return value, gradient and information at a point."""
+        raise NotImplementedError
+
+    def minus_log(self, points: Array) -> Array:
+        """Return the value at several points (k, p): (k,)."""
+        return np.array([self.derivatives(point).value.sum() for point in np.atleast_2d(points)])
+
+    def setup(self, point: Array) -> FilterSetup:
+        """Return the filter setup of a point, its gate as it was."""
+        values = zip(self.names, np.exp(point).tolist(), strict=True)
+        return with_values(self.chosen, {name: self._bounded(name, x) for name, x in values if name not in OUTLIERS})
+
+    def _bounded(self, name: str, value: float) -> float:
+        """Return the value of a parameter of states inside what makes a difference, or sense."""
+        if name in ("gyro.scale_sigma", "gyro.misalignment_sigma"):
+            return min(value, LARGEST_SCALE)
+        if not name.endswith("_time"):
+            return value
+        spans = [case.record.time[-1] - case.record.time[0] for case in self.cases]
+        numbers = [max(len(series.time) for series in case.record.vectors) for case in self.cases]
+        shortest = min(span / number for span, number in zip(spans, numbers, strict=True))
+        return float(np.clip(value, QUICKEST * shortest, SLOWEST * max(spans)))
+
+    def each(self, work: Callable[..., Any], jobs: Sequence[tuple[Any, ...]]) -> list[Any]:
+        """Return ``work`` of the arguments of every job, spread over the threads."""
+        if self.threads == 1 or len(jobs) == 1:
+            return [work(*job) for job in jobs]
+        with ThreadPoolExecutor(self.threads) as pool:
+            return list(pool.map(lambda job: work(*job), jobs))
+
+    def modelled(self, case: Case, chosen: FilterSetup) -> ImuRecord:
+        """Return a record as the filter of a setup processes it, its measurements thinned."""
+        record = setup.modelled_record(case.record, of_sensors(chosen, case.record))
+        if self.spacing > 0.0:
+            record = replace(record, vectors=tuple(thinned(series, self.spacing) for series in record.vectors))
+        return record
+
+    def initial(self, case: Case, chosen: FilterSetup) -> State:
+        """Return the state that the filter of a setup starts from."""
+        if {INITIAL_ATTITUDE, INITIAL_BIAS} & set(self.names):
+            return setup.initial_state(chosen, case.initial.attitude, case.initial.bias)
+        factor = chosen.measurement_sigma_factor / self.chosen.measurement_sigma_factor  # that of all σ alike
+        return case.initial if factor == 1.0 else replace(case.initial, covariance=factor**2 * case.initial.covariance)
+
+
+def posed(
+    cases: Sequence[Case],
+    chosen: FilterSetup,
+    free: Sequence[str],
+    *,
+    spacing: float = 0.0,
+    parts: int = 20,
+    threads: int = 1,
+) -> Objective:
+    """Return the problem of a tuning, checked: records, filter and parameters, without an objective on the records."""
+    setup.need_mekf(chosen, "tuning by name")
+    if not cases:
+        raise InputError("there is no record to tune on; give one")
+    records = [case.record for case in cases]
+    names = checked_names(free, chosen, records)
+    chosen = by_axis(chosen, names, records)
+    values = values_of(chosen, names, records)
+    for name, value in values.items():
+        if value <= 0.0:
+            raise InputError(f"{name} starts from {value:g}; it must start from a number greater than zero")
+    for case in cases:
+        _check_case(case, chosen)
+    return Objective(
+        names=names,
+        chosen=with_values(chosen, values),
+        start=np.log(list(values.values())),
+        cases=tuple(cases),
+        parts=count("parts", parts),
+        threads=count("threads", threads),
+        spacing=non_negative("spacing", spacing, unit="s"),
+    )
+
+
+def _check_case(case: Case, chosen: FilterSetup) -> None:
+    """Refuse a record that has nothing to tune on, or lacks a sensor that the states are of."""
+    what = case.name or "record"
+    for sensor in () if chosen.states is None else chosen.states.sensors:
+        one_of(f"{what}: sensor of the states", sensor, [series.sensor for series in case.record.vectors])
+    first, last = case.span
+    if not any(np.any(_usable(one) & (one.time >= first) & (one.time <= last)) for one in case.record.vectors):
+        raise InputError(
+            f"{what} has no measurement between {first:g} and {last:g} s; tuning needs vector measurements"
+        )
+    if not isinstance(case.initial, State):
+        raise InputError(
+            f"{what}: initial is {case.initial!r}; it must be an estimation.State, which holds the whole bias"
+        )
+
+
+def _usable(series: VectorMeasurements) -> np.ndarray:
+    """Return which measurements of a series have a value (m,)."""
+    content = series.vector_b if series.attitude is None else series.attitude
+    return np.asarray(np.isfinite(content).all(axis=1))
+
+
+def thinned(series: VectorMeasurements, spacing: float) -> VectorMeasurements:
+    """Return the measurements of a series that lie at least ``spacing`` s apart, their σ lowered so that they weigh as much as all did.
+
+    A disturbance that lasts over n samples makes them worth one; a filter that takes them for independent needs a σ larger by √n. Thinned
+    to where disturbances are independent, that σ can be estimated; the filter then uses it on every sample.
+    """
+    usable = np.flatnonzero(_usable(series))
+    # A hair less, so that stamps on a grid of the very spacing are kept.
+    kept, due = [], -np.inf
+    for k in usable:
+        if series.time[k] >= due:
+            kept.append(k)
+            due = series.time[k] + spacing * (1.0 - 1e-6)
+    if len(kept) == len(series.time):
+        return series
+    return series.taken(np.array(kept, np.int64)).noise_scaled(float(np.sqrt(len(kept) / max(len(usable), 1))))
