@@ -74,21 +74,31 @@ def pure(alpha, seed, samples):
 # Allan deviation
 
 
-@pytest.mark.parametrize("noise", [{"N": 1.0}, {"K": 0.1}, {"N": 1.0, "B": 1.0, "R": 1e-3}])
-@pytest.mark.parametrize("samples", [7, 100, 20_001])
-def test_overlapping_equals_allantools(samples, noise):
+@pytest.mark.parametrize(
+    ("estimator", "samples", "noise"),
+    [
+        *itertools.product(
+            ["overlapping"], [7, 100, 20_001], [{"N": 1.0}, {"K": 0.1}, {"N": 1.0, "B": 1.0, "R": 1e-3}]
+        ),
+        *itertools.product(["modified", "hadamard"], [9, 100, 20_001], [{"N": 1.0, "B": 0.3, "K": 0.1}]),
+    ],
+)
+def test_deviation_equals_allantools(estimator, samples, noise):
     dt = 0.01
     record = np.stack([simulate(seed, samples, dt, **noise) + 5.0 for seed in range(3)], axis=1)
-    m = np.unique(np.geomspace(1, samples // 2, 20).astype(int))
-    result = allan.allan_deviation(record, dt, taus=m * dt)
+    m = np.unique(np.geomspace(1, samples // (2 if estimator == "overlapping" else 3), 20).astype(int))
+    result = allan.allan_deviation(record, dt, taus=m * dt, estimator=estimator)
     assert_allclose(result.taus, m * dt, rtol=1e-14)
+    theirs = {"overlapping": allantools.oadev, "modified": allantools.mdev, "hadamard": allantools.ohdev}[estimator]
     for axis in range(3):
         phase = np.concatenate([[0.0], np.cumsum(record[:, axis] - record[:, axis].mean())]) * dt
-        expected = allantools.oadev(phase, 1.0 / dt, "phase", taus=m * dt)
+        expected = theirs(phase, 1.0 / dt, "phase", taus=m * dt)
         # allantools drops taus with a single difference; compare those it kept.
         kept = np.isin(m, np.round(expected[0] / dt).astype(int))
         assert kept.sum() >= len(m) - 1
-        assert_allclose(result.deviation[axis, kept], expected[1], rtol=1e-12)
+        # The running sums of allantools lose digits at long averages of third differences.
+        rtol = 1e-12 if estimator == "overlapping" else 1e-8
+        assert_allclose(result.deviation[axis, kept], expected[1], rtol=rtol)
 
 
 def test_increments_and_rates_give_the_same():
@@ -132,11 +142,10 @@ def test_squares_keep_their_digits_over_many_stretches():
 
 
 def test_phase_keeps_its_digits_over_a_long_record():
-    rate = np.full(2_000_001, 0.1)  # 0.1 is not a binary fraction: a plain running sum drifts by 1e-6 of it here
+    rate = np.full(2_000_001, 0.1)  # not a binary fraction: a plain running sum drifts
     phase = np.empty(len(rate) + 1)
     compiled(accumulate)(rate, 0.0, phase)
     assert phase[-1] == math.fsum(rate)
-    assert abs(np.cumsum(rate)[-1] - math.fsum(rate)) > 1e5 * abs(np.spacing(phase[-1]))
 
 
 @pytest.mark.parametrize("alpha", NOISES)
@@ -202,28 +211,19 @@ def by_definition(alpha, samples, m, estimator):
 
 
 @pytest.mark.parametrize("alpha", [2, 1, 0, -1, -2])
-@pytest.mark.parametrize(("samples", "m"), [(100_000, 100), (100_000, 1003), (100_000, 20_000), (3000, 700)])
-def test_degrees_of_freedom_against_greenhall(alpha, samples, m):
-    expected = edf_greenhall(alpha, 2, m, samples + 1, overlapping=True, modified=False)
+@pytest.mark.parametrize(
+    ("estimator", "samples", "m"),
+    [
+        *(("overlapping", *one) for one in ((100_000, 100), (100_000, 1003), (100_000, 20_000), (3000, 700))),
+        *itertools.product(["modified", "hadamard"], [100_000], [100, 1003, 10_000]),
+    ],
+)
+def test_degrees_of_freedom_against_greenhall(alpha, estimator, samples, m):
+    order, modified = 3 if estimator == "hadamard" else 2, estimator == "modified"
+    expected = edf_greenhall(alpha, order, m, samples + 1, overlapping=True, modified=modified)
     # Greenhall's own shortcuts for long averages are good to one or two percent.
-    assert_allclose(allan.equivalent_degrees_of_freedom(alpha, samples, m), expected, rtol=0.02)
-
-
-@pytest.mark.parametrize("estimator", ["modified", "hadamard"])
-@pytest.mark.parametrize("samples", [9, 100, 20_001])
-def test_modified_and_hadamard_equal_allantools(estimator, samples):
-    dt = 0.01
-    record = simulate(4, samples, dt, N=1.0, B=0.3, K=0.1) + 5.0
-    m = np.unique(np.geomspace(1, samples // 3, 20).astype(int))
-    result = allan.allan_deviation(record, dt, taus=m * dt, estimator=estimator)
-    phase = np.concatenate([[0.0], np.cumsum(record - record.mean())]) * dt
-    expected = {"modified": allantools.mdev, "hadamard": allantools.ohdev}[estimator](
-        phase, 1.0 / dt, "phase", taus=m * dt
-    )
-    kept = np.isin(m, np.round(expected[0] / dt).astype(int))
-    assert kept.sum() >= len(m) - 1
-    # The running sums of allantools lose digits at long averages.
-    assert_allclose(result.deviation[0, kept], expected[1], rtol=1e-8)
+    rtol = 0.02 if estimator == "overlapping" else 0.03
+    assert_allclose(allan.equivalent_degrees_of_freedom(alpha, samples, m, estimator), expected, rtol=rtol)
 
 
 def test_hadamard_does_not_see_a_ramp_and_modified_averages_white_phase():
@@ -236,15 +236,6 @@ def test_hadamard_does_not_see_a_ramp_and_modified_averages_white_phase():
     assert_allclose(with_ramp.deviation, without.deviation, rtol=1e-9)
     white = allan.allan_deviation(pure(2, 6, 200_000), 1.0, taus=[1.0, 10.0, 100.0], estimator="modified")
     assert_allclose(white.deviation[0] ** 2, 3.0 * np.array([1.0, 1e-3, 1e-6]), rtol=0.1)
-
-
-@pytest.mark.parametrize("estimator", ["modified", "hadamard"])
-@pytest.mark.parametrize("alpha", [2, 1, 0, -1, -2])
-@pytest.mark.parametrize(("samples", "m"), [(100_000, 100), (100_000, 1003), (100_000, 10_000)])
-def test_degrees_of_freedom_of_third_differences_against_greenhall(estimator, alpha, samples, m):
-    modified = estimator == "modified"
-    expected = edf_greenhall(alpha, 2 if modified else 3, m, samples + 1, overlapping=True, modified=modified)
-    assert_allclose(allan.equivalent_degrees_of_freedom(alpha, samples, m, estimator), expected, rtol=0.03)
 
 
 @pytest.mark.parametrize("estimator", ["overlapping", "modified"])
@@ -267,42 +258,35 @@ def test_degrees_of_freedom_by_definition(estimator, alpha, m):
     assert_allclose(found, by_definition(alpha, 200, m, estimator), rtol=0.02 if rough else 2e-3)
 
 
-@pytest.mark.parametrize(("estimator", "alpha"), [("modified", 2), ("modified", 0), ("hadamard", 0), ("hadamard", -2)])
-def test_band_of_modified_and_hadamard_covers(estimator, alpha):
-    """Against the closed forms: (1 + 1/m²)/2 N²/τ and 3 Q² dt/τ³, N²/τ and K² τ/6."""
-    taus = np.array([1.0, 8.0, 40.0])
-    truth = {
-        ("modified", 2): np.sqrt(3.0 / taus**3),
-        ("modified", 0): np.sqrt(0.5 * (1.0 + taus**-2.0) / taus),
-        ("hadamard", 0): taus**-0.5,
-        ("hadamard", -2): np.sqrt(taus / 6.0),
-    }[estimator, alpha]
-    if (estimator, alpha) == ("hadamard", -2):
-        truth[0] = np.nan  # one sample that averages the rate is not yet the limit
-    inside = np.zeros(3)
-    for seed in range(200):
-        result = allan.allan_deviation(pure(alpha, [seed, 5], 600), 1.0, taus=taus, estimator=estimator)
-        inside += (result.lower[0] <= truth) & (truth <= result.upper[0])
-    judged = inside[np.isfinite(truth)]
-    assert np.all(judged >= 0.90 * 200)
-    assert np.all(judged <= 199)
+BANDS = {
+    ("overlapping", 2): lambda taus: np.sqrt(3.0) / taus,
+    ("overlapping", 0): lambda taus: taus**-0.5,
+    ("overlapping", -1): lambda taus: np.sqrt(allan.flicker_variance(taus)),
+    ("overlapping", -2): lambda taus: np.sqrt(taus / 3.0),
+    ("modified", 2): lambda taus: np.sqrt(3.0 / taus**3),
+    ("modified", 0): lambda taus: np.sqrt(0.5 * (1.0 + taus**-2.0) / taus),
+    ("hadamard", 0): lambda taus: taus**-0.5,
+    # One sample that averages the rate is not yet the limit.
+    ("hadamard", -2): lambda taus: np.where(taus > 1.0, np.sqrt(taus / 6.0), np.nan),
+}
+"""Closed forms of the deviations of unit noises."""
 
 
-@pytest.mark.parametrize("alpha", NOISES)
-def test_band_covers(alpha):
-    taus = np.array([1.0, 8.0, 60.0])
-    truth = {2: np.sqrt(3.0) / taus, 0: taus**-0.5, -1: np.sqrt(allan.flicker_variance(taus)), -2: np.sqrt(taus / 3.0)}[
-        alpha
-    ]
-    inside = np.zeros(3)
+@pytest.mark.parametrize(("estimator", "alpha"), BANDS)
+def test_band_covers(estimator, alpha):
+    plain = estimator == "overlapping"
+    taus = np.array([1.0, 8.0, 60.0 if plain else 40.0])
+    truth, inside = BANDS[estimator, alpha](taus), np.zeros(3)
     for seed in range(200):
-        result = allan.allan_deviation(pure(alpha, [seed, 2], 600), 1.0, taus=taus)
+        record = pure(alpha, [seed, 2 if plain else 5], 600)
+        result = allan.allan_deviation(record, 1.0, taus=taus, estimator=estimator)
         inside += (result.lower[0] <= truth) & (truth <= result.upper[0])
         assert_allclose(chi2.cdf(result.edf * (result.deviation / result.lower) ** 2, result.edf), 0.975)
         assert_allclose(chi2.cdf(result.edf * (result.deviation / result.upper) ** 2, result.edf), 0.025)
     # At 60 samples, ten blocks, the noise type is the one found at 8; a wrong one widens or narrows the band a little.
-    assert np.all(inside >= 0.90 * 200)
-    assert np.all(inside <= 199)
+    judged = inside[np.isfinite(truth)]
+    assert np.all(judged >= 0.90 * 200)
+    assert np.all(judged <= 199)
 
 
 @pytest.mark.parametrize("alpha", NOISES)
@@ -379,10 +363,10 @@ def test_ramp_coefficients():
         assert_allclose(allan.spectrum.ramp_coefficients(samples, np.arange(1, samples)), expected, atol=1e-11)
 
 
-@pytest.mark.parametrize("m", [1, 2, 5, 12])
+@pytest.mark.parametrize("m", [1, 2, 5, 12, 50])
 def test_model_is_exact_for_averaged_samples(m):
     """Also at one sample: K²τ/3 holds for averages of a random walk (for point samples it would be K²dt (2m² + 1)/(6m))."""
-    samples = 24
+    samples = 2 * m
     combination = np.zeros(samples)
     combination[:m], combination[m : 2 * m] = -1.0 / m, 1.0 / m
     for term, matrix in COVARIANCES.items():
@@ -402,17 +386,8 @@ def _unit(term, dt):
     return dt ** powers[term]
 
 
-def test_flicker_variance_by_quadrature_and_at_the_joint():
-    for m in (1, 2, 7, 50):
-        integral = quad(
-            lambda v, m=m: (
-                4.0 / (2.0 * math.pi * v) * math.sin(math.pi * v * m) ** 4 / (m * math.sin(math.pi * v)) ** 2
-            ),
-            0.0,
-            0.5,
-            limit=500,
-        )[0]
-        assert_allclose(allan.flicker_variance([m]), integral, rtol=1e-8)
+def test_flicker_variance_at_the_joint():
+    """Of few samples: the model's, above."""
     below, above = allan.flicker_variance([4096]), allan.flicker_variance([4097])
     assert_allclose(above, below, rtol=1e-6)
     assert_allclose(allan.flicker_variance([10**7]), 2.0 * math.log(2.0) / math.pi, rtol=1e-9)
@@ -519,20 +494,17 @@ def test_recovery_over_200_records(name):
 
 
 @pytest.mark.slow
-def test_intervals_cover_over_200_seeds():
-    inside, supported, ratio = coverage(200, 1 << 17, 1000.0, 20.0)
-    share = inside.mean(axis=0)[:4]
+@pytest.mark.parametrize(
+    ("corner", "ramp"), [((1 << 17, 1000.0, 20.0), 0.0), ((1 << 14, 200.0, 20.0), 20.0)], ids=["long", "ramp"]
+)
+def test_intervals_cover_over_200_seeds(corner, ramp):
+    inside, supported, ratio = coverage(200, *corner, ramp=ramp)
+    share = inside.mean(axis=0)[: 5 if ramp else 4]
     assert np.all((share >= 0.91) & (share <= 0.98)), share
-    assert np.all(supported[:, :4])
-    assert np.all(np.abs(ratio[:, 2] - 1.0) < 0.10)
-    assert abs(np.median(ratio[:, 2]) - 1.0) < 0.01
-
-
-@pytest.mark.slow
-def test_ramp_interval_covers_over_200_seeds():
-    inside, _, _ = coverage(200, 1 << 14, 200.0, 20.0, ramp=20.0)
-    share = inside.mean(axis=0)
-    assert np.all((share >= 0.91) & (share <= 0.98)), share
+    if not ramp:
+        assert np.all(supported[:, :4])
+        assert np.all(np.abs(ratio[:, 2] - 1.0) < 0.10)
+        assert abs(np.median(ratio[:, 2]) - 1.0) < 0.01
 
 
 def test_terms_that_are_not_there_are_bounded_not_invented():

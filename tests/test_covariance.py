@@ -8,7 +8,7 @@ import json
 import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
-from scipy.stats import norm
+from scipy.stats import chi2, norm
 from typer.testing import CliRunner
 
 from strapdown import cli, coning, consistency, covariance, estimation, montecarlo, motion, quaternion, setup, vectors
@@ -22,8 +22,7 @@ from strapdown.units import ARCSECOND, DEGREE
 from strapdown.vectors import Faults
 
 TUMBLE = motion.HarmonicRates(
-    mean=(0.02, -0.03, 0.05),
-    harmonics=(motion.Harmonic(amplitude=(0.1, 0.05, 0.0), frequency=0.05, phase=0.3),),
+    mean=(0.02, -0.03, 0.05), harmonics=(motion.Harmonic(amplitude=(0.1, 0.05, 0.0), frequency=0.05, phase=0.3),)
 )
 FIELD = np.array([2e-5, 0.0, -4e-5])
 BELIEF = FilterSetup(
@@ -36,8 +35,19 @@ def turning(t):
     return 4e-5 * np.stack([np.cos(0.01 * t), np.sin(0.01 * t), 0.5 * np.ones_like(t)], axis=-1)
 
 
+def plain_sensors():
+    return (
+        vectors.VectorSensor(name="sun", reference_f=np.array([1.0, 0.0, 0.2]), sigma=2e-4, rate=1.0, phase=0.13),
+        vectors.Magnetometer(name="mag", field_f=turning, sigma=1e-8, rate=2.0, phase=0.31),
+        vectors.Magnetometer(name="compass", field_f=FIELD, sigma=1e-8, rate=1.0, kind="heading", phase=0.71),
+        vectors.AttitudeSensor(name="tracker", sigma_across=1e-4, sigma_about=1e-3, rate=0.25),
+    )
+
+
 def everything(duration=120.0):
     """Every source of error that the analysis knows, all kinds of sensors."""
+    sun, mag, compass, tracker = plain_sensors()
+    gnss = vectors.HeadingPair(name="gnss", baseline_b=np.array([1.0, 0.2, 0.0]), sigma=1e-3, rate=1.0, phase=0.5)
     return Scenario(
         motion=TUMBLE,
         gyro=GyroSpec(
@@ -50,47 +60,13 @@ def everything(duration=120.0):
             asymmetry=np.array([1e-4, 0.0, 0.0]),
         ),
         sensors=(
-            vectors.AttitudeSensor(
-                name="tracker",
-                sigma_across=1e-4,
-                sigma_about=1e-3,
-                rate=0.5,
-                faults=Faults(outlier_probability=0.05, outlier_scale=4.0),
+            dataclasses.replace(tracker, rate=0.5, faults=Faults(outlier_probability=0.05, outlier_scale=4.0)),
+            dataclasses.replace(
+                sun, faults=Faults(correlated_sigma=3e-4, correlation_time=15.0, outages=((40.0, 60.0),))
             ),
-            vectors.VectorSensor(
-                name="sun",
-                reference_f=np.array([1.0, 0.0, 0.2]),
-                sigma=2e-4,
-                rate=1.0,
-                phase=0.13,
-                faults=Faults(correlated_sigma=3e-4, correlation_time=15.0, outages=((40.0, 60.0),)),
-            ),
-            vectors.Magnetometer(
-                name="mag",
-                field_f=turning,
-                sigma=1e-8,
-                rate=2.0,
-                kind="vector",
-                phase=0.31,
-                hard_iron=np.array([1e-8, 0.0, -5e-9]),
-            ),
-            vectors.Magnetometer(
-                name="compass",
-                field_f=FIELD,
-                sigma=1e-8,
-                rate=1.0,
-                kind="heading",
-                phase=0.71,
-                faults=Faults(correlated_sigma=1e-8, correlation_time=5.0),
-            ),
-            vectors.HeadingPair(
-                name="gnss",
-                baseline_b=np.array([1.0, 0.2, 0.0]),
-                sigma=1e-3,
-                rate=1.0,
-                phase=0.5,
-                faults=Faults(correlated_sigma=1e-3, correlation_time=5.0),
-            ),
+            dataclasses.replace(mag, kind="vector", hard_iron=np.array([1e-8, 0.0, -5e-9])),
+            dataclasses.replace(compass, faults=Faults(correlated_sigma=1e-8, correlation_time=5.0)),
+            dataclasses.replace(gnss, faults=Faults(correlated_sigma=1e-3, correlation_time=5.0)),
         ),
         rate=10.0,
         duration=duration,
@@ -167,15 +143,6 @@ def run_quiet(record, belief, every):
     estimate = setup.run(record, belief, initial, every=every, full_covariance=True)
     truth = setup.modelled_record(record, belief).truth
     return estimate, consistency.errors(estimate.attitude, estimate.bias, truth.attitude[::every], truth.bias[::every])
-
-
-def plain_sensors():
-    return (
-        vectors.VectorSensor(name="sun", reference_f=np.array([1.0, 0.0, 0.2]), sigma=2e-4, rate=1.0, phase=0.13),
-        vectors.Magnetometer(name="mag", field_f=turning, sigma=1e-8, rate=2.0, phase=0.31),
-        vectors.Magnetometer(name="compass", field_f=FIELD, sigma=1e-8, rate=1.0, kind="heading", phase=0.71),
-        vectors.AttitudeSensor(name="tracker", sigma_across=1e-4, sigma_about=1e-3, rate=0.25),
-    )
 
 
 SIGMA = {"sun": 3e-4, "mag": 5e-4, "compass": 1e-3, "tracker": 1e-3}
@@ -283,50 +250,36 @@ def rotated(record, name, epsilon):
 
 def late(scenario, name, seconds):
     """The record of a sensor that measures later than its stamps say."""
-    shifted = []
-    for sensor in scenario.sensors:
-        if sensor.name == name:
-            shifted.append(dataclasses.replace(sensor, phase=sensor.phase + seconds))
-        else:
-            shifted.append(sensor)
-    record = simulate(dataclasses.replace(scenario, sensors=tuple(shifted)))
-    named = {one.sensor: one for one in simulate(scenario).vectors}
-    series = tuple(
-        dataclasses.replace(
-            one,
-            time=named[one.sensor].time[: len(one.time)],
-            reference_f=named[one.sensor].reference_f[: len(one.time)]
-            if one.reference_f.ndim == 2
-            else one.reference_f,
-        )
-        for one in record.vectors
+    shifted = tuple(
+        dataclasses.replace(one, phase=one.phase + seconds) if one.name == name else one for one in scenario.sensors
     )
-    return dataclasses.replace(record, vectors=series)
+    record, exact = simulate(dataclasses.replace(scenario, sensors=shifted)), simulate(scenario)
+    series = []
+    for one, own in zip(record.vectors, exact.vectors, strict=True):
+        here = slice(len(one.time))
+        reference = own.reference_f[here] if one.reference_f.ndim == 2 else one.reference_f
+        series.append(dataclasses.replace(one, time=own.time[here], reference_f=reference))
+    return dataclasses.replace(record, vectors=tuple(series))
 
 
 def considered(name, size):
     """Cases: what is considered, which axis of it, and the record in which it is so."""
     base, belief = quiet(still_scenario(), SIGMA)
-    if name == "scale factor, y":
-        record = simulate(quiet(still_scenario(scale_factor=np.array([0.0, size, 0.0])), SIGMA)[0])
-        return base, belief, Consider(scale_factor=size), record
-    if name == "misalignment, x of z":
-        M = np.zeros((3, 3))
-        M[0, 2] = size
-        return base, belief, Consider(misalignment=size), simulate(quiet(still_scenario(misalignment=M), SIGMA)[0])
-    if name == "g-sensitivity, z of y":
-        G = np.zeros((3, 3))
-        G[2, 1] = size
-        return base, belief, Consider(g_sensitivity=size), simulate(quiet(still_scenario(g_sensitivity=G), SIGMA)[0])
+    if name.startswith(("scale factor", "misalignment", "g-sensitivity")):
+        of_gyro = name.partition(",")[0].replace(" ", "_").replace("-", "_")
+        place = {"scale_factor": 1, "misalignment": (0, 2), "g_sensitivity": (2, 1)}[of_gyro]
+        error = np.zeros(3 if of_gyro == "scale_factor" else (3, 3))
+        error[place] = size
+        record = simulate(quiet(still_scenario(**{of_gyro: error}), SIGMA)[0])
+        return base, belief, Consider(**{of_gyro: size}), record
     sensor, what = name.split(" ", 1)
     if what == "bias, x":
         iron = tuple(
             dataclasses.replace(one, hard_iron=np.array([size, 0.0, 0.0])) if one.name == sensor else one
             for one in base.sensors
         )
-        record = simulate(dataclasses.replace(base, sensors=iron))
         # The unit of the consideration is that of the sensor's own σ, which the quiet one has too.
-        return base, belief, Consider(sensor_bias={sensor: size}), record
+        return base, belief, Consider(sensor_bias={sensor: size}), simulate(dataclasses.replace(base, sensors=iron))
     if what == "mounting, y":
         return base, belief, Consider(mounting={sensor: size}), rotated(simulate(base), sensor, [0.0, size, 0.0])
     assert what == "time offset"
@@ -393,9 +346,8 @@ def test_coning_shows_as_the_bias_that_the_formula_gives():
         algorithm = coning.ALGORITHMS[name]
         belief = dataclasses.replace(setup.FilterSetup.for_scenario(scenario), integration=algorithm, bias_sigma=1e-3)
         found = covariance.analyse(scenario, belief, epochs=4)
-        increments = scenario.motion.increments(
-            np.arange(1001) / rate
-        )  # a hundred cycles: the body is back where it was
+        # A hundred cycles: the body is back where it was.
+        increments = scenario.motion.increments(np.arange(1001) / rate)
         turned = np.array([1.0, 0.0, 0.0, 0.0])
         for turn in quaternion.exp(coning.rotation_vectors(increments, algorithm)):
             turned = quaternion.multiply(turned, turn)
@@ -416,11 +368,7 @@ def monte_carlo(scenario, belief, runs, epochs, seed=3):
         record = simulate(scenario, seed, run)
         used = setup.modelled_record(record, belief)
         estimate = estimation.run(
-            used,
-            belief.process_noise,
-            montecarlo.start(record, belief, seed, run),
-            every=every,
-            full_covariance=True,
+            used, belief.process_noise, montecarlo.start(record, belief, seed, run), every=every, full_covariance=True
         )
         e = consistency.errors(estimate.attitude, estimate.bias, used.truth.attitude[::every], used.truth.bias[::every])
         errors.append(e)
@@ -434,8 +382,6 @@ def check_monte_carlo(scenario, belief, *, runs, epochs, probability=0.99):
     number = len(found.time) - 1
     C, mean, P = found.covariance, found.mean_error, found.filter_covariance
     each = 1.0 - (1.0 - probability) / number
-    from scipy.stats import chi2, norm
-
     low, high = consistency.mean_bounds(6, runs, each)
     for k in range(1, number + 1):
         away = errors[:, k] - mean[k]
@@ -599,17 +545,19 @@ def test_an_attitude_error_beyond_linear_is_reported_with_its_time():
 
 def test_what_makes_no_sense_is_refused():
     scenario = white("spin", 10.0)
-    with pytest.raises(InputError, match="did you mean 'star'"):
-        covariance.analyse(scenario, consider=Consider(mounting={"stars": 1e-3}))
-    with pytest.raises(InputError, match="epochs"):
-        covariance.analyse(scenario, epochs=100_000)
-    for offset in (10.0, 1e9):
-        with pytest.raises(InputError, match=r"time_offset of star is .* the scenario lasts 10 s"):
-            covariance.analyse(scenario, consider=Consider(time_offset={"star": offset}))
-    with pytest.raises(InputError, match="scale_factor"):
-        Consider(scale_factor=-1.0)
-    with pytest.raises(InputError, match="time_offset"):
-        Consider(time_offset=0.1)
+    for options, message in (
+        ({"consider": Consider(mounting={"stars": 1e-3})}, "did you mean 'star'"),
+        ({"epochs": 100_000}, "epochs"),
+        *(
+            ({"consider": Consider(time_offset={"star": offset})}, r"time_offset of star is .* the scenario lasts 10 s")
+            for offset in (10.0, 1e9)
+        ),
+    ):
+        with pytest.raises(InputError, match=message):
+            covariance.analyse(scenario, **options)
+    for name, value in (("scale_factor", -1.0), ("time_offset", 0.1)):
+        with pytest.raises(InputError, match=name):
+            Consider(**{name: value})
     with pytest.raises(InputError, match="heading pair"):
         covariance.analyse(everything(20.0), BELIEF, consider=Consider(sensor_bias={"gnss": 1.0}), epochs=2)
     perfect = dataclasses.replace(

@@ -11,10 +11,9 @@ from functools import cache
 import mpmath
 import numpy as np
 import pytest
-from scipy.integrate import quad_vec, solve_ivp
-from scipy.special import ellipj
+from scipy.integrate import quad_vec
 
-from strapdown import kinematics, quaternion
+from strapdown import quaternion
 from strapdown.checks import InputError
 from strapdown.motion import (
     Composed,
@@ -197,21 +196,6 @@ def test_attitude_is_unit(truth):
     assert np.abs(np.linalg.norm(q, axis=-1) - 1.0).max() < 1.5e-15
 
 
-def fixed_rate(truth, t):
-    """Equation (16)."""
-    return kinematics.body_to_fixed_rate(truth.attitude(t), truth.body_rate(t))
-
-
-@every_motion
-def test_kinematics_of_the_attitude(truth):
-    """q̇ = ½ q ⊗ w_b (17) and = ½ w_f ⊗ q (3), q̇ by differences of order 8."""
-    t = smooth_times(truth)
-    q_dot = derivative(truth.attitude, t, 5e-4)
-    bound = 1e-10 * (1.0 + rate_scale(truth))
-    assert np.abs(q_dot - kinematics.body_quaternion_derivative(truth.attitude(t), truth.body_rate(t))).max() < bound
-    assert np.abs(q_dot - kinematics.fixed_quaternion_derivative(truth.attitude(t), fixed_rate(truth, t))).max() < bound
-
-
 @every_motion
 def test_acceleration_is_the_derivative_of_the_rate(truth):
     t = smooth_times(truth)
@@ -228,10 +212,8 @@ def test_increments_are_integrals_of_the_body_rate(truth):
     for a, b, increment in zip(edges[:-1], edges[1:], increments, strict=True):
         size = rate_scale(truth) * (b - a)
         cuts = [x for x in breaks(truth) if a < x < b]
-        integral = quad_vec(truth.body_rate, a, b, epsabs=1e-15 * size + 1e-300, epsrel=1e-14, points=cuts, limit=200)[
-            0
-        ]
-        assert np.abs(increment - integral).max() <= 1e-14 * size
+        options = {"epsabs": 1e-15 * size + 1e-300, "epsrel": 1e-14, "points": cuts, "limit": 200}
+        assert np.abs(increment - quad_vec(truth.body_rate, a, b, **options)[0]).max() <= 1e-14 * size
 
 
 @every_motion
@@ -382,23 +364,17 @@ def test_increments_at_1_khz_are_exact_after_an_hour(truth):
     increments = truth.increments(edges)
     with mpmath.workdps(40):
         rate = cache(mp_rate(truth))  # the three components share their nodes
-        exact = np.array(
-            [
-                [float(mpmath.quad(lambda t, i=i: rate(t)[i], [mpmath.mpf(a), mpmath.mpf(b)])) for i in range(3)]
-                for a, b in itertools.pairwise(edges)
-            ]
-        )
+        spans = [[mpmath.mpf(a), mpmath.mpf(b)] for a, b in itertools.pairwise(edges)]
+        exact = np.array([[float(mpmath.quad(lambda t, i=i: rate(t)[i], span)) for i in range(3)] for span in spans])
     assert np.abs(increments - exact).max() <= 1e-15 * np.abs(exact).max()
 
 
 def test_constant_rate_is_exact_after_an_hour():
     rate, t = (123.4, -5.6, 78.9), 3600.1
     with mpmath.workdps(40):
-        w = [mpmath.mpf(x) for x in rate]
-        norm = mpmath.sqrt(sum(x * x for x in w))
+        norm = mpmath.norm(mpmath.matrix(rate))
         half = norm * mpmath.mpf(t) / 2
-        exact = [mpmath.cos(half), *(x / norm * mpmath.sin(half) for x in w)]
-        exact = np.array([float(x) for x in exact])
+        exact = [float(x) for x in (mpmath.cos(half), *(x / norm * mpmath.sin(half) for x in rate))]
     assert np.abs(ConstantRate(rate=rate).attitude(t) - exact).max() < 5e-16
 
 
@@ -411,29 +387,6 @@ def test_slew_increments_are_exact_where_the_rate_is_tiny():
 
 
 # ---------------------------------------------------------------------------------------------------- each for itself
-
-
-def test_coning_is_equation_18():
-    beta, frequency = 0.2, 3.0
-    t = np.linspace(0.0, 1.0, 37)
-    w = 2.0 * math.pi * frequency
-    truth = Coning(angle=beta, frequency=frequency)
-    c, s, zero = np.cos(w * t), np.sin(w * t), np.zeros_like(t)
-    q = np.stack([math.cos(beta / 2) + zero, math.sin(beta / 2) * c, math.sin(beta / 2) * s, zero], axis=-1)
-    across = w * math.sin(beta)
-    w_b = np.stack([-across * s, across * c, w * (math.cos(beta) - 1.0) + zero], axis=-1)
-    w_f = np.stack([-across * s, across * c, w * (1.0 - math.cos(beta)) + zero], axis=-1)
-    assert np.abs(truth.attitude(t) - q).max() < 1e-14
-    assert np.abs(truth.body_rate(t) - w_b).max() < 1e-13
-    assert np.abs(fixed_rate(truth, t) - w_f).max() < 1e-13
-
-
-def test_spin_cone_with_opposite_rates_is_coning():
-    coning = Coning(angle=0.4, frequency=2.0)
-    truth = SpinCone(precession_rate=coning.rate, spin_rate=-coning.rate, angle=0.4)
-    t = np.linspace(-5.0, 5.0, 101)
-    for method in ("attitude", "body_rate", "body_angular_acceleration", "increments"):
-        assert np.abs(getattr(truth, method)(t) - getattr(coning, method)(t)).max() < 1e-13, method
 
 
 def test_spin_cone_is_its_product_of_three_rotations():
@@ -459,7 +412,9 @@ def test_slew_turns_by_its_rotation_vector():
 
 @pytest.mark.parametrize("truth", TORQUE_FREE.values(), ids=TORQUE_FREE.keys())
 def test_torque_free_conserves_energy_and_momentum(truth):
-    """Over two weeks: T, |h|, and h in fixed axes."""
+    """From the start on and over two weeks: T, |h|, and h in fixed axes."""
+    assert np.abs(truth.body_rate(0.0) - truth.initial_rate).max() < 1e-15 * 4.0
+    assert np.abs(truth.attitude(0.0) - START).max() < 1e-15
     t = np.concatenate([np.linspace(-30.0, 30.0, 301), np.random.default_rng(0).uniform(-1e6, 1e6, 100)])
     w, moments = truth.body_rate(t), np.array(truth.inertia)
     energy = 0.5 * (moments * w * w).sum(axis=-1)
@@ -469,16 +424,6 @@ def test_torque_free_conserves_energy_and_momentum(truth):
     assert np.abs(energy / truth.energy - 1.0).max() < 4e-15
     assert np.abs(np.linalg.norm(h_b, axis=-1) / size - 1.0).max() < 4e-15
     assert np.abs(h_f - truth.angular_momentum).max() < 6e-15 * size
-
-
-@pytest.mark.parametrize("truth", TORQUE_FREE.values(), ids=TORQUE_FREE.keys())
-def test_torque_free_starts_as_reported_and_obeys_euler(truth):
-    assert np.abs(truth.body_rate(0.0) - truth.initial_rate).max() < 1e-15 * 4.0
-    assert np.abs(truth.attitude(0.0) - START).max() < 1e-15
-    t, moments = smooth_times(truth), np.array(truth.inertia)
-    w_dot = derivative(truth.body_rate, t, 5e-4)
-    w = truth.body_rate(t)
-    assert np.abs(moments * w_dot + np.cross(w, moments * w)).max() < 1e-11
 
 
 @pytest.mark.parametrize("truth", list(TORQUE_FREE.values())[:21], ids=list(TORQUE_FREE)[:21])
@@ -492,7 +437,7 @@ def test_torque_free_restarted_goes_on_as_before(truth):
     assert quaternion.angle_between(again.attitude(t), truth.attitude(1000.0 + t)).max() < 3e-12
 
 
-@pytest.mark.parametrize("name", list(TORQUE_FREE)[:12] + list(TORQUE_FREE)[20:21])
+@pytest.mark.parametrize("name", list(TORQUE_FREE)[:14] + list(TORQUE_FREE)[20:21])
 def test_torque_free_after_a_hundred_thousand_periods(name):
     """After N periods of the rate (Landau and Lifshitz (37.12)) the body has turned about h by N times the advance of one.
 
@@ -518,10 +463,7 @@ def test_torque_free_after_a_hundred_thousand_periods(name):
             return momentum * (i1 * one + i2 * two) / (i1**2 * one + i2**2 * two)
 
         # Periodic and analytic: equal weights converge geometrically.
-        advance = (
-            period * sum(spin(period * j / 120) for j in range(60)) / 60 / 2
-            + period * sum(spin(period * (j + m.mpf(1) / 2) / 120) for j in range(60)) / 60 / 2
-        )
+        advance = period * sum(spin(period * j / 240) for j in range(120)) / 120
         t = float(periods * period)
         late = float(m.mpf(t) - periods * period)
         turned = float(m.fmod(periods * advance, 4 * m.pi))
@@ -541,29 +483,6 @@ def test_torque_free_increments_over_many_periods(truth):
     assert np.abs(truth.increments([0.0, 50.0, 100.0]) - fine).max() < 1e-15 * 50.0 * rate_scale(truth)
 
 
-@pytest.mark.parametrize("name", list(TORQUE_FREE)[:7:3] + list(TORQUE_FREE)[12:14])
-def test_torque_free_attitude_against_50_turns_of_integration(name):
-    truth = TORQUE_FREE[name]
-    i1, i2, i3 = truth.inertia
-
-    def change(t, y):
-        a, b, c, d, w1, w2, w3 = y.tolist()
-        return [
-            0.5 * (-b * w1 - c * w2 - d * w3),
-            0.5 * (a * w1 + c * w3 - d * w2),
-            0.5 * (a * w2 + d * w1 - b * w3),
-            0.5 * (a * w3 + b * w2 - c * w1),
-            (i2 - i3) / i1 * w2 * w3,
-            (i3 - i1) / i2 * w3 * w1,
-            (i1 - i2) / i3 * w1 * w2,
-        ]
-
-    y0 = np.concatenate([truth.initial_attitude, truth.initial_rate])
-    y = solve_ivp(change, (0.0, 150.0), y0, method="DOP853", rtol=1e-13, atol=1e-14).y[:, -1]
-    assert quaternion.angle_between(quaternion.normalize(y[:4]), truth.attitude(150.0)) < 2e-10
-    assert np.abs(y[4:] - truth.body_rate(150.0)).max() < 2e-10
-
-
 @pytest.mark.parametrize("complement", [1.0, 0.7, 0.1, 1e-3, 1e-8, 1e-20, 1e-40, 1e-300])
 def test_jacobi_functions_against_mpmath(complement):
     """Of the separatrix too, whose 1 − m is 1e-300; K and Π to 45 digits."""
@@ -581,8 +500,6 @@ def test_jacobi_functions_against_mpmath(complement):
             [[float(mpmath.ellipfun(kind, mpmath.mpf(x), m=1 - exact).real) for x in u] for kind in ("sn", "cn", "dn")]
         )
     assert np.abs(got - want).max() < 2e-15
-    if complement > 1e-4:  # SciPy takes 1 less m
-        assert np.abs(np.array(ellipj(u, 1.0 - complement)[:3]) - want).max() < 1e-12
 
 
 # ---------------------------------------------------------------------------------------------------- harmonic rates
@@ -639,13 +556,9 @@ def test_harmonic_attitude_against_mpmath():
         rate = mp_rate(truth)
 
         def change(t, q):
-            x, y, z = rate(t)
-            return [
-                (-q[1] * x - q[2] * y - q[3] * z) / 2,
-                (q[0] * x + q[2] * z - q[3] * y) / 2,
-                (q[0] * y + q[3] * x - q[1] * z) / 2,
-                (q[0] * z + q[1] * y - q[2] * x) / 2,
-            ]
+            w, (x, y, z), (a, b, c) = q[0], q[1:], rate(t)
+            twice = [-x * a - y * b - z * c, w * a + y * c - z * b, w * b + z * a - x * c, w * c + x * b - y * a]
+            return [one / 2 for one in twice]
 
         exact = mpmath.odefun(change, 0, [mpmath.mpf(x) for x in START], tol=mpmath.mpf(10) ** -19)(0.25)
     assert np.abs(truth.attitude(0.25) - np.array([float(x) for x in exact])).max() < 5e-16
@@ -684,28 +597,18 @@ def test_sampled_motion_converges_on_the_motion_sampled(degree, order):
 def test_sampled_rate_is_smooth_at_the_samples(degree, smooth):
     """The attitude is C² (degree 3) or C⁴: the rate is C¹ or C³, and the next derivative jumps."""
     truth = SampledAttitude(time=np.arange(12.0), attitudes=wandering_attitudes(12), degree=degree)
-    h = 0.02
-    jumps = []
-    for k in range(smooth + 2):
-        one_sided = [
-            sum((-1) ** (k - i) * math.comb(k, i) * truth.body_rate(5.0 + side * i * h) for i in range(k + 1))
-            * (side / h) ** k
+
+    def jump(k, h):
+        """Of the k-th derivative at a sample, by one-sided differences."""
+        weights = [(-1) ** (k - i) * math.comb(k, i) for i in range(k + 1)]
+        before, after = (
+            sum(w * truth.body_rate(5.0 + side * i * h) for i, w in enumerate(weights)) * (side / h) ** k
             for side in (-1.0, 1.0)
-        ]
-        jumps.append(np.abs(one_sided[1] - one_sided[0]).max())
-    assert jumps[smooth + 1] > 10.0 * h  # a jump
-    fine = []
-    for step in (h, h / 2):
-        sides = [
-            sum(
-                (-1) ** (smooth - i) * math.comb(smooth, i) * truth.body_rate(5.0 + side * i * step)
-                for i in range(smooth + 1)
-            )
-            * (side / step) ** smooth
-            for side in (-1.0, 1.0)
-        ]
-        fine.append(np.abs(sides[1] - sides[0]).max())
-    assert fine[0] / fine[1] == pytest.approx(2.0, rel=0.3)  # vanishes with the step
+        )
+        return np.abs(after - before).max()
+
+    assert jump(smooth + 1, 0.02) > 0.2
+    assert jump(smooth, 0.02) / jump(smooth, 0.01) == pytest.approx(2.0, rel=0.3)  # vanishes with the step
 
 
 def test_sampled_motion_turns_with_its_axes():
@@ -738,14 +641,6 @@ def test_composition_truly_cones():
     assert np.abs(truth.increments(edges) - coning.increments(edges)).max() < 1e-17
     assert truth.increments([0.0, 1.0])[0, 2] == pytest.approx(-coning.rate * (1.0 - math.cos(0.02)), rel=1e-11)
     assert quaternion.angle_between(truth.attitude(0.3), quaternion.multiply(START, coning.attitude(0.3))) < 1e-15
-
-
-def test_composition_on_one_axis_adds_rates():
-    one, two = ConstantRate(rate=(0.0, 0.0, 0.7)), ConstantRate(rate=(0.0, 0.0, -0.2))
-    truth = Composed(base=one, vibration=two)
-    t = np.linspace(0.0, 10.0, 11)
-    assert quaternion.angle_between(truth.attitude(t), ConstantRate(rate=(0.0, 0.0, 0.5)).attitude(t)).max() < 1e-15
-    assert np.abs(truth.increments(t) - [0.0, 0.0, 0.5]).max() < 1e-15
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -36,39 +36,14 @@ def close(actual: np.ndarray, wanted: np.ndarray, ulps: float = 8.0) -> None:
 # ---------------------------------------------------------------------------------------------------- the algebra
 
 
-def test_unit_products_are_hamiltons():
-    one, i, j, k = np.eye(4)
-    for p, q, product in ((i, j, k), (j, k, i), (k, i, j), (j, i, -k), (k, j, -i), (i, k, -j)):
-        np.testing.assert_array_equal(quaternion.multiply(p, q), product)
-    for unit in (i, j, k):
-        np.testing.assert_array_equal(quaternion.multiply(unit, unit), -one)
-
-
 @pytest.mark.parametrize("shape", SHAPES)
 def test_product_is_that_of_complex_matrices(shape):
     p, q = 3.0 * random_quaternions(shape), 0.2 * random_quaternions(shape, 5)
     close(complex_matrix(quaternion.multiply(p, q)), complex_matrix(p) @ complex_matrix(q))
-
-
-@pytest.mark.parametrize("shape", SHAPES)
-def test_group_axioms(shape):
-    p, q, r = (random_quaternions(shape, seed) for seed in (1, 2, 3))
-    multiply = quaternion.multiply
-    close(multiply(multiply(p, q), r), multiply(p, multiply(q, r)))
-    np.testing.assert_array_equal(multiply(p, quaternion.IDENTITY), p)
-    np.testing.assert_array_equal(multiply(quaternion.IDENTITY, p), p)
-    one = np.broadcast_to(quaternion.IDENTITY, p.shape)
-    close(multiply(p, quaternion.inverse(p)), one)
-    close(multiply(quaternion.inverse(p), p), one)
-    close(quaternion.conjugate(multiply(p, q)), multiply(quaternion.conjugate(q), quaternion.conjugate(p)))
-    close(np.linalg.norm(multiply(p, q), axis=-1), np.ones(shape))
-
-
-@pytest.mark.parametrize("norm", [1e-100, 1e-3, 0.5, 2.0, 1e5, 1e100])
-def test_inverse_divides_by_the_squared_norm(norm):
-    q = norm * random_quaternions((6,))
-    close(quaternion.multiply(q, quaternion.inverse(q)), np.broadcast_to(quaternion.IDENTITY, (6, 4)))
-    np.testing.assert_allclose(np.linalg.norm(quaternion.inverse(q), axis=-1), 1.0 / norm, rtol=4 * EPS)
+    np.testing.assert_array_equal(quaternion.multiply(p, quaternion.IDENTITY), p)
+    np.testing.assert_array_equal(quaternion.multiply(quaternion.IDENTITY, p), p)
+    conjugated = np.swapaxes(complex_matrix(p), -1, -2).conj()
+    np.testing.assert_array_equal(complex_matrix(quaternion.conjugate(p)), conjugated)
 
 
 def test_leading_axes_broadcast():
@@ -77,6 +52,7 @@ def test_leading_axes_broadcast():
     assert product.shape == (2, 3, 4)
     np.testing.assert_array_equal(product[1, 2], quaternion.multiply(p[1, 0], q[2]))
     assert quaternion.rotate(p, random_vectors((3,))).shape == (2, 3, 3)
+    assert quaternion.rotate(p[:0], random_vectors((1, 1))).shape == (0, 1, 3)
     assert quaternion.rotate(p[0, 0], random_vectors(())).shape == (3,)
     assert quaternion.angle_between(p, q).shape == (2, 3)
 
@@ -86,52 +62,18 @@ def test_identity_cannot_be_written_to():
         quaternion.IDENTITY[0] = 2.0
 
 
-def test_normalize():
-    q = random_quaternions((4,))
-    close(quaternion.normalize(np.array([[1e-3], [2.0], [1.0], [1e9]]) * q), q)
-
-
 # ---------------------------------------------------------------------------------------------------- rotation
-
-
-@pytest.mark.parametrize("shape", SHAPES)
-def test_rotate_is_the_sandwich_product_and_the_matrix(shape):
-    q, v = random_quaternions(shape), random_vectors(shape)
-    pure = np.concatenate([np.zeros((*shape, 1)), v], -1)
-    sandwich = quaternion.multiply(quaternion.multiply(q, pure), quaternion.conjugate(q))
-    close(sandwich[..., 0], np.zeros(shape))
-    close(quaternion.rotate(q, v), sandwich[..., 1:], 16)
-    close(quaternion.rotate(q, v), (quaternion.to_matrix(q) @ v[..., None])[..., 0], 16)
-    close(quaternion.rotate(quaternion.conjugate(q), quaternion.rotate(q, v)), v, 16)
-
-
-def test_quarter_turns():
-    # A body yawed by +90° in a fixed frame: its x axis points along the fixed y axis.
-    half = np.sqrt(0.5)
-    close(quaternion.rotate([half, 0.0, 0.0, half], [1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]))
-    close(quaternion.rotate([half, half, 0.0, 0.0], [0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]))
-    close(quaternion.rotate([half, 0.0, half, 0.0], [0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0]))
-
-
-def test_rotating_by_a_tiny_angle_loses_no_digits(rotation_vectors):
-    phi = rotation_vectors(50, 1e-12, 1e-6)
-    v = random_vectors((50,))
-    moved = quaternion.rotate(quaternion.exp(phi), v) - v
-    # v + φ × v to second order, and each of the sums rounds at the size of v
-    np.testing.assert_allclose(moved, np.cross(phi, v), rtol=0.0, atol=3 * EPS * 4 + 1e-12)
 
 
 @pytest.mark.parametrize("shape", SHAPES[:4])
 def test_matrix_and_rotation_agree_with_scipy(shape):
-    q = random_quaternions(shape)
+    q, v = random_quaternions(shape), random_vectors(shape)
     flat = q.reshape(-1, 4)
     theirs = Rotation.from_quat(flat[:, [1, 2, 3, 0]])
     close(quaternion.to_matrix(q).reshape(-1, 3, 3), theirs.as_matrix())
-    v = random_vectors(shape).reshape(-1, 3)
-    close(quaternion.rotate(flat, v), theirs.apply(v), 16)
+    close(quaternion.rotate(q, v).reshape(-1, 3), theirs.apply(v.reshape(-1, 3)), 16)
     close(quaternion.to_rotation(flat).as_matrix(), theirs.as_matrix())
-    back = quaternion.from_rotation(theirs)
-    close(np.abs(np.sum(back * flat, -1)), np.ones(len(flat)))
+    close(np.abs(np.sum(quaternion.from_rotation(theirs) * flat, -1)), np.ones(len(flat)))
     close(quaternion.from_rotation(quaternion.to_rotation(flat[0])), flat[0])
 
 
@@ -219,12 +161,6 @@ def test_zero_rotation():
     np.testing.assert_array_equal(quaternion.log(-quaternion.IDENTITY), np.zeros(3))
 
 
-def test_exp_of_parallel_vectors_adds(rotation_vectors):
-    phi = rotation_vectors(40, 1e-9, 1.5)
-    product = quaternion.multiply(quaternion.exp(0.3 * phi), quaternion.exp(0.7 * phi))
-    close(product, quaternion.exp(phi))
-
-
 def test_angle_between(rotation_vectors):
     phi = rotation_vectors(80, 1e-12, 3.1)
     p = random_quaternions((80,))
@@ -232,16 +168,15 @@ def test_angle_between(rotation_vectors):
     q = quaternion.multiply(p, quaternion.exp(phi))
     np.testing.assert_allclose(quaternion.angle_between(p, q), angle, rtol=1e-14, atol=4 * EPS)
     np.testing.assert_allclose(quaternion.angle_between(q, -p), angle, rtol=1e-14, atol=4 * EPS)
-    np.testing.assert_allclose(
-        quaternion.angle_between(p, q),
-        (quaternion.to_rotation(p).inv() * quaternion.to_rotation(q)).magnitude(),
-        atol=1e-14,
-    )
 
 
 # ---------------------------------------------------------------------------------------------------- bad input
 
 
+THREE, TWO = np.tile(quaternion.IDENTITY, (3, 1)), np.tile(quaternion.IDENTITY, (2, 1))
+
+
+@pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize(
     ("call", "words"),
     [
@@ -259,6 +194,10 @@ def test_angle_between(rotation_vectors):
         (lambda: quaternion.from_matrix(np.diag([1.0, 1.0, -1.0])), ("reflection", "signs of its axes")),
         (lambda: quaternion.from_matrix(np.eye(4)), ("matrix has shape (4, 4)",)),
         (lambda: quaternion.angle_between([2.0, 0.0, 0.0, 0.0], quaternion.IDENTITY), ("p has norm 2",)),
+        (lambda: quaternion.multiply(THREE, TWO), ("p has shape (3, 4) and q has shape (2, 4); their leading axes",)),
+        (lambda: quaternion.rotate(THREE, np.zeros((2, 3))), ("q has shape (3, 4) and v has shape (2, 3)",)),
+        (lambda: quaternion.angle_between(THREE, TWO), ("their leading axes",)),
+        (lambda: quaternion.exp([1e300, 0.0, 0.0]), ("rotation_vector holds 1e+300 rad",)),
     ],
 )
 def test_bad_input_is_named(call, words):
@@ -271,14 +210,8 @@ def test_bad_input_is_named(call, words):
 def test_inputs_are_not_changed():
     q, v = random_quaternions((3,)), random_vectors((3,))
     before = q.copy(), v.copy()
-    for function in (
-        quaternion.conjugate,
-        quaternion.inverse,
-        quaternion.normalize,
-        quaternion.log,
-        quaternion.to_matrix,
-    ):
-        function(q)
+    for name in ("conjugate", "inverse", "normalize", "log", "to_matrix"):
+        getattr(quaternion, name)(q)
     quaternion.rotate(q, v)
     np.testing.assert_array_equal(q, before[0])
     np.testing.assert_array_equal(v, before[1])
@@ -287,16 +220,6 @@ def test_inputs_are_not_changed():
 def test_single_precision_quaternions_are_normalised():
     q = random_quaternions((20,)).astype(np.float32)
     close(np.linalg.det(quaternion.to_matrix(q)), np.ones(20))
-
-
-def test_shapes_that_do_not_go_together_are_named():
-    three, two = np.tile(quaternion.IDENTITY, (3, 1)), np.tile(quaternion.IDENTITY, (2, 1))
-    with pytest.raises(InputError, match=r"p has shape \(3, 4\) and q has shape \(2, 4\); their leading axes"):
-        quaternion.multiply(three, two)
-    with pytest.raises(InputError, match=r"q has shape \(3, 4\) and v has shape \(2, 3\)"):
-        quaternion.rotate(three, np.zeros((2, 3)))
-    with pytest.raises(InputError, match="their leading axes"):
-        quaternion.angle_between(three, two)
 
 
 @pytest.mark.filterwarnings("error")
@@ -310,9 +233,7 @@ def test_quaternions_of_any_size_are_normalised_and_inverted(size):
 
 
 @pytest.mark.filterwarnings("error")
-def test_a_turn_without_a_norm_is_refused():
-    with pytest.raises(InputError, match=r"rotation_vector holds 1e\+300 rad"):
-        quaternion.exp([1e300, 0.0, 0.0])
+def test_a_turn_of_any_norm_is_one():
     assert np.isfinite(quaternion.exp([-1e149, 1e149, 0.0])).all()
 
 

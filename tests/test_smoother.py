@@ -1,4 +1,4 @@
-"""Smoother: equal to the linear one, to its fixed-side twin and to least squares; consistent; never worse than the filter."""
+"""Smoother: equal to its fixed-side twin; consistent; never worse than the filter. Least squares: test_error_states_smoother.py."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ import mpmath
 import numpy as np
 import pytest
 from in_steps import transition_and_noise
-from scipy.optimize import least_squares
 
 from strapdown import coning, consistency, estimation, kinematics, motion, quaternion, records
 from strapdown.checks import InputError
@@ -46,14 +45,18 @@ class Case:
     integration: str | None = None
 
 
+def exact(name, kind, time, reference, sigma, attitude=quaternion.IDENTITY) -> VectorMeasurements:
+    """A sensor without errors that is modelled with some."""
+    z = np.broadcast_to(quaternion.rotate(quaternion.conjugate(attitude), reference), (len(time), 3))
+    return VectorMeasurements(sensor=name, kind=kind, time=time, vector_b=z, reference_f=reference, sigma=sigma)
+
+
 def measure(name, kind, reference, sigma, time, attitude, rng) -> VectorMeasurements:
-    exact = quaternion.rotate(quaternion.conjugate(attitude), reference)
-    z = exact + sigma * rng.standard_normal((len(time), 3))
+    one = exact(name, kind, time, reference, sigma, attitude)
+    z = one.vector_b + sigma * rng.standard_normal((len(time), 3))
     if kind != "vector":
         z /= np.linalg.norm(z, axis=1, keepdims=True)
-    return VectorMeasurements(
-        sensor=name, kind=kind, time=time, vector_b=z, reference_f=reference, sigma=np.full(len(time), sigma)
-    )
+    return dataclasses.replace(one, vector_b=z)
 
 
 def simulate(case: Case, rng: np.random.Generator, edges: np.ndarray | None = None) -> ImuRecord:
@@ -105,8 +108,7 @@ CASES = {
     ),
     "one direction, turning": Case(motion=TURN, sensors=(("direction", STAR, 0.02, (0.1, 0.1)),)),
     "vectors": Case(
-        motion=SWAY,
-        sensors=(("vector", 9.81 * DOWN, 0.2, (0.2, 0.2)), ("vector", 5e-5 * STAR, 2e-6, (0.4, 0.1))),
+        motion=SWAY, sensors=(("vector", 9.81 * DOWN, 0.2, (0.2, 0.2)), ("vector", 5e-5 * STAR, 2e-6, (0.4, 0.1)))
     ),
     "heading": Case(motion=SWAY, sensors=(("direction", DOWN, 0.01, (0.2, 0.2)), ("heading", NORTH, 0.02, (0.3, 0.3)))),
     "asynchronous": Case(
@@ -131,6 +133,13 @@ CASES = {
 
 def errors(estimate: Estimate, record: ImuRecord) -> np.ndarray:
     return consistency.errors(estimate.attitude, estimate.bias, record.truth.attitude, record.truth.bias)
+
+
+def check_consistent(nees: np.ndarray, probability: float, degrees: int = 6) -> None:
+    """The mean over runs (runs, epochs) lies inside the two-sided bounds of all epochs together."""
+    mean = nees.mean(axis=0) / degrees
+    verdict = consistency.Verdict(mean=mean, degrees=degrees, runs=len(nees), probability=probability)
+    assert verdict.consistent, (mean, verdict.simultaneous_bounds)
 
 
 # ---------------------------------------------------------------------------------------------------------- slow plain reference
@@ -249,81 +258,6 @@ def test_equals_the_fixed_side_reference(name: str) -> None:
     assert_same(one, fixed_side_smoother(record, case.noise, initial), 1e-8)
 
 
-# --------------------------------------------------------------------------------------------------------------- linear and oracles
-
-
-def least_squares_estimate(
-    record: ImuRecord, noise: ProcessNoise, initial: estimation.State, guess: Estimate
-) -> np.ndarray:
-    """The whole trajectory that minimises prior, gyro and measurement residuals: its error state (n + 1, 6) from ``guess``."""
-    edges = len(record.time)
-    prior = np.linalg.inv(np.linalg.cholesky(initial.covariance))
-    dt = np.diff(record.time)
-    whitening = []
-    for increment, step in zip(record.increments, dt, strict=True):
-        _, Q = transition(increment / step - initial.bias, step, noise)
-        whitening.append(np.linalg.inv(np.linalg.cholesky(Q)))
-    rows = [(s, np.searchsorted(record.time, s.time), triad(s.reference_f)[:2]) for s in record.vectors]
-
-    def residuals(x: np.ndarray) -> np.ndarray:
-        x = x.reshape(edges, 6)
-        q, b = quaternion.multiply(guess.attitude, quaternion.exp(x[:, :3])), guess.bias + x[:, 3:]
-        start = np.concatenate(
-            [
-                quaternion.log(quaternion.multiply(quaternion.conjugate(initial.attitude), q[0])),
-                b[0] - initial.bias,
-            ]
-        )
-        predicted = quaternion.multiply(q[:-1], quaternion.exp(record.increments - b[:-1] * dt[:, None]))
-        step = np.concatenate(
-            [quaternion.log(quaternion.multiply(quaternion.conjugate(predicted), q[1:])), np.diff(b, axis=0)], axis=1
-        )
-        parts = [prior @ start, np.einsum("kij,kj->ki", whitening, step).ravel()]
-        for series, at, across in rows:
-            parts.append(((quaternion.rotate(q[at], series.vector_b) @ across.T) / series.sigma[:, None]).ravel())
-        return np.concatenate(parts)
-
-    scale = np.tile(np.sqrt(np.diag(initial.covariance)), edges)
-    solution = least_squares(
-        residuals, np.zeros(6 * edges), x_scale=scale, xtol=1e-15, ftol=1e-15, gtol=1e-15, jac="3-point"
-    )
-    return solution.x.reshape(edges, 6)
-
-
-def test_equals_least_squares_to_first_order() -> None:
-    # All errors scaled down by ten: the distance to the optimum, in units of σ, falls by ten. So the difference is of second order.
-    distances = []
-    for scale in (1.0, 0.1):
-        case = Case(
-            motion=TURN,
-            sensors=(
-                ("direction", DOWN, 0.05 * scale, (0.2, 0.2)),
-                ("direction", STAR, 0.05 * scale, (0.4, 0.4)),
-            ),
-            duration=1.6,
-            rate=5.0,
-            noise=ProcessNoise(angle_random_walk=0.05 * scale, rate_random_walk=0.05 * scale),
-            attitude_sigma=0.1 * scale,
-            bias_sigma=0.1 * scale,
-        )
-        edges = np.arange(9) * 0.2
-        times = {0.2: edges[1:-1], 0.4: edges[2:-1:2]}
-        case = dataclasses.replace(case, sensors=tuple((*s[:3], times[s[3][0]]) for s in case.sensors))
-        rng = np.random.default_rng(8)
-        record = simulate(case, rng, edges)
-        error = rng.standard_normal(6) * 0.1 * scale
-        initial = estimation.initial_state(
-            quaternion.multiply(record.truth.attitude[0], quaternion.exp(-error[:3])),
-            attitude_sigma=case.attitude_sigma,
-            bias_sigma=case.bias_sigma,
-            bias=record.truth.bias[0] - error[3:],
-        )
-        estimate = estimation.smooth(record, case.noise, initial)
-        distances.append(np.max(np.abs(least_squares_estimate(record, case.noise, initial, estimate)) / estimate.sigma))
-    assert distances[0] < 0.2
-    assert 5.0 < distances[0] / distances[1] < 20.0
-
-
 # --------------------------------------------------------------------------------------------------------------------- consistency
 
 
@@ -336,20 +270,12 @@ def test_consistent_and_better_than_the_filter(name: str) -> None:
         smoothed = estimation.smooth(record, case.noise, initial, full_covariance=True)
         filtered = estimation.run(record, case.noise, initial)
         epochs = np.linspace(0, len(record.time) - 1, 6).astype(int)
-        e = errors(smoothed, record)
-        P = smoothed.covariance
-        nees.append(
-            [
-                consistency.nees(e, P)[epochs],
-                consistency.nees(e[:, :3], P[:, :3, :3])[epochs],
-                consistency.nees(e[:, 3:], P[:, 3:, 3:])[epochs],
-            ]
-        )
+        e, P = errors(smoothed, record), smoothed.covariance
+        parts = (slice(0, 6), slice(0, 3), slice(3, 6))
+        nees.append([consistency.nees(e[:, s], P[:, s, s])[epochs] for s in parts])
         squares.append([e**2 / filtered.variance, errors(filtered, record) ** 2 / filtered.variance])
-    mean = np.mean(nees, axis=0)
-    for values, degrees in zip(mean, (6, 3, 3), strict=True):
-        verdict = consistency.Verdict(mean=values / degrees, degrees=degrees, runs=runs, probability=0.999)
-        assert verdict.consistent, (values / degrees, verdict.simultaneous_bounds)
+    for of_part, degrees in zip(np.swapaxes(nees, 0, 1), (6, 3, 3), strict=True):
+        check_consistent(of_part, 0.999, degrees)
     smoothed_square, filtered_square = np.mean(squares, axis=(0, 2, 3))
     assert smoothed_square < 0.8 * filtered_square
 
@@ -364,8 +290,7 @@ def test_consistent_over_many_runs(name: str) -> None:
         smoothed = estimation.smooth(record, case.noise, initial, full_covariance=True)
         epochs = np.linspace(0, len(record.time) - 1, 6).astype(int)
         nees.append(consistency.nees(errors(smoothed, record)[epochs], smoothed.covariance[epochs]))
-    verdict = consistency.Verdict(mean=np.mean(nees, axis=0) / 6.0, degrees=6, runs=runs, probability=0.99)
-    assert verdict.consistent, (verdict.mean, verdict.simultaneous_bounds)
+    check_consistent(np.array(nees), 0.99)
 
 
 @pytest.mark.parametrize(("wrong", "above"), [(0.5, True), (2.0, False)])
@@ -419,13 +344,8 @@ def test_large_turns_are_split_into_sub_steps() -> None:
     )
     record, initial = simulated(case, np.random.default_rng(12))
     assert np.all(np.linalg.norm(record.increments, axis=1) > 1.5)
-    parts = 8
-    fine = np.interp(np.arange(parts * (len(record.time) - 1) + 1) / parts, np.arange(len(record.time)), record.time)
-    split = ImuRecord(time=fine, increments=np.repeat(record.increments / parts, parts, axis=0), vectors=record.vectors)
-    coarse = estimation.smooth(record, case.noise, initial, full_covariance=True)
-    fine = estimation.smooth(split, case.noise, initial, full_covariance=True)
-    every = {name: getattr(fine, name)[::parts] for name in ("time", "attitude", "bias", "variance", "covariance")}
-    assert_same(coarse, dataclasses.replace(fine, **every), 1e-9)
+    one = estimation.smooth(record, case.noise, initial, full_covariance=True)
+    assert_same(one, fixed_side_smoother(record, case.noise, initial), 1e-9)
 
 
 def test_a_start_half_way_round_is_survived() -> None:
@@ -462,23 +382,17 @@ def test_a_bias_that_turns_more_than_the_increments_say() -> None:
     series = measure("a", "direction", DOWN, 0.02, time[1:], np.tile(quaternion.IDENTITY, (40, 1)), rng)
     noise = ProcessNoise(angle_random_walk=1e-3, rate_random_walk=1e-5)
 
-    def smoothed(parts: int, bias: float) -> Estimate:
-        edges = np.arange(40 * parts + 1) / parts
-        record = ImuRecord(time=edges, increments=np.zeros((40 * parts, 3)), vectors=(series,))
-        start = estimation.State(
-            attitude=quaternion.IDENTITY,
-            bias=np.array([0.0, 0.0, bias]),
-            covariance=np.diag([1e-4] * 3 + [1e-12] * 3),
-        )
-        return estimation.smooth(record, noise, start, full_covariance=True)
-
+    record = ImuRecord(time=time, increments=np.zeros((40, 3)), vectors=(series,))
+    P = np.diag([1e-4] * 3 + [1e-12] * 3)
     for bias in (0.5, 3.0):
-        whole, cut = smoothed(1, bias), smoothed(10, bias)
-        assert np.max(quaternion.angle_between(whole.attitude, cut.attitude[::10])) < 1e-9
-        np.testing.assert_allclose(whole.bias, cut.bias[::10], rtol=0, atol=1e-10)
-        np.testing.assert_allclose(whole.variance, cut.variance[::10], rtol=1e-8)
+        start = estimation.State(attitude=quaternion.IDENTITY, bias=np.array([0.0, 0.0, bias]), covariance=P)
+        found = estimation.smooth(record, noise, start, full_covariance=True)
+        known = fixed_side_smoother(record, noise, start)
+        assert np.max(quaternion.angle_between(found.attitude, known.attitude)) < 1e-9
+        np.testing.assert_allclose(found.bias, known.bias, rtol=0, atol=1e-10)
+        np.testing.assert_allclose(found.variance, known.variance, rtol=1e-8)
     with pytest.raises(InputError, match="many times round in each gyro interval"):
-        smoothed(1, 1e4)
+        estimation.smooth(record, noise, dataclasses.replace(start, bias=np.array([0.0, 0.0, 1e4])))
 
 
 # ------------------------------------------------------------------------------------------------- recoveries, and lost digits
@@ -505,6 +419,27 @@ def recovery_of(estimate: Estimate) -> records.Event:
     found = [event for event in estimate.events if event.kind == "recovery"]
     assert len(found) == 1
     return found[0]
+
+
+def with_a_turn(record: ImuRecord, edge: int, turn: np.ndarray) -> ImuRecord:
+    """The record with a turn that the gyro did not see at an edge: after it the body's axes are others, q ⊗ turn."""
+    back, when = quaternion.conjugate(turn), record.time[edge]
+
+    def after(time: np.ndarray, before: np.ndarray, turned: np.ndarray) -> np.ndarray:
+        return np.where((time >= when if time is record.time else time > when)[:, None], turned, before)
+
+    vectors = tuple(
+        dataclasses.replace(s, vector_b=after(s.time, s.vector_b, quaternion.rotate(back, s.vector_b)))
+        for s in record.vectors
+    )
+    q, b = record.truth.attitude, record.truth.bias
+    truth = Truth(
+        attitude=after(record.time, q, quaternion.multiply(q, turn)),
+        bias=after(record.time, b, quaternion.rotate(back, b)),
+    )
+    increments = record.increments.copy()
+    increments[edge:] = quaternion.rotate(back, increments[edge:])
+    return ImuRecord(time=record.time, increments=increments, vectors=vectors, truth=truth)
 
 
 def test_a_lost_stretch_is_reported_by_what_was_measured_from_its_beginning_on() -> None:
@@ -535,29 +470,7 @@ def test_of_a_filter_that_is_lost_on_its_way_the_part_before_is_smoothed_too() -
     record, _ = far_off(2)
     initial = estimation.initial_state(record.truth.attitude[0], attitude_sigma=0.03, bias_sigma=3e-3)
     middle = 120
-    turn = quaternion.exp([0.0, 1.2, 0.7])
-    after = record.time >= record.time[middle]
-    moved = tuple(
-        dataclasses.replace(
-            s,
-            vector_b=np.where(
-                (s.time > record.time[middle])[:, None],
-                quaternion.rotate(quaternion.conjugate(turn), s.vector_b),
-                s.vector_b,
-            ),
-        )
-        for s in record.vectors
-    )
-    # After it the body's axes are others: q ⊗ turn, and the gyro's with them.
-    increments = record.increments.copy()
-    increments[middle:] = quaternion.rotate(quaternion.conjugate(turn), increments[middle:])
-    truth = Truth(
-        attitude=np.where(after[:, None], quaternion.multiply(record.truth.attitude, turn), record.truth.attitude),
-        bias=np.where(
-            after[:, None], quaternion.rotate(quaternion.conjugate(turn), record.truth.bias), record.truth.bias
-        ),
-    )
-    record = ImuRecord(time=record.time, increments=increments, vectors=moved, truth=truth)
+    record = with_a_turn(record, middle, quaternion.exp([0.0, 1.2, 0.7]))
     both = estimation.smooth(record, NOISE, initial, gate=GATE, full_covariance=True)
     event = recovery_of(both)
     first = int(np.searchsorted(record.time, event.start))
@@ -567,13 +480,8 @@ def test_of_a_filter_that_is_lost_on_its_way_the_part_before_is_smoothed_too() -
     assert np.max(off[first:]) < 5.0
     # Before it: the smoother of the record that ends with the first refusal, whose measurement was not processed.
     known = estimation.smooth(records.cut(record, 0, first - 1), NOISE, initial, gate=GATE, full_covariance=True)
-    assert_same(
-        known,
-        dataclasses.replace(
-            both, **{n: getattr(both, n)[:first] for n in ("attitude", "bias", "variance", "covariance")}
-        ),
-        1e-9,
-    )
+    before = {n: getattr(both, n)[:first] for n in ("attitude", "bias", "variance", "covariance")}
+    assert_same(known, dataclasses.replace(both, **before), 1e-9)
     ahead = estimation.run(record, NOISE, initial, gate=GATE)
     assert np.all(both.sigma[20:middle] < ahead.sigma[20:middle])
 
@@ -603,22 +511,7 @@ def test_what_lies_between_the_first_refusal_and_the_last_candidate_is_the_filte
 def test_several_recoveries_and_a_record_in_parts() -> None:
     """The second part begins while the filter is lost: what took over then begins with the part at the earliest."""
     record, initial = far_off(1)
-    turn = quaternion.exp([0.3, -1.0, 0.5])
-    back = quaternion.conjugate(turn)
-    increments = record.increments.copy()
-    increments[120:] = quaternion.rotate(back, increments[120:])
-    vectors = tuple(
-        dataclasses.replace(
-            s, vector_b=np.where((s.time > record.time[120])[:, None], quaternion.rotate(back, s.vector_b), s.vector_b)
-        )
-        for s in record.vectors
-    )
-    later = (record.time >= record.time[120])[:, None]
-    truth = Truth(
-        attitude=np.where(later, quaternion.multiply(record.truth.attitude, turn), record.truth.attitude),
-        bias=np.where(later, quaternion.rotate(back, record.truth.bias), record.truth.bias),
-    )
-    twice = ImuRecord(time=record.time, increments=increments, vectors=vectors, truth=truth)
+    twice = with_a_turn(record, 120, quaternion.exp([0.3, -1.0, 0.5]))
     whole = estimation.smooth(twice, NOISE, initial, gate=GATE, full_covariance=True)
     assert [event.kind for event in whole.events] == ["recovery", "recovery"]
     first, second = np.searchsorted(record.time, [event.start for event in whole.events])
@@ -655,9 +548,7 @@ def test_lost_stretches_are_consistent() -> None:
 
 @pytest.mark.slow
 def test_lost_stretches_are_consistent_over_many_runs() -> None:
-    nees = nees_of_recoveries(1000)
-    verdict = consistency.Verdict(mean=nees.mean(axis=0) / 6.0, degrees=6, runs=1000, probability=0.99)
-    assert verdict.consistent, (verdict.mean, verdict.simultaneous_bounds)
+    check_consistent(nees_of_recoveries(1000), 0.99)
 
 
 def test_a_measurement_that_leaves_no_digits_is_smoothed_on_the_square_root() -> None:
@@ -668,17 +559,7 @@ def test_a_measurement_that_leaves_no_digits_is_smoothed_on_the_square_root() ->
     sharp, first = 1e-9, (1.0, 0.1)
     time = np.arange(13) * 0.25
     references = np.array([[1.0, 0.0, 0.0], [0.0, 0.6, 0.8], [0.6, -0.8, 0.0]])
-    series = tuple(
-        VectorMeasurements(
-            sensor=f"s{k}",
-            kind="direction",
-            time=time[1 + k :: 3],
-            vector_b=np.tile(r, (4, 1)),
-            reference_f=r,
-            sigma=np.full(4, sharp),
-        )
-        for k, r in enumerate(references)
-    )
+    series = tuple(exact(f"s{k}", "direction", time[1 + k :: 3], r, sharp) for k, r in enumerate(references))
     record = ImuRecord(time=time, increments=np.zeros((12, 3)), vectors=series)
     initial = estimation.initial_state(quaternion.IDENTITY, attitude_sigma=first[0], bias_sigma=first[1])
     noise = ProcessNoise(angle_random_walk=1e-18, rate_random_walk=0.0)
@@ -739,31 +620,25 @@ def random_covariance(rng: np.random.Generator, decades: float = 1.0) -> np.ndar
 def test_composed_rotations_at_any_angle() -> None:
     # Both lengths of the series on both sides of their bounds; the oracle in 40 digits.
     rng = np.random.default_rng(1)
-    sizes = np.concatenate(
-        [angles(rng), (1.0 - 1e-6) * np.array([0.005, 0.01]), (1.0 + 1e-6) * np.array([0.005, 0.01])]
-    )
-    axes = rng.standard_normal((2 * len(sizes), 3))
-    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
-    for (one, first), (other, second) in zip(
-        zip(sizes, axes, strict=False), zip(rng.permutation(sizes), axes[len(sizes) :], strict=True), strict=True
-    ):
+    near = np.array([0.005, 0.01])
+    sizes = np.concatenate([angles(rng), (1.0 - 1e-6) * near, (1.0 + 1e-6) * near])
+    axes = rng.standard_normal((2, len(sizes), 3))
+    for one, other, first, second in zip(sizes, rng.permutation(sizes), *axes, strict=True):
         with mpmath.workdps(40):
             halves = [mpmath.mpf(float(angle)) / 2 for angle in (one, other)]
-            u, v = (mpmath.matrix(axis.tolist()) for axis in (first, second))
-            u, v = u / mpmath.norm(u), v / mpmath.norm(v)
-            c, d = (mpmath.cos(half) for half in halves)
-            s, t = (mpmath.sin(half) for half in halves)
-            cross = [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]]
-            w = c * d - s * t * sum(u[i] * v[i] for i in range(3))
-            vector = mpmath.matrix([s * d * u[i] + c * t * v[i] + s * t * cross[i] for i in range(3)])
+            u, v = (
+                mpmath.matrix(axis.tolist()) / mpmath.norm(mpmath.matrix(axis.tolist())) for axis in (first, second)
+            )
+            (c, d), (s, t) = ([of(half) for half in halves] for of in (mpmath.cos, mpmath.sin))
+            cross = mpmath.matrix([u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]])
+            w, vector = c * d - s * t * (u.T * v)[0], s * d * u + c * t * v + s * t * cross
             size = mpmath.norm(vector)
             angle = 2 * mpmath.atan2(size, abs(w))
             expected = [float(mpmath.sign(w) * angle * x / size) if size else 0.0 for x in vector]
             r = (float(c), *(float(s * x) for x in u))
             phi = [float(2 * halves[1] * x) for x in v]
         if angle < 3.1:  # else its sign hangs on the rounding of the arguments
-            found = rotation.composed(r, tuple(phi))
-            np.testing.assert_allclose(found, expected, rtol=0, atol=1e-15 * (one + other))
+            np.testing.assert_allclose(rotation.composed(r, tuple(phi)), expected, rtol=0, atol=1e-15 * (one + other))
 
 
 @pytest.mark.parametrize("intervals", [*range(1, 11), 16, 17])
@@ -896,17 +771,8 @@ def test_sigmas_of_any_magnitude_are_smoothed_right() -> None:
         attitude_sigma, bias_sigma = 10.0 ** rng.uniform([-14, -22], [0, 0.5])
         time, measured = np.arange(n + 1) * dt, rng.random(n + 1) < 0.5
         at = time[measured]
-        series = tuple(
-            VectorMeasurements(
-                sensor=str(k),
-                kind="vector",
-                time=at,
-                vector_b=np.tile(axis, (len(at), 1)),
-                reference_f=axis,
-                sigma=np.full(len(at), np.sqrt(2.0) * sigma),  # each shows two of three axes
-            )
-            for k, axis in enumerate(np.eye(3))
-        )
+        # Each shows two of three axes.
+        series = tuple(exact(str(k), "vector", at, axis, np.sqrt(2.0) * sigma) for k, axis in enumerate(np.eye(3)))
         record = ImuRecord(time=time, increments=np.zeros((n, 3)), vectors=series if len(at) else ())
         noise = ProcessNoise(angle_random_walk=arw, rate_random_walk=rrw)
         start = estimation.initial_state(quaternion.IDENTITY, attitude_sigma=attitude_sigma, bias_sigma=bias_sigma)
@@ -930,14 +796,7 @@ def test_a_filter_that_diverges_is_an_error() -> None:
     time, rate = np.arange(41) * 1e-3, np.array([0.1, -0.2, 0.3])
     at = time[3::4]
     attitude = quaternion.exp(at[:, None] * rate)
-    series = VectorMeasurements(
-        sensor="field",
-        kind="vector",
-        time=at,
-        vector_b=quaternion.rotate(quaternion.conjugate(attitude), DOWN),
-        reference_f=DOWN,
-        sigma=np.full(len(at), 1e-12),
-    )
+    series = exact("field", "vector", at, DOWN, 1e-12, attitude)
     record = ImuRecord(time=time, increments=np.tile(1e-3 * rate, (40, 1)), vectors=(series,))
     start = quaternion.exp(0.6 * np.random.default_rng(21).standard_normal(3))
     initial = estimation.initial_state(start, attitude_sigma=1.7, bias_sigma=0.04)
