@@ -244,6 +244,16 @@ def test_start_is_triad_of_the_quiet_second():
     assert np.sqrt(state.covariance[5, 5]) == pytest.approx(0.5 * DEGREE)
 
 
+def test_iron_is_taken_off_the_field_that_the_start_is_made_of():
+    plain = recording()
+    quiet, iron = ahrs.quiet_span(plain), np.array([3.0, -4.0, 2.0])
+    wanted = ahrs.start(plain, quiet, AhrsParameters()).attitude
+    shifted = dataclasses.replace(plain, magnetic_field=plain.magnetic_field + iron)
+    # The unit hardly turns in the quiet second: its mean field holds all of the iron.
+    assert quaternion.angle_between(ahrs.start(shifted, quiet, AhrsParameters(), iron).attitude, wanted) < 2e-3
+    assert quaternion.angle_between(ahrs.start(shifted, quiet, AhrsParameters()).attitude, wanted) > 2e-2
+
+
 def test_quiet_span_is_the_first_quiet_second():
     plain = recording()
     assert ahrs.quiet_span(plain) == slice(0, round(RATE))
