@@ -166,7 +166,7 @@ def test_parts_of_a_parameter_and_what_cannot_have_axes_are_refused():
     chosen = setup.FilterSetup.for_scenario(scenario)
     case = case_of(scenario, chosen, 1)
     with pytest.raises(
-        InputError, match=r"outliers are modelled .* sensors with one sigma for all axes: leave gate out"
+        InputError, match=r"outliers are modelled .* sensors with one sigma for all axes; leave out the gate"
     ):
         tuning.contaminated_likelihood([case], chosen, ["acc.sigma.x"])
     with pytest.raises(InputError, match=r"acc.sigma.y is part of acc.sigma; give that, or the axes"):

@@ -58,8 +58,8 @@ def contaminated_likelihood(
     base = likelihood(cases, chosen, free, threads=threads)
     if not isinstance(base, LaneLikelihood):
         raise InputError(
-            "outliers are modelled of a filter without optional states, and of sensors with one sigma for all axes: leave gate out, or "
-            "those states and axes"
+            "outliers are modelled for filters without optional states, and for sensors with one sigma for all axes; leave out the gate, "
+            "or the states and the single axes"
         )
     if len(base.names) + len(OUTLIERS) > MOST:
         raise InputError(f"{len(base.names)} parameters are free; beside outliers at most {MOST - 2} can be")
