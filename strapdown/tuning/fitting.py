@@ -333,11 +333,7 @@ def fit(
 
     with ThreadPoolExecutor(threads) as pool:
         ranges = list(_reported(report, pool.map(interval, range(len(points[0])))))
-    point = best.point.copy()
-    loose = [j for j in range(len(ranges)) if not ranges[j].identified]
-    if loose:
-        point[loose] = np.log([ranges[j].mean for j in loose])
-        point = search(objective, point, known, fixed=loose).point
+    point = _with_means(objective, best.point, ranges, known)
     misfit = errors.misfit and not objective.composite
 
     def estimated(j: int, name: str) -> Estimated:
@@ -369,6 +365,16 @@ def fit(
         optima_values=np.array([optimum.local.value for optimum in optima]),
         agreeing=sum(1 for optimum in optima if optimum.local.value < best.local.value + NEGLIGIBLE),
     )
+
+
+def _with_means(objective: Objective, point: Array, ranges: Sequence[_Known], priors: Mapping[str, Prior]) -> Array:
+    """Return a point with the parameters that are not identified at their means, and the others the most likely beside them."""
+    loose = [j for j, one in enumerate(ranges) if not one.identified]
+    if not loose:
+        return point.copy()
+    moved = point.copy()
+    moved[loose] = np.log([ranges[j].mean for j in loose])
+    return search(objective, moved, priors, fixed=loose).point
 
 
 def _reported(report: Callable[[int], None], results: Iterable[T]) -> Iterator[T]:
