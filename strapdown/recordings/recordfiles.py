@@ -7,6 +7,7 @@ seed, units, conventions and version. CSV holds the gyro in one file, and each v
 from __future__ import annotations
 
 import contextlib
+import functools
 import itertools
 import json
 import os
@@ -152,23 +153,43 @@ def origin_attributes(origin: Origin | None) -> dict[str, Any]:
     return {name: value for name, value in made.items() if value is not None}
 
 
+class _FiledOrigin(Origin):
+    """The origin that a file states; its scenario is read when it is asked for: that of a gyro preset takes half a second."""
+
+    def __init__(self, text: str, path: str | os.PathLike[str], made: Mapping[str, Any]) -> None:
+        """Keep the TOML; without a specification of the gyro it is the scenario's."""
+        super().__init__(**made)
+        vars(self).pop("scenario")
+        vars(self).update(_text=text, _path=path)
+        if self.gyro is None:
+            vars(self).update(gyro=self.scenario.gyro)
+
+    @functools.cached_property
+    def scenario(self) -> Any:  # type: ignore[override]
+        """The scenario."""
+        from strapdown.scenarios import scenario_from_toml  # and every motion
+
+        with reading.from_file(self._path):
+            return scenario_from_toml(self._text, f"{self._path}: scenario")
+
+    _text: str
+    _path: str | os.PathLike[str]
+
+
 def _origin(attributes: Mapping[str, Any], path: str | os.PathLike[str]) -> Origin | None:
     """Return how a record was made, as its file states."""
     made: dict[str, Any] = {
         name: count(name, attributes[name], minimum=0) for name in ("seed", "run") if name in attributes
     }
-    if "scenario" in attributes:
-        from strapdown.scenarios import scenario_from_toml
-
-        if not isinstance(attributes["scenario"], str):
-            raise InputError(f"{path}: scenario is {attributes['scenario']!r}; it must be TOML text")
-        made["scenario"] = scenario_from_toml(attributes["scenario"], f"{path}: scenario")
-        made["gyro"] = made["scenario"].gyro
     if "gyro" in attributes:
         table = attributes["gyro"]
         table = reading.from_json(table, f"{path}: gyro") if isinstance(table, str) else table
         made["gyro"] = gyro.from_table(table, f"{path}: gyro")
-    return Origin(**made) if made else None
+    if "scenario" not in attributes:
+        return Origin(**made) if made else None
+    if not isinstance(attributes["scenario"], str):
+        raise InputError(f"{path}: scenario is {attributes['scenario']!r}; it must be TOML text")
+    return _FiledOrigin(attributes["scenario"], path, made)
 
 
 def _values(group: Any, name: str, unit: str) -> Array:
