@@ -152,6 +152,7 @@ class LiveFilter:
         self._series = read_only(np.array(series, np.int64).reshape(-1, 6))
         size = 6 + model.states
         self._innovation, self._weight = np.zeros((MOST, 6)), np.ones(MOST)
+        self._weights: Any = self._weight.data
         self._recoveries, self._lock_outs = np.zeros((MOST, 4)), whole[: 4 * (MOST + sensors)].reshape(-1, 4)
         out: Any = root_form.Outputs(
             attitude=np.empty((1, 4)),
@@ -260,26 +261,26 @@ class LiveFilter:
         reference: Mapping[str, ArrayLike] | None,
     ) -> list[_Measured]:
         """Return the measurements of a call in the order of the sensors, without missing ones."""
-        sensors, rows = self._sensors, {}
-        for name in {*(sigma or ()), *(reference or ())}:
-            one_of("sensor", name, sensors)
-            rows[name] = sensors[name].changed((sigma or {}).get(name), (reference or {}).get(name))
-        events, missing, last, sorted_ = [], [], -1, True
-        for name, value in measured.items():
-            sensor = sensors.get(name)
-            if sensor is None:
+        sensors = self._sensors
+        if sigma or reference or not measured.keys() <= sensors.keys():
+            for name in (*measured, *(sigma or ()), *(reference or ())):
                 one_of("sensor", name, sensors)
-                continue
-            event = None if value is None else sensor.measured(time, value, rows.get(name, sensor.row))
+            changed = {*(sigma or ()), *(reference or ())}
+            sensors = sensors | {
+                name: sensors[name].changed((sigma or {}).get(name), (reference or {}).get(name)) for name in changed
+            }
+        events, missing = [], []
+        for name, value in measured.items():
+            event = None if value is None else sensors[name].measured(time, value)
             if event is None:
                 missing.append(name)
-                continue
-            events.append(event)
-            sorted_ = sorted_ and sensor.place > last
-            last = sensor.place
+            else:
+                events.append(event)
         for name in missing:  # not before all of them are known to be good
             self._missing[name] += 1
-        return events if sorted_ else sorted(events, key=_order)
+        if len(events) > 1:
+            events.sort(key=_order)
+        return events
 
     def _go_back(self, time: float, events: list[_Measured]) -> None:
         """Update with measurements of the past, and repeat what came after them."""
@@ -320,18 +321,20 @@ class LiveFilter:
         self._time = end
         self._last = events
         if number and (self._judged or self._headings):
-            self._count(events, result)
+            self._count(events)
+        if self._judged and (result[1] or result[2]):
+            self._report(*result[1:])
 
-    def _count(self, events: Sequence[_Measured], result: Any) -> None:
-        """Count what was refused and what showed nothing, and keep the events that the gate reports."""
+    def _count(self, events: Sequence[_Measured]) -> None:
+        """Count what was refused and what showed nothing."""
         for k, (_, sensor, *_) in enumerate(events):
             if sensor in self._headings and math.isnan(self._innovation[k, 0]):
                 self._counts[sensor, 1] += 1.0
-            elif self._judged and self._weight[k] == 0.0:
+            elif self._judged and self._weights[k] == 0.0:
                 self._counts[sensor, 0] += 1.0
-        if not self._judged:
-            return
-        _, recovered, locked = result
+
+    def _report(self, recovered: int, locked: int) -> None:
+        """Keep the events that the gate reports."""
         self._closed += self._reported(self._recoveries[:recovered], self._slots[:0])
         opened = self._judge.counters[:, gate_rules.REPORTED]
         for k, row in enumerate(self._lock_outs[:locked]):
@@ -469,8 +472,8 @@ class _Sensor:
         row = _row(series.kind, reference, noise, not series.anisotropic, sigma)
         return _Sensor(series.sensor, series.kind, place, reference, noise, sigma, row)
 
-    def changed(self, sigma: float | None, reference: ArrayLike | None) -> _Row:
-        """Return the row of a measurement whose σ or reference is another one."""
+    def changed(self, sigma: float | None, reference: ArrayLike | None) -> _Sensor:
+        """Return the sensor with another σ or reference."""
         r = self.reference_f
         if reference is not None:
             given = _three(f"{self.name}: reference_f", reference)
@@ -479,13 +482,15 @@ class _Sensor:
             r = np.array(given if self.kind == "vector" else _unit(given))
             if self.kind == "heading":
                 need_level(f"{self.name}: reference_f", r)
-        if sigma is None:
-            return _row(self.kind, r, self.covariance, self.row.isotropic, self.sigma)
-        s = positive(f"{self.name}: sigma", sigma)
-        return _row(self.kind, r, s**2 * np.eye(3), self.row.isotropic, s)
+        s, covariance = self.sigma, self.covariance
+        if sigma is not None:
+            s = positive(f"{self.name}: sigma", sigma)
+            covariance = s**2 * np.eye(3)
+        return replace(self, row=_row(self.kind, r, covariance, self.row.isotropic, s))
 
-    def measured(self, time: float, value: Any, row: _Row) -> _Measured | None:
+    def measured(self, time: float, value: Any) -> _Measured | None:
         """Return a measurement; None if it is missing, or of a direction without length."""
+        row = self.row
         if self.kind == "attitude":
             q = np.asarray(value, np.float64)
             if q.shape == (4,) and np.isnan(q).any():
