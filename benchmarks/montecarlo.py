@@ -18,6 +18,8 @@ from typing import Any
 import numpy as np
 
 from strapdown import motion, vectors
+from strapdown.estimation.setup import FilterSetup
+from strapdown.estimation.setup.states import States
 from strapdown.estimation.states import ProcessNoise, initial_state
 from strapdown.estimation.step_filter import StepFilter
 from strapdown.files import write_json
@@ -26,8 +28,6 @@ from strapdown.kernels.machine import describe
 from strapdown.montecarlo import lanes, scalar
 from strapdown.montecarlo.plan import Plan
 from strapdown.scenarios import Scenario
-from strapdown.setup import FilterSetup
-from strapdown.setup.states import States
 
 NOISE = ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-6)
 RATE = 100.0

@@ -19,7 +19,8 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize
 
-from strapdown import gyro, motion, scenarios, setup, tuning, vectors
+from strapdown import gyro, motion, scenarios, tuning, vectors
+from strapdown.estimation import setup
 from strapdown.estimation.step_filter import StepFilter
 from strapdown.files import write_json
 from strapdown.kernels.machine import describe

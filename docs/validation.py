@@ -25,7 +25,8 @@ sys.path.insert(0, str(ROOT))
 
 import strapdown  # noqa: E402
 from sims.coning_algorithms import exact_error  # noqa: E402
-from strapdown import allan, coning, coning_study, consistency, estimation, motion, quaternion  # noqa: E402
+from strapdown import allan, coning, consistency, estimation, motion, quaternion  # noqa: E402
+from strapdown.montecarlo import coning_study  # noqa: E402
 from strapdown.records import ImuRecord  # noqa: E402
 from strapdown.units import DEGREE, DEGREE_PER_HOUR  # noqa: E402
 from strapdown.vectors import VectorMeasurements  # noqa: E402

@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from strapdown import coning, montecarlo, plots
-from strapdown.coning_study import Drift, FilterOutcome, measured_drift, predicted_drift
 from strapdown.estimation.states import ProcessNoise
 from strapdown.gyro import GyroSpec
+from strapdown.montecarlo.coning_study import Drift, FilterOutcome, measured_drift, predicted_drift
 from strapdown.motion import Coning
 from strapdown.scenarios import Scenario
 from strapdown.units import ARCSECOND, DEGREE, DEGREE_PER_HOUR, DEGREE_PER_HOUR_PER_ROOT_HOUR, DEGREE_PER_ROOT_HOUR

@@ -18,12 +18,13 @@ from pathlib import Path
 
 import numpy as np
 
-from strapdown import consistency, covariance, plots, quaternion, scenarios, setup
+from strapdown import consistency, covariance, plots, quaternion, scenarios
 from strapdown.checks import Array
+from strapdown.estimation import setup
+from strapdown.estimation.setup import FilterSetup
 from strapdown.estimation.states import ProcessNoise
 from strapdown.plots import style
 from strapdown.randomness import generator
-from strapdown.setup import FilterSetup
 from strapdown.units import ARCSECOND, DEGREE, DEGREE_PER_HOUR
 
 SMALL = {"runs": 4, "duration": 60.0, "epochs": 10}

@@ -34,11 +34,11 @@ from typing import Any
 import numpy as np
 
 import strapdown
-from strapdown import ahrs, consistency, covariance, montecarlo, quaternion, recordings, scenarios, setup, vectors
+from strapdown import ahrs, consistency, covariance, montecarlo, quaternion, recordings, scenarios, vectors
 from strapdown.ahrs import HAND_HELD
 from strapdown.checks import Array
 from strapdown.consistency import foreign, reference_errors
-from strapdown.estimation import State, filters
+from strapdown.estimation import State, filters, setup
 from strapdown.estimation.states import ProcessNoise
 from strapdown.files import write_json
 from strapdown.gyro import GyroSpec

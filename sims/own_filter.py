@@ -17,8 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
-from strapdown import montecarlo, motion, quaternion, scenarios, setup, vectors
-from strapdown.estimation import State, filters
+from strapdown import montecarlo, motion, quaternion, scenarios, vectors
+from strapdown.estimation import State, filters, setup
 from strapdown.files import write_json
 from strapdown.gyro import GyroSpec
 from strapdown.kinematics import skew

@@ -34,10 +34,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import strapdown
-from strapdown import consistency, montecarlo, quaternion, scenarios, setup, vectors
+from strapdown import consistency, montecarlo, quaternion, scenarios, vectors
 from strapdown.checks import Array
 from strapdown.consistency import foreign
-from strapdown.estimation import State
+from strapdown.estimation import State, setup
 from strapdown.files import write_json
 from strapdown.gyro import GyroSpec
 from strapdown.motion import Harmonic, HarmonicRates

@@ -11,7 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from strapdown import gyro, motion, scenarios, setup, tuning, units, vectors
+from strapdown import gyro, motion, scenarios, tuning, units, vectors
+from strapdown.estimation import setup
 from strapdown.tuning import Comparison, Plan, Tuning
 
 FREE = ("gyro.arw", "gyro.rrw", "star 1.sigma", "star 2.sigma")

@@ -14,7 +14,8 @@ What they take
     value, its place and the remedy; a section *Raises* says what else a function refuses.
 More
     The submodules, each with its own ``__all__``, and below them ``estimation.error_states``, ``estimation.filters``,
-    ``estimation.multiple_model``, ``montecarlo.campaign`` and ``montecarlo.cluster``. Names and submodules load when they are first used.
+    ``estimation.multiple_model``, ``estimation.setup``, ``montecarlo.campaign``, ``montecarlo.cluster``, ``montecarlo.coning_study`` and
+    ``tuning.diagnosis``. Names and submodules load when they are first used.
     Every other module and name (``kernels``, ``cli``, ``checks``, ``files``, ``reading``, ``tables``, …) is private and may change.
 
 Conventions, the same in code, files and plots
@@ -41,10 +42,8 @@ if TYPE_CHECKING:
         ahrs,
         allan,
         coning,
-        coning_study,
         consistency,
         covariance,
-        diagnosis,
         estimation,
         gyro,
         kinematics,
@@ -56,16 +55,15 @@ if TYPE_CHECKING:
         records,
         report,
         scenarios,
-        setup,
         tuning,
         units,
         vectors,
     )
     from strapdown.checks import InputError
     from strapdown.estimation import Gate, LiveFilter, ProcessNoise, Robust, StepFilter, initial_state
+    from strapdown.estimation.setup import FilterSetup
     from strapdown.gyro import GyroSpec
     from strapdown.scenarios import Scenario
-    from strapdown.setup import FilterSetup
     from strapdown.vectors import VectorSensor
     from strapdown.workflows import (
         allan_deviation,
@@ -98,11 +96,9 @@ __all__ = [
     "allan_deviation",
     "check",
     "coning",
-    "coning_study",
     "consistency",
     "covariance",
     "covariance_analysis",
-    "diagnosis",
     "estimate",
     "estimation",
     "fit_noise",
@@ -120,7 +116,6 @@ __all__ = [
     "records",
     "report",
     "scenarios",
-    "setup",
     "simulate",
     "smooth",
     "tune",
@@ -131,7 +126,7 @@ __all__ = [
 ]
 
 _HOMES = {
-    "FilterSetup": "setup",
+    "FilterSetup": "estimation.setup",
     "Gate": "estimation",
     "GyroSpec": "gyro",
     "InputError": "checks",

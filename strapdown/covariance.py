@@ -24,6 +24,7 @@ import numpy as np
 
 from strapdown import coning, gyro, kinematics, quaternion, scenarios, units, vectors
 from strapdown.checks import Array, InputError, count, known_keys, non_negative
+from strapdown.estimation.setup import FilterSetup, modelled_record, need_mekf
 from strapdown.estimation.states import covariance_matrices
 from strapdown.gyro import GyroSpec, flicker
 from strapdown.kernels import covariance_loop
@@ -32,7 +33,6 @@ from strapdown.randomness import generator
 from strapdown.records import ImuRecord
 from strapdown.results import ByValue, Listed, Listing, figure
 from strapdown.scenarios import Scenario
-from strapdown.setup import FilterSetup, modelled_record, need_mekf
 from strapdown.units import DEGREE
 from strapdown.vectors import VectorMeasurements
 
@@ -712,7 +712,7 @@ def analyse(
     scenario : Scenario, str or path
         As of :func:`strapdown.scenarios.simulate`.
     setup : FilterSetup, optional
-        The filter. Default: matched to the scenario (:meth:`strapdown.setup.FilterSetup.for_scenario`).
+        The filter. Default: matched to the scenario (:meth:`strapdown.estimation.setup.FilterSetup.for_scenario`).
     consider : Consider, optional
         Errors besides those of the scenario.
     initial_attitude_sigma, initial_bias_sigma : float, optional

@@ -25,9 +25,7 @@ __all__ = [
     "angle_between",
     "conjugate",
     "exp",
-    "from_euler",
     "from_matrix",
-    "from_mrp",
     "from_rotation",
     "inverse",
     "log",
@@ -35,9 +33,7 @@ __all__ = [
     "multiply",
     "normalize",
     "rotate",
-    "to_euler",
     "to_matrix",
-    "to_mrp",
     "to_rotation",
 ]
 
@@ -380,107 +376,6 @@ def angle_between(p: ArrayLike, q: ArrayLike) -> Array:
     return np.asarray(
         np.linalg.norm(log(multiply(conjugate(unit_quaternions("p", p)), unit_quaternions("q", q))), axis=-1)
     )
-
-
-def to_euler(q: ArrayLike, sequence: str = "ZYX") -> Array:
-    """Return Euler angles of unit quaternions, in the order of the sequence.
-
-    Parameters
-    ----------
-    q : array_like (..., 4)
-        Unit quaternions q_fb.
-    sequence : str, default "ZYX"
-        Axes of the three rotations in SciPy's notation: capitals about the rotating body axes, small letters about the fixed axes.
-        The default is yaw ψ, pitch θ, roll φ with R_fb = R_z(ψ) R_y(θ) R_x(φ): where the fixed z axis points down, the heading,
-        elevation and bank of an aircraft.
-
-    Returns
-    -------
-    ndarray (..., 3)
-        Angles, rad. The middle one lies in [−π/2, π/2], or in [0, π] where the first and last axes are the same; the others in [−π,
-        π]. In gimbal lock (a pitch of ±π/2) the last angle is 0, and SciPy warns.
-
-    Examples
-    --------
-    >>> to_euler([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)]).round(6).tolist()
-    [1.570796, 0.0, 0.0]
-    """
-    value = unit_quaternions("q", q)
-    with _named_sequence(sequence):
-        angles = to_rotation(value.reshape(-1, 4)).as_euler(sequence)
-    return np.asarray(angles).reshape(*value.shape[:-1], 3)
-
-
-def from_euler(angles: ArrayLike, sequence: str = "ZYX") -> Array:
-    """Return the unit quaternions of Euler angles, the inverse of :func:`to_euler`.
-
-    Parameters
-    ----------
-    angles : array_like (..., 3)
-        Angles in the order of the sequence, rad.
-    sequence : str, default "ZYX"
-        Axes of the three rotations, as in :func:`to_euler`.
-
-    Returns
-    -------
-    ndarray (..., 4)
-        Unit quaternions q_fb, w ≥ 0.
-    """
-    from scipy.spatial.transform import Rotation
-
-    value = array("angles", angles, (..., 3))
-    with _named_sequence(sequence):
-        rotation = Rotation.from_euler(sequence, value.reshape(-1, 3))
-    return _with_positive_w(from_rotation(rotation)).reshape(*value.shape[:-1], 4)
-
-
-@contextlib.contextmanager
-def _named_sequence(sequence: str) -> Iterator[None]:
-    """Raise an InputError for a sequence that is not one of three axes."""
-    if not isinstance(sequence, str) or len(sequence) != 3:
-        raise InputError(f"sequence is {sequence!r}; give three axes, as 'ZYX'")
-    try:
-        yield
-    except ValueError as error:
-        raise InputError(
-            f"sequence {sequence!r} is not a sequence of Euler angles ({error}); give three axes, as 'ZYX'"
-        ) from None
-
-
-def to_mrp(q: ArrayLike) -> Array:
-    """Return the modified Rodrigues parameters p = tan(θ/4) n of unit quaternions.
-
-    Parameters
-    ----------
-    q : array_like (..., 4)
-        Unit quaternions q_fb.
-
-    Returns
-    -------
-    ndarray (..., 3)
-        Parameters of the shorter rotation, ``|p| ≤ 1`` (Schaub & Junkins 1996).
-    """
-    value = unit_quaternions("q", q)
-    return np.asarray(to_rotation(value.reshape(-1, 4)).as_mrp()).reshape(*value.shape[:-1], 3)
-
-
-def from_mrp(mrp: ArrayLike) -> Array:
-    """Return the unit quaternions of modified Rodrigues parameters.
-
-    Parameters
-    ----------
-    mrp : array_like (..., 3)
-        p = tan(θ/4) n; p and its shadow ``−p/|p|²`` are the same attitude.
-
-    Returns
-    -------
-    ndarray (..., 4)
-        Unit quaternions q_fb, w ≥ 0.
-    """
-    from scipy.spatial.transform import Rotation
-
-    value = array("mrp", mrp, (..., 3))
-    return _with_positive_w(from_rotation(Rotation.from_mrp(value.reshape(-1, 3)))).reshape(*value.shape[:-1], 4)
 
 
 def _with_positive_w(q: Array) -> Array:

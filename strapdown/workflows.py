@@ -1,8 +1,8 @@
 """The commonest tasks, one call each: what ``import strapdown as sd`` offers by name, shared with the command line.
 
 Each function chooses what the data specify (noise of the gyro, filter, initial state) and then calls the module that does the work, which
-is the place for more options: :mod:`strapdown.estimation` and :mod:`strapdown.setup`, :mod:`strapdown.ahrs`, :mod:`strapdown.consistency`,
-:mod:`strapdown.montecarlo`, :mod:`strapdown.tuning`, :mod:`strapdown.covariance`, :mod:`strapdown.allan`.
+is the place for more options: :mod:`strapdown.estimation` and :mod:`strapdown.estimation.setup`, :mod:`strapdown.ahrs`,
+:mod:`strapdown.consistency`, :mod:`strapdown.montecarlo`, :mod:`strapdown.tuning`, :mod:`strapdown.covariance`, :mod:`strapdown.allan`.
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ from strapdown import (
     scenarios,
     units,
 )
-from strapdown import setup as setups
 from strapdown.checks import Array, InputError, count, instance
 from strapdown.consistency import Judgement
 from strapdown.covariance import analyse as covariance_analysis
+from strapdown.estimation import setup as setups
 from strapdown.estimation.gating import Gate, Robust
+from strapdown.estimation.setup import FilterSetup, for_record
 from strapdown.estimation.states import ProcessNoise, State
 from strapdown.files import written_beside
 from strapdown.gyro import GyroSpec
 from strapdown.recordings import Recording, recordfiles
 from strapdown.records import Estimate, ImuRecord, Truth
 from strapdown.scenarios import Scenario, simulate
-from strapdown.setup import FilterSetup, for_record
 
 if TYPE_CHECKING:
     from strapdown.allan import AllanDeviation, NoiseFit

@@ -13,10 +13,11 @@ from scipy.spatial.transform import Rotation
 
 import strapdown
 from sims import hand_held
-from strapdown import ahrs, estimation, quaternion, setup
+from strapdown import ahrs, estimation, quaternion
 from strapdown.ahrs import AhrsParameters, estimating, motions
 from strapdown.checks import InputError
 from strapdown.consistency import reference_errors
+from strapdown.estimation import setup
 from strapdown.estimation.error_states import BoundedVelocity
 from strapdown.recordings import Recording, hard_iron, read, sensor_delays, sensor_faults
 from strapdown.records import Estimate, Innovations, read_attributes, read_estimate, read_reference, write_estimate

@@ -17,7 +17,7 @@ import strapdown
 from strapdown import cli, recordings, scenarios
 from strapdown.cli import layout
 from strapdown.cli.terminal import app
-from strapdown.coning_study import ALGORITHMS
+from strapdown.montecarlo.coning_study import ALGORITHMS
 from strapdown.records import read_attributes, read_estimate
 
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -82,7 +82,7 @@ def test_unknown_commands_and_options_end_with_status_2(run, tmp_path):
 
 
 def test_ctrl_c_ends_with_status_130(run, monkeypatch, tmp_path):
-    from strapdown import coning_study
+    from strapdown.montecarlo import coning_study
 
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
@@ -262,7 +262,7 @@ def test_bad_options_end_with_one_clear_line_and_nothing_written(run, tmp_path, 
 
 
 def test_an_output_folder_that_cannot_be_is_said_before_the_work(run, monkeypatch, tmp_path):
-    from strapdown import coning_study
+    from strapdown.montecarlo import coning_study
 
     monkeypatch.setattr(coning_study, "run", lambda *_, **__: pytest.fail("computed before the folder was looked at"))
     (tmp_path / "results").write_text("a file")

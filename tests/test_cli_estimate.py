@@ -10,21 +10,10 @@ import pytest
 from matplotlib.figure import Figure
 
 from sims import hand_held
-from strapdown import (
-    ahrs,
-    coning,
-    consistency,
-    estimation,
-    motion,
-    quaternion,
-    records,
-    report,
-    scenarios,
-    setup,
-    units,
-)
+from strapdown import ahrs, coning, consistency, estimation, motion, quaternion, records, report, scenarios, units
 from strapdown.checks import InputError
 from strapdown.cli.filters import filter_for
+from strapdown.estimation import setup
 from strapdown.estimation.states import ONCE, ProcessNoise
 from strapdown.gyro import GyroSpec
 from strapdown.recordings import unit_calibration

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from strapdown import consistency, montecarlo, motion, records, scenarios, setup, vectors
+from strapdown import consistency, montecarlo, motion, records, scenarios, vectors
 from strapdown.checks import InputError
 from strapdown.consistency.judgement import Finding, holm
+from strapdown.estimation import setup
 from strapdown.gyro import GyroSpec
 from strapdown.montecarlo import campaign
 from strapdown.records import Estimate, Innovations, Truth

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from benchmarks import power
-from strapdown import consistency, estimation, montecarlo, motion, quaternion, scenarios, setup, units, vectors
+from strapdown import consistency, estimation, montecarlo, motion, quaternion, scenarios, units, vectors
+from strapdown.estimation import setup
 from strapdown.gyro import GyroSpec
 from strapdown.randomness import generator
 from strapdown.records import Truth

@@ -11,13 +11,14 @@ from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
 from scipy.stats import chi2, norm
 from typer.testing import CliRunner
 
-from strapdown import cli, coning, consistency, covariance, estimation, montecarlo, motion, quaternion, setup, vectors
+from strapdown import cli, coning, consistency, covariance, estimation, montecarlo, motion, quaternion, vectors
 from strapdown.checks import InputError
 from strapdown.covariance import Consider
+from strapdown.estimation import setup
+from strapdown.estimation.setup import FilterSetup
 from strapdown.estimation.states import ProcessNoise
 from strapdown.gyro import GyroSpec
 from strapdown.scenarios import Scenario, load_scenario, simulate
-from strapdown.setup import FilterSetup
 from strapdown.units import ARCSECOND, DEGREE
 from strapdown.vectors import Faults
 

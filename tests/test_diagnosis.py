@@ -13,25 +13,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from strapdown import (
-    coning,
-    consistency,
-    diagnosis,
-    estimation,
-    motion,
-    quaternion,
-    records,
-    scenarios,
-    setup,
-    units,
-    vectors,
-)
+from strapdown import coning, consistency, estimation, motion, quaternion, records, scenarios, units, vectors
 from strapdown.checks import InputError
-from strapdown.diagnosis.likelihood import log_p
+from strapdown.estimation import setup
 from strapdown.gyro import GyroSpec
 from strapdown.randomness import generator
 from strapdown.recordings import recordfiles
 from strapdown.records import ImuRecord
+from strapdown.tuning import diagnosis
+from strapdown.tuning.diagnosis.likelihood import log_p
 
 WALK = 1.0 * units.DEGREE_PER_ROOT_HOUR
 FIELD = np.array([0.2e-4, 0.0, -0.4e-4])
@@ -405,7 +395,7 @@ def test_missing_and_outlying_measurements_do_not_disturb():
 
 
 def test_outliers_are_counted_and_sized():
-    from strapdown.diagnosis.hypotheses import outliers
+    from strapdown.tuning.diagnosis.hypotheses import outliers
 
     random = np.random.default_rng(0)
     white = random.standard_normal((4000, 2))

@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 
 import strapdown
-from strapdown import estimation, gyro, motion, scenarios, setup, vectors
-from strapdown.diagnosis import Cause
+from strapdown import estimation, gyro, motion, scenarios, vectors
+from strapdown.estimation import setup
 from strapdown.motion.orbit import CircularOrbit
+from strapdown.tuning.diagnosis import Cause
 
 FOR_CHECKERS = {"CircularOrbit": CircularOrbit, "GyroSpec": gyro.GyroSpec, "Scenario": scenarios.Scenario}
 """Types that a module imports for type checkers alone: they stand above it."""

@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 from gated_steps import GatedStepFilter
 
-from strapdown import consistency, estimation, kinematics, motion, quaternion, records, scenarios, setup, vectors
+from strapdown import consistency, estimation, kinematics, motion, quaternion, records, scenarios, vectors
 from strapdown.checks import InputError
-from strapdown.estimation import angular_acceleration, error_states, forward
+from strapdown.estimation import angular_acceleration, error_states, forward, setup
 from strapdown.estimation.gating import Gate, Robust
+from strapdown.estimation.setup import FilterSetup, matching
+from strapdown.estimation.setup import states as optional
+from strapdown.estimation.setup.states import SensorStates, States
 from strapdown.estimation.states import ProcessNoise
 from strapdown.gyro import GyroSpec
 from strapdown.randomness import generator
 from strapdown.records import ImuRecord, Truth
 from strapdown.scenarios import Scenario
-from strapdown.setup import FilterSetup, matching
-from strapdown.setup import states as optional
-from strapdown.setup.states import SensorStates, States
 from strapdown.vectors import VectorMeasurements
 
 NOISE = ProcessNoise(angle_random_walk=1e-3, rate_random_walk=1e-5)

@@ -11,10 +11,13 @@ import numpy as np
 import pytest
 from gated_steps import GatedStepFilter
 
-from strapdown import consistency, estimation, montecarlo, motion, quaternion, records, setup
-from strapdown.estimation import error_states, forward
+from strapdown import consistency, estimation, montecarlo, motion, quaternion, records
+from strapdown.estimation import error_states, forward, setup
 from strapdown.estimation.gating import UNIFORM_SIGMA, Gate, Robust
 from strapdown.estimation.model import Model, assemble
+from strapdown.estimation.setup import FilterSetup
+from strapdown.estimation.setup import states as optional
+from strapdown.estimation.setup.states import SensorStates, States
 from strapdown.estimation.states import ProcessNoise
 from strapdown.gyro import GyroSpec
 from strapdown.kernels import gate_rules, iterated_update, root_form
@@ -23,9 +26,6 @@ from strapdown.kernels.triangle import padded
 from strapdown.randomness import generator
 from strapdown.records import ImuRecord, Truth
 from strapdown.scenarios import Scenario
-from strapdown.setup import FilterSetup
-from strapdown.setup import states as optional
-from strapdown.setup.states import SensorStates, States
 from strapdown.vectors import Accelerometer, Magnetometer, VectorMeasurements
 
 HAND = motion.HarmonicRates(

@@ -8,7 +8,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from strapdown import consistency, scenarios, setup
+from strapdown import consistency, scenarios
+from strapdown.estimation import setup
 from strapdown.montecarlo.scalar import start
 
 LENGTH = {"coning": 12.0, "tumbling-satellite": 120.0, "low-orbit": 2400.0, "magnetometer-only": 5400.0, "rest": 120.0}

@@ -15,19 +15,19 @@ import scipy.integrate
 import scipy.linalg
 
 from sims import hand_held
-from strapdown import ahrs, consistency, estimation, kinematics, motion, quaternion, records, scenarios, setup
+from strapdown import ahrs, consistency, estimation, kinematics, motion, quaternion, records, scenarios
 from strapdown.checks import InputError
 from strapdown.consistency import reference_errors
-from strapdown.estimation import error_states
+from strapdown.estimation import error_states, setup
 from strapdown.estimation.error_states import stationary_covariance
 from strapdown.estimation.model import assemble
+from strapdown.estimation.setup.states import SensorStates, States, from_table
 from strapdown.estimation.states import ProcessNoise
 from strapdown.estimation.step_filter import StepFilter
 from strapdown.gyro import GyroSpec
 from strapdown.kernels.gate_rules import WIDE_PASSES
 from strapdown.recordings import Recording, read
 from strapdown.records import ImuRecord
-from strapdown.setup.states import SensorStates, States, from_table
 from strapdown.units import DEGREE
 from strapdown.vectors import Accelerometer, VectorMeasurements
 

@@ -12,9 +12,10 @@ import pytest
 import scipy.stats
 from scipy.spatial.transform import Rotation
 
-from strapdown import cli, consistency, montecarlo, quaternion, recordings, report, scenarios, setup, vectors
+from strapdown import cli, consistency, montecarlo, quaternion, recordings, report, scenarios, vectors
 from strapdown.checks import InputError
 from strapdown.consistency import check_arrays, foreign
+from strapdown.estimation import setup
 from strapdown.gyro import GyroSpec
 from strapdown.motion import Harmonic, HarmonicRates
 from strapdown.recordings import attitudes, recordfiles, ulog

@@ -7,16 +7,16 @@ import pytest
 from scipy.stats import chi2
 
 import strapdown as sd
-from strapdown import consistency, estimation, montecarlo, records, scenarios, setup
+from strapdown import consistency, estimation, montecarlo, records, scenarios
 from strapdown.checks import InputError
-from strapdown.estimation import error_states
+from strapdown.estimation import error_states, setup
 from strapdown.estimation import temperature as driven
 from strapdown.estimation.gating import Gate
+from strapdown.estimation.setup.for_record import drawn_start
 from strapdown.estimation.states import Candidate, GateMemory
 from strapdown.gyro.temperature import from_table, to_table
 from strapdown.montecarlo import lanes
 from strapdown.recordings import formats, recordfiles
-from strapdown.setup.for_record import drawn_start
 from strapdown.units import DEGREE_PER_HOUR, DEGREE_PER_ROOT_HOUR
 from strapdown.vectors import VectorMeasurements
 

@@ -12,13 +12,13 @@ from strapdown import consistency, estimation, montecarlo, motion, quaternion
 from strapdown.checks import InputError
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.schedule import schedule
+from strapdown.estimation.setup import FilterSetup
 from strapdown.estimation.states import ProcessNoise, initial_state
 from strapdown.gyro import GyroSpec
 from strapdown.randomness import generator
 from strapdown.recordings import recordfiles
 from strapdown.records import ImuRecord
 from strapdown.scenarios import Scenario, simulate
-from strapdown.setup import FilterSetup
 from strapdown.vectors import Accelerometer, AttitudeSensor, Faults, VectorMeasurements, VectorSensor
 
 NOISE = ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-5)

@@ -8,9 +8,9 @@ import scipy.stats
 
 from strapdown import coning, estimation, montecarlo, motion, quaternion
 from strapdown.checks import InputError
-from strapdown.coning_study import ConingParameters
 from strapdown.estimation.states import ProcessNoise
 from strapdown.montecarlo import FilterSetup
+from strapdown.montecarlo.coning_study import ConingParameters
 
 PARAMETERS = ConingParameters(duration=60.0)
 SCENARIO = PARAMETERS.scenario

@@ -20,8 +20,8 @@ import pytest
 from hdf5 import changed
 
 from strapdown import consistency, montecarlo, records, scenarios
-from strapdown import setup as setups
 from strapdown.checks import InputError
+from strapdown.estimation import setup as setups
 from strapdown.files import reading
 from strapdown.montecarlo import campaign, engine, scalar, statistics
 from strapdown.recordings import recordfiles

@@ -15,8 +15,8 @@ import pytest
 
 import strapdown
 from strapdown import cli, montecarlo, scenarios
-from strapdown import setup as setups
 from strapdown.checks import InputError
+from strapdown.estimation import setup as setups
 from strapdown.montecarlo import cluster, engine, statistics
 
 distributed = pytest.importorskip(

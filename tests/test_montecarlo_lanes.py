@@ -7,15 +7,16 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from strapdown import coning, motion, setup, vectors
+from strapdown import coning, motion, vectors
 from strapdown.consistency import errors, nees
+from strapdown.estimation import setup
+from strapdown.estimation.setup import FilterSetup
 from strapdown.estimation.states import ProcessNoise
 from strapdown.gyro import GyroSpec
 from strapdown.montecarlo import lanes, scalar
 from strapdown.montecarlo.plan import Dispersions, Plan
 from strapdown.montecarlo.statistics import Statistics
 from strapdown.scenarios import Scenario
-from strapdown.setup import FilterSetup
 
 ARW, RRW = 1e-4, 1e-5
 NOISE = ProcessNoise(angle_random_walk=ARW, rate_random_walk=RRW)

@@ -8,12 +8,12 @@ from functools import cache
 import numpy as np
 import pytest
 
-from strapdown import consistency, montecarlo, motion, scenarios, setup, vectors
-from strapdown.estimation import together
+from strapdown import consistency, montecarlo, motion, scenarios, vectors
+from strapdown.estimation import setup, together
+from strapdown.estimation.setup import FilterSetup, SensorStates, States
 from strapdown.estimation.states import ProcessNoise
 from strapdown.gyro import GyroSpec
 from strapdown.montecarlo import scalar, statistics
-from strapdown.setup import FilterSetup, SensorStates, States
 
 FIELD = np.array([20000.0, 3000.0, -43000.0])
 GYRO = GyroSpec(

@@ -14,8 +14,8 @@ import pytest
 import scipy.stats
 
 from strapdown import consistency, estimation, montecarlo, quaternion, scenarios
-from strapdown import setup as setups
 from strapdown.checks import InputError
+from strapdown.estimation import setup as setups
 from strapdown.montecarlo import campaign, engine, plan, scalar, statistics
 from strapdown.montecarlo.statistics import BINS, ERROR_EXPONENT, NEES_EXPONENT, bin_edges, bin_of
 

@@ -8,10 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from strapdown import coning, coning_study, motion, setup
+from strapdown import coning, motion
 from strapdown.checks import InputError
 from strapdown.coning import ALGORITHMS, Algorithm
 from strapdown.coning import coefficients as exact
+from strapdown.estimation import setup
+from strapdown.montecarlo import coning_study
 from strapdown.units import DEGREE
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "docs" / "examples"

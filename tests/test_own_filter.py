@@ -19,12 +19,11 @@ from strapdown import (
     motion,
     quaternion,
     scenarios,
-    setup,
     tuning,
     vectors,
 )
 from strapdown.checks import InputError
-from strapdown.estimation import filters
+from strapdown.estimation import filters, setup
 from strapdown.estimation.filters import extended
 from strapdown.gyro import GyroSpec
 from strapdown.montecarlo import Plan, campaign, verdicts

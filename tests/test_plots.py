@@ -12,21 +12,10 @@ import pytest
 from hypothesis import strategies as st
 from matplotlib.colors import to_rgb
 
-from strapdown import (
-    coning,
-    consistency,
-    covariance,
-    gyro,
-    montecarlo,
-    plots,
-    quaternion,
-    records,
-    scenarios,
-    setup,
-    units,
-)
+from strapdown import coning, consistency, covariance, gyro, montecarlo, plots, quaternion, records, scenarios, units
 from strapdown.checks import InputError
-from strapdown.coning_study import Drift, FilterOutcome
+from strapdown.estimation import setup
+from strapdown.montecarlo.coning_study import Drift, FilterOutcome
 from strapdown.montecarlo.statistics import BINS_PER_OCTAVE
 from strapdown.plots import decimation, estimates, style
 

@@ -15,7 +15,8 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, f, norm
 
-from strapdown import estimation, gyro, motion, scenarios, setup, vectors
+from strapdown import estimation, gyro, motion, scenarios, vectors
+from strapdown.estimation import setup
 
 DEGREE_PER_HOUR = math.pi / 180.0 / 3600.0
 

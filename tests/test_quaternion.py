@@ -237,61 +237,6 @@ def test_a_turn_of_any_norm_is_one():
     assert np.isfinite(quaternion.exp([-1e149, 1e149, 0.0])).all()
 
 
-# ---------------------------------------------------------------------------------------------------- other parameters
-
-
-def elementary(axis: int, angle: float) -> np.ndarray:
-    """The rotation by an angle about a coordinate axis, written out."""
-    c, s = np.cos(angle), np.sin(angle)
-    i, j = (axis + 1) % 3, (axis + 2) % 3
-    R = np.eye(3)
-    R[i, i], R[i, j], R[j, i], R[j, j] = c, -s, s, c
-    return R
-
-
-@pytest.mark.parametrize("sequence", ["ZYX", "xyz", "ZXZ", "XYZ", "zxz"])
-def test_euler_angles_are_products_of_three_turns(sequence):
-    angles = np.array([0.4, 0.9, -2.1])
-    turns = [elementary("xyz".index(axis), angle) for axis, angle in zip(sequence.lower(), angles, strict=True)]
-    # About the body's axes each turn multiplies on the right, about the fixed ones on the left.
-    R = turns[0] @ turns[1] @ turns[2] if sequence.isupper() else turns[2] @ turns[1] @ turns[0]
-    close(quaternion.to_matrix(quaternion.from_euler(angles, sequence)), R)
-    close(quaternion.to_euler(quaternion.from_matrix(R), sequence), angles)
-
-
-def test_yaw_pitch_and_roll_are_those_of_an_aircraft():
-    """x forward, y right, z down, fixed axes north, east, down: a climb of 30° to the east, and the right wing down."""
-    q = quaternion.from_euler(np.radians([90.0, 30.0, 20.0]))
-    close(quaternion.rotate(q, [1.0, 0.0, 0.0]), [0.0, np.cos(np.pi / 6), -0.5])
-    assert quaternion.rotate(q, [0.0, 1.0, 0.0])[2] == pytest.approx(np.sin(np.radians(20.0)) * np.cos(np.pi / 6))
-
-
-@pytest.mark.parametrize("shape", SHAPES)
-def test_other_parameters_keep_leading_axes_and_come_back(shape):
-    q = random_quaternions(shape)
-    positive = np.where(q[..., :1] < 0.0, -q, q)
-    close(quaternion.from_euler(quaternion.to_euler(q)), positive, 16.0)
-    close(quaternion.from_mrp(quaternion.to_mrp(q)), positive, 16.0)
-    assert quaternion.to_euler(q).shape == quaternion.to_mrp(q).shape == (*shape, 3)
-
-
-def test_mrp_are_the_tangent_of_a_quarter_of_the_turn():
-    axis = np.array([2.0, -1.0, 2.0]) / 3.0
-    for angle in (1e-8, 0.7, 3.0):
-        close(quaternion.to_mrp(quaternion.exp(angle * axis)), np.tan(angle / 4.0) * axis)
-    p = np.tan(1.0) * axis  # a turn of 4 rad, and the way back of 4 − 2π
-    close(quaternion.from_mrp(p), quaternion.from_mrp(-p / (p @ p)))
-    close(quaternion.to_mrp(quaternion.from_mrp(p)), -p / (p @ p))
-
-
-@pytest.mark.parametrize("sequence", ["ZYZX", "", "abc", "ZZX", "zYX", 3])
-def test_a_sequence_of_no_euler_angles_is_refused(sequence):
-    with pytest.raises(InputError, match="sequence"):
-        quaternion.to_euler(quaternion.IDENTITY, sequence)
-    with pytest.raises(InputError, match="sequence"):
-        quaternion.from_euler(np.zeros(3), sequence)
-
-
 # ---------------------------------------------------------------------------------------------------- the mean
 
 

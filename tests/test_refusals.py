@@ -12,12 +12,13 @@ import pytest
 from hdf5 import changed
 from typer.testing import CliRunner
 
-from strapdown import cli, consistency, records, scenarios, setup
+from strapdown import cli, consistency, records, scenarios
 from strapdown.checks import InputError, count
 from strapdown.cli.terminal import scenario_named
+from strapdown.estimation import setup
+from strapdown.estimation.setup.states import States
 from strapdown.files import reading
 from strapdown.recordings import recordfiles
-from strapdown.setup.states import States
 
 
 @pytest.fixture(scope="module")

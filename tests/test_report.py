@@ -14,8 +14,9 @@ import pytest
 from matplotlib.figure import Figure
 from typer.testing import CliRunner
 
-from strapdown import cli, coning, gyro, montecarlo, plots, records, report, scenarios, setup
+from strapdown import cli, coning, gyro, montecarlo, plots, records, report, scenarios
 from strapdown.checks import InputError
+from strapdown.estimation import setup
 from strapdown.montecarlo import campaign
 from strapdown.report import page
 

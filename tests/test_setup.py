@@ -7,12 +7,13 @@ import dataclasses
 import numpy as np
 import pytest
 
-from strapdown import coning, consistency, estimation, quaternion, records, scenarios, setup, units
+from strapdown import coning, consistency, estimation, quaternion, records, scenarios, units
 from strapdown.checks import InputError
+from strapdown.estimation import setup
 from strapdown.estimation.gating import Gate, Robust
+from strapdown.estimation.setup import FilterSetup
 from strapdown.gyro import GyroSpec
 from strapdown.randomness import generator
-from strapdown.setup import FilterSetup
 
 SETUP = FilterSetup(
     process_noise=estimation.ProcessNoise(angle_random_walk=1.234567e-5, rate_random_walk=3.3e-8),

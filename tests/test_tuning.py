@@ -13,16 +13,17 @@ import two_stars
 from scipy.optimize import brentq
 from two_stars import ARW, BELIEVED, FREE, RRW, case, scenario
 
-from strapdown import consistency, gyro, motion, quaternion, scenarios, setup, tuning, units, vectors
+from strapdown import consistency, gyro, motion, quaternion, scenarios, tuning, units, vectors
 from strapdown.checks import InputError
+from strapdown.estimation import setup
 from strapdown.estimation.gating import Gate, Robust
+from strapdown.estimation.setup import FilterSetup
+from strapdown.estimation.setup.states import States
 from strapdown.estimation.states import ProcessNoise
 from strapdown.kernels import likelihood
 from strapdown.kernels.lane_values import WIDTH
 from strapdown.kernels.series import LARGEST_ANGLE
 from strapdown.records import ImuRecord, Truth
-from strapdown.setup import FilterSetup
-from strapdown.setup.states import States
 from strapdown.tuning import fitting, innovations, parameters, planning
 from strapdown.tuning.parameters import own_sigma
 from strapdown.vectors import VectorMeasurements

@@ -8,8 +8,9 @@ import json
 import numpy as np
 import pytest
 
-from strapdown import covariance, gyro, montecarlo, motion, quaternion, scenarios, setup, tuning, units, vectors
+from strapdown import covariance, gyro, montecarlo, motion, quaternion, scenarios, tuning, units, vectors
 from strapdown.checks import InputError
+from strapdown.estimation import setup
 from strapdown.montecarlo import lanes
 from strapdown.montecarlo.scalar import start
 from strapdown.recordings import recordfiles

@@ -10,11 +10,12 @@ import pytest
 
 import strapdown as sd
 from sims import hand_held
-from strapdown import gyro, motion, scenarios, setup, tuning, vectors
+from strapdown import gyro, motion, scenarios, tuning, vectors
 from strapdown.checks import InputError
+from strapdown.estimation import setup
 from strapdown.estimation.gating import Gate
+from strapdown.estimation.setup import FilterSetup
 from strapdown.recordings import recordfiles
-from strapdown.setup import FilterSetup
 
 SCENARIO = scenarios.Scenario(
     name="two stars",

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 from scipy import optimize
 
-from strapdown import coning, consistency, estimation, gyro, motion, scenarios, setup, tuning, vectors
+from strapdown import coning, consistency, estimation, gyro, motion, scenarios, tuning, vectors
 from strapdown.checks import InputError
+from strapdown.estimation import setup
+from strapdown.estimation.setup.states import SensorStates, States
 from strapdown.montecarlo.scalar import start
 from strapdown.randomness import generator
 from strapdown.scenarios import Scenario
-from strapdown.setup.states import SensorStates, States
 from strapdown.tuning import parameters
 
 SWAY = motion.HarmonicRates(

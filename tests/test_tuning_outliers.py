@@ -11,14 +11,15 @@ import two_stars
 from scipy.stats import chi2, norm
 from two_stars import BELIEVED, FREE, TRUTH, WRONG
 
-from strapdown import gyro, motion, quaternion, scenarios, setup, tuning, vectors
+from strapdown import gyro, motion, quaternion, scenarios, tuning, vectors
 from strapdown.checks import InputError
+from strapdown.estimation import setup
 from strapdown.estimation.gating import Gate
+from strapdown.estimation.setup import FilterSetup
 from strapdown.estimation.states import ProcessNoise
 from strapdown.recordings import recordfiles
 from strapdown.records import ImuRecord
 from strapdown.report import tunings
-from strapdown.setup import FilterSetup
 from strapdown.tuning import innovations, outliers
 from strapdown.vectors import VectorMeasurements
 

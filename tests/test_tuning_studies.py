@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 from two_stars import BELIEVED, FREE, scenario
 
-from strapdown import coning, consistency, covariance, gyro, montecarlo, scenarios, setup, tuning, vectors
+from strapdown import coning, consistency, covariance, gyro, montecarlo, scenarios, tuning, vectors
 from strapdown.ahrs import AhrsParameters
 from strapdown.consistency import reference_errors
+from strapdown.estimation import setup
+from strapdown.estimation.setup import FilterSetup
 from strapdown.recordings import read
-from strapdown.setup import FilterSetup
 from strapdown.units import DEGREE
 
 

@@ -9,15 +9,16 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from strapdown import motion, scenarios, setup, tuning, vectors
+from strapdown import motion, scenarios, tuning, vectors
 from strapdown.checks import InputError
-from strapdown.diagnosis import Cause, turning
+from strapdown.estimation import setup
 from strapdown.estimation.gating import Gate
 from strapdown.gyro import GyroSpec
 from strapdown.recordings import recordfiles
 from strapdown.records import Origin
 from strapdown.report import tunings
 from strapdown.tuning import residual_checks
+from strapdown.tuning.diagnosis import Cause, turning
 
 SPEC = GyroSpec(angle_random_walk=3e-5, rate_random_walk=2e-7, turn_on_bias_sigma=1e-5)
 

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from strapdown import gyro, motion, scenarios, tuning, vectors
+from strapdown.estimation.setup import FilterSetup
 from strapdown.estimation.states import ProcessNoise
-from strapdown.setup import FilterSetup
 
 ARW, RRW = 1e-4, 3e-6
 SIGMAS = (1e-4, 2e-4)

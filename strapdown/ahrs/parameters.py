@@ -9,8 +9,8 @@ import numpy as np
 
 from strapdown import estimation
 from strapdown.checks import instance, non_negative, positive
-from strapdown.setup import FilterSetup
-from strapdown.setup.states import SensorStates, States
+from strapdown.estimation.setup import FilterSetup
+from strapdown.estimation.setup.states import SensorStates, States
 from strapdown.units import DEGREE
 
 MIN_VELOCITY = 0.1

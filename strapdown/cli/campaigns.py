@@ -243,8 +243,8 @@ def asked_to_stop() -> Iterator[Callable[[], None]]:
 def _plan(scenario: str, model: _Model) -> Plan:
     from strapdown import montecarlo as engine
     from strapdown import workflows
+    from strapdown.estimation.setup import FilterSetup
     from strapdown.gyro import read_spec
-    from strapdown.setup import FilterSetup
 
     if model.states is not None and model.filter_file is not None:
         raise InputError("--filter names the whole filter, its states too; leave --states and --no-states out")
@@ -288,9 +288,9 @@ def _with_filter(held: Campaign, own: Own, source: Path) -> Campaign:
 def _print_result(campaign: Campaign) -> tuple[int, dict[str, Any]]:
     """Show the statistics and the verdict, that of `strapdown check`; return the exit status, and all as it is written to JSON."""
     from strapdown.cli.judgement import status_of
+    from strapdown.estimation.setup import MEKF
     from strapdown.montecarlo import summary
     from strapdown.montecarlo.verdicts import bound_of
-    from strapdown.setup import MEKF
 
     if campaign.statistics is None:
         raise InputError("no chunk of the campaign is finished; go on with it (--resume)")
@@ -404,8 +404,9 @@ def _replayed(target: Path, run: int) -> list[Path]:
 
 def _replay(plan: Plan, run: int, machine: str, target: Path) -> None:
 
-    from strapdown import consistency, setup
+    from strapdown import consistency
     from strapdown import montecarlo as engine
+    from strapdown.estimation import setup
     from strapdown.recordings import recordfiles
     from strapdown.records import Origin, Truth, write_estimate
     from strapdown.scenarios import scenario_to_toml

@@ -32,11 +32,11 @@ from strapdown.units import DEGREE, DEGREE_PER_HOUR, DEGREE_PER_HOUR_PER_ROOT_HO
 
 if TYPE_CHECKING:
     from strapdown.ahrs import AhrsEstimate, AhrsParameters, Begun
+    from strapdown.estimation.setup import FilterSetup
+    from strapdown.estimation.setup.for_record import Start
     from strapdown.estimation.states import State
     from strapdown.recordings import Recording
     from strapdown.records import Estimate, ImuRecord, Origin
-    from strapdown.setup import FilterSetup
-    from strapdown.setup.for_record import Start
     from strapdown.workflows import RecordRun
 
     Exports = Sequence[tuple[Path, dict[str, Any]]]
@@ -297,7 +297,7 @@ def _write_specified(
     path: Path, origin: Origin | None, chosen: FilterSetup, run: RecordRun, shared: _Shared, out: Path
 ) -> list[Path]:
     """Write the estimate and what is known of it, and print its errors; return the files."""
-    from strapdown import setup
+    from strapdown.estimation import setup
     from strapdown.recordings.recordfiles import origin_attributes
     from strapdown.records import write_estimate
 
@@ -330,7 +330,7 @@ def _say_nis(result: Estimate, path: Path) -> None:
 
 def _observability(out: Path, source: str, record: ImuRecord, chosen: FilterSetup, initial: State) -> Path:
     """Print and write how observable each state is; return the file."""
-    from strapdown import setup
+    from strapdown.estimation import setup
 
     with progress_bar("observability"):
         shown = setup.observability(record, chosen, initial)
@@ -406,8 +406,8 @@ def _print_states(result: Any, record: ImuRecord) -> dict[str, Any]:
 
 def _start(record: ImuRecord, chosen: FilterSetup, attitude: str | None, from_truth: bool) -> Start | None:
     """Return the start that the options give; None: from the first measurements."""
-    from strapdown import setup
-    from strapdown.setup.for_record import Start, drawn_start
+    from strapdown.estimation import setup
+    from strapdown.estimation.setup.for_record import Start, drawn_start
 
     if attitude is not None and from_truth:
         raise InputError("--attitude and --from-truth both give the start; give one of them")
@@ -552,7 +552,7 @@ def _write_recording(
     result: AhrsEstimate, parameters: AhrsParameters, chosen: FilterSetup, motion: str, smoothed: bool, out: Path
 ) -> list[Path]:
     """Write the estimate, its states and the calibration; return the files."""
-    from strapdown import setup
+    from strapdown.estimation import setup
     from strapdown.recordings import unit_calibration
     from strapdown.records import write_estimate
 

@@ -13,9 +13,9 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from strapdown.estimation.filters.own import Own
+    from strapdown.estimation.setup import FilterSetup
     from strapdown.records import ImuRecord
     from strapdown.scenarios import Scenario
-    from strapdown.setup import FilterSetup
 
 
 ChosenStates = tuple[str, ...] | Literal[False] | None
@@ -30,9 +30,9 @@ def filter_for(
     states: ChosenStates,
 ) -> tuple[FilterSetup, list[str]]:
     """Return the filter, and what to say of it: of a file, or matched to the gyro's specification and the record's sensors."""
-    from strapdown import setup
+    from strapdown.estimation import setup
+    from strapdown.estimation.setup.for_record import unmodelled_errors
     from strapdown.gyro import read_spec
-    from strapdown.setup.for_record import unmodelled_errors
 
     if filter_file is not None:
         if states is not None:
@@ -73,7 +73,7 @@ def default_words(names: Sequence[str]) -> str:
 
 def need_angles(filter_file: Path, chosen: FilterSetup, record: ImuRecord) -> None:
     """Refuse σ of the record's sensors that cannot be in rad, but where the record's own are as wide."""
-    from strapdown import setup
+    from strapdown.estimation import setup
 
     fine = {one.sensor: one.kind for one in record.vectors if len(one.time) and np.max(one.sigma) <= np.pi}
     setup.need_angles(chosen, fine, f"{filter_file}: filter")
@@ -81,7 +81,7 @@ def need_angles(filter_file: Path, chosen: FilterSetup, record: ImuRecord) -> No
 
 def filter_of_scenario(filter_file: Path, scenario: Scenario) -> FilterSetup:
     """Read a filter for the sensors of a scenario."""
-    from strapdown import setup
+    from strapdown.estimation import setup
 
     chosen = setup.read_setup(filter_file)
     kinds = {sensor.name: str(getattr(sensor, "kind", "attitude")) for sensor in scenario.sensors}

@@ -32,9 +32,9 @@ from strapdown.files import reading
 if TYPE_CHECKING:
     from strapdown.consistency import Judgement
     from strapdown.consistency.foreign import Checked
-    from strapdown.diagnosis import Diagnosis
+    from strapdown.estimation.setup import FilterSetup
     from strapdown.records import Estimate, ImuRecord, Truth
-    from strapdown.setup import FilterSetup
+    from strapdown.tuning.diagnosis import Diagnosis
 
 CONSISTENT, NOT, CANNOT_TELL = 0, 1, 2
 """Exit status of a verdict. Bad input ends with 2 too, and an error on standard error."""
@@ -245,9 +245,10 @@ def _diagnosed(
     result: Path, record: Path, filter_file: Path | None, judgement: Judgement
 ) -> tuple[dict[str, Any], Diagnosis | None]:
     """Show the causes that a record gives evidence of; return them as plain values, and with the verdict by all evidence, if any."""
-    from strapdown import diagnosis, estimation, records
+    from strapdown import estimation, records
+    from strapdown.estimation.setup.for_record import unmodelled_errors
     from strapdown.recordings import recordfiles
-    from strapdown.setup.for_record import unmodelled_errors
+    from strapdown.tuning import diagnosis
     from strapdown.tuning.residual_checks import accepted
 
     chosen = _filter_of(result, filter_file)
@@ -280,7 +281,8 @@ def _diagnosed(
 
 def _filter_of(result: Path, filter_file: Path | None) -> FilterSetup:
     """Return the setup that an estimate was made with, as a file gives it or as the estimate itself does."""
-    from strapdown import records, setup
+    from strapdown import records
+    from strapdown.estimation import setup
 
     if filter_file is not None:
         return setup.read_setup(filter_file)

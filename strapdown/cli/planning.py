@@ -116,7 +116,8 @@ def covariance(
 ) -> None:
     """Predict a filter's errors and their budget by source, in one pass without noise."""
     from strapdown import covariance as analysis
-    from strapdown import plots, setup
+    from strapdown import plots
+    from strapdown.estimation import setup
     from strapdown.plots.style import save_as
 
     errors.check()

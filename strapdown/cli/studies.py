@@ -30,7 +30,7 @@ from strapdown.units import DEGREE
 
 if TYPE_CHECKING:
     from strapdown.coning import Algorithm
-    from strapdown.coning_study import ConingParameters
+    from strapdown.montecarlo.coning_study import ConingParameters
 
 MIN_SAMPLES_A_CYCLE = 0.1
 """With fewer a step holds more than ten turns of the cone, and nothing of the study means anything."""
@@ -44,7 +44,7 @@ def _drift(value: float | None) -> str:
 
 def _show_own(own: tuple[Algorithm, ...]) -> None:
     """Show what follows from the coefficients of one's own algorithms."""
-    from strapdown.coning_study import own_summary
+    from strapdown.montecarlo.coning_study import own_summary
 
     if not own:
         return
@@ -97,7 +97,7 @@ class _Scenario:
 
     def parameters(self, own: tuple[Algorithm, ...]) -> ConingParameters:
         """Return the parameters of the study, ``own`` algorithms compared too; what no algorithm follows is refused."""
-        from strapdown import coning_study
+        from strapdown.montecarlo import coning_study
 
         if positive("--angle", self.angle, unit="degrees") >= 90.0:  # in the unit that it was given in
             raise InputError(f"--angle is {self.angle:g} degrees; a cone's half-angle is below a right angle")
@@ -124,8 +124,9 @@ def coning(
     tables: Path | None = TABLES,
 ) -> None:
     """Study coning: the drift of each integration algorithm, and what a filter makes of it."""
-    from strapdown import coning_study, plots
+    from strapdown import plots
     from strapdown.coning import read_algorithms
+    from strapdown.montecarlo import coning_study
 
     own = tuple(one for path in algorithm or () for one in read_algorithms(path))
     parameters = motion.parameters(own)

@@ -32,10 +32,10 @@ from strapdown.files import plain, write_json, written_beside
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from strapdown.estimation.setup import FilterSetup
     from strapdown.gyro import GyroSpec
     from strapdown.records import ImuRecord
     from strapdown.scenarios import Scenario
-    from strapdown.setup import FilterSetup
     from strapdown.tuning import Case, Comparison, TunedGate, Tuning, Unmodelled
 
 
@@ -77,7 +77,7 @@ class _Filter:
 
     def setup(self) -> FilterSetup | None:
         """Return the filter of the file, if there is one."""
-        from strapdown.setup import read_setup
+        from strapdown.estimation.setup import read_setup
 
         chosen = None if self.filter_file is None else read_setup(self.filter_file)
         if self.states and chosen is not None:
@@ -399,10 +399,10 @@ def _print_comparison(comparison: Comparison, *, truth: bool) -> None:
 
 def _write(found: _Found, paths: Sequence[Path], of: str, output: _Output) -> None:
     from strapdown import tuning
+    from strapdown.estimation.setup import to_toml
     from strapdown.plots import tuning as drawing
     from strapdown.plots.style import save_as
     from strapdown.report import tunings
-    from strapdown.setup import to_toml
 
     out, result = output.out, found.result
     with written_beside(out) as temporary:
@@ -459,7 +459,8 @@ def _report(found: _Found, paths: Sequence[Path], of: str) -> dict[str, Any]:
 def _plan(
     sources: Sequence[Path], chosen: FilterSetup | None, start: _Filter, length: str | None, threads: int
 ) -> None:
-    from strapdown import scenarios, setup, tuning
+    from strapdown import scenarios, tuning
+    from strapdown.estimation import setup
     from strapdown.recordings import recordfiles
 
     if len(sources) != 1:

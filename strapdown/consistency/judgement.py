@@ -252,7 +252,8 @@ def judge(
     error_states : sequence of str, optional
         Names of the filter's error states, where the estimate does not hold them.
     unmodelled : sequence of str, default empty
-        Errors that are specified and that the filter has no state for (:func:`strapdown.setup.unmodelled_errors`); the verdict names them.
+        Errors that are specified and that the filter has no state for (:func:`strapdown.estimation.setup.unmodelled_errors`); the verdict
+        names them.
 
     Returns
     -------

@@ -15,6 +15,7 @@ tangent space.
 - ``step_filter``: The filter step by step, on filterpy.
 - ``multiple_model``: Unknown start, one vector at a time.
 - ``filters``: Other filters on the same interface, for comparison.
+- ``setup``: The setup of a filter, matched to a scenario or read from a file, and the filter of a setup over a record.
 """
 
 from importlib import import_module
@@ -49,6 +50,7 @@ __all__ = [
 if TYPE_CHECKING:
     from strapdown.estimation import filters as filters
     from strapdown.estimation import multiple_model as multiple_model
+    from strapdown.estimation import setup as setup
     from strapdown.estimation.step_filter import StepFilter
 
 
@@ -57,6 +59,6 @@ def __getattr__(name: str) -> Any:
         from strapdown.estimation.step_filter import StepFilter
 
         return StepFilter
-    if name in ("filters", "multiple_model"):
+    if name in ("filters", "multiple_model", "setup"):
         return import_module(f"{__name__}.{name}")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

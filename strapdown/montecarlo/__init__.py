@@ -10,6 +10,7 @@ order, so the statistics do not depend on the number of threads, processes or ho
 - ``verdicts``: Verdict and numbers from statistics, as a table: :func:`summary`.
 - ``campaign``: A run that survives being killed, and its file.
 - ``cluster``: Chunks on other processes and hosts, through Dask.
+- ``coning_study``: Integration error and consistency of the filter in coning motion: the command ``strapdown coning``.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from strapdown.estimation.setup import FilterSetup as FilterSetup
 from strapdown.montecarlo.engine import choose as choose
 from strapdown.montecarlo.engine import in_threads as in_threads
 from strapdown.montecarlo.engine import replay, run, run_plan
@@ -29,7 +31,6 @@ from strapdown.montecarlo.statistics import Statistics
 from strapdown.montecarlo.statistics import judged_epochs as judged_epochs
 from strapdown.montecarlo.statistics import merge as merge
 from strapdown.montecarlo.verdicts import summary
-from strapdown.setup import FilterSetup as FilterSetup
 
 __all__ = [
     "Dispersions",
@@ -44,9 +45,10 @@ __all__ = [
 if TYPE_CHECKING:
     from strapdown.montecarlo import campaign as campaign
     from strapdown.montecarlo import cluster as cluster
+    from strapdown.montecarlo import coning_study as coning_study
 
 
 def __getattr__(name: str) -> Any:
-    if name in ("campaign", "cluster"):  # files and Dask load when they are needed
+    if name in ("campaign", "cluster", "coning_study"):  # files and Dask load when they are needed
         return import_module(f"{__name__}.{name}")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

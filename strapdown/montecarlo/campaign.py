@@ -25,8 +25,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import strapdown
-from strapdown import scenarios, setup
+from strapdown import scenarios
 from strapdown.checks import InputError, count, finite, one_of
+from strapdown.estimation import setup
 from strapdown.files import locked, reading, set_attributes, whole_hdf5
 from strapdown.montecarlo.engine import MACHINES, Chunks, Work, Workers, arithmetic, choose, in_threads, machine_named
 from strapdown.montecarlo.plan import Plan, from_table

@@ -11,12 +11,12 @@ from threading import Thread
 from typing import Any
 
 from strapdown.checks import InputError, count, one_of
+from strapdown.estimation.setup import FilterSetup
 from strapdown.montecarlo import scalar
 from strapdown.montecarlo.plan import Plan
 from strapdown.montecarlo.statistics import Replay, Statistics, merge
 from strapdown.records import Origin
 from strapdown.scenarios import Scenario
-from strapdown.setup import FilterSetup
 
 Parts = tuple[Statistics, ...]
 """Statistics of the same runs, one a plan."""

@@ -25,8 +25,9 @@ from typing import Any
 
 import numpy as np
 
-from strapdown import estimation, quaternion, setup, vectors
+from strapdown import estimation, quaternion, vectors
 from strapdown.checks import Array, count
+from strapdown.estimation import setup
 from strapdown.estimation.schedule import Schedule, schedule
 from strapdown.estimation.states import covariance_matrices
 from strapdown.gyro import GyroSpec, flicker

@@ -11,11 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from strapdown import scenarios, setup
+from strapdown import scenarios
 from strapdown.checks import Array, InputError, array, count, non_negative, one_of
+from strapdown.estimation import setup
+from strapdown.estimation.setup import FilterSetup
 from strapdown.files import tables
 from strapdown.scenarios import Scenario
-from strapdown.setup import FilterSetup
 
 PRECISIONS = ("float64", "float32")
 
@@ -114,9 +115,9 @@ _FORM: tables.Form = {
 class Plan:
     """Definition of a campaign: everything that run number k depends on, and the epochs of the statistics.
 
-    Filter and truth are separate: a ``setup`` that differs from :meth:`strapdown.setup.FilterSetup.for_scenario` is a mismatched filter.
-    Outages, outliers and correlated noise are the scenario's sensors'. A plan is compared and hashed by identity, so a machine may keep
-    what it derives from one in a ``weakref.WeakKeyDictionary``.
+    Filter and truth are separate: a ``setup`` that differs from :meth:`strapdown.estimation.setup.FilterSetup.for_scenario` is a mismatched
+    filter. Outages, outliers and correlated noise are the scenario's sensors'. A plan is compared and hashed by identity, so a machine may
+    keep what it derives from one in a ``weakref.WeakKeyDictionary``.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
 """The scalar machine: any scenario and any filter; each run goes through the simulator, and one after the other through the filter.
 
-Filters with error states run eight at once (:func:`strapdown.setup.run_together`). A run's bits depend neither on the runs beside it nor on
-whether it is one of a campaign or a replay.
+Filters with error states run eight at once (:func:`strapdown.estimation.setup.run_together`). A run's bits depend neither on the runs
+beside it nor on whether it is one of a campaign or a replay.
 """
 
 from __future__ import annotations
@@ -19,9 +19,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from strapdown import consistency, estimation, setup
+from strapdown import consistency, estimation
 from strapdown.checks import Array, InputError, count
+from strapdown.estimation import setup
 from strapdown.estimation.filters.own import Own
+from strapdown.estimation.setup import FilterSetup
 from strapdown.gyro import GyroSpec
 from strapdown.montecarlo.plan import Dispersions, Plan
 from strapdown.montecarlo.statistics import (
@@ -38,7 +40,6 @@ from strapdown.motion import Motion
 from strapdown.randomness import generator
 from strapdown.records import Estimate, ImuRecord
 from strapdown.scenarios import Scenario, drawn, simulate
-from strapdown.setup import FilterSetup
 
 NAME = "scalar"
 CHUNK = 8

@@ -9,10 +9,10 @@ import numpy as np
 
 from strapdown import consistency, covariance, units
 from strapdown.checks import Array, InputError
+from strapdown.estimation.setup import MEKF, FilterSetup
 from strapdown.files import plain
 from strapdown.montecarlo.plan import Plan
 from strapdown.montecarlo.statistics import COVERED, Counts, Statistics, judged_epochs
-from strapdown.setup import MEKF, FilterSetup
 
 QUANTILES = (0.5, 0.95, 0.997)
 """Quantiles of the last epoch's errors in the summary."""

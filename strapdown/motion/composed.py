@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from strapdown import checks, kinematics, quaternion
+from strapdown import checks, quaternion
 from strapdown.checks import Array
 from strapdown.motion.parameters import edge_stamps, times
 from strapdown.motion.protocol import Motion, break_times
@@ -45,7 +45,7 @@ class Composed:
 
     def _carried_rate(self, time: Array) -> Array:
         """Return R_vᵀ w_base: the rate of the base in body axes."""
-        return kinematics.fixed_to_body_rate(self.vibration.attitude(time), self.base.body_rate(time))
+        return quaternion.rotate(quaternion.conjugate(self.vibration.attitude(time)), self.base.body_rate(time))
 
     def attitude(self, time: ArrayLike) -> Array:
         """Return q_fb (..., 4)."""

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from strapdown.coning_study import (
+from strapdown.montecarlo.coning_study import (
     MANOEUVRE_SECONDS,
     MANOEUVRES,
     ConingStudy,

@@ -6,9 +6,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from strapdown import consistency, setup
+from strapdown import consistency
 from strapdown.checks import InputError
 from strapdown.consistency import Judgement
+from strapdown.estimation import setup
 from strapdown.records import Estimate, Truth, read_reference
 from strapdown.report import page
 from strapdown.scenarios import scenario_from_toml

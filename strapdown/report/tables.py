@@ -138,7 +138,7 @@ def _heading(key: str) -> str:
 
 
 def of_coning(summary: Mapping[str, Any]) -> list[Table]:
-    """Return the tables of a coning study's :meth:`~strapdown.coning_study.ConingStudy.summary`: ``drift`` and ``filters``."""
+    """Return the tables of a coning study's :meth:`~strapdown.montecarlo.coning_study.ConingStudy.summary`: ``drift`` and ``filters``."""
     scenario = summary["scenario"]
     case = f"coning {scenario['angle_deg']:g}° at {scenario['frequency_hz']:g} Hz, gyro at {scenario['rate_hz']:g} Hz"
     rows = [{**row, "bias_mean_z_deg_per_hour": row["bias_mean_deg_per_hour"][2]} for row in summary["filter"]]

@@ -10,6 +10,7 @@
 - ``initialization``: Where the filter starts on a record.
 - ``planning``: The Cramér–Rao bound before there is a record.
 - ``residual_checks``: What the tuned filter leaves unexplained, such as a scale factor that the gyro's noise stands for.
+- ``diagnosis``: Why a filter is inconsistent: the hypothesis under which the record is the likeliest.
 - ``own``: Parameters of a filter of one's own, by the same objectives.
 - ``validation``: What is held out, and the filter before and after on it.
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from strapdown import consistency
 from strapdown.checks import Array, InputError, one_of
-from strapdown.setup import FilterSetup
+from strapdown.estimation.setup import FilterSetup
 from strapdown.tuning.innovations import MOST, LaneLikelihood, RunLikelihood, made, with_engine
 from strapdown.tuning.objective import STEP, Case, Derivatives, Objective, by_part, posed
 

@@ -16,8 +16,8 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from strapdown.checks import Array, InputError, count, known_keys, positive
+from strapdown.estimation.setup import FilterSetup
 from strapdown.results import Listed, Listing, figure
-from strapdown.setup import FilterSetup
 from strapdown.tuning.objective import REACH, Derivatives, Objective
 from strapdown.tuning.parameters import RRW, SCALE, Prior, Unit, with_values
 

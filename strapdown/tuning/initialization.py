@@ -7,14 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from strapdown import ahrs, estimation, setup
+from strapdown import ahrs, estimation
 from strapdown.ahrs import AhrsParameters
 from strapdown.ahrs.starting import need_accelerometer
 from strapdown.checks import InputError
+from strapdown.estimation import setup
+from strapdown.estimation.setup import FilterSetup
 from strapdown.gyro import GyroSpec
 from strapdown.recordings import Recording
 from strapdown.records import ImuRecord
-from strapdown.setup import FilterSetup
 from strapdown.tuning.objective import Case
 from strapdown.tuning.parameters import SCALE
 

@@ -17,9 +17,12 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from strapdown import coning, setup
+from strapdown import coning
 from strapdown.checks import Array
+from strapdown.estimation import setup
 from strapdown.estimation.schedule import Schedule, schedule
+from strapdown.estimation.setup import FilterSetup
+from strapdown.estimation.setup.states import States
 from strapdown.estimation.states import covariance_matrices, pack
 from strapdown.kernels import likelihood as kernel
 from strapdown.kernels import likelihood_outliers
@@ -27,8 +30,6 @@ from strapdown.kernels.lane_values import WIDTH
 from strapdown.kernels.machine import compiled, read_only
 from strapdown.kernels.walk import walk
 from strapdown.records import Estimate, ImuRecord
-from strapdown.setup import FilterSetup
-from strapdown.setup.states import States
 from strapdown.tuning.objective import OUTLIERS, STEP, Case, Derivatives, Objective, by_part, joined, of_sensors, posed
 from strapdown.tuning.parameters import ARW, INITIAL_ATTITUDE, INITIAL_BIAS, RRW, SCALE, SIGMA, axis_of
 

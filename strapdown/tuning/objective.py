@@ -14,11 +14,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from strapdown import setup
 from strapdown.checks import Array, InputError, count, non_negative, one_of
+from strapdown.estimation import setup
+from strapdown.estimation.setup import FilterSetup
 from strapdown.estimation.states import State
 from strapdown.records import ImuRecord
-from strapdown.setup import FilterSetup
 from strapdown.tuning.parameters import (
     INITIAL_ATTITUDE,
     INITIAL_BIAS,

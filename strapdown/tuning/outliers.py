@@ -23,8 +23,8 @@ import numpy as np
 
 from strapdown.checks import Array, InputError, positive
 from strapdown.estimation.gating import Gate
+from strapdown.estimation.setup import FilterSetup
 from strapdown.kernels.lane_values import WIDTH
-from strapdown.setup import FilterSetup
 from strapdown.tuning.fitting import Estimated, Tuning
 from strapdown.tuning.innovations import MOST, SCALES, SHARES, LaneLikelihood, likelihood
 from strapdown.tuning.objective import OUTLIERS, Case

@@ -17,12 +17,13 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from strapdown import gyro, setup, units
+from strapdown import gyro, units
 from strapdown.checks import Array, InputError, one_of, positive
+from strapdown.estimation import setup
+from strapdown.estimation.setup import FilterSetup, Sigma
+from strapdown.estimation.setup.states import VELOCITY, SensorStates, States
 from strapdown.gyro import GyroSpec
 from strapdown.records import ImuRecord
-from strapdown.setup import FilterSetup, Sigma
-from strapdown.setup.states import VELOCITY, SensorStates, States
 
 ARW = "gyro.arw"
 """σ_v, rad/√s."""
@@ -82,7 +83,7 @@ SENSOR_STATES = {
     "lever_sigma": ("lever_arm_sigma", Unit(name="m", factor=1.0)),
     **{name: (name, Unit(name=unit, factor=1.0)) for name, unit in VELOCITY.items()},
 }
-"""Those of a sensor's optional states by what follows its name and a dot: field of :class:`strapdown.setup.states.SensorStates`, unit."""
+"""Those of a sensor's optional states by what follows its name and a dot: field of :class:`.SensorStates`, unit."""
 CONSTANTS = (
     "scale_sigma",
     "misalignment_sigma",
@@ -353,7 +354,7 @@ class Prior:
 def priors_from_gyro(spec: GyroSpec, record: ImuRecord, *, factor: float = 3.0) -> dict[str, Prior]:
     """Return priors of the gyro's two noise parameters from a specification: of a datasheet, or of an Allan deviation.
 
-    Flicker noise is matched as by :meth:`strapdown.setup.FilterSetup.for_record`; a noise that is not specified gets no prior.
+    Flicker noise is matched as by :meth:`strapdown.estimation.setup.FilterSetup.for_record`; a noise that is not specified gets no prior.
 
     Parameters
     ----------

@@ -9,12 +9,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from strapdown import setup
 from strapdown.checks import Array, InputError, count, instance
+from strapdown.estimation import setup
+from strapdown.estimation.setup import FilterSetup
 from strapdown.records import cut
 from strapdown.results import Listed, Listing, figure
 from strapdown.scenarios import Scenario, drawn, simulate
-from strapdown.setup import FilterSetup
 from strapdown.tuning.innovations import likelihood
 from strapdown.tuning.objective import Case
 from strapdown.tuning.parameters import CONSTANTS, Unit, unit_of, values_of

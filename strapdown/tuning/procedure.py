@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from strapdown.checks import InputError
-from strapdown.setup import FilterSetup
+from strapdown.estimation.setup import FilterSetup
 from strapdown.tuning.errors import error_objective
 from strapdown.tuning.fitting import Tuning, fit, rescaled
 from strapdown.tuning.innovations import LaneLikelihood, likelihood

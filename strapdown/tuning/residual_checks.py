@@ -6,7 +6,7 @@ they are, but what explains them better. The scale factor θ of each axis is tri
 which is Rao's score test (1948): at the tuned walk, and at smaller ones beside it, as a filter would have that knows the scale factor.
 Its gain is twice the log-likelihood over the tuned filter's, χ² of three degrees of freedom where θ is zero.
 
-The rate that θ multiplies is the gyro's own less its bias and its noise (:func:`strapdown.diagnosis.turning.turns`), which must not
+The rate that θ multiplies is the gyro's own less its bias and its noise (:func:`strapdown.tuning.diagnosis.turning.turns`), which must not
 explain itself. A prior of ``PLAUSIBLE`` bounds it where the rates are too small to show it.
 """
 
@@ -18,18 +18,20 @@ from typing import Any
 
 import numpy as np
 
-from strapdown import diagnosis, estimation, setup
+from strapdown import estimation
 from strapdown.checks import Array
 from strapdown.consistency import Judgement
 from strapdown.consistency.bounds import tail
 from strapdown.consistency.judgement import concluded
-from strapdown.diagnosis import Cause
-from strapdown.diagnosis.likelihood import Model, log_p, run
-from strapdown.diagnosis.turning import PLAUSIBLE, turns
+from strapdown.estimation import setup
+from strapdown.estimation.setup import FilterSetup
 from strapdown.estimation.states import ProcessNoise
 from strapdown.files import plain
 from strapdown.records import Estimate, ImuRecord, cut
-from strapdown.setup import FilterSetup
+from strapdown.tuning import diagnosis
+from strapdown.tuning.diagnosis import Cause
+from strapdown.tuning.diagnosis.likelihood import Model, log_p, run
+from strapdown.tuning.diagnosis.turning import PLAUSIBLE, turns
 from strapdown.tuning.fitting import Tuning
 from strapdown.tuning.objective import Case, of_sensors
 from strapdown.tuning.parameters import RRW

@@ -9,12 +9,13 @@ from typing import Any, Literal
 
 import numpy as np
 
-from strapdown import consistency, setup
+from strapdown import consistency
 from strapdown.checks import Array, InputError, one_of
 from strapdown.consistency import Judgement, mean_bounds
+from strapdown.estimation import setup
+from strapdown.estimation.setup import FilterSetup
 from strapdown.records import Estimate, Innovations, Truth
 from strapdown.results import Listed, Listing, figure
-from strapdown.setup import FilterSetup
 from strapdown.tuning.objective import Case, of_sensors
 from strapdown.units import DEGREE
 

@@ -13,7 +13,8 @@ import damage
 import h5py
 import numpy as np
 
-from strapdown import coning, gyro, montecarlo, quaternion, recordings, records, scenarios, setup
+from strapdown import coning, gyro, montecarlo, quaternion, recordings, records, scenarios
+from strapdown.estimation import setup
 from strapdown.montecarlo import campaign
 from strapdown.montecarlo import statistics as sums
 from strapdown.recordings import recordfiles

@@ -7,7 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from strapdown import estimation, quaternion, scenarios, setup
+from strapdown import estimation, quaternion, scenarios
+from strapdown.estimation import setup
 
 CHUNK = 100_000
 

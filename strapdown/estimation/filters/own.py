@@ -1,7 +1,7 @@
 """A filter of one's own: a function, or an object with a method ``run``, that takes a record and an initial state and returns an estimate.
 
-Where a filter of this package is named, one's own may stand instead: in :attr:`strapdown.setup.FilterSetup.estimator`, and so in every
-Monte Carlo (threads, processes or Dask, resumed and replayed), and in :func:`strapdown.estimation.filters.compare`.
+Where a filter of this package is named, one's own may stand instead: in :attr:`strapdown.estimation.setup.FilterSetup.estimator`, and so in
+every Monte Carlo (threads, processes or Dask, resumed and replayed), and in :func:`strapdown.estimation.filters.compare`.
 
 >>> import numpy as np
 >>> from strapdown import quaternion

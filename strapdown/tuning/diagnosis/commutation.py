@@ -9,11 +9,11 @@ import numpy as np
 
 from strapdown import coning, quaternion
 from strapdown.checks import Array, InputError
-from strapdown.diagnosis.causes import Cause
-from strapdown.diagnosis.hypotheses import shown
-from strapdown.diagnosis.likelihood import log_p
+from strapdown.estimation.setup import FilterSetup
 from strapdown.records import Estimate, ImuRecord, Truth
-from strapdown.setup import FilterSetup
+from strapdown.tuning.diagnosis.causes import Cause
+from strapdown.tuning.diagnosis.hypotheses import shown
+from strapdown.tuning.diagnosis.likelihood import log_p
 from strapdown.units import DEGREE_PER_HOUR
 
 ACCURATE_ALGORITHM = "matched-1-8-8"

@@ -12,9 +12,9 @@ import numpy as np
 from strapdown import estimation, quaternion
 from strapdown.ahrs.check_conventions import ATTITUDE_READINGS, AXES, axes_words
 from strapdown.checks import Array
-from strapdown.diagnosis.causes import Cause
-from strapdown.diagnosis.likelihood import Hypothesis, Model, Run, log_p, run
-from strapdown.diagnosis.turning import PLAUSIBLE, turns
+from strapdown.tuning.diagnosis.causes import Cause
+from strapdown.tuning.diagnosis.likelihood import Hypothesis, Model, Run, log_p, run
+from strapdown.tuning.diagnosis.turning import PLAUSIBLE, turns
 from strapdown.vectors import VectorMeasurements
 
 

@@ -6,12 +6,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from strapdown import estimation, setup
+from strapdown import estimation
 from strapdown.checks import InputError
-from strapdown.estimation import multiple_model
+from strapdown.estimation import multiple_model, setup
+from strapdown.estimation.setup import FilterSetup
 from strapdown.estimation.states import State
 from strapdown.records import ImuRecord, Origin
-from strapdown.setup import FilterSetup
 from strapdown.units import DEGREE
 from strapdown.vectors.wahba import InconsistentError
 
@@ -51,8 +51,8 @@ class Start(NamedTuple):
 def start(record: ImuRecord, chosen: FilterSetup) -> Start:
     """Return the initial state from the first measurements of a record.
 
-    They count as the filter models them (:func:`strapdown.setup.modelled_record`). Where one set of measurements does not give the
-    attitude, or directions contradict each other, a bank of filters with different initial attitudes finds it
+    They count as the filter models them (:func:`strapdown.estimation.setup.modelled_record`). Where one set of measurements does not give
+    the attitude, or directions contradict each other, a bank of filters with different initial attitudes finds it
     (:mod:`strapdown.estimation.multiple_model`), and the estimate starts where one of them is left.
     """
     try:

@@ -19,9 +19,9 @@ themselves, by a better integration algorithm, and held against the filter's own
 - ``likelihood``: How well a hypothesis explains the record.
 """
 
-from strapdown.diagnosis.causes import Cause, Diagnosis
-from strapdown.diagnosis.commutation import commutation_drift as commutation_drift
-from strapdown.diagnosis.diagnosing import diagnose
+from strapdown.tuning.diagnosis.causes import Cause, Diagnosis
+from strapdown.tuning.diagnosis.commutation import commutation_drift as commutation_drift
+from strapdown.tuning.diagnosis.diagnosing import diagnose
 
 __all__ = [
     "Cause",

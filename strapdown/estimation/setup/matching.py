@@ -10,9 +10,9 @@ import numpy as np
 
 from strapdown.checks import Array
 from strapdown.estimation.forward import strength
+from strapdown.estimation.setup.states import Entries, SensorStates, States
 from strapdown.gyro import GyroSpec, flicker
 from strapdown.records import ImuRecord
-from strapdown.setup.states import Entries, SensorStates, States
 from strapdown.vectors import VectorMeasurements
 
 DECADE = 10.0

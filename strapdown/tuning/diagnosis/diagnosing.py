@@ -10,12 +10,12 @@ from strapdown import consistency, estimation
 from strapdown.checks import InputError
 from strapdown.consistency import Judgement
 from strapdown.consistency.bounds import tail
-from strapdown.diagnosis.causes import Diagnosis
-from strapdown.diagnosis.commutation import commutation
-from strapdown.diagnosis.hypotheses import conventions, mean_hypotheses, noise_hypotheses, outliers
-from strapdown.diagnosis.likelihood import Model, by_mean, by_variance, run
+from strapdown.estimation.setup import FilterSetup, modelled_record, need_mekf
 from strapdown.records import ImuRecord, Truth
-from strapdown.setup import FilterSetup, modelled_record, need_mekf
+from strapdown.tuning.diagnosis.causes import Diagnosis
+from strapdown.tuning.diagnosis.commutation import commutation
+from strapdown.tuning.diagnosis.hypotheses import conventions, mean_hypotheses, noise_hypotheses, outliers
+from strapdown.tuning.diagnosis.likelihood import Model, by_mean, by_variance, run
 
 GROSS = 3.0
 """Discrete conventions are tried where the NIS per degree of freedom of some sensor exceeds this: a wrong one is not subtle."""

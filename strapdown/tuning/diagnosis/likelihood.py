@@ -10,9 +10,9 @@ import numpy as np
 
 from strapdown import estimation
 from strapdown.checks import Array
-from strapdown.diagnosis.causes import Cause
 from strapdown.estimation.states import ProcessNoise
 from strapdown.records import ImuRecord
+from strapdown.tuning.diagnosis.causes import Cause
 from strapdown.vectors import VectorMeasurements
 
 

@@ -18,6 +18,9 @@ from strapdown.checks import Array, InputError, known_keys, one_of, positive
 from strapdown.estimation import Observability, filters
 from strapdown.estimation.filters.own import Own, OwnFilter, as_own
 from strapdown.estimation.gating import Gate, Robust
+from strapdown.estimation.setup import matching
+from strapdown.estimation.setup import states as optional
+from strapdown.estimation.setup.states import SensorStates, States
 from strapdown.estimation.states import ProcessNoise, State
 from strapdown.files import reading, tables
 from strapdown.gyro import GyroSpec
@@ -25,9 +28,6 @@ from strapdown.kernels.lane_values import WIDTH
 from strapdown.randomness import generator
 from strapdown.records import Estimate, ImuRecord, Origin, compress
 from strapdown.results import ByValue
-from strapdown.setup import matching
-from strapdown.setup import states as optional
-from strapdown.setup.states import SensorStates, States
 from strapdown.vectors import VectorMeasurements
 
 if TYPE_CHECKING:
@@ -167,7 +167,8 @@ class FilterSetup(ByValue):
 
         Examples
         --------
-        >>> from strapdown import scenarios, setup
+        >>> from strapdown import scenarios
+        >>> from strapdown.estimation import setup
         >>> print(setup.to_toml(setup.FilterSetup.for_scenario(scenarios.load_scenario("two-stars"))))  # doctest: +SKIP
         """
         from strapdown.scenarios import simulate  # and every motion
@@ -296,7 +297,8 @@ def unmodelled_errors(
 
     Examples
     --------
-    >>> from strapdown import GyroSpec, setup
+    >>> from strapdown import GyroSpec
+    >>> from strapdown.estimation import setup
     >>> setup.unmodelled_errors(GyroSpec(angle_random_walk=1e-5, scale_factor=(1e-4, 0.0, 0.0)))
     ("the gyro's scale factor of 100 ppm",)
     """
