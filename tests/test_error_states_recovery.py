@@ -16,7 +16,6 @@ from strapdown.estimation import error_states, forward, setup
 from strapdown.estimation.gating import UNIFORM_SIGMA, Gate, Robust
 from strapdown.estimation.model import Model, assemble
 from strapdown.estimation.setup import FilterSetup
-from strapdown.estimation.setup import states as optional
 from strapdown.estimation.setup.states import SensorStates, States
 from strapdown.estimation.states import ProcessNoise
 from strapdown.gyro import GyroSpec
@@ -719,7 +718,8 @@ def test_a_setup_with_states_and_a_gate_recovers_and_reports_the_whole_bias(tmp_
 def test_a_lever_arm_recovers():
     one = made("hard iron", 5, duration=6.0)
     states = States(sensors={"mag": SensorStates(bias_sigma=1e-6), "acc": SensorStates(lever_arm_sigma=0.05)})
-    estimate = optional.run(one.record, NOISE, lost(one.initial, 5), states, gate=Gate(), full_covariance=True)
+    filter_setup = FilterSetup(process_noise=NOISE, bias_sigma=BIAS_SIGMA, states=states, gate=Gate())
+    estimate = setup.run(one.record, filter_setup, lost(one.initial, 5), full_covariance=True)
     assert len(recoveries(estimate)) == 1
     error = consistency.errors(estimate.attitude, estimate.bias, one.record.truth.attitude, one.record.truth.bias)
     assert np.all(np.abs(error[-1]) < 4.5 * estimate.sigma[-1])

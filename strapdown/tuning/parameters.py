@@ -20,7 +20,8 @@ import numpy as np
 from strapdown import gyro, units
 from strapdown.checks import Array, InputError, one_of, positive
 from strapdown.estimation import setup
-from strapdown.estimation.setup import FilterSetup, Sigma
+from strapdown.estimation.setup import FilterSetup
+from strapdown.estimation.setup.filter_setup import Sigma
 from strapdown.estimation.setup.states import VELOCITY, SensorStates, States
 from strapdown.gyro import GyroSpec
 from strapdown.records import ImuRecord

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, TypeVar
 
@@ -10,8 +10,6 @@ import numpy as np
 
 from strapdown import units
 from strapdown.checks import Array, InputError, array, known_keys, non_negative, one_of, positive
-from strapdown.estimation import forward, smoothing
-from strapdown.estimation import model as modelling
 from strapdown.estimation.error_states import (
     BoundedVelocity,
     ErrorStates,
@@ -24,18 +22,12 @@ from strapdown.estimation.error_states import (
     SensorMounting,
     VectorBias,
 )
-from strapdown.estimation.gating import Gate, Robust
-from strapdown.estimation.states import ProcessNoise, State
 from strapdown.files import tables
-from strapdown.records import Estimate, ImuRecord
 from strapdown.results import ByValue
 from strapdown.vectors import GRAVITY_F, KINDS
 
 Entries = float | tuple[float, ...] | tuple[tuple[float, ...], ...]
 """A standard deviation: one for all axes or entries, or one each; 0: no state."""
-
-_BIAS = np.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])
-"""Which of attitude and bias is the bias."""
 
 
 def _entries(name: str, value: Any, shape: tuple[int, ...], unit: str) -> Entries:
@@ -369,112 +361,6 @@ def _spread(diagonal: Entries, off_diagonal: Entries) -> tuple[Array, Array]:
     if np.ndim(off_diagonal) == 0:
         np.fill_diagonal(off, 0.0)
     return on, off
-
-
-def initial_state(initial: State, error_states: tuple[ErrorStates, ...], fast_bias_sigma: float = 0.0) -> State:
-    """Return the state to start from where ``initial`` has the *whole* bias, the error states' part of it included.
-
-    Its error is what ``initial`` says, whatever the parts are: of the bias ``b = β − Σ c e`` the covariance follows, so that a drift that
-    is large beside a well-known bias is known only together with it. The part too fast for a state, of σ ``fast_bias_sigma``, is in the
-    initial bias as well and lasts no longer than a sample: the states know the rest of the bias that much worse.
-    """
-    fast = np.diag(_BIAS * fast_bias_sigma**2)
-    plain = modelling.with_error_states(replace(initial, covariance=initial.covariance + fast), error_states)
-    turn = np.eye(len(plain.covariance))
-    turn[3:6, 6:] = -_offsets(error_states)
-    sigma = np.sqrt(np.diag(plain.covariance))
-    root = (turn @ (sigma[:, None] * np.linalg.cholesky(plain.covariance / np.outer(sigma, sigma)))).T
-    return replace(plain, covariance=root.T @ root, factor=root)
-
-
-def _offsets(error_states: tuple[ErrorStates, ...]) -> Array:
-    """Return what a unit of each error state adds to the gyro's bias (3, m)."""
-    return np.concatenate([np.empty((3, 0)), *(np.asarray(one.gyro_offset).T for one in error_states)], axis=1)
-
-
-def run(
-    record: ImuRecord,
-    process_noise: ProcessNoise,
-    initial: State,
-    states: States,
-    *,
-    every: int = 1,
-    full_covariance: bool = False,
-    gate: Gate | None = None,
-    robust: Robust | None = None,
-) -> Estimate:
-    """Run the filter with these states; it estimates the attitude, the whole gyro bias, drifts included, and the error states."""
-    problem = prepared(record, process_noise, initial, states)
-    options = forward.Options(
-        every=every, full_covariance=full_covariance, gate=gate, robust=robust, whole_bias=True, together=True
-    )
-    found = forward.filtered(problem, options).estimate
-    return _reported(found, states, initial)
-
-
-def run_together(
-    records: Sequence[ImuRecord], process_noise: ProcessNoise, initials: Sequence[State], states: States, every: int
-) -> list[Estimate]:
-    """Run the filter over several records, eight at once where it can (:mod:`strapdown.estimation.together`), with full covariance."""
-    problems = [prepared(one, process_noise, start, states) for one, start in zip(records, initials, strict=True)]
-    from strapdown.estimation import together
-
-    options = forward.Options(every=every, full_covariance=True, whole_bias=True, together=True)
-    found = together.run(problems, every, lambda problem: forward.filtered(problem, options).estimate)
-    return [_reported(one, states, start) for one, start in zip(found, initials, strict=True)]
-
-
-def smooth(
-    record: ImuRecord,
-    process_noise: ProcessNoise,
-    initial: State,
-    states: States,
-    *,
-    full_covariance: bool = False,
-    error_state_covariance: bool = True,
-    **options: Any,
-) -> Estimate:
-    """Run the smoother with these states; with drifts among them its estimate is of the whole gyro bias.
-
-    An ``initial`` without values has the whole bias. Options are those of :func:`strapdown.estimation.smooth`. In the first second the
-    variance of the whole bias is an upper bound: the part too fast for a state is taken for independent of the initial error.
-    """
-    blocks = states.blocks({series.sensor: series.kind for series in record.vectors})
-    kept: dict[str, Any] = {"full_covariance": full_covariance, "error_state_covariance": error_state_covariance}
-    if not states.gyro_drift_sigma:
-        return smoothing.smooth(record, process_noise, initial, blocks, **kept, **options)
-    state = initial if len(initial.values) else initial_state(initial, blocks, states.gyro_fast_bias_sigma)
-    found = smoothing.smooth(record, process_noise, state, blocks, full_covariance=True, **options)
-    assert found.whole_covariance is not None
-    offsets = _offsets(blocks)
-    sums = np.eye(6, 6 + offsets.shape[1])
-    sums[3:, 6:] = offsets
-    covariance = sums @ found.whole_covariance @ sums.T + np.diag(_BIAS * states.gyro_fast_bias_sigma**2)
-    return replace(
-        found,
-        bias=found.bias + np.concatenate([one.values for one in found.error_states.values()], axis=1) @ offsets.T,
-        variance=np.einsum("kii->ki", covariance).copy(),
-        covariance=covariance if full_covariance else None,
-        whole_covariance=found.whole_covariance if full_covariance and error_state_covariance else None,
-    )
-
-
-def prepared(record: ImuRecord, process_noise: ProcessNoise, initial: State, states: States) -> forward.Problem:
-    """Return a record prepared for the filter with these states."""
-    error_states = states.blocks({series.sensor: series.kind for series in record.vectors})
-    state = initial if len(initial.values) else initial_state(initial, error_states, states.gyro_fast_bias_sigma)
-    return forward.prepared(record, process_noise, state, error_states, driven=True)
-
-
-def _reported(found: Estimate, states: States, initial: State) -> Estimate:
-    """Return an estimate of the whole bias with the part too fast for a state in its variance."""
-    fast = np.outer(np.ones(len(found.time)), _BIAS * states.gyro_fast_bias_sigma**2)
-    if not len(initial.values):
-        fast[0] *= -1.0  # the initial bias has this part, so its error has not
-    P = found.covariance
-    return replace(
-        found, variance=found.variance + fast, covariance=None if P is None else P + fast[:, :, None] * np.eye(6)
-    )
 
 
 # ------------------------------------------------------------------------------------------------------------------------- files

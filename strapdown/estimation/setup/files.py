@@ -1,0 +1,137 @@
+"""A filter setup as a table of a TOML document, units in the names of its keys; read back it is equal to the last bit."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from typing import Any
+
+from strapdown import coning, gyro
+from strapdown.checks import InputError, known_keys, one_of
+from strapdown.estimation.filters.own import Own
+from strapdown.estimation.gating import Gate, Robust
+from strapdown.estimation.setup import states as optional
+from strapdown.estimation.setup.filter_setup import MEKF, FilterSetup, sensor_sigma
+from strapdown.estimation.states import ProcessNoise
+from strapdown.files import reading, tables
+
+_NOISE_FORM: tables.Form = {name: gyro.FORM[name] for name in ("angle_random_walk", "rate_random_walk")}
+_FORM: tables.Form = {
+    "attitude_sigma": tables.DEGREES,
+    "bias_sigma": tables.DEGREES_PER_HOUR,
+    "measurement_sigma_factor": tables.RATIO,
+}
+_GATE_FORM: tables.Form = {
+    "probability": tables.RATIO,
+    "recovery": tables.PLAIN,
+    "restart_attitude_sigma": tables.DEGREES,
+    "restart_bias_sigma": tables.DEGREES_PER_HOUR,
+}
+_ROBUST_FORM: tables.Form = {
+    "kind": tables.PLAIN,
+    "probability": tables.RATIO,
+    "degrees_of_freedom": tables.RATIO,
+    "iterations": tables.PLAIN,
+}
+_PARTS = ("integration", "sigma", "gate", "robust", "states", "estimator")
+NEVER = 0
+"""Value of ``recovery`` in a file for a gate that never recovers, as TOML has no null."""
+
+
+def to_table(setup: FilterSetup) -> dict[str, Any]:
+    """Return a setup as the table that its file holds."""
+    table = {**tables.encode(setup.process_noise, _NOISE_FORM), **tables.encode(setup, _FORM)}
+    own = setup.integration.name not in coning.ALGORITHMS
+    table["integration"] = setup.integration.to_table() if own else setup.integration.name
+    if setup.sigma:
+        table["sigma"] = {name: list(s) if isinstance(s, tuple) else s for name, s in setup.sigma.items()}
+    if setup.gate is not None:
+        table["gate"] = tables.encode(setup.gate, _GATE_FORM)
+        if setup.gate.recovery is None:
+            table["gate"]["recovery"] = NEVER
+    if setup.robust is not None:
+        table["robust"] = tables.encode(setup.robust, _ROBUST_FORM)
+    if setup.states is not None:
+        table["states"] = optional.to_table(setup.states)
+    if setup.estimator != MEKF:
+        table["estimator"] = setup.estimator.table if isinstance(setup.estimator, Own) else setup.estimator
+    return table
+
+
+def from_table(table: Mapping[str, Any], place: str = "filter") -> FilterSetup:
+    """Return the setup in a table; an unknown key is an error that names the nearest known one."""
+    known_keys(place, table, {*tables.keys(_NOISE_FORM), *tables.keys(_FORM), *_PARTS})
+    own = tables.keys(_NOISE_FORM)
+    parts: dict[str, Any] = {}
+    if "integration" in table:
+        algorithm = table["integration"]
+        if isinstance(algorithm, Mapping):
+            parts["integration"] = coning.Algorithm.from_table(algorithm, f"{place}: integration")
+        else:
+            parts["integration"] = coning.ALGORITHMS[one_of(f"{place}: integration", algorithm, coning.ALGORITHMS)]
+    if "sigma" in table:
+        sigma = _part(table, "sigma", place)
+        parts["sigma"] = {name: sensor_sigma(f"{place}: sigma: {name}", value) for name, value in sigma.items()}
+    if "gate" in table:
+        content = _part(table, "gate", place)
+        never = {name: None for name in ("recovery",) if content.get(name) == NEVER}
+        given = {key: value for key, value in content.items() if key not in never}
+        parts["gate"] = tables.build(Gate, given, _GATE_FORM, f"{place}: gate", **never)
+    if "robust" in table:
+        parts["robust"] = tables.build(Robust, _part(table, "robust", place), _ROBUST_FORM, f"{place}: robust")
+    if "states" in table:
+        parts["states"] = optional.from_table(_part(table, "states", place), f"{place}: states")
+    if "estimator" in table:
+        estimator = table["estimator"]  # a table describes a filter of one's own, whose code no file holds
+        parts["estimator"] = (
+            Own(estimator) if isinstance(estimator, Mapping) and "name" in estimator else str(estimator)
+        )
+    return tables.build(  # type: ignore[no-any-return]
+        FilterSetup,
+        {key: value for key, value in table.items() if key not in own and key not in _PARTS},
+        _FORM,
+        place,
+        process_noise=tables.build(ProcessNoise, {k: v for k, v in table.items() if k in own}, _NOISE_FORM, place),
+        **parts,
+    )
+
+
+def _part(table: Mapping[str, Any], name: str, place: str) -> Mapping[str, Any]:
+    if not isinstance(table[name], Mapping):
+        raise InputError(f"{place}: {name} is {table[name]!r}; it must be a table, [{place}.{name}]")
+    return table[name]  # type: ignore[no-any-return]
+
+
+def to_toml(setup: FilterSetup) -> str:
+    """Return a setup as TOML text with the table ``[filter]``, units in the names of its keys; :func:`read_setup` reads it back."""
+    import tomli_w
+
+    sensors = setup.sigma or (setup.states is not None and setup.states.sensors)
+    note = (
+        "# sigma of sensors: rad, or of one that measures whole vectors the unit of its reference\n" if sensors else ""
+    )
+    return note + tomli_w.dumps({"filter": to_table(setup)})
+
+
+def from_toml(text: str, place: str = "filter") -> FilterSetup:
+    """Return the setup in the table ``[filter]`` of a TOML text, such as :func:`to_toml` gives."""
+    table = reading.from_toml(text, place).get("filter")
+    if not isinstance(table, dict):
+        raise InputError(f"{place} has no table [filter]")
+    return from_table(table, place)
+
+
+def read_setup(path: str | os.PathLike[str]) -> FilterSetup:
+    """Read the table ``[filter]`` of a TOML file, such as ``strapdown tune`` writes; other tables are ignored.
+
+    Parameters
+    ----------
+    path : path
+        The TOML file; keys have their units in their names.
+
+    Returns
+    -------
+    FilterSetup
+        Setup of the table, in SI units and radians.
+    """
+    return tables.read(path, "filter", "`strapdown tune` writes one", from_table)

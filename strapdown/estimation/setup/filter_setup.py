@@ -1,0 +1,243 @@
+"""The setup of a filter: its model, initial uncertainty, integration, gate and error states."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from strapdown import coning, units
+from strapdown.checks import InputError, one_of, positive
+from strapdown.estimation import filters
+from strapdown.estimation.filters.own import Own, OwnFilter, as_own
+from strapdown.estimation.gating import Gate, Robust
+from strapdown.estimation.setup import matching
+from strapdown.estimation.setup.states import States
+from strapdown.estimation.states import ProcessNoise, State
+from strapdown.gyro import GyroSpec
+from strapdown.records import Estimate, ImuRecord, Origin
+from strapdown.results import ByValue
+
+if TYPE_CHECKING:
+    from strapdown.scenarios import Scenario
+
+MIN_BIAS_SIGMA = 0.1 * units.DEGREE_PER_HOUR
+"""Standard deviation of the initial bias error of a gyro whose specification has no bias, rad/s."""
+MEKF = "mekf"
+"""The estimator that all of this package works with; others run over records, and can be judged."""
+
+Sigma = float | tuple[float, float, float]
+"""σ of a sensor: one number, or one about (of whole vectors along) each body axis x, y, z."""
+
+
+def sensor_sigma(name: str, value: Any) -> Sigma:
+    """Return one number above zero, or three."""
+    if not isinstance(value, (list, tuple)) and not (isinstance(value, np.ndarray) and value.ndim):
+        return positive(name, value)
+    if len(value) != 3:
+        raise InputError(f"{name} has {len(value)} numbers; give one, or three of the body axes x, y, z")
+    x, y, z = (positive(f"{name}: {axis}", one) for axis, one in zip("xyz", value, strict=True))
+    return x, y, z
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FilterSetup(ByValue):
+    """The filter's model, its initial uncertainty, and the integration of the gyro.
+
+    Parameters
+    ----------
+    process_noise : ProcessNoise
+        Angle random walk and rate random walk of the gyro, as the filter models them.
+    attitude_sigma : float, default 1°
+        Standard deviation of the initial attitude error, each axis, rad; a Monte Carlo draws the true error from it.
+    bias_sigma : float
+        Standard deviation of the initial bias error, each axis, rad/s; a Monte Carlo draws the true error from it.
+    integration : strapdown.coning.Algorithm, default "one-sample"
+        Coning algorithm that turns its N gyro samples into one filter step.
+    measurement_sigma_factor : float, default 1.0
+        Factor on the record's σ of every sensor.
+    sigma : mapping of str to float or tuple (3,), default empty
+        σ of a sensor, by its name, instead of the record's: rad, or for whole vectors the unit of their reference. One
+        number, or one for each body axis (of a direction the part across it counts; a heading has one). Where the
+        record's σ varies, this is its root mean square and the ratios between samples are kept.
+    gate : Gate, optional
+        Refuses improbable measurements, and recovers. Default: all are used.
+    robust : Robust, optional
+        Weighs measurements by the size of their innovations. Default: all alike.
+    states : States, optional
+        Error states beside attitude and bias. Default: none. With drifts among them, the estimated bias includes them.
+    estimator : str, Own, filter or callable, default MEKF
+        Filter that processes a record: a name of :data:`strapdown.estimation.filters.FILTERS`, or a filter of one's own
+        (:mod:`strapdown.estimation.filters.own`), which starts with the two σ above and does not use ``process_noise``.
+    """
+
+    process_noise: ProcessNoise
+    attitude_sigma: float = matching.ATTITUDE_SIGMA
+    bias_sigma: float
+    integration: coning.Algorithm = field(default_factory=lambda: coning.ALGORITHMS["one-sample"])
+    measurement_sigma_factor: float = 1.0
+    sigma: Mapping[str, Sigma] = field(default_factory=dict)
+    gate: Gate | None = None
+    robust: Robust | None = None
+    states: States | None = None
+    estimator: str | Own | OwnFilter | Callable[[ImuRecord, State], Estimate] = MEKF
+
+    def __post_init__(self) -> None:
+        """Check every number."""
+        if self.states is not None and not isinstance(self.states, States):
+            raise InputError(f"states is {self.states!r}; it must be states.States, or None")
+        positive("attitude_sigma", self.attitude_sigma, unit="rad")
+        positive("bias_sigma", self.bias_sigma, unit="rad/s")
+        positive("measurement_sigma_factor", self.measurement_sigma_factor)
+        sigma = {str(name): sensor_sigma(f"sigma[{name!r}]", s) for name, s in self.sigma.items()}
+        object.__setattr__(self, "sigma", sigma)
+        self._check_estimator()
+
+    def _check_estimator(self) -> None:
+        if isinstance(self.estimator, str):
+            one_of("estimator", self.estimator, filters.FILTERS)
+        else:
+            object.__setattr__(self, "estimator", as_own(self.estimator))
+        if self.estimator != MEKF and (self.gate, self.robust, self.states) != (None, None, None):
+            raise InputError(
+                f"gate, robust and states are options of the mekf, and the estimator is {self.estimator_name}; leave them out"
+            )
+
+    @property
+    def estimator_name(self) -> str:
+        """Name of the estimator."""
+        return self.estimator.name if isinstance(self.estimator, Own) else str(self.estimator)
+
+    @classmethod
+    def for_scenario(
+        cls, scenario: Scenario, *, attitude_sigma: float | None = None, states: bool | Sequence[str] | None = False
+    ) -> FilterSetup:
+        """Return the filter setup that matches a scenario: the noise of its gyro, and the sensors' own σ.
+
+        Parameters
+        ----------
+        scenario : Scenario
+            Its gyro, its sensors and its motion determine the setup.
+        attitude_sigma, states : optional
+            As of :meth:`for_record`.
+
+        Returns
+        -------
+        FilterSetup
+            Setup whose noise model is that of the scenario.
+
+        Raises
+        ------
+        InputError
+            If the gyro has no angle random walk.
+
+        Examples
+        --------
+        >>> from strapdown import scenarios
+        >>> from strapdown.estimation import setup
+        >>> print(setup.to_toml(setup.FilterSetup.for_scenario(scenarios.load_scenario("two-stars"))))  # doctest: +SKIP
+        """
+        from strapdown.scenarios import simulate  # and every motion
+
+        return cls.for_record(simulate(scenario), attitude_sigma=attitude_sigma, states=states)
+
+    @classmethod
+    def for_record(
+        cls,
+        record: ImuRecord,
+        spec: GyroSpec | None = None,
+        *,
+        attitude_sigma: float | None = None,
+        states: bool | Sequence[str] | None = False,
+    ) -> FilterSetup:
+        """Return the filter setup that matches what a record's ``origin`` specifies of its gyro and sensors.
+
+        Flicker noise, which is no random walk, is matched in the attitude at the record's rate and quality of measurements
+        (:func:`strapdown.gyro.matched_process_noise`); without measurements it is bounded over the record's length. Errors without a state
+        (scale factor, misalignment, quantisation, hard iron) are not covered: :func:`unmodelled_errors` names them.
+
+        Parameters
+        ----------
+        record : ImuRecord
+            Its rate, its length and the σ of its measurements determine the noise that stands for flicker.
+        spec : GyroSpec, optional
+            Specification of the gyro. Default: that of the record's origin.
+        attitude_sigma : float, optional
+            σ of the initial attitude error, each axis, rad. Default: 1°, or less where the finest sensor is so fine that its first
+            measurement would not be linear in the error; an extended filter's covariance does not hold beyond that.
+        states : bool, None or sequence of str, default False
+            True: with an error state for each error that the gyro or the origin's sensors specify: scale factor, misalignment,
+            g-sensitivity, slope of the bias over the record's temperature, flicker and Gauss–Markov drift, hard iron, a sensor's bias,
+            correlated noise, lever arm. Each is modelled as one draw of a normal distribution whose σ is the error's size. Where
+            one-sample integration would leave a noticeable commutation error, an integration algorithm of the same rate with less is
+            chosen. Names such as ``"gyro.scale"``: with these of them alone. None: with all where an error is specified that the filter
+            would have no state for.
+
+        Returns
+        -------
+        FilterSetup
+            Setup with the noise of the gyro, and with error states if asked for.
+
+        Raises
+        ------
+        InputError
+            If the gyro is not specified or has no angle random walk, or a name is of no error that is specified.
+        """
+        origin = record.origin or Origin()
+        spec = spec or origin.gyro
+        if spec is None:
+            raise InputError(
+                "the record does not specify its gyro; give the gyro's noise (--gyro; noise= in Python) or a filter (--filter; setup=)"
+            )
+        walk = np.max(np.square(spec.bias_instability) * np.log(1e3)) / np.pi  # flicker over three decades of time
+        tau = spec.markov_correlation_time
+        stationary = 0.5 * np.square(spec.markov_noise) * tau if np.isfinite(tau) else 0.0
+        spread = np.max(np.square(spec.turn_on_bias) + np.square(spec.turn_on_bias_sigma) + stationary) + walk
+        plain = cls(
+            process_noise=ProcessNoise(**matching.noise(spec, record)),
+            attitude_sigma=matching.linear_sigma(record) if attitude_sigma is None else attitude_sigma,
+            bias_sigma=float(max(np.sqrt(spread), MIN_BIAS_SIGMA)),
+        )
+        sensors, gravity_f = matching.specified(origin)
+        if states is False or (
+            states is None
+            and not (origin.gyro and matching.unmodelled_errors(origin.gyro, sensors, gravity_f=gravity_f))
+        ):
+            return plain
+        found = matching.matched(spec, record, sensors, np.asarray(gravity_f))
+        noise = ProcessNoise(**matching.noise_beside_states(spec, found.white))
+        algorithm = (
+            matching.ACCURATE_ALGORITHM if matching.commutes_badly(record, noise.angle_random_walk) else "one-sample"
+        )
+        kept = found.states
+        if not isinstance(states, bool) and states is not None:
+            kept = found.states.chosen(tuple(states)) if states else States()
+        return replace(
+            plain,
+            process_noise=noise
+            if "gyro.drift" in kept.names
+            else plain.process_noise,  # flicker is a state or in the noise
+            integration=coning.ALGORITHMS[algorithm],
+            states=kept if kept.names else None,
+        )
+
+
+def need_mekf(setup: FilterSetup, what: str) -> None:
+    """Refuse a setup of another estimator for ``what`` works with the mekf alone."""
+    if setup.estimator != MEKF:
+        raise InputError(
+            f"{what} works with the mekf, and the estimator is {setup.estimator_name}; take a setup with estimator='mekf'"
+        )
+
+
+def need_angles(setup: FilterSetup, kinds: Mapping[str, str], place: str) -> None:
+    """Raise an error for a σ beyond half a turn of a sensor that measures angles: it must have been meant in another unit than rad."""
+    for name, sigma in setup.sigma.items():
+        largest = float(np.max(sigma))
+        if kinds.get(name, "vector") != "vector" and largest > np.pi:
+            raise InputError(
+                f"{place}: sigma: {name} is {largest:g} rad, beyond half a turn; sigma is in rad, and {largest:g} arcsec would be "
+                f"{largest * units.ARCSECOND:.4g}"
+            )

@@ -1,0 +1,300 @@
+"""The filter of a setup over a record."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from strapdown import estimation, quaternion
+from strapdown.checks import Array, InputError, one_of
+from strapdown.estimation import Observability, filters, forward
+from strapdown.estimation import model as modelling
+from strapdown.estimation.error_states import ErrorStates
+from strapdown.estimation.filters.own import Own
+from strapdown.estimation.setup.filter_setup import MEKF, FilterSetup, need_mekf
+from strapdown.estimation.setup.states import States
+from strapdown.estimation.states import State
+from strapdown.kernels.lane_values import WIDTH
+from strapdown.randomness import generator
+from strapdown.records import Estimate, ImuRecord, compress
+from strapdown.vectors import VectorMeasurements
+
+_BIAS = np.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])
+"""Which of attitude and bias is the bias."""
+WHOLE_BIAS: dict[str, Any] = {"whole_bias": True, "together": True}
+"""Options of the filter that reports the bias with the drifts in it."""
+
+MAX_MEMORY = 8e9
+"""Largest memory for the smoother's forward pass, bytes."""
+
+
+def modelled_record(record: ImuRecord, setup: FilterSetup) -> ImuRecord:
+    """Return the record as the filter of this setup processes it: at the rate of its integration algorithm, with the setup's σ."""
+    names = [series.sensor for series in record.vectors]
+    for name in setup.sigma:
+        one_of("sigma: sensor", name, names)
+    used = (
+        record
+        if setup.integration.samples == 1 and setup.integration.name == "one-sample"
+        else compress(record, setup.integration)
+    )
+    if setup.measurement_sigma_factor == 1.0 and not setup.sigma:
+        return used
+    return replace(used, vectors=tuple(_modelled_series(series, setup) for series in record.vectors))
+
+
+def _modelled_series(series: VectorMeasurements, setup: FilterSetup) -> VectorMeasurements:
+    factor = setup.measurement_sigma_factor
+    if series.sensor in setup.sigma:
+        given = setup.sigma[series.sensor]
+        if isinstance(given, tuple):
+            return _by_axis(series, given, factor)
+        own = float(np.sqrt(np.mean(series.sigma**2))) if len(series.time) else 0.0
+        if own == 0.0:
+            if series.attitude is not None:
+                return replace(series, sigma_axes=np.full(3, factor * given))
+            return replace(series, sigma=np.full(len(series.time), factor * given))
+        factor *= given / own
+    return series if factor == 1.0 else series.noise_scaled(factor)
+
+
+def _by_axis(series: VectorMeasurements, given: tuple[float, float, float], factor: float) -> VectorMeasurements:
+    """Return the series with a σ of its own about each body axis; from sample to sample they vary as its own does."""
+    if series.kind == "heading":
+        raise InputError(
+            f"sigma: {series.sensor} is {given}, three numbers, and a heading has one degree of freedom; give one number"
+        )
+    m = len(series.time)
+    own = float(np.sqrt(np.mean(series.sigma**2))) if m else 0.0
+    level = series.sigma / own if own > 0.0 else np.ones(m)
+    # The root mean square over the axes is made from them.
+    return replace(
+        series, sigma=np.zeros(m), sigma_axes=factor * level[:, None] * np.asarray(given)[None], covariance=None
+    )
+
+
+def run(record: ImuRecord, setup: FilterSetup, initial: State, **options: Any) -> Estimate:
+    """Run the filter of a setup over a record.
+
+    Parameters
+    ----------
+    record : ImuRecord
+        At the gyro's rate; the setup's integration algorithm and σ are applied.
+    setup : FilterSetup
+        Filter whose noise, σ, error states, gate and integration algorithm are applied.
+    initial : State
+        State at the first edge.
+    **options
+        Of :func:`strapdown.estimation.run`; ``gate`` and ``robust`` replace the setup's. Other estimators than the
+        mekf take ``every`` and ``full_covariance`` alone.
+
+    Returns
+    -------
+    Estimate
+        Attitude, bias and, where the setup has any, ``error_states``; with drifts among them ``bias`` is the whole bias.
+    """
+    modelled = modelled_record(record, setup)
+    if setup.estimator != MEKF:
+        return _run_other(modelled, setup, initial, **options)
+    chosen = {"gate": setup.gate, "robust": setup.robust, **options}
+    if setup.states is None:
+        return estimation.run(modelled, setup.process_noise, initial, **chosen)
+    found = forward.filtered(_prepared(modelled, setup, initial), forward.Options(**chosen, **WHOLE_BIAS)).estimate
+    return _reported(found, setup.states, initial)
+
+
+def runs_at_once(setup: FilterSetup) -> int:
+    """Return how many records :func:`run_together` filters at once: 1 for a filter that it is not for."""
+    judged = setup.gate is not None or setup.robust is not None
+    return WIDTH if setup.estimator == MEKF and setup.states is not None and not judged else 1
+
+
+def run_together(
+    records: Sequence[ImuRecord], setup: FilterSetup, initials: Sequence[State], every: int
+) -> list[Estimate]:
+    """Run the filter of a setup over several records, and keep every ``every``-th state with its covariance.
+
+    The filter is one that :func:`runs_at_once` allows. A record's estimate has the same bits whatever the records beside it, and agrees
+    with that of :func:`run` to rounding.
+    """
+    from strapdown.estimation import together
+
+    states = setup.states
+    assert states is not None
+    problems = [
+        _prepared(modelled_record(record, setup), setup, initial)
+        for record, initial in zip(records, initials, strict=True)
+    ]
+    options = forward.Options(every=every, full_covariance=True, **WHOLE_BIAS)
+    found = together.run(problems, every, lambda problem: forward.filtered(problem, options).estimate)
+    return [_reported(one, states, initial) for one, initial in zip(found, initials, strict=True)]
+
+
+def _run_other(
+    record: ImuRecord, setup: FilterSetup, initial: State, *, every: int = 1, full_covariance: bool = False
+) -> Estimate:
+    if isinstance(setup.estimator, Own):
+        return setup.estimator(record, initial, times=None if every == 1 else record.time[::every])
+    return filters.run(
+        setup.estimator_name, record, setup.process_noise, initial, every=every, full_covariance=full_covariance
+    )
+
+
+def smooth(record: ImuRecord, setup: FilterSetup, initial: State, **options: Any) -> Estimate:
+    """Run the fixed-interval smoother of a setup over a record.
+
+    Parameters
+    ----------
+    record, setup, initial : ImuRecord, FilterSetup, State
+        As of :func:`run`.
+    **options
+        Of :func:`strapdown.estimation.smooth`.
+
+    Returns
+    -------
+    Estimate
+        Smoothed estimate at the edges of the filter's steps.
+
+    Raises
+    ------
+    InputError
+        If it would need more memory than :data:`MAX_MEMORY`.
+    """
+    need_mekf(setup, "the smoother")
+    chosen = {"gate": setup.gate, "robust": setup.robust, **options}
+    modelled = modelled_record(record, setup)
+    states = setup.states or States()
+    blocks = _blocks(modelled, states)
+    n = 6 + sum(one.size for one in blocks)
+    segments = len(modelled.increments) + sum(len(series.time) for series in modelled.vectors)
+    need = 8 * (n * (n + 1) // 2 + n + 5) * segments
+    if states.gyro_drift_sigma:
+        need += 8 * n * n * len(modelled.time)
+    if need > MAX_MEMORY:
+        raise InputError(
+            f"smoothing {len(modelled.increments)} samples with {n} states takes {need / 1e9:.3g} GB, more than {MAX_MEMORY / 1e9:g}; "
+            "cut the record, or do not smooth"
+        )
+    if not states.gyro_drift_sigma:
+        return estimation.smooth(modelled, setup.process_noise, initial, blocks, **chosen)
+    start = state_of_whole_bias(initial, blocks, states.gyro_fast_bias_sigma)
+    full = {
+        name: bool(chosen.pop(name, default))
+        for name, default in (("full_covariance", False), ("error_state_covariance", True))
+    }
+    found = estimation.smooth(modelled, setup.process_noise, start, blocks, full_covariance=True, **chosen)
+    assert found.whole_covariance is not None
+    offsets = _offsets(blocks)
+    sums = np.eye(6, 6 + offsets.shape[1])
+    sums[3:, 6:] = offsets
+    covariance = sums @ found.whole_covariance @ sums.T + np.diag(_BIAS * states.gyro_fast_bias_sigma**2)
+    return replace(
+        found,
+        bias=found.bias + np.concatenate([one.values for one in found.error_states.values()], axis=1) @ offsets.T,
+        variance=np.einsum("kii->ki", covariance).copy(),
+        covariance=covariance if full["full_covariance"] else None,
+        whole_covariance=found.whole_covariance if all(full.values()) else None,
+    )
+
+
+def observability(record: ImuRecord, setup: FilterSetup, initial: State) -> Observability:
+    """Return what a record shows of each state of this setup's filter (:func:`strapdown.estimation.observability`)."""
+    need_mekf(setup, "observability")
+    modelled = modelled_record(record, setup)
+    if setup.states is None:
+        return estimation.observability(modelled, setup.process_noise, initial)
+    blocks = _blocks(modelled, setup.states)
+    start = state_of_whole_bias(initial, blocks, setup.states.gyro_fast_bias_sigma)
+    return estimation.observability(modelled, setup.process_noise, start, blocks)
+
+
+def initial_state(
+    setup: FilterSetup, attitude: Array, bias: Array | tuple[float, float, float] = (0.0, 0.0, 0.0)
+) -> State:
+    """Return the state that the filter starts from, with the setup's σ.
+
+    Parameters
+    ----------
+    setup : FilterSetup
+        Filter whose initial σ of attitude and bias are used.
+    attitude : array_like (4,)
+        q_fb.
+    bias : array_like (3,), default zero
+        Gyro bias, rad/s, body axes.
+
+    Returns
+    -------
+    State
+        Attitude and bias with independent errors of these σ.
+    """
+    return estimation.initial_state(
+        attitude, bias=bias, attitude_sigma=setup.attitude_sigma, bias_sigma=setup.bias_sigma
+    )
+
+
+def drawn_state(
+    setup: FilterSetup,
+    record: ImuRecord,
+    seed: int,
+    run: int = 0,
+    *,
+    sigmas: tuple[float, float] | None = None,
+    fixed_errors: tuple[Array, Array] = (np.zeros(3), np.zeros(3)),
+) -> State:
+    """Return the true initial state of a record, off by errors drawn from the setup's σ (or ``sigmas``) and by fixed ones."""
+    if record.truth is None:
+        raise InputError("record has no truth to start from; simulate one, or give an initial state")
+    attitude_sigma, bias_sigma = sigmas or (setup.attitude_sigma, setup.bias_sigma)
+    draw = generator(seed, run, "initial error").standard_normal(6)
+    turn = quaternion.exp(-attitude_sigma * draw[:3] - fixed_errors[0])
+    bias = record.truth.bias[0] - bias_sigma * draw[3:] - fixed_errors[1]
+    return initial_state(setup, quaternion.multiply(record.truth.attitude[0], turn), bias)
+
+
+def state_of_whole_bias(initial: State, error_states: tuple[ErrorStates, ...], fast_bias_sigma: float = 0.0) -> State:
+    """Return the state to start from where ``initial`` has the *whole* bias, the error states' part of it included.
+
+    Its error is what ``initial`` says, whatever the parts are: of the bias ``b = β − Σ c e`` the covariance follows, so that a drift that
+    is large beside a well-known bias is known only together with it. The part too fast for a state, of σ ``fast_bias_sigma``, is in the
+    initial bias as well and lasts no longer than a sample: the states know the rest of the bias that much worse.
+    """
+    if len(initial.values):
+        return initial
+    fast = np.diag(_BIAS * fast_bias_sigma**2)
+    plain = modelling.with_error_states(replace(initial, covariance=initial.covariance + fast), error_states)
+    turn = np.eye(len(plain.covariance))
+    turn[3:6, 6:] = -_offsets(error_states)
+    sigma = np.sqrt(np.diag(plain.covariance))
+    root = (turn @ (sigma[:, None] * np.linalg.cholesky(plain.covariance / np.outer(sigma, sigma)))).T
+    return replace(plain, covariance=root.T @ root, factor=root)
+
+
+def _offsets(error_states: tuple[ErrorStates, ...]) -> Array:
+    """Return what a unit of each error state adds to the gyro's bias (3, m)."""
+    return np.concatenate([np.empty((3, 0)), *(np.asarray(one.gyro_offset).T for one in error_states)], axis=1)
+
+
+def _blocks(record: ImuRecord, states: States) -> tuple[ErrorStates, ...]:
+    return states.blocks({series.sensor: series.kind for series in record.vectors})
+
+
+def _prepared(record: ImuRecord, setup: FilterSetup, initial: State) -> forward.Problem:
+    """Return a record prepared for the filter with the setup's error states."""
+    assert setup.states is not None
+    blocks = _blocks(record, setup.states)
+    start = state_of_whole_bias(initial, blocks, setup.states.gyro_fast_bias_sigma)
+    return forward.prepared(record, setup.process_noise, start, blocks, driven=True)
+
+
+def _reported(found: Estimate, states: States, initial: State) -> Estimate:
+    """Return an estimate of the whole bias with the part too fast for a state in its variance."""
+    fast = np.outer(np.ones(len(found.time)), _BIAS * states.gyro_fast_bias_sigma**2)
+    if not len(initial.values):
+        fast[0] *= -1.0  # the initial bias has this part, so its error has not
+    P = found.covariance
+    return replace(
+        found, variance=found.variance + fast, covariance=None if P is None else P + fast[:, :, None] * np.eye(6)
+    )
