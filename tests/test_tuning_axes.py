@@ -130,7 +130,7 @@ def test_the_monte_carlo_takes_three_of_an_attitude_in_lanes_and_others_on_the_s
     np.testing.assert_allclose(by_lanes.sigma, scalar.sigma, rtol=1e-3)
     chosen = dataclasses.replace(setup.FilterSetup.for_scenario(swaying()), sigma={"mag": (5e-7, 1e-6, 5e-7)})
     reason = lanes.supports(montecarlo.Plan(scenario=swaying(), setup=chosen, epochs=4))
-    assert reason == "mag: a sigma of its own for each axis"
+    assert reason == "mag: a different sigma for each axis"
 
 
 # ----------------------------------------------------------------------------------------------------------- names and values
