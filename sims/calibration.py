@@ -244,7 +244,7 @@ def draw(result: Result, path: Path) -> Path:
         error, sigma = factor * result.errors[0][:, states], factor * result.sigma[:, states]
         envelope = 3.0 * sigma.max(axis=1)
         ax.fill_between(
-            result.time, -envelope, envelope, color=SKY, alpha=0.3, linewidth=0, label="±3σ (99.7 %), the widest"
+            result.time, -envelope, envelope, color=SKY, alpha=0.3, linewidth=0, label="±3σ (99.7 %), the largest"
         )
         colours = (BLUE, VERMILION, GREEN, ORANGE, PURPLE, "black")
         names = ("x", "y", "z") if error.shape[1] == 3 else ("xy", "xz", "yx", "yz", "zx", "zy")

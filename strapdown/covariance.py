@@ -239,10 +239,10 @@ class Analysis(Listed):
 
     @property
     def cramer_rao(self) -> Array:
-        """Posterior Cramér–Rao bound (m, 6, 6) of a matched filter's analysis: the minimum mean square error of any filter.
+        """Posterior Cramér–Rao bound (m, 6, 6) of a matched filter's analysis: lower bound of the mean square error of any filter.
 
         The Riccati recursion along the true trajectory, for small errors (Tichavský, Muravchik & Nehorai, IEEE Trans. Signal Processing
-        46(5), 1998). Fixed errors of the scenario (scale factor, hard iron) are neglected; the bound holds with them too.
+        46(5), 1998). Fixed errors of the scenario (scale factor, hard iron) are treated as known, which can only lower the bound.
 
         Raises
         ------

@@ -379,7 +379,7 @@ def _of_errors(estimate: Estimate, truth: Truth, limits: list[str], beside: Sequ
     variance = estimate.variance[seen]
     if estimate.covariance is None:
         limits.append(
-            "the estimate holds variances only, so errors are judged axis by axis at the end; keep whole covariances"
+            "the estimate holds variances only, so errors are judged axis by axis at the end; keep full covariances"
         )
         return [_largest_at_end(e[-1], variance[-1])]
     # The filter or the reference may have no bias.
@@ -401,8 +401,8 @@ def _of_errors(estimate: Estimate, truth: Truth, limits: list[str], beside: Sequ
             hidden.append(subset)
     if hidden:
         limits.append(
-            f"the {' and '.join(hidden)} errors of a filter with further error states are not averaged over one run: how slowly they "
-            "change is not known"
+            f"the {' and '.join(hidden)} errors of a filter with further error states are not averaged over one run, because their "
+            "correlation time is not known"
         )
     return found
 

@@ -64,7 +64,7 @@ def whitened(error: ArrayLike, covariance: ArrayLike) -> Array:
         least = np.linalg.eigvalsh(P)[..., 0]
         place = [int(i) for i in np.unravel_index(np.argmin(least), least.shape)]
         raise InputError(
-            f"covariance{place or ''} is not positive definite (least eigenvalue {least.min():.3g})"
+            f"covariance{place or ''} is not positive definite (smallest eigenvalue {least.min():.3g})"
         ) from None
     return np.asarray(np.linalg.solve(factor, e[..., None])[..., 0])
 

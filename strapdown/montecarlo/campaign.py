@@ -219,7 +219,7 @@ def run(
     table = plan.to_table()
     if target.exists() and not resume and not overwrite:
         raise InputError(
-            f"{target} exists; go on with it (--resume; resume=True in Python), write over it (--overwrite; overwrite=True), or choose "
+            f"{target} exists; continue it (--resume; resume=True in Python), overwrite it (--overwrite; overwrite=True), or choose "
             "another name"
         )
     chosen = choose(plan, machine)
@@ -295,7 +295,7 @@ def _need_same(target: Path, held: Campaign, plan: Plan, machine: str, chunk: in
             )
     finished = 0 if held.statistics is None else held.statistics.runs
     if runs < finished:
-        raise InputError(f"{target} holds {finished} runs already, more than the {runs} wanted; ask for more of them")
+        raise InputError(f"{target} holds {finished} runs already, more than the {runs} wanted; give more runs")
 
 
 def _flat(table: Mapping[str, Any], place: str = "") -> dict[str, Any]:
@@ -408,13 +408,13 @@ def _statistics_of(group: Any, plan: Plan) -> Statistics:
         sums = _ARRAYS[name].shape[0] == "epochs" and name != "time"  # sums over finite runs
         if value.shape != wanted or (sums and not np.isfinite(value).all()):
             raise InputError(
-                f"{place}: {name} has shape {value.shape}, wanted {wanted}, or is not finite; it is damaged: run the campaign anew"
+                f"{place}: {name} has shape {value.shape}, wanted {wanted}, or is not finite; it is damaged: run the campaign again"
             )
         if value.dtype.kind != ("i" if _ARRAYS[name].counts else "f"):
-            raise InputError(f"{place}: {name} is of type {value.dtype}; the file is damaged: run the campaign anew")
+            raise InputError(f"{place}: {name} is of type {value.dtype}; the file is damaged: run the campaign again")
     names = tuple(reading.from_json(attributes["sensors"], f"{place}: sensors"))
     if names != plan.sensors:
-        raise InputError(f"{place}: sensors are {names}, those of the plan {plan.sensors}; run the campaign anew")
+        raise InputError(f"{place}: sensors are {names}, those of the plan {plan.sensors}; run the campaign again")
     return Statistics(runs=count(f"{place}: runs", attributes["runs"]), sensors=names, **arrays)
 
 
@@ -441,11 +441,11 @@ def _stored(path: Path) -> tuple[Campaign, _Progress]:
             raise InputError(f"{path} is no Monte Carlo campaign; `strapdown montecarlo` writes one")
         if count("format", attributes["format"]) > FORMAT:
             raise InputError(
-                f"{path} has format {attributes['format']}, newer than this package knows; install strapdown {attributes['version']}"
+                f"{path} has format {attributes['format']}, newer than this package supports; install strapdown {attributes['version']}"
             )
         plan = from_table(reading.from_json(attributes["plan"], f"{path}: plan"))
         if attributes["digest"] != plan.digest:
-            raise InputError(f"{path}: digest is not that of the plan; the file is damaged: run the campaign anew")
+            raise InputError(f"{path}: digest is not that of the plan; the file is damaged: run the campaign again")
         campaign = Campaign(
             plan=plan,
             machine=one_of("machine", attributes["machine"], MACHINES),

@@ -49,12 +49,12 @@ def dask_client(*, workers: int | None = None, address: str | None = None) -> It
     Raises
     ------
     InputError
-        If both are given, Dask is not installed, or nothing answers at the address.
+        If both are given, Dask is not installed, or no scheduler answers at the address.
     """
     distributed = _distributed()
     if address is not None:
         if workers is not None:
-            raise InputError("workers and cluster exclude each other: the cluster has workers of its own; give one")
+            raise InputError("workers and cluster exclude each other: the cluster has its own workers; give only one")
         try:
             client = distributed.Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
         except (OSError, ValueError, TypeError) as error:

@@ -120,7 +120,7 @@ class ConingParameters:
         names = [one.name for one in self.algorithms]
         if len(set(names)) < len(names):
             raise InputError(
-                f"own holds an algorithm of a name that is among {', '.join(names)} already; give it another"
+                f"own has an algorithm whose name is already one of {', '.join(names)}; give it another name"
             )
 
     @property

@@ -156,7 +156,7 @@ class Plan:
         one_of("precision", self.precision, PRECISIONS)
         if self.samples % (self.epochs * self.setup.integration.samples):
             raise InputError(
-                f"{self.samples} gyro samples cannot be cut into {self.epochs} epochs of whole {self.setup.integration.name} steps; choose "
+                f"{self.samples} gyro samples do not divide into {self.epochs} epochs of whole {self.setup.integration.name} steps; choose "
                 f"a duration whose sample count is a multiple of {self.epochs * self.setup.integration.samples}, or other epochs"
             )
 
@@ -245,7 +245,7 @@ def whole_epochs(scenario: Scenario, filter_setup: FilterSetup, most: int = 100)
     samples, step = round(scenario.duration * scenario.rate), filter_setup.integration.samples
     if samples % step:
         raise InputError(
-            f"{samples} gyro samples are no whole number of {filter_setup.integration.name} steps of {step}; choose a duration or rate "
+            f"{samples} gyro samples are not a whole number of {filter_setup.integration.name} steps of {step}; choose a duration or rate "
             f"that gives a multiple of {step}"
         )
     return max(n for n in range(1, most + 1) if (samples // step) % n == 0)

@@ -51,7 +51,7 @@ class Plan(Listed):
             )
         ]
         columns = ("parameter", "unit", "value", *(f"{length:g} s" for length in self.lengths), "10 % needs")
-        note = "Above about × 1.5 a record gives a bound and not a value. The last column extrapolates the information linearly."
+        note = "Above about × 1.5 a record gives a bound and not a value. The last column extrapolates the information at its final rate."
         return Listing("Minimum standard error, as a factor (Cramér–Rao)", columns, rows, [note], left=2)
 
     def needed(self, error: float = 0.1) -> Array:

@@ -297,7 +297,7 @@ def conventions(model: Model, base: Run) -> list[Cause]:
         trials.append(("gyro", f"axes should be read as ({axes_words(matrix)})", turned))
     for factor, unit in ((180.0 / np.pi, "57.3 times more"), (np.pi / 180.0, "57.3 times less")):
         scaled = replace(model, record=replace(model.record, increments=model.record.increments * factor))
-        trials.append(("gyro", f"rotates {unit} than its data state (rad for deg?)", scaled))
+        trials.append(("gyro", f"rotation {unit} than recorded (rad for deg?)", scaled))
     for series in model.record.vectors:
         name = series.sensor
         if series.attitude is not None:

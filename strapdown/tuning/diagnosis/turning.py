@@ -18,10 +18,10 @@ UNLIKELY = 0.01
 def turns(record: ImuRecord, noise: ProcessNoise, initial: estimation.State) -> Array:
     """Return the rotation of the body in each gyro interval (n, 3), rad, as far as it exceeds the gyro's noise.
 
-    The increments themselves are unsuitable: adding a fraction of them changes the gyro's noise, so the noise would explain itself, more so
-    the longer the record. So the rate, with the filter's bias subtracted, keeps only the components of its cosine transform above the
-    filter's angle random walk: of m values with standard deviation s the largest is below ``s √(2 ln(m/p))`` except with probability p (the
-    universal threshold of Donoho & Johnstone 1994, Biometrika 81).
+    The increments themselves are unsuitable: subtracting a fraction of them reduces the gyro's noise too, so the noise would explain
+    itself, more so the longer the record. So the rate, with the filter's bias subtracted, keeps only the components of its cosine transform
+    above the filter's angle random walk: of m values with standard deviation s the largest is below ``s √(2 ln(m/p))`` except with
+    probability p (the universal threshold of Donoho & Johnstone 1994, Biometrika 81).
     """
     from scipy.fft import dct, idct
 
