@@ -229,7 +229,7 @@ def by_axis(chosen: FilterSetup, names: Sequence[str], records: Sequence[ImuReco
 
 
 def _silent(sensor: str) -> InputError:
-    return InputError(f"{sensor}: its sigma in the records is 0; give a starting value in [filter.sigma]")
+    return InputError(f"{sensor}: its sigma is 0 in the records; give a starting value in [filter.sigma]")
 
 
 def _size(value: Any) -> float:
