@@ -82,7 +82,7 @@ def test_a_bias_error_shows_in_the_errors_alone():
     assert not any(name == "NIS" for name, _ in rejected)
     blind = consistency.judge(estimate(bias_error=10.0)[0])
     assert blind.verdict == "consistent"
-    assert "bias error that the start hides" in blind.limits[0]  # and it says what it cannot show
+    assert "bias error that the initial state hides" in blind.limits[0]  # and it says what it cannot show
 
 
 def test_an_error_that_hardly_moves_is_not_averaged_over_the_run_and_that_is_reported():

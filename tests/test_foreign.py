@@ -257,14 +257,14 @@ def test_the_reading_of_the_covariance_is_found(run):
         assert found.frame_probability[frame] > 0.99
         np.testing.assert_allclose(found.estimate.covariance, e.covariance, atol=1e-9 * e.covariance.max())
     wrong = checked(run, covariance=fixed_side(e), error_frame="body")
-    assert any("as fixed the errors would fit it better by far" in words for words in wrong.remarks)
+    assert any("the errors fit far better read as fixed" in words for words in wrong.remarks)
 
 
 def test_equal_axes_leave_the_reading_open(run):
     m = len(run.estimate.time)
     found = checked(run, covariance=np.tile(DEGREE**2 * np.eye(3), (m, 1, 1)), bias=None)
     assert found.frame_probability["body"] == pytest.approx(found.frame_probability["fixed"], rel=1e-6)
-    assert any("do not decide how the covariance is meant" in words for words in found.remarks)
+    assert any("do not decide how the covariance is defined" in words for words in found.remarks)
     assert found.error_frame == "body"
 
 
@@ -315,7 +315,7 @@ def test_conventions_of_quaternions_are_found(run, convention):
     assert found.alignment.estimated == ()
     wanted = {
         "conjugate": "the inverse, fixed",
-        "last": "are scalar last:",
+        "last": "read as scalar last,",
         "last, conjugate": "scalar last and the inverse",
     }
     assert any(wanted[convention] in words for words in found.remarks)
@@ -554,7 +554,7 @@ def test_the_command_refuses(files, monkeypatch, capsys):
 
 
 def test_times_without_anything_in_common_are_refused(run):
-    with pytest.raises(InputError, match="no two times in common"):
+    with pytest.raises(InputError, match="fewer than two times in common"):
         checked(run, time=run.estimate.time + 1e4, align="none")
 
 

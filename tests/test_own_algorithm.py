@@ -169,7 +169,7 @@ def test_several_algorithms_need_names_of_their_own(tmp_path):
     path.write_text(2 * '[[algorithm]]\nname = "x"\ncoefficients = ["2/3"]\n')
     with pytest.raises(InputError, match="two algorithms of the name x"):
         coning.read_algorithms(path)
-    with pytest.raises(InputError, match="already; give it another"):
+    with pytest.raises(InputError, match="give it another name"):
         coning_study.ConingParameters(own=(MILLER, MILLER))
     path.write_text("x = 1\n")
     with pytest.raises(InputError, match="x"):
