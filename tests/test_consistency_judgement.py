@@ -13,7 +13,7 @@ import scipy.stats
 from strapdown import consistency, montecarlo, motion, records, scenarios, vectors
 from strapdown.checks import InputError
 from strapdown.consistency.judgement import Finding, holm
-from strapdown.estimation import setup
+from strapdown.estimation import ProcessNoise, setup
 from strapdown.gyro import GyroSpec
 from strapdown.montecarlo import campaign
 from strapdown.records import Estimate, Innovations, Truth
@@ -248,7 +248,7 @@ def scenario():
 @pytest.fixture(scope="module")
 def plan():
     filter_setup = setup.FilterSetup(
-        process_noise=setup.ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-6),
+        process_noise=ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-6),
         attitude_sigma=2e-3,
         bias_sigma=1e-4,
     )

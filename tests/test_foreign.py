@@ -274,7 +274,8 @@ def test_euler_axes_are_the_derivative_of_the_angles():
     for k in range(3):
         moved = angles.copy()
         moved[:, k] += 1e-6
-        turn = quaternion.log(quaternion.multiply(quaternion.conjugate(q), quaternion.from_euler(moved))) / 1e-6
+        near = quaternion.from_rotation(Rotation.from_euler("ZYX", moved))
+        turn = quaternion.log(quaternion.multiply(quaternion.conjugate(q), near)) / 1e-6
         np.testing.assert_allclose(E[:, :, k], turn, atol=1e-5)
 
 
