@@ -107,10 +107,7 @@ def _strength_and_dip(field: Array, vertical: Array) -> Array:
 
 
 def _deviation(level: Array, reference: Array, known: np.ndarray, memory: float) -> Array:
-    """Return the mean square deviation of magnitude (relative) and dip (rad) from those at the start (k,), low-passed.
-
-    ``memory`` is the interval over the time constant.
-    """
+    """Return the square deviation of magnitude (relative) and dip (rad) from the start, low-passed (k,); ``memory``: step/time constant."""
     square = (level[:, 0] / reference[0] - 1.0) ** 2 + (level[:, 1] - reference[1]) ** 2
     return low_pass(_held(square[:, None], known), memory)[:, 0]
 

@@ -146,12 +146,12 @@ def _mean(samples: Array, source: str, sensor: str) -> Array:
     """Return the mean of samples (k, 3) of the quiet second, which must not be zero."""
     if len(samples) == 0:
         raise InputError(
-            f"{source}: the {sensor} has no valid sample in the first quiet second; cut the recording to where it has"
+            f"{source}: the {sensor} has no valid sample in the first quiet second; cut the recording to a part where it has"
         )
     mean = np.asarray(samples.mean(axis=0))
     if norm(mean) == 0.0:
         raise InputError(
-            f"{source}: the {sensor} is zero over the first quiet second and shows no direction; cut the recording to where it has one"
+            f"{source}: the {sensor} is zero over the first quiet second and gives no direction; cut the recording to a part where it does"
         )
     return mean
 
