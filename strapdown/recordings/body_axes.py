@@ -41,9 +41,8 @@ def with_axes(
 ) -> Recording:
     """Return a recording in other body axes, or with the axes of single sensors corrected; its ``remarks`` list the changes.
 
-    ``axes`` are the recorded axes that become x, y, z, for example ``"x,-y,-z"`` from forward-right-down to forward-left-up. They apply to
-    the whole unit including its reference attitude, or to single sensors, ``{"magnetometer": "y,x,-z"}``. ``invert`` lists sensors whose
-    sign is inverted on all axes.
+    ``axes`` are the recorded axes that become x, y, z, ``"x,-y,-z"`` from forward-right-down to forward-left-up, of the whole unit with its
+    reference attitude, or of single sensors, ``{"magnetometer": "y,x,-z"}``. ``invert`` lists sensors with inverted sign on all axes.
     """
     whole, single = (None, dict(axes)) if isinstance(axes, Mapping) else (axes, {})
     matrices = {sensor: axes_matrix(text, f"axes of the {sensor}") for sensor, text in single.items()}
@@ -75,8 +74,7 @@ def _turned(recording: Recording, matrix: Array) -> Recording:
     if recording.true_attitude is not None:
         if np.linalg.det(matrix) < 0.0:
             raise InputError(
-                f"{recording.source}: axes mirror the unit, which is not a rotation of its reference attitude; give the axes of single "
-                "sensors"
+                f"{recording.source}: axes mirror the unit, but its reference attitude can only be rotated; give the axes of single sensors"
             )
         known = np.isfinite(recording.true_attitude).all(axis=1)
         changed["true_attitude"] = recording.true_attitude.copy()

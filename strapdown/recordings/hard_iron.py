@@ -1,9 +1,8 @@
 """Hard iron of a unit, estimated from its recording.
 
-In the frame fixed by the integrated gyro, the field of the surroundings changes little over a second, while the field of iron in the unit
-rotates with the unit. With R the attitude by the gyro and b the iron, the measured field in that frame changes by ``(R − R') b`` from one
-time to another, which is linear in b. A field that varies along the path of the unit causes an apparent iron too, so the estimate is
-reduced by it.
+In the frame fixed by the integrated gyro, the field of the surroundings changes little over a second, while that of iron in the unit
+rotates with it. With R the attitude by the gyro and b the iron, the measured field changes by ``(R − R') b`` from one time to another,
+which is linear in b. A field that varies along the path of the unit causes an apparent iron too, by which the estimate is reduced.
 """
 
 from __future__ import annotations
@@ -28,8 +27,7 @@ NEGLIGIBLE = 1e-3
 RISE = 3.0
 """Time constant of the low-pass filter of the iron found up to each time, s: shorter changes are disturbances of the surroundings."""
 FEIGNED = 0.028
-"""Apparent iron caused by a field that varies along the path, relative to the magnitude of the field. The estimated iron is multiplied by
-1 − (apparent / estimated)²."""
+"""Apparent iron of a field that varies along the path, relative to its magnitude: estimates are multiplied by 1 − (apparent/estimate)²."""
 
 
 def find(field: Array, frame: Array, time: Array, known: np.ndarray, strength: float, *, causal: bool) -> Array:
