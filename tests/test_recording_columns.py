@@ -264,4 +264,4 @@ def test_commands_take_columns_and_say_what_they_guessed(table, tmp_path):
         assert "Columns assigned by their names: time from 't'" in said.output, said.output
         other = CliRunner().invoke(app, [command, str(odd), *out, "--columns", mapping])
         assert other.exit_code == said.exit_code, other.output
-        assert "Columns taken" not in other.output
+        assert "Columns assigned" not in other.output

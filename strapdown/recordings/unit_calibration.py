@@ -164,7 +164,7 @@ def _from_table(table: Mapping[str, Any], place: str) -> UnitCalibration:
     known_keys(place, table, KEYS)
     missing = [key for key in KEYS[:2] if key not in table]
     if missing:
-        raise InputError(f"{place} lacks {', '.join(missing)}")
+        raise InputError(f"{place} lacks {', '.join(missing)}; add the missing keys")
     try:
         return UnitCalibration(
             matrix=np.asarray(table["gyro_scale_and_misalignment"], np.float64),
