@@ -115,7 +115,7 @@ class Scenario:
     gyro_preset : str, default ""
         Name of the preset equal to ``gyro``, for files.
     temperature : Temperature, optional
-        Temperature of the unit, on which the gyro's bias may depend; it is recorded. Default: none.
+        Temperature of the unit, °C, on which the gyro's bias may depend; it is recorded. Default: none.
 
     Examples
     --------
