@@ -1,7 +1,7 @@
 """Frozen dataclasses as tables for TOML and JSON, with the unit in the name of each key, exact in both directions.
 
 A *form* gives for each field of a class the units that its key may have: ``{"angle": DEGREES, "frequency": HERTZ}`` reads and writes
-``angle_deg`` and ``frequency_hz``. A value is written in the first unit in which it is represented bit by bit; the last unit of a choice is
+``angle_deg`` and ``frequency_hz``. A value is written in the first unit in which it is represented exactly; the last unit of a choice is
 SI.
 """
 

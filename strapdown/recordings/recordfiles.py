@@ -1,6 +1,6 @@
 """IMU records in files: HDF5, self-describing; CSV, for exchange.
 
-HDF5 stores everything bit by bit: increments, every vector series, the truth, the specification of the gyro, the scenario,
+HDF5 stores everything exactly: increments, every vector series, the truth, the specification of the gyro, the scenario,
 seed, units, conventions and version. CSV stores the gyro in one file, and each vector series in another one.
 """
 
