@@ -437,7 +437,7 @@ def bad_csv(folder: Path, case: str) -> Path:
     [
         (
             "undeclared",
-            "does not say the unit of its gyro columns; declare it in the header, as in gx [rad/s], or by --gyro-unit",
+            "does not declare the unit of its gyro columns; declare it in the header, as in gx [rad/s], or by --gyro-unit",
         ),
         ("unsorted", "time[11] goes back to 0.1 s after 0.11 s; sort the stamps"),
         ("infinite", "rate[7, 1] is inf"),
