@@ -687,6 +687,35 @@ def test_usque_equals_filterpy_step_by_step(kind, form):
     np.testing.assert_allclose(estimate.innovations[kind].nis, nis, rtol=1e-8)
 
 
+@pytest.mark.parametrize("off", [3.0, -3.0])
+def test_usque_of_a_heading_nearly_half_a_turn_off(off):
+    """Closed form: of thirteen points only two, ±√7 σ about the vertical, lie at another angle, one of them beyond half a turn."""
+    sigma, noise = 0.5, 0.2
+    heading = VectorMeasurements(
+        sensor="compass",
+        kind="heading",
+        time=[1.0],
+        vector_b=[[1.0, 0.0, 0.0]],
+        reference_f=[1.0, 0.0, 0.0],
+        sigma=noise,
+    )
+    record = ImuRecord(time=np.array([0.0, 1.0]), increments=np.zeros((1, 3)), vectors=(heading,))
+    start = estimation.initial_state(quaternion.exp([0.0, 0.0, -off]), attitude_sigma=sigma, bias_sigma=1e-9)
+    still = estimation.ProcessNoise(angle_random_walk=1e-9, rate_random_walk=0.0)
+    found = filters.run("usque", record, still, start, full_covariance=True)
+    angle = 4.0 * np.arctan(np.sqrt(7.0) * sigma / 4.0)
+    assert np.pi - 3.0 < angle < 0.5 * np.pi  # tilted by as much the vector still has its heading
+    S = angle**2 / 7.0 + noise**2
+    gain = sigma * angle / np.sqrt(7.0) / S
+    turned = quaternion.exp([0.0, 0.0, -off + 4.0 * np.arctan(0.25 * gain * off)])
+    np.testing.assert_allclose(found.innovations["compass"].innovation, [[off]], rtol=1e-9)
+    np.testing.assert_allclose(found.innovations["compass"].variance, [[S]], rtol=1e-9)
+    assert quaternion.angle_between(found.attitude[1], turned) < 1e-8
+    np.testing.assert_allclose(
+        found.covariance[1, :3, :3], np.diag([sigma**2, sigma**2, sigma**2 - gain**2 * S]), rtol=1e-9, atol=1e-12
+    )
+
+
 @pytest.mark.parametrize(("kind", "form"), CASES)
 def test_in_the_small_all_filters_are_the_kalman_filter(kind, form):
     """A body at rest, errors of microradians: six states of filterpy's KalmanFilter."""
