@@ -17,7 +17,7 @@ from strapdown.checks import InputError
 from strapdown.estimation import forward, recovery_segments
 from strapdown.estimation.gating import Gate
 from strapdown.estimation.states import ProcessNoise, covariance_matrices
-from strapdown.kernels import rotation, smoother_step
+from strapdown.kernels import rotation, smoother_loop, smoother_step
 from strapdown.kernels.series import LARGEST_ANGLE
 from strapdown.records import Estimate, ImuRecord, Truth
 from strapdown.vectors import VectorMeasurements, triad
@@ -719,6 +719,15 @@ def test_edges_are_found_exactly() -> None:
     filtered = estimation.run(record, noise, initial, full_covariance=True)
     np.testing.assert_array_equal(segments[starts, 4:8], filtered.attitude)
     np.testing.assert_array_equal(covariance_matrices(segments[starts, 11:]), filtered.covariance)
+    for _ in range(
+        300
+    ):  # where a time is less than half the next, their difference is rounded, and the sum need not be the next
+        edges = np.cumsum(10.0 ** rng.uniform(-4.0, 0.0, 30))
+        events = np.sort(np.exp(rng.uniform(*np.log(edges[[0, -1]]), 10)))
+        at = np.sort(np.concatenate([edges, events]))
+        found = np.empty(len(edges), np.int64)
+        smoother_loop.locate_edges(edges, events, np.diff(at)[:, None], len(at) - 1, found)
+        np.testing.assert_array_equal(found, np.searchsorted(at, edges))
 
 
 @pytest.mark.parametrize("name", ["record", "process_noise", "initial", "gate"])
