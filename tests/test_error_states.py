@@ -897,3 +897,21 @@ def test_a_start_that_is_moved_takes_its_covariance_along(option):
     J = carried_by(blocks, turn_to(before.attitude, after.attitude))
     J[:3, :3] = kinematics.right_jacobian(move)
     np.testing.assert_allclose(after.covariance, J @ before.covariance @ J.T, rtol=1e-12, atol=1e-20)
+
+
+@pytest.mark.parametrize("option", ["none", "gyro scale"])
+@pytest.mark.parametrize("angle", [0.9, 1.1, 3.0])
+def test_a_correction_of_any_size_carries_attitude_and_covariance(angle, option):
+    """A measured attitude: the Kalman gain in closed form, and the right Jacobian of the correction."""
+    turn, wide, sigma = angle * np.array([0.48, -0.6, 0.64]), 2.0, 0.5
+    seen = VectorMeasurements(
+        sensor="tracker", kind="attitude", time=[0.0], attitude=quaternion.exp(turn)[None], sigma=sigma
+    )
+    record = ImuRecord(time=np.array([0.0, 1.0]), increments=np.zeros((1, 3)), vectors=(seen,))
+    initial = estimation.initial_state(quaternion.IDENTITY, attitude_sigma=wide, bias_sigma=1e-3)
+    found = estimation.run(record, NOISE, initial, OPTIONS[option], full_covariance=True)
+    correction = wide**2 / (wide**2 + sigma**2) * turn
+    assert quaternion.angle_between(found.attitude[0], quaternion.exp(correction)) < 1e-7
+    J = kinematics.right_jacobian(correction)
+    P = J @ J.T / (wide**-2.0 + sigma**-2.0)
+    np.testing.assert_allclose(found.covariance[0, :3, :3], P, rtol=0, atol=1e-12)
