@@ -503,12 +503,15 @@ def test_from_more_wild_directions_than_it_doubts_it_recovers(size):
         e, nees = judged(found, record)
         assert np.linalg.norm(e[-1, :3]) < 1.0 * DEGREE
         assert nees[-1] < 30.0
-        for event in found.estimate.events:
+        for nth, event in enumerate(found.estimate.events, start=1):
             assert (event.kind, event.sensor, event.value) == ("recovery", "magnetometer", 10.0)
-            if event.end < found.became_one:  # the bank's own: it is as if there had been nothing before
+            if (
+                event.end < found.became_one
+            ):  # the bank's own: but for the bias's σ it is as if there had been nothing before
                 assert event.end - event.start == pytest.approx(90.0)
                 assert found.estimate.time[0] >= event.start
                 assert found.estimate.skipped["magnetometer"] == np.sum(record.vectors[0].time < event.start)
+                np.testing.assert_allclose(found.estimate.sigma[0, 3:], 3.0**nth * 20.0 * DEGREE_PER_HOUR, rtol=0.01)
                 recovered += 1
     assert recovered > 10
 
