@@ -294,6 +294,22 @@ def test_what_is_carried_turns_with_the_attitude(kind, late):
     np.testing.assert_allclose(ratio, 1.0, rtol=1e-2)
 
 
+def test_a_correction_by_a_radian_is_carried_back_with_all_that_turns():
+    """A body at rest, and no noise: what is measured at the end says of the start what it would have said there."""
+    blocks = (error_states.GaussMarkov(sensor="acc", noise_sigma=1.0, correlation_time=1e9, frame="fixed"),)
+    still = ProcessNoise(angle_random_walk=1e-9, rate_random_walk=1e-12)
+    initial = estimation.initial_state(quaternion.IDENTITY, attitude_sigma=[0.1, 0.2, 2.0], bias_sigma=1e-9)
+    true = quaternion.exp([0.1, -0.05, 1.0])
+    felt = quaternion.rotate(quaternion.conjugate(true), UP + [0.6, -0.3, 0.2])
+    found = []
+    for run, at in ((estimation.smooth, 1.0), (estimation.run, 0.0)):
+        acc = VectorMeasurements(sensor="acc", kind="vector", time=[at], vector_b=[felt], reference_f=UP, sigma=0.05)
+        seen = VectorMeasurements(sensor="seen", kind="attitude", time=[at], attitude=[true], sigma=0.05)
+        record = ImuRecord(time=np.array([0.0, 1.0]), increments=np.zeros((1, 3)), vectors=(acc, seen))
+        found.append(run(record, still, initial, blocks, full_covariance=True))
+    assert difference(*found, 0, 0) < 1e-6
+
+
 def pushed(kind: str, runs: int) -> np.ndarray:
     """NEES over its degrees of what is carried, of a body whose heading is found at the end: there, and smoothed amid (runs, 2)."""
     found = np.empty((runs, 2))
