@@ -110,6 +110,13 @@ def test_plan_says_how_long_a_record_is_needed(run, tmp_path):
     assert not (tmp_path / "filter.toml").exists()
 
 
+def test_plan_takes_a_built_in_scenario_by_name(run):
+    status, said, complaint = run("tune", "two-stars", "--plan", "--length", "20", "--free", "gyro.arw")
+    assert (status, "gyro.arw" in said) == (0, True), complaint
+    status, _, complaint = run("tune", "two-star", "--plan")
+    assert (status, "did you mean 'two-stars'" in complaint) == (2, True)
+
+
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [

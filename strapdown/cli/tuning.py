@@ -465,7 +465,9 @@ def _plan(
     if len(sources) != 1:
         raise InputError(f"--plan takes one scenario; {len(sources)} are given")
     lengths = None if length is None else _numbers(length)
-    scenario = _scenario_of(sources[0]) if recordfiles.is_record(sources[0]) else scenarios.load_scenario(sources[0])
+    (source,) = sources
+    of_record = source.is_file() and recordfiles.is_record(source)
+    scenario = _scenario_of(source) if of_record else scenarios.load_scenario(source)
     modelled = chosen or setup.FilterSetup.for_scenario(scenario, states=start.states)
     wanted = start.names or list(tuning.default_names([scenarios.simulate(scenario)]))
     with progress_bar("simulated records", 4) as advance:
