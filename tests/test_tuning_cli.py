@@ -84,9 +84,12 @@ def test_tune_against_the_truth_and_with_a_prior(run, tmp_path, record, wrong):
 def test_tune_by_the_size_of_the_error(run, tmp_path, record, wrong):
     out = tmp_path / "tuned.toml"
     options = ("--filter", wrong, "--rmse", "--free", "gyro.arw,gyro.rrw", "--starts", 1, "--holdout", 0.4)
-    status, _, complaint = run("tune", record, *options, "-o", out)
+    status, said, complaint = run("tune", record, *options, "-o", out)
     assert status == 0, complaint
     found = json.loads(out.with_suffix(".json").read_text())
+    before, after = np.degrees(found["objective"]["attitude_rms_rad"])
+    assert f"RMS attitude error: {before:.4g}° before, {after:.4g}° after." in said
+    assert after < before
     held = found["held_out"]
     assert held["after"]["attitude_rms_rad"] < held["before"]["attitude_rms_rad"]
     assert setup.read_setup(out).measurement_sigma_factor != 1.0
