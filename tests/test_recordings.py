@@ -103,6 +103,12 @@ def test_empty_fields_of_accelerometer_and_magnetometer_are_missing_samples(csv)
 # ---------------------------------------------------------------------------------------------------- CSV: what is refused
 
 
+def test_a_sensor_without_any_sample_is_left_out_and_reported(csv):
+    recording = read(csv(HEADER + ",mx,my,mz", ["0,1,2,3,,,,4,5,6", "1,1,2,3,,,,4,5,6"]))
+    assert recording.specific_force is None
+    assert recording.remarks[-1] == "The accelerometer has no sample from 0 s on."
+
+
 def test_undeclared_units_are_refused_not_guessed(csv):
     refused(
         csv("time,gx,gy,gz,ax [m/s2],ay,az"),
