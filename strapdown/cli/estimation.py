@@ -601,7 +601,7 @@ def _say_recording(result: AhrsEstimate, parameters: AhrsParameters, motion: str
     if result.hard_iron.any():
         iron = ", ".join(f"{value:.3g}" for value in result.hard_iron)
         console.print(
-            f"Hard iron of {iron} (unit of the magnetometer, body axes, at the end) is subtracted from its samples."
+            f"Hard iron of ({iron}) {used.magnetic_unit or '(unit of the magnetometer)'}, body axes, at the end, is subtracted."
         )
     for begin, length in recordings.gaps(used.time):
         console.print(f"Gap of {length:.3g} s after {begin:.3f} s.")
@@ -636,7 +636,7 @@ def _model(moved_by: str, odds: float, parameters: AhrsParameters, result: AhrsE
     bias, sigma = result.initial.bias / DEGREE, np.sqrt(result.initial.covariance[3, 3]) / DEGREE
     shown = ", as the recording shows," if parameters.velocity_from_record else ""
     likelier = (
-        f" (log-likelihood + {odds:.3g} beside a {'hand' if moved_by == 'vehicle' else 'vehicle'})"
+        f" (log-likelihood {odds:.0f} above that of a {'hand' if moved_by == 'vehicle' else 'vehicle'})"
         if odds < np.inf
         else ""
     )
