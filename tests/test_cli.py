@@ -409,6 +409,14 @@ def test_estimate_on_broad(run, broad, tmp_path):
     assert errors["heading_rmse_deg"] <= errors["total_rmse_deg"]
     assert errors["inclination_rmse_deg"] <= errors["total_rmse_deg"]
     assert f"{errors['total_rmse_deg']:.2f}" in said
+    assert "RMS error over the movement phase, degrees" in said
+
+
+def test_errors_against_a_reference_alone_are_over_the_whole_recording(run, tmp_path):
+    columns = np.column_stack([walk()[:, :7], np.tile([1.0, 0.0, 0.0, 0.0], (800, 1))])
+    header = UNITS.removesuffix(",mx,my,mz") + ",reference_qw,reference_qx,reference_qy,reference_qz"
+    _, said, _ = run("estimate", write_csv(tmp_path / "walk.csv", columns, header), "--out", tmp_path / "out")
+    assert "RMS error over the whole recording, degrees" in said
 
 
 def bad_csv(folder: Path, case: str) -> Path:

@@ -502,7 +502,8 @@ def _estimate_recording(
     if shared.observability:
         paths.append(_observability(out, used.source, result.record, parameters.setup, result.initial))
     if rms is not None:
-        paths.append(_rms(out, used.source, rms))
+        over = "the whole recording" if used.movement is None else "the movement phase"
+        paths.append(_rms(out, used.source, rms, over))
     paths += _export(exports, result.estimate, begun.recording)
     if output.drawn_as is not None:
         frame = _fixed_frame(used)
@@ -613,10 +614,10 @@ def _say_recording(result: AhrsEstimate, parameters: AhrsParameters, motion: str
     _print_result(replace(found, skipped={}))
 
 
-def _rms(out: Path, source: str, rms: dict[str, float]) -> Path:
+def _rms(out: Path, source: str, rms: dict[str, float], over: str) -> Path:
     """Print and write the RMS errors against the reference, degrees; return the file."""
     write_json(out / "errors.json", {"source": source, **{f"{name}_rmse_deg": value for name, value in rms.items()}})
-    rows = table("RMS error over the movement phase, degrees", *rms, left=0)
+    rows = table(f"RMS error over {over}, degrees", *rms, left=0)
     rows.add_row(*(f"{value:.2f}" for value in rms.values()))
     show(rows)
     return out / "errors.json"

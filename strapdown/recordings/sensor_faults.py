@@ -90,8 +90,8 @@ def find(recording: Recording) -> Faults:
         variance[k] += turn_variance_over(recording.time, rate, float(steps[k]), usual)
     if len(long):
         words.append(
-            f"{len(long)} intervals between stamps are longer than {LONG_INTERVAL:g} usual ones, up to {steps.max():.3g} s: σ grows over "
-            "each by what the rate changes in as long a time"
+            f"Intervals between stamps longer than {LONG_INTERVAL:g} usual ones: {len(long)}, up to {steps.max():.3g} s; σ grows over each "
+            "by what the rate changes in as long a time"
         )
     if changes:
         recording = replace(recording, **changes)
