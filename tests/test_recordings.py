@@ -146,6 +146,12 @@ def test_contradicting_units_are_refused(csv):
     refused(csv(), "the header says rad/s", "the option deg/s", "drop one", units={"gyro": "deg/s"})
 
 
+def test_units_and_columns_are_mappings_of_what_is_known(csv):
+    refused(csv(), "units is 'deg/s'", "{'gyro': 'deg/s'}", units="deg/s")
+    refused(csv(), "columns is 'gx'", columns="gx")
+    refused(csv(), "role 'gyro' is not known", "did you mean 'gy'", columns={"gyro": "gx"})
+
+
 def test_units_of_an_unknown_sensor_are_refused(csv):
     refused_here = csv("time,gx,gy,gz,ax [g],ay,az")
     with pytest.raises(InputError, match=r"'gyros' is not known.*'gyro'"):
