@@ -109,6 +109,14 @@ def test_a_fault_of_the_program_is_no_verdict(run, monkeypatch):
     assert error.splitlines()[-1].startswith(f"error: a fault of strapdown {strapdown.__version__} itself")
 
 
+def test_a_fault_of_a_filter_of_ones_own_is_not_the_programs(run, tmp_path):
+    (tmp_path / "mine.py").write_text("def mine(record, initial):\n    return record.nothing\n")
+    status, _, error = run("montecarlo", "two-stars", "--runs", 2, "--filter", "mine.py:mine")
+    assert status == 2
+    assert "    return record.nothing" in error.splitlines()
+    assert error.splitlines()[-1].startswith("error: mine, a filter of your own, failed (AttributeError)")
+
+
 def test_an_output_that_cannot_hold_every_letter_gets_question_marks():
     environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
     command = [sys.executable, "-c", "from strapdown import cli; cli.main()", "algorithms", "--no-time"]

@@ -47,7 +47,7 @@ class _Foreign:
 
     truth: Path | None = typer.Option(
         None,
-        help="Reference attitudes, of any clock and frames: a simulated record, TUM, EuRoC, CSV, ROS bag. What differs is printed.",
+        help="Reference attitudes, of any clock and frames: a simulated record, TUM, EuRoC, BROAD, CSV, ROS bag. What differs is printed.",
     )
     error_frame: str = typer.Option(
         "find",
