@@ -490,7 +490,7 @@ def test_a_recording_is_taken_for_that_of_a_hand(run, recording, tmp_path):
     status, said, error = run("estimate", recording, "--out", tmp_path / "out")
     assert (status, error) == (0, "")
     moved = re.search(
-        r"of a hand \(log-likelihood \+ [0-9.]+ beside a vehicle\), ([0-9.]+) m/s, as the recording shows, with a correlation time "
+        r"of a hand \(log-likelihood [0-9]+ above that of a vehicle\), ([0-9.]+) m/s, as the recording shows, with a correlation time "
         r"of 0.3 s\.",
         said,
     )

@@ -154,6 +154,26 @@ def test_exported_and_read_back_it_has_the_same_verdict(run, files, name, monkey
     assert "the file says that its covariance is of the body error" in said
 
 
+def test_the_reference_of_a_broad_trial_is_a_truth(tmp_path):
+    attitude = Rotation.random(50, random_state=0).as_quat(scalar_first=True)
+    attitude[7:9] = np.nan
+    recordings.write(
+        recordings.Recording(
+            source="trial", time=np.arange(50) / 100.0, rate=np.zeros((50, 3)), true_attitude=attitude
+        ),
+        tmp_path / "trial.hdf5",
+    )
+    found = read_attitudes(tmp_path / "trial.hdf5")
+    assert len(found.stamps_ns) == 48
+    assert found.stamps_ns[7] == 90_000_000
+    np.testing.assert_allclose(found.attitude, attitude[np.isfinite(attitude[:, 0])], atol=1e-15)
+    recordings.write(
+        recordings.Recording(source="bare", time=np.arange(50) / 100.0, rate=np.zeros((50, 3))), tmp_path / "bare.hdf5"
+    )
+    with pytest.raises(InputError, match="without a reference attitude"):
+        read_attitudes(tmp_path / "bare.hdf5")
+
+
 def test_a_bag_has_the_attitude_about_fixed_axes(run, files, monkeypatch, capsys):
     pytest.importorskip("rosbags")
     status, said, _ = command(

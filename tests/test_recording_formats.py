@@ -133,6 +133,10 @@ def test_arrays_by_name_are_a_recording():
     columns = {"time": np.arange(3.0), "gx": [1, 2, 3], "gy": np.zeros(3), "gz": np.zeros(3)}
     assert recordings.from_table(columns, units={"gyro": "rad/s"}).rate[2, 0] == 3.0
     assert sd.read(columns, units={"gyro": "rad/s"}).rate[2, 0] == 3.0
+    values = np.arange(12.0).reshape(4, 3)
+    recording = sd.read({"time": np.arange(4.0), "gyro [deg/s]": values, "acc": values}, units={"accelerometer": "g"})
+    np.testing.assert_allclose(recording.rate, np.radians(values), rtol=1e-15)
+    np.testing.assert_allclose(recording.specific_force, values * 9.80665, rtol=1e-15)
     with pytest.raises(InputError, match=r"path is 3, .*give a path, a DataFrame"):
         sd.read(3)
     with pytest.raises(InputError, match=r"table: column gz has shape \(2,\), the first \(3,\)"):

@@ -103,6 +103,12 @@ def test_empty_fields_of_accelerometer_and_magnetometer_are_missing_samples(csv)
 # ---------------------------------------------------------------------------------------------------- CSV: what is refused
 
 
+def test_a_sensor_without_any_sample_is_left_out_and_reported(csv):
+    recording = read(csv(HEADER + ",mx,my,mz", ["0,1,2,3,,,,4,5,6", "1,1,2,3,,,,4,5,6"]))
+    assert recording.specific_force is None
+    assert recording.remarks[-1] == "The accelerometer has no sample from 0 s on."
+
+
 def test_undeclared_units_are_refused_not_guessed(csv):
     refused(
         csv("time,gx,gy,gz,ax [m/s2],ay,az"),
@@ -138,6 +144,12 @@ def test_unknown_units_are_refused(csv):
 def test_contradicting_units_are_refused(csv):
     refused(csv("time,gx [rad/s],gy [deg/s],gz,ax [g],ay,az"), "column gy is in deg/s", "rad/s", "same unit")
     refused(csv(), "the header declares rad/s", "the option is deg/s", "drop one", units={"gyro": "deg/s"})
+
+
+def test_units_and_columns_are_mappings_of_what_is_known(csv):
+    refused(csv(), "units is 'deg/s'", "{'gyro': 'deg/s'}", units="deg/s")
+    refused(csv(), "columns is 'gx'", columns="gx")
+    refused(csv(), "role 'gyro' is not known", "did you mean 'gy'", columns={"gyro": "gx"})
 
 
 def test_units_of_an_unknown_sensor_are_refused(csv):

@@ -85,9 +85,12 @@ def test_tune_against_the_truth_and_with_a_prior(run, tmp_path, record, wrong):
 def test_tune_by_the_size_of_the_error(run, tmp_path, record, wrong):
     out = tmp_path / "tuned.toml"
     options = ("--filter", wrong, "--rmse", "--free", "gyro.arw,gyro.rrw", "--starts", 1, "--holdout", 0.4)
-    status, _, complaint = run("tune", record, *options, "-o", out)
+    status, said, complaint = run("tune", record, *options, "-o", out)
     assert status == 0, complaint
     found = json.loads(out.with_suffix(".json").read_text())
+    before, after = np.degrees(found["objective"]["attitude_rms_rad"])
+    assert f"RMS attitude error: {before:.4g}° before, {after:.4g}° after." in said
+    assert after < before
     held = found["held_out"]
     assert held["after"]["attitude_rms_rad"] < held["before"]["attitude_rms_rad"]
     assert setup.read_setup(out).measurement_sigma_factor != 1.0
@@ -109,6 +112,13 @@ def test_plan_says_how_long_a_record_is_needed(run, tmp_path):
     assert run("simulate", path, "--out", record)[0] == 0
     assert run("tune", "--plan", record, "--free", "gyro.arw,sun.sigma")[:2] == (0, said)
     assert not (tmp_path / "filter.toml").exists()
+
+
+def test_plan_takes_a_built_in_scenario_by_name(run):
+    status, said, complaint = run("tune", "two-stars", "--plan", "--length", "20", "--free", "gyro.arw")
+    assert (status, "gyro.arw" in said) == (0, True), complaint
+    status, _, complaint = run("tune", "two-star", "--plan")
+    assert (status, "did you mean 'two-stars'" in complaint) == (2, True)
 
 
 @pytest.mark.parametrize(

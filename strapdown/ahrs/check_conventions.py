@@ -204,6 +204,7 @@ def examine(recording: Recording) -> Examination:
         )
     unit_changes, doubts = _force_unit(recording)
     doubts += _too_fast(recording)
+    unsaid = [f"as it seems, {words}" for words in unit_changes]  # gravity alone shows it, whatever the turns do
     upright = at_rest(recording)
     found = list(_with_reference(recording) if recording.true_attitude is not None else _without_reference(recording))
     notes = _unseen(recording)
@@ -214,7 +215,7 @@ def examine(recording: Recording) -> Examination:
             reason="the recording has hardly any rotation, or too few samples",
             candidates=(),
             notes=tuple(notes),
-            doubts=tuple(upright + doubts),
+            doubts=tuple(upright + unsaid + doubts),
         )
     candidates = [
         Candidate(
@@ -230,7 +231,7 @@ def examine(recording: Recording) -> Examination:
         result = replace(
             result, verdict="cannot tell", reason="the sensors agree with each other; see the warning on their sign"
         )
-    return replace(result, doubts=tuple(upright + doubts))
+    return replace(result, doubts=tuple(upright + (unsaid if result.verdict == "cannot tell" else []) + doubts))
 
 
 def _concluded(source: str, candidates: list[Candidate], sure: tuple[str, ...], notes: list[str]) -> Examination:

@@ -61,6 +61,7 @@ def measured(steps: FieldSteps, parameters: AhrsParameters, *, causal: bool) -> 
         )
         odds = np.clip((as_measured - without) / (2.0 * parameters.field_deviation**2), -50.0, 0.0)
         iron *= (2.0 / (1.0 + np.exp(-odds)))[:, None]
+        iron[np.linalg.norm(iron, axis=1) < hard_iron.NEGLIGIBLE * reference[0]] = 0.0
         field = field - quaternion.rotate(steps.frame, iron)
         level = _strength_and_dip(field, vertical)
         reference = level[first].mean(axis=0)

@@ -20,7 +20,10 @@ QUIET_SPAN = 1.0
 def need_accelerometer(recording: Recording) -> None:
     """Reject a recording without an accelerometer."""
     if recording.specific_force is None:
-        raise InputError(f"{recording.source} has no accelerometer, which shows the vertical; add columns ax, ay, az")
+        raise InputError(
+            f"{recording.source} has no accelerometer samples from {recording.time[0]:.3g} s on, which show the vertical; add columns "
+            "ax, ay, az"
+        )
 
 
 class Begun(NamedTuple):
@@ -45,7 +48,9 @@ def begin(recording: Recording | Begun) -> Begun:
         return recording
     need_accelerometer(recording)
     span = quiet_span(recording)
-    return Begun(recording, slice(0, span.stop - span.start), sensor_faults.find(recording.since(span.start)))
+    faults = sensor_faults.find(recording.since(span.start))
+    need_accelerometer(faults.recording)  # it may have had samples before the quiet second alone
+    return Begun(recording, slice(0, span.stop - span.start), faults)
 
 
 def quiet_span(recording: Recording) -> slice:

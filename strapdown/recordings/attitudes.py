@@ -3,7 +3,7 @@
 ``read_attitudes`` recognises formats by content:
 
 - results of this package (HDF5): estimate, simulated record (its truth), integrated attitude;
-- TUM trajectories (no covariance) and EuRoC's ground truth;
+- the reference of a BROAD trial, TUM trajectories (no covariance) and EuRoC's ground truth;
 - CSV and TSV with the columns of :data:`COLUMNS`, such as `strapdown convert estimate.h5 estimate.csv` writes;
 - ROS bags: ``sensor_msgs/Imu`` (orientation), ``nav_msgs/Odometry``, ``geometry_msgs/PoseWithCovarianceStamped``, ``PoseStamped``,
   ``QuaternionStamped``;
@@ -29,8 +29,9 @@ from strapdown import quaternion, records
 from strapdown.checks import Array, InputError, array, one_of
 from strapdown.files import reading
 from strapdown.recordings import delimited, recordfiles, ros, trajectories
+from strapdown.recordings.broad import read_broad
 from strapdown.recordings.extras import library
-from strapdown.records import Innovations, outputs
+from strapdown.records import Innovations, Recording, outputs
 from strapdown.units import DEGREE, DEGREE_PER_HOUR
 
 
@@ -65,7 +66,9 @@ def read_attitudes(path: str | os.PathLike[str], *, topic: str = "") -> Attitude
         return _bag(file, topic)
     reading.existing_file(file)
     if reading.is_hdf5(file):
-        return _own(file)
+        with reading.hdf5(file) as content:
+            own = "kind" in reading.attributes(content)
+        return _own(file) if own else _of_recording(read_broad(file))
     with reading.opened(file) as stream:
         head = stream.read(4096)
     if head.startswith(ros.MAGICS):
@@ -116,6 +119,15 @@ def _own(path: Path) -> Attitudes:
     raise InputError(
         f"{path} is a {kind}, which has no attitudes over time; give an estimate, a record or a trajectory"
     )
+
+
+def _of_recording(recording: Recording) -> Attitudes:
+    """Return the reference of a recording."""
+    if recording.true_attitude is None:
+        raise InputError(f"{recording.source} is a recording without a reference attitude; give another reference")
+    known = np.isfinite(recording.true_attitude).all(axis=1)
+    stamps = recording.epoch_ns + _whole_ns(recording.time[known])
+    return Attitudes(source=recording.source, stamps_ns=stamps, attitude=recording.true_attitude[known])
 
 
 # ------------------------------------------------------------------------------------------------------------ tables

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from strapdown.checks import Array, InputError, known_keys, one_of
+from strapdown.checks import Array, InputError, instance, known_keys, one_of
 from strapdown.records.recording import (
     CLOCK_OFFSET,
     FORCE_UNITS,
@@ -116,14 +116,12 @@ def unit_of(group: str, text: str) -> str:
 
 def parse_mapping(text: str) -> dict[str, str]:
     """Return the columns by role from a text ``time=timestamp,gx=gyro_x[dps],…``, the format of ``--columns``."""
-    roles = [role for members in GROUPS.values() for role in members]
     found: dict[str, str] = {}
     for part in text.split(","):
         role, equals, name = part.partition("=")
         role = role.strip()
         if not equals or not name.strip():
             raise InputError(f"columns: {part.strip()!r} is not ROLE=NAME; write time=timestamp,gx=gyro_x[dps],…")
-        one_of("columns: role", role, roles)
         if role in found:
             raise InputError(f"columns: {role} is given twice; keep one")
         found[role] = name.strip()
@@ -147,6 +145,8 @@ def recording(
     header declares none. ``mapping`` gives columns by role, optionally with a unit, ``{"gx": "gyro_x [dps]"}``; the others are found by
     their names.
     """
+    for name, given in (("units", units or {}), ("columns", mapping or {})):
+        instance(name, given, Mapping, "give a mapping, such as units={'gyro': 'deg/s'} or columns={'gx': 'gyro_x'}")
     known_keys("units", units or {}, [group for group in UNITS if group != "temperature"])
     columns = [column(cell) for cell in header]
     _no_doubles(source, columns)
@@ -219,6 +219,7 @@ def _roles(
     unit_by_role: dict[str, str] = {}
     roles: dict[str, int] = {}
     for role, cell in mapping.items():
+        one_of("columns: role", role, [role for members in GROUPS.values() for role in members])
         wanted = column(cell)
         cells = {one.said.lower(): k for k, one in enumerate(columns)} | {name: k for k, name in enumerate(names)}
         found = cells.get(cell.lower(), cells.get(wanted.name.lower()))

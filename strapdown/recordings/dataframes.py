@@ -36,7 +36,7 @@ def from_table(
     Parameters
     ----------
     table : DataFrame, Dataset or mapping of str to array_like
-        Columns named as those of a CSV file; variables of a Dataset with a second dimension of length 3 are x, y and z.
+        Columns named as those of a CSV file; arrays (n, 3) of a mapping or a Dataset hold x, y and z.
     source : str, default "table"
         Name of the recording, for messages.
     units : mapping of str to str, optional
@@ -60,7 +60,7 @@ def from_table(
     Examples
     --------
     >>> import numpy as np
-    >>> rest = {"time": np.arange(3.0), "gx [dps]": np.zeros(3), "gy": np.zeros(3), "gz": np.zeros(3)}
+    >>> rest = {"time": np.arange(3.0), "gyro [dps]": np.zeros((3, 3))}
     >>> from_table(rest).rate.shape
     (3, 3)
     """
@@ -69,7 +69,8 @@ def from_table(
     for name, one in found.items():
         if np.shape(one) != np.shape(arrays[0]) or np.ndim(one) != 1:
             raise InputError(
-                f"{source}: column {name} has shape {np.shape(one)}, the first {np.shape(arrays[0])}; give rows of one length"
+                f"{source}: column {name} has shape {np.shape(one)}, the first {np.shape(arrays[0])}; give arrays (n,) or "
+                "(n, 3) of one length"
             )
 
     def values(k: int) -> Array:
@@ -113,7 +114,8 @@ def _columns(source: str, table: Any) -> dict[str, NDArray[np.generic]]:
             found[str(index.name or "time")] = _plain(index)
         found |= {str(name): _plain(table[name]) for name in table.columns}
     else:
-        found = {str(name): np.asarray(values) for name, values in dict(table).items()}
+        for name, values in dict(table).items():
+            found |= _by_axis(str(name), np.asarray(values))
     if not found:
         raise InputError(f"{source} has no columns; give time, gx, gy, gz, …")
     return found
@@ -137,16 +139,23 @@ def _plain(series: Any) -> NDArray[np.generic]:
     return np.asarray(series)
 
 
+def _by_axis(name: str, values: NDArray[np.generic]) -> dict[str, NDArray[np.generic]]:
+    """Return one column, or three of an array (n, 3), the unit behind the axis."""
+    if values.shape[1:] != (3,):
+        return {name: values}
+    said = naming.column(name)
+    unit = f" [{said.unit}]" if said.unit else ""
+    return {f"{said.name}_{axis}{unit}": values[:, k] for k, axis in enumerate("xyz")}
+
+
 def _of_dataset(table: Any) -> dict[str, NDArray[np.generic]]:
     found: dict[str, NDArray[np.generic]] = {}
     for name, variable in {**table.coords, **table.data_vars}.items():
         unit = str(variable.attrs.get("units", variable.attrs.get("unit", "")))
         values = np.asarray(variable.values)
         declared = f" [{unit}]" if unit and values.dtype.kind not in "mM" else ""
-        if values.ndim == 1 and values.dtype.kind not in "OSU" and name != "axis":
-            found[f"{name}{declared}"] = values
-        elif values.ndim == 2 and values.shape[1] == 3:
-            found |= {f"{name}_{axis}{declared}": values[:, k] for k, axis in enumerate("xyz")}
+        if (values.ndim == 1 and values.dtype.kind not in "OSU" and name != "axis") or values.shape[1:] == (3,):
+            found |= _by_axis(f"{name}{declared}", values)
     length = max((len(values) for values in found.values()), default=0)
     return {name: values for name, values in found.items() if len(values) == length}
 

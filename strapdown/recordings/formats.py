@@ -235,7 +235,7 @@ def read(
         raise InputError(
             f"{file.name} is a {found.name}, which has no inertial samples; give the recording, and this file as its reference"
         )
-    given = {"units": dict(units or {}), "columns": dict(columns or {}), "topic": topic}
+    given = {"units": units or {}, "columns": columns or {}, "topic": topic}
     for name, value in given.items():
         if value and name not in found.options:
             _refuse_option(file, found, name, value)

@@ -90,7 +90,7 @@ def find(recording: Recording) -> Faults:
         variance[k] += turn_variance_over(recording.time, rate, float(steps[k]), usual)
     if len(long):
         words.append(
-            f"{len(long)} intervals between stamps are longer than {LONG_INTERVAL:g} median ones, up to {steps.max():.3g} s: σ grows over "
+            f"Intervals between stamps longer than {LONG_INTERVAL:g} median ones: {len(long)}, up to {steps.max():.3g} s; σ grows over "
             "each according to the change of the rate in that time"
         )
     if changes:

@@ -99,11 +99,19 @@ class Recording(Listed):
                 f"{self.source}: rate[{row}, {axis}] is {self.rate[row, axis]:g} rad/s, which no gyro measures; convert raw counts to "
                 "rad/s or deg/s by the scale factor of the datasheet, or remove the row"
             )
-        for name, width in (("specific_force", 3), ("magnetic_field", 3), ("true_attitude", 4)):
+        for name, sensor in (
+            ("specific_force", "accelerometer"),
+            ("magnetic_field", "magnetometer"),
+            ("true_attitude", "reference"),
+        ):
             value = getattr(self, name)
             if value is not None:
-                value = array(f"{self.source}: {name}", value, (n, width), allow_nan=True)
-                if name != "true_attitude" and not np.any(np.abs(value) > 0.0) and not np.isnan(value).all():
+                value = array(f"{self.source}: {name}", value, (n, 4 if sensor == "reference" else 3), allow_nan=True)
+                if np.isnan(value).all():
+                    words = f"The {sensor} has no sample from {time[0]:.3g} s on."
+                    object.__setattr__(self, "remarks", (*self.remarks, words))
+                    value = None
+                elif sensor != "reference" and not np.any(np.abs(value) > 0.0):
                     raise InputError(
                         f"{self.source}: {name} is 0 in every row, as if there were no such sensor; leave its columns out"
                     )

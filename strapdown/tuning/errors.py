@@ -46,6 +46,11 @@ class ErrorObjective(Objective):
         P = np.concatenate([covariance for _, covariance in found])
         return self._squares(error) if self.measure == "rmse" else self._likelihood(error, P)
 
+    def rms(self, points: Array) -> Array:
+        """Return the RMS attitude error, all axes together, at points (k, p), rad (k,), where that is the measure."""
+        number = 3 * sum(len(one.epochs) for one in self.references)
+        return np.asarray(np.sqrt(3.0) * np.exp(self.minus_log(points) / number))
+
     def errors_of(self, number: int, rows: Array) -> tuple[Array, Array]:
         """Return errors (m, lanes, n) and covariances (m, lanes, n, n) of one record; n is 3 if the true bias is unknown."""
         truth = self.references[number]

@@ -8,7 +8,7 @@ zero is as likely as the best value. Then only an upper bound is reported.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import NamedTuple, TypeVar
@@ -69,6 +69,7 @@ class Optimum:
 def local_at(objective: Objective, point: Array, priors: Mapping[str, Prior]) -> Local:
     """Return the objective with its priors at a point."""
     found = objective.derivatives(point)
+    objective.evaluated()
     value, score, information = float(found.value.sum()), found.score.sum(axis=0), found.information.copy()
     for j, name in enumerate(objective.names):
         if name in priors:
@@ -272,7 +273,7 @@ def fit(
     seed: int = 0,
     threads: int = 1,
     intervals: bool = True,
-    progress: Callable[[int], None] | None = None,
+    progress: Callable[[str], None] | None = None,
 ) -> Tuning:
     """Return the maximum-likelihood parameters with their intervals.
 
@@ -293,7 +294,7 @@ def fit(
     intervals : bool, default True
         Whether to evaluate the profile likelihood of parameters that are not well determined.
     progress : callable, optional
-        Called with the number of searches just finished, and then for each parameter's interval.
+        Called after each evaluation of the objective with the progress, such as ``"searches: 1 of 4, 23 evaluations"``.
 
     Returns
     -------
@@ -314,11 +315,12 @@ def fit(
     known_keys("priors", known, objective.names)
     if not factor > 1.0:
         raise InputError(f"factor is {factor}; it must be greater than 1")
-    report = progress or (lambda done: None)
     points = np.clip(random_starts(objective.start, starts, factor, np.random.default_rng(seed)), *objective.limits)
+    stage = _Stage(progress)
+    objective = replace(objective, evaluated=stage.evaluated)
 
     with ThreadPoolExecutor(threads) as pool:
-        optima = list(_reported(report, pool.map(lambda point: search(objective, point, known), points)))
+        optima = stage.each("searches", pool.map(lambda point: search(objective, point, known), points), len(points))
     best = min(optima, key=lambda optimum: optimum.local.value)
     if not best.converged:
         raise InputError(
@@ -332,7 +334,8 @@ def fit(
         return _wald(best, j, float(errors.standard[j]))
 
     with ThreadPoolExecutor(threads) as pool:
-        ranges = list(_reported(report, pool.map(interval, range(len(points[0])))))
+        ranges = stage.each("intervals", pool.map(interval, range(len(points[0]))), len(points[0]))
+    stage.what = "parameters not identified"
     point = _with_means(objective, best.point, ranges, known)
     misfit = errors.misfit and not objective.composite
 
@@ -377,11 +380,24 @@ def _with_means(objective: Objective, point: Array, ranges: Sequence[_Known], pr
     return search(objective, moved, priors, fixed=loose).point
 
 
-def _reported(report: Callable[[int], None], results: Iterable[T]) -> Iterator[T]:
-    """Yield the results and report each."""
-    for result in results:
-        report(1)
-        yield result
+class _Stage:
+    """Progress of a fit, reported after each evaluation: the number of evaluations of a search is not known beforehand."""
+
+    def __init__(self, progress: Callable[[str], None] | None) -> None:
+        self.progress, self.what, self.evaluations = progress, "", 0
+
+    def evaluated(self) -> None:
+        self.evaluations += 1
+        if self.progress is not None:
+            self.progress(f"{self.what}, {self.evaluations} evaluations")
+
+    def each(self, what: str, results: Iterable[T], number: int) -> list[T]:
+        found: list[T] = []
+        self.what = f"{what}: 0 of {number}"
+        for result in results:
+            found.append(result)
+            self.what = f"{what}: {len(found)} of {number}"
+        return found
 
 
 class _Errors(NamedTuple):
@@ -440,8 +456,13 @@ class Slices:
     """2 Δℓ: decrease of twice the log likelihood from its maximum (p, k)."""
 
 
-def slices(objective: Objective, tuning: Tuning, *, number: int = 24) -> Slices:
-    """Return slices of the objective through the tuned point, somewhat beyond each interval, without priors."""
+def slices(objective: Objective, tuning: Tuning, *, number: int = 25) -> Slices:
+    """Return slices of the objective through the tuned point, somewhat wider than each interval, without priors.
+
+    The points, an odd number, are densest about the tuned point, which is the middle one: a slice may be much narrower than the interval,
+    for which the other parameters vary too.
+    """
+    grid = np.linspace(-1.0, 1.0, number) ** 3
     values, fallen = [], []
     for j, one in enumerate(tuning.parameters):
         width = 2.5 * min(max(one.standard_error, 1e-3), 1.0)
@@ -449,10 +470,10 @@ def slices(objective: Objective, tuning: Tuning, *, number: int = 24) -> Slices:
         ends = np.log([max(min(one.lower, one.value), one.value * np.exp(-2.0 * width), 1e-300), max(top, one.value)])
         ends += np.array([-0.3, 0.3]) * max(float(np.ptp(ends)), 1e-3)
         points = np.tile(tuning.point, (number, 1))
-        points[:, j] = np.linspace(ends[0], ends[1], number)
-        found = objective.minus_log(np.concatenate([tuning.point[None], points]) - np.log(tuning.scale))
+        points[:, j] += np.where(grid < 0.0, tuning.point[j] - ends[0], ends[1] - tuning.point[j]) * grid
+        found = objective.minus_log(points - np.log(tuning.scale))
         values.append(np.exp(points[:, j]))
-        fallen.append(2.0 * (found[1:] - min(found[0], found[1:].min())))
+        fallen.append(2.0 * (found - found.min()))
     return Slices(names=objective.names, values=np.array(values), fallen=np.array(fallen))
 
 

@@ -134,6 +134,8 @@ class Objective:
     """Spans of time of each record whose gradients are kept apart."""
     threads: int = 1
     spacing: float = 0.0
+    evaluated: Callable[[], object] = field(default=lambda: None, repr=False)
+    """Called after each evaluation of a search."""
     composite: ClassVar[bool] = False
     """Whether its curvature is no information, so that errors come from the scatter of its gradient."""
     curvature: ClassVar[Callable[[Any, Array], Array] | None] = None

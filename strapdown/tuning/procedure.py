@@ -82,7 +82,7 @@ def tune(
     factor: float = 30.0,
     seed: int = 0,
     threads: int = 1,
-    progress: Callable[[int], None] | None = None,
+    progress: Callable[[str], None] | None = None,
     gate: bool = False,
     **objective: Any,
 ) -> Tuned:
@@ -132,12 +132,15 @@ def tune(
         starts=starts,
         factor=factor,
         seed=seed,
-        threads=threads if isinstance(made, LaneLikelihood) else 1,
+        threads=threads if isinstance(made, LaneLikelihood) or (made.composite and len(cases) == 1) else 1,
         progress=progress,
     )
     if objective.get("rmse"):
         # The size of the error leaves a common scale open; the innovations determine it.
-        scaled = fit(likelihood(cases, result.setup, ["filter.scale"]), starts=2, threads=threads)
+        scale = likelihood(cases, result.setup, ["filter.scale"])
+        scaled = fit(
+            scale, starts=2, threads=threads, progress=progress and (lambda now: progress(f"scale of all σ, {now}"))
+        )
         result = rescaled(result, scaled["filter.scale"].value)
     found = tuned_gate(made, result) if gate and isinstance(made, LaneLikelihood) else None
     if found is not None and found.gate is not None:
