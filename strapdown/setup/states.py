@@ -24,7 +24,6 @@ from strapdown.estimation.error_states import (
     SensorMounting,
     VectorBias,
 )
-from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.states import ProcessNoise, State
 from strapdown.files import tables
 from strapdown.records import Estimate, ImuRecord
@@ -392,23 +391,13 @@ def _offsets(error_states: tuple[ErrorStates, ...]) -> Array:
     return np.concatenate([np.empty((3, 0)), *(np.asarray(one.gyro_offset).T for one in error_states)], axis=1)
 
 
-def run(
-    record: ImuRecord,
-    process_noise: ProcessNoise,
-    initial: State,
-    states: States,
-    *,
-    every: int = 1,
-    full_covariance: bool = False,
-    gate: Gate | None = None,
-    robust: Robust | None = None,
-) -> Estimate:
-    """Run the filter with these states; it estimates the attitude, the whole gyro bias, drifts included, and the error states."""
+def run(record: ImuRecord, process_noise: ProcessNoise, initial: State, states: States, **options: Any) -> Estimate:
+    """Run the filter with these states; it estimates the attitude, the whole gyro bias, drifts included, and the error states.
+
+    ``options`` are fields of :class:`strapdown.estimation.forward.Options`.
+    """
     problem = prepared(record, process_noise, initial, states)
-    options = forward.Options(
-        every=every, full_covariance=full_covariance, gate=gate, robust=robust, whole_bias=True, together=True
-    )
-    found = forward.filtered(problem, options).estimate
+    found = forward.filtered(problem, forward.Options(whole_bias=True, together=True, **options)).estimate
     return _reported(found, states, initial)
 
 
