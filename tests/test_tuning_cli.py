@@ -191,12 +191,23 @@ def test_a_filter_with_states_and_a_gate_is_tuned_against_the_truth(run, tmp_pat
     assert run(*given)[1].count("--truth tunes the filter as it runs") == 1
 
 
-def test_outliers_are_not_modelled_beside_optional_states(run, tmp_path, scaled):
+def test_outliers_beside_optional_states(run, tmp_path):
     out = tmp_path / "states.toml"
-    status, _, complaint = run("tune", scaled, "--states", "--gate", "-o", out)
-    assert status != 0
-    assert "optional states" in complaint
-    assert not out.exists()
+    faults = vectors.Faults(outlier_probability=0.1, outlier_scale=10.0)
+    spec = gyro.GyroSpec(angle_random_walk=1e-4, turn_on_bias_sigma=1e-5, scale_factor=np.full(3, 2e-3))
+    sensors = tuple(dataclasses.replace(one, faults=faults) for one in SCENARIO.sensors)
+    struck = scenarios.simulate(dataclasses.replace(SCENARIO, gyro=spec, sensors=sensors), 2)
+    recordfiles.write_record(tmp_path / "struck.h5", struck)
+    options = ("--states", "--gate", "--free", "sun.sigma,star.sigma", "--starts", 1, "--holdout", 0.3)
+    status, said, complaint = run("tune", tmp_path / "struck.h5", *options, "-o", out)
+    assert status == 0, complaint
+    assert "An outlier is the likelier explanation" in said
+    found, content = setup.read_setup(out), json.loads(out.with_suffix(".json").read_text())
+    assert found.states is not None
+    assert found.gate is not None
+    assert found.gate.probability == pytest.approx(content["gate"]["probability"])
+    held = content["held_out"]
+    assert held["after"]["log_likelihood_per_innovation"] > held["before"]["log_likelihood_per_innovation"]
 
 
 def test_a_plan_of_a_filter_with_states_says_how_well_their_sizes_will_be_known(run, scaled):

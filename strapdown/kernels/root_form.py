@@ -77,6 +77,7 @@ from strapdown.kernels.triangle import (
 )
 from strapdown.kernels.walk import step_within, turn_squared
 
+REPLACEABLE = ("take",)
 CALLED = ("store_segment", "age_chains", "aged_chain")
 """Called, not inlined; only functions of few arrays, because each array of a NamedTuple is a separate argument."""
 
@@ -144,7 +145,8 @@ class Body(NamedTuple):
     x: np.ndarray
     """(2, n − 3)"""
     F: np.ndarray
-    """(2, rows, width): the triangle, and below it scratch for noise rows, each :func:`strapdown.kernels.triangle.padded`."""
+    """(2, rows, width): the triangle, and below it scratch for noise rows, or n + 1 rows of outliers, each
+    :func:`strapdown.kernels.triangle.padded`."""
     length: np.ndarray
     """Divisor of the effects of error states on each measurement, in order of time (events,)."""
     turning: np.ndarray
@@ -157,6 +159,8 @@ class Body(NamedTuple):
     least_share: float
     """0: no digits are lost."""
     check: int
+    outliers: tuple[float, float] = (0.0, 1.0)
+    """Share of the measurements that are outliers, and their variance over that of the others, where they are modelled."""
 
 
 class Restart(NamedTuple):
@@ -311,11 +315,10 @@ def predict(state, part, dt, body, out):
 def update(state, e, now, measured, body, out):
     """Update with a measurement."""
     q, segments, behind = state
-    model, scratch, x, F = body.model, body.scratch, body.x[0], body.F[0]
-    H, step = scratch.rows[0], scratch.lines[STEP]
+    model, x, F, step = body.model, body.x[0], body.F[0], body.scratch.lines[STEP]
     size = len(x) + 3
     if behind > 0:
-        absorb(model, scratch, x, F, 0.0)
+        absorb(model, body.scratch, x, F, 0.0)
     place = measured.place[e]
     sensor = measured.sensor[e]
     kind = measured.series[sensor, KIND]
@@ -333,7 +336,7 @@ def update(state, e, now, measured, body, out):
         if kind == DIRECTION:
             u, v = dot(axes[0], axes[0]), dot(axes[1], axes[1])
         spread = (variance * u, variance * v, variance)
-    errors, s = take_rows(F, size, loose(model), H, rows, y, spread, step, scratch.lines[ROWS:])
+    errors, s = take(body, place, rows, y, spread, out)
     for r in range(rows):
         out.innovation[place, 2 * r] = errors[r]
         out.innovation[place, 2 * r + 1] = s[r]
@@ -352,6 +355,13 @@ def update(state, e, now, measured, body, out):
     turn_rows(F, size, G)
     settle(model, F, before, q, x)
     return q, segments, 0 * behind
+
+
+def take(form, place, rows, y, variance, out):
+    """Update the factor with the rows in the scratch; return innovations and variances, and leave the correction in ``step``."""
+    scratch, size = form.scratch, len(form.x[0]) + 3
+    step, work = scratch.lines[STEP], scratch.lines[ROWS:]
+    return take_rows(form.F[0], size, loose(form.model), scratch.rows[0], rows, y, variance, step, work)
 
 
 def seen_rows(form, e, q, x, kind, z, frame, sensor):

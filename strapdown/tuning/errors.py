@@ -19,7 +19,7 @@ import numpy as np
 from strapdown import consistency
 from strapdown.checks import Array, InputError, one_of
 from strapdown.estimation.setup import FilterSetup
-from strapdown.tuning.innovations import MOST, LaneLikelihood, RunLikelihood, made, with_engine
+from strapdown.tuning.innovations import MOST, Likelihood, made, with_engine
 from strapdown.tuning.objective import STEP, Case, Derivatives, Objective, by_part, posed
 
 Measure = Literal["likelihood", "rmse"]
@@ -31,7 +31,7 @@ MAX_EPOCHS = 1000
 class ErrorObjective(Objective):
     """Objective of the parameters from the state errors; created by :func:`error_objective`."""
 
-    base: LaneLikelihood | RunLikelihood
+    base: Likelihood
     """The filter whose errors are judged."""
     measure: Measure
     references: tuple[Reference, ...] = field(repr=False)
@@ -145,7 +145,7 @@ def reference(case: Case, edges: np.ndarray) -> Reference:
     return Reference(np.flatnonzero(judged), attitude[rows], None if truth is None else truth.bias[rows])
 
 
-def _spread(base: LaneLikelihood | RunLikelihood, number: int, measure: Measure) -> Reference:
+def _spread(base: Likelihood, number: int, measure: Measure) -> Reference:
     """Return the truth of a record at edges spaced by the correlation time of the attitude error at the starting point."""
     case = base.cases[number]
     known = reference(case, np.arange(0, len(case.record.time), base.chosen.integration.samples))
