@@ -87,8 +87,8 @@ class Options:
     factor: bool = False
     """Carry the triangular factor even without error states."""
     outliers: tuple[float, float] | None = None
-    """Share of outliers and their variance over that of the others: of a factor, without a gate. As ``weight`` each measurement then has
-    minus its log likelihood, the probability that it is one, and the mean share of its own noise in its innovations' variances (m, 3)."""
+    """Share and variance ratio of outliers, for the factor without a gate. ``weight`` of each measurement is then minus its log likelihood,
+    the probability that it is an outlier, and the mean ratio of its noise to its innovations' variances (m, 3)."""
 
     def __post_init__(self) -> None:
         """Check the classes of gate and robust."""

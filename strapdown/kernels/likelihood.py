@@ -1,8 +1,8 @@
-"""The filter at eight sets of parameters in step, one a lane, and the sensitivities of its innovations: a body of the walk.
+"""The filter for eight sets of parameters together, one per lane, and the sensitivities of its innovations: a body of the walk.
 
-The same filter as :mod:`strapdown.kernels.covariance_form`: gyro noise, the σ of each sensor and the initial covariance differ from lane to
-lane. Where lane i is lane 0 with parameter i moved a little, differences between lanes are the derivatives of each innovation and of its
-variance, and their sums the score and the information of the likelihood.
+The filter is that of :mod:`strapdown.kernels.covariance_form`; gyro noise, σ of each sensor and initial covariance differ between lanes. If
+lane i is lane 0 with a small change of parameter i, differences between lanes are the derivatives of each innovation and of its variance,
+from which score and information of the likelihood are summed.
 """
 
 from __future__ import annotations
@@ -37,65 +37,65 @@ from strapdown.kernels.walk import MAX_TURN, SQUARED_RANGE
 REPLACEABLE = ("counted",)
 
 HALF_RANGE = 0.25 * SQUARED_RANGE
-"""The square of half the turn that the polynomials bear."""
+"""Squared half of the maximum angle of the polynomials, rad²."""
 FOUND = 12 * WIDTH
-"""Place in the work space of innovations and variances; before it the rows of a measurement."""
+"""Offset of innovations and variances in the work space, after the rows of a measurement."""
 WORK = 18 * WIDTH
 WIDE = 21 * WIDTH
-"""Innovations and variances with those of an outlier."""
+"""Offset of innovations and variances for the noise of an outlier."""
 ROOM = 27 * WIDTH
 """Size of the work space."""
 
 
 class Body(NamedTuple):
-    """Parameters of each lane, and the spans of the record whose sums are kept apart."""
+    """Parameters of each lane, and the time spans of the record with separate sums."""
 
     noise: np.ndarray
     """σ_v² and σ_u² in lanes (2 × WIDTH)."""
     factors: np.ndarray
-    """What each sensor's variances are multiplied by (sensors × WIDTH)."""
+    """Factor on the variances of each sensor (sensors × WIDTH)."""
     outliers: np.ndarray
-    """Share of outliers and their variance over that of the others (2 × WIDTH); empty where there are none."""
+    """Share and variance ratio of outliers (2 × WIDTH); empty without outliers."""
     state: np.ndarray
-    """Initial states (28 × WIDTH), left at the end states."""
+    """Initial states (28 × WIDTH); at return, the end states."""
     cuts: np.ndarray
-    """The span from ``cuts[c − 1]`` to ``cuts[c]``, the last without end, is part c of the record."""
+    """Limits of the parts: part c is from ``cuts[c − 1]`` to ``cuts[c]``, the last one unlimited."""
     epochs: np.ndarray
-    """Edges at which states are kept."""
+    """Edges at which states are stored."""
     free: int
-    """How many parameters lanes 1, 2, … have moved by ``step``."""
+    """Number of parameters, changed by ``step`` in lanes 1, 2, …"""
     step: float
     room: np.ndarray
     """Scratch (``ROOM``,)."""
 
 
 class Outputs(NamedTuple):
-    """What a run adds to, by part of the record, and writes."""
+    """Sums by part of the record, and outputs of a run."""
 
     minus_log: np.ndarray
     """Σ ½ (log s + e²/s) of the innovations (parts × WIDTH)."""
     score: np.ndarray
     """Derivatives of lane 0 (parts, free)."""
     information: np.ndarray
-    """Lower triangles (parts, free, free): of a mixture, the sums of the outer products of each measurement's gradient."""
+    """Lower triangles (parts, free, free); with outliers, sums of the outer products of each measurement's gradient."""
     states: np.ndarray
     """States at the epochs (epochs × 28 × WIDTH)."""
     probability: np.ndarray
-    """Of lane 0, that each measurement is an outlier, and the mean share of its own noise in its innovations' variances (events, 2), or
+    """Probability that each measurement is an outlier, and mean ratio of its noise to its innovations' variances, in lane 0 (events, 2), or
     (0, 2)."""
 
 
 def begin(body):
-    """Return (q, b, A, B, C) in lanes, the part of the record, and the number of states kept."""
+    """Return (q, b, A, B, C) in lanes, the part of the record, and the number of states stored."""
     q, b, A, B, C = load_lanes(body.state, 0)
     none = 0 * len(body.cuts)
     return q, b, A, B, C, none, none
 
 
 def longest_step(state, part, dt, body):
-    """Return the longest step, s, that turns no lane too far; a lane that is lost, of a turn above ``MAX_TURN``, is left out."""
+    """Return the longest step, s, for all lanes except diverged ones, with angles above ``MAX_TURN``."""
     b = state[1]
-    # Nearly always short: the sum over the lanes is no less than the largest, and NaN is not below anything.
+    # Usually sufficient: the sum over the lanes is not less than the largest, and comparisons with NaN are false.
     if dot(part, part) <= HALF_RANGE and total(dot(b, b)) * (dt * dt) < HALF_RANGE:
         return dt
     turn = combine(1.0, part, -dt, b)
@@ -116,7 +116,7 @@ def predict(state, part, dt, body, out):
 
 
 def part_at(span, now, cuts):
-    """Return the part of the record that a time is in, from that before it on."""
+    """Return the part of the record at a time, searched from the previous part."""
     while span < len(cuts) and now > cuts[span]:
         span += 1
     return span
@@ -134,7 +134,7 @@ def put_axes(rows, y):
 
 
 def measured_rows(q, z, kind, t, triads, rows):
-    """Write the rows of one measurement to ``rows`` and return how many take part in the update."""
+    """Write the rows of one measurement to ``rows`` and return their number."""
     if kind == ATTITUDE:
         measured = frame_at(triads, t)
         y = rotation_vector(quaternion_multiply((q[0], -q[1], -q[2], -q[3]), measured))
@@ -158,8 +158,8 @@ def measured_rows(q, z, kind, t, triads, rows):
 def add_derivatives(room, number, free, step, score, information):
     """Add one event to the score Σ ∂ℓ/∂θ and the information; ℓ = ½ (log s + e²/s).
 
-    The work space holds e and s of ``number`` innovations in lanes; lane i is lane 0 with parameter i moved by ``step``. The information is
-    Fisher's by sensitivities, ``ė_j ė_k/s + ½ ṡ_j ṡ_k/s²`` (Segal & Weinstein 1989): positive semidefinite whatever the data.
+    The work space holds e and s of ``number`` innovations in lanes; lane i is lane 0 with parameter i changed by ``step``. The information
+    is Fisher's by sensitivities, ``ė_j ė_k/s + ½ ṡ_j ṡ_k/s²`` (Segal & Weinstein 1989): positive semidefinite for any data.
     """
     found = room[FOUND:]
     work = room[WORK:]
@@ -227,7 +227,7 @@ def counted(b, A, B, C, e, span, number, measured, z, body, out):
 def updated(b, A, B, C, number, measured, place, sensor, z, factor, room, found):
     """Update with all variances of a measurement times ``factor``; return the attitude correction, b, A, B, C.
 
-    Innovations and their variances go to the work space at ``found``, in lanes; a vector's length has the third.
+    Innovations and their variances are written to the work space at ``found``, in lanes; the third is that of a vector's length.
     """
     kind = measured.series[sensor, KIND]
     correction = (spread(0.0), spread(0.0), spread(0.0))
@@ -245,7 +245,7 @@ def updated(b, A, B, C, number, measured, place, sensor, z, factor, room, found)
 
 
 def deviance_of(room, found, number, i):
-    """Return the NIS of a measurement in lane i and the determinant of its innovations' covariance."""
+    """Return the NIS of a measurement and the determinant of its innovation covariance in lane i."""
     deviance, product = 0.0, 1.0
     for r in range(number):
         e = room[found + 2 * WIDTH * r + i]
@@ -271,7 +271,7 @@ def keep(state, row, e, body, out):
 
 
 def finish(state, row, e, body):
-    """Leave the end states."""
+    """Store the end states."""
     q, b, A, B, C, _, _ = state
     store_lanes(body.state, 0, q, b, A, B, C)
     return row

@@ -1,7 +1,7 @@
-"""The update where some of the measurements are outliers: of :mod:`strapdown.kernels.likelihood`, and of :mod:`.root_form`.
+"""Update for measurements with outliers: for :mod:`strapdown.kernels.likelihood` and :mod:`.root_form`.
 
-The noise of a measurement is normal with its variance, or with probability ε of one ``spread`` times that (Tukey 1960). The update is made
-both ways; the likelihood is that of the mixture, and the state goes on with the mean and the covariance of the mixture of both (generalised
+The noise of a measurement is normal with its variance or, with probability ε, with ``spread`` times that (Tukey 1960). The update is made
+with both; the likelihood is that of the mixture, and the filter continues with mean and covariance of the mixture (generalised
 pseudo-Bayes of first order; Bar-Shalom, Li & Kirubarajan 2001, section 11.6).
 """
 
@@ -21,7 +21,7 @@ from strapdown.kernels.triangle import take_rows, triangularise
 def mixed(share, nis, product, wide, wide_product):
     """Return minus the log likelihood of a measurement, and the probability that it is an outlier.
 
-    NIS and determinant of the innovations' covariance are of both kinds of noise; ``share`` is how frequent outliers are.
+    NIS and determinant of the innovation covariance are given for both noises; ``share`` is the probability of an outlier.
     """
     inside = math.log1p(-share) - 0.5 * (nis + math.log(product))
     outside = math.log(share) - 0.5 * (wide + math.log(wide_product))
@@ -53,7 +53,7 @@ def between_symmetric(w, S, T, x, y):
 
 
 def counted(b, A, B, C, e, span, number, measured, z, body, out):
-    """Update all lanes both ways, and add to the sums; return attitude correction, b, A, B, C of the mixture."""
+    """Update all lanes with both noises, and add to the sums; return attitude correction, b, A, B, C of the mixture."""
     room, place, sensor = body.room, measured.place[e], measured.sensor[e]
     kind = measured.series[sensor, KIND]
     factor = load(body.factors, WIDTH * sensor)
@@ -76,7 +76,7 @@ def counted(b, A, B, C, e, span, number, measured, z, body, out):
 
 
 def weigh(span, number, body, out):
-    """Leave the probability of an outlier in lanes in the work space, and add to the sums."""
+    """Write the probability of an outlier, in lanes, to the work space, and add to the sums."""
     room, free = body.room, body.free
     base = 0.0
     for i in range(WIDTH):
@@ -99,7 +99,7 @@ def weigh(span, number, body, out):
 
 
 def take(form, place, rows, y, variance, out):
-    """Update the factor both ways, and go on with the mixture; write what :class:`strapdown.estimation.forward.Options` says of it."""
+    """Update the factor with both noises and replace it by that of the mixture; write the outputs of :class:`.Options`."""
     scratch, (share, spread), F = form.scratch, form.outliers, form.F[0]
     H, step, other, work = scratch.rows[0], scratch.lines[STEP], scratch.lines[PRIOR], scratch.lines[ROWS:]
     size, width, first = len(form.x[0]) + 3, F.shape[1], loose(form.model)
@@ -116,7 +116,7 @@ def take(form, place, rows, y, variance, out):
         own += variance[r] / (s[r] * rows)
     value, w = mixed(share, nis, product, wide_nis, wide_product)
     out.innovation[place, 6], out.innovation[place, 7], out.innovation[place, 8] = value, w, own
-    # (1 − w) P₀ + w P₁ + w (1 − w) d dᵀ: the factors and d, row under row.
+    # (1 − w) P₀ + w P₁ + w (1 − w) d dᵀ: factors and d stacked by rows.
     for c in range(0, width, WIDTH):
         d = load(other, c) - load(step, c)
         store(step, c, load(step, c) + w * d)

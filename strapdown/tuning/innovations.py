@@ -1,11 +1,11 @@
 """The likelihood of filter parameters from the filter's own innovations, with its score and information.
 
-The filter turns a record into independent innovations e with variances s, so its likelihood is ``Π N(e; 0, s)`` (prediction-error
-decomposition; Schweppe 1965, Harvey 1989 section 3.4). A filter of attitude and bias runs at eight points at once, the derivatives in the
-same pass (:class:`LaneLikelihood`). One with optional states, or with noise that differs by axis, runs once more a parameter, off by
-:data:`STEP` (:class:`RunLikelihood`); the curvature at its best point, from which standard errors come, is the observed one, by central
-differences of the score. The σ of a constant state is known from as many draws as there are such states and records: of a scale factor on
-three axes, one record determines it within a factor of 1.5 at best.
+The innovations e of a filter are independent with variances s, so the likelihood of a record is ``Π N(e; 0, s)`` (prediction-error
+decomposition; Schweppe 1965, Harvey 1989 section 3.4). A filter of attitude and bias runs at eight points at once, with derivatives in the
+same pass (:class:`LaneLikelihood`). A filter with error states, or with noise that differs by axis, runs once more for each parameter,
+changed by :data:`STEP` (:class:`RunLikelihood`); standard errors are from the observed curvature at the maximum, by central differences of
+the score. The σ of a constant error state is estimated from one draw per state and record: for a scale factor on three axes, one record
+determines it within a factor of 1.5 at best.
 """
 
 from __future__ import annotations
@@ -44,14 +44,14 @@ from strapdown.tuning.objective import (
 from strapdown.tuning.parameters import ARW, INITIAL_ATTITUDE, INITIAL_BIAS, RRW, SCALE, SIGMA, axis_of
 
 MOST = WIDTH - 1
-"""Derivatives that one pass over a record gives."""
+"""Maximum number of derivatives in one pass over a record."""
 CURVATURE_STEP = 0.02
-"""Step of a log parameter for the differences of the score that are the curvature."""
+"""Step of a log parameter for the curvature by differences of the score."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Prepared:
-    """A record as the kernel takes it."""
+    """A record in the form of the kernel."""
 
     time: Array
     increments: Array
@@ -59,12 +59,12 @@ class Prepared:
     state: Array
     cuts: Array
     used: np.ndarray
-    """Which parts count (parts,), bool."""
+    """Which parts are used (parts,), bool."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LaneLikelihood(Objective):
-    """Minus the log likelihood of the innovations, eight points at once; with outliers where their parameters are among the names."""
+    """Minus the log likelihood of the innovations, for eight points at once; with outliers if their parameters are among the names."""
 
     prepared: tuple[Prepared, ...] = field(repr=False)
 
@@ -81,7 +81,7 @@ class LaneLikelihood(Objective):
         return np.asarray(self._pass(case, points)["minus_log"][case.used].sum(axis=0)[: len(points)])
 
     def derivatives(self, point: Array) -> Derivatives:
-        """Return the likelihood and its derivatives at a point; one pass over each record for up to seven parameters."""
+        """Return the likelihood and its derivatives at a point, in one pass over each record for up to seven parameters."""
         p = len(self.names)
         blocks = [tuple(range(p))] if p <= MOST else _pairs_of_groups(p)
         jobs = [(case, point, block) for case in self.prepared for block in blocks]
@@ -121,7 +121,7 @@ class LaneLikelihood(Objective):
         return found
 
     def lanes(self, case: Prepared, points: Array) -> dict[str, Array]:
-        """Return what up to eight points (k, p) give a kernel, flat: gyro noise, factors of sensors' variances, state, outliers."""
+        """Return the parameters of up to eight points (k, p) for the kernel, flat: gyro noise, factors on variances, state, outliers."""
         rows = np.concatenate([points, np.repeat(points[:1], WIDTH - len(points), axis=0)])
         lane = {name: np.exp(rows[:, j]) for j, name in enumerate(self.names)}
         base = dict(zip(self.names, np.exp(self.start), strict=True))
@@ -155,7 +155,7 @@ class LaneLikelihood(Objective):
         epochs: np.ndarray | None = None,
         judged: bool = False,
     ) -> dict[str, Array]:
-        """Run up to eight points over one record; return what it writes, by names of :class:`strapdown.kernels.likelihood.Outputs`."""
+        """Run up to eight points over one record; return the outputs by names of :class:`strapdown.kernels.likelihood.Outputs`."""
         kept = np.empty(0, np.int64) if epochs is None else np.ascontiguousarray(epochs, np.int64)
         parts = len(case.cuts) + 1
         room = {
@@ -182,14 +182,14 @@ class LaneLikelihood(Objective):
 
 
 def _pairs_of_groups(p: int) -> list[tuple[int, ...]]:
-    """Return blocks of at most six parameters such that every two share one: each pair of groups of three."""
+    """Return sets of at most six parameters such that any two parameters are in one of them: each pair of groups of three."""
     groups = [range(first, min(first + 3, p)) for first in range(0, p, 3)]
     return [(*a, *b) for a, b in itertools.combinations(groups, 2)]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RunLikelihood(Objective):
-    """The same of a filter with optional states, or with noise that differs by axis, one run of it a point."""
+    """The same for a filter with error states, or with noise that differs by axis: one run per point."""
 
     def minus_log(self, points: Array) -> Array:
         """Return minus the log likelihood, without its constant, at several points (k, p): (k,)."""
@@ -224,7 +224,7 @@ class RunLikelihood(Objective):
         return [(name, np.asarray(one.weight)[:, 1:]) for by_sensor in found for name, one in by_sensor.items()]
 
     def _runs(self, points: Array) -> list[list[tuple[Array, ...]]]:
-        """Return of every point and record what each term adds, the part that it belongs to, and innovations with variances."""
+        """Return the value of each term, its part, and innovations with variances, for each point and record."""
         found = self.each(self._run, [(point, case) for point in points for case in self.cases])
         return [found[k : k + len(self.cases)] for k in range(0, len(found), len(self.cases))]
 
@@ -240,11 +240,11 @@ class RunLikelihood(Objective):
         return tuple(np.concatenate(column) for column in zip(*found, strict=True))
 
     def _innovations(self, point: Array, case: Case) -> dict[str, Innovations]:
-        """Return the innovations that count of a record, by sensor."""
+        """Return the innovations of a record that are used, by sensor."""
         chosen = self.setup(point)
-        # The filter of optional states has the innovations of measurements whose noise differs by axis, with none too.
+        # The filter with error states, also without any, has the innovations of measurements whose noise differs by axis.
         used = replace(chosen, states=States() if chosen.states is None else chosen.states)
-        # Of the states only the first and the last are kept.
+        # Only the first and the last state are stored.
         every = max(1, len(case.record.increments) // used.integration.samples)
         mixture: Any = tuple(map(float, outliers_at(point))) if self.mixed else None
         estimate = self._estimate(used, case, every=every, gate=None, robust=None, outliers=mixture)
@@ -272,7 +272,7 @@ Made = TypeVar("Made", bound=Objective)
 
 
 def made(kind: type[Made], problem: Objective, **more: Any) -> Made:
-    """Return an objective of this kind on a problem."""
+    """Return an objective of this class for a problem."""
     return kind(**{one.name: getattr(problem, one.name) for one in fields(Objective)} | more)
 
 
@@ -285,7 +285,7 @@ def likelihood(
     parts: int = 20,
     threads: int = 1,
 ) -> Likelihood:
-    """Return the likelihood of the free parameters, by the innovations of the filter on some records.
+    """Return the likelihood of the free parameters from the innovations of the filter on some records.
 
     Parameters
     ----------
@@ -295,15 +295,15 @@ def likelihood(
         Starting values of the free parameters, and values of the fixed ones; its gate and robust weights are not applied.
     free : sequence of str
         Names of parameters: ``"gyro.arw"``, ``"gyro.rrw"``, ``"SENSOR.sigma"``, ``"SENSOR.sigma.x"`` (about one body axis),
-        ``"initial.attitude"``, ``"initial.bias"``, those of the filter's optional states such as ``"gyro.scale_sigma"`` and
+        ``"initial.attitude"``, ``"initial.bias"``, those of the filter's error states such as ``"gyro.scale_sigma"`` and
         ``"SENSOR.correlation_time"``, or ``"filter.scale"`` alone.
     spacing : float, default 0
-        Least time between the measurements of a sensor that are used, s; those kept have the weight of all. For disturbances that last:
-        only white innovations have this likelihood.
+        Minimum time between the measurements of a sensor that are used, s; these have the weight of all. For correlated disturbances: this
+        likelihood holds for white innovations only.
     parts : int, default 20
-        Spans of time of each record whose gradients are kept apart.
+        Number of time spans of each record with separate gradients.
     threads : int, default 1
-        Records, or points, evaluated at once.
+        Number of records, or points, evaluated in parallel.
 
     Returns
     -------
@@ -314,7 +314,7 @@ def likelihood(
 
 
 def with_engine(problem: Objective, *, lanes: bool = True) -> Likelihood:
-    """Return the likelihood of a problem, eight points at once where the filter can be run so and ``lanes`` allows it."""
+    """Return the likelihood of a problem, for eight points at once if the filter and ``lanes`` allow it."""
     records = [problem.modelled(case, problem.chosen) for case in problem.cases]
     by_axis = any(axis_of(name) for name in problem.names) or any(
         one.anisotropic for record in records for one in record.vectors

@@ -1,8 +1,7 @@
-"""What a tuning minimises: a problem checked once, its setups, and the sum of an objective over records and threads.
+"""Objectives of tuning: the checked problem, the setup of a point, and the sum of an objective over records and threads.
 
-A *point* is the vector of the logarithms of the free parameters; −∞ is a value of zero. What differs between objectives is their value on a
-record: the likelihood of the innovations (:mod:`strapdown.tuning.innovations`), or of the errors against a truth
-(:mod:`strapdown.tuning.errors`).
+A *point* is the vector of the logarithms of the free parameters; −∞ is a value of zero. Objectives differ in their value on a record: the
+likelihood of the innovations (:mod:`strapdown.tuning.innovations`), or of the errors against a truth (:mod:`strapdown.tuning.errors`).
 """
 
 from __future__ import annotations
@@ -34,19 +33,19 @@ from strapdown.tuning.parameters import (
 from strapdown.vectors import VectorMeasurements
 
 STEP = 2.0**-15
-"""Step of a log-parameter for derivatives: the difference is wrong by half of it relative to the curvature, 1.5e-5."""
+"""Step of a log parameter for derivatives; the error of the difference is half of it times the curvature."""
 REACH = 16.0
-"""How far a log parameter may go from where it starts."""
+"""Maximum change of a log parameter from its initial value."""
 OUTLIERS = (OUTLIER_SHARE, OUTLIER_SCALE)
-"""Parameters of the outliers, the last two of a likelihood that has them."""
+"""Parameters of the outliers, the last two of a likelihood with outliers."""
 SHARES = (1e-4, 0.4)
-"""Shares of outliers that are searched: what is more frequent is no outlier."""
+"""Range of the share of outliers; more frequent ones are not outliers."""
 SCALES = (2.0, 100.0)
-"""Scales of outliers that are searched: what is hardly wider is none either."""
+"""Range of the scale of outliers; smaller ones are not outliers."""
 LARGEST_SCALE = 0.1
-"""σ of scale factors and misalignments from which on a filter that is linear in them makes no sense: noise would pass for a turn."""
+"""Maximum σ of scale factors and misalignments, in which the filter is linear."""
 QUICKEST, SLOWEST = 0.05, 100.0
-"""Range of a time constant that makes a difference: from this part of the interval between measurements to this multiple of the record."""
+"""Range of a time constant: relative to the interval between measurements, and to the duration of the record."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -58,17 +57,17 @@ class Case:
     record : ImuRecord
         Gyro increments and measurements, at the gyro's rate.
     initial : State
-        State at the first edge, of the whole bias; its covariance is the setup's where the initial σ are tuned.
+        State at the first edge, with the whole bias; its covariance is that of the setup if the initial σ are tuned.
     name : str, default ""
-        What errors and reports call the record.
+        Name of the record in errors and reports.
     first : float, default -inf
-        Innovations from this time on count for tuning, s.
+        Start of the innovations used for tuning, s.
     last : float, default inf
-        Innovations up to this time count for tuning, s; what comes later is held out.
+        End of the innovations used for tuning, s; later ones are held out.
     true_attitude : ndarray (n + 1, 4), optional
-        q_fb at the edges from a reference system, where the record itself has no truth; rows of NaN are unknown.
+        q_fb at the edges from a reference system, if the record has no truth; rows of NaN are unknown.
     judged : ndarray (n + 1,) of bool, optional
-        Edges at which errors against ``true_attitude`` count. Default: all.
+        Edges at which errors against ``true_attitude`` are used. Default: all.
     """
 
     record: ImuRecord
@@ -81,19 +80,19 @@ class Case:
 
     @property
     def span(self) -> tuple[float, float]:
-        """First and last time that count, s."""
+        """Start and end of the time used, s."""
         return max(self.first, float(self.record.time[0])), min(self.last, float(self.record.time[-1]))
 
 
 def of_sensors(chosen: FilterSetup, record: ImuRecord) -> FilterSetup:
-    """Return a setup without the σ of sensors that a record lacks."""
+    """Return a setup without the σ of sensors that are not in the record."""
     own = {series.sensor for series in record.vectors}
     return replace(chosen, sigma={name: value for name, value in chosen.sigma.items() if name in own})
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Derivatives:
-    """Minus the log likelihood, without its constant, and its derivatives by the log parameters, part by part."""
+    """Minus the log likelihood, without its constant, and its derivatives with respect to the log parameters, by part."""
 
     value: Array
     """(parts,)"""
@@ -104,7 +103,7 @@ class Derivatives:
 
 
 def outliers_at(points: Array) -> tuple[Array, Array]:
-    """Return share and variance, over that of the others, of outliers at points (…, p); differences and profiles go beyond the search."""
+    """Return share and variance ratio of outliers at points (…, p); differences and profiles may exceed the range of the search."""
     return np.minimum(np.exp(points[..., -2]), 0.9), np.exp(2.0 * points[..., -1])
 
 
@@ -118,7 +117,7 @@ def joined(found: Sequence[Derivatives]) -> Derivatives:
 
 
 def by_part(value: Array, score: Array, information: Array, place: np.ndarray, parts: int) -> Derivatives:
-    """Return derivatives from the value (m,) and the gradient (m, p) of each term, which belongs to part ``place`` (m,)."""
+    """Return derivatives from the value (m,), gradient (m, p) and part ``place`` (m,) of each term."""
     sums = np.zeros((parts, score.shape[1]))
     np.add.at(sums, place, score)
     summed = np.bincount(place, value, parts).astype(np.float64)
@@ -127,28 +126,28 @@ def by_part(value: Array, score: Array, information: Array, place: np.ndarray, p
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Objective:
-    """Objective to minimise: minus a log likelihood, or a substitute; a subclass gives its value on the records.
+    """Objective to minimise: minus a log likelihood, or a substitute; a subclass defines its value on the records.
 
-    Built by :func:`strapdown.tuning.likelihood`, :func:`contaminated_likelihood` and :func:`error_objective` of the same package.
+    Created by :func:`strapdown.tuning.likelihood`, :func:`contaminated_likelihood` and :func:`error_objective` of the same package.
     """
 
     names: tuple[str, ...]
     """Names of the free parameters."""
     chosen: FilterSetup
-    """The setup that the fixed parameters are taken from."""
+    """Setup with the values of the fixed parameters."""
     start: Array
     """Logarithms of the free parameters in that setup (p,)."""
     cases: tuple[Case, ...] = field(repr=False)
     parts: int = 20
-    """Spans of time of each record whose gradients are kept apart."""
+    """Number of time spans of each record with separate gradients."""
     threads: int = 1
     spacing: float = 0.0
     evaluated: Callable[[], object] = field(default=lambda: None, repr=False)
     """Called after each evaluation of a search."""
     composite: ClassVar[bool] = False
-    """Whether its curvature is no information, so that errors come from the scatter of its gradient."""
+    """Whether its curvature is not an information matrix, so standard errors are from the scatter of its gradient."""
     curvature: ClassVar[Callable[[Any, Array], Array] | None] = None
-    """Second derivatives at a point (p, p), where the information of the search is not good enough for errors."""
+    """Second derivatives at a point (p, p), if the information of the search is not accurate enough for standard errors."""
 
     @property
     def mixed(self) -> bool:
@@ -157,14 +156,14 @@ class Objective:
 
     @property
     def limits(self) -> tuple[Array, Array]:
-        """Least and largest logarithm of each parameter that a search looks at (p,), (p,)."""
+        """Minimum and maximum logarithm of each parameter in a search (p,), (p,)."""
         low, high = self.start - REACH, self.start + REACH
         if self.mixed:
             low[-2:], high[-2:] = np.log([SHARES, SCALES]).T
         return low, high
 
     def unit(self, name: str) -> Unit:
-        """Return the unit that a parameter is printed in."""
+        """Return the unit in which a parameter is printed."""
         return unit_of(name, [case.record for case in self.cases])
 
     def derivatives(self, point: Array) -> Derivatives:
@@ -176,12 +175,12 @@ class Objective:
         return np.array([self.derivatives(point).value.sum() for point in np.atleast_2d(points)])
 
     def setup(self, point: Array) -> FilterSetup:
-        """Return the filter setup of a point, its gate as it was."""
+        """Return the filter setup of a point, with the gate unchanged."""
         values = zip(self.names, np.exp(point).tolist(), strict=True)
         return with_values(self.chosen, {name: self._bounded(name, x) for name, x in values if name not in OUTLIERS})
 
     def _bounded(self, name: str, value: float) -> float:
-        """Return the value of a parameter of states inside what makes a difference, or sense."""
+        """Return the value of a parameter of error states, limited to its range."""
         if name in ("gyro.scale_sigma", "gyro.misalignment_sigma"):
             return min(value, LARGEST_SCALE)
         if not name.endswith("_time"):
@@ -192,24 +191,24 @@ class Objective:
         return float(np.clip(value, QUICKEST * shortest, SLOWEST * max(spans)))
 
     def each(self, work: Callable[..., Any], jobs: Sequence[tuple[Any, ...]]) -> list[Any]:
-        """Return ``work`` of the arguments of every job, spread over the threads."""
+        """Return ``work`` for the arguments of every job, distributed over the threads."""
         if self.threads == 1 or len(jobs) == 1:
             return [work(*job) for job in jobs]
         with ThreadPoolExecutor(self.threads) as pool:
             return list(pool.map(lambda job: work(*job), jobs))
 
     def modelled(self, case: Case, chosen: FilterSetup) -> ImuRecord:
-        """Return a record as the filter of a setup processes it, its measurements thinned."""
+        """Return a record as processed by the filter of a setup, with thinned measurements."""
         record = setup.modelled_record(case.record, of_sensors(chosen, case.record))
         if self.spacing > 0.0:
             record = replace(record, vectors=tuple(thinned(series, self.spacing) for series in record.vectors))
         return record
 
     def initial(self, case: Case, chosen: FilterSetup) -> State:
-        """Return the state that the filter of a setup starts from."""
+        """Return the initial state of the filter of a setup."""
         if {INITIAL_ATTITUDE, INITIAL_BIAS} & set(self.names):
             return setup.initial_state(chosen, case.initial.attitude, case.initial.bias)
-        factor = chosen.measurement_sigma_factor / self.chosen.measurement_sigma_factor  # that of all σ alike
+        factor = chosen.measurement_sigma_factor / self.chosen.measurement_sigma_factor  # the common scale of all σ
         return case.initial if factor == 1.0 else replace(case.initial, covariance=factor**2 * case.initial.covariance)
 
 
@@ -222,7 +221,7 @@ def posed(
     parts: int = 20,
     threads: int = 1,
 ) -> Objective:
-    """Return the problem of a tuning, checked: records, filter and parameters, without an objective on the records."""
+    """Return the checked problem of a tuning: records, filter and parameters, without an objective on the records."""
     setup.need_mekf(chosen, "tuning by name")
     if not cases:
         raise InputError("there is no record to tune on; give one")
@@ -247,7 +246,7 @@ def posed(
 
 
 def _check_case(case: Case, chosen: FilterSetup) -> None:
-    """Refuse a record that has nothing to tune on, or lacks a sensor that the states are of."""
+    """Refuse a record without data for tuning, or without a sensor that has error states."""
     what = case.name or "record"
     for sensor in () if chosen.states is None else chosen.states.sensors:
         one_of(f"{what}: sensor of the states", sensor, [series.sensor for series in case.record.vectors])
@@ -269,13 +268,13 @@ def _usable(series: VectorMeasurements) -> np.ndarray:
 
 
 def thinned(series: VectorMeasurements, spacing: float) -> VectorMeasurements:
-    """Return the measurements of a series that lie at least ``spacing`` s apart, their σ lowered so that they weigh as much as all did.
+    """Return the measurements of a series at least ``spacing`` s apart, with σ reduced so that they have the weight of all.
 
-    A disturbance that lasts over n samples makes them worth one; a filter that takes them for independent needs a σ larger by √n. Thinned
-    to where disturbances are independent, that σ can be estimated; the filter then uses it on every sample.
+    With a disturbance correlated over n samples, a filter that treats samples as independent needs a σ larger by √n. If samples are thinned
+    until their disturbances are independent, that σ can be estimated; the filter then uses it for every sample.
     """
     usable = np.flatnonzero(_usable(series))
-    # A hair less, so that stamps on a grid of the very spacing are kept.
+    # Slightly less, so that stamps on a grid of exactly this spacing are kept.
     kept, due = [], -np.inf
     for k in usable:
         if series.time[k] >= due:

@@ -1,13 +1,13 @@
-"""Outliers in the measurements, and the gate that suits them, by maximum likelihood.
+"""Outliers in the measurements, and the gate for them, by maximum likelihood.
 
-A gate's threshold cannot be tuned by the likelihood of what passes it: the narrower the gate, the likelier what is left. So outliers are
-modelled: with probability ε (``outliers.share``) the noise of a measurement is κ times as large (``outliers.scale``; Tukey's contaminated
-normal, 1960). Each innovation is then a mixture of two normals, and share and scale are estimated with the filter's other parameters, which
-so no longer answer for the outliers. The filter of this likelihood makes each update both ways and goes on with mean and covariance of the
-mixture (:mod:`strapdown.kernels.likelihood_outliers`). Share and scale are those of all sensors together. The noise of an
-angular acceleration, at a lever arm, is taken to be larger with that of the accelerometer.
+The threshold of a gate cannot be tuned by the likelihood of the accepted measurements, which increases as the gate becomes narrower.
+Outliers are therefore modelled: with probability ε (``outliers.share``) the noise of a measurement is larger by the factor κ
+(``outliers.scale``; Tukey's contaminated normal, 1960). The distribution of each innovation is a mixture of two normals, and share and
+scale are estimated together with the other parameters, which are then not biased by the outliers. The filter of this likelihood makes each
+update with both noises and continues with mean and covariance of the mixture (:mod:`strapdown.kernels.likelihood_outliers`). Share and
+scale are common to all sensors. With a lever arm, the noise of the angular acceleration is scaled like that of the accelerometer.
 
-The gate refuses where an outlier has become the likelier explanation (Bayes): with d rows and κ′ the ratio of σ of the innovations,
+The gate refuses a measurement if it is more likely to be an outlier (Bayes): with d rows and κ′ the ratio of σ of the innovations,
 
     NIS > 2 (ln((1 − ε)/ε) + d ln κ′)/(1 − 1/κ′²).
 
@@ -32,11 +32,11 @@ from strapdown.tuning.parameters import OUTLIER_SCALE, OUTLIER_SHARE
 from strapdown.vectors import KINDS
 
 SHARE, SCALE = 0.02, 5.0
-"""Where the search for share and scale starts."""
+"""Initial share and scale of the search."""
 MAX_REFUSED = 0.25
-"""A share above which what is called outliers is a second size of the noise, and nothing to refuse."""
+"""Maximum share of outliers; above it they are a second noise level, and no gate is set."""
 MIN_REFUSED = 1e-9
-"""Share of right measurements that any gate refuses."""
+"""Minimum share of valid measurements that a gate refuses."""
 
 
 def contaminated_likelihood(
@@ -48,7 +48,7 @@ def contaminated_likelihood(
     scale: float = SCALE,
     threads: int = 1,
 ) -> Likelihood:
-    """Return the likelihood of the free parameters, and of the outliers' share and scale, which are always free."""
+    """Return the likelihood of the free parameters and of share and scale of the outliers, which are always free."""
     for name, value, (least, most) in (("share", share, SHARES), ("scale", scale, SCALES)):
         if not least <= positive(name, value) <= most:
             raise InputError(f"{name} of the outliers is {value:g}; it must lie between {least:g} and {most:g}")
@@ -58,24 +58,24 @@ def contaminated_likelihood(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TunedGate:
-    """The gate that suits the outliers of the records."""
+    """The gate for the outliers of the records."""
 
     gate: Gate | None
-    """None where the records show no outliers, or so many that they are noise: then there is nothing to refuse."""
+    """None if the records have no outliers, or more than :data:`MAX_REFUSED`."""
     probability: float
-    """That a right measurement passes; NaN where there is no gate, and so its interval."""
+    """Probability that a valid measurement is accepted; it and its interval are NaN without a gate."""
     lower: float
     """Lower end of its 95 % interval."""
     upper: float
     """Upper end."""
     thresholds: dict[str, float]
-    """The NIS from which on an outlier is likelier, by sensor; the filter has one probability for all, the mean over measurements."""
+    """NIS above which an outlier is more likely, by sensor; the filter has one probability for all, the mean over measurements."""
     share: Estimated
     scale: Estimated
 
 
 def tuned_gate(objective: Likelihood, tuning: Tuning, *, draws: int = 2000) -> TunedGate:
-    """Return the gate at the Bayes threshold, its interval from that of share and scale."""
+    """Return the gate at the Bayes threshold, with its interval from those of share and scale."""
     share, scale = tuning[OUTLIER_SHARE], tuning[OUTLIER_SCALE]
     seen = _seen(objective, tuning.point[:-2])
     best, thresholds = _probability(seen, np.array([[share.value, scale.value]]))
@@ -84,7 +84,7 @@ def tuned_gate(objective: Likelihood, tuning: Tuning, *, draws: int = 2000) -> T
         return TunedGate(
             gate=None, probability=math.nan, lower=math.nan, upper=math.nan, thresholds={}, share=share, scale=scale
         )
-    # Errors by the sandwich where the tuning took those.
+    # Standard errors by the sandwich if the tuning used it.
     swollen = np.array([one.standard_error for one in (share, scale)]) / np.sqrt(np.diag(tuning.covariance)[-2:])
     covariance = tuning.covariance[-2:, -2:] * swollen[:, None] * swollen
     normal = np.random.default_rng(0).standard_normal((draws, 2)) @ np.linalg.cholesky(covariance).T
@@ -103,7 +103,7 @@ def tuned_gate(objective: Likelihood, tuning: Tuning, *, draws: int = 2000) -> T
 
 
 def log_likelihood(cases: Sequence[Case], tuned: Likelihood, result: Tuning) -> float:
-    """Return the log likelihood of cases under the tuned filter and its outliers, in nats an innovation, as on data held out."""
+    """Return the log likelihood of cases, such as held-out ones, under the tuned filter and its outliers, in nats per innovation."""
     share, scale = result[OUTLIER_SHARE].value, result[OUTLIER_SCALE].value
     other = contaminated_likelihood(
         cases,
@@ -118,12 +118,12 @@ def log_likelihood(cases: Sequence[Case], tuned: Likelihood, result: Tuning) -> 
 
 @dataclass(frozen=True, kw_only=True)
 class _Seen:
-    """How one sensor's measurements look to the filter."""
+    """Measurements of one sensor, as processed by the filter."""
 
     degrees: int
     number: int
     noise: float
-    """Mean share of the measurement's own noise in the variance of its innovation."""
+    """Mean ratio of measurement noise to innovation variance."""
 
 
 def _seen(objective: Likelihood, point: Array) -> dict[str, _Seen]:
@@ -140,7 +140,7 @@ def _seen(objective: Likelihood, point: Array) -> dict[str, _Seen]:
 
 
 def _probability(seen: dict[str, _Seen], tried: Array) -> tuple[Array, dict[str, Array]]:
-    """Return for each share and scale (k, 2) the probability that a right measurement passes, and the thresholds of the sensors."""
+    """Return the probability that a valid measurement is accepted, and the thresholds of the sensors, for each share and scale (k, 2)."""
     from scipy.special import chdtrc
 
     share, scale = tried.T

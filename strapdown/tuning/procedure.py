@@ -1,4 +1,4 @@
-"""A whole tuning: which objective, the search with its intervals, and what each objective leaves to be done after it."""
+"""A complete tuning: choice of the objective, search with intervals, and the steps after it for each objective."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from strapdown.tuning.outliers import TunedGate, contaminated_likelihood, tuned_
 from strapdown.tuning.parameters import Prior, default_names
 
 GATED = ("gate.probability", *OUTLIERS)
-"""Names of parameters that ask for a model of outliers."""
+"""Names of parameters that need a model of outliers."""
 
 
 class Tuned(NamedTuple):
@@ -29,7 +29,7 @@ class Tuned(NamedTuple):
     objective : Objective
         Function that was minimised, for :func:`fit` again or slices of it.
     gate : TunedGate or None
-        The gate found where outliers were modelled, else None.
+        The gate, if outliers were modelled.
     """
 
     tuning: Tuning
@@ -50,9 +50,9 @@ def objective_for(
 ) -> Objective:
     """Return the objective of a tuning, for :func:`fit`: by default the likelihood of the innovations.
 
-    ``truth`` is that of the errors against the truth, of the filter as it runs, its gate included; ``rmse`` the RMS attitude error.
-    Innovations are those of the filter without its gate, because what passes one is the likelier the narrower it is; ``gate`` models
-    outliers. ``spacing`` is the least time between the samples of a sensor that are used, s.
+    ``truth``: likelihood of the errors against the truth, of the filter as used, including its gate; ``rmse``: RMS attitude error.
+    Innovations are those of the filter without its gate, because the likelihood of accepted ones increases as the gate becomes narrower;
+    ``gate``: model outliers. ``spacing``: minimum time between the samples of a sensor that are used, s.
     """
     if rmse and truth:
         raise InputError("rmse and truth both say which errors against the truth count; give one of them")
@@ -70,7 +70,7 @@ def objective_for(
         if gate
         else likelihood(cases, setup, names, spacing=spacing, threads=threads)
     )
-    # Where eight points run at once, searches run in the threads; else records and points do.
+    # If eight points run at once, the threads run searches, otherwise records and points.
     return dataclasses.replace(made, threads=1) if isinstance(made, LaneLikelihood) else made
 
 
@@ -97,21 +97,21 @@ def tune(
     setup : FilterSetup
         The filter to start from.
     names : sequence of str, optional
-        Parameters to tune; those of :data:`GATED` ask for ``gate``. Default: :func:`default_names`.
+        Parameters to tune; those of :data:`GATED` imply ``gate``. Default: :func:`default_names`.
     priors : mapping of str to Prior, optional
         Prior knowledge by parameter; the result is then the maximum of the posterior density.
     starts : int, default 4
-        Searches: the first from the setup's own values, the others from random starts.
+        Number of searches: the first from the setup's values, the others from random starts.
     factor : float, default 30
-        Random starts differ from the setup's values by factors of up to this, either way.
+        Maximum factor, up or down, between random starts and the setup's values.
     seed : int, default 0
         Seed of the random starts.
     threads : int, default 1
-        Searches, or records, computed at once.
+        Number of searches, or records, computed in parallel.
     progress : callable, optional
         As of :func:`fit`.
     gate : bool, default False
-        Model outliers too, and set the gate where an outlier is the likelier explanation.
+        Model outliers, and set the gate where an outlier is more likely.
     **objective
         ``truth``, ``rmse``, ``spacing`` of :func:`objective_for`.
 
@@ -138,7 +138,7 @@ def tune(
         progress=progress,
     )
     if objective.get("rmse"):
-        # The size of the error leaves a common scale open; the innovations determine it.
+        # The RMS error does not determine a common scale of all σ; the innovations do.
         scale = likelihood(cases, result.setup, ["filter.scale"])
         scaled = fit(
             scale, starts=2, threads=threads, progress=progress and (lambda now: progress(f"scale of all σ, {now}"))
