@@ -245,7 +245,7 @@ def test_names_units_and_strength():
         ({"velocity_time": 1.0, "velocity_sigma": 1.0}, "two must be above zero"),
         (
             {"velocity_time": 1.0, "velocity_sigma": 1.0, "acceleration_sigma": 3.0, "acceleration_time": 1.0},
-            "do not go together",
+            "contradict each other",
         ),
         ({"velocity_time": 1.0, "velocity_sigma": -1.0, "acceleration_time": 1.0}, "velocity_sigma is -1"),
         (
@@ -254,7 +254,7 @@ def test_names_units_and_strength():
         ),
         (
             {"velocity_time": 1.0, "velocity_sigma": 1.0, "acceleration_sigma": 1.0, "position_time": 0.5},
-            "less than velocity_time and position_time alone make",
+            "less than velocity_time and position_time imply",
         ),
         ({"velocity_time": 1.0, "velocity_sigma": 1.0, "acceleration_time": 1.0, "strength": 0.0}, "strength is 0"),
     ],
