@@ -267,7 +267,7 @@ def test_impossible_blocks_are_refused(fields, words):
 @pytest.mark.parametrize(
     ("fields", "words"),
     [
-        ({"feed": [1.0, 1.0]}, "no state comes after it"),
+        ({"feed": [1.0, 1.0]}, "no state follows it"),
         ({"feed": [1.0, 1.0, 1.0, 0.0]}, "a chain has at most 3"),
         ({"feed": [1.0, 0.0], "gyro_offset": np.eye(3)[:2]}, "belongs to a chain and enters the gyro"),
         ({"feed": [1.0, 0.0, 0.0]}, "feed"),
@@ -648,7 +648,7 @@ def test_what_is_carried_must_be_alike_on_three_axes():
             return super().decay * np.array([1.0, 1.0, 1.0, 1.0, 1.0, 2.0])
 
     block = Lopsided(sensor="acc", velocity_time=0.3, velocity_sigma=0.5, acceleration_time=0.1)
-    with pytest.raises(InputError, match="axes x, y and z in turn"):
+    with pytest.raises(InputError, match="axes x, y and z, in this order"):
         assemble((block,), {"acc": "vector"})
 
 
