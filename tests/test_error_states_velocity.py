@@ -686,7 +686,7 @@ def test_a_setup_has_the_block_for_either_kind_of_accelerometer():
     (whole,), (direction,) = (states.blocks({"acc": kind}) for kind in ("vector", "direction"))
     assert (whole.strength, direction.strength) == (1.0, 9.7)
     assert whole.velocity_sigma == 0.5
-    with pytest.raises(InputError, match=r"acc: velocity_time goes with an accelerometer; kind 'heading'"):
+    with pytest.raises(InputError, match=r"acc: velocity_time needs an accelerometer; kind 'heading'"):
         states.blocks({"acc": "heading"})
 
 

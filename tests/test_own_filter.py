@@ -395,7 +395,7 @@ def test_what_works_with_the_mekf_alone_says_so():
         lambda: covariance.analyse(SCENARIO, chosen),
         lambda: tuning.likelihood([tuning.record_case(record.record, SETUP)], chosen, ["gyro.arw"]),
     ):
-        with pytest.raises(InputError, match="works with the mekf, and the estimator is wrapped"):
+        with pytest.raises(InputError, match="needs the mekf, but the estimator is wrapped"):
             work()
     assert "wrapped" in str(montecarlo.choose(with_filter(wrapped)))
 

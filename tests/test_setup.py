@@ -95,7 +95,7 @@ def test_no_sigma_may_be_zero(change):
 def test_a_sigma_beyond_half_a_turn_is_refused_of_angles_alone():
     wide = dataclasses.replace(SETUP, sigma={"star": (1e-4, 3.2, 1e-4)})
     for kind in ("direction", "heading", "attitude"):
-        with pytest.raises(InputError, match=r"mine: sigma: star is 3\.2 rad, beyond half a turn"):
+        with pytest.raises(InputError, match=r"mine: sigma: star is 3\.2 rad, more than half a rotation"):
             setup.need_angles(wide, {"star": kind}, "mine")
     for kinds in ({"star": "vector"}, {}):
         setup.need_angles(wide, kinds, "mine")
