@@ -100,7 +100,7 @@ def test_a_filter_from_a_file_and_the_options(run, record, tmp_path):
     options = ("--filter", tmp_path / "filter.toml", "--from-truth", "--every", 10, "--variances", "--gate", 0.999)
     status, said, error = run("estimate", record, "--out", tmp_path / "out", *options, "--robust", "huber")
     assert (status, error) == (0, "")
-    assert "off by errors drawn" in said
+    assert "with errors drawn" in said
     estimate = read_estimate(tmp_path / "out" / "estimate.h5")
     assert estimate.covariance is None
     assert np.allclose(np.diff(estimate.time), 0.4)

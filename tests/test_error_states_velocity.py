@@ -737,7 +737,7 @@ def test_the_command_line_takes_it_from_a_filter_file(run):
 
 def test_what_no_state_covers_is_reported():
     moved = Accelerometer(name="acc", sigma=0.05, rate=25.0, acceleration_f=lambda t: np.zeros((*np.shape(t), 3)))
-    words = "the acceleration of the point that the acc is at"
+    words = "the acceleration of the point where the acc is mounted"
     assert words in setup.unmodelled_errors(GyroSpec(), (moved,))
     assert words not in setup.unmodelled_errors(GyroSpec(), (moved,), States(sensors={"acc": TOLD}))
     assert words not in setup.unmodelled_errors(GyroSpec(), (dataclasses.replace(moved, acceleration_f=None),))

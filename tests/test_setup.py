@@ -280,5 +280,5 @@ def test_what_cannot_be_smoothed_is_refused(monkeypatch):
     filter_setup = setup.FilterSetup.for_scenario(chosen)
     start = setup.initial_state(filter_setup, record.truth.attitude[0])
     monkeypatch.setattr(setup.running, "MAX_MEMORY", 1e5)
-    with pytest.raises(InputError, match=r"with 6 states takes .* GB, more than 0.0001; cut the record"):
+    with pytest.raises(InputError, match=r"with 6 states needs .* GB, more than 0.0001; cut the record"):
         setup.smooth(record, filter_setup, start)
