@@ -401,7 +401,7 @@ def test_one_direction_that_turns_starts_by_a_bank(run, tmp_path):
     write_record(path, whole)
     status, said, error = run("estimate", path, "--out", tmp_path / "out")
     assert (status, error) == (0, "")
-    assert "96 hypotheses about it became one at" in said
+    assert "96 hypotheses were merged into one at" in said
     assert "the estimate begins there" in said
     estimate = read_estimate(tmp_path / "out" / "estimate.h5")
     assert 300.0 < estimate.time[0] < 2000.0

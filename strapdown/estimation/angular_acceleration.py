@@ -17,7 +17,7 @@ _REACH = WINDOWS[-1] // 2
 MOST = 20000
 """Maximum number of samples from which order and window are chosen."""
 LASTING = 4.0
-"""Weight of the bias by curvature within the window relative to noise."""
+"""Weight of the bias due to curvature within the window relative to noise."""
 LEAST = 100
 """Minimum number of samples, to separate noise from motion; more than the longest window."""
 UNEVEN = 0.01
@@ -28,7 +28,7 @@ def turning(record: ImuRecord, time: Array) -> tuple[Array, Array]:
     """Return measured rate and angular acceleration at times (m, 6), rad/s and rad/s², and the variances of the latter's axes (m, 3).
 
     The slope of a polynomial over a window of samples is a compromise between the gyro's noise, ``σ √Σ h²`` for weights h, and the bias due
-    to the curvature of the motion within the window. The bias is estimated from the difference to the slope over half the window, whose
+    to the curvature of the motion within the window. The bias is estimated by comparison with the slope over half the window, whose
     bias is smaller by a factor of sixteen or more, after subtraction of the difference due to noise; order and window of the smallest sum
     are used. σ is estimated from the fifth differences of the rates, to which a smooth motion contributes nothing: ``σ² = E(Δ⁵)²/252``.
     """

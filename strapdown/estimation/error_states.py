@@ -362,7 +362,7 @@ class _FirstOrder(ErrorStates):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class GyroGaussMarkov(_FirstOrder):
-    """A gyro drift beside the bias: first-order Gauss–Markov, stationary. Several with different times together approximate flicker.
+    """Gyro drift in addition to the bias: first-order Gauss–Markov, stationary. Several with different times together approximate flicker.
 
     Parameters
     ----------
@@ -403,7 +403,7 @@ class VectorBias(ErrorStates):
     bias_sigma : float or ndarray (3,)
         Initial standard deviation of the bias, by body axis, in the unit of the sensor's reference (1 for directions and headings).
     rate_random_walk : float, default 0.0
-        Random walk of each component, in the unit of ``bias_sigma`` per √s (for a gyro the unit is rad/s/√s).
+        Random walk of each component, in the unit of ``bias_sigma`` per √s (not rad/s/√s, as for a gyro).
     varying : bool, default False
         Whether the bias is constant while the magnitude of the measured field changes: see :attr:`Effect.varying`.
     unit : str, default "1"

@@ -894,7 +894,7 @@ def level_sigma(series: VectorMeasurements) -> Array:
     sigma = series.sigma * level
     if np.any(sigma <= 0.0):
         raise InputError(
-            f"{series.sensor}: sigma is 0, from which the magnitude of the measured vector does not follow; give it, or varying=False"
+            f"{series.sensor}: sigma is 0, which does not determine the magnitude of the measured vector; give it, or varying=False"
         )
     return np.asarray(sigma)
 

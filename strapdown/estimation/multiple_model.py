@@ -138,9 +138,9 @@ def run(
     largest_share : float
         Maximum fraction of the mixture's covariance due to the distance of the hypotheses at which they are merged into one.
     gate : Gate, optional
-        Each hypothesis refuses improbable measurements; the weight of a hypothesis that refuses one is that of a measurement at the
-        threshold. When most of the hypotheses have refused ``recovery`` measurements in a row, they restart from the first of these, with
-        three times the bias σ, and an event reports it. After the merger it is the gate of :func:`strapdown.estimation.run`.
+        Each hypothesis refuses improbable measurements; a refused one reduces its weight like a measurement at the threshold. When most of
+        the hypotheses have refused ``recovery`` measurements in a row, they restart from the first of these, with three times the bias σ,
+        and an event reports it. After the merger it is the gate of :func:`strapdown.estimation.run`.
     robust : Robust, optional
         Each hypothesis weights measurements by their residuals, and hypotheses are weighted by likelihoods with heavier tails. Without a
         gate the bank cannot recover if the first measurements are wrong.
@@ -294,7 +294,7 @@ def _walked(
     kept = kept[record.time[kept] >= began]
     if len(kept) == 0:
         raise InputError(
-            f"the first direction comes at {began:.6g} s, after the last kept edge; keep more edges or give a longer record"
+            f"the first direction comes at {began:.6g} s, after the last stored edge; store more edges or give a longer record"
         )
     weight = np.empty(len(states))
     out = hypotheses_kernel.Outputs(

@@ -43,7 +43,7 @@ class Schedule:
     bounds: np.ndarray
     """Index of each sensor's first event, and the number of events, with one sensor after the other (sensors + 1,)."""
     codes: np.ndarray
-    """Code of :mod:`strapdown.kernels.filter_loop` of each sensor (sensors,)."""
+    """Code of each sensor's kind in :mod:`strapdown.kernels.measurement` (sensors,)."""
     frames: np.ndarray
     """Row of ``triads`` of each sensor's first event, and step in rows to the next event's, 0 or 1 (sensors, 2)."""
     triads: Array

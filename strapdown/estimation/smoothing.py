@@ -70,7 +70,7 @@ def smooth(
     error_state_covariance : bool
         Whether those include the error states; without them the smoother is faster.
     gate, robust : optional
-        As for :func:`strapdown.estimation.run`: measurements that the filter refused or down-weighted are so in the smoother too.
+        As for :func:`strapdown.estimation.run`; refused measurements and weights are those of the filter.
 
     Returns
     -------

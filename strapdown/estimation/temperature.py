@@ -38,14 +38,14 @@ def slopes(error_states: Sequence[ErrorStates]) -> slice | None:
 def need_none(error_states: Sequence[ErrorStates], what: str) -> None:
     """Raise an error if there are slopes, which this estimator does not use."""
     if slopes(error_states) is not None:
-        raise InputError(f"{what} has no bias driven by temperature; leave these states out")
+        raise InputError(f"{what} has no bias driven by temperature; leave the gyro temperature states out")
 
 
 def of(record: ImuRecord) -> Array:
     """Return the temperature of a record (n + 1,), °C."""
     if record.temperature is None:
         raise InputError(
-            "the record has no temperature, which drives the gyro's bias; give it, or leave these states out"
+            "the record has no temperature, which drives the gyro's bias; give it, or leave the gyro temperature states out"
         )
     return record.temperature
 

@@ -58,7 +58,7 @@ def run(
 
 
 def checked_schedule(record: ImuRecord, process_noise: ProcessNoise, initial: State, every: int) -> Schedule:
-    """Return the measurements of a record in order of time; after a check of the arguments."""
+    """Return the measurements of a record in order of time, after a check of the arguments."""
     check_arguments(record=record, process_noise=process_noise, initial=initial)
     count("every", every)
     return schedule(record.vectors, record.time[0], record.time[-1], anisotropic=True)

@@ -155,7 +155,7 @@ def read_filter(place: str | os.PathLike[str]) -> Own:
     Parameters
     ----------
     place : path
-        ``FILE.py:NAME``, or ``FILE.py`` for the name ``estimator``. The file can import modules of its folder.
+        ``FILE.py:NAME``, or ``FILE.py`` for the name ``estimator``. During execution it can import modules of its folder.
 
     Returns
     -------

@@ -81,9 +81,9 @@ def _by_multiple_models(record: ImuRecord, chosen: FilterSetup, problem: str, wh
     try:
         found = multiple_model.run(record, chosen.process_noise, bias_sigma=chosen.bias_sigma)
     except InputError as error:
-        raise InputError(f"{problem}, nor does a bank of hypotheses ({error}); {REMEDY}") from None
+        raise InputError(f"{problem}; a bank of hypotheses does not find it either ({error}); {REMEDY}") from None
     if not found.converged:
-        raise InputError(f"{problem}, nor does a bank of hypotheses: {found.reason}; or {REMEDY}")
+        raise InputError(f"{problem}; a bank of hypotheses does not find it either: {found.reason}; or {REMEDY}")
     edge = int(np.searchsorted(record.time, found.became_one))
     if edge >= len(record.increments):
         raise InputError(f"{problem}, and a bank of hypotheses found it only at the end; record longer, or {REMEDY}")
@@ -95,7 +95,7 @@ def _by_multiple_models(record: ImuRecord, chosen: FilterSetup, problem: str, wh
         covariance=found.estimate.covariance[row],
     )
     words = (
-        f"{why}: {len(found.angles)} hypotheses about it became one at {found.became_one:.6g} s, σ {_sigma_words(state)}; the estimate "
+        f"{why}: {len(found.angles)} hypotheses were merged into one at {found.became_one:.6g} s, σ {_sigma_words(state)}; the estimate "
         "begins there."
     )
     return Start(state, words, edge)
@@ -105,7 +105,7 @@ def _sigma_words(state: State) -> str:
     """Return the σ of an attitude as text: one, or the smallest and the largest if it differs by direction (tilt and heading)."""
     least, _, most = np.sqrt(np.maximum(np.linalg.eigvalsh(state.covariance[:3, :3]), 0.0)) / DEGREE
     if most < UNEVEN * least:
-        return f"{np.sqrt(np.trace(state.covariance[:3, :3]) / 3.0) / DEGREE:.3g}° an axis"
+        return f"{np.sqrt(np.trace(state.covariance[:3, :3]) / 3.0) / DEGREE:.3g}° per axis"
     return f"{least:.3g} to {most:.3g}° by direction"
 
 

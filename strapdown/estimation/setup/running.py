@@ -228,7 +228,7 @@ def initial_state(
     Returns
     -------
     State
-        Attitude and bias with independent errors with these σ.
+        Attitude and bias with independent errors of these σ.
     """
     return estimation.initial_state(
         attitude, bias=bias, attitude_sigma=setup.attitude_sigma, bias_sigma=setup.bias_sigma
