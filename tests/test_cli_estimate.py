@@ -100,7 +100,7 @@ def test_a_filter_from_a_file_and_the_options(run, record, tmp_path):
     options = ("--filter", tmp_path / "filter.toml", "--from-truth", "--every", 10, "--variances", "--gate", 0.999)
     status, said, error = run("estimate", record, "--out", tmp_path / "out", *options, "--robust", "huber")
     assert (status, error) == (0, "")
-    assert "off by errors drawn" in said
+    assert "with errors drawn" in said
     estimate = read_estimate(tmp_path / "out" / "estimate.h5")
     assert estimate.covariance is None
     assert np.allclose(np.diff(estimate.time), 0.4)
@@ -401,7 +401,7 @@ def test_one_direction_that_turns_starts_by_a_bank(run, tmp_path):
     write_record(path, whole)
     status, said, error = run("estimate", path, "--out", tmp_path / "out")
     assert (status, error) == (0, "")
-    assert "96 hypotheses about it became one at" in said
+    assert "96 hypotheses were merged into one at" in said
     assert "the estimate begins there" in said
     estimate = read_estimate(tmp_path / "out" / "estimate.h5")
     assert 300.0 < estimate.time[0] < 2000.0

@@ -857,7 +857,7 @@ class Wrong(error_states.ErrorStates):
             lambda: estimation.run(
                 record_of(), NOISE, estimation.with_error_states(start(), OPTIONS["hard iron"]), OPTIONS["gyro scale"]
             ),
-            "initial has 3 error states, and 9 are declared",
+            "initial has 3 error states, but 9 are declared",
         ),
         (lambda: estimation.run(record_of(), NOISE, start(), (Wrong(sigma=np.zeros(1)),)), r"sigma\[0\] is 0"),
         (lambda: estimation.run(record_of(), NOISE, start(), (Wrong(units=(), sigma=np.ones(1)),)), "0 units for 1"),

@@ -245,7 +245,7 @@ def test_names_units_and_strength():
         ({"velocity_time": 1.0, "velocity_sigma": 1.0}, "two must be above zero"),
         (
             {"velocity_time": 1.0, "velocity_sigma": 1.0, "acceleration_sigma": 3.0, "acceleration_time": 1.0},
-            "do not go together",
+            "contradict each other",
         ),
         ({"velocity_time": 1.0, "velocity_sigma": -1.0, "acceleration_time": 1.0}, "velocity_sigma is -1"),
         (
@@ -254,7 +254,7 @@ def test_names_units_and_strength():
         ),
         (
             {"velocity_time": 1.0, "velocity_sigma": 1.0, "acceleration_sigma": 1.0, "position_time": 0.5},
-            "less than velocity_time and position_time alone make",
+            "less than velocity_time and position_time imply",
         ),
         ({"velocity_time": 1.0, "velocity_sigma": 1.0, "acceleration_time": 1.0, "strength": 0.0}, "strength is 0"),
     ],
@@ -267,7 +267,7 @@ def test_impossible_blocks_are_refused(fields, words):
 @pytest.mark.parametrize(
     ("fields", "words"),
     [
-        ({"feed": [1.0, 1.0]}, "no state comes after it"),
+        ({"feed": [1.0, 1.0]}, "no state follows it"),
         ({"feed": [1.0, 1.0, 1.0, 0.0]}, "a chain has at most 3"),
         ({"feed": [1.0, 0.0], "gyro_offset": np.eye(3)[:2]}, "belongs to a chain and enters the gyro"),
         ({"feed": [1.0, 0.0, 0.0]}, "feed"),
@@ -648,7 +648,7 @@ def test_what_is_carried_must_be_alike_on_three_axes():
             return super().decay * np.array([1.0, 1.0, 1.0, 1.0, 1.0, 2.0])
 
     block = Lopsided(sensor="acc", velocity_time=0.3, velocity_sigma=0.5, acceleration_time=0.1)
-    with pytest.raises(InputError, match="axes x, y and z in turn"):
+    with pytest.raises(InputError, match="axes x, y and z, in this order"):
         assemble((block,), {"acc": "vector"})
 
 
@@ -686,7 +686,7 @@ def test_a_setup_has_the_block_for_either_kind_of_accelerometer():
     (whole,), (direction,) = (states.blocks({"acc": kind}) for kind in ("vector", "direction"))
     assert (whole.strength, direction.strength) == (1.0, 9.7)
     assert whole.velocity_sigma == 0.5
-    with pytest.raises(InputError, match=r"acc: velocity_time goes with an accelerometer; kind 'heading'"):
+    with pytest.raises(InputError, match=r"acc: velocity_time needs an accelerometer; kind 'heading'"):
         states.blocks({"acc": "heading"})
 
 
@@ -737,7 +737,7 @@ def test_the_command_line_takes_it_from_a_filter_file(run):
 
 def test_what_no_state_covers_is_reported():
     moved = Accelerometer(name="acc", sigma=0.05, rate=25.0, acceleration_f=lambda t: np.zeros((*np.shape(t), 3)))
-    words = "the acceleration of the point that the acc is at"
+    words = "the acceleration of the point where the acc is mounted"
     assert words in setup.unmodelled_errors(GyroSpec(), (moved,))
     assert words not in setup.unmodelled_errors(GyroSpec(), (moved,), States(sensors={"acc": TOLD}))
     assert words not in setup.unmodelled_errors(GyroSpec(), (dataclasses.replace(moved, acceleration_f=None),))

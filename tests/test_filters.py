@@ -1359,10 +1359,10 @@ def test_bad_input_is_refused():
         for arguments, message in (
             ((record, BELIEF, initial, 0), "^every is 0; it must be a whole number"),
             ((record, BELIEF, initial, 1.5), "^every is 1.5"),
-            (("record.h5", BELIEF, initial, 1), "^record is 'record.h5', not of class ImuRecord; make it by"),
+            (("record.h5", BELIEF, initial, 1), "^record is 'record.h5', not of class ImuRecord; make it with"),
             ((None, BELIEF, initial, 1), "^record is None, not"),
             ((record, 1e-4, initial, 1), "^process_noise is 0.0001, not of class ProcessNoise; give"),
-            ((record, BELIEF, [1.0, 0.0, 0.0, 0.0], 1), "^initial is .*not of class State; make it by"),
+            ((record, BELIEF, [1.0, 0.0, 0.0, 0.0], 1), "^initial is .*not of class State; make it with"),
             ((record, initial, BELIEF, 1), "^process_noise is State"),
             *(((dataclasses.replace(record, vectors=(s,)), BELIEF, initial, 1), said) for s, said in wrong),
         ):

@@ -403,7 +403,7 @@ def test_noise_that_is_no_noise_is_refused_by_the_filter():
         record = ImuRecord(time=[0.0, 1.0], increments=np.zeros((1, 3)), vectors=(series,))
         with pytest.raises(InputError, match=words):
             estimation.run(record, NOISE, start)
-        with pytest.raises(InputError, match="one sigma a sample"):
+        with pytest.raises(InputError, match="one sigma per sample"):
             schedule(record.vectors, 0.0, 1.0)
 
 

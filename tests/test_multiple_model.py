@@ -673,7 +673,7 @@ def test_what_makes_no_sense_is_refused():
         ({"hypotheses": 4}, "hypotheses"),
         ({"least_weight": 1.0}, "least_weight"),
         ({"bias_sigma": [1.0, 0.0, 1.0]}, r"bias_sigma\[1\]"),
-        ({"every": 200}, "kept edge"),
+        ({"every": 200}, "stored edge"),
     ):
         with pytest.raises(InputError, match=message):
             multiple_model.run(record, belief, **wrong)

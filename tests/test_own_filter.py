@@ -291,7 +291,7 @@ def test_a_campaign_goes_on_and_is_replayed(own, tmp_path):
     read = campaign.read(path).plan
     assert read.digest == plan.digest
     assert read.setup == plan.setup
-    with pytest.raises(InputError, match="Wrapped is a filter of your own, whose code no result file holds"):
+    with pytest.raises(InputError, match="Wrapped is a filter of your own, whose code is not in the result file"):
         montecarlo.replay(read, 0)
     assert "textbook" not in campaigns.report(path, 0.99)[0]
 
@@ -377,7 +377,7 @@ def test_bad_filters_are_refused():
 
     for bad, message in (
         (lambda record, initial: 3, "return Estimate.from_arrays"),
-        (shifted, "time\\[0\\] is 0.01 s, and the record has no edge there"),
+        (shifted, "time\\[0\\] is 0.01 s, where the record has no edge"),
     ):
         with pytest.raises(InputError, match=message):
             montecarlo.run_plan(with_filter(bad), runs=1)
@@ -395,7 +395,7 @@ def test_what_works_with_the_mekf_alone_says_so():
         lambda: covariance.analyse(SCENARIO, chosen),
         lambda: tuning.likelihood([tuning.record_case(record.record, SETUP)], chosen, ["gyro.arw"]),
     ):
-        with pytest.raises(InputError, match="works with the mekf, and the estimator is wrapped"):
+        with pytest.raises(InputError, match="needs the mekf, but the estimator is wrapped"):
             work()
     assert "wrapped" in str(montecarlo.choose(with_filter(wrapped)))
 

@@ -412,7 +412,7 @@ def test_sigma_of_an_angle_in_another_unit_is_reported(folder, short, tmp_path, 
     (tmp_path / "filter.toml").write_text(setup.to_toml(filter_setup))
     out = tmp_path / {"tune": "new.toml", "montecarlo": "new.h5"}.get(command, "new")
     said = refused([command, folder / source, "--filter", tmp_path / "filter.toml", "--out", out])
-    assert "sigma: star 1 is 20 rad, beyond half a turn; sigma is in rad, and 20 arcsec would be 9.696e-05" in said
+    assert "star 1 is 20 rad, more than half a rotation; sigma is in rad, and 20 arcsec would be 9.696e-05" in said
     assert not out.exists()
 
 

@@ -95,7 +95,7 @@ def test_no_sigma_may_be_zero(change):
 def test_a_sigma_beyond_half_a_turn_is_refused_of_angles_alone():
     wide = dataclasses.replace(SETUP, sigma={"star": (1e-4, 3.2, 1e-4)})
     for kind in ("direction", "heading", "attitude"):
-        with pytest.raises(InputError, match=r"mine: sigma: star is 3\.2 rad, beyond half a turn"):
+        with pytest.raises(InputError, match=r"mine: sigma: star is 3\.2 rad, more than half a rotation"):
             setup.need_angles(wide, {"star": kind}, "mine")
     for kinds in ({"star": "vector"}, {}):
         setup.need_angles(wide, kinds, "mine")
@@ -280,5 +280,5 @@ def test_what_cannot_be_smoothed_is_refused(monkeypatch):
     filter_setup = setup.FilterSetup.for_scenario(chosen)
     start = setup.initial_state(filter_setup, record.truth.attitude[0])
     monkeypatch.setattr(setup.running, "MAX_MEMORY", 1e5)
-    with pytest.raises(InputError, match=r"with 6 states takes .* GB, more than 0.0001; cut the record"):
+    with pytest.raises(InputError, match=r"with 6 states needs .* GB, more than 0.0001; cut the record"):
         setup.smooth(record, filter_setup, start)

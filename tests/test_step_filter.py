@@ -154,7 +154,7 @@ def test_steps_that_contradict_the_clock_are_refused(arguments, message):
 def test_turns_that_nothing_makes_are_refused():
     f = StepFilter(NOISE, start())
     for turn in (1e200, -2e6):
-        with pytest.raises(InputError, match="nothing turns so far between two samples"):
+        with pytest.raises(InputError, match="too large for the rotation between two samples"):
             f.predict([0.0, turn, 0.0], 0.01)
     assert f.time == 0.0
 

@@ -113,7 +113,7 @@ def test_a_heading_has_one():
     scenario = swaying("heading", 5.0)
     record = scenarios.simulate(scenario, 1)
     chosen = setup.FilterSetup.for_scenario(scenario)
-    with pytest.raises(InputError, match=r"mag is .*three numbers, and a heading has one degree of freedom; give one"):
+    with pytest.raises(InputError, match=r"mag is .*three numbers, but a heading has one degree of freedom; give one"):
         setup.modelled_record(record, dataclasses.replace(chosen, sigma={"mag": (0.1, 0.1, 0.1)}))
     case = case_of(scenario, chosen, 1)
     with pytest.raises(InputError, match=r"mag\.sigma\.x: a heading has one degree of freedom; give mag\.sigma"):

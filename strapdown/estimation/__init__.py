@@ -1,20 +1,20 @@
 """Attitude, gyro bias and error states from gyro increments and vector measurements.
 
 The process model is equation (17), ``q̇ = ½ q ⊗ (w_meas − b)``; the error state is ``(δθ, δb, δc)`` with ``q_true = q ⊗ exp(δθ)`` and
-``δb = b_true − b``. Transition and process noise are exact at constant rate; after each correction the covariance is carried to the new
+``δb = b_true − b``. Transition and process noise are exact at constant rate; after each correction the covariance is transformed to the new
 tangent space.
 
-- ``states``: Process noise, state, where the filter starts.
-- ``error_states``: Declarations of states beside attitude and gyro bias; ``model`` turns them into arrays.
+- ``states``: Process noise, state, initial states.
+- ``error_states``: Declarations of states in addition to attitude and gyro bias; ``model`` converts them to arrays.
 - ``gating``: Gate and robust weights.
 - ``schedule``: Measurements in order of time.
 - ``forward``: The filter over whole records.
-- ``smoothing``: The smoothers; ``recovery_segments`` what they make of recoveries.
-- ``observability``: What a record shows of each state.
-- ``live``: The compiled filter for data that arrive as they are measured.
-- ``step_filter``: The filter step by step, on filterpy.
-- ``multiple_model``: Unknown start, one vector at a time.
-- ``filters``: Other filters on the same interface, for comparison.
+- ``smoothing``: The smoothers; ``recovery_segments``: smoothing across recoveries.
+- ``observability``: Information of a record about each state.
+- ``live``: The compiled filter for data in real time.
+- ``step_filter``: The filter in single steps, on filterpy.
+- ``multiple_model``: Unknown initial attitude, by multiple-model estimation.
+- ``filters``: Other filters with the same interface, for comparison.
 - ``setup``: The setup of a filter, matched to a scenario or read from a file, and the filter of a setup over a record.
 """
 

@@ -1,4 +1,4 @@
-"""Rate and angular acceleration of the body from the gyro's own samples: what an accelerometer off the centre of turning feels."""
+"""Rate and angular acceleration of the body from the gyro's samples: the acceleration of a point off the centre of rotation."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ from strapdown.records import ImuRecord
 ORDERS = (3, 5, 7)
 """Degrees of the polynomial fitted to the rate over a window; its slope at the middle is the acceleration (Savitzky & Golay 1964)."""
 WINDOWS = (5, 7, 9, 11, 13, 17, 21, 25, 31, 37, 45, 53, 61)
-"""Windows tried, samples."""
+"""Windows tried, number of samples."""
 _REACH = WINDOWS[-1] // 2
 MOST = 20000
-"""Samples by which order and window are chosen."""
+"""Maximum number of samples from which order and window are chosen."""
 LASTING = 4.0
-"""Weight of curvature within the window relative to noise."""
+"""Weight of the bias due to curvature within the window relative to noise."""
 LEAST = 100
-"""Samples needed to separate noise from motion, more than the longest window."""
+"""Minimum number of samples, to separate noise from motion; more than the longest window."""
 UNEVEN = 0.01
-"""Tolerated difference of the gyro's intervals, as a part of their mean."""
+"""Maximum difference of the gyro's intervals from their mean, relative to it."""
 
 
 def turning(record: ImuRecord, time: Array) -> tuple[Array, Array]:
     """Return measured rate and angular acceleration at times (m, 6), rad/s and rad/s², and the variances of the latter's axes (m, 3).
 
-    The slope of a polynomial over a window of samples trades the gyro's noise, ``σ √Σ h²`` for weights h, against what the motion bends
-    within the window. That is seen from how the slope differs from that over half the window, which a motion bends sixteen times less or
-    better, less what noise alone would make; the order and window of the least sum are taken. σ is that of the rates' fifth differences,
-    in which a smooth motion is nothing: ``σ² = E(Δ⁵)²/252``.
+    The slope of a polynomial over a window of samples is a compromise between the gyro's noise, ``σ √Σ h²`` for weights h, and the bias due
+    to the curvature of the motion within the window. The bias is estimated by comparison with the slope over half the window, whose
+    bias is smaller by a factor of sixteen or more, after subtraction of the difference due to noise; order and window of the smallest sum
+    are used. σ is estimated from the fifth differences of the rates, to which a smooth motion contributes nothing: ``σ² = E(Δ⁵)²/252``.
     """
     from scipy.signal import savgol_filter
 
@@ -39,12 +39,12 @@ def turning(record: ImuRecord, time: Array) -> tuple[Array, Array]:
     k = int(np.argmax(np.abs(dt - mean)))
     if abs(dt[k] - mean) > UNEVEN * mean:
         raise InputError(
-            f"a lever arm needs gyro intervals that are alike, and that from {record.time[k]:.9g} s is {dt[k]:.6g} s, "
+            f"a lever arm needs equal gyro intervals, but that from {record.time[k]:.9g} s is {dt[k]:.6g} s, "
             f"the mean {mean:.6g} s; cut the record, or leave the lever arm out"
         )
     if len(dt) < LEAST:
         raise InputError(
-            f"a lever arm needs {LEAST} gyro samples or more, to tell noise from motion; the record has {len(dt)}"
+            f"a lever arm needs {LEAST} gyro samples or more, to separate noise from motion; the record has {len(dt)}"
         )
     rates = record.rates
     white = np.mean(np.diff(rates, 5, axis=0) ** 2, axis=0) / 252.0
@@ -76,7 +76,7 @@ def turning(record: ImuRecord, time: Array) -> tuple[Array, Array]:
     # A sample is the mean over its interval, f + f″ dt²/24.
     for series in (smooth, acceleration):
         series[1:-1] -= np.diff(series, 2, axis=0) / 24.0
-    # The cubic through the four nearest middles: a straight line would cut the crests of what swings within some ten samples.
+    # Cubic interpolation from the four nearest midpoints: linear interpolation would reduce the peaks of oscillations of about ten samples.
     place = np.clip((time - 0.5 * (record.time[0] + record.time[1])) / mean, 0.0, len(dt) - 1.0)
     k = np.clip(np.floor(place).astype(np.int64), 1, len(dt) - 3)
     s = place - k
@@ -103,17 +103,17 @@ def _products(series: Array) -> Array:
     n = len(series) - width + 1
     products = np.zeros((width, width))
     products[0] = np.einsum("n,nj->j", series[:n], np.lib.stride_tricks.sliding_window_view(series, width))
-    for i in range(1, width):  # one leaves each sum, one joins it
+    for i in range(1, width):  # one product leaves each sum, one enters
         gone, new = series[i - 1 : width - 1], series[n + i - 1 :]
         products[i, i:] = products[i - 1, i - 1 : -1] + new[0] * new - gone[0] * gone
     return np.asarray(np.triu(products) + np.triu(products, 1).T)
 
 
 def _mean_squares(weights: Array, bending: Array, products: list[Array]) -> Array:
-    """Return the mean squares (3,) of what weights of samples, as :func:`_slopes` has them, make of axes of second differences (3, n).
+    """Return the mean squares (3,) of the difference of two slopes, from its weights of samples and axes of second differences (3, n).
 
-    What two slopes differ by is nothing of a straight line, so summed twice the weights are those of the differences, in which the rate
-    itself, of which little is left, costs no digits. ``products`` are those of each axis.
+    The difference is zero for a straight line, so its weights summed twice are weights of the second differences; then no digits are lost
+    by cancellation of the rate itself. ``products`` are those of each axis.
     """
     summed = np.cumsum(np.cumsum(weights, axis=1), axis=1)[:, :-2]
     inside, width = summed[_REACH], summed.shape[1]
@@ -126,7 +126,7 @@ def _mean_squares(weights: Array, bending: Array, products: list[Array]) -> Arra
 
 @functools.cache
 def _slopes(order: int, window: int) -> Array:
-    """Return the weights of slopes: at the first samples of a series, in the middle of the longest window, and at the last ones."""
+    """Return the weights of slopes: at the first samples of a series, in the middle of the longest window, and at the last samples."""
     from scipy.signal import savgol_filter
 
     width = WINDOWS[-1]
@@ -136,17 +136,18 @@ def _slopes(order: int, window: int) -> Array:
 
 
 def _half(order: int, window: int) -> int:
-    """Return about half of an odd window, odd too and enough for a polynomial of this order."""
+    """Return about half of an odd window, also odd, and long enough for a polynomial of this order."""
     return max(order + 2, window // 4 * 2 + 1)
 
 
 def _lost(slope: Array, sharper: Array, own: Array, common: Array) -> Array:
-    """Return the factor of each axis (3,), 1 or more, by which slopes (n, 3) fall short of those over half the window: least squares.
+    """Return the factor of each axis (3,), at least 1, by which slopes (n, 3) are smaller than those over half the window: least squares.
 
-    What a window bends of a vibration is little of every sample, but alike in all of them, and a lever arm, which is constant, makes up for
-    it by its length. ``own`` is what the gyro's noise makes of the mean square of a slope, ``common`` of the mean product of both (3,).
+    The smoothing of a vibration by the window is small in each sample but the same in all of them, so a constant lever arm would compensate
+    it by its length. ``own`` is the contribution of the gyro's noise to the mean square of a slope, ``common`` to the mean product of both
+    slopes (3,).
     """
     power = np.mean(slope**2, axis=0) - own
-    seen = power > own  # nothing is known of an axis that hardly turns
+    seen = power > own  # no factor for an axis that hardly rotates
     shared = np.mean(slope * sharper, axis=0) - common
     return np.where(seen, np.maximum(shared / np.where(seen, power, 1.0), 1.0), 1.0)

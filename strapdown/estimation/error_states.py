@@ -1,7 +1,7 @@
-"""Declarations of error states: what each is, how it changes, and how it enters the gyro and the sensors.
+"""Declarations of error states: components, dynamics, and effects on the gyro and the sensors.
 
-:class:`ErrorStates` describes them by arrays, and the compiled filter needs nothing else. A new declaration is a subclass that overrides
-what it has.
+:class:`ErrorStates` describes them by arrays, which are all that the compiled filter needs. A new kind is a subclass that overrides
+those properties in which it differs from "no effect".
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ __all__ = [
 
 AXES = ("x", "y", "z")
 MAX_CHAIN_DECAY = 0.5
-"""Largest λ dt of a state in a chain in one step, where its series and Gauss's rule are exact."""
+"""Largest λ dt of a state in a chain in one step for which its series and Gauss's rule are exact."""
 ENTRIES = tuple(a if a == b else f"{a}{b}" for a in AXES for b in AXES)
-"""Entries of a matrix by rows: x, xy, xz, yx, y, …"""
+"""Names of the entries of a matrix, row by row: x, xy, xz, yx, y, …"""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Effect:
-    """How the states c of a block enter one sensor: it measures ``(I + Σ c U) R_fbᵀ (r + Σ c d) + Σ c a``.
+    """Effect of error states c on one sensor, which then measures ``(I + Σ c U) R_fbᵀ (r + Σ c d) + Σ c a``.
 
-    a and d are in the unit of the sensor's references (of directions and headings: the length of the reference is 1). Of a sensor of whole
-    attitudes ``Σ c a`` is the rotation vector from the body's axes to the sensor's, rad, and nothing else is taken.
+    a and d are in the unit of the sensor's references (1 for directions and headings). For a sensor of whole attitudes ``Σ c a`` is the
+    rotation vector from the body's axes to the sensor's, rad, and the only effect allowed.
     """
 
     offset_b: Array | None = None
@@ -54,36 +54,36 @@ class Effect:
     scale: Array | None = None
     """U of each state (size, 3, 3)."""
     lever: Array | None = None
-    """a′ of each state (size, 3), body axes, in place of a: ``a = ([ẇ] + [w]²) a′``, the acceleration of a point of the body that lies a′
-    from the centre of turning, over the strength of what is measured. Of directions and whole vectors only."""
+    """a′ of each state (size, 3), body axes, instead of a: ``a = ([ẇ] + [w]²) a′``, the acceleration of a point of the body at a′ from the
+    centre of rotation, divided by the magnitude of the measured vector. For directions and whole vectors only."""
     varying: bool = False
-    """Of a direction or heading: whether a and d are fixed in the sensor's own unit while the strength of what it measures changes, as
-    the earth's field does along an orbit. Its σ, which is its noise over that strength, shows how; c is then relative to the strength at
-    the root mean square σ."""
+    """For a direction or heading: whether a and d are constant in the sensor's own unit while the magnitude of the measured field changes,
+    as the earth's field does along an orbit. The sensor's σ, its noise divided by that magnitude, gives the change; c is then relative to
+    the magnitude at the root mean square σ."""
     carried: bool = False
-    """Whether d is known only relative to the estimated attitude, and goes along when that is corrected: right for a noise that is alike in
-    all directions. Firm in the fixed frame, an estimate of the noise would seem to show the attitude, which it does not: turn both, and
-    every measurement and the noise's own law stay as they are. (A filter whose linearisation breaks such a symmetry finds information
-    where there is none: Huang, Mourikis & Roumeliotis 2010.) A correction of the attitude turns the states, with their covariance, by
-    itself. For that the block's states are those of the axes x, y and z in turn, alike: ``offset_f`` is ``kron(I, a)`` of a column a. They
-    are reported in the axes of the estimated attitude, and so is their covariance, without the uncertainty of that attitude."""
+    """Whether d is defined relative to the estimated attitude and rotates with its corrections: right for isotropic noise. A common
+    rotation of attitude and noise changes neither the measurements nor the noise model, so states in fixed axes would add information
+    about the attitude that the measurements do not contain (Huang, Mourikis & Roumeliotis 2010, on linearisations that break a symmetry).
+    Each correction of the attitude rotates the states and their covariance. This requires equal states for the axes x, y and z, in this
+    order: ``offset_f`` is ``kron(I, a)`` of a column a. States and covariance are reported in the axes of the estimated attitude, without
+    its uncertainty."""
 
 
 class ErrorStates(ByValue):
-    """Error states that enter linearly and change each by itself, or in chains: ``ċₖ = −λₖ cₖ + gₖ cₖ₊₁ + √qₖ wₖ``.
+    """Error states that enter linearly, with dynamics that are independent or in chains: ``ċₖ = −λₖ cₖ + gₖ cₖ₊₁ + √qₖ wₖ``.
 
-    Transition and noise are exact over any dt. A chain, of up to three states that do not enter the gyro, shapes the noise of its last one
-    by any real poles. A subclass overrides what it has; everything else is "no effect".
+    Transition and noise are exact over any dt. A chain has at most three states, none of which enters the gyro, and shapes the noise of
+    its last state by any real poles. A subclass overrides the properties that it needs; the default of all others is "no effect".
     """
 
     name: str
-    """Its name, which no other block has."""
+    """Name, unique among the error states of a filter."""
     components: tuple[str, ...]
     """Name of each state."""
     units: tuple[str, ...]
     """Unit of each state."""
     sigma: Array
-    """Standard deviation of each state at the start (size,), above zero; all are expected to be zero then."""
+    """Initial standard deviation of each state (size,), greater than zero; all states are initially zero."""
 
     def _set(self, **values: Any) -> None:
         """Set attributes of a frozen declaration."""
@@ -97,12 +97,12 @@ class ErrorStates(ByValue):
 
     @property
     def covariance(self) -> Array:
-        """Covariance of the states at the start (size, size): of states that are independent then, their variances."""
+        """Initial covariance of the states (size, size). Default: independent states."""
         return np.diag(np.asarray(self.sigma) ** 2)
 
     @property
     def decay(self) -> Array:
-        """λ of each state (size,), 1/s; 0: it stays."""
+        """λ of each state (size,), 1/s; 0: constant or random walk."""
         return np.zeros(self.size)
 
     @property
@@ -112,27 +112,27 @@ class ErrorStates(ByValue):
 
     @property
     def feed(self) -> Array:
-        """How the next state feeds each, g (size,), 1/s times unit over unit; 0: it does not."""
+        """Coupling g of each state to the next (size,), 1/s times the ratio of their units; 0: none."""
         return np.zeros(self.size)
 
     @property
     def gyro_offset(self) -> Array:
-        """Vectors e by state (size, 3): the gyro measures ``(I + Σ c T) w_b + b + Σ c e + n``."""
+        """Vectors e of the states (size, 3): the gyro measures ``(I + Σ c T) w_b + b + Σ c e + n``."""
         return np.zeros((self.size, 3))
 
     @property
     def gyro_scale(self) -> Array:
-        """Matrices T by state (size, 3, 3)."""
+        """Matrices T of the states (size, 3, 3)."""
         return np.zeros((self.size, 3, 3))
 
     @property
     def gyro_force(self) -> Array:
-        """Matrices G by state (size, 3, 3): ``Σ c G R_fbᵀ f`` is added to the measured rate, f being :attr:`force_f`."""
+        """Matrices G of the states (size, 3, 3): ``Σ c G R_fbᵀ f`` is added to the measured rate, f being :attr:`force_f`."""
         return np.zeros((self.size, 3, 3))
 
     @property
     def force_f(self) -> Array:
-        """Specific force of a body held at rest (3,), m/s², fixed axes; zero: the block has nothing to do with it."""
+        """Specific force of a body at rest (3,), m/s², fixed axes; zero: not used."""
         return np.zeros(3)
 
     @property
@@ -146,12 +146,12 @@ class ErrorStates(ByValue):
         Parameters
         ----------
         dt : float
-            s.
+            Time step, s.
 
         Returns
         -------
         ndarray (size, size)
-            Φ, by which the states of the block change over ``dt``.
+            Φ of these states over ``dt``.
         """
         return np.diag(np.exp(-self.decay * dt)) if not np.any(self.feed) else self._chained(dt)[0]
 
@@ -161,12 +161,12 @@ class ErrorStates(ByValue):
         Parameters
         ----------
         dt : float
-            s.
+            Time step, s.
 
         Returns
         -------
         ndarray (size, size)
-            Q of the states of the block over ``dt``, in their units squared.
+            Q of these states over ``dt``, in their units squared.
         """
         if np.any(self.feed):
             return self._chained(dt)[1]
@@ -175,8 +175,8 @@ class ErrorStates(ByValue):
         return np.diag(self.density * time)
 
     def _chained(self, dt: float) -> tuple[Array, Array]:
-        """Return Φ and Q of states in chains: of a step short enough for the kernel's series, doubled as often as it takes."""
-        if dt == 0.0:  # where the series divides by dt
+        """Return Φ and Q of states in chains: the kernel's series for a short enough step, then repeated doubling."""
+        if dt == 0.0:  # the series divides by dt
             return np.eye(self.size), np.zeros((self.size, self.size))
         decay, density = np.asarray(self.decay, np.float64), np.asarray(self.density, np.float64)
         link = np.stack([np.asarray(self.feed, np.float64), density], axis=1)
@@ -196,7 +196,7 @@ class ErrorStates(ByValue):
 
 
 def stationary_covariance(decay: Array, density: Array, feed: Array) -> Array:
-    """Return what chains of states settle at (n, n): ``A P + P Aᵀ + diag(q) = 0``, solved from the last state up, where all is a sum."""
+    """Return the stationary covariance (n, n) of chains of states, ``A P + P Aᵀ + diag(q) = 0``, solved from the last state backwards."""
     n = len(decay)
     P = np.zeros((n + 1, n + 1))
     link = np.append(feed[:-1], 0.0)
@@ -213,7 +213,7 @@ def _spread(name: str, value: float | Array, unit: str, size: int = 3) -> Array:
 
 
 def _matrix(name: str, diagonal: float | Array, off_diagonal: float | Array, units: tuple[str, str]) -> Array:
-    """Return standard deviations of the entries of a matrix (3, 3), of which zeros are no states; all zero is refused."""
+    """Return the standard deviations of the entries of a matrix (3, 3); entries of zero are no states, and all zero is refused."""
     for what, value in zip(units, (diagonal, off_diagonal), strict=True):
         if np.ndim(value) == 0:
             positive(f"{name}: {what}", value)  # type: ignore[arg-type]
@@ -229,18 +229,18 @@ def _matrix(name: str, diagonal: float | Array, off_diagonal: float | Array, uni
         i, j = np.argwhere(whole < 0.0)[0]
         raise InputError(f"{name}: the sigma of {ENTRIES[3 * i + j]} is {whole[i, j]:g}; it must not be negative")
     if not whole.any():
-        raise InputError(f"{name}: {units[0]} and {units[1]} are both 0; give one of them, or leave the block out")
+        raise InputError(f"{name}: {units[0]} and {units[1]} are both 0; give one of them, or drop these states")
     return whole
 
 
 def _entries(sigmas: Array) -> tuple[tuple[str, ...], Array]:
-    """Return the names and the σ of the entries of a matrix that are states."""
+    """Return names and σ of those entries of a matrix that are states."""
     chosen = np.flatnonzero(sigmas.ravel())
     return tuple(ENTRIES[k] for k in chosen), np.asarray(sigmas.ravel()[chosen])
 
 
 def _units_of_entries(names: tuple[str, ...]) -> Array:
-    """Return for each entry the matrix (3, 3) that is 1 there."""
+    """Return for each named entry the matrix (3, 3) that is 1 there and 0 elsewhere."""
     return np.asarray(np.eye(9)[[ENTRIES.index(name) for name in names]].reshape(-1, 3, 3))
 
 
@@ -248,7 +248,7 @@ def _units_of_entries(names: tuple[str, ...]) -> Array:
 class GyroScale(ErrorStates):
     """Scale factors and misalignments of the gyro: the entries of M in ``w_meas = (I + M) w_b + b + n``, constant.
 
-    Entries of an array whose σ is 0 are taken for exact and are no states.
+    Entries whose σ is 0 are treated as exact and are no states.
 
     Parameters
     ----------
@@ -257,7 +257,7 @@ class GyroScale(ErrorStates):
     misalignment_sigma : float or ndarray (3, 3)
         Standard deviation of each misalignment, rad, by entry of M; zeros on the diagonal.
     name : str, default "gyro scale"
-        Name of the block of states.
+        Name of these error states.
     """
 
     scale_sigma: float | Array
@@ -265,14 +265,14 @@ class GyroScale(ErrorStates):
     name: str = "gyro scale"
 
     def __post_init__(self) -> None:
-        """Check both; the states are the entries of M by rows, xy being how much of the rate about y shows on axis x."""
+        """Check both; the states are the entries of M, row by row; xy is the sensitivity of axis x to the rate about y."""
         sigmas = _matrix(self.name, self.scale_sigma, self.misalignment_sigma, ("scale_sigma", "misalignment_sigma"))
         components, sigma = _entries(sigmas)
         self._set(components=components, units=tuple("1" if one in AXES else "rad" for one in components), sigma=sigma)
 
     @property
     def gyro_scale(self) -> Array:
-        """One entry of M a state."""
+        """One entry of M per state."""
         return _units_of_entries(self.components)
 
 
@@ -280,7 +280,7 @@ class GyroScale(ErrorStates):
 class GyroForce(ErrorStates):
     """Sensitivity of the gyro to specific force: the entries of G in ``w_meas = w_b + b + G f_b + n``, constant.
 
-    The force is that of a body held up, the reaction to gravity alone, ``f_b = −R_fbᵀ g_f``. Entries whose σ is 0 are no states.
+    The specific force is that of a body without acceleration, ``f_b = −R_fbᵀ g_f``. Entries whose σ is 0 are no states.
 
     Parameters
     ----------
@@ -291,7 +291,7 @@ class GyroForce(ErrorStates):
     gravity_f : ndarray (3,), default strapdown.vectors.GRAVITY_F
         Acceleration of gravity in the fixed frame, m/s².
     name : str, default "gyro force"
-        Name of the block of states.
+        Name of these error states.
     """
 
     along_sigma: float | Array
@@ -300,19 +300,19 @@ class GyroForce(ErrorStates):
     name: str = "gyro force"
 
     def __post_init__(self) -> None:
-        """Check all; the states are the entries of G by rows, xy being the bias about x that a force along y makes."""
+        """Check all; the states are the entries of G, row by row; xy is the bias about x per force along y."""
         sigmas = _matrix(self.name, self.along_sigma, self.across_sigma, ("along_sigma", "across_sigma"))
         components, sigma = _entries(sigmas)
         gravity = array(f"{self.name}: gravity_f", self.gravity_f, (3,))
         self._set(components=components, units=("rad s/m",) * len(components), sigma=sigma, gravity_f=gravity)
         if not np.any(self.gravity_f):
             raise InputError(
-                f"{self.name}: gravity_f is zero, and a body in free fall feels no force; leave the block out"
+                f"{self.name}: gravity_f is zero, and the specific force in free fall is zero; leave these error states out"
             )
 
     @property
     def gyro_force(self) -> Array:
-        """One entry of G a state."""
+        """One entry of G per state."""
         return _units_of_entries(self.components)
 
     @property
@@ -323,16 +323,16 @@ class GyroForce(ErrorStates):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class GyroTemperature(ErrorStates):
-    """Slopes of the gyro's bias over temperature c, constant, which the record's temperature drives: ``ḃ = c Ṫ + n_u``.
+    """Slopes c of the gyro's bias over temperature, constant, driven by the record's temperature: ``ḃ = c Ṫ + n_u``.
 
-    The bias b of the filter is the whole one, at the temperature of its time (:mod:`strapdown.estimation.temperature`).
+    The filter's bias b is the whole bias, at the temperature of its time (:mod:`strapdown.estimation.temperature`).
 
     Parameters
     ----------
     slope_sigma : float or ndarray (3,)
         Standard deviation of the slope about each body axis, rad/s/K.
     name : str, default "gyro temperature"
-        Name of the block of states.
+        Name of these error states.
     """
 
     slope_sigma: float | Array
@@ -345,7 +345,7 @@ class GyroTemperature(ErrorStates):
 
 
 class _FirstOrder(ErrorStates):
-    """First-order Gauss–Markov states of one correlation time, stationary with ``sigma``."""
+    """First-order Gauss–Markov states with one correlation time, stationary with ``sigma``."""
 
     correlation_time: float
 
@@ -362,7 +362,7 @@ class _FirstOrder(ErrorStates):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class GyroGaussMarkov(_FirstOrder):
-    """A second gyro bias that forgets: first-order Gauss–Markov, stationary. Several of different times together cover flicker.
+    """Gyro drift in addition to the bias: first-order Gauss–Markov, stationary. Several with different times together approximate flicker.
 
     Parameters
     ----------
@@ -371,7 +371,7 @@ class GyroGaussMarkov(_FirstOrder):
     correlation_time : float
         Correlation time of the drift, s.
     name : str, default "gyro drift"
-        Name of the block of states.
+        Name of these error states.
     """
 
     bias_sigma: float | Array
@@ -388,7 +388,7 @@ class GyroGaussMarkov(_FirstOrder):
 
     @property
     def gyro_offset(self) -> Array:
-        """One axis a state."""
+        """One axis per state."""
         return np.eye(3)
 
 
@@ -401,16 +401,15 @@ class VectorBias(ErrorStates):
     sensor : str
         Name of the sensor.
     bias_sigma : float or ndarray (3,)
-        Standard deviation of the bias at the start, by body axis, in the unit of the sensor's reference (for directions
-        and headings its length is 1).
+        Initial standard deviation of the bias, by body axis, in the unit of the sensor's reference (1 for directions and headings).
     rate_random_walk : float, default 0.0
-        Random walk of each component, in the unit of ``bias_sigma`` per √s: unlike that of a gyro not in rad/s/√s.
+        Random walk of each component, in the unit of ``bias_sigma`` per √s (not rad/s/√s, as for a gyro).
     varying : bool, default False
-        Whether the bias is constant while the strength of what the sensor measures changes: see :attr:`Effect.varying`.
+        Whether the bias is constant while the magnitude of the measured field changes: see :attr:`Effect.varying`.
     unit : str, default "1"
         SI unit of the bias, for tables and messages.
     name : str, default "<sensor> bias"
-        Name of the block of states.
+        Name of these error states.
     """
 
     sensor: str
@@ -435,16 +434,16 @@ class VectorBias(ErrorStates):
 
     @property
     def effects(self) -> Mapping[str, Effect]:
-        """One axis a state."""
+        """One axis per state."""
         return {self.sensor: Effect(offset_b=np.eye(3), varying=self.varying)}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LeverArm(ErrorStates):
-    """The place of an accelerometer on the body, from the point that does not accelerate: ``f_b = −R_fbᵀ g + ([ẇ] + [w]²) r``, constant.
+    """Position r of an accelerometer relative to the point that does not accelerate: ``f_b = −R_fbᵀ g + ([ẇ] + [w]²) r``, constant.
 
-    Rate and angular acceleration are those of the gyro (:func:`strapdown.estimation.angular_acceleration.turning`), whose noise becomes
-    noise of the sensor. Components whose σ is 0 are no states.
+    Rate and angular acceleration come from the gyro (:func:`strapdown.estimation.angular_acceleration.turning`), whose noise adds to that
+    of the sensor. Components whose σ is 0 are no states.
 
     Parameters
     ----------
@@ -453,9 +452,9 @@ class LeverArm(ErrorStates):
     arm_sigma : float or ndarray (3,)
         Standard deviation of each component of r, m, body axes.
     strength : float, default 9.80665
-        Specific force by which the sensor's vector is divided, m/s²: 1 where it gives whole vectors in m/s².
+        Specific force by which the sensor's vector is divided, m/s²: 1 if it gives whole vectors in m/s².
     name : str, default "<sensor> lever arm"
-        Name of the block of states.
+        Name of these error states.
     """
 
     sensor: str
@@ -471,21 +470,21 @@ class LeverArm(ErrorStates):
         for k, one in enumerate(spread):
             non_negative(f"{self.name}: arm_sigma[{k}]", one, unit="m")
         if not spread.any():
-            raise InputError(f"{self.name}: arm_sigma is 0; give one above zero, or leave the block out")
+            raise InputError(f"{self.name}: arm_sigma is 0; give a value above zero, or leave these error states out")
         used = np.flatnonzero(spread)
         components = tuple(AXES[k] for k in used)
         self._set(arm_sigma=spread.copy(), components=components, units=("m",) * len(used), sigma=spread[used])
 
     @property
     def effects(self) -> Mapping[str, Effect]:
-        """One axis a state."""
+        """One axis per state."""
         used = np.flatnonzero(self.arm_sigma)
         return {self.sensor: Effect(lever=np.eye(3)[used] / self.strength)}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class VectorScale(ErrorStates):
-    """Scale factors and misalignments of a vector sensor: all nine of S in ``m_b = (I + S) R_fbᵀ r``, constant: soft iron.
+    """Scale factors and misalignments (soft iron) of a vector sensor: all nine entries of S in ``m_b = (I + S) R_fbᵀ r``, constant.
 
     Parameters
     ----------
@@ -494,7 +493,7 @@ class VectorScale(ErrorStates):
     scale_sigma : float
         Standard deviation of each entry of S, dimensionless.
     name : str, default "<sensor> scale"
-        Name of the block of states.
+        Name of these error states.
     """
 
     sensor: str
@@ -510,7 +509,7 @@ class VectorScale(ErrorStates):
 
     @property
     def effects(self) -> Mapping[str, Effect]:
-        """One entry of S a state."""
+        """One entry of S per state."""
         return {self.sensor: Effect(scale=np.eye(9).reshape(9, 3, 3))}
 
 
@@ -518,17 +517,17 @@ class VectorScale(ErrorStates):
 class SensorMounting(ErrorStates):
     """Mounting of a vector sensor: the small constant rotation θ from the body's axes to the sensor's, ``m = (I − [θ]×) R_fbᵀ r``.
 
-    It is the C of attitude–bias–calibration filters. A common rotation of all sensors is not observable: leave one sensor without this
-    block; that sensor defines the body's axes. For a sensor of whole attitudes the mounting is a :class:`VectorBias`.
+    It is the C of attitude–bias–calibration filters. A common rotation of all sensors is not observable: declare no mounting for one of
+    them; that sensor defines the body's axes. For a sensor of whole attitudes the mounting is a :class:`VectorBias`.
 
     Parameters
     ----------
     sensor : str
         Name of the sensor.
     mounting_sigma : float or ndarray (3,)
-        Standard deviation of θ at the start, rad, by body axis.
+        Initial standard deviation of θ, rad, by body axis.
     name : str, default "<sensor> mounting"
-        Name of the block of states.
+        Name of these error states.
 
     Examples
     --------
@@ -551,14 +550,14 @@ class SensorMounting(ErrorStates):
 
     @property
     def effects(self) -> Mapping[str, Effect]:
-        """One axis a state."""
+        """One axis per state."""
         axes = np.eye(3)
         return {self.sensor: Effect(scale=np.cross(axes[:, None], axes))}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class GaussMarkov(_FirstOrder):
-    """First-order coloured noise on a vector sensor, stationary: the acceleration of a moving hand on an accelerometer.
+    """First-order coloured noise of a vector sensor, stationary; for example the acceleration of a moving hand on an accelerometer.
 
     Parameters
     ----------
@@ -569,15 +568,14 @@ class GaussMarkov(_FirstOrder):
     correlation_time : float
         Correlation time, s.
     frame : {"body", "fixed"}, default "body"
-        Axes in which the noise is correlated: an acceleration keeps its direction in the fixed frame while the body
-        turns. There its σ must be the same for all axes.
+        Axes in which the noise is correlated: an acceleration keeps its direction in the fixed frame while the body rotates. In
+        ``"fixed"`` σ must be the same for all axes.
     varying : bool, default False
-        Whether the noise keeps its size while the strength of what the sensor measures changes: see
-        :attr:`Effect.varying`.
+        Whether σ is constant while the magnitude of the measured field changes: see :attr:`Effect.varying`.
     unit : str, default "1"
-        SI unit of what the sensor measures.
+        SI unit of the measured quantity.
     name : str, default "<sensor> disturbance"
-        Name of the block of states.
+        Name of these error states.
     """
 
     sensor: str
@@ -601,7 +599,7 @@ class GaussMarkov(_FirstOrder):
 
     @property
     def effects(self) -> Mapping[str, Effect]:
-        """One axis a state."""
+        """One axis per state."""
         axes = np.eye(3)
         if self.frame == "body":
             return {self.sensor: Effect(offset_b=axes, varying=self.varying)}
@@ -610,15 +608,14 @@ class GaussMarkov(_FirstOrder):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BoundedVelocity(ErrorStates):
-    """Acceleration of a moving hand that an accelerometer measures: an acceleration whose velocity is bounded, stationary, in fixed axes.
+    """Acceleration of a moving hand in the accelerometer's measurement: stationary, with bounded velocity, in fixed axes.
 
     ``f_b = R_fbᵀ (a_f − g_f)`` with ``a = v̇``: on each axis ``v̇ = −v/τ_v + u``, ``u̇ = −u/τ_a + w``. The spectrum of a is that of
-    first-order coloured noise at high frequency and vanishes at zero, as that of every body does which stays about where it is; a part of
-    the noise that lasts would pass for tilt. With ``position_time`` the position is bounded too: ``ṗ = −p/τ_p + s``, ``ṡ = −s/τ_v + u``,
-    ``v = ṗ``.
+    first-order coloured noise at high frequency and vanishes at zero, as for every body that stays near one place; a constant part of the
+    noise would appear as tilt. With ``position_time`` the position is bounded too: ``ṗ = −p/τ_p + s``, ``ṡ = −s/τ_v + u``, ``v = ṗ``.
 
-    The noise is alike in all directions. Of ``velocity_sigma``, ``acceleration_sigma`` and ``acceleration_time`` give two: with the rates
-    ``d₁ = λ_p λ_v + (λ_p + λ_v) λ_a`` of the three times, 1/τ, ``σ_a = σ_v √d₁`` (λ_p = 0 without a bounded position).
+    The noise is isotropic. Give two of ``velocity_sigma``, ``acceleration_sigma`` and ``acceleration_time``: with the rates
+    ``d₁ = λ_p λ_v + (λ_p + λ_v) λ_a`` of the three times, λ = 1/τ, ``σ_a = σ_v √d₁`` (λ_p = 0 without a bounded position).
 
     Parameters
     ----------
@@ -633,11 +630,11 @@ class BoundedVelocity(ErrorStates):
     acceleration_time : float, default 0.0
         Time constant τ_a of the acceleration, s.
     position_time : float, default 0.0
-        Time constant τ_p of the position, s; 0: the position is not bounded, and no state.
+        Time constant τ_p of the position, s; 0: the position is not bounded and is no state.
     strength : float, default 9.80665
-        Specific force by which the sensor's vector is divided, m/s²: 1 where it gives whole vectors in m/s².
+        Specific force by which the sensor's vector is divided, m/s²: 1 if it gives whole vectors in m/s².
     name : str, default "<sensor> velocity"
-        Name of the block of states.
+        Name of these error states.
     """
 
     sensor: str
@@ -650,7 +647,7 @@ class BoundedVelocity(ErrorStates):
     name: str = ""
 
     def __post_init__(self) -> None:
-        """Check all, and work out the third of the three that are given by two."""
+        """Check all, and compute the third of the three values of which two are given."""
         self._set(name=self.name or f"{self.sensor} velocity")
         positive(f"{self.name}: velocity_time", self.velocity_time, unit="s")
         positive(f"{self.name}: strength", self.strength, unit="m/s²")
@@ -663,14 +660,14 @@ class BoundedVelocity(ErrorStates):
         velocity, acceleration, time = values
         given = ", ".join(f"{name} {value:g} {three[name]}" for name, value in zip(three, values, strict=True))
         if sum(value > 0.0 for value in values) < 2:
-            raise InputError(f"{self.name}: of {given} two must be above zero; the third follows from them")
+            raise InputError(f"{self.name}: {given}: two must be above zero; the third follows from them")
         slow, p = 1.0 / self.velocity_time, 1.0 / self.position_time if self.position_time > 0.0 else 0.0
         if time == 0.0:
             rate = ((acceleration / velocity) ** 2 - p * slow) / (p + slow)
             if rate <= 0.0:
                 raise InputError(
-                    f"{self.name}: acceleration_sigma is {acceleration:g} m/s² beside a velocity_sigma of {velocity:g} m/s, less than "
-                    f"velocity_time and position_time alone make ({velocity * np.sqrt(p * slow):g} m/s²); give more, or longer times"
+                    f"{self.name}: acceleration_sigma is {acceleration:g} m/s² with a velocity_sigma of {velocity:g} m/s, less than "
+                    f"velocity_time and position_time imply ({velocity * np.sqrt(p * slow):g} m/s²); give more, or longer times"
                 )
             self._set(acceleration_time=1.0 / rate)
             return
@@ -680,7 +677,7 @@ class BoundedVelocity(ErrorStates):
         elif velocity == 0.0:
             self._set(velocity_sigma=acceleration / ratio)
         elif abs(acceleration / (ratio * velocity) - 1.0) > 1e-9:
-            raise InputError(f"{self.name}: {given} do not go together at these times; give two of them")
+            raise InputError(f"{self.name}: {given} contradict each other at these times; give two of them")
 
     @property
     def _rates(self) -> Array:
@@ -690,23 +687,23 @@ class BoundedVelocity(ErrorStates):
 
     @property
     def components(self) -> tuple[str, ...]:  # type: ignore[override]
-        """Axis by axis: velocity v and the drive u; with a bounded position p, s and u, and the velocity is ``s − p/τ_p``."""
+        """For each axis velocity v and drive u; with a bounded position p, s and u, with velocity ``s − p/τ_p``."""
         words = ("position", "velocity drive", "drive") if self.position_time > 0.0 else ("velocity", "drive")
         return tuple(f"{word} {axis}" for axis in AXES for word in words)
 
     @property
     def units(self) -> tuple[str, ...]:  # type: ignore[override]
-        """Each its own."""
+        """Unit of each state."""
         return ("m", "m/s", "m/s²")[3 - len(self._rates) :] * 3
 
     @property
     def covariance(self) -> Array:
-        """The stationary one."""
+        """Stationary covariance."""
         return stationary_covariance(self.decay, self.density, self.feed)
 
     @property
     def sigma(self) -> Array:  # type: ignore[override]
-        """The stationary one."""
+        """Stationary standard deviations."""
         return np.sqrt(np.diag(self.covariance))
 
     @property
@@ -716,7 +713,7 @@ class BoundedVelocity(ErrorStates):
 
     @property
     def density(self) -> Array:
-        """``2 σ_v² (d₁ d₂ − d₀)`` of each drive, dᵢ the coefficients of ``∏ (s + 1/τ) = s³ + d₂ s² + d₁ s + d₀``."""
+        """``2 σ_v² (d₁ d₂ − d₀)`` of each drive, with dᵢ the coefficients of ``∏ (s + 1/τ) = s³ + d₂ s² + d₁ s + d₀``."""
         _, d2, d1, d0 = np.append(np.poly(-self._rates), np.zeros(3 - len(self._rates)))
         one = np.zeros(len(self._rates))
         one[-1] = 2.0 * self.velocity_sigma**2 * (d1 * d2 - d0)
@@ -724,7 +721,7 @@ class BoundedVelocity(ErrorStates):
 
     @property
     def feed(self) -> Array:
-        """1 within an axis."""
+        """1 between the states of one axis."""
         return np.tile(np.append(np.ones(len(self._rates) - 1), 0.0), 3)
 
     @property
@@ -738,13 +735,13 @@ class BoundedVelocity(ErrorStates):
 
 
 def check(blocks: tuple[ErrorStates, ...]) -> None:
-    """Refuse blocks that do not say what they are, and two of one name."""
+    """Refuse objects that are no declarations of error states, and names used twice."""
     names: list[str] = []
     for block in blocks:
         if not isinstance(block, ErrorStates):
             raise InputError(f"{block!r} declares no error states; subclass ErrorStates")
         if block.name in names:
-            raise InputError(f"two declarations of error states are named {block.name!r}; give each a name of its own")
+            raise InputError(f"two declarations of error states are named {block.name!r}; give each a different name")
         names.append(block.name)
         if len(block.units) != block.size:
             raise InputError(f"{block.name}: {len(block.units)} units for {block.size} components; give one each")

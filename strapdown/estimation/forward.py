@@ -1,7 +1,7 @@
-"""The filter over whole records, compiled: :func:`run`, and :func:`run_part` for a record in parts.
+"""The compiled filter over whole records: :func:`run`, and :func:`run_part` for a record in parts.
 
-Without error states the covariance is carried in blocks (:mod:`strapdown.kernels.covariance_form`), the fast way; where it would lose its
-digits, and with error states, as its triangular factor (:mod:`strapdown.kernels.root_form`).
+Without error states the covariance is carried in blocks (:mod:`strapdown.kernels.covariance_form`), which is faster; with error states,
+and where the blocks would lose their digits, as its triangular factor (:mod:`strapdown.kernels.root_form`).
 """
 
 from __future__ import annotations
@@ -48,44 +48,44 @@ from strapdown.vectors import KINDS, VectorMeasurements
 GAP_FACTOR = 5.0
 """A gyro interval longer than this many times the median one is reported as a gap."""
 CHECK_INTERVALS = 1024
-"""Check the covariance for lost digits every 1024 intervals."""
+"""Number of intervals between checks of the covariance for lost digits."""
 SHARPNESS = 1e9
-"""Largest ratio of an innovation's variance to the measurement's at which the covariance keeps enough digits."""
+"""Maximum ratio of an innovation's variance to the measurement's at which the covariance keeps enough digits."""
 MIN_SHARE = 1e-10
-"""Smallest part of a state's variance, given the states after it, at which the covariance keeps enough digits."""
+"""Minimum conditional variance of a state, given the states after it, relative to its variance, at which enough digits are kept."""
 SMOOTHED_DIGITS = (1e11, 1e-11)
-"""The same two for a smoother, which carries the whole record as its factor beyond them: that takes a dozen times as long."""
+"""The same two limits for a smoother, which beyond them uses the factor for the whole record, a dozen times as slow."""
 HEALTHY_SHARE = 1e-7
-"""Part of each variance, given the states after it, from which on the covariance is carried in blocks again."""
+"""Conditional variance, relative to the variance, from which on the covariance is carried in blocks again."""
 FIRST_SPAN = 64
-"""Intervals carried as a factor before the covariance is checked again; each further span is twice as long."""
+"""Number of intervals carried as a factor before the covariance is checked again; each further span is twice as long."""
 SHRINK = 1.0 - 1e-14
-"""Factor on reported correlations: rounding could make the covariance of one nearer to 1 indefinite."""
+"""Factor on reported correlations: near 1, rounding could make the covariance indefinite."""
 
 
 class LostDigitsError(InputError):
-    """The covariance in blocks keeps no digit, and whoever asked for its segments must take the factor's."""
+    """The covariance in blocks has lost its digits; the caller that needs the segments must use the factor."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """How a record is filtered."""
+    """Options of a run over a record."""
 
     every: int = 1
     full_covariance: bool = False
     error_state_covariance: bool = True
-    """Keep by ``full_covariance`` the covariance of the error states too."""
+    """Whether ``full_covariance`` includes the covariance of the error states."""
     gate: Gate | None = None
     robust: Robust | None = None
     together: bool = False
-    """The factor takes all steps between two measurements at once: for few rows of a long record."""
+    """Whether the factor takes all steps between two measurements at once: faster if few rows of a long record are stored."""
     segments: int = 0
-    """How many predictions to keep for a smoother."""
+    """Maximum number of predictions to store for a smoother."""
     whole_bias: bool = False
-    """Report the whole gyro bias, with what the error states add to it, and by ``full_covariance`` its covariance instead of that of all
-    states."""
+    """Report the whole gyro bias, including the contributions of the error states, and with ``full_covariance`` its covariance instead of
+    that of all states."""
     factor: bool = False
-    """Carry the triangular factor even without error states."""
+    """Whether to carry the triangular factor even without error states."""
     outliers: tuple[float, float] | None = None
     """Share and variance ratio of outliers, for the factor without a gate. ``weight`` of each measurement is then minus its log likelihood,
     the probability that it is an outlier, and the mean ratio of its noise to its innovations' variances (m, 3)."""
@@ -96,7 +96,7 @@ class Options:
 
     @property
     def judged(self) -> bool:
-        """Whether measurements are tested or weighed."""
+        """Whether measurements are tested or weighted."""
         return self.gate is not None or self.robust is not None
 
 
@@ -124,16 +124,16 @@ class Problem:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Passed:
-    """A record that the filter has passed through."""
+    """Result of the filter over a record."""
 
     estimate: Estimate
     make_end: Callable[[], State] = field(repr=False)
     segments: Array
-    """A row for each prediction, as the kernel of the form stores it, and one more for the end state."""
+    """A row for each prediction, as stored by the kernel of the form, and one more for the end state."""
 
     @property
     def end(self) -> State:
-        """The end state, made and checked when it is asked for."""
+        """End state, built and checked on request."""
         return self.make_end()
 
 
@@ -150,39 +150,39 @@ def run(
 ) -> Estimate:
     """Run the multiplicative EKF over a whole record.
 
-    Gyro intervals are split exactly at the times of measurements. Intervals in which the body turns by more than a third of a radian are
-    cut into sub-steps of the same constant-rate model. Missing measurements (NaN) and those outside the record are counted as skipped; gaps
+    Gyro intervals are split exactly at the times of measurements. Intervals with a rotation of more than a third of a radian are divided
+    into sub-steps of the same constant-rate model. Missing measurements (NaN) and those outside the record are counted as skipped; gaps
     of the gyro are reported as events.
 
     Parameters
     ----------
     record : ImuRecord
-        Increments are used as turns at constant rate: correct them for coning first (:func:`strapdown.records.compress`).
+        Increments are treated as rotations at constant rate: correct them for coning first (:func:`strapdown.records.compress`).
     process_noise : ProcessNoise
         Angle random walk and rate random walk of the gyro, as the filter models them.
     initial : State
-        State at the first edge. Without values, error states start at zero with their own sigma.
+        State at the first edge. If it has no error states, these start at zero with their declared sigma.
     error_states : sequence of ErrorStates
-        States beside attitude and gyro bias. Default: none.
+        States in addition to attitude and gyro bias. Default: none.
     every : int
-        Keep the state at every ``every``-th edge, the first included. With error states the rows of different ``every`` agree to rounding.
+        Store every ``every``-th edge, starting with the first. With error states, rows for different ``every`` agree to rounding.
     full_covariance : bool
-        Keep whole covariance matrices too.
+        Whether to store whole covariance matrices too.
     gate : Gate, optional
-        Refuse measurements that are too improbable, and recover where refused ones agree with each other; error states then start anew.
-        Default: use all.
+        Gate that refuses improbable measurements and recovers if the refused ones agree with each other; error states then restart.
+        Default: use all measurements.
     robust : Robust, optional
-        Weigh measurements by their distance from the estimate. Default: all alike.
+        Robust updates, which weight measurements by their residuals. Default: all equally.
 
     Returns
     -------
     Estimate
-        Attitude, bias and error states with their variances at the kept edges; innovations of every sensor; events.
+        Attitude, bias and error states with their variances at the stored edges; innovations of every sensor; events.
 
     Raises
     ------
     InputError
-        If an argument is not what it should be.
+        If an argument is invalid.
     """
     options = Options(
         every=count("every", every), full_covariance=full_covariance, gate=gate, robust=robust, together=every > 1
@@ -202,18 +202,18 @@ def run_part(
     gate: Gate | None = None,
     robust: Robust | None = None,
 ) -> tuple[Estimate, State]:
-    """Run the filter and return the end state too, from which the next part of a record goes on, bit for bit.
+    """Run the filter and return the end state too, from which the next part of a record continues, bit for bit.
 
-    The end state holds what a gate remembers as well: its counts, its candidate, and how wide a restart is. A lock-out that goes on is
-    reported by both parts, by the second as a whole. Where the covariance is carried as its factor for
-    want of digits, parts agree to its rounding.
+    The end state includes the gate's state: its counts, its candidate, and the σ of the next restart. A lock-out that continues is reported
+    by both parts, by the second as a whole. Where the blocks would lose their digits and the covariance is carried as its factor, parts
+    agree to its rounding.
 
-    Effects that are fixed in a sensor's own unit (``varying``) keep in all parts the unit of the first in which the sensor is, the strength
-    at the root mean square σ there (``unit_sigma`` of the state). A run over the whole record has that of the whole, and so another prior,
-    unless ``initial`` has the same one. With a lever arm parts agree to some 1e-6 of their estimates only: the angular acceleration is
-    found from the gyro about each measurement, and at a cut from one side of it.
+    Effects that are constant in a sensor's own unit (``varying``) refer in all parts to the first part with the sensor: to the magnitude at
+    the root mean square σ there (``unit_sigma`` of the state). A run over the whole record refers to that of the whole record, and so has
+    another prior, unless ``initial`` has the same one. With a lever arm parts agree only to about 1e-6 of their estimates: the angular
+    acceleration is computed from the gyro samples around each measurement, at a cut from those on one side.
 
-    Without ``error_state_covariance`` whole covariances are those of attitude and bias alone, which saves a tenth of the time.
+    If ``error_state_covariance`` is false, whole covariances are those of attitude and bias only, which saves a tenth of the time.
     """
     options = Options(
         every=count("every", every),
@@ -236,7 +236,7 @@ def prepared(
 ) -> Problem:
     """Return a record with its measurements in order of time, and the error states as arrays.
 
-    ``driven``: a bias driven by temperature may be among them, for :func:`filtered`.
+    ``driven``: whether a bias driven by temperature is allowed, as for :func:`filtered`.
     """
     check_arguments(record=record, process_noise=process_noise)
     declared = modelling.as_blocks(error_states)
@@ -256,7 +256,7 @@ def prepared(
 
 
 def filtered(problem: Problem, options: Options) -> Passed:
-    """Run the filter over a prepared record, in the form that it needs; one that diverges is refused."""
+    """Run the filter over a prepared record, in the form that it needs; raise an error if it diverges."""
     slopes = temperature.slopes(problem.error_states)
     if slopes is not None:
         passed = _over_temperature(problem, options, slopes)
@@ -267,17 +267,17 @@ def filtered(problem: Problem, options: Options) -> Passed:
     else:
         passed = _in_blocks(problem, options)
     attitude = passed.estimate.attitude
-    if not np.isfinite(attitude[-1]).all():  # what is no number once remains so
+    if not np.isfinite(attitude[-1]).all():  # NaN persists
         end = problem.record.time[options.every * int(np.argmin(np.isfinite(attitude).all(axis=1)))]
         raise InputError(
-            f"the filter diverged before {end:g} s: its attitude is no number; the errors of the start or of the measurements are many "
+            f"the filter diverged before {end:g} s: its attitude is not a number; the errors of the start or of the measurements are many "
             "times their sigmas"
         )
     return passed
 
 
 def _over_temperature(problem: Problem, options: Options, slopes: slice) -> Passed:
-    """Run the filter with a bias over temperature, in stretches of nearly one temperature."""
+    """Run the filter with a bias driven by temperature, in segments of nearly constant temperature."""
     record, initial = problem.record, problem.initial
     T = temperature.of(record)
     state = replace(initial, unit_sigma=unit_sigmas(record, problem.model, initial.unit_sigma))
@@ -300,7 +300,7 @@ def gaps(time: Array, factor: float = GAP_FACTOR) -> list[Event]:
     """Return the gyro intervals that are more than ``factor`` times as long as the median interval, as events."""
     steps = np.diff(time)
     if np.max(steps, initial=0.0) <= factor * np.min(steps, initial=np.inf):
-        return []  # the median need not be sought
+        return []  # skips the sort for the median
     usual = float(np.median(steps))
     return [
         Event(kind="gap", start=float(time[k]), end=float(time[k + 1]), value=float(steps[k] / usual))
@@ -314,7 +314,7 @@ def in_order(events: Sequence[Event]) -> tuple[Event, ...]:
 
 
 def _innovations(events: Schedule, *, judged: bool) -> tuple[int, int]:
-    """Return the shape of the innovations' array: as many numbers a measurement as are written."""
+    """Return the shape of the array of innovations: measurements, and the largest number of values written for one."""
     most = 6 if judged else max([4, *(2 * KINDS[kind] for kind in events.kinds)])
     return int(events.bounds[-1]), most
 
@@ -323,7 +323,7 @@ def _innovations(events: Schedule, *, judged: bool) -> tuple[int, int]:
 
 
 def _block_outputs(problem: Problem, options: Options, *, judged: bool) -> covariance_form.Outputs:
-    """Return room for what a run writes."""
+    """Return arrays for the outputs of a run."""
     rows = len(problem.record.increments) // options.every + 1
     shapes = (rows, 4), (rows, 3), (rows, 6), (rows if options.full_covariance else 0, 21)
     innovations = _innovations(problem.events, judged=judged)
@@ -333,7 +333,7 @@ def _block_outputs(problem: Problem, options: Options, *, judged: bool) -> covar
 
 
 def _block_body(problem: Problem, options: Options, states: Array) -> covariance_form.Body:
-    """Return the filter as the kernels take it."""
+    """Return the filter as the kernels' arguments."""
     sharpness, share = SMOOTHED_DIGITS if options.segments else (SHARPNESS, MIN_SHARE)
     angle_variance, rate_variance = problem.variances
     return covariance_form.Body(
@@ -349,7 +349,7 @@ def _block_body(problem: Problem, options: Options, states: Array) -> covariance
 
 
 def _packed_states(initial: State) -> Array:
-    """Return the filter's state and its candidate's packed (2, 28)."""
+    """Return the states of the filter and its candidate, packed (2, 28)."""
     states = np.zeros((2, 28))
     states[0] = pack(initial.attitude, initial.bias, initial.covariance)
     if initial.gate is not None and initial.gate.candidate is not None:
@@ -359,7 +359,7 @@ def _packed_states(initial: State) -> Array:
 
 
 def _in_blocks(problem: Problem, options: Options) -> Passed:
-    """Run the filter without options; spans in which the covariance would lose its digits are carried as its factor."""
+    """Run the filter without gate and robust weights; spans in which the blocks would lose their digits are carried as the factor."""
     record, events, every = problem.record, problem.events, options.every
     out = _block_outputs(problem, options, judged=False)
     written = out._replace(segments=out.segments[: options.segments])
@@ -388,7 +388,7 @@ def _in_blocks(problem: Problem, options: Options) -> Passed:
 
 
 def after(measurements: Measurements, first: int, last: int | None = None) -> Measurements:
-    """Return the measurements from one in order of time to another."""
+    """Return the measurements from number ``first`` to ``last`` in order of time."""
     own = slice(first, last)
     return measurements._replace(
         time=measurements.time[own], place=measurements.place[own], sensor=measurements.sensor[own]
@@ -396,7 +396,7 @@ def after(measurements: Measurements, first: int, last: int | None = None) -> Me
 
 
 def _rows_from(out: covariance_form.Outputs, row: int) -> covariance_form.Outputs:
-    """Return the outputs of edges from a row on."""
+    """Return the outputs from a row on."""
     kept = {name: getattr(out, name)[row:] for name in ("attitude", "bias", "variance", "covariance")}
     return out._replace(**kept)
 
@@ -411,7 +411,7 @@ def _block_result(
     events: Sequence[Event] = (),
     memory: GateMemory | None = None,
 ) -> Passed:
-    """Return what a run has written, and its packed end state."""
+    """Return the result of a run from its outputs and its packed end state."""
     if options.segments:
         out.segments[number, :4] = 0.0
         out.segments[number, 4:] = end
@@ -434,7 +434,7 @@ def _block_result(
 
 
 def _judged_in_blocks(problem: Problem, options: Options) -> Passed:
-    """Run the filter with a gate, robust weights or noise of any shape; all of it as its factor where digits would be lost."""
+    """Run the filter with a gate, robust weights or anisotropic noise; with the factor for the whole record if digits would be lost."""
     body = _block_body(problem, options, _packed_states(problem.initial))
     judge = Judge(problem, options)
     out = _block_outputs(problem, options, judged=True)
@@ -473,7 +473,7 @@ def _judged_in_blocks(problem: Problem, options: Options) -> Passed:
 
 
 class Judge:
-    """A gate and robust weights beside a run: what they remember, and what they report."""
+    """Gate and robust weights of a run: their state and their reports."""
 
     def __init__(self, problem: Problem, options: Options) -> None:
         self.problem = problem
@@ -483,14 +483,14 @@ class Judge:
         self.memory, self.counters = remembered(options.gate, problem.initial.gate, sensors)
 
     def body(self, form: covariance_form.Body | root_form.Body, restart: Any) -> gate.Body:
-        """Return the body of the walk around a form."""
+        """Return the body of the walk, with the gate around a form."""
         return gate.Body(form=form, options=self.options, restart=restart, standing=self.counters, memory=self.memory)
 
     def outputs(self, form: covariance_form.Outputs | root_form.Outputs) -> gate.Outputs:
-        """Return room for what is written beside the form's outputs.
+        """Return arrays for the outputs of the gate in addition to the form's.
 
-        A recovery or a lock-out needs two refusals, but for the first recovery, whose others may be of the part before, and a lock-out
-        that goes on.
+        A recovery or a lock-out needs two refusals, except the first recovery, whose other refusals may lie in the part before, and a
+        lock-out that continues.
         """
         number = len(self.problem.events.time)
         return gate.Outputs(
@@ -505,14 +505,14 @@ class Judge:
         return gate_events(out.recoveries[:recovered], out.lock_outs[:locked], self.problem.events.sensors)
 
     def remembered(self, candidate: Candidate | None) -> GateMemory | None:
-        """Return what the gate remembers at the end; None without a gate."""
+        """Return the gate's state at the end; None without a gate."""
         if self.gate is None:
             return None
         counters = dict(zip(self.problem.events.sensors, self.counters, strict=True))
         return replace(self.start(), candidate=candidate, counts=self.memory, counters=counters)
 
     def start(self) -> GateMemory:
-        """Return what a gate knows of a candidate's start, as of the start of the first part of the record."""
+        """Return the data of a candidate's start, as of the start of the first part of the record."""
         initial = self.problem.initial
         if initial.gate is not None:
             return initial.gate
@@ -528,7 +528,7 @@ class Judge:
 
 
 def gate_options(gate_: Gate | None, robust: Robust | None) -> gate.Options:
-    """Return a gate and a robust update as the kernels take them."""
+    """Return a gate and a robust update as the kernels' arguments."""
     return gate.Options(
         thresholds=np.full(3, np.inf) if gate_ is None else gate_.thresholds,
         robust=0
@@ -543,7 +543,7 @@ def gate_options(gate_: Gate | None, robust: Robust | None) -> gate.Options:
 
 
 def remembered(gate_: Gate | None, memory: GateMemory | None, sensors: tuple[str, ...]) -> tuple[Array, Array]:
-    """Return what a kernel goes on with: its ``memory``, and ``counters`` of these sensors."""
+    """Return the gate's state with which a kernel continues: its ``memory``, and ``counters`` of these sensors."""
     counts, counters = np.zeros(gate_rules.MEMORY), np.zeros((len(sensors), gate_rules.STANDING))
     counts[gate_rules.PASSES] = 1.0
     if gate_ is not None and memory is not None:
@@ -557,7 +557,7 @@ def remembered(gate_: Gate | None, memory: GateMemory | None, sensors: tuple[str
 
 
 def gate_events(recoveries: Array, lock_outs: Array, sensors: tuple[str, ...]) -> list[Event]:
-    """Return recoveries (n, 4) and lock-outs (m, 4) of a kernel as events."""
+    """Return recoveries (n, 4) and lock-outs (m, 4) from a kernel as events."""
     rows = [("recovery", row[[2, 0, 1, 3]]) for row in recoveries]
     rows += [("lock-out", row) for row in lock_outs if row[3] > 0.0]
     return [
@@ -567,10 +567,10 @@ def gate_events(recoveries: Array, lock_outs: Array, sensors: tuple[str, ...]) -
 
 
 def restart_states(state: State, error_states: tuple[ErrorStates, ...]) -> tuple[Array, Array]:
-    """Return values (m,) and covariance (m, m) that the error states of a candidate have at the start of the record.
+    """Return values (m,) and covariance (m, m) of a candidate's error states at the start of the record.
 
-    They are those of the filter's own start, but each state at least as uncertain as its declaration says: a start that goes on from an
-    earlier part of a record may be what led the filter astray.
+    They are those of the filter's initial state, but with at least the declared σ of each state: an initial state from an earlier part of
+    the record may be the cause of the filter's error.
     """
     P = state.covariance[6:, 6:].copy()
     minimum = np.concatenate([np.empty(0), *(np.asarray(one.sigma) ** 2 for one in error_states)])
@@ -582,7 +582,7 @@ def restart_states(state: State, error_states: tuple[ErrorStates, ...]) -> tuple
 
 
 def model_arrays(model: Model, variances: tuple[float, float]) -> root_form.Model:
-    """Return noise and error states as the kernels take them."""
+    """Return noise and error states as the kernels' arguments."""
     same = {name: getattr(model, name) for name in root_form.Model._fields[2:]}
     return root_form.Model(*variances, **{**same, "force_f": tuple(model.force_f.tolist())})
 
@@ -600,7 +600,7 @@ def scratch(model: Model) -> root_form.Scratch:
 
 
 def factor_body(problem: Problem, units: Mapping[str, float], *, together: bool = False) -> root_form.Body:
-    """Return the filter as the kernels take it."""
+    """Return the filter as the kernels' arguments."""
     model, initial = problem.model, problem.initial
     size = 6 + model.states
     rows = size + max(model.noise_rows, size + 1)
@@ -662,7 +662,7 @@ def _in_factor(problem: Problem, options: Options) -> Passed:
             body, weight = body._replace(outliers=options.outliers), out.innovation[:, 6:]
         bodies = (root_form,) if options.outliers is None else (likelihood_outliers, root_form)
         number = compiled(walk, *bodies)(*arguments, body, out)
-    if number < 0:  # rows from there on are not written
+    if number < 0:  # the following rows are not written
         raise RuntimeError("the triangular factor lost its last digits; please report this with the record")
     if options.segments:
         stored[number, :4] = 0.0
@@ -695,7 +695,7 @@ def _in_factor(problem: Problem, options: Options) -> Passed:
 
 
 def restart_in_factor(judge: Judge) -> root_form.Restart:
-    """Return what a restart candidate starts from."""
+    """Return the initial state of a restart candidate."""
     problem, first = judge.problem, judge.start()
     model = problem.model
     return root_form.Restart(
@@ -708,7 +708,7 @@ def restart_in_factor(judge: Judge) -> root_form.Restart:
 
 
 def whole_bias(model: Model, x: Array) -> Array:
-    """Return the gyro's whole bias (rows, 3) of the kernels' bias and error states (rows, 3 + m)."""
+    """Return the whole gyro bias (rows, 3) from the kernels' bias and error states (rows, 3 + m)."""
     offsets = model.gyro[:, :3] * (model.gyro_use & OFFSET > 0)[:, None]
     return np.asarray(x[:, :3] + x[:, 3:] @ offsets)
 
@@ -745,9 +745,9 @@ def end_in_factor(body: root_form.Body, model: Model, memory: GateMemory | None,
 def factor_estimate(
     problem: Problem, every: int, attitude: Array, x: Array, variance: Array, P: Array | None
 ) -> Estimate:
-    """Return the estimate of states in the kernels' order, (b, c) and P, in the order of the declarations.
+    """Return the estimate from arrays in the kernels' order, (b, c) and P, in the order of the declarations.
 
-    P (rows, n, n), or (rows, 6, 6) of attitude and bias alone.
+    P is (rows, n, n), or (rows, 6, 6) of attitude and bias only.
     """
     model = problem.model
     if P is not None and not model.states:
@@ -778,24 +778,24 @@ def factor_estimate(
 
 
 def _columns(values: Array, which: np.ndarray) -> Array:
-    """Return columns of an array, without a copy where one follows the other."""
+    """Return columns of an array, without a copy if they are adjacent."""
     if np.all(np.diff(which) == 1):
         return values[:, which[0] : which[0] + len(which)]
     return values[:, which]
 
 
 def _reported(P: Array) -> Array:
-    """Return covariances (..., n, n) that rounding cannot have made indefinite."""
+    """Return covariances (..., n, n) with correlations reduced so that rounding cannot make them indefinite."""
     return np.where(np.eye(P.shape[-1], dtype=bool), P, SHRINK * P)
 
 
 def _span_in_factor(
     problem: Problem, options: Options, state: Array, out: covariance_form.Outputs, row: int, event: int
 ) -> tuple[int, int]:
-    """Go on from a row of the outputs and a measurement with the factor until the covariance has digits enough, or to the end.
+    """Continue from a row of the outputs and a measurement with the factor until the blocks keep enough digits, or to the end.
 
-    ``state`` (28,) is that at the row, and is left at that of the row returned, or at the end state after the last one. Returns the row
-    and the number of measurements processed up to there.
+    ``state`` (28,) is the state at the row, replaced by that at the returned row, or after the last row by the end state. Returns the row
+    and the number of measurements processed up to it.
     """
     events, every = problem.events, options.every
     (edges, increments), measurements = problem.gyro, events.measurements
@@ -841,7 +841,7 @@ def _span_in_factor(
 
 
 def _singular_triangle(P: Array) -> Array:
-    """Return F, lower triangular, with ``P = Fᵀ F``, of a covariance that may be singular."""
+    """Return F, lower triangular, with ``P = Fᵀ F``, for a covariance that may be singular."""
     sigma = np.sqrt(np.diag(P))
     scale = np.where(sigma > 0.0, sigma, 1.0)
     values, vectors = np.linalg.eigh(P / np.outer(scale, scale))
@@ -850,7 +850,7 @@ def _singular_triangle(P: Array) -> Array:
 
 
 def turns(record: ImuRecord, events: Schedule, model: Model) -> Array:
-    """Return rate, angular acceleration and the variances of the latter's axes at the events (events, 9); none without a lever arm."""
+    """Return rate, angular acceleration and the latter's variances per axis at the events (events, 9); no rows without a lever arm."""
     if not model.levers.any():
         return np.empty((0, 9))
     turns, variance = turning(record, events.time)
@@ -859,10 +859,10 @@ def turns(record: ImuRecord, events: Schedule, model: Model) -> Array:
 
 
 def lengths(record: ImuRecord, events: Schedule, model: Model, units: Mapping[str, float]) -> Array:
-    """Return what each measurement's effects are divided by, in order of time (events,).
+    """Return the divisor of each measurement's effects, in order of time (events,).
 
-    For kind ``"vector"`` that is the length of its reference; for a direction or heading with an effect that is fixed in the sensor's unit
-    the strength of what is measured over that at the σ in ``units``; else 1.
+    For kind ``"vector"`` it is the length of the reference; for a direction or heading with an effect that is constant in the sensor's own
+    unit, the magnitude of the measured vector relative to that at the σ in ``units``; else 1.
     """
     result = np.ones(len(events.time))
     for i, series in enumerate(record.vectors if model.states else ()):
@@ -878,7 +878,7 @@ def lengths(record: ImuRecord, events: Schedule, model: Model, units: Mapping[st
 
 
 def unit_sigmas(record: ImuRecord, model: Model, kept: Mapping[str, float]) -> dict[str, float]:
-    """Return ``unit_sigma`` of a :class:`State` after a record: that kept, and of sensors without it this record's."""
+    """Return ``unit_sigma`` of a :class:`State` after a record: the given values, and for other sensors those of this record."""
     found = {
         series.sensor: float(np.sqrt(np.mean(level_sigma(series) ** 2)))
         for series in record.vectors
@@ -888,26 +888,26 @@ def unit_sigmas(record: ImuRecord, model: Model, kept: Mapping[str, float]) -> d
 
 
 def strength(series: VectorMeasurements) -> Array:
-    """Return the strength of what a direction or heading measures (m,), over that at its root mean square σ."""
+    """Return the magnitude (m,) of the vector measured as a direction or heading, relative to that at its root mean square σ."""
     sigma = level_sigma(series)
     return np.asarray(np.sqrt(np.mean(sigma**2)) / sigma)
 
 
 def level_sigma(series: VectorMeasurements) -> Array:
-    """Return a sensor's own noise over the strength of what it measures (m,): σ, which of a heading is over the level part of it."""
+    """Return the noise over the magnitude of the measured vector (m,): σ, for a heading times the horizontal part of its reference."""
     level = np.ones(len(series.time))
     if series.kind == "heading":
         level = np.linalg.norm(series.references_f[:, :2], axis=1)
     sigma = series.sigma * level
     if np.any(sigma <= 0.0):
         raise InputError(
-            f"{series.sensor}: sigma is 0, which does not say how strong what it measures is; give it, or varying=False"
+            f"{series.sensor}: sigma is 0, which does not determine the magnitude of the measured vector; give it, or varying=False"
         )
     return np.asarray(sigma)
 
 
 def most_segments(problem: Problem) -> int:
-    """Return a bound of the number of predictions: one an interval and a measurement, and the sub-steps of both limits."""
+    """Return an upper bound of the number of predictions: one per interval and per measurement, and the sub-steps of both limits."""
     record = problem.record
     most = len(record.increments) + int(problem.events.bounds[-1])
     if np.isinf(problem.model.limit) and (

@@ -1,11 +1,11 @@
 """Protection of a filter against wrong measurements: a gate with recovery, and robust updates.
 
 :class:`Gate`
-    A χ² test of each measurement, with as many degrees of freedom as it has. A filter that is wrong itself would refuse good measurements
-    for ever; so at a refusal a *restart candidate* is started beside it, and replaces it when the refused measurements agree with each
-    other.
+    A χ² test of each measurement, with as many degrees of freedom as it has. If the filter itself is wrong, it would refuse good
+    measurements for ever. So the first refusal starts a *restart candidate* in parallel, which replaces the filter if the refused
+    measurements agree with each other.
 :class:`Robust`
-    Updates that weigh a measurement the less the larger its innovation, for noise with heavier tails than the normal distribution.
+    Updates that reduce the weight of a measurement with a large innovation, for noise with heavier tails than the normal distribution.
 
 They are options of :func:`strapdown.estimation.run`, of :class:`strapdown.estimation.LiveFilter` and of the other estimators there.
 """
@@ -22,11 +22,11 @@ from strapdown.checks import Array, InputError, count, finite, one_of, positive
 from strapdown.kernels import gate_rules
 
 UNIFORM_SIGMA = gate_rules.UNIFORM_SIGMA
-"""Standard deviation of an angle that is uniform over the whole turn, rad."""
+"""Standard deviation of an angle that is uniform over a full rotation, rad."""
 
 
 LOCK_OUT = 10
-"""A gate without recovery reports a sensor that was refused more often than accepted by more than this."""
+"""Default limit, without recovery: a lock-out is reported if the refusals of a sensor exceed its acceptances by more than this."""
 
 
 def _probability(name: str, value: float) -> None:
@@ -36,24 +36,25 @@ def _probability(name: str, value: float) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Gate:
-    """Refuse measurements whose NIS is improbable, and recover when the filter itself is wrong and refuses good ones.
+    """Refuse measurements whose NIS is improbable, and recover if the filter itself is wrong and refuses good ones.
 
-    At the first refusal a restart candidate is started from the filter's state with the uncertainty of a new start: attitude independent of
-    the bias with ``restart_attitude_sigma``, bias variance plus that of ``restart_bias_sigma``, and error states at their prior,
+    The first refusal starts a restart candidate from the filter's state with the uncertainty of a new start: attitude independent of the
+    bias with ``restart_attitude_sigma``, bias variance increased by that of ``restart_bias_sigma``, and error states at their prior,
     independent of both, because the cause of the error may have corrupted them too. It processes all measurements that follow, and is
     dropped as soon as no sensor is refused any more. When one sensor has been refused ``recovery`` times in a row and the candidate has
     accepted as many of the refused measurements, these agree with each other and not with the filter: the candidate replaces the filter,
-    and the estimate holds an event of it.
+    and the estimate contains an event ``"recovery"``.
 
-    A candidate fails when it refuses three measurements in a row, or more than 1 + half of those that it accepts; the next starts with
-    three times the σ. Its own σ is increased by the same factor, as if it had started so, when its bias moves far from its start (squares
-    over the first variances beyond the median of χ²₃) or the NIS that it accepts adds up to more than three standard deviations above the
-    degrees of freedom. σ of the attitude grows up to uniform, that of the bias up to 3⁷ times the first, with only refusals counted; then
-    the first comes again. A recovery makes the next one wider too, until the filter has accepted ``5 recovery`` measurements. The process
-    noise does not change. The rotation between two measurements that is left unknown by such a bias must stay well below a radian.
+    A candidate fails if it refuses three measurements in a row, or more than 1 + half of those that it accepts; the next starts with
+    three times the σ. Its σ is increased during its run by the same factor, as if it had started with it, if its bias moves far from its
+    start (the sum of squares over the initial variances exceeds the median of χ²₃) or if the sum of its accepted NIS exceeds the degrees
+    of freedom by more than three standard deviations. A recovery increases the σ of the next candidate too. The attitude's σ is limited to
+    that of a uniform angle, the bias's to 3⁷ times the first; after that, or when the filter has accepted ``5 recovery`` measurements, σ
+    is that of the first candidate again. The process noise does not change. The rotation between two measurements that results from such
+    an unknown bias must stay well below one radian.
 
-    In either case the estimate holds an event of kind ``"lock-out"`` for each stretch in which a sensor was refused more often than
-    accepted by more than ``recovery`` (without recovery, ten); a recovery within twice that number is reported instead.
+    With and without recovery, the estimate contains an event of kind ``"lock-out"`` for each interval in which the refusals of a sensor
+    exceed its acceptances by more than ``recovery`` (ten without recovery); a recovery within twice that number is reported instead.
 
     Parameters
     ----------
@@ -63,11 +64,11 @@ class Gate:
     recovery : int or None, default 10
         Refusals of one sensor in a row that lead to recovery; None: no recovery.
     restart_attitude_sigma : float, default π/√3
-        Standard deviation of a restart candidate's initial attitude error, rad, each axis; the default is that of an
-        unknown angle, uniform over a full turn.
+        Standard deviation of a restart candidate's initial attitude error, rad, per axis; the default is that of an
+        unknown angle, uniform over a full rotation.
     restart_bias_sigma : float, optional
-        Standard deviation added to the first restart candidate's bias error, rad/s, each axis. Default: that of the
-        initial state, by axis (of a record filtered in parts: of the initial state of the first part).
+        Standard deviation added to that of the first restart candidate's bias error, rad/s, per axis. Default: that of the
+        initial state (for a record filtered in parts, of the initial state of the first part).
     """
 
     probability: float = 0.999
@@ -86,18 +87,18 @@ class Gate:
 
     @property
     def thresholds(self) -> Array:
-        """The largest NIS accepted of one, two and three degrees of freedom (3,)."""
+        """Maximum accepted NIS for one, two and three degrees of freedom (3,)."""
         from scipy.special import chdtri
 
         return np.asarray(chdtri([1.0, 2.0, 3.0], 1.0 - self.probability))
 
     @property
     def lock_out_limit(self) -> int:
-        """A sensor that is refused more often than accepted by more than this is reported."""
+        """Difference of refusals and acceptances of a sensor above which a lock-out is reported."""
         return self.recovery or LOCK_OUT
 
     def restart_bias_variance(self, initial: Array) -> Array:
-        """Return what is added to the bias variance of the first restart candidate.
+        """Return the increase of the bias variance of the first restart candidate.
 
         Parameters
         ----------
@@ -107,7 +108,7 @@ class Gate:
         Returns
         -------
         ndarray (3,)
-            (rad/s)².
+            Increase per axis, (rad/s)².
         """
         if self.restart_bias_sigma is None:
             return np.diag(initial)[3:6].copy()
@@ -116,29 +117,29 @@ class Gate:
 
 @dataclass(frozen=True, kw_only=True)
 class Robust:
-    """Weigh each measurement by its residual after the update: its variance is divided by the weight.
+    """Weight each measurement by its residual after the update: its covariance is divided by the weight.
 
     With r the residual *after* the update and R the measurement's covariance, the weight is found by iteration (IRLS):
 
     - ``"huber"``: w = min(1, k/√(rᵀR⁻¹r)), k² the quantile ``probability`` of χ² (Huber 1964);
     - ``"student"``: w = (ν + d)/(cν + rᵀR⁻¹r + tr R⁻¹HP⁺Hᵀ), the variational update for noise of Student's t with ν
       ``degrees_of_freedom`` and scale cR, d the number of rows (Agamennoni, Nieto & Nebot 2012); c is chosen so that the covariance is
-      right to first order where the noise is normal with covariance R after all (:func:`student_scale`).
+      right to first order if the noise is in fact normal with covariance R (:func:`student_scale`).
 
-    In normal noise both cost a few hundredths of accuracy. In contaminated noise they are somewhat overconfident, because an outlier with
-    little weight still has some effect: tests/test_robustness.py has the figures.
+    In normal noise both lose a few per cent of accuracy. In contaminated noise their covariance is somewhat too small, because an outlier
+    with little weight still has some effect: tests/test_robustness.py has the figures.
 
     Parameters
     ----------
     kind : {"student", "huber"}, default "student"
         Weight function.
     probability : float, default 0.82
-        Huber: share of normal measurements that keep their full weight; 0.82 is the usual 1.345 σ of one degree of
+        Huber: fraction of normal measurements that keep full weight; 0.82 is the usual 1.345 σ of one degree of
         freedom.
     degrees_of_freedom : float, default 4.0
-        Student: ν; the smaller, the heavier the tails.
+        Student: ν; smaller values mean heavier tails.
     iterations : int, default 5
-        Passes of the iteration.
+        Number of iterations.
     """
 
     kind: Literal["huber", "student"] = "student"

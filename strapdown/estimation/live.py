@@ -1,8 +1,8 @@
-"""The compiled filter for data that arrive as they are measured: :class:`LiveFilter`.
+"""The compiled filter for data in real time: :class:`LiveFilter`.
 
-Each gyro interval is a record of its own to :mod:`strapdown.kernels.walk`, which keeps its state in the same arrays from one to the next.
-The covariance is carried as its triangular factor, which never loses its digits. Where measurements may be late, the filter keeps the state
-before each interval of its look-back, goes back to the one that a late measurement belongs to, and walks on from there.
+Each gyro interval is treated as a record by :mod:`strapdown.kernels.walk`, with the state in the same arrays from one to the next. The
+covariance is carried as its triangular factor, which never loses its digits. If measurements may be late, the filter keeps the state before
+each interval of its look-back, returns to the interval of a late measurement, and repeats from there.
 """
 
 from __future__ import annotations
@@ -34,50 +34,49 @@ from strapdown.vectors import KINDS, VectorMeasurements, VectorSensor, need_leve
 from strapdown.vectors.sensors import UNIT_TOLERANCE
 
 MOST = 64
-"""Most measurements within one gyro interval."""
+"""Maximum number of measurements within one gyro interval."""
 UNIT = 2.0 * UNIT_TOLERANCE
-"""A measured direction whose squared length is nearer to 1 than this is taken as it is, like a record's."""
+"""A measured direction whose squared length differs from 1 by less than this is used without normalisation, as in a record."""
 UPPER = np.triu_indices(3)
 
 
 class LiveFilter:
-    """Multiplicative extended Kalman filter, one sample after the other, compiled: a few microseconds a sample.
+    """Multiplicative extended Kalman filter for one sample at a time, compiled: a few microseconds per sample.
 
     Parameters
     ----------
     process_noise : ProcessNoise
         Noise of the gyro.
     initial : State
-        Where the filter starts. The end state of :func:`strapdown.estimation.run_part` continues that run; give its time.
+        Initial state. The end state of :func:`strapdown.estimation.run_part` continues that run; give its time.
     error_states : sequence of ErrorStates, default ()
-        Error states of the gyro and the sensors beside attitude and bias.
+        Error states of the gyro and the sensors in addition to attitude and bias.
     sensors : sequence of VectorSensor or VectorMeasurements
-        The sensors that may be given to :meth:`update`: name, kind, reference and noise (of a series, its first sample's); a record's
-        ``vectors`` for instance. Measurements of one time are processed in this order.
+        Sensors that :meth:`update` accepts: name, kind, reference and noise (of a series, those of its first sample); for example the
+        ``vectors`` of a record. Measurements of one time are processed in this order.
     gate : Gate, optional
-        Refuses outliers, and recovers from a wrong state.
+        Gate that refuses outliers and recovers from a wrong state.
     robust : Robust, optional
-        Weighs each measurement by its distance from the estimate.
+        Robust updates, which weight measurements by their residuals.
     look_back : float, default 0.0
-        How late a measurement may be given, s. Memory holds the states of that span.
+        Maximum delay of a measurement, s. The states of this span are kept in memory.
     time : float, default 0.0
         Time of the initial state, s.
 
     Raises
     ------
     InputError
-        If an argument is not what it should be, or an error state needs the whole record: a lever arm, a strength that varies.
+        If an argument is invalid, or an error state needs the whole record: a lever arm, a varying field magnitude.
 
     See Also
     --------
-    StepFilter : The same filter on filterpy, two hundred times slower, for looking inside.
+    StepFilter : The same filter on filterpy, two hundred times slower, for inspection of its steps.
 
     Notes
     -----
-    Given the samples of a record, the estimate is that of :func:`strapdown.estimation.run`: to the bit with error states, otherwise
-    to rounding, because a record without them is filtered with the covariance itself in place of its factor. Late measurements within the
-    look-back lead to the same bits as those in order. A filter is for one thread at a time, and cannot be copied; start another one from
-    its :meth:`state`.
+    For the samples of a record, the estimate equals that of :func:`strapdown.estimation.run`: bit for bit with error states, otherwise to
+    rounding, because without them a record is filtered with the covariance instead of its factor. Late measurements within the look-back
+    give the same bits as those in order. A filter is not thread-safe and cannot be copied; start another one from its :meth:`state`.
 
     Examples
     --------
@@ -109,12 +108,12 @@ class LiveFilter:
         self._sensors = {one.sensor: _Sensor.of(one, place) for place, one in enumerate(series)}
         if len(self._sensors) < len(series):
             raise InputError(f"sensors has a name twice: {', '.join(one.sensor for one in series)}")
-        # The kernels take each interval as a record; this one, which has no turn yet, says how its arrays look.
+        # The kernels process each interval as a record; this one, without rotation, defines its arrays.
         record = ImuRecord(time=self._time + np.arange(2.0), increments=np.zeros((1, 3)), vectors=tuple(series))
         self._problem = forward.prepared(record, process_noise, initial, error_states)
         if self._problem.model.levers.any() or self._problem.model.varying:
             raise InputError(
-                "lever arms, and effects on a strength that varies, need the whole record; use estimation.run for them"
+                "lever arms, and effects relative to a varying field magnitude, need the whole record; use estimation.run for them"
             )
         self._judge = Judge(self._problem, Options(gate=gate, robust=robust))
         self._judged = gate is not None or robust is not None
@@ -133,8 +132,8 @@ class LiveFilter:
         """Make the arrays that the kernels work on, and load the kernel."""
         sensors, model = len(self._sensors), self._problem.model
         body, judge = forward.factor_body(self._problem, {}), self._judge
-        # All that changes lies in one piece, of which a copy is a snapshot. Lock-outs that go on are the last rows of the array that the
-        # kernel reports new ones in.
+        # All that changes lies in one array, of which a copy is a snapshot. Continuing lock-outs are the last rows of the array in which
+        # the kernel reports new ones.
         slots = np.zeros((sensors, 4))
         parts = [slots, body.attitude, body.x, body.F, judge.counters, judge.memory, np.zeros((sensors, 2))]
         sizes = np.cumsum([0, *(part.size for part in parts)])
@@ -172,11 +171,11 @@ class LiveFilter:
             dispatcher = compiled(walk, gate, root_form)
         self._out = out
         self._arguments = functools.cache(self._new_arguments)
-        # What a dispatcher does beside the work, finding out the types of sixty arrays, takes longer than the work.
+        # The dispatcher's type inference for sixty arrays takes longer than the update itself.
         self._kernel = dispatcher.compile(tuple(map(dispatcher.typeof_pyval, self._arguments(0, 1))))
 
     def _new_arguments(self, number: int, intervals: int) -> tuple[Any, ...]:
-        """Return the kernel's arguments for so many measurements and one or no interval."""
+        """Return the kernel's arguments for this number of measurements and zero or one interval."""
         edges = read_only(self._edges[: intervals + 1])
         increments = read_only(self._increment.reshape(1, 3)[:intervals])
         return edges, increments, self._at.measurements(number, self._series), 1 << 30, self._given, self._out
@@ -193,29 +192,29 @@ class LiveFilter:
         reference_f: Mapping[str, ArrayLike] | None = None,
         **measured: ArrayLike | None,
     ) -> None:
-        """Propagate by a gyro sample to its time, and update with what was measured then.
+        """Propagate by a gyro sample to its time, and update with the measurements of that time.
 
         Parameters
         ----------
         time : float
-            End of the gyro's sample interval, s, and time of the measurements. Without a gyro sample it may be any time since the last
-            ``look_back`` seconds began.
+            End of the gyro's sample interval, s, and time of the measurements. Without a gyro sample, any time within the last
+            ``look_back`` seconds.
         gyro : array_like (3,), optional
             Angular rate over the interval since the last sample, rad/s, body axes.
         delta_theta : array_like (3,), optional
-            In its place the rate integrated over the interval, rad. Default: no gyro sample, only measurements.
+            Alternative to ``gyro``: the rate integrated over the interval, rad. Default: no gyro sample, only measurements.
         sigma : mapping of str to float, optional
-            σ of a sensor's measurement in this call, by name, in place of the declared noise.
+            σ of a sensor's measurement in this call, by name, instead of the declared noise.
         reference_f : mapping of str to array_like (3,), optional
-            Reference of a sensor's measurement in this call, in place of the declared one.
+            Reference of a sensor's measurement in this call, instead of the declared one.
         **measured : array_like (3,) or (4,)
-            Measured vector of each sensor, by name, body axes; of kind ``"attitude"`` the quaternion q_fb. Of a direction or a heading the
-            length does not matter. None or NaN: missing.
+            Measured vector of each sensor, by name, body axes; for kind ``"attitude"`` the quaternion q_fb. The length of a direction or
+            heading is ignored. None or NaN: missing.
 
         Raises
         ------
         InputError
-            If a sensor is unknown, a number infinite, or a time out of order. The filter is then as before.
+            If a sensor is unknown, a number infinite, or a time out of order. The filter is then unchanged.
         """
         now = self._time
         if not math.isfinite(time):
@@ -224,7 +223,7 @@ class LiveFilter:
         if gyro is not None or delta_theta is not None:
             increment = self._increment_to(time, gyro, delta_theta)
         elif time > now:
-            raise InputError(f"time is {time:.9g} s, after the filter's {now:.9g} s; give the gyro sample of it first")
+            raise InputError(f"time is {time:.9g} s, after the filter's {now:.9g} s; give the gyro sample up to it")
         events = self._events(time, measured, sigma, reference_f)
         if increment is not None and time > now:
             self._process(time, increment, events)
@@ -245,12 +244,12 @@ class LiveFilter:
         name = "delta_theta" if gyro is None else "gyro"
         given = _three(name, delta_theta if gyro is None else gyro)
         if given is None:
-            raise InputError(f"{name} has a NaN; leave out the sample, and the next one is taken to span both")
+            raise InputError(f"{name} has a NaN; omit the sample; the next one then covers both intervals")
         x, y, z = given
         if gyro is not None:
             x, y, z = x * dt, y * dt, z * dt
         if not max(abs(x), abs(y), abs(z)) <= LARGEST_TURN:
-            raise InputError(f"{name} is {given}, and nothing turns so far between two samples; check the unit")
+            raise InputError(f"{name} is {given}, too large for the rotation between two samples; check the unit")
         return x, y, z
 
     def _events(
@@ -276,17 +275,17 @@ class LiveFilter:
                 missing.append(name)
             else:
                 events.append(event)
-        for name in missing:  # not before all of them are known to be good
+        for name in missing:  # only after all of them have passed the checks
             self._missing[name] += 1
         if len(events) > 1:
             events.sort(key=_order)
         return events
 
     def _go_back(self, time: float, events: list[_Measured]) -> None:
-        """Update with measurements of the past, and repeat what came after them."""
+        """Update with measurements of the past, and repeat the later intervals."""
         past = self._intervals
         later: list[_Interval] = []
-        # What is measured at the begin of an interval belongs to the one before.
+        # A measurement at the start of an interval belongs to the one before.
         if not past or time < past[0].start or time == past[0].start < past[0].end:
             self.late += len(events)
             return
@@ -302,7 +301,7 @@ class LiveFilter:
             self._process(one.end, one.increment, one.events)
 
     def _process(self, end: float, increment: _Three | None, events: Sequence[_Measured]) -> None:
-        """Walk over an interval from the present state, and keep it as long as a measurement may still come in it."""
+        """Walk over an interval from the present state, and store it while a measurement may still arrive in it."""
         number = len(events)
         if number > MOST:
             raise InputError(f"there are more than {MOST} measurements in one gyro interval; give gyro samples between")
@@ -326,7 +325,7 @@ class LiveFilter:
             self._report(*result[1:])
 
     def _count(self, events: Sequence[_Measured]) -> None:
-        """Count what was refused and what showed nothing."""
+        """Count refused measurements and headings of vertical vectors."""
         for k, (_, sensor, *_) in enumerate(events):
             if sensor in self._headings and math.isnan(self._innovation[k, 0]):
                 self._counts[sensor, 1] += 1.0
@@ -334,14 +333,14 @@ class LiveFilter:
                 self._counts[sensor, 0] += 1.0
 
     def _report(self, recovered: int, locked: int) -> None:
-        """Keep the events that the gate reports."""
+        """Store the events that the gate reports."""
         self._closed += self._reported(self._recoveries[:recovered], self._slots[:0])
         opened = self._judge.counters[:, gate_rules.REPORTED]
         for k, row in enumerate(self._lock_outs[:locked]):
             sensor = int(row[2])
             self._closed += self._reported(self._recoveries[:0], self._slots[sensor : sensor + 1])
             self._slots[sensor] = row
-            if opened[sensor] == k:  # it goes on: the kernel finds it in that row
+            if opened[sensor] == k:  # if it continues, the kernel finds it in that row
                 opened[sensor] = MOST + sensor
 
     def _reported(self, recoveries: Array, lock_outs: Array) -> tuple[Event, ...]:
@@ -366,7 +365,7 @@ class LiveFilter:
 
     @property
     def values(self) -> Array:
-        """Error states (m,), one block after the other."""
+        """Error states (m,), in the order of their declarations."""
         return forward.outside(self._body, self._problem.model, 0)[2]
 
     @property
@@ -377,18 +376,18 @@ class LiveFilter:
 
     @property
     def events(self) -> tuple[Event, ...]:
-        """Recoveries and lock-outs so far, in order of time."""
+        """Recoveries and lock-outs up to now, in order of time."""
         found = self._closed + self._reported(self._recoveries[:0], self._slots)
         return tuple(sorted(found, key=lambda event: event.start))
 
     @property
     def refused(self) -> dict[str, int]:
-        """How many measurements of each sensor the gate has refused."""
+        """Number of measurements of each sensor that the gate has refused."""
         return {name: int(n) for name, n in zip(self._sensors, self._counts[:, 0], strict=True)}
 
     @property
     def skipped(self) -> dict[str, int]:
-        """How many measurements of each sensor were missing, or headings of a vertical vector."""
+        """Number of measurements of each sensor that were missing, or headings of a vertical vector."""
         return {n: self._missing[n] + int(k) for n, k in zip(self._sensors, self._counts[:, 1], strict=True)}
 
     @property
@@ -408,19 +407,19 @@ class LiveFilter:
         return found
 
     def state(self) -> State:
-        """Return the present state, from which another filter, live or over a record, goes on.
+        """Return the present state, from which another filter, live or over a record, can continue.
 
         Returns
         -------
         State
-            Attitude, bias, error states and covariance at ``time``, with what the gate remembers.
+            Attitude, bias, error states and covariance at ``time``, and the gate's state.
         """
         model, memory = self._problem.model, self._judge.memory
         candidate = forward.candidate_in_factor(self._body, model) if memory[gate_rules.CANDIDATE] else None
         return copy.deepcopy(forward.end_in_factor(self._body, model, self._judge.remembered(candidate), {}))
 
     def __reduce__(self) -> Any:
-        """Refuse to be copied: the compiled kernel works on these very arrays."""
+        """Raise an error: a copy would share the arrays of the compiled kernel."""
         raise TypeError("a LiveFilter cannot be copied or pickled; start another one from its state()")
 
 
@@ -430,24 +429,24 @@ _Three = tuple[float, float, float]
 
 
 class _Row(NamedTuple):
-    """What the kernels take of a measurement beside its value."""
+    """Data of a measurement for the kernels, except its value."""
 
     frame: tuple[float, ...]
     """Triad of the reference by rows (9), or the measured quaternion and zeros."""
     length: float
-    """Of the reference of a whole vector; else 1."""
+    """Length of the reference of a whole vector; else 1."""
     sigma: float
-    """Over that length."""
+    """σ over that length."""
     noise: tuple[float, ...]
-    """Upper triangle of the covariance in body axes (6), likewise."""
+    """Upper triangle of the covariance in body axes over the squared length (6)."""
     variances: _Three
-    """Of the body axes; the value of an attitude."""
+    """Variances of the body axes; the value of an attitude."""
     isotropic: bool
-    """Whether σ, or of an attitude the variances of the axes, say all."""
+    """Whether σ, or for an attitude the variances of the axes, define the noise completely."""
 
 
 _Measured = tuple[float, int, _Three, _Row]
-"""A measurement: time, place of its sensor, value, and what goes with it."""
+"""A measurement: time, index of its sensor, value and further data."""
 
 
 def _order(one: _Measured) -> tuple[float, int]:
@@ -456,7 +455,7 @@ def _order(one: _Measured) -> tuple[float, int]:
 
 @dataclass(frozen=True, eq=False)
 class _Sensor:
-    """A sensor as it was declared."""
+    """Declaration of a sensor."""
 
     name: str
     kind: str
@@ -489,7 +488,7 @@ class _Sensor:
         return replace(self, row=_row(self.kind, r, covariance, self.row.isotropic, s))
 
     def measured(self, time: float, value: Any) -> _Measured | None:
-        """Return a measurement; None if it is missing, or of a direction without length."""
+        """Return a measurement; None if it is missing, or a direction of length zero."""
         row = self.row
         if self.kind == "attitude":
             q = np.asarray(value, np.float64)
@@ -512,17 +511,17 @@ class _Sensor:
 
 
 def _template(sensor: VectorSensor | VectorMeasurements, time: float) -> VectorMeasurements:
-    """Return one measurement of a sensor, as it was declared."""
+    """Return one measurement of a sensor as declared."""
     if isinstance(sensor, VectorSensor):
         r = sensor.reference_f
-        # The noise of a heading is that across the direction over its horizontal part.
+        # The σ of a heading is that across the direction, divided by the horizontal part.
         level = math.hypot(r[0], r[1]) if sensor.kind == "heading" else 1.0
         given: dict[str, Any] = {"vector_b": r[None], "reference_f": r, "sigma": sensor.sigma / level}
         return VectorMeasurements(sensor=sensor.name, kind=sensor.kind, time=np.array([time]), **given)
     if not isinstance(sensor, VectorMeasurements):
         raise InputError(f"sensors has {sensor!r}; give vectors.VectorSensor, or the vectors of a record")
     if not len(sensor.time):
-        raise InputError(f"{sensor.sensor}: the series is empty and shows no noise; give one with a sample")
+        raise InputError(f"{sensor.sensor}: the series is empty, so its noise is unknown; give one with a sample")
     return replace(sensor.taken(slice(0, 1)), time=np.array([time]), arrival=None)
 
 
@@ -531,7 +530,7 @@ def _frame(reference_f: Array) -> tuple[float, ...]:
 
 
 def _row(kind: str, reference_f: Array, covariance: Array, isotropic: bool, sigma: float) -> _Row:
-    """Return the row of a measurement of this noise."""
+    """Return the row of a measurement with this noise."""
     length = float(np.linalg.norm(reference_f)) if kind == "vector" else 1.0
     x, y, z = np.diag(covariance).tolist()
     return _Row(
@@ -545,7 +544,7 @@ def _row(kind: str, reference_f: Array, covariance: Array, isotropic: bool, sigm
 
 
 def _three(name: str, value: Any) -> _Three | None:
-    """Return three numbers, or None where one is NaN."""
+    """Return three numbers, or None if one is NaN."""
     try:
         x, y, z = value.tolist() if isinstance(value, np.ndarray) else value
         total = x + y + z
@@ -566,7 +565,7 @@ def _unit(vector: _Three) -> _Three:
 
 
 class _Interval(NamedTuple):
-    """A gyro sample and the measurements in it; the first of a filter with a look-back has no length."""
+    """A gyro sample and the measurements in it; with a look-back, the first has no duration."""
 
     end: float
     increment: _Three | None
@@ -576,12 +575,12 @@ class _Interval(NamedTuple):
 
     @property
     def start(self) -> float:
-        """Its begin, s."""
+        """Start time, s."""
         return self.before[2]
 
 
 class _Slots:
-    """The arrays in which the kernels find the measurements of an interval, one after the other."""
+    """Arrays of the measurements of an interval, one after the other, for the kernels."""
 
     def __init__(self, *, anisotropic: bool) -> None:
         self.time, self.sigma = np.zeros(MOST), np.ones(MOST)
@@ -589,13 +588,13 @@ class _Slots:
         self.value, self.frame = np.zeros(3 * MOST), np.zeros((MOST, 9))
         self.noise = np.zeros((MOST if anisotropic else 0, 6))
         self.place = np.arange(MOST, dtype=np.uint32)
-        # A store by a memory view takes half the time of one by NumPy.
+        # Writing to a memory view takes half the time of writing to an array.
         self.stores: Any = self.time.data, self.sensor.data, self.value.data
         self.rows: list[_Row | None] = [None] * MOST
-        """What the last measurement in each slot brought beside its value."""
+        """Data of the last measurement in each slot, except its value."""
 
     def measurements(self, number: int, series: np.ndarray) -> Measurements:
-        """Return the first measurements as the kernels take them."""
+        """Return the first measurements as the kernels' arguments."""
         return Measurements(
             time=read_only(self.time[:number]),
             place=read_only(self.place[:number]),
@@ -608,7 +607,7 @@ class _Slots:
         )
 
     def fill(self, events: Sequence[_Measured], length: Array) -> None:
-        """Write measurements, and to ``length`` what their effects are divided by."""
+        """Write measurements, and to ``length`` the divisors of their effects."""
         (times, sensors, value), rows = self.stores, self.rows
         for k, (time, sensor, z, row) in enumerate(events):
             times[k] = time

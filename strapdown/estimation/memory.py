@@ -10,19 +10,17 @@ from typing import Any
 import numpy as np
 
 _ALIGNMENT = 64
-"""Bytes: each array begins at a multiple."""
+"""Each array begins at a multiple of this number of bytes."""
 _SMALL = 1 << 20
-"""Bytes: less is not worth keeping."""
+"""Minimum size of memory that is kept, bytes."""
 KEPT = 128 << 20
-"""Bytes of memory kept at most for the results of later runs."""
+"""Maximum memory kept for the results of later runs, bytes."""
 
-_kept: deque[np.ndarray] = (
-    deque()
-)  # of which each operation is whole, whatever thread or collection of garbage it comes from
+_kept: deque[np.ndarray] = deque()  # whose operations are atomic: threads and garbage collection may interleave
 
 
 class _Block:
-    """Memory that is kept for a later run when the last array in it is gone."""
+    """Memory that is kept for a later run when its last array is deleted."""
 
     def __init__(self, memory: np.ndarray) -> None:
         self.memory = memory
@@ -52,9 +50,9 @@ def _taken(size: int) -> np.ndarray:
 def side_by_side(*wanted: tuple[Sequence[int], Any]) -> list[np.ndarray]:
     """Return uninitialised arrays of these shapes and types in one piece of memory.
 
-    A system hands out fresh memory page by page when it is first touched, and clears it, which for the results of a filter takes up to
-    a fifth of the filtering. In one large piece it can use large pages; and pieces of earlier results that are no longer needed are used
-    again, up to :data:`KEPT` bytes.
+    The system provides fresh memory page by page at first access and clears it, which for the results of a filter takes up to a fifth of
+    the filtering. One large piece can use large pages; and pieces of earlier results that are no longer needed are reused, up to
+    :data:`KEPT` bytes.
     """
     types = [np.dtype(of) for _, of in wanted]
     sizes = [math.prod(shape) * of.itemsize for (shape, _), of in zip(wanted, types, strict=True)]

@@ -1,7 +1,7 @@
-"""Blocks as the arrays that the kernels take, and the states in both orders.
+"""Error states as the kernels' arrays, and the states in both orders.
 
-For whoever looks from outside the order is attitude, bias, then the blocks as given. In the kernels the states that change come before the
-constant ones, which then cost the prediction next to nothing (:mod:`strapdown.kernels.triangle`).
+The external order is attitude, bias, then the error states in the order of their declarations. In the kernels the states that change come
+before the constant ones, which then cost the prediction almost nothing (:mod:`strapdown.kernels.triangle`).
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from strapdown.kernels.chains import CHAIN, chain_start
 from strapdown.kernels.error_state_step import CARRIED, FIXED, FORCE, LEVER, OFFSET, SCALE
 
 MAX_DECAY = 0.5
-"""Largest λ dt of one step, for a well conditioned step back; a tenth for states that enter the gyro, where Gauss's rule is exact."""
+"""Maximum λ dt of one step, for a well conditioned backward step; 0.1 for states that enter the gyro, where Gauss's rule is exact."""
 
 
 def as_blocks(blocks: Sequence[ErrorStates]) -> tuple[ErrorStates, ...]:
-    """Return the blocks as a tuple; one by itself is refused."""
+    """Return the declarations as a tuple; a single declaration is refused."""
     if isinstance(blocks, ErrorStates):
-        raise InputError(f"error_states is {blocks.name} by itself; give a tuple, (…,)")
+        raise InputError(f"error_states is the single declaration {blocks.name}; give a tuple, (…,)")
     if not isinstance(blocks, Iterable):
         raise InputError(f"error_states is {blocks!r}; give a tuple of declarations, () for none")
     return tuple(blocks)
 
 
 def with_error_states(initial: State, blocks: Sequence[ErrorStates]) -> State:
-    """Return a state whose blocks are zero, with errors of their own sigma independent of attitude and bias."""
+    """Return a state with error states of zero added, with their declared covariance, independent of attitude and bias."""
     blocks = as_blocks(blocks)
     check(blocks)
     size = sum(block.size for block in blocks)
@@ -49,7 +49,7 @@ def with_error_states(initial: State, blocks: Sequence[ErrorStates]) -> State:
 
 
 def begin(initial: State, blocks: tuple[ErrorStates, ...]) -> State:
-    """Return the state to start from: one without error states is given those of the blocks, at their prior."""
+    """Return the initial state; if it has no error states, with those declared, at their prior."""
     check_arguments(initial=initial)
     check(blocks)
     size = sum(block.size for block in blocks)
@@ -57,24 +57,24 @@ def begin(initial: State, blocks: tuple[ErrorStates, ...]) -> State:
         return with_error_states(initial, blocks)
     if len(initial.values) != size:
         raise InputError(
-            f"initial has {len(initial.values)} error states, and {size} are declared; declare the same ones"
+            f"initial has {len(initial.values)} error states, but {size} are declared; declare the same ones"
         )
     return initial
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Model:
-    """Linear blocks as arrays, in the kernels' order."""
+    """Declarations of error states as arrays, in the kernels' order."""
 
     order: np.ndarray
-    """Which state from outside each of the kernels' block states is (m,)."""
+    """External index of each of the kernels' error states (m,)."""
     decay: Array
     density: Array
     chains: Array
-    """How the next state feeds each, the PSD that drives a chain, which is then not in ``density``, and of the x components of vectors that
-    are carried by how many states the next one follows (m, 3); empty where there is neither."""
+    """Coupling of each state to the next, PSD that drives a chain (then not in ``density``), and for x components of vectors that are
+    carried the number of states to the next component (m, 3); no rows if there are neither chains nor carried states."""
     changing: int
-    """How many come first that decay, are driven, belong to a chain or are carried."""
+    """Number of leading states that decay, are driven, belong to a chain or are carried."""
     limit: float
     """Longest step, s."""
     gyro: Array
@@ -82,9 +82,9 @@ class Model:
     sensors: Array
     sensor_use: np.ndarray
     force_f: Array
-    """Specific force that states of the gyro are about (3,), m/s²; zero: none is."""
+    """Specific force for the gyro's sensitivity to it (3,), m/s²; zero: not used."""
     varying: frozenset[str] = frozenset()
-    """Sensors whose effects are fixed in the sensor's own unit."""
+    """Sensors with effects that are constant in the sensor's own unit."""
 
     @property
     def levers(self) -> np.ndarray:
@@ -93,23 +93,23 @@ class Model:
 
     @property
     def states(self) -> int:
-        """Number of block states."""
+        """Number of error states."""
         return len(self.order)
 
     @property
     def loose(self) -> int:
-        """How many rows of the factor come first that the kernels leave loose (:func:`strapdown.kernels.root_form.loose`)."""
+        """Number of leading rows of the factor that a correction leaves non-triangular (:func:`strapdown.kernels.root_form.loose`)."""
         return 6 + self.changing if len(self.chains) else 3
 
     @property
     def noise_rows(self) -> int:
-        """Number of rows of noise of a step."""
+        """Number of rows of process noise of a step."""
         chained = sum(int(k - chain_start(self.chains, k) + 1) for k in np.flatnonzero(self.chains[:, 1]))
         return 6 + int(np.sum(self.density > 0.0)) + chained
 
     @property
     def whole_order(self) -> np.ndarray:
-        """Which state from outside each of the kernels' states is (6 + m,)."""
+        """External index of each of the kernels' states (6 + m,)."""
         return np.concatenate([np.arange(6), 6 + self.order])
 
 
@@ -118,13 +118,13 @@ def _stack(blocks: Sequence[ErrorStates], name: str, shape: tuple[int, ...]) -> 
 
 
 def assemble(blocks: tuple[ErrorStates, ...], kinds: Mapping[str, str]) -> Model:
-    """Return the model of blocks for the sensors named, whose kinds are given."""
+    """Return the model of error states for the named sensors of the given kinds."""
     if not blocks:
         return _empty(len(kinds))
     decay, density = _stack(blocks, "decay", ()), _stack(blocks, "density", ())
     for name, values in (("decay", decay), ("density", density)):
         if np.any(values < 0.0):
-            raise InputError(f"{name} of block state {int(np.argmax(values < 0.0))} is negative; give zero or more")
+            raise InputError(f"{name} of error state {int(np.argmax(values < 0.0))} is negative; give zero or more")
     scales, forces = (_stack(blocks, name, (3, 3)).reshape(-1, 9) for name in ("gyro_scale", "gyro_force"))
     gyro = np.concatenate([_stack(blocks, "gyro_offset", (3,)), scales + forces], axis=1)
     force_f = _force(blocks, np.any(scales != 0.0, axis=1) & np.any(forces != 0.0, axis=1))
@@ -137,7 +137,7 @@ def assemble(blocks: tuple[ErrorStates, ...], kinds: Mapping[str, str]) -> Model
     gyro_use = _uses(gyro[:, :3], scales) + FORCE * np.any(forces != 0.0, axis=1)
     if np.any(linked & (gyro_use != 0)):
         raise InputError(
-            f"block state {int(np.argmax(linked & (gyro_use != 0)))} belongs to a chain and enters the gyro; give it a feed of 0, or no "
+            f"error state {int(np.argmax(linked & (gyro_use != 0)))} belongs to a chain and enters the gyro; give it a feed of 0, or no "
             "effect on the gyro"
         )
     chains = np.stack([feed, np.where(fed, density, 0.0), seen.stride], axis=1)
@@ -160,7 +160,7 @@ def assemble(blocks: tuple[ErrorStates, ...], kinds: Mapping[str, str]) -> Model
 
 
 class _Seen(NamedTuple):
-    """What the sensors see of the states: effects and their use as in :class:`Model`, in the order from outside."""
+    """Effects of the states on the sensors and their use as in :class:`Model`, in the external order."""
 
     sensors: Array
     use: np.ndarray
@@ -183,7 +183,7 @@ def _on_sensors(blocks: Sequence[ErrorStates], kinds: Mapping[str, str], states:
             one_of(f"{block.name}: sensor", sensor, names)
             if kinds[sensor] == "attitude" and (effect.offset_f is not None or effect.scale is not None):
                 raise InputError(
-                    f"{block.name}: {sensor} gives whole attitudes, of which only an offset_b can be estimated; "
+                    f"{block.name}: {sensor} gives whole attitudes, for which only an offset_b can be estimated; "
                     "use VectorBias for its mounting"
                 )
             _check_lever(block, sensor, kinds[sensor], effect)
@@ -224,26 +224,24 @@ def _empty(sensors: int) -> Model:
 
 
 def _feeds(blocks: tuple[ErrorStates, ...]) -> Array:
-    """Return how the next state feeds each, of chains that stay within their block."""
+    """Return the coupling of each state to the next, after a check that chains stay within their declaration."""
     feed = _stack(blocks, "feed", ())
     first = 0
     for block in blocks:
         own = feed[first : first + block.size]
         first += block.size
         if block.size and own[-1] != 0.0:
-            raise InputError(
-                f"{block.name}: feed of the last state is {own[-1]:g}, and no state comes after it; give 0"
-            )
+            raise InputError(f"{block.name}: feed of the last state is {own[-1]:g}, but no state follows it; give 0")
         longest = max((k - chain_start(own[:, None], k) + 1 for k in range(block.size)), default=0)
         if longest > CHAIN:
-            raise InputError(f"{block.name}: {longest} states feed one another; a chain has at most {CHAIN}")
+            raise InputError(f"{block.name}: a chain of {longest} states; a chain has at most {CHAIN}")
     return feed
 
 
 def _force(blocks: tuple[ErrorStates, ...], both: np.ndarray) -> Array:
-    """Return the specific force that the blocks are about, one for all."""
+    """Return the specific force of the declarations, which must be the same for all."""
     if both.any():
-        raise InputError(f"block state {int(np.argmax(both))} has a gyro_scale and a gyro_force; make two states of it")
+        raise InputError(f"error state {int(np.argmax(both))} has a gyro_scale and a gyro_force; declare two states")
     known = [np.asarray(b.force_f, np.float64) for b in blocks if np.any(b.force_f)]
     for one in known[1:]:
         if not np.array_equal(one, known[0]):
@@ -254,7 +252,7 @@ def _force(blocks: tuple[ErrorStates, ...], both: np.ndarray) -> Array:
 
 
 def _check_carried(block: ErrorStates, effect: Effect) -> None:
-    """Refuse a block that is not the same on three axes in turn, which a turn makes the same again."""
+    """Raise an error unless the states are equal for the three axes, so that a rotation does not change the model."""
     rows = np.asarray(effect.offset_f)
     alike = block.size % 3 == 0 and np.array_equal(rows, np.kron(np.eye(3), rows[: block.size // 3, :1]))
     for name in ("decay", "density", "feed"):
@@ -262,8 +260,8 @@ def _check_carried(block: ErrorStates, effect: Effect) -> None:
         alike = alike and np.array_equal(values, np.tile(values[: block.size // 3], 3))
     if not alike:
         raise InputError(
-            f"{block.name}: what is carried is turned with the attitude, and its states are not those of the axes x, y and z in turn, "
-            "alike; give offset_f as kron(I, a) with the same decay, density and feed on each, or leave carried out"
+            f"{block.name}: carried states rotate with the attitude and must be equal for the axes x, y and z, in this order; give "
+            "offset_f as kron(I, a) with the same decay, density and feed for each, or carried=False"
         )
 
 
@@ -272,10 +270,10 @@ def _check_lever(block: ErrorStates, sensor: str, kind: str, effect: Effect) -> 
         return
     if kind not in ("direction", "vector"):
         raise InputError(
-            f"{block.name}: {sensor} is of kind {kind!r}, which a lever arm does not touch; leave the block out"
+            f"{block.name}: {sensor} is of kind {kind!r}, which a lever arm does not affect; leave these states out"
         )
     if effect.offset_b is not None or effect.offset_f is not None or effect.scale is not None:
-        raise InputError(f"{block.name}: a lever arm has no other effect beside it; make two blocks of it")
+        raise InputError(f"{block.name}: a lever arm cannot be combined with another effect; declare both separately")
 
 
 def _numbers(block: ErrorStates, effect: Effect) -> Array:
@@ -312,7 +310,7 @@ def triangle(state: State | Candidate, model: Model) -> Array:
     if state.factor is None:
         return lower_root(state.covariance[np.ix_(order, order)])
     root = state.factor[:, order]
-    if np.array_equal(root[:, model.loose :], np.tril(root)[:, model.loose :]):  # goes on as it is, to the bit
+    if np.array_equal(root[:, model.loose :], np.tril(root)[:, model.loose :]):  # unchanged, bit for bit
         return np.ascontiguousarray(root)
     return lower(root)
 
@@ -325,10 +323,10 @@ def lower(root: Array) -> Array:
 
 
 def turning_matrix(chains: Array, size: int, before: Array, after: Array) -> Array:
-    """Return what a correction of the attitude from one q_fb to another makes of the states (size, size), in the order of ``chains``."""
+    """Return the matrix (size, size) by which a correction of the attitude from one q_fb to another transforms the states."""
     T = np.eye(size)
     if len(chains):
-        # A turn of the columns of the identity's rows: Tᵀ, by rows.
+        # Rotate the columns of the rows of the identity: this gives Tᵀ row by row.
         error_state_step.turn_columns(chains, error_state_step.fixed_turn(tuple(before), tuple(after)), T, size)
     return T.T
 
@@ -336,7 +334,7 @@ def turning_matrix(chains: Array, size: int, before: Array, after: Array) -> Arr
 def aged_prior(
     error_states: tuple[ErrorStates, ...], values: Array, covariance: Array, dt: float
 ) -> tuple[Array, Array]:
-    """Return values (m,) and covariance (m, m) of the error states after dt, s, in which nothing was measured."""
+    """Return values (m,) and covariance (m, m) of the error states after dt, s, without measurements."""
     transition, driven = np.zeros((2, len(values), len(values)))
     first = 0
     for one in error_states:

@@ -1,13 +1,13 @@
-"""Unknown attitude, one vector at a time: a bank of hypotheses that becomes one filter.
+"""Attitude from an unknown start, one vector at a time: a bank of hypotheses that is reduced to one filter.
 
-A measured direction leaves one thing open: the turn about it. The attitudes that map the first direction on its reference are a circle;
-hypotheses spread evenly over it, each a filter with the covariance that fills its part of the circle, cover every attitude whatever the
-start. The innovations of the measurements that follow weigh them (multiple-model estimation: Magill 1965, IEEE Trans. Automatic Control
-10); the improbable are dropped, and when those left lie on top of each other their mixture is matched by one Gaussian, which the plain
-filter (:mod:`strapdown.estimation`) takes over.
+A measured direction leaves the rotation about it undetermined: the attitudes that map the first direction onto its reference form a circle.
+Hypotheses spread evenly over it, each a filter whose covariance covers its part of the circle, together cover every possible attitude. They
+are weighted by the innovations of the following measurements (multiple-model estimation: Magill 1965, IEEE Trans. Automatic Control 10);
+improbable ones are dropped, and when the others agree, their mixture is replaced by one Gaussian with the same moments, with which the
+plain filter (:mod:`strapdown.estimation`) continues.
 
-Where the measurements do not distinguish the hypotheses they stay apart, and :attr:`BankEstimate.reason` says why. A single filter from an
-arbitrary start would have converged to some attitude with a small σ.
+If the measurements do not distinguish the hypotheses, several remain, and :attr:`BankEstimate.reason` gives the cause. A single filter from
+an arbitrary start would have converged to some attitude with a small σ.
 """
 
 from __future__ import annotations
@@ -42,42 +42,42 @@ from strapdown.vectors import VectorMeasurements
 __all__ = ["BankEstimate", "run"]
 
 HYPOTHESES = 96
-"""Hypotheses on the circle where nobody says: 3.75° apart. Fewer find the attitude as soon, but some are optimistic:
+"""Default number of hypotheses on the circle: 3.75° apart. Fewer find the attitude as soon, but some have too small a covariance:
 ``sims/unknown_start.py``."""
 MIN_WEIGHT = 1e-6
-"""A hypothesis of less than this part of the heaviest one's weight is dropped."""
+"""Minimum weight of a hypothesis, relative to the largest; below it the hypothesis is dropped."""
 LARGEST_SHARE = 0.15
-"""Hypotheses are one Gaussian when less than this part of its covariance lies between them."""
+"""Maximum fraction of the mixture's covariance due to the distance of the hypotheses at which they are merged into one Gaussian."""
 DOUBTED = 3
 """With a gate or robust updates: number of first directions that may all be outliers."""
 DOUBT = 1e-3
-"""Weight of a hypothesis that refuses a direction, relative to one that uses it, until the next one decides: that of a measurement at the
-threshold of a gate which refuses a right one with this probability."""
+"""Weight of a hypothesis that refuses a direction, relative to one that uses it, until the next direction decides: that of a measurement
+at the threshold of a gate that refuses correct measurements with this probability."""
 CONSTANT = 1.0 * DEGREE
-"""References that turn by less than this over a record count as constant, rad."""
+"""Maximum rotation of the references over a record at which they count as constant, rad."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BankEstimate:
-    """Estimate of a bank of hypotheses, with the time at which one was left.
+    """Estimate of a bank of hypotheses, with the time at which they were merged into one.
 
     Parameters
     ----------
     estimate : Estimate
-        The Gaussian of the mixture's mean and whole covariance at the kept edges from the first direction on; once one
-        hypothesis is left, the plain filter's. Innovations are those of the heaviest hypothesis until then.
+        Mean and covariance of the mixture at the stored edges from the first direction on; after the hypotheses were merged into one,
+        those of the plain filter. Innovations are those of the hypothesis with the largest weight until then.
     edges : ndarray of int (m,)
-        Indices of the record's edges at which the rows of ``estimate`` are, at ``record.time[edges]``, s: its truth there is
+        Indices of the record's edges for the rows of ``estimate``: their times are ``record.time[edges]``, s, and their true attitudes
         ``record.truth.attitude[edges]``.
     angles : ndarray (h,)
-        Where the hypotheses started on their circle, rad: the rotation about the first reference from the first of
-        them; with a gate or a robust update then those that each of the next directions left open.
+        Initial position of the hypotheses on their circle, rad: the rotation about the first reference relative to the first of
+        them; with a gate or a robust update followed by those for each of the next directions.
     weights : ndarray (k, h)
-        Weights of the hypotheses at the first k rows, until one was left.
+        Weights of the hypotheses at the first k rows, until they were merged into one.
     became_one : float
-        Time at which one hypothesis was left, s; infinite if more were left at the end.
+        Time at which the hypotheses were merged into one, s; infinite if several were left at the end.
     reason : str
-        Why more than one was left, and what would help; empty if one was.
+        Why several were left, and what would help; empty if they were merged into one.
     """
 
     estimate: Estimate
@@ -89,12 +89,12 @@ class BankEstimate:
 
     @property
     def converged(self) -> bool:
-        """Whether one Gaussian stands for all that is known of the attitude."""
+        """Whether the hypotheses were merged into one Gaussian."""
         return bool(np.isfinite(self.became_one))
 
     @property
     def left(self) -> int:
-        """Hypotheses left at the end of the bank's part."""
+        """Number of hypotheses at the end of the bank's part."""
         return int(np.sum(self.weights[-1] > 0.0))
 
 
@@ -113,37 +113,37 @@ def run(
 ) -> BankEstimate:
     """Estimate attitude and gyro bias from an unknown initial attitude.
 
-    Measurements before the first direction (or vector, or attitude) are left out and counted as skipped. Until one hypothesis is left, a
-    noise that differs by body axis (``sigma_axes``, ``covariance``) is replaced by its largest σ about every axis.
+    Measurements before the first direction (or vector, or attitude) are omitted and counted as skipped. Until the hypotheses are merged
+    into one, a noise that differs by body axis (``sigma_axes``, ``covariance``) is replaced by its largest σ about every axis.
 
-    With a gate or a robust update the first direction may be wrong: further hypotheses leave it out and start from the second, others from
-    the third and the fourth.
+    With a gate or a robust update the first direction may be an outlier: further sets of hypotheses omit it and start from the second,
+    third and fourth.
 
     Parameters
     ----------
     record : ImuRecord
-        Increments corrected for coning (:func:`strapdown.records.compress`), measurements of any kind, at least one of them a direction.
+        Record with increments corrected for coning (:func:`strapdown.records.compress`) and at least one direction, vector or attitude.
     process_noise : ProcessNoise
         Angle random walk and rate random walk of the gyro, as the filter models them.
     hypotheses : int, default 96
-        Initial attitudes on the circle about the first direction, 8 or more. The time is proportional to their number.
+        Number of initial attitudes on the circle about the first direction, at least 8. The computing time is proportional to it.
     bias_sigma : float or array_like (3,), default 20 °/h
         Standard deviation of the initial bias error, rad/s.
     bias : array_like (3,), default zero
         Initial bias, rad/s, body axes.
     every : int, default 1
-        Store every n-th edge; hypotheses can merge into one at stored edges.
+        Store every n-th edge; hypotheses are merged into one only at stored edges.
     least_weight : float
-        Hypotheses of less than this part of the largest weight are dropped.
+        Minimum weight of a hypothesis, relative to the largest; below it the hypothesis is dropped.
     largest_share : float
-        The hypotheses become one when less than this part of the covariance lies between them.
+        Maximum fraction of the mixture's covariance due to the distance of the hypotheses at which they are merged into one.
     gate : Gate, optional
-        Each hypothesis refuses improbable measurements; a refused one counts against it as if it lay at the threshold. When most of the
-        hypotheses have refused ``recovery`` measurements in a row, they restart from the first of these, with three times the bias σ, and
-        an event reports it. When one is left, this is the gate of :func:`strapdown.estimation.run`.
+        Each hypothesis refuses improbable measurements; a refused one reduces its weight like a measurement at the threshold. When most of
+        the hypotheses have refused ``recovery`` measurements in a row, they restart from the first of these, with three times the bias σ,
+        and an event reports it. After the merger it is the gate of :func:`strapdown.estimation.run`.
     robust : Robust, optional
-        Each hypothesis weighs measurements by the size of their innovations, and hypotheses are weighed by likelihoods with heavier tails.
-        By itself it cannot recover where the first measurements mislead it: give a gate too.
+        Each hypothesis weights measurements by their residuals, and hypotheses are weighted by likelihoods with heavier tails. Without a
+        gate the bank cannot recover if the first measurements are wrong.
 
     Returns
     -------
@@ -153,14 +153,14 @@ def run(
     Raises
     ------
     InputError
-        If the record has no direction at all, or an argument is out of range.
+        If the record has no direction, vector or attitude, or an argument is out of range.
 
     References
     ----------
     Y. Bar-Shalom, X. R. Li, T. Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, section 11.6 (multiple models).
     """
     check_arguments(record=record, process_noise=process_noise, gate=gate, robust=robust)
-    initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=1.0, bias_sigma=bias_sigma, bias=bias)  # refuses bad ones
+    initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=1.0, bias_sigma=bias_sigma, bias=bias)  # checks the arguments
     count("hypotheses", hypotheses, minimum=8)
     count("every", every)
     for name, value in (("least_weight", least_weight), ("largest_share", largest_share)):
@@ -181,18 +181,18 @@ def run(
         return found
     rest, one = _from_where_one(record, found)
     if gate is not None and gate.restart_bias_sigma is None:
-        # A restart is from as little as this one was, not from what the bank has learnt.
+        # A restart has the bank's initial σ of the bias, not the smaller one of the merged estimate.
         gate = replace(gate, restart_bias_sigma=float(np.max(bias_sigma)))
     after = estimation.run(rest, process_noise, one, every=every, full_covariance=True, gate=gate, robust=robust)
-    own = tuple(event for event in after.events if event.kind != "gap")  # those of the whole record are there already
+    own = tuple(event for event in after.events if event.kind != "gap")  # gaps are already included
     return replace(found, estimate=joined([found.estimate, replace(after, events=own)]))
 
 
 def _from_where_one(record: ImuRecord, found: BankEstimate) -> tuple[ImuRecord, State]:
-    """Return the record from where the hypotheses became one, and the state there."""
+    """Return the record from the time of the merger on, and the state there."""
     edge = int(np.searchsorted(record.time, found.became_one))
     rest = records.cut(record, edge, len(record.time) - 1)
-    # The bank has processed what was measured at that edge, which a cut leaves with a record's first part.
+    # The bank has processed the measurements at that edge, which `cut` assigns to the first part of a record.
     rest = replace(rest, vectors=tuple(series.taken(series.time > found.became_one) for series in rest.vectors))
     last = found.estimate
     assert last.covariance is not None
@@ -200,7 +200,7 @@ def _from_where_one(record: ImuRecord, found: BankEstimate) -> tuple[ImuRecord, 
 
 
 class _Options(NamedTuple):
-    """Options of :func:`run` until one hypothesis is left."""
+    """Options of :func:`run` until the hypotheses are merged."""
 
     hypotheses: int
     bias: Array
@@ -218,23 +218,23 @@ class _Options(NamedTuple):
 
 
 class _Walked(NamedTuple):
-    """Bank from one first direction on."""
+    """Result of the bank from a given first direction on."""
 
     estimate: Estimate
     kept: np.ndarray
-    """Edges of the record at which rows are stored; the estimate has the first of them."""
+    """Edges of the record whose rows are stored; the estimate has the first of them."""
     angles: Array
     weights: Array
     weight: Array
     """Weights at the end."""
     at: int
-    """Edge at which one hypothesis was left, or ``NEVER`` or ``LOST``."""
+    """Edge at which the hypotheses were merged, or ``NEVER`` or ``LOST``."""
     used: int
-    """Events processed; if lost, the first of those that were refused."""
+    """Number of events processed; if lost, index of the first of the refused ones."""
 
 
 def _until_one(record: ImuRecord, process_noise: ProcessNoise, options: _Options) -> BankEstimate:
-    """Return the bank's own part of :func:`run`: until its hypotheses are one, or to the end."""
+    """Return the bank's part of :func:`run`: until the hypotheses are merged, or to the end."""
     coarse = tuple(_isotropic(series) for series in record.vectors)
     events = schedule(coarse, record.time[0], record.time[-1])
     recovery = 0 if options.gate is None else options.gate.recovery or 0
@@ -246,7 +246,7 @@ def _until_one(record: ImuRecord, process_noise: ProcessNoise, options: _Options
         found = _walked(record, process_noise, events, first, options._replace(bias_sigma=wide), recovery)
         if found.at != hypotheses_kernel.LOST:
             break
-        # What came before may be wrong: the circle is that of the first refused direction.
+        # Earlier measurements may be wrong: start from the circle of the first refused direction.
         again = _directions(events, found.used)
         if len(again) == 0 or events.time[again[0]] > record.time[:: options.every][-1]:
             recovery = 0  # too late for another start
@@ -281,7 +281,7 @@ def _until_one(record: ImuRecord, process_noise: ProcessNoise, options: _Options
 def _walked(
     record: ImuRecord, process_noise: ProcessNoise, events: Schedule, first: int, options: _Options, recovery: int
 ) -> _Walked:
-    """Walk over the record with the hypotheses that the first direction leaves open, and where it is doubted the next ones'."""
+    """Run the bank with the hypotheses of the first direction and, if it may be an outlier, of the next ones."""
     later = _directions(events, first + 1)[: DOUBTED if options.doubted else 0]
     sets = [
         start(record, events, int(one), options.hypotheses, bias=options.bias, bias_sigma=options.bias_sigma)
@@ -294,7 +294,7 @@ def _walked(
     kept = kept[record.time[kept] >= began]
     if len(kept) == 0:
         raise InputError(
-            f"the first direction comes at {began:.6g} s, after the last kept edge; keep more edges or give a longer record"
+            f"the first direction comes at {began:.6g} s, after the last stored edge; store more edges or give a longer record"
         )
     weight = np.empty(len(states))
     out = hypotheses_kernel.Outputs(
@@ -342,7 +342,7 @@ def _walked(
 
 
 def _from_time(record: ImuRecord, time: float) -> tuple[Array, Array, int]:
-    """Return edges and increments from a time on, and the number of the edge at it or before it."""
+    """Return edges and increments from a time on, and the index of the last edge at or before it."""
     k = int(np.searchsorted(record.time, time, side="right")) - 1
     edges, increments = record.time[k:].copy(), np.ascontiguousarray(record.increments[k:])
     if time > edges[0]:
@@ -361,10 +361,10 @@ def start(
     bias: ArrayLike = (0.0, 0.0, 0.0),
     bias_sigma: ArrayLike,
 ) -> tuple[Array, Array]:
-    """Return the hypotheses (h, 28), packed, that event ``first``, a direction, leaves open, and their angles on the circle (h,), rad.
+    """Return the hypotheses (h, 28), packed, for event ``first``, a direction, and their angles on the circle (h,), rad.
 
-    Across the direction each has the measurement's covariance. About it each has a standard deviation of
-    half the spacing: of Gaussians spread so, the sum is uniform over the circle to 1.5 %. A measured attitude leaves a single hypothesis.
+    Across the direction each has the measurement's covariance; about it, a standard deviation of half the spacing, for which the sum of the
+    Gaussians is uniform over the circle to 1.5 %. A measured attitude gives a single hypothesis.
     """
     spread = np.broadcast_to(bias_sigma, 3).astype(np.float64)
     for k, value in enumerate(spread):
@@ -377,7 +377,7 @@ def start(
         P[:3, :3] = np.diag(events.vector_b[first])
         return pack(frame[:4], given, P)[None, :].copy(), np.zeros(1)
     z = events.vector_b[first] / np.linalg.norm(events.vector_b[first])
-    # Any attitude that maps z on the reference: the one that takes a triad about it to a triad about the reference.
+    # Any attitude that maps z onto the reference: the one that maps a triad about it to a triad about the reference.
     q = quaternion.from_matrix(frame.reshape(3, 3).T @ vectors.triad(z))
     angles = 2.0 * np.pi * np.arange(hypotheses) / hypotheses
     P[:3, :3] = events.variance[first] * (np.eye(3) - np.outer(z, z)) + (np.pi / hypotheses) ** 2 * np.outer(z, z)
@@ -386,22 +386,22 @@ def start(
 
 
 def _first_direction(events: Schedule) -> int:
-    """Return the first event that is more than a heading."""
+    """Return the first event that is not a heading."""
     more = _directions(events, 0)
     if len(more) == 0:
         raise InputError(
-            "the record has no direction, vector or attitude to start from inside its time; a bank needs one, a heading alone is not enough"
+            "the record has no direction, vector or attitude within its time to start from; add one: a heading is not enough"
         )
     return int(more[0])
 
 
 def _directions(events: Schedule, first: int) -> np.ndarray:
-    """Return the events from number ``first`` on that are more than headings."""
+    """Return the events from number ``first`` on that are not headings."""
     return np.asarray(first + np.flatnonzero(events.kind[first:] != measurement.HEADING))
 
 
 def _isotropic(series: VectorMeasurements) -> VectorMeasurements:
-    """Return the series with one σ a sample, the largest about any axis, if it has more than one."""
+    """Return the series with one σ per sample, the largest of any axis if it is anisotropic."""
     if not series.anisotropic:
         return series
     largest = np.sqrt(np.linalg.eigvalsh(series.covariances)[..., -1])
@@ -412,13 +412,13 @@ def _isotropic(series: VectorMeasurements) -> VectorMeasurements:
 
 
 def _reason(record: ImuRecord, events: Schedule, weight: Array, estimate: Estimate) -> str:
-    """Return why the hypotheses did not become one, in words."""
+    """Return why the hypotheses were not merged, as text for the user."""
     assert estimate.covariance is not None
     values, axes = np.linalg.eigh(estimate.covariance[-1, :3, :3])
     axis = quaternion.rotate(estimate.attitude[-1], axes[:, -1])
     seen = (
         f"{int(np.sum(weight > 0.0))} hypotheses are still possible after {record.time[-1] - record.time[0]:.6g} s; "
-        f"the turn about the fixed axis ({axis[0]:+.2f}, {axis[1]:+.2f}, {axis[2]:+.2f}) is known to 1σ "
+        f"the rotation about the fixed axis ({axis[0]:+.2f}, {axis[1]:+.2f}, {axis[2]:+.2f}) is known to 1σ "
         f"{np.sqrt(values[-1]) / DEGREE:.3g}°"
     )
     references: Array = np.asarray(events.triads)[events.reference[events.kind != measurement.ATTITUDE]][:, 6:]
@@ -426,10 +426,10 @@ def _reason(record: ImuRecord, events: Schedule, weight: Array, estimate: Estima
     turned = float(np.arcsin(min(apart, 1.0)))
     if turned < CONSTANT:
         return (
-            f"{seen}: all references lie along one line of the fixed frame, and the turn about it cannot be observed, however the body "
-            "moves; add a sensor of another direction, or record until the reference has turned"
+            f"{seen}: all references lie along one line of the fixed frame, and the rotation about it cannot be observed, however the body "
+            "moves; add a sensor of another direction, or record until the reference has rotated"
         )
     return (
-        f"{seen}: the references lie up to {turned / DEGREE:.3g}° apart, which has not separated the hypotheses yet; record longer, or "
+        f"{seen}: the references differ by up to {turned / DEGREE:.3g}°, which has not separated the hypotheses yet; record longer, or "
         "add a sensor of another direction"
     )

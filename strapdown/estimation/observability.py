@@ -1,4 +1,4 @@
-"""Observability of each state over a record: rank, singular values, and the weakest directions in words."""
+"""Observability of each state over a record: rank, singular values, and the weakest directions as text."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from strapdown.estimation.states import ProcessNoise, State
 from strapdown.records import ImuRecord
 
 NAMED = 0.25
-"""Smallest share, relative to the largest, of a state that is named in a direction."""
+"""Minimum component of a direction, relative to its largest, for a state to be named."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Observability:
-    """Information of a record's measurements on the initial state, relative to the prior.
+    """Information of a record's measurements about the initial state, relative to the prior.
 
-    With the prior covariance ``P₀ = S Sᵀ`` and the covariance P of the same state after the whole record, the measurements' own
-    information is ``O = Sᵀ (P⁻¹ − P₀⁻¹) S``: the observability Gramian, linearised along the estimate, with process noise taken into
-    account and every state counted in its own prior σ, so that rad, T and ppm can be compared. A singular value s of
-    ``√O`` is dimensionless: along its direction the record leaves ``1/√(1 + s²)`` of the prior σ. In the units of the states
-    it is ``left``: the rows of ``left`` are independent errors of one σ each, ``leftᵀ left = P``.
+    With the prior covariance ``P₀ = S Sᵀ`` and the covariance P of the same state after the whole record, the information of the
+    measurements is ``O = Sᵀ (P⁻¹ − P₀⁻¹) S``: the observability Gramian, linearised along the estimate, including process noise,
+    with every state relative to its prior σ, so that rad, T and ppm can be compared. A singular value s of
+    ``√O`` is dimensionless: along its direction the record reduces the σ to ``1/√(1 + s²)`` of the prior σ. In the units of the states
+    these are the rows of ``left``, independent errors of one σ each: ``leftᵀ left = P``.
 
     Parameters
     ----------
@@ -44,13 +44,13 @@ class Observability:
     final_sigma : ndarray (n,)
         Standard deviations at the last edge, in ``units``.
     singular_values : ndarray (n,)
-        Dimensionless, the greatest first.
+        Singular values, dimensionless, in descending order.
     directions : ndarray (n, n)
-        Unit directions in the space of states over their prior σ, one a row, in the order of the singular values.
+        Unit directions in the space of states relative to their prior σ, one per row, in the order of the singular values.
     left : ndarray (n, n)
-        One σ of what is left along each direction, one a row, in ``units``.
+        Remaining error of one σ along each direction, one per row, in ``units``.
     threshold : float
-        Singular value from which on a direction counts as observed.
+        Minimum singular value of an observed direction.
     """
 
     states: tuple[str, ...]
@@ -70,11 +70,11 @@ class Observability:
 
     @property
     def unobserved(self) -> Array:
-        """Share of each state that lies in directions not observed (n,): 0 all observed, 1 nothing is."""
+        """Part of each state in directions that are not observed (n,): 0 fully observed, 1 not at all."""
         return np.asarray(np.sqrt(np.sum(self.directions[self.rank :] ** 2, axis=0)))
 
     def words(self, k: int) -> str:
-        """Return one direction in words: states with their shares, each in its prior σ, and in its unit what one σ left along it is.
+        """Return one direction as text: states with their components relative to the prior σ, and the remaining σ in their units.
 
         Parameters
         ----------
@@ -84,7 +84,7 @@ class Observability:
         Returns
         -------
         str
-            States with a notable share in the direction, the largest first.
+            States with large components in the direction, the largest first.
         """
         direction = self.directions[k]
         large = np.flatnonzero(np.abs(direction) >= NAMED * np.max(np.abs(direction)))
@@ -96,7 +96,7 @@ class Observability:
         return " ".join(parts).removeprefix("+")
 
     def __str__(self) -> str:
-        """Say all of it."""
+        """Return the table as text."""
         n = len(self.states)
         width = max(len(f"{state}, {unit}") for state, unit in zip(self.states, self.units, strict=True))
         lines = [f"{self.rank} of {n} directions are observed (singular value {self.threshold:g} or more)", ""]
@@ -109,7 +109,7 @@ class Observability:
                 f"{self.start_sigma[i] / self.prior_sigma[i]:11.3g} {self.final_sigma[i] / self.prior_sigma[i]:11.3g} "
                 f"{self.unobserved[i]:10.2f}"
             )
-        lines += ["", "singular value: direction, each state in its prior σ (and one σ of what is left)"]
+        lines += ["", "singular value: direction, each state relative to its prior σ (and the remaining σ)"]
         lines += [f"{self.singular_values[k]:14.3g}: {self.words(k)}" for k in range(n - 1, -1, -1)]
         return "\n".join(lines)
 
@@ -148,7 +148,7 @@ class Observability:
 
 
 def state_names(blocks: Sequence[ErrorStates]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return name and unit of every state: attitude, bias, blocks."""
+    """Return name and unit of every state: attitude, bias, error states."""
     names = [f"attitude {axis}" for axis in AXES] + [f"gyro bias {axis}" for axis in AXES]
     units = ["rad"] * 3 + ["rad/s"] * 3
     for block in blocks:
@@ -165,12 +165,12 @@ def observability(
     *,
     threshold: float = 1.0,
 ) -> Observability:
-    """Return what a record shows of each state of a filter.
+    """Return the observability of each state of a filter over a record.
 
-    The model is linearised along the smoothed attitude, with no calibration errors. A direction in the space of the states counts as
-    observed if its singular value is ``threshold`` or more: at 1 the record holds as much information on it as the prior. Singular values
-    are accurate up to about 1e7. A state with a correlation time (:class:`strapdown.estimation.error_states.GaussMarkov`) is judged by
-    what the record shows of its initial value.
+    The model is linearised along the smoothed attitude, with no calibration errors. A direction in the space of the states is
+    observed if its singular value is ``threshold`` or more: at 1 the record has as much information about it as the prior. Singular values
+    are accurate up to about 1e7. For a state with a correlation time (:class:`strapdown.estimation.error_states.GaussMarkov`), the
+    information about its initial value counts.
 
     Parameters
     ----------
@@ -179,18 +179,18 @@ def observability(
     initial : State
         State at the first edge, with the prior σ.
     blocks : sequence of ErrorStates, default none
-        Error states beside attitude and bias.
+        Error states in addition to attitude and bias.
     threshold : float, default 1
 
     Returns
     -------
     Observability
-        Prints as a table.
+        Result, which prints as a table.
 
     Raises
     ------
     InputError
-        If an argument is out of range, or an error state is for a sensor that the record does not have.
+        If an argument is out of range, or an error state belongs to a sensor that the record does not have.
     """
     blocks = modelling.as_blocks(blocks)
     positive("threshold", threshold)
@@ -204,7 +204,7 @@ def observability(
     P = covariance[0]
     sigma = np.sqrt(np.diag(state.covariance))
     value, vector = np.linalg.eigh(state.covariance / np.outer(sigma, sigma))
-    # The symmetric root of the correlation turns the states as little as can be: none where the prior is diagonal.
+    # The symmetric root of the correlation rotates the states as little as possible: not at all if the prior is diagonal.
     root, inverse = (vector * np.sqrt(value)) @ vector.T, (vector / np.sqrt(value)) @ vector.T
     left, direction = np.linalg.eigh(inverse @ (P / np.outer(sigma, sigma)) @ inverse)
     left = np.clip(left, 1e-15, 1.0)
@@ -224,10 +224,10 @@ def observability(
 
 
 def without_errors(record: ImuRecord, attitude: Array) -> ImuRecord:
-    """Return what ideal sensors would give of a body with these attitudes at the edges (n + 1, 4), turning at constant rate between them.
+    """Return the record of ideal sensors on a body with these attitudes at the edges (n + 1, 4), rotating at constant rate between them.
 
-    A filter started on it stays on it, whatever its noise model, so its covariance is linearised along one trajectory: linearised along an
-    estimate that each measurement moves, it would find information in directions that nothing shows.
+    A filter started on it stays on it, whatever its noise model, so its covariance is linearised along one trajectory. Linearised along an
+    estimate that changes with each measurement, it would have spurious information about unobservable directions.
     """
     turns = quaternion.log(quaternion.multiply(quaternion.conjugate(attitude[:-1]), attitude[1:]))
     series = []
@@ -242,7 +242,7 @@ def without_errors(record: ImuRecord, attitude: Array) -> ImuRecord:
             continue
         exact_f = s.references_f
         if s.kind == "heading":
-            # Of its reference only the heading counts; how far it is from level is the measurement's.
+            # Only the heading of the reference is used; its inclination is that of the measurement.
             seen_f = quaternion.rotate(q, s.vector_b)
             level = np.linalg.norm(exact_f[:, :2], axis=1, keepdims=True)
             size = np.linalg.norm(seen_f[:, :2], axis=1, keepdims=True)

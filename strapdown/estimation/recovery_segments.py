@@ -23,34 +23,34 @@ from strapdown.kernels.smoother_loop import locate_edges
 from strapdown.records import Estimate, Event, ImuRecord
 
 MAX_CUT = 64
-"""Times the segments that a record takes by its increments: a filter that takes more is lost."""
+"""Maximum ratio of the number of sub-steps to that expected from the increments; above it the filter has diverged."""
 
 
 def filtered_whole(problem: Problem, options: Options) -> tuple[Estimate, Array]:
     """Return the filter's estimate of a record and all its predictions (:attr:`strapdown.estimation.forward.Passed.segments`)."""
     usual = most = most_segments(problem)
     while True:
-        # One more than it should take, which shows whether it took more.
+        # One row more than expected shows whether more were needed.
         passed = filtered(problem, replace(options, segments=most + 1, full_covariance=False))
         if len(passed.segments) - 1 <= most:
             return passed.estimate, passed.segments
-        # Steps are cut by the turn without the bias, which is known only when they are taken.
+        # The number of sub-steps depends on the rotation without the bias, which is known only during the run.
         most *= 4
         if most > MAX_CUT * usual:
             raise InputError(
-                "the filter lost its way: by the bias that it found the body turns many times round in each gyro interval; "
-                "look at the record and the start with estimation.run first"
+                "the filter diverged: with its estimate of the bias the body makes many rotations in each gyro interval; "
+                "check the record and the initial state with estimation.run first"
             )
 
 
 @dataclass(frozen=True, kw_only=True)
 class Break:
-    """A recovery as a smoother takes it; times in s."""
+    """A recovery for a smoother; times in s."""
 
     start: float
-    """First refusal: where the trajectory before it ends."""
+    """First refusal: end of the trajectory before."""
     since: float
-    """Where the trajectory after it begins."""
+    """Start of the trajectory after."""
     end: float
     """Recovery."""
 
@@ -63,7 +63,7 @@ def recoveries(events: Sequence[Event]) -> list[Event]:
 def part(record: ImuRecord, begin: float, end: float) -> ImuRecord:
     """Return the record between two times, with the measurements from ``begin`` on and before ``end``.
 
-    The others are marked missing rather than removed, so that counts of the whole series stay.
+    Measurements outside are marked missing rather than removed, so that counts of the whole series stay.
     """
     inside = (record.time > begin) & (record.time < end)
     time = np.concatenate([[begin], record.time[inside], [end]])
@@ -80,9 +80,9 @@ def part(record: ImuRecord, begin: float, end: float) -> ImuRecord:
 
 
 def break_of(event: Event, memory: GateMemory | None, begin: float) -> Break:
-    """Return a recovery as a break, not before the record's ``begin``.
+    """Return a recovery as a break, not earlier than ``begin`` of the record.
 
-    ``memory`` is what the gate remembers just before, None where nobody knows what took over.
+    ``memory`` is the gate's state just before; None if the candidate that took over is unknown.
     """
     since = event.end
     if memory is not None and memory.counts[CANDIDATE]:
@@ -91,7 +91,7 @@ def break_of(event: Event, memory: GateMemory | None, begin: float) -> Break:
 
 
 def restarted(gate: Gate, memory: GateMemory) -> tuple[Array, Array, Array]:
-    """Return bias (3,) and variances of attitude and bias (6,) of a restart candidate's start, with its increased σ; and its counts."""
+    """Return bias (3,) and variances of attitude and bias (6,) at a restart candidate's start, with its increased σ; and its counts."""
     sigma = restart_attitude(gate.restart_attitude_sigma, memory.counts)
     bias, variance = memory.counts[FIRST_BIAS : FIRST_BIAS + 3], memory.counts[FIRST_BIAS + 3 : FIRST_BIAS + 6]
     counts = memory.counts.copy()
@@ -101,18 +101,18 @@ def restarted(gate: Gate, memory: GateMemory) -> tuple[Array, Array, Array]:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Trajectory:
-    """Segments that a smoother goes back over, and what of them it writes."""
+    """Segments for a backward pass, and the rows that it writes."""
 
     segments: np.ndarray
-    """Rows as the filter stores them, from that of the first stop on."""
+    """Rows as stored by the filter, from that of the first stop on."""
     starts: np.ndarray
-    """Number of the row that starts at each stop, −1 where there is none."""
+    """Index of the row that starts at each stop, −1 if there is none."""
     edge: np.ndarray
     """Stops to write, in order."""
     last: int
-    """Stop from which a smoother goes back; what lies after it is the filter's own."""
+    """Stop at which the backward pass starts; later states are the filter's."""
     row: np.ndarray
-    """Edge of the record of each."""
+    """Edge of the record for each of ``edge``."""
 
 
 def stops(time: Array, breaks: Sequence[Break]) -> Array:
@@ -123,14 +123,14 @@ def stops(time: Array, breaks: Sequence[Break]) -> Array:
 
 
 def starts(time: Array, event_time: Array, segments: Array) -> np.ndarray:
-    """Return the number of the segment that starts at each time; the last row of segments is the end state."""
+    """Return the index of the segment that starts at each time; the last row of segments is the end state."""
     found = np.empty(len(time), np.int64)
     compiled(locate_edges)(read_only(time), event_time, segments, len(segments) - 1, found)
     return found
 
 
 Rerun = tuple[Array, np.ndarray] | None
-"""Segments of a trajectory from its ``since`` to its ``end``, and the number of that which starts at each stop between; None: none."""
+"""Segments of a trajectory from its ``since`` to its ``end``, and the index of the one that starts at each stop between; None: none."""
 
 
 def trajectories(
@@ -142,7 +142,7 @@ def trajectories(
 ) -> list[Trajectory]:
     """Return the trajectories of a record with these edges.
 
-    ``segments`` are the filter's, ``first`` says which of them starts at each stop, and ``reruns`` those of each break.
+    ``segments`` are the filter's, ``first`` is the index of the one that starts at each stop, and ``reruns`` are those of each break.
     """
     if not breaks:
         every = np.arange(len(time))

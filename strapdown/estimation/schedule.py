@@ -1,4 +1,4 @@
-"""Measurements of all sensors in one order of time, as the kernels take them, and their innovations sorted back by sensor."""
+"""Measurements of all sensors in order of time, as the kernels' arguments, and their innovations by sensor."""
 
 from __future__ import annotations
 
@@ -26,29 +26,29 @@ KIND_CODES = {
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Schedule:
-    """Measurements of all sensors and their order of time. Those at one time keep the order of the sensors.
+    """Measurements of all sensors and their order of time. Simultaneous ones keep the order of the sensors.
 
-    What was measured stays where it came from, series by series. The columns of all in order of time are made when they are asked for.
+    The measured values stay in the arrays of their series. The columns in order of time are computed on request.
     """
 
     series_time: tuple[Array, ...]
     """Times (m,) of each sensor, s."""
     series_vector_b: tuple[Array, ...]
-    """Measured vectors over the length of their references (m, 3) of each sensor; of an attitude its three variances."""
+    """Measured vectors over the length of their references (m, 3) of each sensor; for an attitude its three variances."""
     series_sigma: tuple[Array, ...]
     """σ of each component of the vector (m,) of each sensor."""
     noise_by_axis: Array | None = None
     """Upper triangles of the covariances in body axes (events, 6), over the squared lengths of the references, one sensor after the
-    other, if any is anisotropic."""
+    other, if any sensor is anisotropic."""
     bounds: np.ndarray
-    """Where each sensor's events begin, and the last ones end, if they stand one sensor after the other (sensors + 1,)."""
+    """Index of each sensor's first event, and the number of events, with one sensor after the other (sensors + 1,)."""
     codes: np.ndarray
-    """Code of :mod:`strapdown.kernels.filter_loop` of each sensor (sensors,)."""
+    """Code of each sensor's kind in :mod:`strapdown.kernels.measurement` (sensors,)."""
     frames: np.ndarray
-    """Row of ``triads`` of each sensor's first event, and how many rows on that of each next lies, 0 or 1 (sensors, 2)."""
+    """Row of ``triads`` of each sensor's first event, and step in rows to the next event's, 0 or 1 (sensors, 2)."""
     triads: Array
-    """Right-handed frames (u, v, r) by rows about the references r (rows, 9), one a sensor or one a measurement; of an attitude the
-    measured quaternion."""
+    """Right-handed frames (u, v, r) about the references r (rows, 9), one per sensor or one per measurement; for an attitude the measured
+    quaternion."""
     sensors: tuple[str, ...]
     kinds: tuple[str, ...]
     skipped: dict[str, int]
@@ -57,7 +57,7 @@ class Schedule:
     def order(self) -> tuple[Array, np.ndarray, np.ndarray]:
         """Time, row (one sensor after the other) and sensor of each event, in order of time (events,)."""
         number = int(self.bounds[-1])
-        # A byte for the sensor where it will do: the loops read it with each event.
+        # One byte for the sensor if possible: the loops read it for each event.
         narrow = np.uint8 if len(self.sensors) <= 256 else np.uint32
         time, row, sensor = side_by_side(((number,), float), ((number,), np.uint32), ((number,), narrow))
         first, *others = self.series_time or (np.empty(0),)
@@ -115,7 +115,7 @@ class Schedule:
 
     @property
     def measurements(self) -> measurement.Measurements:
-        """The same as the kernels take it."""
+        """Measurements as the kernels' argument."""
         (value, values), (sigma, sigmas) = places(self.series_vector_b), places(self.series_sigma)
         first = self.bounds[:-1]
         columns = (values - 3 * first, sigmas - first, first, self.codes, *self.frames.T)
@@ -128,7 +128,7 @@ class Schedule:
 
     @property
     def body_noise(self) -> Array:
-        """Upper triangle of each measurement's covariance in body axes (events, 6); of a heading the first number is its variance."""
+        """Upper triangle of each measurement's covariance in body axes (events, 6); for a heading the first number is its variance."""
         if self.noise is not None:
             return self.noise
         attitude = (self.kind == measurement.ATTITUDE)[:, None]
@@ -142,13 +142,13 @@ def schedule(
 ) -> Schedule:
     """Return the measurements inside [start, end] in order of time; missing (NaN) ones and those outside are counted as skipped.
 
-    A caller that takes measurements by their ``noise`` says so by ``anisotropic``; otherwise a series that has more than one σ a sample (of
-    an attitude one an axis) is refused.
+    ``anisotropic``: whether the caller uses the ``noise`` of measurements; otherwise a series with more than one σ per sample (for an
+    attitude one per axis) is refused.
     """
     for series in vectors:
         if series.anisotropic and not anisotropic:
             raise InputError(
-                f"{series.sensor}: this filter takes one sigma a sample, not sigma_axes or covariance; use estimation.run, or give sigma"
+                f"{series.sensor}: this filter needs one sigma per sample, not sigma_axes or covariance; use estimation.run, or give sigma"
             )
     parts = [_scheduled(series, start, end) for series in vectors]
     bounds = np.cumsum([0, *(len(part.time) for part in parts)])
@@ -171,9 +171,9 @@ def schedule(
 
 
 def places(columns: Sequence[Array]) -> tuple[Array, np.ndarray]:
-    """Return the first of several arrays, flat, and where each begins, counted from its first number.
+    """Return the first of several arrays, flat, and the offset of each array from its first number.
 
-    A kernel reads them so by :func:`strapdown.kernels.lane_values.element`: one array stands for as many as there are sensors.
+    With the offsets a kernel reads any of them through the first, by :func:`strapdown.kernels.lane_values.element`.
     """
     if not columns:
         return np.empty(0), np.empty(0, np.int64)
@@ -196,7 +196,7 @@ class _Part:
     value: Array
     sigma: Array
     moving: bool
-    """Whether each measurement has a frame of its own."""
+    """Whether the reference changes between measurements."""
     frames: Array
     """(rows, 9)."""
     series: VectorMeasurements
@@ -217,7 +217,7 @@ def _scheduled(series: VectorMeasurements, start: float, end: float) -> _Part:
     if len(series.time) and not (start <= series.time[0] and series.time[-1] <= end):
         used = series.taken(slice(*np.searchsorted(series.time, [start, np.nextafter(end, np.inf)])))
     content = used.vector_b if used.attitude is None else used.attitude
-    # One number that is not finite makes their sum so; a sum takes no memory.
+    # One non-finite number makes the sum non-finite; a sum needs no memory.
     if not np.isfinite(np.sum(content)):
         used = used.taken(np.isfinite(content).all(axis=1))
     if used.attitude is not None:
@@ -236,7 +236,7 @@ def _scheduled(series: VectorMeasurements, start: float, end: float) -> _Part:
     value, sigma = used.vector_b, used.sigma
     length: Array | float = 1.0
     if used.kind == "vector":
-        # A vector is taken over the length of its reference, so that the kernel sees unit references only.
+        # A vector is divided by the length of its reference, so that the kernel sees unit references only.
         length = np.asarray(np.linalg.norm(used.reference_f, axis=-1))
         value, sigma = value / (length[:, None] if moving else length), sigma / length
     return _Part(
@@ -261,7 +261,7 @@ def _need_noise(series: VectorMeasurements) -> None:
             f"{series.sensor}: sigma_axes[{k}] has a 0; a filter needs a noise greater than zero about each axis"
         )
     if series.covariance is not None and len(series.time):
-        # A (3, 3) spread over all samples is one matrix.
+        # A (3, 3) broadcast over all samples is one matrix.
         whole = series.covariance[:1] if series.covariance.strides[0] == 0 else series.covariance
         spread = np.linalg.eigvalsh(whole)
         if np.any(spread[:, 0] <= 1e-12 * spread[:, -1]):
@@ -274,10 +274,10 @@ def _need_noise(series: VectorMeasurements) -> None:
 def innovations_by_sensor(
     events: Schedule, rows: Array, weight: Array | None = None, processed: Array | None = None
 ) -> dict[str, Innovations]:
-    """Return what a kernel wrote of each measurement by place, e₁, s₁, e₂, s₂, …, by sensor, as many as it has degrees of freedom.
+    """Return the innovations written by a kernel, e₁, s₁, e₂, s₂, … per measurement, by sensor, with their degrees of freedom.
 
-    Left out are those not ``processed`` (by place, bool; default: all are), and headings whose row is NaN, of a vertical vector, which
-    shows none (:func:`skipped_too`).
+    Omitted are those not ``processed`` (bool; default: all are), and headings of a vertical vector, whose row is NaN
+    (:func:`skipped_too`).
     """
     result = {}
     for i, (sensor, kind) in enumerate(zip(events.sensors, events.kinds, strict=True)):
@@ -293,14 +293,14 @@ def innovations_by_sensor(
 
 
 def selected(innovations: Innovations, which: np.ndarray) -> Innovations:
-    """Return the innovations of some of the measurements, given by a mask (m,)."""
+    """Return the innovations of the measurements selected by a mask (m,)."""
     return replace(
         innovations, **{name: value[which] for name, value in vars(innovations).items() if value is not None}
     )
 
 
 def skipped_too(events: Schedule, innovations: Mapping[str, Innovations]) -> dict[str, int]:
-    """Return the measurements skipped by sensor: those that were not scheduled, and headings that a vertical vector does not show."""
+    """Return the number of skipped measurements by sensor: those that were not scheduled, and headings of a vertical vector."""
     numbers = np.diff(events.bounds)
     return {
         sensor: events.skipped[sensor] + int(number) - len(innovations[sensor].time)
@@ -309,7 +309,7 @@ def skipped_too(events: Schedule, innovations: Mapping[str, Innovations]) -> dic
 
 
 def joined(parts: Sequence[Estimate]) -> Estimate:
-    """Return the estimates of successive parts of a record as one; at an edge between two stands the first part's."""
+    """Return the estimates of successive parts of a record as one; at a common edge, the row of the first part."""
     if len(parts) == 1:
         return parts[0]
 
@@ -337,7 +337,7 @@ def joined(parts: Sequence[Estimate]) -> Estimate:
         )
         for name, block in parts[0].error_states.items()
     }
-    # A lock-out that goes on is reported by each part, by the last as a whole.
+    # A lock-out that continues is reported by each part, by the last as a whole.
     events = {(event.kind, event.sensor, event.start): event for part in parts for event in part.events}
     return replace(
         parts[0],

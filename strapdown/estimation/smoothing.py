@@ -1,20 +1,19 @@
 """Smoothers: attitude, gyro bias and error states at each edge from the measurements before *and after* it.
 
-A Rauch–Tung–Striebel smoother on the manifold (Rauch, Tung & Striebel 1965; Särkkä 2013, section 8.2), over the states that the filter
-passed through. The filter moves its attitude at each correction and carries its covariance along, so every covariance has a tangent space
-of its own; the backward pass carries them from one to the next by the Jacobians of the rotation vector
-(:mod:`strapdown.kernels.smoother_step`, with the triangular factor :mod:`strapdown.kernels.root_smoother`). To first order in the
-errors this is the least-squares estimate over the whole record.
+A Rauch–Tung–Striebel smoother on the manifold (Rauch, Tung & Striebel 1965; Särkkä 2013, section 8.2) over the stored states of the
+filter. Each correction of the attitude moves the filter's tangent space and its covariance; the backward pass carries covariances from
+one tangent space to the next by the Jacobians of the rotation vector (:mod:`strapdown.kernels.smoother_step`, with the triangular factor
+:mod:`strapdown.kernels.root_smoother`). To first order in the errors this is the least-squares estimate over the whole record.
 
-Where a gate has recovered, the states before and after are two trajectories (:mod:`strapdown.estimation.recovery_segments`), each smoothed
-by itself:
+After a recovery of a gate, the states before and after are two trajectories (:mod:`strapdown.estimation.recovery_segments`), smoothed
+separately:
 
-- up to the first refusal of those that led to it by what was measured before it;
-- from the start of the candidate that took over by what was measured from there on. That is as a rule the first refusal too: then the span
-  in which the filter was lost is estimated right;
-- what may lie between the two, if candidates failed, is the filter's own, and as wrong as the event says.
+- up to the first of the refusals that led to the recovery, from the measurements before it;
+- from the start of the candidate that took over, from the measurements after it. That start usually is the first refusal, so that the
+  interval in which the filter was wrong is estimated correctly;
+- any interval between the two, if candidates failed, is the filter's estimate, which is wrong there, as the event reports.
 
-Nothing is learnt across: not even the bias, which the candidate starts from as uncertain as :class:`strapdown.estimation.Gate` says.
+No information crosses a recovery, not even about the bias, for which the candidate has the σ given by :class:`strapdown.estimation.Gate`.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ from strapdown.kernels.machine import compiled
 from strapdown.records import Estimate, Event, ImuRecord
 
 MIN_SMOOTHED = {"blocks": 1e-9, "factor": 1e-25}
-"""Smallest smoothed variance, as a part of what one interval adds, at which backward passes in either form keep enough digits."""
+"""Minimum smoothed variance, relative to what one interval adds, at which backward passes in either form keep enough digits."""
 
 
 def smooth(
@@ -67,24 +66,24 @@ def smooth(
     error_states : sequence of ErrorStates
         As for :func:`strapdown.estimation.run`.
     full_covariance : bool
-        Keep whole covariance matrices too.
+        Whether to return whole covariance matrices too.
     error_state_covariance : bool
-        Those of all states; otherwise of attitude and bias alone, in less time.
+        Whether those include the error states; without them the smoother is faster.
     gate, robust : optional
-        As for :func:`strapdown.estimation.run`: what the filter refused or weighed down, the smoother does not use either.
+        As for :func:`strapdown.estimation.run`; refused measurements and weights are those of the filter.
 
     Returns
     -------
     Estimate
-        Attitude, bias, error states and variance are smoothed; those at the last edge are the filter's. Innovations and events are the
-        filter's. Where a gate has recovered and error states hold a lever arm, the second trajectory begins only with the recovery, and
-        from the first refusal to there the rows are the filter's own.
+        Smoothed attitude, bias, error states and variances; at the last edge those of the filter. Innovations and events are the
+        filter's. After a recovery of a gate, if there is a lever arm among the error states, the second trajectory begins at the
+        recovery, and the rows from the first refusal to there are the filter's.
 
     Notes
     -----
-    Memory for the filter's states: 256 bytes a gyro interval and a measurement, with error states 8 (n (n + 1)/2 + n + 5), n states in
-    all. A record without error states whose covariance would lose its digits is smoothed on its triangular factor, which takes a dozen
-    times as long.
+    Memory for the filter's states: 256 bytes per gyro interval and per measurement; with error states 8 (n (n + 1)/2 + n + 5), for n states
+    in total. A record without error states whose covariance would lose its digits is smoothed with its triangular factor, a dozen times
+    as slow.
     """
     problem = forward.prepared(record, process_noise, initial, error_states)
     options = Options(
@@ -105,20 +104,20 @@ def smooth(
     if lost is not None:
         raise InputError(
             f"the smoothed variances at {record.time[lost]:g} s have no digits left: the sigmas of the start and the process noise of an "
-            "interval lie too many orders of magnitude apart; raise the smallest of them"
+            "interval differ by too many orders of magnitude; raise the smallest of them"
         )
     return estimate
 
 
 def _digits_lost(problem: Problem, estimate: Estimate, share: float) -> int | None:
-    """Return the first edge whose smoothed variances have lost their digits, None if there is none.
+    """Return the first edge at which the smoothed variances have lost their digits; None if there is none.
 
-    A step back subtracts what the interval had added: the process noise, and at the start the uncertainty of the bias.
+    A backward step subtracts what the interval had added: the process noise, and at the start the uncertainty of the bias.
     """
     angle, rate = problem.variances
     dt = np.diff(problem.record.time)
     start = dt[0] ** 2 * np.diag(problem.initial.covariance)[3:6].max()
-    # Nearly always the smallest of all exceeds even the largest interval's share, which is seen in a tenth of the time.
+    # If the minimum over all rows exceeds the limit of the longest interval, as nearly always, the check takes a tenth of the time.
     longest, smallest = dt.max(), estimate.variance.min()
     most = share * max(angle * longest + rate * longest**3 / 3.0 + start, rate * longest)
     if smallest > most and np.isfinite(estimate.attitude.sum()):
@@ -139,19 +138,19 @@ def relinearized_start(
     *,
     passes: int = 2,
 ) -> State:
-    """Return the start moved to the smoother's estimate of it, as uncertain as it was.
+    """Return the initial state with the smoother's estimate of its values and with its covariance unchanged.
 
-    From a start that is off by tenths of a radian the first measurements are linearised at the wrong place, and the covariance stays too
-    small for good. Started anew from here the filter is linearised where it belongs. The record is used once for the place and once for
-    the estimate, which counts the prior too little by ``1/s²`` of its information, s the singular value of
-    :func:`strapdown.estimation.observability`: for records that show a state much better than the prior.
+    If the initial state is in error by tenths of a radian, the first measurements are linearised at the wrong attitude, and the covariance
+    stays too small. A filter that starts from the result is linearised correctly. The record is used twice, for the point of linearisation
+    and for the estimate, so the prior has too little weight, by ``1/s²`` of its information, with s the singular value of
+    :func:`strapdown.estimation.observability`: suitable for records that determine the states much better than the prior.
     """
     check_arguments(record=record)
     problem = forward.prepared(record, process_noise, initial, error_states)
     state, model = problem.initial, problem.model
     for _ in range(count("passes", passes)):
         whole = smooth(record, process_noise, state, problem.error_states)
-        # The prior's tangent space goes along: exp(a + ε) = exp(a) ⊗ exp(J_r(a) ε).
+        # The prior moves to the new tangent space: exp(a + ε) = exp(a) ⊗ exp(J_r(a) ε).
         back = np.argsort(model.whole_order)
         carry = modelling.turning_matrix(model.chains, len(back), state.attitude, whole.attitude[0])[np.ix_(back, back)]
         a = quaternion.log(quaternion.multiply(quaternion.conjugate(state.attitude), whole.attitude[0]))
@@ -168,7 +167,7 @@ def relinearized_start(
 
 @dataclass(frozen=True, eq=False)
 class _Smoother:
-    """A record, and the form in which it is smoothed."""
+    """A record and the form of the covariance for smoothing it."""
 
     problem: Problem
     options: Options
@@ -210,9 +209,9 @@ class _Smoother:
     def _reruns(
         self, recovered: Sequence[Event], event_time: Array, segments: Array
     ) -> tuple[list[Break], list[Rerun]]:
-        """Return the breaks of a record, and the candidate that took over at each, from its start to the recovery.
+        """Return the breaks of a record, and for each the candidate that took over, from its start to the recovery.
 
-        With a lever arm, which parts of a record do not show alike, a trajectory begins with the recovery.
+        With a lever arm, whose accelerations at the end of a part differ from those of the whole, a trajectory begins with the recovery.
         """
         record, gate = self.problem.record, self.options.gate
         assert gate is not None
@@ -266,7 +265,7 @@ class _BlockForm:
     problem: Problem
 
     def outputs(self, edges: int, options: Options) -> list[Array]:
-        """Return room for the smoothed states."""
+        """Return arrays for the smoothed states."""
         shapes = (edges, 4), (edges, 3), (edges, 6), (edges if options.full_covariance else 0, 21)
         return side_by_side(*((shape, float) for shape in shapes))
 
@@ -282,7 +281,7 @@ class _BlockForm:
         )
 
     def go_back(self, one: Trajectory, first: int, last: int, outputs: Sequence[Array]) -> None:
-        """Go back from the filtered state at a stop of a trajectory to the first, and write all between."""
+        """Smooth from the filtered state at stop ``last`` of a trajectory back to ``first``, and write all rows between."""
         segments = one.segments
         if len(segments) < smoother_loop.FEWEST_ROWS:
             short = smoother_loop.FEWEST_ROWS - len(segments)
@@ -304,7 +303,7 @@ class _FactorForm:
     problem: Problem
 
     def outputs(self, edges: int, options: Options) -> list[Array]:
-        """Return room for the smoothed states."""
+        """Return arrays for the smoothed states."""
         size = 6 + self.problem.model.states
         kept = size if options.error_state_covariance else 6
         whole = (edges if options.full_covariance else 0, kept, kept)
@@ -317,7 +316,7 @@ class _FactorForm:
         return forward.factor_estimate(self.problem, 1, attitude, x, variance, P if options.full_covariance else None)
 
     def go_back(self, one: Trajectory, first: int, last: int, outputs: Sequence[Array]) -> None:
-        """Go back from the filtered state at a stop of a trajectory to the first, and write all between."""
+        """Smooth from the filtered state at stop ``last`` of a trajectory back to ``first``, and write all rows between."""
         model = self.problem.model
         compiled(root_smoother.smooth_augmented)(
             one.segments,

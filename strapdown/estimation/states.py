@@ -1,4 +1,4 @@
-"""What the filter holds: process noise, state, where it starts, and the packing of a state for the kernels."""
+"""Process noise and state of the filter, initial states, and the packing of a state for the kernels."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ from strapdown.records import ImuRecord
 from strapdown.vectors import wahba
 
 LARGEST_NOISE = 1e9
-"""Noise of a gyro in SI beyond which it is a mistake."""
+"""Noise of a gyro, SI, above which the value is taken to be a mistake."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ProcessNoise:
-    """White noise and random walk of the gyro's bias, as the filter models them.
+    """White noise of the gyro and random walk of its bias, as the filter models them.
 
     The noise of the attitude over an interval is that of a continuous rate, σ_v² dt I. A gyro gives increments, and the noise of an
-    increment φ + ν enters the attitude by the right Jacobian of SO(3), as σ_v² dt J_r(φ) J_r(φ)ᵀ: σ_v² dt about the axis of turn and
-    2(1 − cos x)/x² of it across, x = |φ|. So the filter's variance across the axis is too large by a share of about x²/12: 1 % at a turn
-    of 0.35 rad a sample, 9 % at 1 rad, 41 % at 2 rad. It is never too small. Where a body turns farther, sample the gyro faster.
+    increment φ + ν enters the attitude by the right Jacobian of SO(3), as σ_v² dt J_r(φ) J_r(φ)ᵀ: σ_v² dt about the axis of rotation and
+    2(1 − cos x)/x² of it across, x = |φ|. So the filter's variance across the axis is too large by a fraction of about x²/12: 1 % for a
+    rotation of 0.35 rad per sample, 9 % for 1 rad, 41 % for 2 rad. It is never too small. For faster rotations, sample the gyro faster.
 
     Parameters
     ----------
@@ -56,12 +56,12 @@ class ProcessNoise:
         non_negative("rate_random_walk", self.rate_random_walk, unit="rad/s/√s")
         for name, unit in (("angle_random_walk", "rad/√s"), ("rate_random_walk", "rad/s/√s")):
             if getattr(self, name) > LARGEST_NOISE:
-                raise InputError(f"{name} is {getattr(self, name):g} {unit}, and no gyro has so much; check the unit")
+                raise InputError(f"{name} is {getattr(self, name):g} {unit}, more than any gyro has; check the unit")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Candidate:
-    """The restart candidate that runs beside a gated filter."""
+    """Restart candidate that runs in parallel with a gated filter."""
 
     attitude: Array
     """q_fb (4,)."""
@@ -75,21 +75,21 @@ class Candidate:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class GateMemory:
-    """Memory of a gate at the end of a part of a record, from which the next part continues."""
+    """State of a gate at the end of a part of a record, from which the next part continues."""
 
     restart_bias_variance: Array
-    """Default increase of the first candidate's bias variance (3,), (rad/s)²."""
+    """Default increase of the bias variance of the first candidate (3,), (rad/s)²."""
     candidate: Candidate | None = None
     counts: Array
-    """Whether there is a candidate, how it does, and how wide the next one starts, as :mod:`strapdown.kernels.gate_rules` holds them."""
+    """Whether there is a candidate, its counts, and how much the next one's σ is increased, as in :mod:`strapdown.kernels.gate_rules`."""
     counters: Mapping[str, Array]
-    """Refusals of each sensor, as held there."""
+    """Counts of refusals of each sensor, likewise."""
     start: float = 0.0
-    """Time that the first part of the record began, s."""
+    """Start time of the first part of the record, s."""
     values: Array = field(default_factory=lambda: np.empty(0))
     """Error states of a candidate at that time (m,)."""
     covariance: Array = field(default_factory=lambda: np.empty((0, 0)))
-    """The covariance of them (m, m)."""
+    """Covariance of those (m, m)."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -105,14 +105,14 @@ class State:
     covariance : ndarray (6 + m, 6 + m)
         P of the errors (δθ, δb, δc), with δθ in the body frame: rad², rad²/s, (rad/s)², …
     values : ndarray (m,), default empty
-        Error states c, one block after the other.
+        Error states c, in the order of their declarations.
     factor : ndarray (6 + m, 6 + m), optional
-        A root R of P, ``P = Rᵀ R``, of a filter that has one; it may hold what P itself has no digits for.
+        A root R of P, ``P = Rᵀ R``, if the filter has one; it may keep digits that are lost in P itself.
     gate : GateMemory, optional
-        What a gate remembers at the end of a part of a record.
+        State of a gate at the end of a part of a record.
     unit_sigma : mapping of str to float, default empty
-        For sensors with ``varying`` effects, the σ, rad, at whose strength their values are given. Default: the root
-        mean square of the record's.
+        For each sensor with ``varying`` effects, the σ, rad, that fixes the magnitude to which their values are relative. Default: the
+        root mean square of the sensor's σ in the record.
     """
 
     attitude: Array
@@ -124,7 +124,7 @@ class State:
     unit_sigma: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Check shapes, the norm and positive definiteness."""
+        """Check shapes, the norm of the attitude and positive definiteness."""
         object.__setattr__(self, "attitude", unit_quaternions("attitude", array("attitude", self.attitude, (4,))))
         object.__setattr__(self, "bias", array("bias", self.bias, (3,)))
         values = array("values", self.values, ("m",))
@@ -151,9 +151,9 @@ def initial_state(
     attitude : array_like (4,)
         q_fb.
     attitude_sigma : float or array_like (3,)
-        σ of the attitude error, rad, of each body axis.
+        σ of the attitude error, rad, per body axis.
     bias_sigma : float or array_like (3,)
-        σ of the bias error, rad/s, of each body axis.
+        σ of the bias error, rad/s, per body axis.
     bias : array_like (3,), default zero
         Gyro bias, rad/s, body axes.
 
@@ -186,20 +186,20 @@ def initial_state(
 
 
 def _by_axis(name: str, value: ArrayLike) -> Array:
-    """Return three numbers, one an axis."""
+    """Return three numbers, one per axis."""
     given = numbers(name, value)
     if given.shape not in ((), (1,), (3,)):
-        raise InputError(f"{name} has shape {given.shape}; give one number, or three, one an axis")
+        raise InputError(f"{name} has shape {given.shape}; give one number, or three, one per axis")
     return np.broadcast_to(given, 3)
 
 
 def first_bias_variance(initial: State) -> Array:
-    """Return the bias variance (3,) of the state that the first part of a record started from."""
+    """Return the bias variance (3,) of the initial state of the first part of a record."""
     return np.diag(initial.covariance)[3:6].copy() if initial.gate is None else initial.gate.restart_bias_variance
 
 
 def restart_bias_variance(gate: Gate | None, initial: State) -> Array:
-    """Return what a gate adds to the variance of its first candidate's bias (3,), (rad/s)², of a filter that goes on from ``initial``."""
+    """Return the increase of the bias variance of a gate's first candidate (3,), (rad/s)², in a filter that continues from ``initial``."""
     if gate is None:
         return np.zeros(3)
     if gate.restart_bias_sigma is None and initial.gate is not None:
@@ -208,11 +208,11 @@ def restart_bias_variance(gate: Gate | None, initial: State) -> Array:
 
 
 NEEDED = {
-    "record": (ImuRecord, "make it by records.ImuRecord, or read one by recordfiles.read_record"),
+    "record": (ImuRecord, "make it with records.ImuRecord, or read one by recordfiles.read_record"),
     "process_noise": (ProcessNoise, "give estimation.ProcessNoise(angle_random_walk=…, …)"),
-    "initial": (State, "make it by estimation.initial_state, or from a record by estimation.first_state"),
+    "initial": (State, "make it with estimation.initial_state, or from a record by estimation.first_state"),
 }
-"""Arguments of filters by name: class, and how to make one."""
+"""Arguments of filters by name: class, and how to obtain one."""
 OPTIONAL = {
     "gate": (Gate, "give estimation.Gate(probability=0.999), or None"),
     "robust": (Robust, "give estimation.Robust(kind='huber'), or None"),
@@ -221,7 +221,7 @@ OPTIONAL = {
 
 
 def check_arguments(**given: object) -> None:
-    """Refuse what a filter is given, by name, in place of the objects that it wants."""
+    """Raise an error for arguments, given by name, of a wrong class."""
     for name, value in given.items():
         if name in NEEDED:
             instance(name, value, *NEEDED[name])
@@ -230,29 +230,29 @@ def check_arguments(**given: object) -> None:
 
 
 FIRST_SETS = 10
-"""Sets of first measurements that a start is tried from, one after the other, should one hold an outlier."""
+"""Number of sets of first measurements that are tried in turn for an initial attitude, in case one holds an outlier."""
 VERTICAL = math.radians(1.0)
-"""A reference so near the fixed z axis is the vertical, rad."""
+"""Largest angle between the fixed z axis and a reference that is treated as the vertical, rad."""
 ONCE = 10.0
-"""Factor on σ of a start from measurements, because the filter processes the same measurements again."""
+"""Factor on σ of an initial attitude from measurements, because the filter processes the same measurements again."""
 
 
 def first_state(
     record: ImuRecord, process_noise: ProcessNoise, *, bias_sigma: float, bias: ArrayLike = (0.0, 0.0, 0.0)
 ) -> State:
-    """Return a state at the first edge from the first measurements: a measured attitude, or by Wahba's problem two directions or more.
+    """Return a state at the first edge from the first measurements: a measured attitude, or two or more directions (Wahba's problem).
 
-    The gyro carries each measurement back to the first edge, with its noise increased by that of the gyro and of the bias. The attitude's σ
-    is ``ONCE`` times what results, so that these measurements, which the filter processes again, count once.
+    Each measurement is rotated back to the first edge by the gyro; its noise is increased by that of the gyro and of the bias. The σ of
+    the attitude is multiplied by ``ONCE``, because the filter processes the same measurements again.
 
     Parameters
     ----------
     record : ImuRecord
-        With measurements of an attitude, or of two directions that are not parallel.
+        Record with measurements of an attitude, or of two directions that are not parallel.
     process_noise : ProcessNoise
         Angle random walk and rate random walk of the gyro, as the filter models them.
     bias_sigma : float
-        Standard deviation of the bias error, each axis, rad/s.
+        Standard deviation of the bias error, rad/s, per axis.
     bias : array_like (3,), default zero
         Gyro bias, rad/s, body axes.
 
@@ -264,9 +264,9 @@ def first_state(
     Raises
     ------
     InputError
-        If no measurement gives the attitude: fewer than two directions, or all on one line.
+        If the measurements do not determine the attitude: fewer than two directions, or all parallel.
     InconsistentError
-        Of :mod:`strapdown.vectors.wahba`: if directions contradict each other.
+        If directions contradict each other (:mod:`strapdown.vectors.wahba`).
 
     References
     ----------
@@ -315,14 +315,14 @@ def _attitude_of_set(
         if one.kind == "heading":
             headings.append((body.pop(), fixed.pop(), sigmas.pop()))
     if len(body) == 1 and headings and abs(fixed[0][2]) > np.cos(VERTICAL):
-        # Beside the vertical a heading is a direction: the horizontal part of its vector.
+        # Together with the vertical, a heading is a direction: the horizontal part of its vector.
         seen, reference, sigma = headings[0]
         level = seen - body[0] * (seen @ body[0])
         horizontal = reference - fixed[0] * (reference @ fixed[0])
         attitude = wahba.solve(
             np.array([*body, level]), np.array([*fixed, horizontal]), np.array([*sigmas, sigma])
         ).attitude
-        # A tilt turns the heading with it, by the tangent of the dip, and the heading says nothing of the tilt.
+        # A tilt changes the heading too, by the tangent of the dip, but the heading has no information about the tilt.
         R = quaternion.to_matrix(attitude)
         row = np.array(heading_row(tuple(R.ravel()), tuple(seen)))
         if not row.any():
@@ -331,7 +331,7 @@ def _attitude_of_set(
         return attitude, np.asarray(np.linalg.inv(tilt / sigmas[0] ** 2 + np.outer(row, row) / sigma**2))
     if len(body) < 2:
         raise InputError(
-            f"two directions are needed, or the vertical and a heading, and it has {len(body)} of directions "
+            f"two directions are needed, or the vertical and a heading; the record has {len(body)} of directions "
             f"and {len(headings)} of headings"
         )
     solution = wahba.solve(np.array(body), np.array(fixed), np.array(sigmas))
@@ -339,12 +339,12 @@ def _attitude_of_set(
 
 
 def _turn_until(record: ImuRecord, bias: Array, time: float) -> Array:
-    """Return the turn q from the first edge to a time, by the gyro."""
+    """Return the rotation q from the first edge to a time, from the gyro."""
     k = int(np.searchsorted(record.time, time, side="right")) - 1
     dt = np.diff(record.time[: k + 2])
     steps = record.increments[: k + 1] - bias * dt[:, None]
     if k < len(record.increments):
-        # The last interval is entered only so far.
+        # Of the last interval only the part before the time counts.
         steps[k] *= (time - record.time[k]) / dt[k]
     turns = quaternion.exp(steps)
     while len(turns) > 1:  # pairs of neighbours
@@ -353,24 +353,24 @@ def _turn_until(record: ImuRecord, bias: Array, time: float) -> Array:
     return quaternion.normalize(turns[0])
 
 
-# Blocks of P as the kernels hold them: rows and columns of A = P_θθ (upper), B = P_θb, C = P_bb (upper).
+# Blocks of P in the kernels: rows and columns of A = P_θθ (upper), B = P_θb, C = P_bb (upper).
 _UPPER = ((0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2))
 _ROWS = np.array([*_UPPER[0], *np.repeat(range(3), 3), *(3 + np.array(_UPPER[0]))])
 _COLUMNS = np.array([*_UPPER[1], *(3 + np.tile(range(3), 3)), *(3 + np.array(_UPPER[1]))])
 
 
 def pack(attitude: Array, bias: Array, covariance: Array) -> Array:
-    """Return a state as the kernels' 28 numbers: q, b, and P in blocks."""
+    """Return a state packed as the kernels' 28 numbers: q, b, and P in blocks."""
     return np.concatenate([attitude, bias, covariance_blocks(covariance)])
 
 
 def covariance_blocks(covariance: Array) -> Array:
-    """Return the kernels' 21 numbers (..., 21) of whole matrices P (..., 6, 6)."""
+    """Return the kernels' 21 numbers (..., 21) of matrices P (..., 6, 6)."""
     return np.asarray(covariance[..., _ROWS, _COLUMNS])
 
 
 def covariance_matrices(blocks: Array) -> Array:
-    """Return whole matrices P (..., 6, 6) of the kernels' 21 numbers (..., 21)."""
+    """Return the matrices P (..., 6, 6) of the kernels' 21 numbers (..., 21)."""
     P = np.empty((*blocks.shape[:-1], 6, 6))
     P[..., _ROWS, _COLUMNS] = blocks
     P[..., _COLUMNS, _ROWS] = blocks

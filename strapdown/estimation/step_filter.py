@@ -1,7 +1,7 @@
-"""The filter step by step, on filterpy, for looking inside.
+"""The filter in single steps, on filterpy, for inspection.
 
-:class:`StepFilter` is the filter of :mod:`strapdown.estimation`, on whole covariance matrices. Motion model and measurement rows are the
-kernels' own functions, run as plain Python.
+:class:`StepFilter` is the filter of :mod:`strapdown.estimation` with whole covariance matrices. Motion model and measurement rows are the
+kernels' functions, run as plain Python.
 """
 
 from __future__ import annotations
@@ -40,42 +40,42 @@ from strapdown.records import LARGEST_TURN
 from strapdown.vectors import need_level, need_unit, triad
 
 NO_LEVER = (0.0,) * 9
-"""The matrix by which a lever arm enters a measurement: of none."""
+"""Matrix by which a lever arm enters a measurement, if there is none."""
 
 
 class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
-    """Multiplicative extended Kalman filter, step by step: ``P``, ``F``, ``Q``, ``R``, ``y``, ``S``, ``K`` and ``Saver`` as in filterpy.
+    """Multiplicative extended Kalman filter in single steps: ``P``, ``F``, ``Q``, ``R``, ``y``, ``S``, ``K`` and ``Saver`` as in filterpy.
 
     ``x`` is the error state (δθ, δb, δc) (n,): zero before and after each update, because the correction goes into ``attitude``, ``bias``
-    and ``values``; ``x_post`` keeps the last correction. Rows of ``y`` and ``S`` are in the unit of the measurement, or rad.
+    and ``values``; ``x_post`` stores the last correction. Rows of ``y`` and ``S`` are in the unit of the measurement, or rad.
 
     Parameters
     ----------
     process_noise : ProcessNoise
         Noise of the gyro.
     initial : State
-        Where the filter starts. The end state of :func:`strapdown.estimation.run_part` continues that run; give its ``time``.
+        Initial state. The end state of :func:`strapdown.estimation.run_part` continues that run; give its ``time``.
     error_states : sequence of ErrorStates, optional
-        Optional error states of the gyro and the sensors.
+        Error states of the gyro and the sensors in addition to attitude and bias.
     sensors : sequence of str, optional
-        Names of the sensors; with error states no other name is accepted. Default: with error states the sensors that those are about, if
-        any; else any.
+        Names of the sensors; with error states no other name is accepted. Default: with error states, the sensors that they affect, if
+        any; otherwise any name.
     time : float
         Time of the initial state, s.
 
     See Also
     --------
-    LiveFilter : The same filter compiled, two hundred times faster, with a gate and robust weights, which takes late measurements too.
+    LiveFilter : The same filter compiled, two hundred times faster, with a gate, robust weights and late measurements.
 
     Notes
     -----
-    The filter holds, beside what filterpy's has:
+    Attributes in addition to those of filterpy's class:
 
-    - ``attitude`` q_fb (4,), ``bias`` of the gyro (3,), rad/s, body axes, and ``values`` of the optional error states (m,), one block
-      after the other, all at ``time``, s;
+    - ``attitude`` q_fb (4,), ``bias`` of the gyro (3,), rad/s, body axes, and ``values`` of the error states (m,), in the order of their
+      declarations, all at ``time``, s;
     - ``nis`` of the last measurement that was not skipped;
-    - ``skipped``, by sensor: how many measurements were missing (NaN) or headings of a vertical vector;
-    - ``repeated``: how many gyro samples had no duration.
+    - ``skipped``, by sensor: number of measurements that were missing (NaN) or headings of a vertical vector;
+    - ``repeated``: number of gyro samples without duration.
 
     Examples
     --------
@@ -117,20 +117,20 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         self._sensor_models: dict[str, modelling.Model] = {}
 
     def _sensors_of_states(self, names: tuple[str, ...]) -> tuple[str, ...]:
-        """Return the only sensors that may be updated by; none: any may. Error states about other sensors are refused."""
+        """Return the only sensors accepted in updates; empty: any. Error states of other sensors are refused."""
         about = {sensor: block.name for block in self.error_states for sensor in block.effects}
         for sensor, block in about.items() if names else ():
             one_of(f"{block}: sensor", sensor, names)
         return (names or tuple(about)) if self.error_states else ()
 
     def _model(self, sensor: str, kind: str) -> modelling.Model:
-        """Return the error states as arrays, in the filter's own order, with their effects on one sensor alone."""
+        """Return the error states as arrays, in the order of their declarations, with their effects on one sensor only."""
         need_none(self.error_states, "this filter")
         kinds = {name: "vector" for block in self.error_states for name in block.effects} | {sensor: kind}
         model = modelling.assemble(self.error_states, kinds)
         if model.levers.any() or model.varying:
             raise InputError(
-                "lever arms, and effects on a strength that varies, need the whole record; use estimation.run for them"
+                "lever arms, and effects relative to a varying field magnitude, need the whole record; use estimation.run for them"
             )
         back, here = np.argsort(model.order), [list(kinds).index(sensor)]
         return replace(
@@ -147,7 +147,7 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
 
     @property
     def skipped(self) -> dict[str, int]:
-        """Measurements without information, by sensor: missing (NaN) ones and headings of a vertical vector."""
+        """Number of measurements without information, by sensor: missing (NaN) ones and headings of a vertical vector."""
         names = dict.fromkeys((*self._missing, *self._vertical))
         return {name: self._missing.get(name, 0) + self._vertical.get(name, 0) for name in names}
 
@@ -157,7 +157,7 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         Returns
         -------
         State
-            Attitude, bias, error states and covariance at ``time``, without what the gate remembers.
+            Attitude, bias, error states and covariance at ``time``.
         """
         P = 0.5 * (self.P + self.P.T)
         return State(attitude=self.attitude, bias=self.bias, values=self.values, covariance=P)
@@ -170,11 +170,11 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         Parameters
         ----------
         delta_theta : array_like (3,)
-            The rate integrated over the step, rad, body axes.
+            Rate integrated over the step, rad, body axes.
         dt : float, optional
-            Length of the step, s. A step of no length is counted as ``repeated``.
+            Duration of the step, s. A step without duration is counted as ``repeated``.
         time : float, optional
-            In its place the end of the step, s.
+            Alternative to ``dt``: end of the step, s.
 
         Raises
         ------
@@ -184,7 +184,7 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         increment = array("delta_theta", delta_theta, (3,))
         if np.max(np.abs(increment)) > LARGEST_TURN:
             raise InputError(
-                f"delta_theta is {increment}, and nothing turns so far between two samples; it is the rate times dt, rad: check the unit"
+                f"delta_theta is {increment}, too large for the rotation between two samples; it is the rate times dt, rad: check the unit"
             )
         if dt is not None and time is None:
             step = non_negative("dt", dt, unit="s")
@@ -193,7 +193,7 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
             end = finite("time", time, unit="s")
             step = end - self.time
         else:
-            raise InputError("give either dt, the length of the step in s, or time, when it ends")
+            raise InputError("give either dt, the duration of the step in s, or time, its end")
         if step < 0.0:
             raise InputError(f"time is {end:.9g} s, before the filter's {self.time:.9g} s; give the samples in order")
         if step == 0.0:
@@ -202,7 +202,7 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         self._predict(increment, step, end)
 
     def _predict(self, increment: Array, step: float, end: float) -> None:
-        """Propagate in sub-steps: as long as series and decaying states allow."""
+        """Propagate in sub-steps, each as long as the series and the decay rates of the states allow."""
         left = step
         while left > 0.0:
             turn = tuple((increment - left * self.bias).tolist())
@@ -213,7 +213,7 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         self.time = end
 
     def _sub_step(self, part: Array, dt: float) -> None:
-        """Propagate over an increment at constant rate, by the kernels' own functions."""
+        """Propagate over an increment at constant rate, with the kernels' functions."""
         white = self.process_noise.angle_random_walk**2, self.process_noise.rate_random_walk**2
         model, m, n = model_arrays(self._motion, white), len(self.values), len(self.x)
         q, phi, x = tuple(self.attitude.tolist()), tuple(part.tolist()), np.concatenate([self.bias, self.values])
@@ -236,7 +236,7 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
     # ---------------------------------------------------------------------------------------------------------------- updates
 
     def update(self, *arguments: Any, **options: Any) -> None:
-        """Refuse filterpy's own updates by any ``Hx``: they would leave the correction in ``x``, outside ``attitude`` and ``bias``.
+        """Raise an error: filterpy's updates by an ``Hx`` would leave the correction in ``x``, outside ``attitude`` and ``bias``.
 
         Parameters
         ----------
@@ -249,7 +249,7 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
             Always; use :meth:`update_direction`, :meth:`update_vector`, :meth:`update_heading` or :meth:`update_attitude`.
         """
         raise InputError(
-            "an update by HJacobian and Hx knows no attitude, and would leave its correction in x; use update_direction, update_vector, "
+            "an update by HJacobian and Hx would leave its correction in x, not in the attitude; use update_direction, update_vector, "
             "update_heading or update_attitude"
         )
 
@@ -269,20 +269,20 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         Parameters
         ----------
         vector_b : array_like (3,)
-            The measured unit vector, body axes; NaN if it is missing.
+            Measured unit vector, body axes; NaN if it is missing.
         reference_f : array_like (3,)
-            The known direction, fixed axes, of any length.
+            Reference direction, fixed axes, of any length.
         sigma : array_like () or (3,), optional
-            Standard deviation across the direction, rad; one, or one a body axis.
+            Standard deviation across the direction, rad; one, or one per body axis.
         sensor : str
-            Its name, by which the gate counts.
+            Name of the sensor.
         covariance : array_like (3, 3), optional
-            Of the noise, body axes, in place of ``sigma``; the part across the direction counts.
+            Covariance of the noise, body axes, instead of ``sigma``; only the part across the direction is used.
 
         Returns
         -------
         bool
-            Whether the measurement was used: neither refused nor missing.
+            Whether the measurement was used; false if it is missing.
         """
         return self._update_by_vector("direction", vector_b, reference_f, (sigma, covariance), sensor)
 
@@ -304,16 +304,16 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         reference_f : array_like (3,)
             The same vector in the fixed frame.
         sigma : float or array_like (3,), optional
-            σ of each component, in that unit; or one a body axis.
+            σ of each component, in that unit; one, or one per body axis.
         sensor : str, optional
-            Name of the sensor, for gate and events.
+            Name of the sensor.
         covariance : array_like (3, 3), optional
-            Of the noise, instead of ``sigma``.
+            Covariance of the noise, instead of ``sigma``.
 
         Returns
         -------
         bool
-            Whether it was used.
+            Whether the measurement was used; false if it is missing.
 
         Raises
         ------
@@ -340,12 +340,12 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         sigma : float
             σ of the heading, rad.
         sensor : str, optional
-            Name of the sensor, for gate and events.
+            Name of the sensor.
 
         Returns
         -------
         bool
-            Whether it was used.
+            Whether the measurement was used; false if it is missing or vertical.
 
         Raises
         ------
@@ -371,14 +371,14 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         sigma : float or array_like (3,), optional
             σ about the body axes, rad.
         sensor : str, optional
-            Name of the sensor, for gate and events.
+            Name of the sensor.
         covariance : array_like (3, 3), optional
-            Of the noise, rad², body axes, instead of ``sigma``.
+            Covariance of the noise, rad², body axes, instead of ``sigma``.
 
         Returns
         -------
         bool
-            Whether it was used.
+            Whether the measurement was used; false if it is missing.
 
         Raises
         ------
@@ -421,7 +421,7 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
     def _need_known(self, sensor: str) -> None:
         if self.sensors and sensor not in self.sensors:
             raise InputError(
-                f"sensor is {sensor!r}, which is none of {', '.join(self.sensors)}; say which of them it is, or name all sensors to "
+                f"sensor is {sensor!r}, which is none of {', '.join(self.sensors)}; give one of these names, or name all sensors in "
                 "StepFilter(sensors=…)"
             )
 
@@ -451,13 +451,13 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         return True
 
     def _filterpy_update(self, residual: Array, H: Array, R: Array) -> Array:
-        """Return the correction (n,) that filterpy's own update makes; P is then that about the corrected state."""
+        """Return the correction (n,) of filterpy's update; P is then the covariance about the corrected state."""
         super().update(residual, HJacobian=lambda x: H, Hx=lambda x: H @ x, R=R)
         correction, self.x = self.x, np.zeros(len(self.x))
         return np.asarray(correction)
 
     def _move(self, correction: Array, P: Array) -> None:
-        """Add the correction to attitude, bias and error states; P is that of the tangent space there."""
+        """Add the correction to attitude, bias and error states; P is the covariance in the tangent space there."""
         before = self.attitude
         self.attitude = quaternion.normalize(quaternion.multiply(before, quaternion.exp(correction[:3])))
         self.bias, self.values = self.bias + correction[3:6], self.values + correction[6:]
@@ -475,7 +475,7 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         return self._sensor_models[sensor]
 
     def _rows(self, measurement: _Measurement, sensor: str) -> tuple[Array, Array, Array]:
-        """Return residual (d,), H (d, n) and noise (d, d) of a measurement, by the kernels' own function."""
+        """Return residual (d,), H (d, n) and noise (d, d) of a measurement, from the kernels' function."""
         model, others = self._sensor_model(sensor, measurement.kind), np.concatenate([self.bias, self.values])
         H = np.zeros((3, len(self.x)))
         value = measurement.frame[:4] if measurement.kind == "attitude" else (*measurement.z, 0.0)
@@ -488,7 +488,7 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Measurement:
-    """A measurement as the kernels take it (:func:`strapdown.kernels.sensor_rows.fill_rows`)."""
+    """A measurement as the arguments of :func:`strapdown.kernels.sensor_rows.fill_rows`."""
 
     kind: str
     z: tuple[float, ...]
@@ -498,29 +498,29 @@ class _Measurement:
     length: float = 1.0
     """Length of a vector's reference; else 1."""
     noise: Array
-    """Covariance of ``z``, body axes (3, 3); of a heading the variance stands on the diagonal."""
+    """Covariance of ``z``, body axes (3, 3); for a heading its variance on the diagonal."""
 
     def has_direction(self, attitude: Array) -> bool:
-        """Return whether it is anything but the heading of a vector that is vertical at this attitude."""
+        """Return whether the measurement has information: all except the heading of a vector that is vertical at this attitude."""
         if self.kind != "heading":
             return True
         return bool(has_heading(rotation_matrix(tuple(attitude.tolist())), self.z))
 
 
 def _sensor_names(sensors: Sequence[str]) -> tuple[str, ...]:
-    """Return names of sensors as a tuple; one by itself is refused."""
+    """Return names of sensors as a tuple; a single string is refused."""
     if isinstance(sensors, str):
         raise InputError(f"sensors is {sensors!r}; it must be a sequence of names, ({sensors!r},)")
     return tuple(sensors)
 
 
 def _label(sensor: str, name: str) -> str:
-    """Return what a value is called in messages."""
+    """Return the name of a value for messages."""
     return f"{sensor}: {name}" if sensor else name
 
 
 def _noise_covariance(sensor: str, sigma: ArrayLike | None, covariance_b: ArrayLike | None) -> Array:
-    """Return the covariance (3, 3) in body axes of one σ, of one a body axis, or itself."""
+    """Return the covariance (3, 3) in body axes from one σ, three σ, or itself."""
     if (sigma is None) == (covariance_b is None):
         raise InputError("give either sigma or covariance: the noise of the measurement")
     if sigma is None:
@@ -529,7 +529,7 @@ def _noise_covariance(sensor: str, sigma: ArrayLike | None, covariance_b: ArrayL
     given = numbers(name, sigma)
     if given.shape not in ((), (1,), (3,)):
         raise InputError(
-            f"{name} has shape {given.shape}; give one number, three of the body axes, or a covariance (3, 3) as covariance"
+            f"{name} has shape {given.shape}; give one number, one per body axis, or a matrix as covariance"
         )
     spread = np.array([positive(name, float(value)) for value in np.broadcast_to(given, 3)])
     return np.diag(spread**2)

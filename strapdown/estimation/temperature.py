@@ -1,8 +1,8 @@
-"""The gyro's bias driven by temperature: a record in stretches of nearly one temperature, between which the slopes change the bias.
+"""Gyro bias driven by temperature: the record in segments of nearly constant temperature, between which the bias changes by its slopes.
 
-The state of a stretch has the bias at the stretch's mean temperature. At the next one it is ``b + c ΔT`` (:func:`shifted`, an exact linear
-step of mean and covariance, no kernel's matter). Within a stretch the slopes estimated at its start are applied to each sample, so that
-what is neglected is the slopes' error over 1/200 of the range of temperature, about its mean; and the σ is that at the mean.
+The state of a segment has the bias at the segment's mean temperature. At the next segment it is ``b + c ΔT`` (:func:`shifted`, an exact
+linear step of mean and covariance, outside the kernels). Within a segment the slopes estimated at its start are applied to each sample.
+This neglects the slopes' error over 1/200 of the range of temperature, about its mean; σ is that at the mean.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from strapdown.estimation.states import State
 from strapdown.records import Estimate, ImuRecord
 
 LEVELS = 200
-"""Stretches over the range of temperature, at the least."""
+"""Minimum number of segments over the range of temperature."""
 BLOCKS = 1000
-"""Parts of the record whose means show the temperature, at the most: a noisy thermometer makes as many stretches."""
+"""Maximum number of parts of the record whose mean temperatures are compared: limits the segments of a noisy thermometer."""
 
 
 def slopes(error_states: Sequence[ErrorStates]) -> slice | None:
-    """Return where the slopes stand among the error states; None where there are none."""
+    """Return the position of the slopes among the error states; None if there are none."""
     first = 0
     for one in error_states:
         if isinstance(one, GyroTemperature):
@@ -36,22 +36,22 @@ def slopes(error_states: Sequence[ErrorStates]) -> slice | None:
 
 
 def need_none(error_states: Sequence[ErrorStates], what: str) -> None:
-    """Refuse slopes where nothing drives them."""
+    """Raise an error if there are slopes, which this estimator does not use."""
     if slopes(error_states) is not None:
-        raise InputError(f"{what} has no bias driven by temperature; leave that state out")
+        raise InputError(f"{what} has no bias driven by temperature; leave the gyro temperature states out")
 
 
 def of(record: ImuRecord) -> Array:
     """Return the temperature of a record (n + 1,), °C."""
     if record.temperature is None:
         raise InputError(
-            "the record has no temperature, which drives the gyro's bias; give it, or leave that state out"
+            "the record has no temperature, which drives the gyro's bias; give it, or leave the gyro temperature states out"
         )
     return record.temperature
 
 
 def stretches(record: ImuRecord, every: int) -> Iterator[tuple[int, int, float]]:
-    """Yield first and last edge and mean temperature, °C, of stretches of whole numbers of ``every`` intervals."""
+    """Yield first and last edge and mean temperature, °C, of segments whose length is a multiple of ``every`` intervals."""
     T = of(record)
     middle, dt = 0.5 * (T[1:] + T[:-1]), np.diff(record.time)
     starts = np.arange(0, len(dt), every * max(1, -(-len(dt) // (BLOCKS * every))))
@@ -67,7 +67,7 @@ def stretches(record: ImuRecord, every: int) -> Iterator[tuple[int, int, float]]
 
 
 def shifted(state: State, own: slice, change: float) -> State:
-    """Return a state, and the restart candidate of its gate, after a change of temperature, K: ``b + c ΔT``."""
+    """Return a state and its gate's restart candidate after a change of temperature, K: ``b + c ΔT``."""
     columns = slice(6 + own.start, 6 + own.stop)
     J = np.eye(6 + len(state.values))
     J[3:6, columns] = change * np.eye(3)
@@ -88,14 +88,14 @@ def shifted(state: State, own: slice, change: float) -> State:
 
 
 def at_mean(record: ImuRecord, mean: float, slope: Array) -> tuple[ImuRecord, Array]:
-    """Return a stretch with the increments that it would have at its mean temperature, and the temperature's differences (n + 1,), K."""
+    """Return a segment with increments as if at its mean temperature, and the differences of temperature from it (n + 1,), K."""
     off = of(record) - mean
     turns = 0.5 * ((off[1:] + off[:-1]) * np.diff(record.time))[:, None] * slope
     return replace(record, increments=record.increments - turns), off
 
 
 def at_edges(estimate: Estimate, own: slice, off: Array) -> Estimate:
-    """Return an estimate of a stretch with the bias at the temperatures of its edges, ``off`` K from the mean."""
+    """Return an estimate of a segment with the bias at the temperatures of its edges, ``off`` K from the mean."""
     values = np.concatenate([one.values for one in estimate.error_states.values()], axis=1)[:, own]
     change = values * off[:, None]
     return replace(estimate, bias=estimate.bias + change)

@@ -1,6 +1,6 @@
-"""The filter with error states over several records at once, eight in the lanes of machine vectors: a Monte Carlo's runs.
+"""The filter with error states over several records at once, eight in the lanes of SIMD vectors: for the runs of a Monte Carlo.
 
-A record's estimate has the same bits whatever the records beside it, and agrees with that of :func:`strapdown.estimation.run` to rounding.
+A record's estimate is bit for bit independent of the other records, and agrees with that of :func:`strapdown.estimation.run` to rounding.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ from strapdown.kernels.machine import compiled, read_only
 from strapdown.records import Estimate
 
 PATTERN = (0.0,) * WIDTH
-"""One run a lane."""
+"""Argument that gives a kernel the number of lanes: one run per lane."""
 
 
 def supports(problem: Problem) -> bool:
-    """Return whether a record can be filtered beside others: its model has no chains, no offset in fixed axes and no temperature."""
+    """Return whether a record can be filtered with others: its model has no chains, no offset in fixed axes and no temperature."""
     model = problem.model
     return (
         temperature.slopes(problem.error_states) is None
@@ -53,14 +53,14 @@ def run(problems: Sequence[Problem], every: int, alone: Callable[[Problem], Esti
     problems : sequence of Problem
         Records, prepared for the same filter.
     every : int
-        Keep the state at every ``every``-th edge, the first included.
+        Store every ``every``-th edge, starting with the first.
     alone : callable
-        Filters a record that :func:`supports` refuses, or whose covariance lost its digits on the way.
+        Function that filters a record that :func:`supports` refuses, or whose covariance lost its digits.
 
     Returns
     -------
     list of Estimate
-        As of a run with ``full_covariance`` and ``whole_bias``, without the covariance of the error states.
+        Estimates as of a run with ``full_covariance`` and ``whole_bias``, without the covariance of the error states.
     """
     groups: list[list[int]] = []
     for i, problem in enumerate(problems):
@@ -97,14 +97,14 @@ def _alike(one: Problem, other: Problem) -> bool:
 
 
 def _common(problem: Problem) -> lane_states.Events:
-    """Return what the measurements of records that are alike have in common."""
+    """Return the data that the measurements of such records have in common."""
     record, events, model = problem.record, problem.events, problem.model
     columns = (
         events.time,
         events.row.astype(np.int64),
         events.sensor.astype(np.int64),
         events.kind.astype(np.int64),
-        events.triads[events.reference],  # of an attitude no kernel asks for it
+        events.triads[events.reference],  # not used for an attitude
         events.body_noise,
         lengths(record, events, model, unit_sigmas(record, model, problem.initial.unit_sigma)),
     )
@@ -112,7 +112,7 @@ def _common(problem: Problem) -> lane_states.Events:
 
 
 def _in_lanes(columns: Sequence[Array]) -> Array:
-    """Return a column of each record as the lanes of one array (..., WIDTH); the last record fills the lanes that are left."""
+    """Return a column of each record as the lanes of one array (..., WIDTH); the last record fills the remaining lanes."""
     (lanes,) = side_by_side(((*columns[0].shape, WIDTH), float))
     for lane in range(WIDTH):
         lanes[..., lane] = columns[min(lane, len(columns) - 1)]
@@ -120,7 +120,7 @@ def _in_lanes(columns: Sequence[Array]) -> Array:
 
 
 def _values(problem: Problem) -> Array:
-    """Return what was measured, in order of time (events, 4): a vector, or an attitude."""
+    """Return the measured values in order of time (events, 4): vectors, or attitudes."""
     events = problem.events
     values = np.zeros((len(events.time), 4))
     values[:, :3] = events.vector_b
@@ -130,7 +130,7 @@ def _values(problem: Problem) -> Array:
 
 
 def _filtered(problems: Sequence[Problem], every: int) -> list[Estimate | None]:
-    """Filter up to eight records that are alike; None in place of one whose covariance lost its digits."""
+    """Filter up to eight such records; None for one whose covariance lost its digits."""
     first = problems[0]
     events, model, edges = first.events, first.model, read_only(first.record.time)
     n, order, runs = 6 + model.states, first.model.whole_order, len(problems)
@@ -173,7 +173,7 @@ def _filtered(problems: Sequence[Problem], every: int) -> list[Estimate | None]:
 
 
 def _estimate(problem: Problem, every: int, kept: Array, innovation: Array) -> Estimate:
-    """Return what was written of one record."""
+    """Return the estimate of one record from the outputs of the kernel."""
     model, n = problem.model, 6 + problem.model.states
     attitude, x, variance, upper = np.split(kept, (4, n + 1, 2 * n + 1), axis=1)
     covariance = np.empty((len(kept), 6, 6))

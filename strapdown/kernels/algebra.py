@@ -1,7 +1,7 @@
 """Vectors, 3×3 matrices and symmetric matrices as tuples of scalars.
 
 A 3-vector is a 3-tuple, a 3×3 matrix a 9-tuple by rows, a symmetric one the 6-tuple of its upper triangle (00, 01, 02, 11, 12, 22).
-The scalars may be Python floats, numba scalars, lanes, or NumPy arrays.
+The scalars may be Python floats, numba scalars, SIMD lanes (:mod:`strapdown.kernels.lanes`), or NumPy arrays.
 """
 
 from __future__ import annotations
@@ -158,8 +158,8 @@ def skew_polynomial(identity, linear, quadratic, v):
 def factored(S):
     """Return S = L D Lᵀ of a symmetric positive-definite matrix, as (l10, l20, l21, 1/d0, 1/d1, 1/d2).
 
-    Eliminated without fractions (Bareiss 1968), so that no division waits for another: the differences, and with them the rounding, are
-    those of the elimination by rows times the pivots before.
+    Elimination without fractions (Bareiss 1968), so that no division waits for another: the differences, and so the rounding, are those of
+    the elimination by rows multiplied by the previous pivots.
     """
     m11 = S[0] * S[3] - S[1] * S[1]
     m21 = S[0] * S[4] - S[1] * S[2]

@@ -1,6 +1,6 @@
-"""Measurements: their kinds, their order of time, where their numbers are, and the rows that a filter updates with.
+"""Measurements: their kinds, their order of time, the storage of their numbers, and their rows in an update.
 
-Every kind enters as scalar rows ``y = h · δθ + noise`` of the body-side attitude error (:mod:`strapdown.kernels.filter_step`), on floats or
+Every kind enters by scalar rows ``y = h · δθ + noise`` of the body-side attitude error (:mod:`strapdown.kernels.filter_step`), on floats or
 lanes.
 """
 
@@ -32,11 +32,11 @@ ATTITUDE = 3
 variances."""
 
 VERTICAL = 1e-24
-"""Squared horizontal part of a vector below which it has no heading: a picoradian from the vertical, if it is of length one."""
+"""Minimum squared horizontal part of a vector with a heading: of a unit vector at a picoradian from the vertical."""
 
 
 class Measurements(NamedTuple):
-    """Measurements of all sensors (m in all). *Place*: number of a measurement where one sensor stands after the other."""
+    """Measurements of all sensors (m in total). *Place*: index of a measurement with one sensor after the other."""
 
     time: np.ndarray
     """Times in order (m,)."""
@@ -45,24 +45,24 @@ class Measurements(NamedTuple):
     sensor: np.ndarray
     """Sensor of each, in order of time (m,)."""
     value: np.ndarray
-    """Three numbers each, of the first sensor; ``series`` leads to those of the others."""
+    """Three numbers per measurement of the first sensor; ``series`` has the offsets of the others."""
     sigma: np.ndarray
-    """σ each, of the first sensor, likewise."""
+    """σ of each measurement of the first sensor, likewise."""
     noise: np.ndarray
-    """Covariances in body axes (m, 6) by place, or (0, 6) where σ is all."""
+    """Covariances in body axes (m, 6) by place, or (0, 6) if σ defines all noise."""
     series: np.ndarray
-    """A row for each sensor (sensors, 6), in the columns below."""
+    """One row per sensor (sensors, 6), with the columns below."""
     triads: np.ndarray
-    """Right-handed frames (u, v, r) by rows about references r (rows, 9); of an attitude the measured quaternion."""
+    """Right-handed frames (u, v, r) by rows about references r (rows, 9); for an attitude the measured quaternion."""
 
 
 VALUE_ORIGIN = 0
-"""Where place 0 of a sensor would be in ``value``, and in ``sigma``: each sensor's numbers stay where they were measured."""
+"""Index that place 0 of a sensor would have in ``value``, and in ``sigma``: each sensor's numbers stay in their original arrays."""
 SIGMA_ORIGIN = 1
 FIRST_PLACE = 2
 KIND = 3
 FIRST_FRAME = 4
-"""Row of ``triads`` of a sensor's first measurement, and how many rows on that of each next is, 0 or 1."""
+"""Row of ``triads`` of a sensor's first measurement, and step in rows to the next measurement's, 0 or 1."""
 FRAME_STEP = 5
 COLUMNS = 6
 
@@ -106,7 +106,7 @@ def frame_of(measured, place, sensor):
 
 
 def noise_of(measured, place, sensor, kind, z):
-    """Return the covariance of a measurement in body axes (6-tuple); of a heading its first number is the variance."""
+    """Return the covariance of a measurement in body axes (6-tuple); for a heading its first number is the variance."""
     if len(measured.noise) > 0:
         return six_at(measured.noise, place)
     if kind == ATTITUDE:
@@ -116,7 +116,7 @@ def noise_of(measured, place, sensor, kind, z):
 
 
 def degrees_of_freedom(kind):
-    """Return how many degrees of freedom a measurement of a kind has."""
+    """Return the number of degrees of freedom of a measurement of a kind."""
     if kind == HEADING:
         return 1
     return 2 if kind == DIRECTION else 3
@@ -141,10 +141,10 @@ def direction_rows(R, u, v, z):
 
 
 def heading_row(R, z):
-    """Return h of the heading of the horizontal part of a vector ``z`` (body): the turn δθ of the body shifts it by h · δθ.
+    """Return h of the heading of the horizontal part of a vector ``z`` (body): a rotation δθ of the body changes it by h · δθ.
 
-    With m = R z, a turn δφ in fixed axes shifts the heading by ``δφ_z − m_z (m_x δφ_x + m_y δφ_y)/(m_x² + m_y²)``: only of a level vector
-    is it the turn about the vertical alone. A vertical vector has no heading, and its row is zero.
+    With m = R z, a rotation δφ in fixed axes changes the heading by ``δφ_z − m_z (m_x δφ_x + m_y δφ_y)/(m_x² + m_y²)``: only for a
+    horizontal vector is it the rotation about the vertical. A vertical vector has no heading, and its row is zero.
     """
     m = matrix_times_vector(R, z)
     level = m[0] * m[0] + m[1] * m[1]
@@ -155,7 +155,7 @@ def heading_row(R, z):
 
 
 def has_heading(R, z):
-    """Return whether a vector ``z`` (body) is not vertical; scalar machine only."""
+    """Return whether a vector ``z`` (body) is not vertical; scalars only."""
     x, y, _ = matrix_times_vector(R, z)
     return x * x + y * y > VERTICAL
 
@@ -169,8 +169,8 @@ def heading_error(R, z, reference):
 def measurement_rows(kind, q, R, z, frame, noise):
     """Return (h1, h2, h3, y1, y2, y3, covariance of the rows); ``frame`` the triad of the reference by rows, or a measured quaternion.
 
-    ``noise`` is the covariance in body axes (6-tuple); of a heading its first number is the variance. A measurement of fewer than three
-    degrees of freedom is filled up by rows of h = 0, y = 0 and unit variance, which change nothing. Scalar machine only.
+    ``noise`` is the covariance in body axes (6-tuple); for a heading its first number is the variance. A measurement of fewer than three
+    degrees of freedom is completed by rows of h = 0, y = 0 and unit variance, which have no effect. Scalars only.
     """
     none = (0.0, 0.0, 0.0)
     if kind == ATTITUDE:
@@ -210,10 +210,10 @@ def independent_rows(h1, h2, h3, y1, y2, y3, noise):
 
 
 def merge_order(time, heads, ends, ordered, place, sensor):
-    """Merge several series, each sorted, that stand one after the other in ``time``; at one time the earlier series comes first.
+    """Merge several sorted series, stored one after the other in ``time``; at equal times the earlier series comes first.
 
-    Writes for each measurement in order of time when and where it stands and the number of its series. ``heads`` and ``ends`` bound each
-    series; ``heads`` is used up.
+    Writes time, place and index of the series of each measurement, in order of time. ``heads`` and ``ends`` bound each series; ``heads``
+    is modified.
     """
     for e in range(len(place)):
         best = 0
@@ -230,9 +230,9 @@ def merge_order(time, heads, ends, ordered, place, sensor):
 
 
 def common_order(time, number, ordered, place, sensor):
-    """Write what :func:`merge_order` does for ``number`` series that share the times ``time``."""
+    """Write the result of :func:`merge_order` for ``number`` series with the same times ``time``."""
     count = len(time)
-    if number == 2:  # the commonest; written out, the loop goes in machine vectors and takes a third of the time
+    if number == 2:  # the most frequent; written out, the loop is vectorised and takes a third of the time
         for k in range(count):
             now = time[k]
             ordered[2 * k] = now

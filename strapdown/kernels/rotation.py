@@ -1,8 +1,8 @@
 """Rotations on tuples: quaternions (w, x, y, z), rotation vectors, right Jacobians. Conventions as in :mod:`strapdown`.
 
-Of small angles (up to ``LARGEST_ANGLE``) the functions are polynomials without branches, of floats or lanes: :func:`exponential`,
-:func:`turned`, :func:`right_jacobian`, :func:`near_inverse_right_jacobian`. Of any angle they are scalar: :func:`moved`, :func:`logarithm`,
-:func:`inverse_right_jacobian`, :func:`composed`; :func:`far_turn` is for lanes too.
+For small angles (up to ``LARGEST_ANGLE``) the functions are polynomials without branches, for floats or SIMD lanes: :func:`exponential`,
+:func:`turned`, :func:`right_jacobian`, :func:`near_inverse_right_jacobian`. For any angle they are scalar: :func:`moved`,
+:func:`logarithm`, :func:`inverse_right_jacobian`, :func:`composed`; only :func:`far_turn` accepts lanes too.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _A0, _A1, _A2, _A3, _A4, _A5, _A6, _A7, _A8, _A9, _A10, _A11 = _A
 _I0, _I1, _I2 = 1.0 / 12.0, 1.0 / 720.0, 1.0 / 30240.0
 _I3, _I4, _I5 = 1.0 / 1209600.0, 1.0 / 47900160.0, 691.0 / 1307674368000.0
 SHORT = 1e-4
-"""rad²: where two angles are not larger than its root, four terms of the series of their composition are good to rounding."""
+"""Maximum squared angle, rad², of both rotations for which four terms of the series of their composition are exact to rounding."""
 _SINE_SQUARED = math.sin(0.5 * LARGEST_ANGLE) ** 2
 
 
@@ -50,8 +50,8 @@ def exponential(phi):
 def turned(q, phi):
     """Return q ⊗ exp(φ), with the norm of q brought back to one: equation (17) over a step at constant rate.
 
-    The factor (3 − |q|²)/2, one Newton step, goes into the exponential, where it costs no latency. It removes the rounding of the step
-    before (a norm error of 1e-15 falls to 1e-30) and cannot hide a fault: an error of 1e-3 stays visible at 1e-6.
+    The factor (3 − |q|²)/2, one Newton step, is applied to the exponential, where it adds no latency. It removes the rounding of the
+    previous step (a norm error of 1e-15 falls to 1e-30) and cannot hide a fault: an error of 1e-3 remains visible at 1e-6.
     """
     y = 0.25 * dot(phi, phi)
     n = 1.5 - 0.5 * (q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
@@ -60,7 +60,7 @@ def turned(q, phi):
 
 
 def renormalized(q):
-    """Return q scaled by (3 − |q|²)/2, the Newton step of :func:`turned` on its own."""
+    """Return q scaled by (3 − |q|²)/2, the Newton step of :func:`turned`."""
     n = 1.5 - 0.5 * (q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
     return (n * q[0], n * q[1], n * q[2], n * q[3])
 
@@ -105,10 +105,10 @@ def right_jacobian(phi):
 
 
 def far_turn(phi):
-    """Return exp(φ) and J_r(φ) of a turn beyond the range of the polynomials, from a 64th of it by doubling.
+    """Return exp(φ) and J_r(φ) of a rotation beyond the range of the polynomials, from a 64th of it by doubling.
 
-    ``J_r(2φ) = ½ (I + exp(−[φ])) J_r(φ)``. Good to rounding up to 20 rad: a correction of more than half a turn says only that the filter
-    is lost, but its Jacobian must stay one, of norm one at most, for the covariance to stay finite.
+    ``J_r(2φ) = ½ (I + exp(−[φ])) J_r(φ)``. Exact to rounding up to 20 rad. A correction of more than half a rotation occurs only if the
+    filter has diverged, but its Jacobian must still have a norm of at most one for the covariance to stay finite.
     """
     part = scale(0.015625, phi)
     q = exponential(part)
@@ -127,12 +127,12 @@ def arcsine(x):
 
 
 def arcsine_series(x):
-    """Return 2 asin s / s at s = √x to the fourth term: good to rounding for x ≤ ``SHORT``."""
+    """Return 2 asin s / s at s = √x to the fourth term: exact to rounding for x ≤ ``SHORT``."""
     return (2.0 + 2.0 * _A1 * x) + (x * x) * (2.0 * _A2 + 2.0 * _A3 * x)
 
 
 def logarithm(q):
-    """Return the rotation vector of a unit quaternion, the shorter way round, any angle."""
+    """Return the rotation vector of a unit quaternion, of any angle, as the shorter rotation."""
     v = (q[1], q[2], q[3])
     x = dot(v, v)
     if x <= _SINE_SQUARED:
@@ -144,7 +144,7 @@ def logarithm(q):
 
 
 def near_inverse_right_jacobian(phi):
-    """Return :func:`inverse_right_jacobian` for θ ≤ ``LARGEST_ANGLE``, of floats or lanes."""
+    """Return :func:`inverse_right_jacobian` for θ ≤ ``LARGEST_ANGLE``, for floats or lanes."""
     return skew_polynomial(1.0, 0.5, polynomial(dot(phi, phi), _I0, _I1, _I2, _I3, _I4, _I5), phi)
 
 
@@ -158,7 +158,7 @@ def inverse_right_jacobian(phi):
 
 
 def moved(q, phi):
-    """Return q ⊗ exp(φ) and J_r(φ) at any angle: what the filter does to an attitude and its tangent space, without its bound."""
+    """Return q ⊗ exp(φ) and J_r(φ) for any angle: a correction of an attitude and of its tangent space."""
     x = dot(phi, phi)
     if x <= LARGEST_ANGLE * LARGEST_ANGLE:
         return turned(q, phi), right_jacobian(phi)

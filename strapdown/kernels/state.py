@@ -1,4 +1,4 @@
-"""A state (q, b, A, B, C) as 28 numbers: attitude, bias, and the blocks of the covariance, of one filter or of one a lane."""
+"""A state (q, b, A, B, C) as 28 numbers: attitude, bias, and the blocks of the covariance; of one filter, or of one per SIMD lane."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ SIZE = 28
 
 
 def load_state(row):
-    """Return (q, b, A, B, C) of 28 numbers."""
+    """Return (q, b, A, B, C) from 28 numbers."""
     n = tuple(row[i] for i in range(SIZE))
     return n[:4], n[4:7], n[7:13], n[13:22], n[22:]
 
@@ -26,7 +26,7 @@ def store_row(out, row, values):
 
 
 def keep_state(out, row, q, b, A, B, C):
-    """Write a state to a row of the outputs: attitude, bias, variances, and the blocks of the covariance where there is room."""
+    """Write a state to a row of the outputs: attitude, bias, variances, and, if the outputs have them, the blocks of the covariance."""
     store_row(out.attitude, row, q)
     store_row(out.bias, row, b)
     store_row(out.variance, row, (A[0], A[3], A[5], C[0], C[3], C[5]))
@@ -50,7 +50,7 @@ def load_matrix(array, start):
 
 
 def store_several(array, start, values):
-    """Write the lanes of any number of components to ``array[start]`` and on."""
+    """Write the lanes of any number of components from ``array[start]`` on."""
     for i, value in enumerate(values):
         store(array, start + i * WIDTH, value)
 

@@ -1,29 +1,29 @@
-"""Other attitude filters on one interface.
+"""Other attitude filters with the same interface, for comparison.
 
-They can be compared in one line, which prints a table::
+They are compared by one call, which returns a table::
 
     print(filters.compare(record, process_noise, initial))
 
-All of them estimate attitude and gyro bias from the same record, by the same schedule of measurements, with the same model of the gyro,
-and report their covariance in the body-side convention of the package, (δθ, δb). They differ in how they define the error:
+All of them estimate attitude and gyro bias from the same record, with the same order of measurements and the same model of the gyro, and
+report their covariance in the body-side convention of the package, (δθ, δb). They differ in the definition of the error:
 
-- ``mekf``: body side, ``q_true = q ⊗ exp(δθ)``, with the reset of the covariance (:mod:`strapdown.estimation.forward`; the one to use);
+- ``mekf``: body side, ``q_true = q ⊗ exp(δθ)``, with the reset of the covariance (:mod:`strapdown.estimation.forward`; recommended);
 - ``fixed-side``: ``q_true = exp(δφ) ⊗ q``, with its reset: the same filter in other coordinates;
 - ``right-invariant``: fixed-side without a reset, the "imperfect" invariant filter (Barrau & Bonnabel 2017);
 - ``two-frame``: right-invariant on the two-frames group, attitude and bias error both in fixed axes (Barrau & Bonnabel 2023);
-- ``equivariant``: that of two-frame, with the equivariant rows of directions (van Goor, Hamel & Mahony 2022; Fornasier et al. 2022);
+- ``equivariant``: two-frame with the equivariant rows of directions (van Goor, Hamel & Mahony 2022; Fornasier et al. 2022);
 - ``geometric``: bias error in a common frame, body side (Andrle & Crassidis 2015);
 - ``schmidt``: body side, the gyro bias considered and not estimated (Schmidt 1966);
 - ``usque``: unscented, generalised Rodrigues parameters (Crassidis & Markley 2003);
 - ``mahony``: complementary, fixed gains (Mahony, Hamel & Pflimlin 2008).
 
-Every filter takes directions, vectors, headings and attitudes with every form of noise (:mod:`strapdown.vectors`). Mahony's gains are
-one number a sensor, whatever the shape of its noise; the covariance that it reports is that of those gains under that noise.
+Every filter accepts directions, vectors, headings and attitudes with every kind of noise (:mod:`strapdown.vectors`). Mahony's filter has
+one gain per sensor, whatever the shape of its noise; the covariance that it reports is that of those gains under that noise.
 
-They run over whole records only: sample by sample the MEKF is there (:class:`strapdown.estimation.StepFilter`).
+They run over whole records only; for sample-by-sample processing use the MEKF (:class:`strapdown.estimation.StepFilter`).
 
-A filter of one's own is compared by giving it beside their names (:mod:`strapdown.estimation.filters.own`). To add one to the package,
-write a module like those of :mod:`strapdown.kernels.filters`, which defines its error, and enter it in :data:`FILTERS`.
+A filter of your own can be compared with them (:mod:`strapdown.estimation.filters.own`). To add one to the package, write a module like
+those of :mod:`strapdown.kernels.filters`, which defines its error, and enter it in :data:`FILTERS`.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ FILTERS: dict[str, Filter] = {
     "usque": unscented.run,
     "mahony": complementary.run,
 }
-"""The filters by name."""
+"""Filters by name."""
 
 
 def run(
@@ -96,7 +96,7 @@ def run(
     name : str
         One of :data:`FILTERS`.
     record : ImuRecord
-        With measurements of any kind and noise.
+        Record with measurements of any kind and noise.
     process_noise : ProcessNoise
         Angle random walk and rate random walk of the gyro, as the filter models them.
     initial : State
@@ -109,7 +109,7 @@ def run(
     Returns
     -------
     Estimate
-        Attitude and bias with their variances at the kept edges, and the innovations.
+        Attitude and bias with their variances at the stored edges, and the innovations.
 
     Raises
     ------
@@ -138,25 +138,25 @@ def compare(
     Parameters
     ----------
     record : ImuRecord
-        With its truth, errors are compared; without it, the differences from the first filter.
+        Record; if it has a truth, errors are compared, otherwise the differences from the first filter.
     process_noise : ProcessNoise
         Angle random walk and rate random walk of the gyro, as the filters model them.
     initial : State
         State at the first edge, from which all filters start.
     filters : iterable of str or filter, default all of :data:`FILTERS`
-        Names, and filters of one's own (:mod:`strapdown.estimation.filters.own`). The unscented filter needs some tenths of a
-        millisecond a step, the others a microsecond.
+        Names, and filters of your own (:mod:`strapdown.estimation.filters.own`). The unscented filter needs some tenths of a
+        millisecond per step, the others a microsecond.
     every : int, default 1
         Store every n-th edge, the first included.
     full_covariance : bool, default False
         Store whole covariance matrices too.
     bound : array_like (n, 6, 6), optional
-        Cramér–Rao bound at the kept edges (:attr:`strapdown.covariance.Analysis.cramer_rao`): errors are compared with its root.
+        Cramér–Rao bound at the stored edges (:attr:`strapdown.covariance.Analysis.cramer_rao`): errors are compared with its root.
 
     Returns
     -------
     Comparison
-        Prints as a table.
+        Result, which prints as a table.
 
     Raises
     ------
@@ -174,7 +174,7 @@ def compare(
     names = [one if isinstance(one, str) else one.name for one in chosen]
     twice = {name for name in names if names.count(name) > 1}
     if twice:
-        raise InputError(f"filters holds two of the name {min(twice)}; give yours another by an attribute name")
+        raise InputError(f"filters has two of the name {min(twice)}; give yours another one by an attribute `name`")
     estimates = {
         name: one(record, initial, times=record.time[::every])
         if isinstance(one, Own)

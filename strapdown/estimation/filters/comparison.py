@@ -1,4 +1,4 @@
-"""Several filters over one record, side by side, as numbers and as a table."""
+"""Several filters over one record, compared in numbers and in a table."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ from strapdown.units import DEGREE, DEGREE_PER_HOUR
 class Comparison(Listed):
     """Estimates of one record by several filters. Printed, it is a table.
 
-    The numbers are of the second half of the record, when filters that find their way have found it: root mean squares over time and axes.
+    The numbers are root mean squares over time and axes in the second half of the record, after convergence.
     """
 
     estimates: Mapping[str, Estimate]
     """Estimates by filter."""
     truth: Truth | None = None
-    """At the times of the estimates."""
+    """Truth at the times of the estimates."""
     bound: Array | None = None
     """Cramér–Rao bound (n, 6, 6) at those times."""
 
     def summary(self) -> dict[str, dict[str, float]]:
-        """Return the numbers of each filter by name, in SI; what the record does not show is NaN.
+        """Return the numbers of each filter by name, in SI; NaN if not available.
 
-        ``attitude_error`` and ``bias_error`` are against the truth, or without one the differences from the first filter;
-        ``attitude_sigma`` and ``bias_sigma`` the filter's own σ; ``nis`` is the mean normalised innovation squared over the
-        degrees of freedom, of which there are ``degrees``: 1 for a right filter, give or take √(2/degrees). With a bound,
-        ``attitude_over_bound`` and ``bias_over_bound`` are the RMS of the errors over the root of the bound.
+        ``attitude_error`` and ``bias_error`` are relative to the truth, or without one to the first filter; ``attitude_sigma`` and
+        ``bias_sigma`` are the filter's σ; ``nis`` is the mean normalised innovation squared over the ``degrees`` of freedom, which is
+        1 ± √(2/degrees) for a consistent filter. With a bound, ``attitude_over_bound`` and ``bias_over_bound`` are the RMS of the
+        errors over the root of the bound.
         """
         first = next(iter(self.estimates.values()))
         attitude, bias = (first.attitude, first.bias) if self.truth is None else (self.truth.attitude, self.truth.bias)
@@ -59,12 +59,12 @@ class Comparison(Listed):
         return result
 
     def listing(self) -> Listing:
-        """Return errors beside the filter's own σ, which should agree, as a table."""
+        """Return errors and the filter's σ, which should agree, as a table."""
         against = "error" if self.truth is not None else f"from {next(iter(self.estimates))}"
         found = self.summary()
         rows: list[tuple[str, ...]] = []
         for name, row in found.items():
-            itself = self.truth is None and not rows  # its difference from itself
+            itself = self.truth is None and not rows  # no difference to report
             bias, bias_sigma = row["bias_error"] / DEGREE_PER_HOUR, row["bias_sigma"] / DEGREE_PER_HOUR
             angle = "-" if itself else figure(row["attitude_error"] / DEGREE)
             numbers = (row["attitude_sigma"] / DEGREE, math.nan if itself else bias, bias_sigma, row["nis"])
@@ -76,7 +76,7 @@ class Comparison(Listed):
         ]
         if bounded:
             notes.append(
-                "error/√bound: error over the root of the Cramér–Rao bound, about 1 over many runs of the best filter."
+                "error/√bound: error over the root of the Cramér–Rao bound, about 1 on average for an efficient filter."
             )
         if degrees := max(row["degrees"] for row in found.values()):
             notes.append(

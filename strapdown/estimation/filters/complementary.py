@@ -1,7 +1,7 @@
 """The explicit complementary filter with bias correction (Mahony, Hamel & Pflimlin 2008, equations (32)): the baseline.
 
-It has fixed gains and converges from almost any start. It knows no covariance of its own; the one reported is that of its linearised error
-under its own gains, so that it can be judged like the others.
+It has fixed gains and converges from almost any start. It computes no covariance; the one reported is that of its linearised error under
+its gains, so that its consistency can be tested like that of the others.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ class Gains:
     """Gains of each sensor, in the order of the record, for ``ω_mes = z × R̂ᵀ r``."""
 
     attitude: Array
-    """Turn of the attitude, rad a rad (sensors,): k_P times the weight of the sensor times its sample interval."""
+    """Rotation of the attitude per angle, rad/rad (sensors,): k_P times the weight of the sensor times its sample interval."""
     bias: Array
-    """Change of the bias, rad/s a rad (sensors,), not positive: −k_I times the same."""
+    """Change of the bias per angle, rad/s/rad (sensors,), not positive: −k_I times the same."""
 
 
 def farrenkopf_gains(
@@ -41,7 +41,7 @@ def farrenkopf_gains(
     sv = angle_random_walk * math.sqrt(interval) / sigma
     gamma = math.sqrt(1.0 + sv * sv / 4.0 + su * su / 48.0)
     zeta = gamma + su / 4.0 + 0.5 * math.sqrt(2.0 * gamma * su + sv * sv + su * su / 3.0)
-    # (ζ² − 1)/ζ² written by (ζ − 1), which keeps its digits when the gain is small.
+    # (ζ² − 1)/ζ² written with (ζ − 1), which keeps its digits if the gain is small.
     return (zeta - 1.0) * (zeta + 1.0) / (zeta * zeta), -su / (interval * zeta)
 
 
@@ -73,10 +73,10 @@ def run(
     full_covariance: bool = False,
     gains: Gains | None = None,
 ) -> Estimate:
-    """Run the filter over a whole record, compiled; options as :func:`strapdown.estimation.filters.run`.
+    """Run the filter over a whole record, compiled; options as for :func:`strapdown.estimation.filters.run`.
 
-    Default gains: Farrenkopf's of all sensors together, shared among them by information, for random walks that also carry attitude and
-    bias through their initial standard deviations over the record: a gain that is fixed must serve the start as well as the end.
+    Default gains: Farrenkopf's for all sensors together, divided among them by information, with random walks increased by the initial
+    standard deviations of attitude and bias over the record: a fixed gain must be suitable for the start as well as the end.
     """
     events = extended.checked_schedule(record, process_noise, initial, every)
     if gains is not None:

@@ -1,8 +1,8 @@
-"""Extended Kalman filters that differ from the MEKF in what they call the error, compiled.
+"""Extended Kalman filters that differ from the MEKF in the definition of the error, compiled.
 
-Between updates most of them propagate the same Gaussian, seen in different coordinates, and their gains are the same matrix seen in
-different coordinates. What differs is the step over an update: which tangent space the covariance belongs to afterwards, and how a
-correction moves the bias. In body-side terms, after an attitude correction a, the covariance is carried by
+Between updates most of them propagate the same Gaussian in different coordinates, and their gains are the same matrix in different
+coordinates. They differ in the step after an update: the tangent space of the covariance, and how a correction changes the bias. In
+body-side terms, after an attitude correction a, the covariance is transformed by G:
 
 ===============  ==================================  =====================================
 filter           G on (δθ, δb)                       bias
@@ -16,14 +16,14 @@ geometric        [[I, 0], [[b⁺ − b], I]]             exp(−[a]) b + c
 schmidt          diag(J_r(a), I)                     b
 ===============  ==================================  =====================================
 
-with c the linear correction of the filter's own bias error, and [·] the skew matrix. The geometric filter leaves the covariance of (δθ, η)
-alone, η = δb − [b] δθ; that is its G in (δθ, δb). The equivariant filter differs from the two-frame one in the rows of directions.
+with c the linear correction of the filter's bias error, and [·] the skew matrix. The geometric filter leaves the covariance of (δθ, η)
+unchanged, η = δb − [b] δθ; that is its G in (δθ, δb). The equivariant filter differs from the two-frame one in the rows of directions.
 
-Each is a module of :mod:`strapdown.kernels.filters`, and an entry of :data:`strapdown.estimation.filters.FILTERS`. All stay finite from any
-start, however far off and however wrong its covariance, and P positive definite to rounding: corrections of any size go through closed
-forms, a row of a measurement is processed by Joseph's form, and a heading whose vector is estimated to be vertical is skipped and counted.
-The geometric filter needs one bound more, which the paper does not have: its bias grows across corrections beyond 1.8955 rad, so a longer
-one is shortened to that (:data:`strapdown.kernels.filters.geometric.LARGEST_CORRECTION`).
+Each is a module of :mod:`strapdown.kernels.filters`, and an entry of :data:`strapdown.estimation.filters.FILTERS`. All stay finite for any
+initial error and covariance, and P positive definite to rounding: corrections of any size use closed forms, measurement rows are processed
+in Joseph's form, and a heading whose vector is estimated to be vertical is skipped and counted. The geometric filter needs a bound that the
+paper does not have: corrections beyond 1.8955 rad would increase its bias, so they are shortened to that
+(:data:`strapdown.kernels.filters.geometric.LARGEST_CORRECTION`).
 """
 
 from __future__ import annotations
@@ -52,13 +52,13 @@ def run(
     every: int = 1,
     full_covariance: bool = False,
 ) -> Estimate:
-    """Run the filter that a module of :mod:`strapdown.kernels.filters` defines over a whole record."""
+    """Run the filter defined by a module of :mod:`strapdown.kernels.filters` over a whole record."""
     events = checked_schedule(record, process_noise, initial, every)
     return run_scheduled(definition, record, events, process_noise, initial, np.empty((2, 0)), every, full_covariance)
 
 
 def checked_schedule(record: ImuRecord, process_noise: ProcessNoise, initial: State, every: int) -> Schedule:
-    """Return the measurements of a record in order of time; arguments of the wrong kind are refused."""
+    """Return the measurements of a record in order of time, after a check of the arguments."""
     check_arguments(record=record, process_noise=process_noise, initial=initial)
     count("every", every)
     return schedule(record.vectors, record.time[0], record.time[-1], anisotropic=True)
@@ -74,7 +74,7 @@ def run_scheduled(
     every: int,
     full_covariance: bool,
 ) -> Estimate:
-    """Run the filter over scheduled measurements, with ``gains`` (2, sensors) if it has fixed ones."""
+    """Run the filter over scheduled measurements, with ``gains`` (2, sensors) if it has fixed gains."""
     states = np.empty((len(record.increments) // every + 1, 28))
     innovation = np.empty((len(events.time), 6))
     body = kernel.Body(

@@ -1,6 +1,6 @@
-"""A filter of one's own: a function, or an object with a method ``run``, that takes a record and an initial state and returns an estimate.
+"""User-defined filters: functions, or objects with a method ``run``, of a record and an initial state that return an estimate.
 
-Where a filter of this package is named, one's own may stand instead: in :attr:`strapdown.estimation.setup.FilterSetup.estimator`, and so in
+Such a filter can be given in place of a filter of this package: in :attr:`strapdown.estimation.setup.FilterSetup.estimator`, and so in
 every Monte Carlo (threads, processes or Dask, resumed and replayed), and in :func:`strapdown.estimation.filters.compare`.
 
 >>> import numpy as np
@@ -39,60 +39,60 @@ from strapdown.files import reading
 from strapdown.records import Estimate, ImuRecord
 
 DEFAULT_NAME = "estimator"
-"""Name of the filter in a Python file where none is given."""
+"""Default name of the filter in a Python file."""
 
 
 class OwnFilter(Protocol):
-    """Interface of a filter of one's own; a plain function of the same two arguments does as well."""
+    """Interface of a user-defined filter; a function of the same two arguments may be given instead."""
 
     def run(self, record: ImuRecord, initial: State) -> Estimate:
-        """Return the estimate at the record's edges, or at some of them.
+        """Return the estimate at all or some of the record's edges.
 
         Parameters
         ----------
         record : ImuRecord
-            Gyro increments, rad, and measurements; without the truth. Its σ are those that the setup says the filter assumes.
+            Gyro increments, rad, and measurements, without the truth. Its σ are those of the setup.
         initial : State
-            Attitude, gyro bias (rad/s) and covariance (6, 6) of their errors at the first edge. A filter that finds its start by itself
-            ignores it.
+            Attitude, gyro bias (rad/s) and covariance (6, 6) of their errors at the first edge. A filter that finds its own initial state
+            may ignore it.
 
         Returns
         -------
         Estimate
-            :meth:`strapdown.records.Estimate.from_arrays` makes one.
+            Estimate, for example from :meth:`strapdown.records.Estimate.from_arrays`.
         """
 
 
 @dataclass(frozen=True, eq=False)
 class Own:
-    """A filter of one's own with its description; :func:`as_own` makes it. Two of the same description are equal.
+    """A user-defined filter with its description, from :func:`as_own`. Filters with the same description are equal.
 
-    Each call works on a deep copy of an object, so that runs share no state: they may go on in several threads, and in any order.
+    Each call works on a deep copy of an object, so that runs share no state and can proceed in several threads, in any order.
 
     Parameters
     ----------
     given : callable, object with a method ``run``, or mapping
-        The function or object, or the description of one that was read from a file, which cannot run.
+        Function or object, or the description of one that was read from a file, which cannot run.
     source : mapping, default empty
-        Of a filter read from a Python file: that file and its SHA-256, which stand in the description.
+        For a filter read from a Python file: that file and its SHA-256, for the description.
     """
 
     given: Any
     source: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Check that it can be called."""
+        """Check that the filter can be called."""
         if not isinstance(self.given, Mapping):
             _function(self.given)
 
     @property
     def name(self) -> str:
-        """Its attribute ``name`` where it has one, or the name of the function or class."""
+        """Attribute ``name`` of the filter if it has one, otherwise the name of the function or class."""
         return str(self.table["name"])
 
     @functools.cached_property
     def table(self) -> dict[str, Any]:
-        """Identity in files: name, parameters, and the SHA-256 of its source where Python knows that."""
+        """Identity in files: name, parameters, and the SHA-256 of the source if available."""
         if isinstance(self.given, Mapping):
             return dict(self.given)
         inner, parameters = self.given, {}
@@ -116,7 +116,7 @@ class Own:
             return table | dict(self.source)
         try:
             table["source_sha256"] = hashlib.sha256(inspect.getsource(code).encode()).hexdigest()
-        except (OSError, TypeError):  # typed at a prompt, or compiled
+        except (OSError, TypeError):  # interactive or compiled code
             table["module"] = str(getattr(code, "__module__", ""))
         return table
 
@@ -129,15 +129,15 @@ class Own:
         return hash(json.dumps(self.table, sort_keys=True, default=str))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Send the filter itself; its description is made anew."""
+        """Pickle the filter; its description is recomputed."""
         return Own, (self.given, self.source)
 
     def __call__(self, record: ImuRecord, initial: State, *, times: Array | None = None) -> Estimate:
-        """Run it over a record without its truth, and check what it returns; only the ``times`` wanted, of the record's edges, if given."""
+        """Run the filter over a record without its truth, and check the result; if ``times`` of edges are given, return only those."""
         if isinstance(self.given, Mapping):
             again = f"--filter {self.table['file']}" if "file" in self.table else "--filter FILE.py:NAME"
             raise InputError(
-                f"{self.name} is a filter of your own, whose code no result file holds; give it again: {again}, or in Python "
+                f"{self.name} is a filter of your own, whose code is not in the result file; give it again: {again}, or in Python "
                 "replace(plan, setup=replace(plan.setup, estimator=…))"
             )
         function = _function(_copied(self.given, self.name))
@@ -150,22 +150,22 @@ class Own:
 
 
 def as_own(filter_: Any) -> Own:
-    """Return one's own filter, a function or an object with a method ``run`` (:class:`OwnFilter`), with its description."""
+    """Return a user-defined filter, a function or an object with a method ``run`` (:class:`OwnFilter`), with its description."""
     return filter_ if isinstance(filter_, Own) else Own(filter_)
 
 
 def read_filter(place: str | os.PathLike[str]) -> Own:
-    """Return a filter of one's own from a Python file. The file is executed, with all that it imports.
+    """Return a user-defined filter from a Python file. The file is executed, with all that it imports.
 
     Parameters
     ----------
     place : path
-        ``FILE.py:NAME``, or ``FILE.py`` for the name ``estimator``. Files beside it can be imported while it is executed.
+        ``FILE.py:NAME``, or ``FILE.py`` for the name ``estimator``. During execution it can import modules of its folder.
 
     Returns
     -------
     Own
-        The function or object of that name. The hash of the file is part of its description.
+        Function or object of that name. The hash of the file is part of its description.
 
     Raises
     ------
@@ -186,7 +186,7 @@ def read_filter(place: str | os.PathLike[str]) -> Own:
     code = reading.content(path)
     module = types.ModuleType(path.stem)
     module.__file__ = str(path)
-    # Known by its name while it is executed, as dataclasses need, and not after: so it is sent to other processes by value.
+    # Registered under its name only during execution, as dataclasses need; so it is pickled to other processes by value.
     before = sys.modules.get(path.stem)
     sys.modules[path.stem] = module
     sys.path.insert(0, str(path.parent))
@@ -210,7 +210,7 @@ def read_filter(place: str | os.PathLike[str]) -> Own:
 
 
 def _function(given: Any) -> Any:
-    """Return what is called: the method ``run`` of an object that has one, else the object itself."""
+    """Return the function to call: the method ``run`` of an object that has one, else the object itself."""
     if isinstance(given, type):
         raise InputError(f"{given.__name__} is a class; give an object of it, {given.__name__}(…)")
     function = getattr(given, "run", given)
@@ -231,25 +231,23 @@ def _function(given: Any) -> Any:
 
 def _copied(given: Any, name: str) -> Any:
     try:
-        return copy.deepcopy(given)  # functions come back as they are
+        return copy.deepcopy(given)  # functions are returned unchanged
     except Exception as error:
         raise InputError(
-            f"{name} cannot be copied for each run ({error}); give a function that makes what cannot be copied anew"
+            f"{name} cannot be copied for each run ({error}); give a function that creates the parts that cannot be copied"
         ) from None
 
 
 def _checked(name: str, estimate: Any, record: ImuRecord, times: Array | None) -> Estimate:
-    """Return an estimate, of the wanted times only; refuse what cannot be compared with the record's truth."""
+    """Return an estimate at the wanted times only; raise an error if it cannot be compared with the record's truth."""
     own: Estimate = estimate
-    instance(
-        f"what {name} returns", estimate, Estimate, "return Estimate.from_arrays(record.time, attitude, covariance)"
-    )
+    instance(f"result of {name}", estimate, Estimate, "return Estimate.from_arrays(record.time, attitude, covariance)")
     time = increasing(f"{name}: time", estimate.time)
     place = np.minimum(np.searchsorted(record.time, time), len(record.time) - 1)
     if not np.array_equal(record.time[place], time):
         k = int(np.argmax(record.time[place] != time))
         raise InputError(
-            f"{name}: time[{k}] is {time[k]:.9g} s, and the record has no edge there; return values at record.time"
+            f"{name}: time[{k}] is {time[k]:.9g} s, where the record has no edge; return values at record.time"
         )
     for what, width in (("attitude", 4), ("bias", 3), ("variance", 6)):
         array(f"{name}: {what}", np.nan_to_num(getattr(estimate, what)), (len(time), width))
@@ -267,7 +265,7 @@ def _checked(name: str, estimate: Any, record: ImuRecord, times: Array | None) -
 
 
 def _plain(value: Any) -> Any:
-    """Return a parameter as a file can hold it: numbers and texts as they are, anything else by its type."""
+    """Return a parameter in a form for files: numbers and texts unchanged, anything else by its type."""
     if isinstance(value, np.ndarray | np.generic):
         value = value.tolist()
     if isinstance(value, bool | int | float | str):

@@ -1,11 +1,11 @@
 """USQUE, the unscented quaternion estimator (Crassidis & Markley 2003), on the sigma points of filterpy.
 
 The attitude error of each sigma point is three generalised Rodrigues parameters p about the central quaternion, body side,
-``q_true = q ⊗ δq(p)``, scaled so that p is the rotation vector for small errors. Two points are not the paper's: the process noise is the
-exact one of :mod:`strapdown.estimation`, added after the propagation, where the paper adds half of a trapezoid before and half after; and a
-direction enters with all three components (Shuster's trick: along the direction goes the mean of the two variances across it), its
-innovation reported as its two degrees of freedom. A measured attitude enters as its own three parameters about the central quaternion,
-linear in the state: no spread of the points, however wide, cuts it at half a turn.
+``q_true = q ⊗ δq(p)``, scaled so that p is the rotation vector for small errors. There are two differences from the paper. The process
+noise is the exact one of :mod:`strapdown.estimation`, added after the propagation (in the paper half of a trapezoid before and half after).
+A direction enters with all three components (Shuster's method: the variance along it is the mean of the two variances across it), and its
+innovation is reported in its two degrees of freedom. A measured attitude enters as its three parameters about the central quaternion,
+linear in the state, so that sigma points with a large spread cause no discontinuity at π.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])
 _A = 1.0
 _F = 2.0 * (_A + 1.0)
 _WHOLE = [0, 1, 2, 1, 3, 4, 2, 4, 5]
-"""Places of a whole symmetric matrix in its upper triangle."""
+"""Indices of the entries of a symmetric matrix in its upper triangle."""
 
 
 def rodrigues_to_quaternion(p: ArrayLike) -> Array:
@@ -43,7 +43,7 @@ def rodrigues_to_quaternion(p: ArrayLike) -> Array:
 
 
 def quaternion_to_rodrigues(q: ArrayLike) -> Array:
-    """Return p (..., 3) of unit quaternions (..., 4): f ρ / (a + w) = f tan(θ/4) n, of the shorter turn."""
+    """Return p (..., 3) of unit quaternions (..., 4): f ρ / (a + w) = f tan(θ/4) n, of the shorter rotation."""
     dq = np.asarray(q, np.float64)
     dq = np.where(dq[..., :1] < 0.0, -dq, dq)
     return np.asarray(_F * dq[..., 1:] / (_A + dq[..., :1]))
@@ -58,10 +58,10 @@ def run(
     full_covariance: bool = False,
     points: Any = None,
 ) -> Estimate:
-    """Run the filter over a whole record, in NumPy: some tenths of a millisecond a step.
+    """Run the filter over a whole record, in NumPy: some tenths of a millisecond per step.
 
-    ``points`` are filterpy's sigma points of 6 states; default: Julier's with κ = 1, the paper's λ, all weights positive. Other options as
-    :func:`strapdown.estimation.filters.run`.
+    ``points`` are filterpy's sigma points for 6 states; default: Julier's with κ = 1, the paper's λ, all weights positive. Other options as
+    for :func:`strapdown.estimation.filters.run`.
     """
     from filterpy.kalman import JulierSigmaPoints  # with SciPy's statistics, half a second that few uses need
 
@@ -69,7 +69,7 @@ def run(
     if getattr(points, "n", None) != 6:
         what = f"are of {points.n} states" if hasattr(points, "n") else f"is {points!r}"
         raise InputError(
-            f"points {what}; give filterpy's sigma points of 6 states, three of attitude and three of bias"
+            f"points {what}; give filterpy's sigma points for 6 states, three of attitude and three of bias"
         )
     events = extended.checked_schedule(record, process_noise, initial, every)
     steps = in_steps(record, events, every)
@@ -90,24 +90,24 @@ def run(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Steps:
-    """Each step predicts over ``dt`` if ``dt > 0``, then updates with an event if it has one, then keeps the state if asked."""
+    """Steps: each predicts over ``dt`` if ``dt > 0``, then updates with an event if there is one, then stores the state if requested."""
 
     dt: Array
-    """s (k,)."""
+    """Duration, s (k,)."""
     increment: Array
     """Integral of the measured rate over dt (k, 3), rad."""
     event: np.ndarray
     """Index of the measurement, −1: none."""
     row: np.ndarray
-    """Row of the estimate that the state goes to, −1: none."""
+    """Row of the estimate in which the state is stored, −1: none."""
     time: Array
     """Times of the rows (m,), s."""
 
 
 def in_steps(record: ImuRecord, events: Schedule, every: int) -> Steps:
-    """Return the steps that take a filter through a record."""
+    """Return the steps of a filter over a record."""
     edges = record.time
-    # Both are in order already; at one time the events come first.
+    # Both are sorted; at equal times the events come first.
     at_event = np.arange(len(events.time)) + np.searchsorted(edges, events.time, side="left")
     at_edge = np.arange(len(edges)) + np.searchsorted(events.time, edges, side="right")
     time = np.empty(len(at_event) + len(at_edge))
@@ -120,7 +120,7 @@ def in_steps(record: ImuRecord, events: Schedule, every: int) -> Steps:
     interval[at_edge] = np.maximum(np.arange(len(edges)) - 1, 0)
     dt = np.diff(time, prepend=edges[0])
     increment = record.increments[interval] * (dt / np.diff(edges)[interval])[:, None]
-    # Parts of a large turn end in steps without measurement or stored row; the last part has both.
+    # Parts of a large rotation end in steps without measurement or stored row; the last part has both.
     parts = (np.linalg.norm(increment, axis=1) / LARGEST_ANGLE).astype(np.int64) + 1
     whole = np.repeat(np.arange(len(dt)), parts)
     last = np.append(whole[1:] != whole[:-1], True)
@@ -135,7 +135,7 @@ def in_steps(record: ImuRecord, events: Schedule, every: int) -> Steps:
 
 
 def _product(p: Array, q: Array) -> Array:
-    """Return p ⊗ q of clouds of quaternions, without the checks of :func:`strapdown.quaternion.multiply`, which would double the time."""
+    """Return p ⊗ q of arrays of quaternions, without the checks of :func:`strapdown.quaternion.multiply`, which would double the time."""
     return np.array(quaternion_multiply(p.T, q.T)).T
 
 
@@ -148,7 +148,7 @@ def _spread(points: Any, q: Array, b: Array, P: Array) -> tuple[Array, Array]:
 def _predict(
     points: Any, q: Array, b: Array, P: Array, increment: Array, dt: float, process_noise: ProcessNoise
 ) -> tuple[Array, Array, Array]:
-    """Propagate each sigma point by equation (17) with its own bias."""
+    """Propagate each sigma point by equation (17) with its bias."""
     sigma, attitudes = _spread(points, q, b, P)
     attitudes = _product(attitudes, quaternion.exp(increment - dt * sigma[:, 3:]))
     sigma[:, :3] = quaternion_to_rodrigues(_product(attitudes[0] * _CONJUGATE, attitudes))
@@ -166,7 +166,7 @@ def _transformed(sigma: Array, points: Any, noise: Array) -> tuple[Array, Array]
 
 
 def _process_noise(phi: Array, dt: float, process_noise: ProcessNoise) -> Array:
-    """Return Q (6, 6) over a turn φ (3,) of any size."""
+    """Return Q (6, 6) over a rotation φ (3,) of any size."""
     q11, q12, q22 = process_noise_of(
         tuple(phi.tolist()), dt, process_noise.angle_random_walk**2, process_noise.rate_random_walk**2
     )
@@ -180,9 +180,9 @@ def _moved(q: Array, mean: Array) -> Array:
 def _update(
     points: Any, q: Array, b: Array, P: Array, events: Schedule, event: int, noise: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Take in one measurement of covariance ``noise`` (3, 3), body axes; return the innovations too, made independent, and their variances.
+    """Update with one measurement of covariance ``noise`` (3, 3), body axes; return the decorrelated innovations and variances too.
 
-    A heading that the central quaternion does not show is passed over, and its innovation is NaN.
+    A heading whose vector is vertical at the central quaternion is skipped, and its innovation is NaN.
     """
     kind, z = events.kind[event], events.vector_b[event]
     frame = events.triads[events.reference[event]]
@@ -195,7 +195,7 @@ def _update(
     sigma, attitudes = _spread(points, q, b, P)
     if kind == HEADING:
         residuals = np.array([heading_error(R.ravel(), z, triad[2]) for R in quaternion.to_matrix(attitudes)])[:, None]
-        # Angles near the central one, so that the cut at π parts no two points of one cloud by a whole turn.
+        # Angles near the central one, so that the discontinuity at π does not separate the points by 2π.
         residuals = residuals[0] + (residuals - residuals[0] + np.pi) % (2.0 * np.pi) - np.pi
         degrees, noise = 1, noise[:1, :1]
     elif kind == ATTITUDE:

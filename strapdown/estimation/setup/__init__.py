@@ -1,14 +1,14 @@
 """Filter setups: noise model of the gyro and of each sensor, initial uncertainty, integration algorithm, gate and error states.
 
-One object for the command line, the Monte Carlo and the tuning. As a file it is the table ``[filter]`` of a TOML document, units in the
-names of its keys; a setup read back is equal to the last bit.
+One object for the command line, the Monte Carlo and the tuning. As a file it is the table ``[filter]`` of a TOML document, with units in
+the names of its keys; a setup is read back bit for bit.
 
 - ``filter_setup``: :class:`FilterSetup`, given or matched to a scenario or a record.
 - ``states``: :class:`States` and :class:`SensorStates`, the error states of a setup.
-- ``matching``: Noise and error states that follow from a specification.
+- ``matching``: Noise and error states for a specification.
 - ``running``: The filter of a setup over a record: :func:`run`, :func:`smooth`.
 - ``files``: Setups in TOML files.
-- ``for_record``: The initial state on a record.
+- ``for_record``: The initial state for a record.
 """
 
 from strapdown.estimation.setup.files import from_table as from_table

@@ -1,4 +1,4 @@
-"""A filter setup as a table of a TOML document, units in the names of its keys; read back it is equal to the last bit."""
+"""A filter setup as a table of a TOML document, with units in the names of its keys; it is read back bit for bit."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ NEVER = 0
 
 
 def to_table(setup: FilterSetup) -> dict[str, Any]:
-    """Return a setup as the table that its file holds."""
+    """Return a setup as the table of its file."""
     table = {**tables.encode(setup.process_noise, _NOISE_FORM), **tables.encode(setup, _FORM)}
     own = setup.integration.name not in coning.ALGORITHMS
     table["integration"] = setup.integration.to_table() if own else setup.integration.name
@@ -82,7 +82,7 @@ def from_table(table: Mapping[str, Any], place: str = "filter") -> FilterSetup:
     if "states" in table:
         parts["states"] = optional.from_table(_part(table, "states", place), f"{place}: states")
     if "estimator" in table:
-        estimator = table["estimator"]  # a table describes a filter of one's own, whose code no file holds
+        estimator = table["estimator"]  # a table describes a user's filter, whose code is in no file
         parts["estimator"] = (
             Own(estimator) if isinstance(estimator, Mapping) and "name" in estimator else str(estimator)
         )
@@ -103,18 +103,16 @@ def _part(table: Mapping[str, Any], name: str, place: str) -> Mapping[str, Any]:
 
 
 def to_toml(setup: FilterSetup) -> str:
-    """Return a setup as TOML text with the table ``[filter]``, units in the names of its keys; :func:`read_setup` reads it back."""
+    """Return a setup as TOML text with the table ``[filter]``, with units in the names of its keys; :func:`read_setup` reads it."""
     import tomli_w
 
     sensors = setup.sigma or (setup.states is not None and setup.states.sensors)
-    note = (
-        "# sigma of sensors: rad, or of one that measures whole vectors the unit of its reference\n" if sensors else ""
-    )
+    note = "# sigma of sensors: rad, or for whole vectors the unit of their reference\n" if sensors else ""
     return note + tomli_w.dumps({"filter": to_table(setup)})
 
 
 def from_toml(text: str, place: str = "filter") -> FilterSetup:
-    """Return the setup in the table ``[filter]`` of a TOML text, such as :func:`to_toml` gives."""
+    """Return the setup in the table ``[filter]`` of a TOML text, as from :func:`to_toml`."""
     table = reading.from_toml(text, place).get("filter")
     if not isinstance(table, dict):
         raise InputError(f"{place} has no table [filter]")
@@ -122,12 +120,12 @@ def from_toml(text: str, place: str = "filter") -> FilterSetup:
 
 
 def read_setup(path: str | os.PathLike[str]) -> FilterSetup:
-    """Read the table ``[filter]`` of a TOML file, such as ``strapdown tune`` writes; other tables are ignored.
+    """Read the table ``[filter]`` of a TOML file, as written by ``strapdown tune``; other tables are ignored.
 
     Parameters
     ----------
     path : path
-        The TOML file; keys have their units in their names.
+        TOML file; keys have their units in their names.
 
     Returns
     -------

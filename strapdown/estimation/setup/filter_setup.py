@@ -24,20 +24,20 @@ if TYPE_CHECKING:
     from strapdown.scenarios import Scenario
 
 MIN_BIAS_SIGMA = 0.1 * units.DEGREE_PER_HOUR
-"""Standard deviation of the initial bias error of a gyro whose specification has no bias, rad/s."""
+"""Standard deviation of the initial bias error for a gyro whose specification has no bias, rad/s."""
 MEKF = "mekf"
-"""The estimator that all of this package works with; others run over records, and can be judged."""
+"""Name of the package's own filter; other estimators can be run over records and compared."""
 
 Sigma = float | tuple[float, float, float]
-"""σ of a sensor: one number, or one about (of whole vectors along) each body axis x, y, z."""
+"""σ of a sensor: one number, or one about (for whole vectors along) each body axis x, y, z."""
 
 
 def sensor_sigma(name: str, value: Any) -> Sigma:
-    """Return one number above zero, or three."""
+    """Return one or three numbers, after a check that they are above zero."""
     if not isinstance(value, (list, tuple)) and not (isinstance(value, np.ndarray) and value.ndim):
         return positive(name, value)
     if len(value) != 3:
-        raise InputError(f"{name} has {len(value)} numbers; give one, or three of the body axes x, y, z")
+        raise InputError(f"{name} has {len(value)} numbers; give one, or three for the body axes x, y, z")
     x, y, z = (positive(f"{name}: {axis}", one) for axis, one in zip("xyz", value, strict=True))
     return x, y, z
 
@@ -51,25 +51,25 @@ class FilterSetup(ByValue):
     process_noise : ProcessNoise
         Angle random walk and rate random walk of the gyro, as the filter models them.
     attitude_sigma : float, default 1°
-        Standard deviation of the initial attitude error, each axis, rad; a Monte Carlo draws the true error from it.
+        Standard deviation of the initial attitude error, rad, per axis; a Monte Carlo draws the true error from it.
     bias_sigma : float
-        Standard deviation of the initial bias error, each axis, rad/s; a Monte Carlo draws the true error from it.
+        Standard deviation of the initial bias error, rad/s, per axis; a Monte Carlo draws the true error from it.
     integration : strapdown.coning.Algorithm, default "one-sample"
-        Coning algorithm that turns its N gyro samples into one filter step.
+        Coning algorithm that converts its N gyro samples into one filter step.
     measurement_sigma_factor : float, default 1.0
-        Factor on the record's σ of every sensor.
+        Factor on the σ of every sensor in the record.
     sigma : mapping of str to float or tuple (3,), default empty
         σ of a sensor, by its name, instead of the record's: rad, or for whole vectors the unit of their reference. One
-        number, or one for each body axis (of a direction the part across it counts; a heading has one). Where the
-        record's σ varies, this is its root mean square and the ratios between samples are kept.
+        number, or one for each body axis (for a direction the part across it counts; a heading has one). If the record's
+        σ varies, this is its root mean square and the ratios between samples are kept.
     gate : Gate, optional
-        Refuses improbable measurements, and recovers. Default: all are used.
+        Gate that refuses improbable measurements, and recovers. Default: all are used.
     robust : Robust, optional
-        Weighs measurements by the size of their innovations. Default: all alike.
+        Robust updates, which weight measurements by their residuals. Default: all equally.
     states : States, optional
-        Error states beside attitude and bias. Default: none. With drifts among them, the estimated bias includes them.
+        Error states in addition to attitude and bias. Default: none. If they include drifts, so does the estimated bias.
     estimator : str, Own, filter or callable, default MEKF
-        Filter that processes a record: a name of :data:`strapdown.estimation.filters.FILTERS`, or a filter of one's own
+        Filter that processes a record: a name of :data:`strapdown.estimation.filters.FILTERS`, or a filter of your own
         (:mod:`strapdown.estimation.filters.own`), which starts with the two σ above and does not use ``process_noise``.
     """
 
@@ -102,7 +102,7 @@ class FilterSetup(ByValue):
             object.__setattr__(self, "estimator", as_own(self.estimator))
         if self.estimator != MEKF and (self.gate, self.robust, self.states) != (None, None, None):
             raise InputError(
-                f"gate, robust and states are options of the mekf, and the estimator is {self.estimator_name}; leave them out"
+                f"gate, robust and states are options of the mekf, but the estimator is {self.estimator_name}; leave them out"
             )
 
     @property
@@ -114,14 +114,14 @@ class FilterSetup(ByValue):
     def for_scenario(
         cls, scenario: Scenario, *, attitude_sigma: float | None = None, states: bool | Sequence[str] | None = False
     ) -> FilterSetup:
-        """Return the filter setup that matches a scenario: the noise of its gyro, and the sensors' own σ.
+        """Return the filter setup that matches a scenario: the noise of its gyro, and the σ of its sensors.
 
         Parameters
         ----------
         scenario : Scenario
-            Its gyro, its sensors and its motion determine the setup.
+            Scenario whose gyro, sensors and motion determine the setup.
         attitude_sigma, states : optional
-            As of :meth:`for_record`.
+            As for :meth:`for_record`.
 
         Returns
         -------
@@ -139,7 +139,7 @@ class FilterSetup(ByValue):
         >>> from strapdown.estimation import setup
         >>> print(setup.to_toml(setup.FilterSetup.for_scenario(scenarios.load_scenario("two-stars"))))  # doctest: +SKIP
         """
-        from strapdown.scenarios import simulate  # and every motion
+        from strapdown.scenarios import simulate  # imports every motion
 
         return cls.for_record(simulate(scenario), attitude_sigma=attitude_sigma, states=states)
 
@@ -152,38 +152,38 @@ class FilterSetup(ByValue):
         attitude_sigma: float | None = None,
         states: bool | Sequence[str] | None = False,
     ) -> FilterSetup:
-        """Return the filter setup that matches what a record's ``origin`` specifies of its gyro and sensors.
+        """Return the filter setup that matches the specifications of gyro and sensors in a record's ``origin``.
 
-        Flicker noise, which is no random walk, is matched in the attitude at the record's rate and quality of measurements
-        (:func:`strapdown.gyro.matched_process_noise`); without measurements it is bounded over the record's length. Errors without a state
-        (scale factor, misalignment, quantisation, hard iron) are not covered: :func:`unmodelled_errors` names them.
+        Flicker noise is replaced by random walks that match it in the attitude at the rate and precision of the record's measurements
+        (:func:`strapdown.gyro.matched_process_noise`); without measurements it is bounded over the record's duration. Errors without a
+        state (scale factor, misalignment, quantisation, hard iron) are not covered: :func:`unmodelled_errors` lists them.
 
         Parameters
         ----------
         record : ImuRecord
-            Its rate, its length and the σ of its measurements determine the noise that stands for flicker.
+            Record whose rate, duration and σ of measurements determine the noise that replaces flicker.
         spec : GyroSpec, optional
             Specification of the gyro. Default: that of the record's origin.
         attitude_sigma : float, optional
-            σ of the initial attitude error, each axis, rad. Default: 1°, or less where the finest sensor is so fine that its first
-            measurement would not be linear in the error; an extended filter's covariance does not hold beyond that.
+            σ of the initial attitude error, rad, per axis. Default: 1°, or less if the first measurement of the most precise sensor would
+            not be linear in that error; the covariance of an extended filter is not valid beyond that.
         states : bool, None or sequence of str, default False
-            True: with an error state for each error that the gyro or the origin's sensors specify: scale factor, misalignment,
+            True: with an error state for each specified error of the gyro and the origin's sensors: scale factor, misalignment,
             g-sensitivity, slope of the bias over the record's temperature, flicker and Gauss–Markov drift, hard iron, a sensor's bias,
-            correlated noise, lever arm. Each is modelled as one draw of a normal distribution whose σ is the error's size. Where
-            one-sample integration would leave a noticeable commutation error, an integration algorithm of the same rate with less is
-            chosen. Names such as ``"gyro.scale"``: with these of them alone. None: with all where an error is specified that the filter
-            would have no state for.
+            correlated noise, lever arm. Each is modelled as one draw of a normal distribution whose σ is the error's size. If one-sample
+            integration would cause a noticeable commutation error, a more accurate integration algorithm of the same rate is chosen.
+            Names such as ``"gyro.scale"``: only with these. None: with all if any error is specified that the filter would have no state
+            for.
 
         Returns
         -------
         FilterSetup
-            Setup with the noise of the gyro, and with error states if asked for.
+            Setup with the noise of the gyro, and with error states if requested.
 
         Raises
         ------
         InputError
-            If the gyro is not specified or has no angle random walk, or a name is of no error that is specified.
+            If the gyro is not specified or has no angle random walk, or a name is not that of a specified error.
         """
         origin = record.origin or Origin()
         spec = spec or origin.gyro
@@ -225,19 +225,19 @@ class FilterSetup(ByValue):
 
 
 def need_mekf(setup: FilterSetup, what: str) -> None:
-    """Refuse a setup of another estimator for ``what`` works with the mekf alone."""
+    """Raise an error for a setup of another estimator, as ``what`` needs the mekf."""
     if setup.estimator != MEKF:
         raise InputError(
-            f"{what} works with the mekf, and the estimator is {setup.estimator_name}; take a setup with estimator='mekf'"
+            f"{what} needs the mekf, but the estimator is {setup.estimator_name}; use a setup with estimator='mekf'"
         )
 
 
 def need_angles(setup: FilterSetup, kinds: Mapping[str, str], place: str) -> None:
-    """Raise an error for a σ beyond half a turn of a sensor that measures angles: it must have been meant in another unit than rad."""
+    """Raise an error for a σ of more than π rad of a sensor that measures angles: it must have been meant in another unit."""
     for name, sigma in setup.sigma.items():
         largest = float(np.max(sigma))
         if kinds.get(name, "vector") != "vector" and largest > np.pi:
             raise InputError(
-                f"{place}: sigma: {name} is {largest:g} rad, beyond half a turn; sigma is in rad, and {largest:g} arcsec would be "
+                f"{place}: sigma: {name} is {largest:g} rad, more than half a rotation; sigma is in rad, and {largest:g} arcsec would be "
                 f"{largest * units.ARCSECOND:.4g}"
             )

@@ -1,4 +1,4 @@
-"""The filter for a record, from what the record holds of its origin: the setup that matches its origin, and the initial state."""
+"""The filter for a record from the specifications in the record: the setup that matches its origin, and the initial state."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ REMEDY = "give the initial attitude (--attitude, or --from-truth; initial= in Py
 
 
 def unmodelled_errors(record: ImuRecord, chosen: FilterSetup) -> tuple[str, ...]:
-    """Return, in words, the specified errors of a record that a filter has no state for; empty where nothing is specified."""
+    """Return, as texts, the specified errors of a record for which a filter has no state; empty if nothing is specified."""
     origin = record.origin or Origin()
     if origin.gyro is None:
         return ()
@@ -31,14 +31,14 @@ def unmodelled_errors(record: ImuRecord, chosen: FilterSetup) -> tuple[str, ...]
 
 
 class Start(NamedTuple):
-    """Where a filter starts on a record.
+    """Initial state of a filter for a record.
 
     Parameters
     ----------
     state : State
         Initial attitude, bias and covariance.
     words : str
-        How the state was found, in one sentence.
+        Description of how the state was found, in one sentence.
     edge : int, default 0
         Edge of the filter's steps at which the filter starts.
     """
@@ -51,15 +51,15 @@ class Start(NamedTuple):
 def start(record: ImuRecord, chosen: FilterSetup) -> Start:
     """Return the initial state from the first measurements of a record.
 
-    They count as the filter models them (:func:`strapdown.estimation.setup.modelled_record`). Where one set of measurements does not give
+    Their noise is that of the filter (:func:`strapdown.estimation.setup.modelled_record`). If one set of measurements does not determine
     the attitude, or directions contradict each other, a bank of filters with different initial attitudes finds it
-    (:mod:`strapdown.estimation.multiple_model`), and the estimate starts where one of them is left.
+    (:mod:`strapdown.estimation.multiple_model`), and the estimate starts where its hypotheses are merged into one.
     """
     try:
         state = estimation.first_state(record, chosen.process_noise, bias_sigma=chosen.bias_sigma)
     except InconsistentError as error:
         problem = _without_remedy(error)
-        # A sensor's own errors may be among the states, and then the filter estimates them.
+        # With a sensor's errors among the states, the filter can estimate them.
         if chosen.states is None:
             raise InputError(
                 f"{problem}; if a sensor has a bias, give the filter its state (--states; states=True in Python); or {REMEDY}"
@@ -67,7 +67,7 @@ def start(record: ImuRecord, chosen: FilterSetup) -> Start:
         return _by_multiple_models(record, chosen, problem, f"{problem[:1].upper()}{problem[1:]}")
     except InputError as error:
         return _by_multiple_models(
-            record, chosen, _without_remedy(error), "One direction at a time does not give the attitude at once"
+            record, chosen, _without_remedy(error), "One direction at a time does not determine the attitude"
         )
     return Start(state, f"Started from the first measurements, σ {_sigma_words(state)}.")
 
@@ -77,13 +77,13 @@ def _without_remedy(error: InputError) -> str:
 
 
 def _by_multiple_models(record: ImuRecord, chosen: FilterSetup, problem: str, why: str) -> Start:
-    """Return the state of the one filter of a bank that is left."""
+    """Return the state of a bank of filters at which its hypotheses are merged into one."""
     try:
         found = multiple_model.run(record, chosen.process_noise, bias_sigma=chosen.bias_sigma)
     except InputError as error:
-        raise InputError(f"{problem}, nor does a bank of hypotheses ({error}); {REMEDY}") from None
+        raise InputError(f"{problem}; a bank of hypotheses does not find it either ({error}); {REMEDY}") from None
     if not found.converged:
-        raise InputError(f"{problem}, nor does a bank of hypotheses: {found.reason}; or {REMEDY}")
+        raise InputError(f"{problem}; a bank of hypotheses does not find it either: {found.reason}; or {REMEDY}")
     edge = int(np.searchsorted(record.time, found.became_one))
     if edge >= len(record.increments):
         raise InputError(f"{problem}, and a bank of hypotheses found it only at the end; record longer, or {REMEDY}")
@@ -95,26 +95,26 @@ def _by_multiple_models(record: ImuRecord, chosen: FilterSetup, problem: str, wh
         covariance=found.estimate.covariance[row],
     )
     words = (
-        f"{why}: {len(found.angles)} hypotheses about it became one at {found.became_one:.6g} s, σ {_sigma_words(state)}; the estimate "
+        f"{why}: {len(found.angles)} hypotheses were merged into one at {found.became_one:.6g} s, σ {_sigma_words(state)}; the estimate "
         "begins there."
     )
     return Start(state, words, edge)
 
 
 def _sigma_words(state: State) -> str:
-    """Return the σ of an attitude in words: one, or where it differs by direction (tilt and heading) the least and the largest."""
+    """Return the σ of an attitude as text: one, or the smallest and the largest if it differs by direction (tilt and heading)."""
     least, _, most = np.sqrt(np.maximum(np.linalg.eigvalsh(state.covariance[:3, :3]), 0.0)) / DEGREE
     if most < UNEVEN * least:
-        return f"{np.sqrt(np.trace(state.covariance[:3, :3]) / 3.0) / DEGREE:.3g}° an axis"
+        return f"{np.sqrt(np.trace(state.covariance[:3, :3]) / 3.0) / DEGREE:.3g}° per axis"
     return f"{least:.3g} to {most:.3g}° by direction"
 
 
 def drawn_start(record: ImuRecord, chosen: FilterSetup) -> Start:
-    """Return the true initial state with errors drawn from the σ of the setup, by seed and run of the record's ``origin``."""
+    """Return the true initial state with errors drawn from the setup's σ, by seed and run of the record's ``origin``."""
     if record.truth is None:
         raise InputError(
             "a start drawn about the truth (--from-truth) needs a record with its truth; this one has none"
         )
     origin = record.origin or Origin()
-    words = "Started from the truth, off by errors drawn from the filter's σ."
+    words = "Started from the truth with errors drawn from the filter's σ."
     return Start(setup.drawn_state(chosen, record, origin.seed or 0, origin.run or 0), words)

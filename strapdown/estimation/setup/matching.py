@@ -1,4 +1,4 @@
-"""What of a filter follows from the specified errors of gyro and sensors: its noise, and its error states with their σ."""
+"""Noise and error states of a filter from the specified errors of gyro and sensors."""
 
 from __future__ import annotations
 
@@ -17,40 +17,40 @@ from strapdown.records import ImuRecord, Origin
 from strapdown.vectors import VectorMeasurements
 
 ATTITUDE_SIGMA = 1.0 * units.DEGREE
-"""Standard deviation of the initial attitude error where nobody says, each axis, rad; less where the sensors are very fine."""
+"""Default standard deviation of the initial attitude error, per axis, rad; less for very precise sensors."""
 LINEAR_SHARE = 0.2
-"""The second-order error of a first measurement, half the square of the initial error, may be about this share of half its σ."""
+"""Limit on the second-order error of a first measurement, half the square of the initial error, relative to half its σ."""
 COMMUTATION_SHARE = 0.1
-"""Part of the σ of a constant rate, by white noise over the record; a one-sample drift above it calls for a better algorithm."""
+"""Limit on the drift of one-sample integration, relative to the σ of a constant rate estimated in white noise over the record."""
 ACCURATE_ALGORITHM = "matched-1-8-8"
-"""The integration algorithm chosen then: one step a sample."""
+"""Integration algorithm used above that limit: one step per sample."""
 MIN_SAMPLES = 32
-"""Fewest gyro samples for which the commutation error is estimated."""
+"""Minimum number of gyro samples for an estimate of the commutation error."""
 DECADE = 10.0
-"""Ratio of the time constants of neighbouring drifts: their sum follows 1/f within 6 %."""
+"""Ratio of the time constants of neighbouring drifts: their sum is 1/f within 6 %."""
 QUICK = 0.3
-"""A drift is a state if its time constant is at least this part of the filter's own."""
+"""Minimum time constant of a drift that is a state, relative to that of the filter."""
 UNSEEN = 1e4
-"""Part of the record's length that the quickest drift lasts where nothing is measured."""
+"""Ratio of the record's duration to the minimum time constant of a drift if there are no measurements."""
 MIN_STEPS = 10.0
-"""Gyro intervals that the quickest drift lasts at least."""
+"""Minimum time constant of a drift, in gyro intervals."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Matched:
-    """States for a record, and what beside them changes."""
+    """States for a record, and the noise to be added for errors without a state."""
 
     states: States
     white: float
-    """PSD that the gyro's white noise gains by flicker too quick for a state, rad²/s."""
+    """PSD to be added to the gyro's white noise for the flicker above the bandwidth of the states, rad²/s."""
 
 
 def matched(spec: GyroSpec, record: ImuRecord, sensors: Sequence[Any], gravity_f: Array) -> Matched:
-    """Return the states that the specified errors of a gyro and of sensors call for on a record.
+    """Return the states for the specified errors of a gyro and of sensors on a record.
 
-    Each error is taken for one draw from a normal distribution whose σ is its size, entry by entry; one of zero is no state. Of flicker,
-    parts a decade apart from the record's length down to what the measurements can follow are states (their sum is 1/f within 6 %), what is
-    quicker is white noise of the attitude and a σ of the reported bias.
+    Each error is modelled as one draw from a normal distribution whose σ is its size, entry by entry; an error of zero is no state. Flicker
+    is modelled by states with time constants a decade apart, from the record's duration down to the shortest that the measurements can
+    resolve (their sum is 1/f within 6 %); flicker of higher frequency is white noise of the attitude and a σ of the reported bias.
     """
     drift_sigma, drift_time, fast, white = _drifts(spec, record, measurement_density(record))
     force = np.abs(spec.g_sensitivity) if np.any(gravity_f) else np.zeros((3, 3))
@@ -79,7 +79,7 @@ def matched(spec: GyroSpec, record: ImuRecord, sensors: Sequence[Any], gravity_f
 
 
 def _slope(spec: GyroSpec, record: ImuRecord) -> Entries:
-    """Return the size of the bias's slope over the record's temperature (3,), rad/s/K: its root mean square and its σ; 0 without any."""
+    """Return the slope of the bias over the record's temperature (3,), rad/s/K: its root mean square combined with its σ; 0 if none."""
     if spec.temperature is None or record.temperature is None or np.ptp(record.temperature) == 0.0:
         return 0.0
     steps = np.diff(record.temperature)[:, None]
@@ -91,7 +91,7 @@ def _slope(spec: GyroSpec, record: ImuRecord) -> Entries:
 
 
 def _entries(values: Array) -> Entries:
-    """Return entries as they are specified: 0 where there is none."""
+    """Return entries as specified; 0 if all are zero."""
     return (
         tuple(map(tuple, values.tolist()))
         if values.ndim == 2 and values.any()
@@ -102,7 +102,7 @@ def _entries(values: Array) -> Entries:
 def _drifts(
     spec: GyroSpec, record: ImuRecord, density: float
 ) -> tuple[tuple[float, ...], tuple[float, ...], float, float]:
-    """Return σ and time constants of Gauss–Markov drifts, the σ of what is quicker, rad/s, and its PSD, rad²/s."""
+    """Return σ and time constants of Gauss–Markov drifts, and σ, rad/s, and PSD, rad²/s, of the flicker above their bandwidth."""
     sigma, time, fast, white = [], [], 0.0, 0.0
     if np.isfinite(spec.markov_correlation_time) and np.any(np.asarray(spec.markov_noise) > 0.0):
         driven = float(np.max(spec.markov_noise))
@@ -125,17 +125,17 @@ def _drifts(
 
 
 def bandwidth(spec: GyroSpec, density: float) -> float:
-    """Return about how quickly the filter follows, rad/s: ``σ_v/√r`` of white noise, or where it is more the ω of ``r ω³ = B²/2``."""
+    """Return the approximate bandwidth of the filter, rad/s: ``σ_v/√r`` for white noise, or the ω of ``r ω³ = B²/2`` if it is larger."""
     white = float(np.max(spec.angle_random_walk))
     instability = float(np.max(spec.bias_instability))
     return float(max(white / np.sqrt(density), (0.5 * instability**2 / density) ** (1.0 / 3.0)))
 
 
 def _quicker(samples: int, step: float, instability: float, each: float, times: Array) -> float:
-    """Return the variance of the simulated flicker at an edge less that of the drifts, over what is quicker than they, (rad/s)²."""
+    """Return the variance of the simulated flicker at an edge minus that of the drifts, above their bandwidth, (rad/s)²."""
     lowest = step / (2.0 * np.pi * float(times[-1]) * np.sqrt(DECADE))
     f = np.geomspace(min(lowest, 0.1), 0.5, 4000)
-    # At an edge it is the mean of the intervals' values on either side.
+    # The value at an edge is the mean of the intervals' values on either side.
     whole = instability**2 * flicker.shaping(samples).spectrum(f) * np.cos(np.pi * f) ** 2
     w = 2.0 * np.pi * f[:, None] / step
     held = np.sum(2.0 * each**2 * times / (1.0 + (w * times) ** 2), axis=1) / step
@@ -143,11 +143,11 @@ def _quicker(samples: int, step: float, instability: float, each: float, times: 
 
 
 def _of_sensor(sensor: Any, series: VectorMeasurements) -> SensorStates:
-    """Return the states that one sensor calls for."""
+    """Return the states for the specified errors of one sensor."""
     own = float(sensor.sigma) if hasattr(sensor, "sigma") else 0.0
     over, varying = 1.0, False
     if series.kind in ("direction", "heading") and own > 0.0 and hasattr(sensor, "field_f"):
-        # The series gives the sensor's noise over the field's strength.
+        # The σ of the series is the sensor's noise divided by the field's magnitude.
         level = np.linalg.norm(series.references_f[:, :2], axis=1) if series.kind == "heading" else 1.0
         over = float(np.sqrt(np.mean((series.sigma * level) ** 2))) / own
         varying = bool(np.ptp(strength(series)) > 1e-9)
@@ -170,20 +170,20 @@ def _of_sensor(sensor: Any, series: VectorMeasurements) -> SensorStates:
 
 
 def _all_axes(size: Array) -> Entries:
-    """Return σ of each axis, those without an error as small beside the others as it makes no difference."""
+    """Return σ of each axis; where the error is zero, a σ that is negligible beside the others."""
     if not size.any():
         return 0.0
     return tuple(np.where(size > 0.0, size, 1e-6 * float(size.max())).tolist())
 
 
 def specified(origin: Origin) -> tuple[Sequence[Any], Sequence[float]]:
-    """Return the sensors, whose errors are specified, and gravity in the fixed frame, as far as they are known."""
+    """Return the sensors with their specified errors, and gravity in the fixed frame, if known."""
     scenario = origin.scenario
     return ((), vectors.GRAVITY_F) if scenario is None else (scenario.sensors, scenario.gravity_f)
 
 
 def noise_beside_states(spec: GyroSpec, white: float) -> dict[str, float]:
-    """Return the two noises of a filter that has drifts as states, ``white`` being the PSD of what of them is too quick, rad²/s."""
+    """Return the two noises of a filter that has drifts as states; ``white`` is the PSD of flicker above their bandwidth, rad²/s."""
     walk = np.max(np.square(spec.rate_random_walk))
     if not np.isfinite(spec.markov_correlation_time):
         walk = np.max(np.square(spec.rate_random_walk) + np.square(spec.markov_noise))
@@ -196,7 +196,7 @@ def noise_beside_states(spec: GyroSpec, white: float) -> dict[str, float]:
 
 
 def commutes_badly(record: ImuRecord, white: float) -> bool:
-    """Return whether a turn at constant rate over each sample drifts by more than the record can leave unnoticed."""
+    """Return whether the drift of one-sample integration would be noticeable in the record."""
     better = coning.ALGORITHMS[ACCURATE_ALGORITHM]
     if len(record.increments) < MIN_SAMPLES:
         return False
@@ -214,9 +214,9 @@ def unmodelled_errors(
     *,
     gravity_f: Sequence[float] = vectors.GRAVITY_F,
 ) -> tuple[str, ...]:
-    """Return, in words with their size, the specified errors of gyro and sensors that a filter has no state for.
+    """Return the specified errors of gyro and sensors for which a filter has no state, as texts with their size.
 
-    Where there are any, a filter that models the noise alone is overconfident.
+    If there are any, the covariance of a filter that models only the noise is too small.
 
     Examples
     --------
@@ -252,9 +252,9 @@ def unmodelled_errors(
             (
                 getattr(sensor, "lever_arm_b", 0.0),
                 f"{name}.lever",
-                f"the accelerations that the {name} feels at its lever arm",
+                f"the accelerations of the {name} at its lever arm",
             ),
-            (accelerated, f"{name}.velocity", f"the acceleration of the point that the {name} is at"),
+            (accelerated, f"{name}.velocity", f"the acceleration of the point where the {name} is mounted"),
             (faults.correlated_sigma, f"{name}.correlated", f"the correlated noise of the {name}"),
             (faults.outlier_probability, "", f"the outliers of the {name}"),
         ]
@@ -263,20 +263,20 @@ def unmodelled_errors(
 
 
 def linear_sigma(record: ImuRecord) -> float:
-    """Return the σ of the initial attitude that the finest sensor's first measurement is still linear in, rad, at most 1°."""
+    """Return the largest σ of the initial attitude for which the most precise sensor's first measurement is linear, rad, at most 1°."""
     finest = min((_finest(series) for series in record.vectors if len(series.time)), default=np.inf)
     return float(min(ATTITUDE_SIGMA, np.sqrt(LINEAR_SHARE * finest))) if finest > 0.0 else ATTITUDE_SIGMA
 
 
 def _finest(series: VectorMeasurements) -> float:
-    """Return the least σ of a series, rad."""
+    """Return the smallest σ of a series, rad."""
     if series.kind == "vector":
         return float(np.min(series.sigma / np.linalg.norm(series.references_f, axis=1)))
     return float(np.min(series.sigma if series.sigma_axes is None else series.sigma_axes))
 
 
 def noise(spec: GyroSpec, record: ImuRecord) -> dict[str, float]:
-    """Return the two noises of a filter without drifts as states; flicker is matched to the record's measurements, or its length."""
+    """Return the two noises of a filter without drifts as states; flicker is matched to the record's measurements, or its duration."""
     density = measurement_density(record)
     if not np.any(np.asarray(spec.bias_instability) > 0.0):
         found = gyro.process_noise(spec)
@@ -291,13 +291,13 @@ def noise(spec: GyroSpec, record: ImuRecord) -> dict[str, float]:
 def _need_white(found: Mapping[str, float]) -> None:
     if found["angle_random_walk"] == 0.0:
         raise InputError(
-            "the gyro's specification has no angle random walk, and a filter needs one greater than zero; "
-            "give it, or a filter setup of your own"
+            "the gyro's specification has no angle random walk, but a filter needs one greater than zero; "
+            "give it, or a filter setup"
         )
 
 
 def measurement_density(record: ImuRecord) -> float:
-    """Return the variance of a measurement about an axis times the interval between measurements, rad² s, over all sensors and axes."""
+    """Return the variance of a measurement about an axis times the interval between measurements, rad² s, for all sensors and axes."""
     information = sum(_information(series) for series in record.vectors)
     length = float(record.time[-1] - record.time[0])
     return length / information if information > 0.0 else float("inf")

@@ -23,16 +23,16 @@ from strapdown.records import Estimate, ImuRecord, compress
 from strapdown.vectors import VectorMeasurements
 
 _BIAS = np.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])
-"""Which of attitude and bias is the bias."""
+"""1 for the bias, 0 for the attitude."""
 WHOLE_BIAS: dict[str, Any] = {"whole_bias": True, "together": True}
-"""Options of the filter that reports the bias with the drifts in it."""
+"""Options of the filter by which the reported bias includes the drifts."""
 
 MAX_MEMORY = 8e9
-"""Largest memory for the smoother's forward pass, bytes."""
+"""Maximum memory for the smoother's forward pass, bytes."""
 
 
 def modelled_record(record: ImuRecord, setup: FilterSetup) -> ImuRecord:
-    """Return the record as the filter of this setup processes it: at the rate of its integration algorithm, with the setup's σ."""
+    """Return the record as processed by the filter of this setup: at the rate of its integration algorithm, with the setup's σ."""
     names = [series.sensor for series in record.vectors]
     for name in setup.sigma:
         one_of("sigma: sensor", name, names)
@@ -62,15 +62,15 @@ def _modelled_series(series: VectorMeasurements, setup: FilterSetup) -> VectorMe
 
 
 def _by_axis(series: VectorMeasurements, given: tuple[float, float, float], factor: float) -> VectorMeasurements:
-    """Return the series with a σ of its own about each body axis; from sample to sample they vary as its own does."""
+    """Return the series with a separate σ about each body axis, whose ratios between samples are those of the series."""
     if series.kind == "heading":
         raise InputError(
-            f"sigma: {series.sensor} is {given}, three numbers, and a heading has one degree of freedom; give one number"
+            f"sigma: {series.sensor} is {given}, three numbers, but a heading has one degree of freedom; give one number"
         )
     m = len(series.time)
     own = float(np.sqrt(np.mean(series.sigma**2))) if m else 0.0
     level = series.sigma / own if own > 0.0 else np.ones(m)
-    # The root mean square over the axes is made from them.
+    # sigma is recomputed as the root mean square over the axes.
     return replace(
         series, sigma=np.zeros(m), sigma_axes=factor * level[:, None] * np.asarray(given)[None], covariance=None
     )
@@ -82,19 +82,19 @@ def run(record: ImuRecord, setup: FilterSetup, initial: State, **options: Any) -
     Parameters
     ----------
     record : ImuRecord
-        At the gyro's rate; the setup's integration algorithm and σ are applied.
+        Record at the gyro's rate; the setup's integration algorithm and σ are applied.
     setup : FilterSetup
-        Filter whose noise, σ, error states, gate and integration algorithm are applied.
+        Setup whose noise, σ, error states, gate and integration algorithm are used.
     initial : State
         State at the first edge.
     **options
-        Of :func:`strapdown.estimation.run`; ``gate`` and ``robust`` replace the setup's. Other estimators than the
-        mekf take ``every`` and ``full_covariance`` alone.
+        Options of :func:`strapdown.estimation.run`; ``gate`` and ``robust`` replace the setup's. Other estimators than the
+        mekf accept only ``every`` and ``full_covariance``.
 
     Returns
     -------
     Estimate
-        Attitude, bias and, where the setup has any, ``error_states``; with drifts among them ``bias`` is the whole bias.
+        Attitude, bias and any ``error_states`` of the setup; if drifts are among them, ``bias`` is the whole bias.
     """
     modelled = modelled_record(record, setup)
     if setup.estimator != MEKF:
@@ -107,7 +107,7 @@ def run(record: ImuRecord, setup: FilterSetup, initial: State, **options: Any) -
 
 
 def runs_at_once(setup: FilterSetup) -> int:
-    """Return how many records :func:`run_together` filters at once: 1 for a filter that it is not for."""
+    """Return the number of records that :func:`run_together` filters at once: 1 for a filter that it does not support."""
     judged = setup.gate is not None or setup.robust is not None
     return WIDTH if setup.estimator == MEKF and setup.states is not None and not judged else 1
 
@@ -115,10 +115,10 @@ def runs_at_once(setup: FilterSetup) -> int:
 def run_together(
     records: Sequence[ImuRecord], setup: FilterSetup, initials: Sequence[State], every: int
 ) -> list[Estimate]:
-    """Run the filter of a setup over several records, and keep every ``every``-th state with its covariance.
+    """Run the filter of a setup over several records, and store every ``every``-th state with its covariance.
 
-    The filter is one that :func:`runs_at_once` allows. A record's estimate has the same bits whatever the records beside it, and agrees
-    with that of :func:`run` to rounding.
+    The filter must be one for which :func:`runs_at_once` is above 1. A record's estimate is bit for bit independent of the other records,
+    and agrees with that of :func:`run` to rounding.
     """
     from strapdown.estimation import together
 
@@ -149,9 +149,9 @@ def smooth(record: ImuRecord, setup: FilterSetup, initial: State, **options: Any
     Parameters
     ----------
     record, setup, initial : ImuRecord, FilterSetup, State
-        As of :func:`run`.
+        As for :func:`run`.
     **options
-        Of :func:`strapdown.estimation.smooth`.
+        Options of :func:`strapdown.estimation.smooth`.
 
     Returns
     -------
@@ -161,7 +161,7 @@ def smooth(record: ImuRecord, setup: FilterSetup, initial: State, **options: Any
     Raises
     ------
     InputError
-        If it would need more memory than :data:`MAX_MEMORY`.
+        If the smoother would need more memory than :data:`MAX_MEMORY`.
     """
     need_mekf(setup, "the smoother")
     chosen = {"gate": setup.gate, "robust": setup.robust, **options}
@@ -175,7 +175,7 @@ def smooth(record: ImuRecord, setup: FilterSetup, initial: State, **options: Any
         need += 8 * n * n * len(modelled.time)
     if need > MAX_MEMORY:
         raise InputError(
-            f"smoothing {len(modelled.increments)} samples with {n} states takes {need / 1e9:.3g} GB, more than {MAX_MEMORY / 1e9:g}; "
+            f"smoothing {len(modelled.increments)} samples with {n} states needs {need / 1e9:.3g} GB, more than {MAX_MEMORY / 1e9:g}; "
             "cut the record, or do not smooth"
         )
     if not states.gyro_drift_sigma:
@@ -201,7 +201,7 @@ def smooth(record: ImuRecord, setup: FilterSetup, initial: State, **options: Any
 
 
 def observability(record: ImuRecord, setup: FilterSetup, initial: State) -> Observability:
-    """Return what a record shows of each state of this setup's filter (:func:`strapdown.estimation.observability`)."""
+    """Return the observability of each state of this setup's filter on a record (:func:`strapdown.estimation.observability`)."""
     need_mekf(setup, "observability")
     modelled = modelled_record(record, setup)
     if setup.states is None:
@@ -214,14 +214,14 @@ def observability(record: ImuRecord, setup: FilterSetup, initial: State) -> Obse
 def initial_state(
     setup: FilterSetup, attitude: Array, bias: Array | tuple[float, float, float] = (0.0, 0.0, 0.0)
 ) -> State:
-    """Return the state that the filter starts from, with the setup's σ.
+    """Return the initial state of the filter, with the setup's σ.
 
     Parameters
     ----------
     setup : FilterSetup
-        Filter whose initial σ of attitude and bias are used.
+        Setup whose initial σ of attitude and bias are used.
     attitude : array_like (4,)
-        q_fb.
+        Initial attitude q_fb.
     bias : array_like (3,), default zero
         Gyro bias, rad/s, body axes.
 
@@ -244,7 +244,7 @@ def drawn_state(
     sigmas: tuple[float, float] | None = None,
     fixed_errors: tuple[Array, Array] = (np.zeros(3), np.zeros(3)),
 ) -> State:
-    """Return the true initial state of a record, off by errors drawn from the setup's σ (or ``sigmas``) and by fixed ones."""
+    """Return the true initial state of a record with errors drawn from the setup's σ (or ``sigmas``) and fixed errors added."""
     if record.truth is None:
         raise InputError("record has no truth to start from; simulate one, or give an initial state")
     attitude_sigma, bias_sigma = sigmas or (setup.attitude_sigma, setup.bias_sigma)
@@ -255,11 +255,11 @@ def drawn_state(
 
 
 def state_of_whole_bias(initial: State, error_states: tuple[ErrorStates, ...], fast_bias_sigma: float = 0.0) -> State:
-    """Return the state to start from where ``initial`` has the *whole* bias, the error states' part of it included.
+    """Return the initial state of the filter if ``initial`` has the *whole* bias, including the contribution of the error states.
 
-    Its error is what ``initial`` says, whatever the parts are: of the bias ``b = β − Σ c e`` the covariance follows, so that a drift that
-    is large beside a well-known bias is known only together with it. The part too fast for a state, of σ ``fast_bias_sigma``, is in the
-    initial bias as well and lasts no longer than a sample: the states know the rest of the bias that much worse.
+    The error of the whole bias β is that of ``initial``, whatever its parts. The covariance of the bias ``b = β − Σ c e`` follows: a drift
+    that is large relative to the σ of the whole bias is strongly correlated with b. The part with a bandwidth above that of the states, of
+    σ ``fast_bias_sigma``, is also contained in the initial bias but lasts no longer than a sample: its variance is added to that of b.
     """
     if len(initial.values):
         return initial
@@ -273,7 +273,7 @@ def state_of_whole_bias(initial: State, error_states: tuple[ErrorStates, ...], f
 
 
 def _offsets(error_states: tuple[ErrorStates, ...]) -> Array:
-    """Return what a unit of each error state adds to the gyro's bias (3, m)."""
+    """Return the contribution of a unit of each error state to the gyro's bias (3, m)."""
     return np.concatenate([np.empty((3, 0)), *(np.asarray(one.gyro_offset).T for one in error_states)], axis=1)
 
 
@@ -290,10 +290,10 @@ def _prepared(record: ImuRecord, setup: FilterSetup, initial: State) -> forward.
 
 
 def _reported(found: Estimate, states: States, initial: State) -> Estimate:
-    """Return an estimate of the whole bias with the part too fast for a state in its variance."""
+    """Return an estimate of the whole bias whose variance includes the part with a bandwidth above that of the states."""
     fast = np.outer(np.ones(len(found.time)), _BIAS * states.gyro_fast_bias_sigma**2)
     if not len(initial.values):
-        fast[0] *= -1.0  # the initial bias has this part, so its error has not
+        fast[0] *= -1.0  # the initial bias contains this part, so its error does not
     P = found.covariance
     return replace(
         found, variance=found.variance + fast, covariance=None if P is None else P + fast[:, :, None] * np.eye(6)

@@ -1,4 +1,4 @@
-"""Optional states as part of a filter's setup: what is declared, as a table of a file, and as blocks of the filter on a record."""
+"""Error states as part of a filter's setup: their declaration, as a table of a file, and as the filter's error states for a record."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ from strapdown.results import ByValue
 from strapdown.vectors import GRAVITY_F, KINDS
 
 Entries = float | tuple[float, ...] | tuple[tuple[float, ...], ...]
-"""A standard deviation: one for all axes or entries, or one each; 0: no state."""
+"""A standard deviation: one for all axes or entries, or one for each; 0: no state."""
 
 
 def _entries(name: str, value: Any, shape: tuple[int, ...], unit: str) -> Entries:
-    """Return a number, or nested tuples of an array of this shape; none is negative."""
+    """Return a number, or nested tuples of an array of this shape; none may be negative."""
     if np.ndim(value) == 0:
         return non_negative(name, value, unit=unit)
     values = array(name, value, shape)
@@ -53,12 +53,12 @@ VELOCITY = {
     "acceleration_time": "s",
     "position_time": "s",
 }
-"""Fields of :class:`SensorStates` about a bounded velocity, and their units."""
+"""Fields of :class:`SensorStates` for a bounded velocity, and their units."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SensorStates:
-    """Error states of one sensor by their σ; 0: no such state.
+    """Error states of one sensor, by their σ; 0: no such state.
 
     Parameters
     ----------
@@ -71,18 +71,18 @@ class SensorStates:
     correlated_sigma : float, default 0.0
         Stationary σ of each component of a first-order Gauss–Markov noise, in the unit of ``bias_sigma``.
     correlation_time : float, default 0.0
-        Correlation time of that noise, s; above zero where ``correlated_sigma`` is.
+        Correlation time of that noise, s; must be above zero if ``correlated_sigma`` is.
     frame : {"body", "fixed"}, default "body"
         Axes in which that noise is correlated.
     varying : bool, default False
-        For a direction or heading whose reference changes in strength, as the earth's field does along an orbit: bias
-        and correlated noise are constant in the sensor's own unit, and their σ above are relative to the strength at
+        For a direction or heading whose reference changes in magnitude, as the earth's field does along an orbit: bias
+        and correlated noise are constant in the sensor's own unit, and their σ above are relative to the magnitude at
         the root mean square σ of the series.
     lever_arm_sigma : float or tuple (3,), default 0.0
         σ of the position of an accelerometer relative to the point that does not accelerate, on each body axis, m.
     velocity_time : float, default 0.0
-        Correlation time of the velocity of a hand-held unit, s, which bounds the acceleration that its accelerometer
-        measures (:class:`strapdown.estimation.error_states.BoundedVelocity`). Give two of the next three with it.
+        Correlation time of the velocity of a hand-held unit, s, for the acceleration that its accelerometer measures
+        (:class:`strapdown.estimation.error_states.BoundedVelocity`). Give also two of the next three.
     velocity_sigma : float, default 0.0
         Stationary σ of each component of the velocity, m/s, fixed axes.
     acceleration_sigma : float, default 0.0
@@ -122,7 +122,7 @@ class SensorStates:
         for name in ("mounting_sigma", "bias_sigma"):
             value = getattr(self, name)
             if np.ndim(value) and _any(value) and 0.0 in np.asarray(value):
-                raise InputError(f"{name} is {value}; give every axis one above zero, or leave it out")
+                raise InputError(f"{name} is {value}; give a value above zero for every axis, or leave it out")
         if not isinstance(self.varying, bool):
             raise InputError(f"varying is {self.varying!r}; it must be true or false")
         for name, unit in VELOCITY.items():
@@ -140,16 +140,16 @@ class SensorStates:
         Parameters
         ----------
         sensor : str
-            Its name.
+            Name of the sensor.
         kind : {"direction", "vector", "heading", "attitude"}
             Kind of its measurements.
         gravity : float
-            m/s²; a direction's specific force is divided by it.
+            Magnitude of gravity, m/s², by which the specific force of a direction is divided.
 
         Returns
         -------
         tuple of ErrorStates
-            One block for each error of the sensor with a σ above zero.
+            Declarations for each error of the sensor with a σ above zero.
         """
         one_of(f"{sensor}: kind", kind, KINDS)
         found: list[ErrorStates] = []
@@ -171,14 +171,14 @@ class SensorStates:
                 )
             )
         if self.velocity_time > 0.0:
-            one_of(f"{sensor}: velocity_time goes with an accelerometer; kind", kind, ("direction", "vector"))
+            one_of(f"{sensor}: velocity_time needs an accelerometer; kind", kind, ("direction", "vector"))
             found.append(self._velocity(sensor, 1.0 if kind == "vector" else gravity))
         return tuple(found)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class States(ByValue):
-    """Error states of a filter beside attitude and bias, by their initial standard deviations; 0: no such state.
+    """Error states of a filter in addition to attitude and bias, by their initial standard deviations; 0: no such state.
 
     Parameters
     ----------
@@ -198,7 +198,7 @@ class States(ByValue):
     gyro_drift_time : tuple of float, default empty
         Correlation time of each of these parts, s.
     gyro_fast_bias_sigma : float, default 0.0
-        σ of the part of the gyro's bias that changes too quickly to be estimated, rad/s: no state, but included in the
+        σ of the part of the gyro's bias with a bandwidth too large to be estimated, rad/s: no state, but included in the
         reported σ of the bias.
     gravity_f : tuple of float (3,), default strapdown.vectors.GRAVITY_F
         Acceleration of gravity in the fixed frame, m/s², for the gyro's sensitivity to specific force and for lever
@@ -234,7 +234,7 @@ class States(ByValue):
         if len(self.gyro_drift_sigma) != len(self.gyro_drift_time):
             raise InputError(
                 f"gyro_drift_sigma has {len(self.gyro_drift_sigma)} entries and gyro_drift_time {len(self.gyro_drift_time)}; "
-                "give each part of the drift one of both"
+                "give each part of the drift both"
             )
         non_negative("gyro_fast_bias_sigma", self.gyro_fast_bias_sigma, unit="rad/s")
         object.__setattr__(self, "gravity_f", tuple(array("gravity_f", self.gravity_f, (3,)).tolist()))
@@ -255,8 +255,8 @@ class States(ByValue):
         Returns
         -------
         tuple of ErrorStates
-            One block each for scale and misalignment, sensitivity to specific force, slope over temperature, and each
-            drift, where its σ is above zero.
+            Declarations for scale and misalignment, sensitivity to specific force, slope over temperature, and each drift,
+            if its σ is above zero.
         """
         found: list[ErrorStates] = []
         if _any(self.gyro_scale_sigma) or _any(self.gyro_misalignment_sigma):
@@ -265,7 +265,7 @@ class States(ByValue):
         if _any(self.gyro_force_sigma) or _any(self.gyro_cross_force_sigma):
             along, across = _spread(self.gyro_force_sigma, self.gyro_cross_force_sigma)
             found.append(GyroForce(along_sigma=along, across_sigma=across, gravity_f=np.array(self.gravity_f)))
-        if _any(self.gyro_temperature_sigma):  # on an axis of σ 0 as small as makes no difference
+        if _any(self.gyro_temperature_sigma):  # negligible on an axis with σ 0
             slope = _spread(self.gyro_temperature_sigma, 0.0)[0]
             found.append(GyroTemperature(slope_sigma=np.maximum(slope, 1e-6 * slope.max())))
         for sigma, time in zip(self.gyro_drift_sigma, self.gyro_drift_time, strict=True):
@@ -283,7 +283,7 @@ class States(ByValue):
         Returns
         -------
         tuple of ErrorStates
-            Blocks of the gyro, then those of the sensors in the order of ``sensors``.
+            Declarations of the gyro, then those of the sensors in the order of ``sensors``.
         """
         found = list(self.gyro_blocks())
         for name, one in self.sensors.items():
@@ -300,12 +300,12 @@ class States(ByValue):
         return tuple(found)
 
     def chosen(self, names: tuple[str, ...]) -> States:
-        """Return the states of these names alone.
+        """Return only the states with these names.
 
         Parameters
         ----------
         names : tuple of str
-            Of :attr:`names`.
+            Names from :attr:`names`.
 
         Returns
         -------
@@ -314,7 +314,7 @@ class States(ByValue):
         """
         for name in names:
             if not self.names:
-                raise InputError(f"states: {name!r} is asked for, and there is none to choose from")
+                raise InputError(f"states: {name!r} is requested, but no states are declared; leave it out")
             one_of("states: name", name, self.names)
         sensors = {sensor: _kept(one, sensor, _SENSOR_PARTS, names) for sensor, one in self.sensors.items()}
         used = {sensor: one for sensor, one in sensors.items() if one.blocks(sensor, "direction", 1.0)}
@@ -328,7 +328,7 @@ _GYRO_PARTS = {
     "temperature": ("gyro_temperature_sigma",),
     "drift": ("gyro_drift_sigma",),
 }
-"""Fields that declare each state of the gyro, by its name."""
+"""Fields that declare each state of the gyro, by name."""
 _SENSOR_PARTS = {
     "mounting": ("mounting_sigma",),
     "bias": ("bias_sigma",),
@@ -336,9 +336,9 @@ _SENSOR_PARTS = {
     "correlated": ("correlated_sigma",),
     "velocity": tuple(VELOCITY),
 }
-"""The same of a sensor."""
+"""Fields that declare each state of a sensor, by name."""
 _BESIDE = {"gyro_drift_sigma": ("gyro_drift_time", "gyro_fast_bias_sigma"), "correlated_sigma": ("correlation_time",)}
-"""Fields that go with another and declare no state by themselves."""
+"""Fields that belong to another field and declare no state."""
 Part = TypeVar("Part", States, SensorStates)
 
 
@@ -347,7 +347,7 @@ def _declared(states: States | SensorStates, fields: tuple[str, ...]) -> bool:
 
 
 def _kept(states: Part, owner: str, parts: Mapping[str, tuple[str, ...]], names: tuple[str, ...]) -> Part:
-    """Return the states of an owner, the gyro or a sensor, whose names are given."""
+    """Return the states of an owner, the gyro or a sensor, for the given names."""
     none = type(states)()
     dropped = [field for part, fields in parts.items() if f"{owner}.{part}" not in names for field in fields]
     dropped += [beside for field in dropped for beside in _BESIDE.get(field, ())]
@@ -355,7 +355,7 @@ def _kept(states: Part, owner: str, parts: Mapping[str, tuple[str, ...]], names:
 
 
 def _spread(diagonal: Entries, off_diagonal: Entries) -> tuple[Array, Array]:
-    """Return σ of a matrix's diagonal (3,) and of what is off it (3, 3), zeros on the diagonal of that."""
+    """Return σ of a matrix's diagonal entries (3,) and of its other entries (3, 3), with zeros on the diagonal."""
     on = np.broadcast_to(np.asarray(diagonal, np.float64), (3,)).copy()
     off = np.broadcast_to(np.asarray(off_diagonal, np.float64), (3, 3)).copy()
     if np.ndim(off_diagonal) == 0:
@@ -399,11 +399,11 @@ SENSOR_FORM: tables.Form = {
     "acceleration_time": tables.SECONDS,
     "position_time": tables.SECONDS,
 }
-"""Keys of the states of a sensor: its σ in rad, or of whole vectors in the unit of their reference."""
+"""Keys of the states of a sensor: its σ in rad, or for whole vectors in the unit of their reference."""
 
 
 def to_table(states: States) -> dict[str, Any]:
-    """Return states as the table that a file holds, units in the keys; exact both ways."""
+    """Return states as a table of a file, units in the keys; exact in both directions."""
     table = tables.encode(states, FORM)
     if states.sensors:
         table["sensors"] = {name: tables.encode(one, SENSOR_FORM) for name, one in states.sensors.items()}
