@@ -69,7 +69,7 @@ def test_terms_not_seen_are_left_out_and_bounded_in_comments(run, tmp_path):
     assert np.all(np.array(list(bounds.values())) > 0.0)
     fit = allan.fit_noise(walking, 0.01)
     assert bounds["quantization_arcsec"] == pytest.approx(fit.upper[:, 0] / units.ARCSECOND, rel=1e-3)
-    partly = next(line for line in text.splitlines() if "0 where not seen" in line)
+    partly = next(line for line in text.splitlines() if "0 where not detected" in line)
     bound = fit.upper[:2, 3] / units.DEGREE_PER_HOUR_PER_ROOT_HOUR
     assert f"x below {bound[0]:.4g}, y below {bound[1]:.4g}." in partly
     # Six digits, in the unit of the key.

@@ -346,7 +346,7 @@ def test_tune_with_a_gate_writes_it_into_the_filter(run, tmp_path):
     status, said, complaint = run("tune", path, *options, "-o", out)
     assert status == 0, complaint
     assert "outliers.share" in said
-    assert "An outlier is the likelier explanation" in said
+    assert "is more likely an outlier than noise" in said
     content = json.loads(out.with_suffix(".json").read_text())
     found = setup.read_setup(out)
     assert found.gate is not None
