@@ -141,7 +141,7 @@ def test_a_name_with_a_line_break_still_gives_toml(run, tmp_path):
         (white(100, axes=2), AT_100_HZ, "gyro.npy has 2 columns"),
         (white(3), AT_100_HZ, "gyro.npy: values has 3 samples; at least 64"),
         (white(0), AT_100_HZ, "gyro.npy: values has 0 samples"),
-        (np.zeros((500, 3)), AT_100_HZ, "gyro.npy: values, axis 0, holds no noise"),
+        (np.zeros((500, 3)), AT_100_HZ, "gyro.npy: values, axis 0, has no noise"),
         (np.zeros((10, 20, 3)), AT_100_HZ, "gyro.npy has shape (10, 20, 3)"),
         (np.where(np.arange(300)[:, None] == 7, np.nan, white(300)), AT_100_HZ, "gyro.npy[7, 0] is nan"),
         (white(300), (), "give its rate in Hz and its unit"),

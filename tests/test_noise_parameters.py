@@ -117,9 +117,9 @@ def test_what_is_not_seen_is_bounded_and_said():
     assert not fit.supported[:, i].any()
     assert noise_parameters.largest(fit, "rate_random_walk") == (fit.upper[:, i].max(), False)
     text = noise_parameters.to_kalibr({"gyro": fit, "accelerometer": fit})
-    assert text.count("not seen, the upper end of its interval") == 2
+    assert text.count("not detected, the upper end of its interval") == 2
     assert f"gyroscope_random_walk: {fit.upper[:, i].max():.6e}" in text
-    assert "# EKF2_GYR_B_NOISE: not seen" in noise_parameters.to_px4({"gyro": fit, "accelerometer": fit})
+    assert "# EKF2_GYR_B_NOISE: not detected" in noise_parameters.to_px4({"gyro": fit, "accelerometer": fit})
     with pytest.raises(
         InputError, match="Kalibr takes the noise of gyro and accelerometer; identify the accelerometer too"
     ):
