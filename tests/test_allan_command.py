@@ -87,7 +87,9 @@ def test_one_column_gives_one_number_for_all_axes(run, tmp_path):
 def test_a_record_of_something_else_is_said_in_the_file_and_last(run, tmp_path):
     rates = white()
     rates[8000:12_000, 1] += 0.3  # two steps: a spectrum as f⁻², like that of a rate random walk
-    words = "axis y holds more than such noises: its noise is not steady, and largest from 78.12 to 81.25 s"
+    words = (
+        "axis y has other errors than these noise terms: its noise is not stationary, and largest from 78.12 to 81.25 s"
+    )
     np.save(tmp_path / "gyro.npy", rates)
     status, said, _ = run("allan", "gyro.npy", *AT_100_HZ)
     assert status == 0

@@ -256,7 +256,7 @@ def test_what_the_filter_has_no_state_for_is_reported(spinning, record, tmp_path
     assert filter_for(record, read_record(record), None, None, None)[1] == []
     chosen, (message,) = filter_for(spinning, held, None, None, None)
     assert chosen.states.names == ("gyro.scale",)
-    assert message.startswith("The filter has states for the specified errors, gyro.scale: without states")
+    assert message.startswith("The filter has states for the specified errors, gyro.scale: without them")
 
 
 def test_the_verdict_names_what_the_filter_has_no_state_for(run, spinning, tmp_path):
