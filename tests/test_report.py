@@ -192,7 +192,7 @@ def test_a_tuning_is_reported_from_its_json(folder, scenario, tmp_path):
     assert tuned["held_out"]["after"]["judgements"][0]["verdict"].capitalize() in content.split("<h2>")[0]
     assert content.count("data:image/png") == 2
     assert "[filter]" in content
-    with pytest.raises(InputError, match="not what `strapdown tune` writes"):
+    with pytest.raises(InputError, match="give the JSON that `strapdown tune` writes"):
         report.write(folder / "right.report.json", tmp_path / "page.html")
     # A tuning without data held out, of the same name, leaves nothing of what was said of held-out data before.
     figure = (tmp_path / "filter-heldout.png").read_bytes()
