@@ -519,9 +519,7 @@ def _truth_at(result: Estimate, truth: Truth | ImuRecord | None) -> Truth | None
             raise InputError("the record has no truth; leave it out to test the innovations only")
         rows = np.minimum(np.searchsorted(truth.time, result.time - SAME_STAMP), len(truth.time) - 1)
         if np.max(np.abs(truth.time[rows] - result.time)) > SAME_STAMP:
-            raise InputError(
-                "the time stamps of record and estimate differ; give the record from which the estimate was made"
-            )
+            raise InputError("the time stamps of record and estimate differ; give the record of the estimate")
         return Truth(attitude=truth.truth.attitude[rows], bias=truth.truth.bias[rows])
     if truth is not None:
         instance("truth", truth, Truth, "give the record, or a Truth at the epochs of the estimate")

@@ -121,7 +121,7 @@ def test_what_is_not_seen_is_bounded_and_said():
     assert f"gyroscope_random_walk: {fit.upper[:, i].max():.6e}" in text
     assert "# EKF2_GYR_B_NOISE: not detected" in noise_parameters.to_px4({"gyro": fit, "accelerometer": fit})
     with pytest.raises(
-        InputError, match="Kalibr takes the noise of gyro and accelerometer; identify the accelerometer too"
+        InputError, match="Kalibr needs the noise of gyro and accelerometer; identify the accelerometer too"
     ):
         noise_parameters.to_kalibr({"gyro": fit})
 

@@ -123,9 +123,7 @@ def _power_laws(multiples: NDArray[np.int64], variance: Array) -> NDArray[np.int
         near = np.abs(x - x[i]) <= np.log(3.0)
         slopes[i] = np.polyfit(x[near], y[near], 1)[0] if near.sum() > 2 else -1.0
     law = np.where(slopes < -1.5, 2, np.where(slopes < -0.5, 0, np.where(slopes < 0.5, -1, -2)))
-    for i in range(
-        1, len(law)
-    ):  # the exponent of sensor noise decreases with τ; with few averages the slope is uncertain
+    for i in range(1, len(law)):  # the exponent of sensor noise decreases with τ, and few averages are uncertain
         law[i] = min(law[i], law[i - 1])
     return np.asarray(law[np.clip(np.searchsorted(usable, np.arange(len(multiples))), 0, len(usable) - 1)])
 

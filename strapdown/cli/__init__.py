@@ -71,9 +71,7 @@ def main() -> None:
     """Run the command line; bad input ends with one line and status 2, Ctrl-C with 130, an internal error with 70."""
     warnings.showwarning = functools.partial(_say, warnings.showwarning)
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(
-            stream, io.TextIOWrapper
-        ):  # characters that ASCII or cp1252 lacks become question marks, not an error
+        if isinstance(stream, io.TextIOWrapper):  # characters missing in ASCII or cp1252 become question marks
             stream.reconfigure(errors="replace")
     console.stderr = False  # an earlier command in this process may have set it (--json -)
     if "--quiet" in sys.argv[1:]:

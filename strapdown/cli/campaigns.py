@@ -83,9 +83,7 @@ class _Computing:
         "auto",
         help="lanes: eight runs at once in SIMD lanes; scalar: any scenario and filter; auto: lanes if they support both.",
     )
-    chunk: int | None = typer.Option(
-        None, help="Number of runs between merges and writes. Default: chosen by the machine."
-    )
+    chunk: int | None = typer.Option(None, help="Runs between merges and writes. Default: chosen by the machine.")
     workers: int | None = typer.Option(None, help="Number of processes to use instead of threads (needs Dask).")
     cluster: str | None = typer.Option(
         None,
@@ -271,9 +269,7 @@ def _plan(scenario: str, model: _Model) -> Plan:
     if model.states is None and model.filter_file is None and plan.setup.states is not None:
         console.print(default_words(plan.setup.states.names))
     if plan.individuals:
-        console.print(
-            "Each run draws its own gyro and sensors: the specified constant errors are used as standard deviations."
-        )
+        console.print("Each run draws its own gyro and sensors: specified constant errors are standard deviations.")
     return plan
 
 

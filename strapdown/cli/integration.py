@@ -116,9 +116,7 @@ def integrate(
         known = np.isfinite(reference).all(axis=1)
     if truth is not None and known.any():
         error = np.degrees(quaternion.angle_between(quaternion.normalize(reference[known]), attitude[known]))
-        console.print(
-            f"Error relative to the file's attitude: at the end {error[-1]:.4g}°, maximum {error.max():.4g}°."
-        )
+        console.print(f"Error relative to the file's attitude: final {error[-1]:.4g}°, maximum {error.max():.4g}°.")
     for begin, length in gaps:
         console.print(f"Gap of {length:.3g} s after {begin:.3f} s: the rotation during it is interpolated.")
     if words:

@@ -114,9 +114,7 @@ class _Objective:
 
     truth: bool = typer.Option(False, "--truth", help="Tune by the likelihood of the errors relative to the truth.")
     rmse: bool = typer.Option(
-        False,
-        "--rmse",
-        help="Tune by the RMS attitude error relative to the truth; then scale all σ by the innovations.",
+        False, "--rmse", help="Tune by the RMS attitude error against the truth; then scale all σ by innovations."
     )
     gate: bool = typer.Option(
         False,
@@ -124,8 +122,7 @@ class _Objective:
         help="Also model the fraction and scale of outliers, and set the filter's gate where an outlier is more likely than noise.",
     )
     spacing: float = typer.Option(
-        0.0,
-        help="Use only samples of a sensor that are this far apart, s, with the weight of all: for correlated disturbances.",
+        0.0, help="Use samples of a sensor this far apart, s, with the weight of all: for correlated disturbances."
     )
     holdout: float | None = typer.Option(
         None, help="Fraction of the data held out, for comparing the filter before and after tuning."
@@ -151,9 +148,7 @@ class _Objective:
 class _Search:
     """Search."""
 
-    starts: int = typer.Option(
-        4, help="Number of searches: one from the initial filter, the others from random values."
-    )
+    starts: int = typer.Option(4, help="Number of searches: one from the filter, the others from random values.")
     factor: float = typer.Option(30.0, help="Maximum factor between random and initial values, up or down.")
     seed: int = typer.Option(0, help="Seed of the random values.")
     threads: int | None = typer.Option(None, help="Number of threads. Default: one per core.")
@@ -174,10 +169,7 @@ class _Output:
     """Output."""
 
     out: Path = typer.Option(
-        Path("filter.toml"),
-        "--out",
-        "-o",
-        help="TOML for --filter of other commands; JSON and figures are written beside it.",
+        Path("filter.toml"), "--out", "-o", help="TOML for --filter of other commands, beside it JSON and figures."
     )
     form: FigureFormat = FORMAT
     tables: Path | None = TABLES

@@ -48,9 +48,7 @@ def small_angle_drift(algorithm: str | Algorithm, frequency_ratio: float) -> flo
     table = named(algorithm)
     lam = checks.non_negative("frequency_ratio", frequency_ratio)
     if lam > 1.0:
-        raise InputError(
-            f"frequency_ratio is {lam:g}; the series is valid up to 1 (6 samples per period): sample faster"
-        )
+        raise InputError(f"frequency_ratio is {lam:g}; the series is valid up to 1 (6 samples a period): sample faster")
     total = 0.0
     for c in reversed(table.drift_series):
         total = total * lam * lam + c

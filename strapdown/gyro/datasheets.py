@@ -111,9 +111,7 @@ def from_datasheet(**quantities: str) -> GyroSpec:
     """
     known_keys("from_datasheet", quantities, _QUANTITIES)
     if "quantization" in quantities and "angle_resolution" in quantities:
-        raise InputError(
-            "from_datasheet got quantization and angle_resolution, which are the same quantity; give one of them"
-        )
+        raise InputError("quantization and angle_resolution are the same quantity; give one of them")
     values: dict[str, Any] = {}
     for name, text in quantities.items():
         field, wanted, example = _QUANTITIES[name]

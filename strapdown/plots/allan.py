@@ -81,8 +81,6 @@ def allan_overview(deviation: AllanDeviation, fit: NoiseFit) -> Figure:
         ax.set_title(f"{AXES[axis]} axis", loc="left")
         ax.set_ylabel(f"Allan deviation, {unit}" if axis == 0 else "")
     drawn = deviation.deviation[deviation.deviation > 0.0] / scale
-    axes[0, 0].set_ylim(
-        0.3 * drawn.min(), 3.0 * drawn.max()
-    )  # shared: the limits of the last axis could cut off the others
+    axes[0, 0].set_ylim(0.3 * drawn.min(), 3.0 * drawn.max())  # shared: those of the last axis could cut off others
     legend_below(figure, list(axes[0]), ncols=8)
     return figure
