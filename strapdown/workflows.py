@@ -395,7 +395,7 @@ def _record_setup(
         instance(
             "setup", setup, FilterSetup, "give a FilterSetup, as setup.FilterSetup.for_scenario or tune returns it"
         )
-        _refuse("the scenario's own filter, and setup is a whole one", noise=noise, states=states or None)
+        _refuse("the filter of the scenario, and setup defines another", noise=noise, states=states or None)
         return setup
     if not isinstance(noise, ProcessNoise):
         spec = None if noise is None else _specification(noise)

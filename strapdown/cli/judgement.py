@@ -95,7 +95,7 @@ def check(
 
     json_target(json, result, record, filter_file, foreign.truth)
     if record is None and filter_file is not None:
-        raise InputError("--filter goes with --record: the record is needed to look for causes")
+        raise InputError("--filter goes with --record: the record is needed to search for causes")
     tail(probability)
     own = _is_own(result)
     if record is not None and (foreign.truth is not None or not own):

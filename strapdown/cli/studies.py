@@ -96,7 +96,7 @@ class _Scenario:
     seed: int = typer.Option(1, help="Seed; the same one gives the same runs.")
 
     def parameters(self, own: tuple[Algorithm, ...]) -> ConingParameters:
-        """Return the parameters of the study, ``own`` algorithms compared too; what no algorithm follows is refused."""
+        """Return the parameters of the study, with ``own`` algorithms; raise an error if no algorithm can follow the motion."""
         from strapdown.montecarlo import coning_study
 
         if positive("--angle", self.angle, unit="degrees") >= 90.0:  # in the unit that it was given in
