@@ -188,7 +188,7 @@ def test_a_tuning_is_reported_from_its_json(folder, scenario, tmp_path):
     assert "<td>star 1.sigma, arcsec</td>" in content
     for value in (parameter["value"], parameter["lower"], parameter["upper"]):
         assert f"{value / parameter['si_per_unit']:.4g}" in content
-    assert "the verdict takes all tests of a record together" in content
+    assert "the verdict is for all tests of a record together" in content
     assert tuned["held_out"]["after"]["judgements"][0]["verdict"].capitalize() in content.split("<h2>")[0]
     assert content.count("data:image/png") == 2
     assert "[filter]" in content
@@ -283,7 +283,7 @@ def test_passing_findings_are_called_pass_and_failing_ones_fail(folder):
     for name, failing in (("right", False), ("wrong", True)):
         content = body(folder / f"{name}.html")
         judgement = json.loads((folder / f"{name}.report.json").read_text())["judgement"]
-        evidence = content.split("<h2>The evidence</h2>")[1].split("</section>")[0]
+        evidence = content.split("<h2>Evidence</h2>")[1].split("</section>")[0]
         marks = [mark for kind, mark in re.findall(r'<tr><td class="(pass|fail)">(\w+)</td>', evidence) if kind == mark]
         assert marks == ["fail" if one["rejected"] else "pass" for one in judgement["findings"]]
         assert ("fail" in marks) == failing

@@ -115,7 +115,7 @@ def coning_consistency(outcomes: Sequence[FilterOutcome]) -> Figure:
         passed = [one for one, verdict in zip(outcomes, verdicts, strict=True) if verdict.consistent]
         title = f"{subset.capitalize()}: {len(passed)} of {len(outcomes)} pass"
         if any(_leaves(one, subset, bounds) for one in passed):
-            title += "\nOutside the bounds only at epochs not tested"
+            title += "\nOutside the bounds only at epochs not judged"
         ax.set_title(title, loc="left")
     low, high = axes[0].get_ylim()
     axes[0].set_ylim(min(0.3, low), max(3.0, min(high, 30.0)))
