@@ -490,8 +490,8 @@ def test_a_recording_is_taken_for_that_of_a_hand(run, recording, tmp_path):
     status, said, error = run("estimate", recording, "--out", tmp_path / "out")
     assert (status, error) == (0, "")
     moved = re.search(
-        r"of a hand \(log-likelihood larger by [0-9.]+ than for a vehicle\), ([0-9.]+) m/s, from the recording, with a correlation time "
-        r"of 0.3 s\.",
+        r"of a hand \(log-likelihood larger by [0-9.]+ than for a vehicle\), velocity σ ([0-9.]+) m/s "
+        r"\(from the recording\), correlation time 0.3 s\.",
         said,
     )
     assert moved is not None

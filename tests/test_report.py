@@ -202,7 +202,7 @@ def test_a_tuning_is_reported_from_its_json(folder, scenario, tmp_path):
     (tmp_path / "filter-heldout.png").write_bytes(figure)
     content = body(report.write(tmp_path / "filter.json").page)
     assert content.count("data:image/png") == 1
-    assert "<strong>Consistent.</strong> The tuned filter explains the data that it was tuned on" in content
+    assert "<strong>Consistent.</strong> The tuned filter agrees with the data used for tuning" in content
 
 
 def test_gaps_become_null_not_nan():

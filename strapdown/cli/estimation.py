@@ -633,16 +633,16 @@ def _model(moved_by: str, odds: float, parameters: AhrsParameters, result: AhrsE
     if moved_by == "any":
         return "Motion: any, its acceleration modelled as white noise."
     bias, sigma = result.initial.bias / DEGREE, np.sqrt(result.initial.covariance[3, 3]) / DEGREE
-    shown = ", from the recording," if parameters.velocity_from_record else ""
+    shown = " (from the recording)" if parameters.velocity_from_record else ""
     likelier = (
         f" (log-likelihood larger by {odds:.3g} than for a {'hand' if moved_by == 'vehicle' else 'vehicle'})"
         if odds < np.inf
         else ""
     )
     words = (
-        f"Motion: of a {moved_by}{likelier}, {parameters.velocity_sigma:.2g} m/s{shown} with a correlation time of "
+        f"Motion: of a {moved_by}{likelier}, velocity σ {parameters.velocity_sigma:.2g} m/s{shown}, correlation time "
         f"{parameters.velocity_time:g} s. "
-        f"Gyro bias at the start: {', '.join(f'{value:.3g}' for value in bias)} °/s, σ {sigma:.2g} °/s"
+        f"Initial gyro bias: {', '.join(f'{value:.3g}' for value in bias)} °/s, σ {sigma:.2g} °/s"
     )
     if not _rested(parameters, result):
         return f"{words}: no second is quiet enough to estimate it, so the heading may drift at first."
