@@ -1,4 +1,4 @@
-"""Overlapping Allan deviation against allantools, side by side in one run: python benchmarks/allan.py [--json FILE]."""
+"""Overlapping Allan deviation compared with allantools in one run: python benchmarks/allan.py [--json FILE]."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from strapdown.kernels.machine import describe
 
 
 def seconds(function, repeats=1):
-    """Return the shortest time of ``repeats`` calls, and the last result."""
+    """Return the minimum time of ``repeats`` calls, and the last result."""
     best, result = float("inf"), None
     for _ in range(repeats):
         start = time.perf_counter()
@@ -27,7 +27,7 @@ def main(samples=10_000_000, taus=100, large=0):
     """Return times and ratios on the same record and taus."""
     rate = np.random.default_rng(1).standard_normal(samples)
     multiples = np.unique(np.geomspace(1, samples // 3, taus).astype(int))
-    allan.allan_deviation(rate[:1000], 1.0)  # compile outside the clock
+    allan.allan_deviation(rate[:1000], 1.0)  # compile before timing
     allan.allan_deviation(rate[:1000], 1.0, estimator="robust")
     allan.fit_noise(rate[:1000], 1.0)
     own, result = seconds(lambda: allan.allan_deviation(rate, 1.0, taus=multiples), repeats=2)
@@ -65,7 +65,7 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--samples", type=int, default=10_000_000)
     parser.add_argument("--large", type=int, default=0, help="also run on this many samples, for example 100000000")
-    parser.add_argument("--json", help="write the figures to this file")
+    parser.add_argument("--json", help="write the results to this file")
     arguments = parser.parse_args()
     figures = main(arguments.samples, large=arguments.large)
     for name, value in figures.items():

@@ -1,7 +1,7 @@
-"""Whole-record filters side by side, in one process and one thread: ns a sample, and ratios. ``python benchmarks/filter.py``.
+"""Whole-record filters compared in one process and one thread: ns per sample, and ratios. ``python benchmarks/filter.py``.
 
-Each is fed the same record: gyro, and a vector a sample (an accelerometer at rest under noise). The filters do not estimate the same
-states or aim at the same thing; the table compares what a user waits for, not how good they are.
+Each processes the same record: gyro, and a vector per sample (an accelerometer at rest with noise). The filters differ in their states and
+purpose; the table compares only their run time, not their quality.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ STATES = (
     VectorBias(sensor="up", bias_sigma=1e-2),
     VectorBias(sensor="field", bias_sigma=1e-2),
 )
-"""15 error states."""
+"""Filter states: 15 in addition to attitude and bias."""
 
 
 def samples(n: int, vectors: int) -> tuple[ImuRecord, np.ndarray, np.ndarray, np.ndarray]:
-    """Return a record with one or two directions a sample, and the same as rate, specific force and field."""
+    """Return a record with one or two directions per sample, and the same data as rate, specific force and field."""
     generator = np.random.default_rng(0)
     rate = 0.1 * generator.standard_normal((n, 3))
     force = np.array([0.0, 0.0, 9.81]) + 0.1 * generator.standard_normal((n, 3))
@@ -63,7 +63,7 @@ def samples(n: int, vectors: int) -> tuple[ImuRecord, np.ndarray, np.ndarray, np
 
 
 def asynchronous(record: ImuRecord) -> ImuRecord:
-    """Return the record with both series between the gyro's edges, each at its own phase: every interval is split in three."""
+    """Return the record with both series between the gyro's edges at different phases: every interval is split in three."""
     shifted = tuple(
         replace(series, time=series.time - share / RATE)
         for series, share in zip(record.vectors, (0.31, 0.67), strict=True)
@@ -72,7 +72,7 @@ def asynchronous(record: ImuRecord) -> ImuRecord:
 
 
 def at_edges(record: ImuRecord) -> ImuRecord:
-    """Return a record of the same turns with gyro samples between all times: the same predictions and updates, no interval to split."""
+    """Return a record of the same rotations with gyro edges at all times: the same predictions and updates, no interval is split."""
     times = np.unique(np.concatenate([record.time, *(series.time for series in record.vectors)]))
     interval = np.searchsorted(record.time, times[:-1], side="right") - 1
     share = np.diff(times) / np.diff(record.time)[interval]
@@ -80,7 +80,7 @@ def at_edges(record: ImuRecord) -> ImuRecord:
 
 
 def with_states(record: ImuRecord, recording: Recording) -> dict[str, tuple[Callable[[], Any], int]]:
-    """Return the filters with error states: the record's, also with measurements at each fiftieth sample, and that of recordings."""
+    """Return the filters with error states: on the record, also with measurements at every 50th sample, and for recordings."""
     n, few = len(record.increments), len(recording.time)
     rare = replace(record, vectors=tuple(one.taken(slice(49, None, 50)) for one in record.vectors))
     return {
@@ -102,7 +102,7 @@ def with_states(record: ImuRecord, recording: Recording) -> dict[str, tuple[Call
 
 
 def peers(rate: np.ndarray, force: np.ndarray, field: np.ndarray) -> dict[str, tuple[Callable[[], Any], int]]:
-    """Return what each installed peer does with the record, and how many samples of it it gets (slow ones get fewer)."""
+    """Return the call of each installed peer on the record, and its number of samples (fewer for slow ones)."""
     found: dict[str, tuple[Callable[[], Any], int]] = {}
     n = len(rate)
     try:
@@ -138,7 +138,7 @@ def peers(rate: np.ndarray, force: np.ndarray, field: np.ndarray) -> dict[str, t
 
 
 def step_by_step(record: ImuRecord, few: int) -> Callable[[], None]:
-    """Return a loop of the filterpy face over the first ``few`` samples."""
+    """Return a loop of the filterpy interface over the first ``few`` samples."""
 
     def work() -> None:
         f = StepFilter(NOISE, START)
@@ -163,7 +163,7 @@ def import_times(repeats: int = 7) -> tuple[float, float]:
 
 
 def main(*, n: int = 200_000, repeats: int = 7) -> dict[str, Any]:
-    """Return ns a sample (median and least) of each, the ratios to ours, and the import times."""
+    """Return ns per sample (median and minimum) of each, the ratios to ours, and the import times."""
     one, rate, force, field = samples(n, 1)
     two, *_ = samples(n, 2)
     between = asynchronous(two)
@@ -198,11 +198,11 @@ def main(*, n: int = 200_000, repeats: int = 7) -> dict[str, Any]:
     }
     for work, _ in works.values():
         work()
-    # Taken in turn, so that a drift of the machine's speed falls on all alike.
+    # Timed in turns, so that a drift of the machine's speed affects all equally.
     times: dict[str, list[float]] = {name: [] for name in works}
     for _ in range(repeats):
         for name, (work, count) in works.items():
-            start = time.process_time()  # what else the machine does is not counted
+            start = time.process_time()  # excludes other processes
             work()
             times[name].append((time.process_time() - start) / count * 1e9)
     base = statistics.median(times["strapdown estimation.run, one vector"])

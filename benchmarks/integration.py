@@ -1,8 +1,7 @@
-"""Attitude from gyro increments: this package beside numpy-quaternion, ahrs and SciPy, in one run, ratios printed.
+"""Attitude from gyro increments: this package compared with numpy-quaternion, ahrs and SciPy in one run, with ratios.
 
-Run it: ``python benchmarks/integration.py [--json FILE] [--samples N]``. Every figure is the least processor time of several runs, in ns a
-sample.
-A peer that is not installed is left out and named.
+Run ``python benchmarks/integration.py [--json FILE] [--samples N]``. Every figure is the minimum processor time of several runs, in ns per
+sample. Peers that are not installed are skipped and named.
 """
 
 from __future__ import annotations
@@ -22,13 +21,13 @@ from strapdown.kernels import integration as kernels
 from strapdown.kernels.machine import compiled, describe
 
 IN_CACHE = 2000
-"""Samples of the record that fits in cache with its attitude: 48 + 64 kB."""
+"""Number of samples of a record that fits in the cache with its attitude: 48 + 64 kB."""
 INTERVAL = 0.01
-"""s; the peers want a rate and an interval."""
+"""Sample interval, s; the peers take a rate and an interval."""
 
 
 def least_time(function: Callable[[], object], seconds: float) -> float:
-    """Return the least processor time of one call, s, over as many calls as fit in ``seconds``, two at least."""
+    """Return the minimum processor time of a call, s, over the calls that fit in ``seconds``, at least two."""
     function()
     best, spent = math.inf, 0.0
     while spent < seconds or best == math.inf:
@@ -119,23 +118,23 @@ def main(arguments: list[str] | None = None) -> dict:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--json", type=Path)
     parser.add_argument("--samples", type=int, default=20_160)
-    parser.add_argument("--seconds", type=float, default=0.5, help="spent on each figure")
+    parser.add_argument("--seconds", type=float, default=0.5, help="time per figure, s")
     options = parser.parse_args(arguments)
     result = measure(options.samples, options.seconds)
     print(", ".join(f"{k} {v}" for k, v in result["machine"].items()))
     print(
-        f"exact exponential, sequential, {result['samples_in_cache']} samples in cache: {result['kernel_ns']:.2f} ns a sample"
+        f"exact exponential, sequential, {result['samples_in_cache']} samples in cache: {result['kernel_ns']:.2f} ns per sample"
     )
     for name, ns in result["algorithms_ns"].items():
-        print(f"  {name:30s} {ns:10.1f} ns a sample")
+        print(f"  {name:30s} {ns:10.1f} ns per sample")
     for name, ns in result["peers_ns"].items():
         wanted = f" (wanted {WANTED[name]:g})" if name in WANTED else ""
         print(
-            f"{name:30s} {ns:10.1f} ns a sample: {result['ratios'][name]:.0f} times one-sample{wanted}; "
+            f"{name:30s} {ns:10.1f} ns per sample: {result['ratios'][name]:.0f} times one-sample{wanted}; "
             f"attitudes differ by {result['difference_rad'][name]:.1e} rad"
         )
     for name in result["absent"]:
-        print(f"{name}: not installed, left out")
+        print(f"{name}: not installed, skipped")
     if options.json:
         write_json(options.json, result)
     return result

@@ -1,8 +1,8 @@
-"""Filters called once a sample, side by side in one process and thread: µs a call, and ratios. ``python benchmarks/live.py``.
+"""Filters called once per sample, compared in one process and thread: µs per call, and ratios. ``python benchmarks/live.py``.
 
-Each is given the same samples one by one, as lists or arrays, whichever it takes faster: gyro, accelerometer, magnetometer. They do not
-estimate the same states or aim at the same thing; the table compares what a user waits for. smsfusion and AttiPy take a heading in place
-of the magnetometer. What numba itself needs to find out the types of the kernel's arguments and to unpack them is measured too.
+Each gets the same samples one at a time, as lists or arrays, whichever is faster for it: gyro, accelerometer, magnetometer. The filters
+differ in their states and purpose; the table compares only their run time. smsfusion and AttiPy use a heading in place of the
+magnetometer. The time that numba needs to determine the types of the kernel's arguments and to unpack them is measured too.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ Call = Callable[[int], object]
 
 
 def ours(rate: list[Any], force: list[Any], field: list[Any]) -> dict[str, tuple[Call, int]]:
-    """Return a call of each of our own filters with a sample, and how many samples it gets."""
+    """Return a call of each of our filters with a sample, and its number of samples."""
     n = len(rate)
 
     def live(two: bool = True, **options: Any) -> Call:
@@ -64,7 +64,7 @@ def ours(rate: list[Any], force: list[Any], field: list[Any]) -> dict[str, tuple
 
 
 def peers(rate: np.ndarray, force: np.ndarray, field: np.ndarray) -> dict[str, tuple[Call, int]]:
-    """Return a call of each installed peer with a sample, and how many samples it gets."""
+    """Return a call of each installed peer with a sample, and its number of samples."""
     found: dict[str, tuple[Call, int]] = {}
     n, few = len(rate), 2000
     try:
@@ -107,7 +107,7 @@ def peers(rate: np.ndarray, force: np.ndarray, field: np.ndarray) -> dict[str, t
 
 
 def main(*, n: int = 20_000, repeats: int = 5) -> dict[str, Any]:
-    """Return µs a call (median and least) of each, and the ratios to ours with two vectors."""
+    """Return µs per call (median and minimum) of each, and the ratios to ours with two vectors."""
     generator = np.random.default_rng(0)
     rate = 0.1 * generator.standard_normal((n, 3))
     force = np.array([0.0, 0.0, 9.81]) + 0.1 * generator.standard_normal((n, 3))
@@ -115,11 +115,11 @@ def main(*, n: int = 20_000, repeats: int = 5) -> dict[str, Any]:
     works = {**ours(rate.tolist(), force.tolist(), field.tolist()), **peers(rate, force, field)}
     for call, _ in works.values():
         call(0)
-    # Taken in turn, so that a drift of the machine's speed falls on all alike.
+    # Timed in turns, so that a drift of the machine's speed affects all equally.
     times: dict[str, list[float]] = {name: [] for name in works}
     for _ in range(repeats):
         for name, (call, count) in works.items():
-            start = time.process_time()  # what else the machine does is not counted
+            start = time.process_time()  # excludes other processes
             for k in range(count):
                 call(k)
             times[name].append((time.process_time() - start) / count * 1e6)

@@ -1,8 +1,7 @@
-"""The Monte Carlo of the lanes: ns a run-step, against the machine's own peak and against peers. ``python benchmarks/montecarlo.py``.
+"""The Monte Carlo in lanes: ns per run-step, compared with the machine's peak and with peers. ``python benchmarks/montecarlo.py``.
 
-A run-step is one gyro sample of one run: noise, sensor, prediction, one update with a direction, statistics. Times are process times, the
-least of several repeats, so that other work on the machine counts little; the ratio of two threads is of wall times and wants an idle
-machine.
+A run-step is one gyro sample of one run: noise, sensor, prediction, one update with a direction, statistics. Times are the minimum process
+times of several repeats, so that other load has little effect; the ratio of two threads is of wall times and needs an idle machine.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ RATE = 100.0
 
 
 def plan(steps: int, precision: str = "float64") -> Plan:
-    """Return one direction a gyro sample, ARW and rate random walk, a hundred epochs."""
+    """Return a plan with one direction per gyro sample, angle and rate random walk, and 100 epochs."""
     scenario = Scenario(
         motion=motion.ConstantRate(rate=np.array([0.02, -0.03, 0.05])),
         gyro=GyroSpec(angle_random_walk=1e-4, rate_random_walk=1e-6, turn_on_bias_sigma=1e-3),
@@ -47,7 +46,7 @@ def plan(steps: int, precision: str = "float64") -> Plan:
 
 
 def with_states(seconds: float) -> Plan:
-    """Return a satellite's star tracker at 2 Hz beside a gyro whose scale, misalignments and drift are error states."""
+    """Return a plan of a satellite with a star tracker at 2 Hz and a gyro with error states for scale, misalignment and drift."""
     spec = GyroSpec(angle_random_walk=4e-5, scale_factor=np.full(3, 2e-4), turn_on_bias_sigma=1e-4)
     scenario = Scenario(
         motion=motion.ConstantRate(rate=np.array([0.02, -0.03, 0.05])),
@@ -63,7 +62,7 @@ def with_states(seconds: float) -> Plan:
 
 
 def least(work: Callable[[], Any], repeats: int) -> float:
-    """Return the least process time of some calls after one to warm up, s."""
+    """Return the minimum process time of some calls after one to warm up, s."""
     work()
     times = []
     for _ in range(repeats):
@@ -74,7 +73,7 @@ def least(work: Callable[[], Any], repeats: int) -> float:
 
 
 def simdkalman_ns(repeats: int) -> float | None:
-    """Return ns a run-step of simdkalman: plain 6 states, 3 measurements, 200 runs at once."""
+    """Return ns per run-step of simdkalman: 6 states, 3 measurements, 200 runs at once."""
     try:
         import simdkalman
     except ImportError:
@@ -90,7 +89,7 @@ def simdkalman_ns(repeats: int) -> float | None:
 
 
 def filterpy_ns(repeats: int, few: int = 200) -> float:
-    """Return ns a step of the filter's face on filterpy."""
+    """Return ns per step of the filter's interface on filterpy."""
 
     def work() -> None:
         f = StepFilter(NOISE, initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=1e-2, bias_sigma=1e-3))
@@ -102,7 +101,7 @@ def filterpy_ns(repeats: int, few: int = 200) -> float:
 
 
 def threads_ratio(one: Plan, runs: int) -> float:
-    """Return wall time of two chunks one after the other over that of two threads."""
+    """Return the ratio of the wall time of two chunks in sequence to that in two threads."""
     start = time.perf_counter()
     for first in (0, runs):
         lanes.run_chunk(one, first, runs)
@@ -114,11 +113,11 @@ def threads_ratio(one: Plan, runs: int) -> float:
 
 
 def main(*, steps: int = 10_000, runs: int = 160, repeats: int = 9) -> dict[str, Any]:
-    """Return all figures, ns a run-step unless the name says otherwise."""
+    """Return all figures, in ns per run-step unless named otherwise."""
     full = {}
     for precision in ("float64", "float32"):
         one = plan(steps, precision)
-        # The first runs are kept as examples; later ones are what a campaign is made of.
+        # The first runs are kept as examples; later ones represent a campaign.
         full[precision] = least(lambda p=one: lanes.run_chunk(p, 1000, runs), repeats) / runs / steps * 1e9  # type: ignore[misc]
     few, long = plan(2000), with_states(600.0)
     peers = {

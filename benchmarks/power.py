@@ -1,8 +1,8 @@
 """False alarms and power of the consistency statistics, over many simulated filters. ``python benchmarks/power.py [--json FILE]``.
 
-The filters are linear: angle and bias of one axis, a gyro step and two angle measurements a step, the covariance by its own recursion. They
-are simulated all at once, so ten thousand of them take seconds; the truth is then made to differ from the filter's model, and the
-share of filters that each statistic refuses at 95 and 99 % is printed. Of a right filter it should be 5 and 1 %.
+The filters are linear: angle and bias of one axis, a gyro step and two angle measurements per step, the covariance by recursion. They are
+simulated all at once, so ten thousand take seconds. The truth differs from the filter's model in known ways, and the fraction of filters
+rejected by each statistic at 95 and 99 % is printed; for a correct filter it should be 5 and 1 %.
 """
 
 from __future__ import annotations
@@ -22,34 +22,34 @@ from strapdown.files import write_json
 
 @dataclass(frozen=True, kw_only=True)
 class Filters:
-    """What many linear filters did: of each run the errors over their covariances, and the innovations over theirs."""
+    """Errors of many linear filters with their covariances, and whitened innovations."""
 
     error: Array
     """Errors (runs, steps, 2): angle, bias."""
     covariance: Array
-    """What every filter takes their covariance for (steps, 2, 2)."""
+    """Covariance in every filter (steps, 2, 2)."""
     innovation: Array
-    """Whitened innovations (runs, steps, 2): of two measurements, the second after the first."""
+    """Whitened innovations of two sequential measurements (runs, steps, 2)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Mismatch:
-    """How the truth differs from the filter's model. The default is nothing."""
+    """Difference of the truth from the filter's model. Default: none."""
 
     measurement: float = 1.0
-    """The truth's measurement noise over the modelled one."""
+    """Ratio of the true measurement noise to the modelled one."""
     process: float = 1.0
-    """The truth's angle random walk over the modelled one."""
+    """Ratio of the true angle random walk to the modelled one."""
     bias_walk: float = 1.0
-    """The truth's rate random walk over the modelled one."""
+    """Ratio of the true rate random walk to the modelled one."""
     outliers: float = 0.0
     """Probability that a measurement has ten times the noise."""
     colour: float = 0.0
-    """Correlation of one measurement's noise with the last of its sensor."""
+    """Correlation of successive measurement noise of a sensor."""
     offset: float = 0.0
-    """Constant error of the first sensor over its σ."""
+    """Constant error of the first sensor relative to its σ."""
     drift: float = 0.0
-    """Constant rate error that is no bias to the truth, over the bias's σ at the end: what commutation of coning does."""
+    """Constant rate error that is not a bias, such as coning error, relative to the final σ of the bias."""
 
 
 ANGLE_WALK, BIAS_WALK, MEASUREMENT = 0.3, 0.03, 1.0
@@ -58,7 +58,7 @@ ANGLE_WALK, BIAS_WALK, MEASUREMENT = 0.3, 0.03, 1.0
 def linear_filters(
     runs: int, steps: int, generator: np.random.Generator, mismatch: Mismatch | None = None, every: int = 1
 ) -> Filters:
-    """Return what ``runs`` filters did over ``steps`` steps of unit time; errors are kept at every ``every``-th."""
+    """Return the results of ``runs`` filters over ``steps`` steps of unit time; errors are kept at every ``every``-th."""
     truth = mismatch or Mismatch()
     F = np.array([[1.0, -1.0], [0.0, 1.0]])
     Q = ANGLE_WALK**2 * np.diag([1.0, 0.0]) + BIAS_WALK**2 * np.array([[1.0 / 3.0, -0.5], [-0.5, 1.0]])
@@ -129,7 +129,7 @@ def single_run_p_values(filters: Filters, *, averages: bool = True) -> dict[str,
 
 
 def many_run_p_values(white: Array) -> dict[str, Array]:
-    """Return p-values (groups,) of what independent runs tell at one epoch, of whitened errors (groups, runs, n)."""
+    """Return p-values (groups,) of the statistics of independent runs at one epoch, from whitened errors (groups, runs, n)."""
     _, runs, n = white.shape
     squares = np.sum(white**2, axis=2)
     return {
@@ -159,7 +159,7 @@ MISMATCHES: dict[str, Mismatch] = {
 
 
 def main(*, runs: int = 1000, steps: int = 500, group: int = 50, groups: int = 400, seed: int = 1) -> dict[str, Any]:
-    """Return the share of filters refused at 95 and 99 %, by mismatch and statistic."""
+    """Return the fraction of filters rejected at 95 and 99 %, by mismatch and statistic."""
     rows = []
     for name, mismatch in MISMATCHES.items():
         random = np.random.default_rng([seed, len(rows)])
@@ -189,9 +189,7 @@ if __name__ == "__main__":
     arguments = parser.parse_args()
     result = main(runs=arguments.runs, steps=arguments.steps)
     statistics = list(dict.fromkeys(row["statistic"] for row in result["rows"]))
-    print(
-        f"Share refused at 99 %, in %. The last four are of {result['group']} runs at one epoch, the others of one run."
-    )
+    print(f"Rejected at 99 %, in %. The last four are for {result['group']} runs at one epoch, the others for one run.")
     print(f"{'':26s}" + " ".join(f"{name[:11]:>11s}" for name in statistics))
     for mismatch in MISMATCHES:
         shares = [row["refused_at_99"] for row in result["rows"] if row["mismatch"] == mismatch]

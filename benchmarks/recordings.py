@@ -1,7 +1,7 @@
-"""Reading recordings beside iterating by the format's own library: ns a message, and ratios. ``python benchmarks/recordings.py``.
+"""Reading recordings compared with iteration by the format's library: ns per message, and ratios. ``python benchmarks/recordings.py``.
 
-Each file holds gyro and accelerometer alone, written by this package. rosbags yields raw messages, which nobody has decoded then; pyulog
-decodes all of them.
+Each file contains only gyro and accelerometer, written by this package. rosbags yields raw messages, not decoded; pyulog decodes all of
+them.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def recording(n: int) -> Recording:
 
 
 def iterate(path: Path) -> None:
-    """Do what the library of the format does to show each message."""
+    """Iterate over all messages by the library of the format."""
     if path.suffix == ".ulg":
         import pyulog
 
@@ -53,7 +53,7 @@ def iterate(path: Path) -> None:
 
 
 def main(*, n: int = 1_000_000, repeats: int = 3) -> dict[str, Any]:
-    """Return ns a message (least of the repeats) of our reader and of the library, and their ratio, for each format."""
+    """Return ns per message (minimum of the repeats) of our reader and of the library, and their ratio, for each format."""
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         for ending in ENDINGS:
@@ -63,7 +63,7 @@ def main(*, n: int = 1_000_000, repeats: int = 3) -> dict[str, Any]:
             times: dict[str, list[float]] = {name: [] for name in works}
             for _ in range(repeats):
                 for name, work in works.items():
-                    start = time.process_time()  # what else the machine does is not counted
+                    start = time.process_time()  # excludes other processes
                     work(path)
                     times[name].append((time.process_time() - start) / n * 1e9)
             ours, theirs = min(times["read"]), min(times["library"])

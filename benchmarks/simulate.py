@@ -1,4 +1,4 @@
-"""Simulating a three-axis gyro beside NumPy doing the same work, in one run: python benchmarks/simulate.py [--json FILE].
+"""Simulation of a three-axis gyro compared with NumPy in one run: python benchmarks/simulate.py [--json FILE].
 
 The gyro has angle random walk, rate random walk, flicker, scale factors and misalignment. NumPy's flicker is by FFT, as usual.
 """
@@ -25,7 +25,7 @@ SPEC = gyro.GyroSpec(
 
 
 def with_numpy(spec, increments, edges, stream):
-    """Return the increments as one would write them with NumPy."""
+    """Return the increments computed with NumPy."""
     n, dt = len(increments), np.diff(edges)[:, None]
     draws = stream.standard_normal((2, n, 3))
     walk = np.concatenate([np.zeros((1, 3)), np.cumsum(spec.rate_random_walk * np.sqrt(dt) * draws[0], axis=0)])
@@ -43,7 +43,7 @@ def with_numpy(spec, increments, edges, stream):
 
 
 def best(function, repeats=3):
-    """Return the shortest processor time of some calls, s."""
+    """Return the minimum processor time of some calls, s."""
     shortest = float("inf")
     for _ in range(repeats):
         start = time.process_time()
@@ -53,9 +53,9 @@ def best(function, repeats=3):
 
 
 def main(samples=1 << 20):
-    """Return times an axis and sample, and ratios."""
+    """Return times per axis and sample, and ratios."""
     edges, increments = np.arange(samples + 1) / 100.0, np.zeros((samples, 3))
-    gyro.simulate(SPEC, increments[:100], edges[:101], generator(1, 0, "gyro"))  # compile outside the clock
+    gyro.simulate(SPEC, increments[:100], edges[:101], generator(1, 0, "gyro"))  # compile before timing
     own = best(lambda: gyro.simulate(SPEC, increments, edges, generator(1, 0, "gyro")))
     peer = best(lambda: with_numpy(SPEC, increments, edges, generator(1, 0, "gyro")))
     state, words, out = np.empty((2, 4), np.uint64), np.empty((2, 256), np.uint64), np.empty(512)

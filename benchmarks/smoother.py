@@ -1,7 +1,7 @@
-"""The smoother beside the filter and beside vqf's offline variant, in one run, ratios printed.
+"""The smoother compared with the filter and with vqf's offline variant in one run, with ratios.
 
-Run it: ``python benchmarks/smoother.py [--json FILE] [--samples N]``. Every figure is the least of several runs, in ns a gyro sample. The
-smoother's time holds its own run of the filter. A peer that is not installed is left out and named.
+Run ``python benchmarks/smoother.py [--json FILE] [--samples N]``. Every figure is the minimum of several runs, in ns per gyro sample. The
+smoother's time includes its run of the filter. Peers that are not installed are skipped and named.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from strapdown.records import ImuRecord
 from strapdown.vectors import VectorMeasurements
 
 INTERVAL = 0.01
-"""s."""
+"""Sample interval, s."""
 SPACING = {"two vectors a sample": 1, "two vectors every 10 samples": 10, "no measurements": 0}
 UP, FIELD = np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.5, -math.sqrt(0.75)])
 GYRO_SIGMA, SIGMA = 5e-3, 0.02
@@ -30,7 +30,7 @@ WANTED = {"filter": 6.0, "vqf": 5.0}
 
 
 def least_times(functions: dict[str, Callable[[], object]], seconds: float) -> dict[str, float]:
-    """Return the least time of one call of each, s, timed in turns so that other load of the machine affects all alike."""
+    """Return the minimum time of a call of each, s, timed in turns so that other load affects all equally."""
     best = dict.fromkeys(functions, math.inf)
     for function in functions.values():
         function()
@@ -46,7 +46,7 @@ def least_times(functions: dict[str, Callable[[], object]], seconds: float) -> d
 
 
 def sensors(samples: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return rate (n, 3), rad/s, and the directions up and of the field (n, 3) that a swaying body measures."""
+    """Return rate (n, 3), rad/s, and measured directions of up and of the field (n, 3) of a swaying body."""
     rng = np.random.default_rng(0)
     t = INTERVAL * np.arange(samples)
     rate = np.stack([0.5 * np.sin(1.3 * t), 0.4 * np.cos(0.9 * t), 0.3 * np.sin(0.7 * t + 1.0)], axis=-1)
@@ -93,7 +93,7 @@ def measure(samples: int, seconds: float) -> dict:
             "filter": lambda one=one: estimation.run(one, noise, initial),
             "smoother": lambda one=one: estimation.smooth(one, noise, initial),
         }
-        if not absent:  # it takes the vectors of every sample in any case
+        if not absent:  # it uses the vectors of every sample in any case
             gyr, acc, mag = (np.ascontiguousarray(x) for x in (data[0], 9.81 * data[1], 50.0 * data[2]))
             functions["vqf"] = lambda gyr=gyr, acc=acc, mag=mag: vqf.offlineVQF(gyr, acc, mag, INTERVAL)
         best = least_times(functions, seconds)
@@ -109,23 +109,23 @@ def main(arguments: list[str] | None = None) -> dict:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--json", type=Path)
     parser.add_argument("--samples", type=int, default=20_000)
-    parser.add_argument("--seconds", type=float, default=2.0, help="spent on each case")
+    parser.add_argument("--seconds", type=float, default=2.0, help="time per case, s")
     options = parser.parse_args(arguments)
     result = measure(options.samples, options.seconds)
     print(", ".join(f"{k} {v}" for k, v in result["machine"].items()))
     for name, figures in result["cases"].items():
         print(
-            f"{name:30s} filter {figures['filter_ns']:7.1f}, smoother {figures['smoother_ns']:7.1f} ns a sample: "
+            f"{name:30s} filter {figures['filter_ns']:7.1f}, smoother {figures['smoother_ns']:7.1f} ns per sample: "
             f"{figures['smoother_over_filter']:.2f} times the filter (wanted: {WANTED['filter']:g} at most)"
         )
         if "vqf_ns" in figures:
             target = f"wanted: {WANTED['vqf']:g} at least" if SPACING[name] == 1 else "with vectors at every sample"
             print(
-                f"{'vqf.offlineVQF':30s} {figures['vqf_ns']:.1f} ns a sample: {figures['vqf_over_smoother']:.2f} times the "
+                f"{'vqf.offlineVQF':30s} {figures['vqf_ns']:.1f} ns per sample: {figures['vqf_over_smoother']:.2f} times the "
                 f"smoother ({target})"
             )
     for name in result["absent"]:
-        print(f"{name}: not installed, left out")
+        print(f"{name}: not installed, skipped")
     if options.json:
         write_json(options.json, result)
     return result

@@ -1,9 +1,10 @@
-"""Tuning four parameters of a long record: ours, other optimisers on the same likelihood, the filterpy face.
+"""Tuning four parameters on a long record: ours, other optimisers on the same likelihood, the filterpy interface.
 
 Run ``python benchmarks/tuning.py``.
 
-Each optimiser starts from parameters wrong by a factor and has the same likelihood to work on; derivatives come from one pass of lanes, or
-from differences of whole filter runs. The filterpy face is timed a pass; its tuning is computed from the search without derivatives.
+Each optimiser starts from parameters wrong by a factor and uses the same likelihood; derivatives are from one pass of lanes, or from
+differences of whole filter runs. A pass of the filterpy interface is timed; its tuning time is extrapolated from the search without
+derivatives.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ FREE = ("gyro.arw", "gyro.rrw", "star 1.sigma", "star 2.sigma")
 
 
 def record(duration: float, rate: float) -> tuple[scenarios.Scenario, Any]:
-    """Return a scenario of two stars seen once a second, and its record."""
+    """Return a scenario with two star directions at 1 Hz, and its record."""
     scenario = scenarios.Scenario(
         motion=motion.ConstantRate(rate=np.array([0.01, 0.02, 0.05])),
         gyro=gyro.GyroSpec(angle_random_walk=3e-5, rate_random_walk=2e-7, turn_on_bias_sigma=1e-5),
@@ -55,7 +56,7 @@ def seconds(work: Callable[[], Any], repeats: int) -> float:
 
 
 def step_seconds(one: tuning.Case, chosen: setup.FilterSetup, samples: int) -> float:
-    """Return processor seconds a gyro sample of the filterpy face, measurements and all."""
+    """Return the processor time per gyro sample of the filterpy interface, including measurements, s."""
     modelled = setup.modelled_record(one.record, chosen)
     filter_ = StepFilter(chosen.process_noise, one.initial)
     first, second = modelled.vectors
@@ -72,7 +73,7 @@ def step_seconds(one: tuning.Case, chosen: setup.FilterSetup, samples: int) -> f
 
 
 def main(*, duration: float = 1800.0, rate: float = 100.0, wrong: float = 30.0, repeats: int = 5) -> dict[str, Any]:
-    """Return times of a pass, and of each optimiser with how far from the best it ended."""
+    """Return times of a pass, and of each optimiser with the difference of its end from the best."""
     scenario, data = record(duration, rate)
     right = setup.FilterSetup.for_scenario(scenario, attitude_sigma=1e-3)
     one = tuning.record_case(data, right, seed=1)
@@ -105,7 +106,7 @@ def main(*, duration: float = 1800.0, rate: float = 100.0, wrong: float = 30.0, 
             {
                 "optimiser": name,
                 "seconds": used,
-                "passes": int(number),  # COBYLA counts in an int64
+                "passes": int(number),  # COBYLA returns an int64
                 "short_of_best": float(objective.minus_log(point)[0] - best.after),
             }
         )

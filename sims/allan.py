@@ -1,8 +1,8 @@
-"""What noises does a gyro at rest have? Simulate a record, draw its Allan deviation, fit the coefficients, compare with the truth.
+"""What noise does a gyro at rest have? Simulate a record, draw its Allan deviation, fit the coefficients, compare with the truth.
 
-The round trip of the gyro specification: what is put into the simulator must come back, within its interval. ``python sims/allan.py``;
-``--study`` repeats it over 400 axes for records of several lengths and gyros of several random walks (two minutes) and counts how often
-the intervals hold the truth, and how large the errors are beside those expected.
+The fitted coefficients must agree with the simulated specification within their intervals. Run ``python sims/allan.py``; ``--study``
+repeats it over 400 axes for records of several durations and gyros of several random walks (two minutes), counts how often the intervals
+contain the truth, and compares the errors with the expected ones.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ TRUTH = GyroSpec(
     bias_instability=3.0 * units.DEGREE_PER_HOUR,
     rate_random_walk=60.0 * units.DEGREE_PER_HOUR_PER_ROOT_HOUR,
 )
-"""A fibre-optic or good MEMS gyro, alike on all axes."""
+"""A fibre-optic or good MEMS gyro, the same on all axes."""
 
 CASES = {
     "5 min": (1 << 15, {}),
@@ -36,10 +36,10 @@ CASES = {
     "22 min, strong K": (1 << 17, {"rate_random_walk": 180.0 * units.DEGREE_PER_HOUR_PER_ROOT_HOUR}),
     "22 min, strong B": (1 << 17, {"bias_instability": 10.0 * units.DEGREE_PER_HOUR}),
 }
-"""Records of the study: samples at 100 Hz, and what differs from the truth above."""
+"""Records of the study: number of samples at 100 Hz, and differences from :data:`TRUTH`."""
 
 SMALL = {"samples": 1 << 15}
-"""Arguments of a run that only shows that the script works."""
+"""Arguments of a quick test run."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,31 +54,31 @@ class Result:
 
 @dataclass(frozen=True, kw_only=True)
 class Study:
-    """Many fits of one gyro, by axis and term."""
+    """Many fits of one gyro, by axis and noise term."""
 
     truth: dict[str, float]
     covered: Array
-    """Whether the interval holds the truth (axes, terms)."""
+    """Whether the interval contains the truth (axes, terms)."""
     supported: Array
     estimate: Array
-    """NaN where not supported."""
+    """Estimated coefficients; NaN if not supported."""
     expected: dict[str, float]
-    """Standard errors by :func:`strapdown.allan.expected_errors`, of the terms that are there."""
+    """Standard errors by :func:`strapdown.allan.expected_errors`, of the terms present."""
     misfit_probability: Array
 
     def relative_rms(self, term: str) -> float:
-        """Return the rms error over the truth, of the fits that support the term."""
+        """Return the RMS error relative to the truth, of the fits that support the term."""
         error = self.estimate[:, allan.TERMS.index(term)] / self.truth[term] - 1.0
         return float(np.sqrt(np.nanmean(error**2)))
 
 
 def coefficients(spec: GyroSpec) -> dict[str, float]:
-    """Return the coefficients of a gyro whose axes are alike."""
+    """Return the coefficients of a gyro with equal axes."""
     return {term: float(np.max(getattr(spec, term))) for term in allan.TERMS}
 
 
 def rest_increments(spec: GyroSpec, samples: int, sample_interval: float, seed: int, run: int = 0) -> Array:
-    """Return what such a gyro measures at rest (samples, 3), rad."""
+    """Return simulated increments of the gyro at rest (samples, 3), rad."""
     edges = np.arange(samples + 1) * sample_interval
     return gyro.simulate(spec, np.zeros((samples, 3)), edges, generator(seed, run, "gyro")).increments
 
@@ -86,7 +86,7 @@ def rest_increments(spec: GyroSpec, samples: int, sample_interval: float, seed: 
 def main(
     *, samples: int = 1 << 19, sample_interval: float = 0.01, seed: int = 1, out: str | Path | None = None
 ) -> Result:
-    """Simulate a gyro at rest, identify it, and draw it into ``out`` if that is given."""
+    """Simulate a gyro at rest and identify it; figures are written to ``out`` if it is given."""
     increments = rest_increments(TRUTH, samples, sample_interval, seed)
     deviation = allan.allan_deviation(increments, sample_interval, kind="increments")
     fit = allan.fit_noise(increments, sample_interval, kind="increments")
@@ -149,7 +149,7 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path, default=Path("results/allan"))
-    parser.add_argument("--study", action="store_true", help="count how often the intervals hold the truth")
+    parser.add_argument("--study", action="store_true", help="count how often the intervals contain the truth")
     arguments = parser.parse_args()
     if arguments.study:
         for each in CASES:

@@ -1,14 +1,14 @@
-"""Calibrate a MEMS unit in the field by turning it in the hand for two minutes: what it learns of itself, and whether it is right.
+"""Calibration of a MEMS unit in the field, by rotating it by hand for two minutes: accuracy and consistency.
 
-A consumer-grade gyro with 1 % scale factors, 10 mrad misalignments and half a degree a second of bias; a magnetometer with 4 µT of hard
-iron left; an accelerometer with 0.1 m/s² of bias, in a hand that accelerates by 0.2 m/s² and so is no vertical. The unit is turned about
-all axes. One filter (:mod:`strapdown.estimation`, 24 states) estimates attitude, gyro bias, the nine entries of the gyro's scale matrix,
-hard iron, accelerometer bias and the acceleration of the hand. It starts from the first samples, so its heading is off by a fifth of a
-radian, which is what the hard iron does to it; so it starts anew from where the smoother puts that start
-(:func:`strapdown.estimation.relinearized_start`), and the result without it is reported beside.
+A consumer-grade gyro with 1 % scale factors, 10 mrad misalignments and 0.5 °/s of bias; a magnetometer with 4 µT of residual hard iron; an
+accelerometer with 0.1 m/s² of bias, held in a hand that accelerates by 0.2 m/s². The unit is rotated about all axes. One filter
+(:mod:`strapdown.estimation`, 24 states) estimates attitude, gyro bias, the nine entries of the gyro's scale matrix, hard iron,
+accelerometer bias and the acceleration of the hand. It is initialised from the first samples, whose heading the hard iron puts in error by
+0.2 rad; therefore it is started again from the smoother's estimate of the initial state (:func:`strapdown.estimation.relinearized_start`).
+The result without this is reported too.
 
-Reported are, for each state, what was known before and after, whether the errors of all runs are what the covariance says, and what the
-plain filter makes of the same records. The figure shows one run's errors in the filter's own ±3σ.
+Reported for each state: its σ before and after, and its RMS error; the NEES over all runs; and the errors of the plain filter on the same
+records. The figure shows the errors of one run with the filter's ±3σ.
 
 Run ``python sims/calibration.py [--out FOLDER]`` (a minute).
 """
@@ -34,7 +34,7 @@ from strapdown.units import DEGREE, DEGREE_PER_HOUR_PER_ROOT_HOUR, DEGREE_PER_RO
 from strapdown.vectors import Accelerometer, Magnetometer, wahba
 
 FIELD = np.array([0.0, 20e-6, -43e-6])
-"""T, East-North-Up."""
+"""Magnetic field, T, East-North-Up."""
 UP = np.array([0.0, 0.0, 9.80665])
 BIAS = 0.5 * DEGREE
 SWAY_SIGMA, SWAY_TIME = 0.2, 0.3
@@ -53,33 +53,33 @@ SWAY = error_states.GaussMarkov(
 BLOCKS = (SCALE, IRON, FORCE, SWAY)
 
 SMALL = {"runs": 2, "duration": 10.0}
-"""Arguments of a run that only shows that the script works."""
+"""Arguments of a quick test run."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Result:
-    """What the study found."""
+    """Results of the study."""
 
     states: tuple[str, ...]
     units: tuple[str, ...]
     prior_sigma: Array
-    """(n,)."""
+    """Initial σ of each state, in ``units`` (n,)."""
     time: Array
     """Epochs (m,), s."""
     errors: Array
-    """True less estimated (runs, m, n), in ``units``."""
+    """True minus estimated (runs, m, n), in ``units``."""
     sigma: Array
-    """Of the first run (m, n)."""
+    """σ of the first run (m, n)."""
     final_sigma: Array
-    """At the end, root mean square over the runs (n,)."""
+    """σ at the end, RMS over the runs (n,)."""
     nees: Array
-    """Of all states at the end, per degree of freedom (runs,)."""
+    """NEES of all states at the end, per degree of freedom (runs,)."""
     nees_of_first_start: Array
-    """The same without starting anew (runs,)."""
+    """The same without the second start (runs,)."""
     plain_errors: Array
-    """Attitude error of the filter without blocks (runs, m), rad."""
+    """Attitude error of the filter without error states (runs, m), rad."""
     rank: int
-    """Observed directions of the first record."""
+    """Number of observable directions of the first record."""
     figures: tuple[Path, ...] = ()
 
     @property
@@ -89,12 +89,12 @@ class Result:
 
     @property
     def bounds(self) -> tuple[float, float]:
-        """Two-sided 99 % bounds of it."""
+        """Two-sided 99 % bounds of the mean NEES."""
         return consistency.mean_bounds(len(self.states), len(self.nees))
 
 
 def hand(random: np.random.Generator) -> HarmonicRates:
-    """Return slow turns about all axes: rates of about 1.5 rad/s."""
+    """Return slow rotations about all axes, with rates of about 1.5 rad/s."""
     return HarmonicRates(
         harmonics=tuple(
             Harmonic(
@@ -108,7 +108,7 @@ def hand(random: np.random.Generator) -> HarmonicRates:
 
 
 def simulated(seed: int, run: int, duration: float) -> tuple[ImuRecord, dict[str, Array], Array]:
-    """Return a record of a unit drawn from what is known of its kind, its true calibration, and the acceleration at the edges (n, 3)."""
+    """Return a record of a unit drawn from the specification, its true calibration, and the acceleration at the edges (n, 3)."""
     random = generator(seed, run, "unit")
     M = SCALE.sigma.reshape(3, 3) * random.standard_normal((3, 3))
     truth = {SCALE.name: M.ravel(), IRON.name: IRON.sigma * random.standard_normal(3)}
@@ -143,19 +143,19 @@ def simulated(seed: int, run: int, duration: float) -> tuple[ImuRecord, dict[str
         rate=200.0,
         duration=duration,
     )
-    # The turns are not about one axis: without the commutation of two samples the increments themselves would drift as much as the bias.
+    # The axis of rotation changes: without coning compensation the increments would drift by as much as the bias.
     record = records.compress(simulate(scenario, seed, run), coning.ALGORITHMS["two-sample"])
     return record, truth, sway
 
 
 def start(record: ImuRecord) -> estimation.State:
-    """Return the attitude that the first samples show, and what hard iron and acceleration leave of it."""
+    """Return the attitude from the first samples, with its uncertainty due to hard iron and acceleration."""
     series = {s.sensor: s for s in record.vectors}
     up, field = (series[name].vector_b[0] for name in ("accelerometer", "magnetometer"))
     attitude = wahba.from_vertical_and_heading(up, field)
     tilt = np.hypot(SWAY_SIGMA, FORCE.sigma[0]) / UP[2]
     heading = np.hypot(IRON.sigma[0], np.abs(FIELD[2]) * tilt) / FIELD[1]
-    # The heading's uncertainty is about the vertical, wherever that lies in the body.
+    # The uncertainty of the heading is about the vertical, here in body axes.
     vertical = up / np.linalg.norm(up)
     P = np.zeros((6, 6))
     P[:3, :3] = tilt**2 * np.eye(3) + (heading**2 - tilt**2) * np.outer(vertical, vertical)
@@ -164,7 +164,7 @@ def start(record: ImuRecord) -> estimation.State:
 
 
 def main(*, runs: int = 20, duration: float = 120.0, seed: int = 1, out: Path | None = None) -> Result:
-    """Calibrate ``runs`` units, each turned for ``duration`` s; figure and table are written to ``out`` if it is given."""
+    """Calibrate ``runs`` units, each rotated for ``duration`` s; figure and table are written to ``out`` if it is given."""
     noise = ProcessNoise(
         angle_random_walk=0.3 * DEGREE_PER_ROOT_HOUR, rate_random_walk=30.0 * DEGREE_PER_HOUR_PER_ROOT_HOUR
     )
@@ -215,7 +215,7 @@ def main(*, runs: int = 20, duration: float = 120.0, seed: int = 1, out: Path | 
 
 
 def without_blocks(record: ImuRecord, noise: ProcessNoise, initial: estimation.State, every: int) -> Array:
-    """Return the attitudes of the plain filter, which takes all that it has no state for as white noise of the same weight a second."""
+    """Return the attitudes of the plain filter, which models all errors without a state as white noise of equal spectral density."""
     spread = {
         "accelerometer": np.sqrt(0.05**2 + FORCE.sigma[0] ** 2 * 120.0 + 2.0 * SWAY_SIGMA**2 * SWAY_TIME * 100.0),
         "magnetometer": IRON.sigma[0] * np.sqrt(50.0),
@@ -238,13 +238,13 @@ PANELS = (
 
 
 def draw(result: Result, path: Path) -> Path:
-    """Draw one run's errors in ±3σ and write the figure."""
+    """Draw the errors of one run with ±3σ and write the figure."""
     figure, grid = plots.new_figure(2, 3, size=(12.0, 6.2), sharex=True)
     for ax, (_, states, factor, label) in zip(grid.flat, PANELS, strict=True):
         error, sigma = factor * result.errors[0][:, states], factor * result.sigma[:, states]
         envelope = 3.0 * sigma.max(axis=1)
         ax.fill_between(
-            result.time, -envelope, envelope, color=SKY, alpha=0.3, linewidth=0, label="±3σ (99.7 %), the widest"
+            result.time, -envelope, envelope, color=SKY, alpha=0.3, linewidth=0, label="±3σ (99.7 %), the largest"
         )
         colours = (BLUE, VERMILION, GREEN, ORANGE, PURPLE, "black")
         names = ("x", "y", "z") if error.shape[1] == 3 else ("xy", "xz", "yx", "yz", "zx", "zy")
@@ -257,7 +257,7 @@ def draw(result: Result, path: Path) -> Path:
     for ax in grid[1]:
         ax.set_xlabel("time, s")
     for ax in grid[:, 0]:
-        ax.set_ylabel("true less estimated")
+        ax.set_ylabel("true minus estimated")
     legend_below(figure, [grid[0, 2], grid[1, 0]], ncols=10)
     return plots.save(figure, path)
 
@@ -270,10 +270,10 @@ def table(result: Result) -> str:
     whole = np.linalg.norm(result.errors[:, late, :3], axis=2)
     lines = [
         f"{runs} units, {result.time[-1]:g} s each; {result.rank} of {len(result.states)} directions observed",
-        f"NEES of all states at the end, per degree of freedom: {result.anees:.3f} (99 %: {low:.3f} to {high:.3f}); "
+        f"NEES of all states at the end, per degree of freedom: {result.anees:.3f} (99 % bounds {low:.3f} to {high:.3f}); "
         f"from the first start {np.mean(result.nees_of_first_start):.3g}",
         f"attitude error over the second half, RMS: {np.sqrt(np.mean(whole**2)) / DEGREE:.2f}°, "
-        f"without the blocks {np.sqrt(np.mean(result.plain_errors[:, late] ** 2)) / DEGREE:.2f}°",
+        f"without the error states {np.sqrt(np.mean(result.plain_errors[:, late] ** 2)) / DEGREE:.2f}°",
         "",
         f"{'state':28s} {'before':>10s} {'after, σ':>10s} {'RMS error':>10s}",
     ]

@@ -1,8 +1,8 @@
-"""A Monte Carlo against theory: a right filter passes, and a mismatched one fails by as much as its mismatch says.
+"""A Monte Carlo compared with theory: a matched filter passes, and a mismatched one fails by the predicted amount.
 
-A body at rest, a gyro with white and random-walk noise, an attitude sensor once a second. The filter models too much or too little of
-its noises by a known factor. Then the covariance of its true errors is known too: it goes by the filter's own gains, but with the true
-noises (Joseph's form). From both follow the mean NEES and NIS at every moment, before any run. ``python sims/campaign.py``
+A body at rest, a gyro with white and random-walk noise, an attitude sensor once a second. The filter's noise differs from the true one by a
+known factor. The covariance of its true errors is then also known: it is propagated with the filter's gains and the true noise (Joseph's
+form). Both covariances give the mean NEES and NIS at every time without a run. Run ``python sims/campaign.py``.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from strapdown.units import ARCSECOND, DEGREE_PER_HOUR, DEGREE_PER_HOUR_PER_ROOT
 from strapdown.vectors import AttitudeSensor
 
 SMALL = {"runs": 40, "machine": "scalar"}
-"""Arguments of a run that only shows that the script works."""
+"""Arguments of a quick test run."""
 
 GYRO = GyroSpec(angle_random_walk=0.15 * DEGREE_PER_ROOT_HOUR, rate_random_walk=20.0 * DEGREE_PER_HOUR_PER_ROOT_HOUR)
 SIGMA = 40.0 * ARCSECOND
-"""Noise of the attitude sensor about each axis, rad."""
+"""σ of the attitude sensor about each axis, rad."""
 INTERVAL = 1.0
-"""Seconds from one attitude to the next."""
+"""Interval of the attitude measurements, s."""
 SCENARIO = Scenario(
     name="rest-mismatched",
     motion=motion.rest(),
@@ -53,26 +53,26 @@ FACTORS: dict[str, tuple[float, float]] = {
     "R x 4": (1.0, 4.0),
     "R / 4": (1.0, 0.25),
 }
-"""What the filter takes process noise Q and measurement noise R for, as multiples of the true ones."""
+"""Process noise Q and measurement noise R of the filter, as multiples of the true ones."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Prediction:
-    """What theory says of one axis at each epoch, the start included."""
+    """Theoretical values for one axis at each epoch, including the start."""
 
     covariance: np.ndarray
     """The filter's covariance (m, 2, 2): attitude, bias."""
     true_covariance: np.ndarray
-    """The covariance of its true errors (m, 2, 2)."""
+    """The covariance of the filter's true errors (m, 2, 2)."""
     nis: np.ndarray
     """Mean NIS of each measurement, per degree of freedom (measurements,)."""
 
     def anees(self, subset: str) -> np.ndarray:
-        """Return the mean NEES of a subset per state (m,): tr(P⁻¹ Σ) over the number of states."""
+        """Return the mean NEES of a subset per state (m,): tr(P⁻¹ Σ) divided by the number of states."""
         return self._eigenvalues(subset).mean(axis=1)
 
     def standard_error(self, subset: str, runs: int) -> np.ndarray:
-        """Return the standard error of a Monte Carlo's ANEES over three axes (m,): eᵀP⁻¹e has the variance 2 tr((P⁻¹ Σ)²)."""
+        """Return the standard error of the ANEES of a Monte Carlo over three axes (m,): eᵀP⁻¹e has variance 2 tr((P⁻¹ Σ)²)."""
         values = self._eigenvalues(subset)
         return np.sqrt(2.0 * np.sum(values**2, axis=1) / (3.0 * runs)) / values.shape[1]
 
@@ -83,7 +83,7 @@ class Prediction:
 
 
 def predict(factor_q: float, factor_r: float, epochs: int) -> Prediction:
-    """Return what theory says of a filter that models ``factor_q`` times Q and ``factor_r`` times R, at rest, one axis by itself."""
+    """Return the theoretical values for one axis at rest of a filter that models ``factor_q`` times Q and ``factor_r`` times R."""
     T, white, walk = INTERVAL, float(GYRO.angle_random_walk) ** 2, float(GYRO.rate_random_walk) ** 2
     phi = np.array([[1.0, -T], [0.0, 1.0]])
     Q = np.array([[white * T + walk * T**3 / 3.0, -walk * T**2 / 2.0], [-walk * T**2 / 2.0, walk * T]])
@@ -144,7 +144,7 @@ def main(*, runs: int = 4000, seed: int = 1, machine: str = "auto", out: Path | 
 
 
 def draw(statistics: dict[str, Statistics], predictions: dict[str, Prediction], runs: int) -> Any:
-    """Draw NEES of attitude and bias and NIS over time, found and predicted."""
+    """Draw NEES of attitude and bias and NIS over time, from the runs and predicted."""
     figure, axes = plots.new_figure(1, 3, size=(12.0, 4.6))
     for ax, subset in zip(axes, ("attitude", "bias", None), strict=True):
         low, high = consistency.mean_bounds(3, runs)
@@ -168,7 +168,7 @@ def draw(statistics: dict[str, Statistics], predictions: dict[str, Prediction], 
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=6, frameon=False)
     figure.suptitle(
-        f"Filters whose Q or R is off by a factor: {runs} runs (dots) and theory, tr(P⁻¹Σ) along the filter's own gains (lines)"
+        f"Filters whose Q or R is wrong by a factor: {runs} runs (dots) and theory, tr(P⁻¹Σ) with the filter's gains (lines)"
     )
     return figure
 
@@ -181,7 +181,7 @@ if __name__ == "__main__":
     arguments = parser.parse_args()
     result = main(runs=arguments.runs, seed=arguments.seed, out=arguments.out)
     print(
-        f"{arguments.runs} runs of each, machine: {result.machine}. At the end, per degree of freedom, found (predicted):"
+        f"{arguments.runs} runs of each, machine: {result.machine}. At the end, per degree of freedom, from the runs (predicted):"
     )
     for name, found in result.statistics.items():
         predicted = result.predictions[name]

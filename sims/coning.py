@@ -1,6 +1,6 @@
-"""What under-sampled coning does to an attitude filter.
+"""Effect of under-sampled coning on an attitude filter.
 
-Read from top to bottom, change what you like, run it: ``python sims/coning.py``. It is the study of ``strapdown coning``, spelt out.
+The study of ``strapdown coning``, written out step by step as a script to modify. Run ``python sims/coning.py``.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from strapdown.units import ARCSECOND, DEGREE, DEGREE_PER_HOUR, DEGREE_PER_HOUR_
 from strapdown.vectors import VectorSensor
 
 SMALL = {"runs": 4, "duration": 24.0}
-"""Arguments of a run that only shows that the script works."""
+"""Arguments of a quick test run."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Result:
-    """Drift of each integration algorithm, and what the same filter made of each."""
+    """Drift of each integration algorithm, and the outcome of the same filter with each."""
 
     drifts: tuple[Drift, ...]
     outcomes: tuple[FilterOutcome, ...]
@@ -38,18 +38,18 @@ def main(*, runs: int = 100, duration: float = 240.0, seed: int = 1, out: Path |
     # 1. The motion: a cone of 0.7° half-angle at 10 Hz, equation (18), known in closed form.
     motion = Coning(angle=0.7 * DEGREE, frequency=10.0)
 
-    # 2. The gyro: ten samples a cycle, a good MEMS unit.
+    # 2. The gyro: ten samples per cycle, a good MEMS unit.
     rate = 100.0
     gyro = GyroSpec(angle_random_walk=0.08 * DEGREE_PER_ROOT_HOUR, rate_random_walk=1.0 * DEGREE_PER_HOUR_PER_ROOT_HOUR)
 
-    # 3. Two directions, 20 arcsec, about once a second: every 96 samples, which is a whole number of steps of every algorithm below.
+    # 3. Two directions, 20 arcsec, about once a second: every 96 samples, a whole number of steps of every algorithm below.
     sensors = tuple(
         VectorSensor(name=name, reference_f=np.array(r), sigma=20.0 * ARCSECOND, rate=rate / 96)
         for name, r in (("direction x", [1.0, 0.0, 0.0]), ("direction yz", [0.0, 1.0, 1.0]))
     )
     scenario = Scenario(motion=motion, gyro=gyro, sensors=sensors, rate=rate, duration=duration)
 
-    # 4. Integration: one sample a step with no correction, then better and better ones.
+    # 4. Integration: one sample per step without correction, then increasingly accurate algorithms.
     algorithms = [
         coning.ALGORITHMS[name] for name in ("one-sample", "two-sample", "three-sample", "four-sample", "matched-4-11")
     ]
@@ -63,7 +63,7 @@ def main(*, runs: int = 100, duration: float = 240.0, seed: int = 1, out: Path |
         for algorithm in algorithms
     )
 
-    # 5. The same filter on each. Its model of the gyro's noise is exact; it knows nothing of coning.
+    # 5. The same filter with each. Its model of the gyro's noise is exact; it does not model coning errors.
     noise = ProcessNoise(angle_random_walk=gyro.angle_random_walk, rate_random_walk=gyro.rate_random_walk)
     setups = tuple(
         montecarlo.FilterSetup(
@@ -76,13 +76,13 @@ def main(*, runs: int = 100, duration: float = 240.0, seed: int = 1, out: Path |
     )
     statistics = montecarlo.run(scenario, setups, runs=runs, seed=seed, epochs=100)
 
-    # 6. The verdict: NEES and NIS at 20 epochs against two-sided 99 % bounds.
+    # 6. The verdict: NEES and NIS at 20 epochs, with two-sided 99 % bounds.
     outcomes = tuple(
         FilterOutcome(integration=a.name, statistics=s, probability=0.99, epochs=np.arange(5, 101, 5))
         for a, s in zip(algorithms, statistics, strict=True)
     )
 
-    # 7. The pictures.
+    # 7. The figures.
     figures = []
     if out is not None:
         out = Path(out)

@@ -1,9 +1,9 @@
-"""Which integration algorithm, at what sample rate? Drift and periodic error under coning, exactly, and cost beside error.
+"""Which integration algorithm, at what sample rate? Exact drift and periodic error under coning, and cost against error.
 
-The errors come from no simulation. Under coning every step of an algorithm is the same rotation δq, turned about the cone's axis by ωT a
-step; so δq ⊗ R_z(ωT) is one fixed rotation, applied again and again. Its angle less ωT is the drift of a step, and the angle between its
-axis and the true one is half the greatest periodic error. Both are worked out here with mpmath, to 50 digits, with the step written a
-second time and in another way than in the package: a drift of 1e-30 is shown as readily as one of 1e-3.
+The errors are computed without simulation. Under coning every step of an algorithm is the same rotation δq, rotated about the cone's axis
+by ωT per step; so δq ⊗ R_z(ωT) is one fixed rotation, applied repeatedly. Its angle minus ωT is the drift per step, and the angle between
+its axis and the true one is half the maximum periodic error. Both are computed with mpmath to 50 digits, by a second implementation of the
+step that is independent of the package's, so that a drift of 1e-30 is resolved as well as one of 1e-3.
 
 Run it: ``python sims/coning_algorithms.py --out results/coning_algorithms`` (about two minutes; ``--quick`` for a coarse grid).
 """
@@ -29,14 +29,14 @@ from strapdown.units import DEGREE
 
 DIGITS = 50
 SMALL = {"quick": True}
-"""Arguments of a run that only shows that the script works."""
+"""Arguments of a quick test run."""
 OWN = ("matched-2-8", "matched-4-11", "matched-1-4-4", "matched-1-8-8")
 PUBLISHED = tuple(name for name in ALGORITHMS if name not in OWN and "-rate-" not in name)
 ROUNDING = 2.0**-52
-"""rad a step: below it an error is no error of the algorithm."""
+"""Errors per step below this are rounding and not due to the algorithm, rad."""
 
 MANOEUVRE_ROUNDING = 1e-12
-"""rad after hundreds of steps with large fit weights: below it the error of a manoeuvre is rounding."""
+"""Errors of a manoeuvre below this are rounding, after hundreds of steps with large fit weights, rad."""
 
 Vector = tuple[Any, ...]
 
@@ -87,7 +87,7 @@ def pair_sum(pairs: Any, vectors: Sequence[Vector]) -> Vector:
 def vandermonde(window: int, start: int, digits: int) -> Any:
     """Return the matrix from increments to the powers of the rate, t = 0 at the start of the step, by inverting the integrals of powers.
 
-    ``digits`` is the working precision, given so that the cache does not serve one precision with another's matrix.
+    ``digits`` is the working precision, an argument because the results are cached.
     """
     edges = [mp.mpf(k - start) for k in range(window + 1)]
     rows = [[(edges[i + 1] ** (m + 1) - edges[i] ** (m + 1)) / (m + 1) for m in range(window)] for i in range(window)]
@@ -101,7 +101,7 @@ def rate_powers(window: Sequence[Vector], start: int) -> list[Vector]:
 
 
 def polynomial_step(powers: Sequence[Vector], samples: int) -> Vector:
-    """Return the solution of equation (17) over ``samples`` intervals on a rate polynomial: one power series a half interval."""
+    """Return the solution of equation (17) over ``samples`` intervals on a rate polynomial: one power series per half interval."""
     total: Vector = (mp.mpf(1), mp.mpf(0), mp.mpf(0), mp.mpf(0))
     half = mp.mpf(1) / 2
     for _ in range(2 * samples):
@@ -115,9 +115,9 @@ def polynomial_step(powers: Sequence[Vector], samples: int) -> Vector:
             q.append(tuple(x / (2 * (n + 1)) for x in term))
             arrived = tuple(a + b for a, b in zip(arrived, q[-1], strict=True))
             if n >= len(scaled) and max(abs(x) for term in q[-len(scaled) :] for x in term) < mp.eps:
-                break  # every term that later ones are made of is negligible
+                break  # all terms that later ones depend on are negligible
         total = multiply(total, arrived)
-        # Move the polynomial's origin on by half an interval.
+        # Shift the polynomial's origin by half an interval.
         powers = [
             combination([math.comb(k, m) * half ** (k - m) for k in range(m, len(powers))], powers[m:])
             for m in range(len(powers))
@@ -126,7 +126,7 @@ def polynomial_step(powers: Sequence[Vector], samples: int) -> Vector:
 
 
 def exact_step(table: Algorithm, window: Sequence[Vector]) -> Vector:
-    """Return the step quaternion of an algorithm from the increments of its window, straight from its definition."""
+    """Return the step quaternion of an algorithm from the increments of its window, directly by its definition."""
     n, p = table.samples, table.previous
     whole = combination([1] * n, window[p : p + n])
     if table.solver == "compressed":
@@ -190,7 +190,7 @@ def moment_step(solver: str, powers: Sequence[Vector], samples: int) -> Vector:
 
 @functools.cache
 def moment_weights(samples: int, order: int, digits: int) -> tuple[Any, ...]:
-    """Return T⁻ⁱ ∫ (t − T/2)ⁱ tᵏ dt for every power k, T = ``samples``; ``digits`` is the working precision, for the cache."""
+    """Return T⁻ⁱ ∫ (t − T/2)ⁱ tᵏ dt for every power k, T = ``samples``; ``digits`` is the precision of the cached result."""
     half = mp.mpf(samples) / 2
     return tuple(
         mp.quad(lambda t, k=k: (t - half) ** order * t**k, [0, samples]) / mp.mpf(samples) ** order
@@ -212,7 +212,7 @@ def coning_increments(angle: Any, ratio: Any, first: int, last: int) -> list[Vec
 
 
 def rate_increments(angle: Any, ratio: Any, first: int, last: int, points: int) -> list[Vector]:
-    """Return the increments that ``points``-point quadrature forms from samples of the coning rate."""
+    """Return the increments by ``points``-point quadrature from samples of the coning rate."""
 
     def rate(k: Any) -> Vector:
         return (
@@ -229,12 +229,12 @@ def rate_increments(angle: Any, ratio: Any, first: int, last: int, points: int) 
 
 @dataclass(frozen=True, kw_only=True)
 class ConingError:
-    """What coning does to an algorithm, for ever."""
+    """Errors of an algorithm under continuous coning."""
 
     drift: Any
-    """About the cone's axis, in units of ω."""
+    """Drift about the cone's axis, in units of ω."""
     periodic: Any
-    """Greatest angle of the error left when the drift is taken off, rad."""
+    """Maximum angle of the error without the drift, rad."""
 
 
 def exact_error(algorithm: str | Algorithm, angle: float, ratio: float, digits: int = DIGITS) -> ConingError:
@@ -257,7 +257,7 @@ def exact_error(algorithm: str | Algorithm, angle: float, ratio: float, digits: 
         true_length = mp.sqrt(sum(x * x for x in true[1:]))
         # sin and cos of the difference of the half angles, then of the axes.
         drift = 2 * mp.atan2(length * true[0] - fixed[0] * true_length, fixed[0] * true[0] + length * true_length)
-        drift *= mp.sign(true[3])  # after an odd number of half turns the axis of the rotation points the other way
+        drift *= mp.sign(true[3])  # the axis of the rotation is reversed after an odd number of half rotations
         axis = cross(tuple(x / length for x in fixed[1:]), tuple(x / true_length for x in true[1:]))
         tilt = mp.sqrt(sum(x * x for x in axis))
         return ConingError(drift=+drift / turn, periodic=+2 * mp.asin(min(tilt, mp.mpf(1))))
@@ -271,25 +271,25 @@ class Comparison:
     """Exact errors of every algorithm over a grid of cone angles and frequency ratios, as lists (angle, ratio) by name."""
 
     angles: tuple[float, ...]
-    """rad"""
+    """Half-angles of the cone, rad."""
     ratios: tuple[float, ...]
     drift: dict[str, list[list[float]]]
-    """In units of ω; zero where it is below the least float."""
+    """Drift in units of ω; zero below the smallest float."""
     periodic: dict[str, list[list[float]]]
-    """rad"""
+    """Maximum periodic error, rad."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Verdict:
-    """How one of the package's own algorithms stands against one set of published ones, point by point of the grid."""
+    """Comparison of one of the package's algorithms with the published ones at the points of the grid."""
 
     own: str
     points: int
     drift_lost: tuple[tuple[float, float, str], ...]
-    """(angle in degrees, ratio, published algorithm) wherever some published drift is lower and the own one above rounding."""
+    """(angle in degrees, ratio, published algorithm) where a published drift is lower and the package's is above rounding."""
     periodic_lost: tuple[tuple[float, float, str], ...]
     worst_drift_ratio: float
-    """Greatest own drift over the least published one, where the own is above rounding."""
+    """Maximum ratio of its drift to the smallest published one, where its drift is above rounding."""
     worst_periodic_ratio: float
 
 
@@ -309,22 +309,22 @@ class Curves:
 
 @dataclass(frozen=True, kw_only=True)
 class Cost:
-    """What an algorithm costs and what it gains, on one coning."""
+    """Cost and errors of an algorithm under one coning motion."""
 
     name: str
     nanoseconds: float
-    """A sample, on this machine."""
+    """Time per sample on this machine, ns."""
     drift: float
-    """In units of ω."""
+    """Drift in units of ω."""
     periodic: float
-    """rad"""
+    """Maximum periodic error, rad."""
     noise_gain: float
-    """White noise of the increments reaches the attitude through the cross terms with this factor, a unit of turn a sample."""
+    """Factor of the increments' white noise in the attitude through the cross terms, per unit of rotation per sample."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ManoeuvreError:
-    """Errors on random manoeuvres: greatest attitude error, rad, by algorithm; one entry a manoeuvre."""
+    """Errors on random manoeuvres: maximum attitude error, rad, by algorithm; one entry per manoeuvre."""
 
     ratios: tuple[float, ...]
     """2π × the highest frequency of the manoeuvre × sample interval."""
@@ -333,7 +333,7 @@ class ManoeuvreError:
 
 @dataclass(frozen=True, kw_only=True)
 class Result:
-    """Everything the figures show."""
+    """Data of the figures."""
 
     comparison: Comparison
     verdicts: tuple[Verdict, ...]
@@ -360,7 +360,7 @@ CURVES = (
 
 
 def compare(angles: Sequence[float], ratios: Sequence[float]) -> Comparison:
-    """Return the exact errors of every published and every own algorithm over the grid."""
+    """Return the exact errors of every published algorithm and of the package's own over the grid."""
     drift: dict[str, list[list[float]]] = {}
     periodic: dict[str, list[list[float]]] = {}
     for name in (*PUBLISHED, *OWN):
@@ -371,7 +371,7 @@ def compare(angles: Sequence[float], ratios: Sequence[float]) -> Comparison:
 
 
 def judge(comparison: Comparison, own: str) -> Verdict:
-    """Return where ``own`` beats every published algorithm or lies at rounding, and where not."""
+    """Return the points where ``own`` is neither better than every published algorithm nor at rounding."""
     samples = ALGORITHMS[own].samples
     lost: dict[str, list[tuple[float, float, str]]] = {"drift": [], "periodic": []}
     worst = {"drift": 0.0, "periodic": 0.0}
@@ -419,13 +419,13 @@ def curves(
 
 
 def noise_gain(table: Algorithm) -> float:
-    """Return the root sum of squares of Σ_j K_ij over the window, over √N: noise beside a steady turn of one unit a sample."""
+    """Return the root sum of squares of Σ_j K_ij over the window, over √N: noise during a constant rotation of one unit per sample."""
     row = [float(sum(products)) for products in table.products]
     return math.sqrt(math.fsum(x * x for x in row) / table.samples)
 
 
 def cost(name: str, angle: float, ratio: float, samples: int) -> Cost:
-    """Return an algorithm's time a sample, least of several runs, beside its errors."""
+    """Return an algorithm's time per sample, minimum of several runs, with its errors."""
     table = ALGORITHMS[name]
     error = exact_error(name, angle, ratio)
     return Cost(
@@ -438,7 +438,7 @@ def cost(name: str, angle: float, ratio: float, samples: int) -> Cost:
 
 
 def manoeuvres(count: int, seed: int) -> ManoeuvreError:
-    """Return errors on random manoeuvres: sums of harmonics on all axes, sampled at a random ratio up to 0.8."""
+    """Return errors on random manoeuvres: sums of harmonics on all axes, sampled at random ratios λ up to 0.8."""
     from strapdown.motion import Harmonic, HarmonicRates
     from strapdown.quaternion import conjugate, log, multiply
 
@@ -472,7 +472,7 @@ def manoeuvres(count: int, seed: int) -> ManoeuvreError:
 
 
 def draw_drift(result: Curves, axes: Any) -> None:
-    """Draw drift against frequency ratio at both cone angles, the closed forms dotted."""
+    """Draw drift against frequency ratio at both cone angles; closed forms are dotted."""
     shown = np.asarray(result.ratios)
     for ax, table, angle in zip(
         axes,
@@ -501,7 +501,7 @@ def draw_drift(result: Curves, axes: Any) -> None:
 
 
 def draw_floor(result: Curves, ax: Any) -> None:
-    """Draw drift against cone angle: second-order forms leave their β² line for a floor that grows as β⁴."""
+    """Draw drift against cone angle: second-order forms deviate from β² towards a floor that grows as β⁴."""
     angles = np.asarray(result.angles) / DEGREE
     for k, (name, drift) in enumerate(result.drift_by_angle.items()):
         own = name in OWN
@@ -520,7 +520,7 @@ def draw_floor(result: Curves, ax: Any) -> None:
 
 
 def draw_costs(costs: Sequence[Cost], ax: Any) -> None:
-    """Draw the drift beside the time a sample, and the Pareto front."""
+    """Draw drift against time per sample, with the Pareto front."""
     front = [c for c in costs if not any(o.nanoseconds < c.nanoseconds and o.drift < c.drift for o in costs)]
     ax.loglog([c.nanoseconds for c in costs], [c.drift for c in costs], "o", color="0.7", ms=4, label="others")
     front.sort(key=lambda c: c.nanoseconds)
@@ -530,23 +530,23 @@ def draw_costs(costs: Sequence[Cost], ax: Any) -> None:
         "o-",
         color="C0",
         ms=5,
-        label="none is both faster and better",
+        label="none is both faster and more accurate",
     )
     labelled: list[Cost] = []
-    for c in front:  # labels that would lie on one another are left out
+    for c in front:  # labels that would overlap are omitted
         if all(abs(math.log10(c.drift / o.drift)) > 0.7 for o in labelled):
             ax.annotate(
                 c.name, (c.nanoseconds, c.drift), fontsize=7, xytext=(-6, -3), textcoords="offset points", ha="right"
             )
             labelled.append(c)
     ax.set_xlim(left=1.0)
-    ax.set(xlabel="time a sample, ns", ylabel="drift / ω", title="cost beside error")
+    ax.set(xlabel="time per sample, ns", ylabel="drift / ω", title="cost against error")
     ax.grid(alpha=0.3)
     ax.legend(fontsize=8, loc="lower left")
 
 
 def draw_comparison(comparison: Comparison, own: str, axes: Any) -> None:
-    """Draw own error over the least published one, on the grid: below zero the own is better. Dot: at rounding; cross: worse."""
+    """Draw the ratio of own error to the smallest published one over the grid: below zero own is better. Dot: rounding; cross: worse."""
     angles, ratios = np.asarray(comparison.angles) / DEGREE, np.asarray(comparison.ratios)
     for ax, table, what in zip(axes, (comparison.drift, comparison.periodic), ("drift", "periodic error"), strict=True):
         mine = np.abs(np.array(table[own]))
@@ -560,22 +560,22 @@ def draw_comparison(comparison: Comparison, own: str, axes: Any) -> None:
             ax.text(j, i, "×", ha="center", va="center", fontsize=9)
         ax.set_xticks(range(len(ratios)), [f"{r:g}" for r in ratios], fontsize=7)
         ax.set_yticks(range(len(angles)), [f"{a:g}" for a in angles], fontsize=7)
-        ax.set(xlabel="frequency ratio λ", ylabel="cone half-angle β, °", title=f"{own}: {what} (dots: at rounding)")
-        ax.figure.colorbar(image, ax=ax, label="log₁₀ (own / least published)")
+        ax.set(xlabel="frequency ratio λ", ylabel="cone half-angle β, °", title=f"{own}: {what} (dots: rounding)")
+        ax.figure.colorbar(image, ax=ax, label="log₁₀ (own / smallest published)")
 
 
 def draw_manoeuvres(result: ManoeuvreError, ax: Any) -> None:
-    """Draw the errors on random manoeuvres against their frequency ratio: all published in grey, the best of them and the own in colour."""
+    """Draw the errors on random manoeuvres against their frequency ratio: published in grey, their best and the package's in colour."""
     ratios = np.asarray(result.ratios)
     published = np.array([result.errors[name] for name in PUBLISHED])
     for k, errors in enumerate(published):
-        ax.loglog(ratios, errors, ".", color="0.75", ms=3, label=None if k else "published, each")
-    ax.loglog(ratios, published.min(axis=0), "v", color="C3", ms=5, label="least of all published")
+        ax.loglog(ratios, errors, ".", color="0.75", ms=3, label=None if k else "each published")
+    ax.loglog(ratios, published.min(axis=0), "v", color="C3", ms=5, label="smallest published")
     for k, name in enumerate(OWN):
         ax.loglog(ratios, result.errors[name], "o", color=f"C{k}" if k < 3 else "k", ms=3, label=name)
     ax.set(
         xlabel="frequency ratio λ of the highest frequency",
-        ylabel="greatest attitude error, rad",
+        ylabel="maximum attitude error, rad",
         title="random manoeuvres, 840 samples",
     )
     ax.grid(alpha=0.3)
@@ -619,7 +619,7 @@ def draw(result: Result, folder: Path) -> list[Path]:
 
 
 def main(*, out: str | Path | None = None, quick: bool = False, seed: int = 1) -> Result:
-    """Answer the question; with ``out``, write the figures and ``coning.json`` into that folder."""
+    """Run the study; with ``out``, write the figures and ``coning.json`` into that folder."""
     degrees = (1.0, 20.0) if quick else (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 20.0, 30.0, 45.0)
     ratios = (0.1, 0.5) if quick else (0.01, 0.03, 0.1, 0.2, 0.3, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 1.0)
     comparison = compare([d * DEGREE for d in degrees], ratios)
@@ -651,8 +651,8 @@ def table(result: Result) -> str:
     lines = []
     for v in result.verdicts:
         lines.append(
-            f"{v.own:15s} {v.points} points: drift lost at {len(v.drift_lost)} (worst own/published {v.worst_drift_ratio:.2g}), "
-            f"periodic error lost at {len(v.periodic_lost)} (worst {v.worst_periodic_ratio:.2g})"
+            f"{v.own:15s} {v.points} points: drift worse at {len(v.drift_lost)} (maximum own/published {v.worst_drift_ratio:.2g}), "
+            f"periodic error worse at {len(v.periodic_lost)} (maximum {v.worst_periodic_ratio:.2g})"
         )
         for what, places in (("drift", v.drift_lost), ("periodic", v.periodic_lost)):
             lines += [f"    {what}: β = {b:g}°, λ = {r:g}: {name}" for b, r, name in places]

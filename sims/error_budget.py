@@ -1,9 +1,9 @@
-"""Where do the errors come from? The error budget of a filter from one pass without noise, held against a Monte Carlo.
+"""What are the sources of a filter's errors? Its error budget from one pass without noise, compared with a Monte Carlo.
 
-A satellite tumbles, its star tracker is blinded for a minute, its gyro has white noise, a walking bias and flicker, errors of scale factor
-and misalignment that no filter models. The covariance analysis (:mod:`strapdown.covariance`) predicts the RMS error, the filter's
-σ, the NEES that comes of the difference, and the part of each source. Independent runs show whether that is so: for the
-filter that matches the noise, and for one that models a quarter of the process noise.
+A tumbling satellite with a star tracker that is blinded for a minute, and a gyro with white noise, rate random walk, flicker, and errors of
+scale factor and misalignment that no filter models. The covariance analysis (:mod:`strapdown.covariance`) predicts the RMS error, the
+filter's σ, the resulting NEES, and the contribution of each source. Independent runs test the prediction, for the filter that matches the
+noise and for one that models a quarter of the process noise.
 
 Run it: ``python sims/error_budget.py --out error-budget-results`` (a minute).
 """
@@ -28,12 +28,12 @@ from strapdown.randomness import generator
 from strapdown.units import ARCSECOND, DEGREE, DEGREE_PER_HOUR
 
 SMALL = {"runs": 4, "duration": 60.0, "epochs": 10}
-"""Arguments of a run that only shows that the script works."""
+"""Arguments of a quick test run."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Comparison:
-    """One filter: what was predicted, and what came."""
+    """Prediction and Monte Carlo of one filter."""
 
     filter: str
     analysis: covariance.Analysis
@@ -45,14 +45,14 @@ class Comparison:
 
     @property
     def worst(self) -> float:
-        """Largest difference of log RMS between prediction and runs, all epochs and states, in its standard deviations 1/√(2 runs)."""
+        """Largest difference of log RMS between prediction and runs over epochs and states, in standard deviations 1/√(2 runs)."""
         ratio = np.log(self.rms[1:] / self.analysis.rms[1:])
         return float(np.abs(ratio).max() * np.sqrt(2.0 * self.runs))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Result:
-    """What the study found."""
+    """Results of the study."""
 
     comparisons: tuple[Comparison, ...]
     figures: tuple[Path, ...]
@@ -100,7 +100,7 @@ def draw(comparisons: tuple[Comparison, ...], path: Path) -> Path:
             )
             ax.semilogy(a.time, predicted, color=colour, label=f"{c.filter}: predicted RMS")
             ax.semilogy(a.time, actual, ".", color=colour, markersize=4, label=f"{c.filter}: {c.runs} runs")
-            ax.semilogy(a.time, own, "--", color=colour, linewidth=1.0, label=f"{c.filter}: its own σ")
+            ax.semilogy(a.time, own, "--", color=colour, linewidth=1.0, label=f"{c.filter}: its σ")
         axes[2].semilogy(a.time, a.expected_nees[:, 0], color=colour)
         axes[2].semilogy(a.time, c.anees, ".", color=colour, markersize=4)
     axes[0].set(xlabel="time, s", ylabel="attitude, one axis, arcsec")
@@ -115,17 +115,17 @@ def table(result: Result) -> str:
     lines = []
     for c in result.comparisons:
         a = c.analysis
-        lines += [f"{c.filter}, at {a.time[-1]:g} s, RMS of an axis", ""]
+        lines += [f"{c.filter}, at {a.time[-1]:g} s, RMS per axis", ""]
         lines += [f"  {'source':32s} {'kind':10s} {'attitude, arcsec':>16s} {'bias, °/h':>10s}"]
         for name, kind, attitude, bias in sorted(a.budget(), key=lambda row: -row[2]):
             lines.append(f"  {name:32s} {kind:10s} {attitude / ARCSECOND:16.3f} {bias / DEGREE_PER_HOUR:10.4f}")
-        totals = (("predicted", a.rms[-1]), (f"{c.runs} runs", c.rms[-1]), ("the filter's own σ", a.filter_sigma[-1]))
+        totals = (("predicted", a.rms[-1]), (f"{c.runs} runs", c.rms[-1]), ("the filter's σ", a.filter_sigma[-1]))
         for name, values in totals:
             attitude, bias = (float(np.sqrt(np.mean(values[part] ** 2))) for part in (slice(0, 3), slice(3, 6)))
             lines.append(f"  {name:43s} {attitude / ARCSECOND:16.3f} {bias / DEGREE_PER_HOUR:10.4f}")
         lines += [
             f"  NEES per state: predicted {a.expected_nees[-1, 0]:.4g}, {c.runs} runs {c.anees[-1]:.4g}",
-            f"  largest difference of an RMS over all epochs and states: {c.worst:.2f} of its standard deviations",
+            f"  largest difference of an RMS over all epochs and states: {c.worst:.2f} standard deviations",
             "",
         ]
     return "\n".join(lines)
@@ -165,7 +165,7 @@ def main(
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("results/error_budget"))
-    parser.add_argument("--scenario", default="tumbling-satellite", help="name of a built-in one, or a TOML file")
+    parser.add_argument("--scenario", default="tumbling-satellite", help="name of a built-in scenario, or a TOML file")
     parser.add_argument("--runs", type=int, default=200)
     parser.add_argument("--seed", type=int, default=1)
     print(table(main(**vars(parser.parse_args()))))

@@ -1,20 +1,20 @@
-"""How do attitude filters compare on the same records? Ours and peers: accuracy against the bound, consistency, time a sample.
+"""How do attitude filters compare on the same records? The package's and peers: accuracy, consistency, time per sample.
 
-*Simulated*: a hand-held unit at one place: a MEMS gyro, an accelerometer and a magnetometer at 50 Hz, all noises white and known. Errors
-are root mean squares over runs and the second half of each, divided by what no estimator can beat, the root of the posterior Cramér–Rao
-bound. Filters with a noise model get the true noises and start from the truth off by 1° an axis; the others find their start themselves.
+*Simulated*: a hand-held unit at one place: a MEMS gyro, an accelerometer and a magnetometer at 50 Hz, with known white noise. Errors are
+RMS over runs and over the second half of each, divided by the root of the posterior Cramér–Rao bound, the minimum for any estimator.
+Filters with a noise model get the true noise and start from the truth with an error of 1° per axis; the others initialise themselves.
 
-*Recorded*: hand-held units of the BROAD data set beside an optical reference. Errors are over the movement.
+*Recorded*: hand-held units of the BROAD data set with an optical reference. Errors are over the movement.
 
-Nothing is tuned for ours that is not tuned alike for peers: every filter with a gain gets the one with the least RMS error elsewhere, of
-the same powers of two over its default. Simulated: on records of other seeds. Recorded: on the first half minute of movement of the
-*other* recordings; of ``strapdown estimate`` the gain is that on the accelerometer (``velocity_sigma``). What a peer's frames differ by
-from ours, in right angles, is found there too and taken out.
+All filters are tuned alike: each one with a gain uses the gain of minimum RMS error on other data, from the same powers of two times its
+default. Simulated: on records of other seeds. Recorded: on the first half minute of movement of the *other* recordings; for ``strapdown
+estimate`` the gain is that of the accelerometer (``velocity_sigma``). The rotation by right angles between a peer's frames and the
+package's is found there too, and removed.
 
 ``pip install vqf imufusion ahrs smsfusion``, then ``python sims/filter_comparison.py [--out docs/_data] [RECORDING...]`` (some minutes),
-recordings being files of the BROAD data set; it writes ``filter_comparison.json``, which the page *Comparison* of the documentation
-prints. Without recordings the part of a file that is there already stays. Peers that are not installed are left out. Where sensors
-disagree, from a large start and with disturbances the order is another: ``filter_family.py`` and ``hand_held.py`` look there.
+where the recordings are files of the BROAD data set. It writes ``filter_comparison.json``, which the page *Comparison* of the documentation
+prints. Without recordings that part of an existing file is kept. Peers that are not installed are skipped. With conflicting sensors, a
+large initial error or disturbances the order is different: see ``filter_family.py`` and ``hand_held.py``.
 """
 
 from __future__ import annotations
@@ -49,21 +49,21 @@ from strapdown.records.outputs import euler
 from strapdown.units import DEGREE, DEGREE_PER_HOUR_PER_ROOT_HOUR, DEGREE_PER_ROOT_HOUR
 
 SMALL = {"runs": 2, "unscented_runs": 1, "training": 1, "duration": 8.0, "own": ("mekf", "usque", "mahony")}
-"""Arguments of a run that only shows that the script works."""
+"""Arguments of a quick test run."""
 
 RATE = 50.0
 FORCE_NOISE = 0.01 * 9.81 / np.sqrt(RATE)
 """White noise of the specific force, m/s²/√Hz."""
 FIELD = np.array([0.0, 0.45, -0.89])
-"""Magnetic North and down, fixed frame East-North-Up."""
+"""Direction of the magnetic field, North and down, fixed frame East-North-Up."""
 OWN = ("mekf", "right-invariant", "equivariant", "geometric", "usque", "mahony")
 
 Peer = Callable[[Array, Array, Array, float, float], Array]
-"""Attitudes (n, 4) of gyro (n, 3), rad/s, accelerometer (n, 3), g, magnetometer (n, 3), interval, s, and gain over the default."""
+"""Attitudes (n, 4) from gyro (n, 3), rad/s, accelerometer (n, 3), g, magnetometer (n, 3), interval, s, and gain over the default."""
 
 
 def vqf_peer(gyro: Array, acc: Array, mag: Array, interval: float, gain: float) -> Array:
-    """VQF (Laidig & Seel 2023), C++; the gain shortens both time constants."""
+    """VQF (Laidig & Seel 2023), C++; the gain divides both time constants."""
     import vqf
 
     found = vqf.VQF(interval, tauAcc=3.0 / gain, tauMag=9.0 / gain).updateBatch(
@@ -90,14 +90,14 @@ def imufusion_peer(gyro: Array, acc: Array, mag: Array, interval: float, gain: f
 
 
 def madgwick_peer(gyro: Array, acc: Array, mag: Array, interval: float, gain: float) -> Array:
-    """Madgwick's filter (2010) of ahrs, Python."""
+    """Madgwick's filter (2010) of the package ahrs, Python."""
     from ahrs.filters import Madgwick
 
     return np.asarray(Madgwick(gyr=gyro, acc=acc, mag=mag, frequency=1.0 / interval, gain=0.041 * gain).Q)
 
 
 def smsfusion_peer(gyro: Array, acc: Array, mag: Array, interval: float, gain: float) -> Array:
-    """AHRS of smsfusion (a multiplicative EKF), numba; the gain is that on its zero velocity, 10 m/s; σ of the heading 5°."""
+    """AHRS of smsfusion (a multiplicative EKF), numba; the gain divides the σ of zero velocity, 10 m/s; σ of the heading 5°."""
     import smsfusion
 
     up = acc[0] / np.linalg.norm(acc[0])
@@ -118,7 +118,7 @@ def smsfusion_peer(gyro: Array, acc: Array, mag: Array, interval: float, gain: f
     velocity, heading = np.full(3, (10.0 / gain) ** 2), (5.0 * DEGREE) ** 2
     result = np.empty((len(gyro), 4))
     q = x0[6:10]
-    for k, rate in enumerate(np.roll(gyro, -1, axis=0)):  # it corrects first, and goes on with the rate given
+    for k, rate in enumerate(np.roll(gyro, -1, axis=0)):  # an update precedes the propagation by the rate
         field = quaternion.rotate(q, mag[k])
         yaw = euler(q[None]).angles[0, 0] + np.arctan2(field[0], field[1])  # the field's horizontal part points North
         ahrs.update(9.81 * acc[k], rate, head=yaw, head_var=heading, head_degrees=False, vel_var=velocity)
@@ -126,7 +126,7 @@ def smsfusion_peer(gyro: Array, acc: Array, mag: Array, interval: float, gain: f
         w = 0.5 * interval * (rate - ahrs.bias_gyro())
         q = quaternion.normalize(
             quaternion.multiply(result[k], np.array([1.0, *w]))
-        )  # where it will be at the next sample
+        )  # predicted attitude at the next sample
     return result
 
 
@@ -136,13 +136,13 @@ PEERS: dict[str, tuple[str, Peer]] = {
     "smsfusion": ("smsfusion", smsfusion_peer),
     "ahrs Madgwick": ("ahrs", madgwick_peer),
 }
-"""The package that each needs, and how it is run."""
+"""The package that each peer needs, and the function that runs it."""
 GAINS = tuple(2.0**k for k in range(-4, 7))
 RECORDED_GAINS = tuple(4.0**k for k in range(-2, 4))
 SEARCHED = 20.0
-"""Of the movement of a recording, s, that gains are searched on."""
+"""Duration of the movement of a recording on which gains are searched, s."""
 SLOW = {"smsfusion": 4, "ahrs Madgwick": 4}
-"""Samples of a recording that are averaged into one, of filters that Python runs sample by sample."""
+"""Number of samples of a recording averaged into one, for filters run in Python sample by sample."""
 
 
 def scenario(duration: float) -> scenarios.Scenario:
@@ -169,22 +169,22 @@ def scenario(duration: float) -> scenarios.Scenario:
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """One filter on all runs."""
+    """Result of one filter over all runs."""
 
     name: str
     runs: int
     rms: float
-    """Of the attitude error, an axis, rad."""
+    """RMS attitude error per axis, rad."""
     ratio: float
-    """RMS over the root of the bound."""
+    """RMS error over the root of the bound."""
     anees: float
-    """Of the attitude at the end, per state; NaN without a covariance."""
+    """ANEES of the attitude at the end, per state; NaN without a covariance."""
     consistent: bool | None
-    """Whether ANEES lies within its 99 % bounds; None without a covariance."""
+    """Whether the ANEES is within its 99 % bounds; None without a covariance."""
     microseconds: float
-    """A sample."""
+    """Time per sample, µs."""
     gain: float
-    """Of a filter with gains, over its default; NaN of others."""
+    """Gain over the default; NaN for filters without gains."""
 
     def summary(self) -> dict[str, Any]:
         """Return plain values for JSON."""
@@ -199,16 +199,16 @@ class Outcome:
 
 @dataclass(frozen=True, kw_only=True)
 class Recorded:
-    """One filter on all recordings."""
+    """Result of one filter over all recordings."""
 
     errors: Array
     """RMS over the movement (recordings, 3), rad: total, heading, inclination."""
     default: Array
-    """The same with its default gain."""
+    """The same with the default gain."""
     gains: Array
-    """Over the default, by recording, found on the others."""
+    """Gain over the default for each recording, found on the others."""
     microseconds: float
-    """A sample."""
+    """Time per sample, µs."""
 
     def summary(self) -> dict[str, Any]:
         """Return plain values for JSON."""
@@ -222,23 +222,23 @@ class Recorded:
 
 @dataclass(frozen=True, kw_only=True)
 class Result:
-    """What the study found."""
+    """Results of the study."""
 
     outcomes: tuple[Outcome, ...]
     bound: float
-    """Root of the bound, an axis, rad: of the second half of the runs."""
+    """Root of the bound per axis over the second half of the runs, rad."""
     recorded: dict[str, Recorded]
-    """By filter."""
+    """Results on recordings by filter."""
 
 
 def samples(record: ImuRecord) -> tuple[Array, Array, Array, float]:
-    """Return gyro, accelerometer and magnetometer at the ends of the intervals, and their length, as peers take them."""
+    """Return gyro, accelerometer and magnetometer at the ends of the intervals, and the interval, as input of peers."""
     force, field = record.vectors
     return record.rates, force.vector_b, field.vector_b, 1.0 / RATE
 
 
 def frame_of(attitude: Array, time: Array, truth: Array) -> foreign.Alignment:
-    """Return what a peer's frames differ by from ours, in right angles, by its attitudes in the second half of a record."""
+    """Return the rotations by right angles between a peer's frames and the package's, from the second half of a record."""
     half = slice(len(time) // 2, None)
     series = foreign._Series(time[half], quaternion.normalize(attitude)[half])
     found = foreign.fit(series, foreign._Series(time[half], truth[half]), ("fixed", "body"), 0.0)
@@ -247,7 +247,7 @@ def frame_of(attitude: Array, time: Array, truth: Array) -> foreign.Alignment:
 
 
 def _snapped(rotation: Array) -> Array:
-    """Return the rotation vector of the nearest of the 24 turns by right angles."""
+    """Return the rotation vector of the nearest of the 24 rotations by right angles."""
     R = quaternion.to_matrix(quaternion.exp(rotation))
     near = np.zeros((3, 3))
     for row in np.argsort(-np.abs(R).max(axis=1)):
@@ -257,7 +257,7 @@ def _snapped(rotation: Array) -> Array:
 
 
 def errors_of(attitude: Array, record: ImuRecord) -> Array:
-    """Return the attitude errors (m, 3), rad, of the second half, of attitudes at all edges or all but the first."""
+    """Return the attitude errors over the second half (m, 3), rad, from attitudes at all edges or all except the first."""
     assert record.truth is not None
     truth = record.truth.attitude[-len(attitude) :]
     error = quaternion.log(quaternion.multiply(quaternion.conjugate(attitude), truth))
@@ -265,7 +265,7 @@ def errors_of(attitude: Array, record: ImuRecord) -> Array:
 
 
 def starts(record: ImuRecord, plan: montecarlo.Plan, run: int) -> State:
-    """Return where a Kalman filter starts."""
+    """Return the initial state of a Kalman filter."""
     return montecarlo.start(record, plan.setup, plan.seed, run)
 
 
@@ -282,7 +282,7 @@ def main(
     progress: Callable[[str], None] | None = None,
 ) -> Result:
     """Run the study; JSON is written to ``out`` if it is given."""
-    recorded = [recordings.read(file) for file in files]  # what cannot be read is refused first
+    recorded = [recordings.read(file) for file in files]  # fails first if a file cannot be read
     scene = scenario(duration)
     base = setup.FilterSetup.for_scenario(scene)
     plan = montecarlo.Plan(scenario=scene, setup=base, seed=seed, epochs=20)
@@ -358,10 +358,10 @@ def ours(recording: Recording, gain: float) -> tuple[Array, Array]:
 
 
 def complementary(recording: Recording, gain: float) -> tuple[Array, Array]:
-    """Return the stamps and attitudes of this package's complementary filter (Mahony's), with the measurements of the MEKF."""
+    """Return the stamps and attitudes of this package's complementary filter (Mahony's), with the same measurements as the MEKF."""
     found = ahrs.estimate(recording, ahrs.MOTIONS["any"])
     noise = HAND_HELD.setup.process_noise
-    factor = 8.0 * gain  # fixed gains must follow the disturbances too
+    factor = 8.0 * gain  # fixed gains must also allow for disturbances
     scaled = ProcessNoise(
         angle_random_walk=factor * noise.angle_random_walk, rate_random_walk=factor**2 * noise.rate_random_walk
     )
@@ -369,7 +369,7 @@ def complementary(recording: Recording, gain: float) -> tuple[Array, Array]:
 
 
 def peer_on(peer: Peer, every: int) -> Callable[[Recording, float], tuple[Array, Array]]:
-    """Return a peer as a function of a recording and a gain, on means of so many samples."""
+    """Return a peer as a function of a recording and a gain, on means of ``every`` samples."""
 
     def run(recording: Recording, gain: float) -> tuple[Array, Array]:
         assert recording.specific_force is not None
@@ -384,9 +384,9 @@ def peer_on(peer: Peer, every: int) -> Callable[[Recording, float], tuple[Array,
 
 
 def on_recordings(read: Sequence[Recording], progress: Callable[[str], None] | None = None) -> dict[str, Recorded]:
-    """Return what each filter makes of recordings with a reference, its gain chosen on the others."""
+    """Return the errors of each filter on recordings with a reference, with its gain chosen on the others."""
     begun = [int(np.searchsorted(one.time, ahrs.estimate(one).recording.time[0])) for one in read]
-    whole = [one.since(first) for one, first in zip(read, begun, strict=True)]  # all start where ours does
+    whole = [one.since(first) for one, first in zip(read, begun, strict=True)]  # with the package's start
     short = [_until(one, float(one.time[np.argmax(one.movement)]) + SEARCHED) for one in whole]
     chosen: dict[str, Callable[[Recording, float], tuple[Array, Array]]] = {
         "strapdown estimate": ours,
@@ -435,7 +435,7 @@ def _errors(
     recording: Recording,
     gain: float,
 ) -> tuple[list[float], float]:
-    """Return the RMS errors over the movement, total, heading and inclination, rad, and the time that a sample took, s."""
+    """Return the RMS errors over the movement, total, heading and inclination, rad, and the time per sample, s."""
     begun = clock.process_time()
     time, q = run(recording, gain)
     spent = clock.process_time() - begun
@@ -473,7 +473,7 @@ def _outcome(
 def table(result: Result) -> str:
     """Return the outcomes as a table in Markdown."""
     lines = [
-        "| filter | runs | RMS, ° | RMS/√PCRB | ANEES attitude | consistent | µs a sample | gain over default |",
+        "| filter | runs | RMS, ° | RMS/√PCRB | ANEES attitude | consistent | µs per sample | gain over default |",
         "|---|---|---|---|---|---|---|---|",
     ]
     for one in result.outcomes:
@@ -495,4 +495,4 @@ if __name__ == "__main__":
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path, default=Path("results/filter_comparison"))
     found = main(**vars(parser.parse_args()), progress=lambda line: print(line, file=sys.stderr))
-    print(f"Root of the bound: {found.bound / DEGREE:.4f}° an axis.\n\n{table(found)}")
+    print(f"Root of the bound: {found.bound / DEGREE:.4f}° per axis.\n\n{table(found)}")

@@ -1,24 +1,24 @@
-"""Which attitude filter? Convergence and consistency of the family, from small and from large initial errors.
+"""Which attitude filter? Convergence and consistency of the family, from small and large initial errors.
 
 One tumbling body, a MEMS gyro, and four cases:
 
-- ``small``: two directions, the initial error 1° an axis, drawn from the filter's own prior;
-- ``large``: the same, the initial error 60° to 150° about any axis;
-- ``one direction``: as large, with one constant reference only. The turn about it can never be observed. The error shown is the angle
-  between the true and the estimated reference in the body; the NEES shows whether a filter knows what it cannot know.
-- ``tracker``: as large, with a star tracker that gives whole attitudes, ten times as coarse about its boresight as across it.
+- ``small``: two directions; the initial error, 1° per axis, is drawn from the filter's prior;
+- ``large``: the same with an initial error of 60° to 150° about any axis;
+- ``one direction``: as large, with only one constant reference. The rotation about it is unobservable. The error shown is the angle
+  between the true and the estimated reference in the body; the NEES shows whether the covariance of the unobservable rotation is right;
+- ``tracker``: as large, with a star tracker that measures the attitude, with a σ about its boresight ten times that across it.
 
-All filters run on the same records and start from the same states. Run it:
-``python sims/filter_family.py --out filter-family-results`` (some minutes, nearly all of them the unscented filter's). It prints a table
-and what the numbers say of each case, and writes both with the figure and ``filter_family.json``.
+All filters run on the same records from the same initial states. Run
+``python sims/filter_family.py --out filter-family-results`` (some minutes, nearly all for the unscented filter). It prints a table and the
+findings for each case, and writes both with the figure and ``filter_family.json``.
 
-Why they differ. While errors are small all Kalman filters carry the same Gaussian in other coordinates, and only the fixed gains of
-Mahony's filter cost accuracy: one number a sensor, which cannot weigh a tracker's axes either. From a large error, what the first direction
-hides is a turn about an axis that is fixed in the fixed frame; seen in body axes that axis moves by the correction. The invariant filters
-carry their covariance the whole way with it, the MEKF's reset half the way, the geometric filter not at all: in that order their covariance
-of the hidden turn is wrong, and slow to recover. Fixed gains never become overconfident. Of the Kalman filters the unscented one is the
-fastest to converge where one measurement gives all that can be known, and the slowest where two must agree on it. A start this poor wants
-another tool than any of them: ``wahba`` where the first measurements give the attitude, ``multiple_model`` where not.
+Reasons for the differences. For small errors all Kalman filters propagate the same Gaussian in different coordinates, and only the fixed
+gains of Mahony's filter cost accuracy: one gain per sensor, which cannot weight the axes of a tracker. For a large error, the rotation that
+the first direction leaves unobserved is about an axis constant in the fixed frame; in body axes that axis moves with the correction. The
+invariant filters transform their covariance fully with it, the MEKF's reset by half, the geometric filter not at all; in that order the
+covariance of the unobserved rotation is in error, and slow to recover. Fixed gains never become overconfident. Of the Kalman filters the
+unscented one converges fastest if one measurement determines all that is observable, and slowest if two must be combined. For such initial
+errors other methods are better: ``wahba`` if the first measurements determine the attitude, ``multiple_model`` if not.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ from strapdown.vectors import AttitudeSensor, Sensor, VectorSensor
 
 CASES = ("small", "large", "one direction", "tracker")
 CONVERGED = 3.0 * DEGREE
-"""An attitude error below which a run counts as converged, rad."""
+"""Maximum attitude error of a converged run, rad."""
 
 SUN = np.array([0.0, 0.6, 0.8])
 FIELD = np.array([0.8, 0.0, -0.6])
@@ -54,11 +54,11 @@ BIAS_SIGMA = 20.0 * DEGREE_PER_HOUR
 SMALL_SIGMA = 1.0 * DEGREE
 LARGE = (60.0 * DEGREE, 150.0 * DEGREE)
 LARGE_SIGMA = np.sqrt((LARGE[0] ** 2 + LARGE[0] * LARGE[1] + LARGE[1] ** 2) / 9.0)
-"""rad an axis: the second moment of angles uniform between the two, about any axis."""
+"""RMS per axis of angles uniform between the two, about any axis, rad."""
 
 
 SMALL = {"runs": 6, "unscented_runs": 1, "duration": 20.0}
-"""Arguments of a run that only shows that the script works."""
+"""Arguments of a quick test run."""
 
 COLOURS = {
     "mekf": plots.BLUE,
@@ -72,7 +72,7 @@ COLOURS = {
     "mahony": plots.GREEN,
 }
 DASHES = {"fixed-side": (0, (2, 3)), "two-frame": (0, (5, 2, 1, 2))}
-"""Filters that nearly always lie on another's line."""
+"""Filters whose lines nearly coincide with another's."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,12 +95,12 @@ class Outcome:
 
     @property
     def converged(self) -> float:
-        """Fraction of the runs that end converged."""
+        """Fraction of the runs that are converged at the end."""
         return float(np.mean(self.error[:, -1] < CONVERGED))
 
     @property
     def convergence_time(self) -> float:
-        """Time after which nine tenths of the runs are converged and stay so, s; NaN if never."""
+        """Time from which on 90 % of the runs are converged, s; NaN if never."""
         return consistency.convergence_time(self.time, np.quantile(self.error, 0.9, axis=0), CONVERGED)
 
     @property
@@ -110,16 +110,16 @@ class Outcome:
 
     @property
     def anees(self) -> Array:
-        """Mean NEES over the runs (m,), 1 for a right filter."""
+        """Mean NEES over the runs (m,), 1 for a consistent filter."""
         return np.asarray(self.nees.mean(axis=0))
 
     @property
     def anees_at_first(self) -> float:
-        """Mean NEES ten seconds after the start, when what the first corrections left behind still shows."""
+        """Mean NEES ten seconds after the start, which still shows the effect of the first corrections."""
         return float(self.anees[min(int(np.searchsorted(self.time, 10.0)), len(self.time) - 1)])
 
     def summary(self) -> dict[str, Any]:
-        """Return the numbers as plain values for JSON; what never happens is None."""
+        """Return the results as plain values for JSON; times that do not exist are None."""
         low, high = consistency.mean_bounds(6, self.runs)
         within = self.convergence_time
         return {
@@ -137,14 +137,14 @@ class Outcome:
 
     @property
     def consistent(self) -> bool:
-        """Whether the ANEES lies within its two-sided 99 % bounds at five epochs of the second half together."""
+        """Whether the ANEES is within its joint two-sided 99 % bounds at five epochs of the second half."""
         epochs = np.linspace(len(self.time) // 2, len(self.time) - 1, 5).astype(int)
         return consistency.Verdict(mean=self.anees[epochs], degrees=6, runs=self.runs, probability=0.99).consistent
 
 
 @dataclass(frozen=True, kw_only=True)
 class Result:
-    """What the study found."""
+    """Results of the study."""
 
     outcomes: tuple[Outcome, ...]
     figures: tuple[Path, ...]
@@ -175,7 +175,7 @@ def scenario(case: str, duration: float) -> Scenario:
 
 
 def initial_state(case: str, attitude: Array, bias: Array, random: np.random.Generator) -> estimation.State:
-    """Return the state that a run starts from: the truth, off by an error of the case's kind."""
+    """Return the initial state of a run: the truth with an error as defined by the case."""
     axis = random.standard_normal(3)
     if case == "small":
         sigma, turn = SMALL_SIGMA, SMALL_SIGMA * axis
@@ -228,12 +228,12 @@ def _pointing_error(attitude: Array, truth: Array) -> Array:
 
 
 def draw(outcomes: Sequence[Outcome], path: Path) -> Path:
-    """Draw error and ANEES over time, one column a case, and write the figure."""
+    """Draw error and ANEES over time, one column per case, and write the figure."""
     cases = list(dict.fromkeys(o.case for o in outcomes))
     figure, grid = plots.new_figure(2, len(cases), size=(4.0 * len(cases), 6.6), squeeze=False, sharex=True)
     titles = {
-        "small": "start 1° an axis off",
-        "large": "start 60° to 150° off",
+        "small": "initial error 1° per axis",
+        "large": "initial error 60° to 150°",
         "one direction": "60° to 150°, one direction only",
         "tracker": "60° to 150°, star tracker",
     }
@@ -288,7 +288,7 @@ def table(result: Result) -> str:
 
 
 def findings(result: Result) -> list[str]:
-    """Return what the numbers say of each case, of the runs that all filters have."""
+    """Return the findings for each case, over the runs common to all filters."""
     lines = []
     for case in dict.fromkeys(o.case for o in result.outcomes):
         whole = [o for o in result.outcomes if o.case == case]
@@ -297,17 +297,17 @@ def findings(result: Result) -> list[str]:
         quick = [o for o in mine if np.isfinite(o.convergence_time)]
         parts = [f"most accurate at the end: {_least(mine, lambda o: o.final_rms, lambda x: f'{x / DEGREE:.2f}°')}"]
         if case != "small" and quick:
-            parts.insert(0, f"quickest to {CONVERGED / DEGREE:g}°: {_least(quick, _settling, lambda x: f'{x:.0f} s')}")
+            parts.insert(0, f"fastest to {CONVERGED / DEGREE:g}°: {_least(quick, _settling, lambda x: f'{x:.0f} s')}")
         never = [o.filter for o in mine if o.converged < 0.9]
         if never:
-            parts.append(f"not there in nine runs of ten: {', '.join(never)}")
+            parts.append(f"converged in fewer than 90 % of the runs: {', '.join(never)}")
         right = [o.filter for o in whole if o.consistent]
         said = "all" if len(right) == len(whole) else ", ".join(right) or "none"
         parts.append(f"consistent (ANEES inside its bounds in the second half): {said}")
         wrong = sorted((o for o in whole if not o.consistent), key=_misjudged)
         if wrong:
             others = ", ".join(f"{o.filter} {_late_anees(o):.3g}" for o in wrong)
-            parts.append(f"the others by their mean ANEES/6 there: {others}")
+            parts.append(f"mean ANEES/6 of the others there: {others}")
         lines.append(f"{case} ({common} {'run' if common == 1 else 'runs'}): {'; '.join(parts)}.")
     return lines
 
@@ -321,12 +321,12 @@ def _late_anees(outcome: Outcome) -> float:
 
 
 def _misjudged(outcome: Outcome) -> float:
-    """Return how far the mean ANEES of the second half is from one, either way."""
+    """Return the absolute logarithm of the mean ANEES of the second half."""
     return float(abs(np.log(_late_anees(outcome))))
 
 
 def _least(outcomes: Sequence[Outcome], value: Callable[[Outcome], float], said: Callable[[float], str]) -> str:
-    """Return the filters of the least value, and those within five per cent of it."""
+    """Return the filters within 5 % of the minimum value."""
     least = min(value(o) for o in outcomes)
     return f"{', '.join(o.filter for o in outcomes if value(o) <= 1.05 * least)} ({said(least)})"
 

@@ -1,25 +1,24 @@
-"""What should a filter do about flicker, which no random walk represents? Four filters on the gyros of the presets, at rest.
+"""How should a filter model flicker, which no random walk represents? Four filters on the gyros of the presets, at rest.
 
-For each preset and run, a record at the gyro's natural rate with vector measurements once a second goes through
+For each preset and run, a record at the gyro's natural rate with vector measurements once a second is processed by
 
 ``own``
-    the MEKF with the gyro's angle and rate random walk alone, blind to flicker;
+    the MEKF with only the gyro's angle and rate random walk, without flicker;
 ``bound``
     the MEKF with the spectral bound of :func:`strapdown.gyro.process_noise` at :func:`strapdown.gyro.best_bandwidth`;
 ``matched``
     the MEKF with :func:`strapdown.gyro.matched_process_noise`;
 ``augmented``
-    a linear Kalman filter, one an axis, with the sixteen states of :class:`strapdown.gyro.flicker.Shaping` beside attitude and drift.
+    a linear Kalman filter per axis, with the sixteen states of :class:`strapdown.gyro.flicker.Shaping` besides attitude and drift.
 
-and ``control`` is the MEKF of ``own`` on the same gyro without flicker. Reported are the NEES of the attitude over its three degrees of
+``control`` is the MEKF of ``own`` on the same gyro without flicker. Reported are the NEES of the attitude over its three degrees of
 freedom, averaged over runs and late epochs (1 if the covariance is right), the standard error of that mean, and the RMS error.
 
 Run ``python sims/flicker_in_filter.py [--out FOLDER]`` (some minutes).
 
-Found on the presets, each at its natural rate with vector measurements once a second: mean
-NEES of the attitude over its three degrees of freedom (40 runs of 600 s; the scatter of each is 0.012 to 0.049, 0.073 for the
-mpu-9250 with its flicker ignored; the columns share their random numbers):
-
+Results for the presets, each at its natural rate with vector measurements once a second: mean NEES of the attitude over its three degrees
+of freedom (40 runs of 600 s; standard errors 0.012 to 0.049, 0.073 for the mpu-9250 with its flicker ignored; the columns share their
+random numbers):
 ===========  ===============  =========  ==============  =======  =========
 preset       without flicker  ignored    spectral bound  matched  augmented
 ===========  ===============  =========  ==============  =======  =========
@@ -61,12 +60,12 @@ SIGMA = {
     "fibre-optic": 10.0,
     "navigation, ring laser": 2.0,
 }
-"""Noise of the vector measurements that go with a grade of gyro, arcsec."""
+"""σ of the vector measurements by grade of the gyro, arcsec."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """Of one preset: by filter, mean NEES over 3, its standard error, and RMS attitude error (rad)."""
+    """Result for one preset, by filter: mean NEES over 3, its standard error, and RMS attitude error (rad)."""
 
     preset: str
     anees: dict[str, float]
@@ -76,7 +75,7 @@ class Outcome:
 
 @dataclass(frozen=True, kw_only=True)
 class Result:
-    """All presets."""
+    """Results for all presets."""
 
     outcomes: tuple[Outcome, ...]
     runs: int
@@ -84,11 +83,11 @@ class Result:
 
 
 SMALL = {"presets": ("stim300",), "runs": 2, "duration": 60.0, "rate": 50.0}
-"""Arguments of a run that only shows that the script works."""
+"""Arguments of a quick test run."""
 
 
 def main(*, presets=tuple(datasheets.PRESETS), runs=40, duration=600.0, seed=1, rate=None, out=None):
-    """Judge the filters on each preset; ``rate`` (Hz) in place of the natural one makes it quicker.
+    """Test the filters on each preset; a ``rate`` (Hz) below the natural one makes it faster.
 
     Returns
     -------
@@ -106,7 +105,7 @@ def main(*, presets=tuple(datasheets.PRESETS), runs=40, duration=600.0, seed=1, 
 def judge(preset, runs, duration, seed, rate=None):
     """Return the outcome of one preset."""
     sigma = SIGMA[preset.grade] * ARCSECOND
-    # No deterministic errors: this is about the noise. The three directions give each axis two looks a second.
+    # No deterministic errors: only the noise matters. The three directions give each axis two measurements per second.
     names = ("angle_random_walk", "rate_random_walk", "bias_instability", "turn_on_bias_sigma")
     spec = gyro.GyroSpec(**{name: getattr(preset.spec, name) for name in names})
     density = 0.5 * sigma**2
@@ -160,20 +159,20 @@ def judge(preset, runs, duration, seed, rate=None):
 
 
 def _look(vectors, axis):
-    """Return the angle about one axis that the two directions across it show, at rest in the fixed frame, to first order."""
+    """Return the angle about one axis, to first order, measured by the two directions across it at rest in the fixed frame."""
     second, third = (axis + 1) % 3, (axis + 2) % 3
-    # A small turn δ about ``axis`` shows in body components: e_second moves by −δ along e_third, e_third by +δ along e_second.
+    # A small rotation δ about ``axis`` changes the body components: e_second moves by −δ along e_third, e_third by +δ along e_second.
     return 0.5 * (vectors[third].vector_b[:, second] - vectors[second].vector_b[:, third])
 
 
 def augmented(angle, looks, spec, shaping, every, dt, variance, start):
-    """Return errors (m + 1, 3) and variance (m + 1,) of a Kalman filter with flicker states, one an axis at rest, all three at once.
+    """Return errors (m + 1, 3) and variance (m + 1,) of Kalman filters with flicker states, one per axis at rest, all three at once.
 
     States: error angle, drift (turn-on bias and random walk), flicker states. ``angle`` (m + 1, 3) is the integrated gyro output, ``looks``
-    (m, 3) the measured angles, both of an axis that truly rests at 0.
+    (m, 3) the measured angles, both of axes whose true angle is 0.
     """
     n = 2 + len(shaping.gains)
-    # One sample: angle error grows by the drift and the flicker of the interval.
+    # One sample: the angle error grows by the drift and the flicker of the interval.
     F, Q = np.eye(n), np.zeros((n, n))
     F[2:, 2:] = np.diag(shaping.poles)
     F[0, 1] = dt
@@ -196,7 +195,7 @@ def augmented(angle, looks, spec, shaping, every, dt, variance, start):
     errors, variances = [x[0].copy()], [P[0, 0]]
     for gained, look in zip(angle[1:], looks, strict=True):
         x, P = whole @ x, whole @ P @ whole.T + total
-        # The gyro's integrated angle less the true one (none, at rest) is the error angle: measured by the look.
+        # The gyro's integrated angle minus the true one (zero, at rest) is the error angle, which ``look`` measures.
         gain = P @ H / (P[0, 0] + variance)
         x = x + np.outer(gain, (gained - look) - x[0])
         P = P - np.outer(gain, H @ P)
@@ -214,7 +213,7 @@ def draw(result, *, ax=None):
     for number, name in enumerate(FILTERS):
         value = np.array([outcome.anees[name] for outcome in result.outcomes])
         bar = student * np.array([outcome.scatter[name] for outcome in result.outcomes])
-        label = {"control": "control: a gyro without flicker", "own": "own: blind to flicker"}.get(name, name)
+        label = {"control": "control: a gyro without flicker", "own": "own: flicker not modelled"}.get(name, name)
         ax.errorbar(
             place + 0.15 * (number - 2.0), value, bar, fmt="o", ms=5, capsize=3, color=style.CYCLE[number], label=label
         )

@@ -1,21 +1,21 @@
-"""How good is the attitude of a unit in the hand, and does its σ hold? On BROAD files or simulated, beside other filters.
+"""How accurate is the attitude of a hand-held unit, and is its σ right? On BROAD files or simulated, compared with other filters.
 
-The same recordings go through ``strapdown estimate``'s filter and smoother (:data:`strapdown.ahrs.HAND_HELD`, and ``any`` motion), VQF 9D,
-offline VQF, imufusion and Madgwick's filter (package ``ahrs``), each with one set of numbers for all; packages that are not installed are
-left out. The error is that of the BROAD benchmark: RMS over the movement, of the whole rotation, the heading and the inclination.
+The same recordings are processed by ``strapdown estimate``'s filter and smoother (:data:`strapdown.ahrs.HAND_HELD`, and ``any`` motion),
+VQF 9D, offline VQF, imufusion and Madgwick's filter (package ``ahrs``), each with one set of parameters for all; packages that are not
+installed are skipped. The error is that of the BROAD benchmark: RMS over the movement, of the total rotation, heading and inclination.
 
-As recorded, the gyro's samples come some milliseconds after the reference (:func:`gyro_latency`, 4.1 ms in BROAD), which no recording shows
-by itself; compensated, every filter's samples are shifted by ``--latency``.
+As recorded, the gyro's samples are some milliseconds later than the reference (:func:`gyro_latency`, 4.1 ms in BROAD), which is not
+observable from a recording without one; *compensated*, every filter's samples are shifted by ``--latency``.
 
-- *coverage*: share of the movement in which the 95 % regions of our σ hold the error: of all angles, the heading, the inclination.
+- *coverage*: fraction of the movement in which the 95 % regions of our σ contain the error: of all angles, heading, inclination.
 - *NIS*: normalised innovation squared per degree of freedom, accelerometer and magnetometer. That of the magnetometer is far below 1: its
-  disturbance, which lasts for seconds and at rest for good, is modelled as white at the level of its slow part.
-- *left out*: the error on each recording with the numbers (:data:`CANDIDATES`) that are best on all the others.
-- *modified*: recordings with a clipped gyro, dropouts, uneven or repeated stamps, no magnetometer, no rest at the start, and with hard
-  iron that is found or not: error, σ and coverage.
+  disturbance, with a correlation time of seconds, infinite at rest, is modelled as white noise of the level of its low frequencies.
+- *left out*: the error on each recording with the parameters (:data:`CANDIDATES`) that are best on all the others.
+- *modified*: error, σ and coverage on recordings with a clipped gyro, dropouts, uneven or repeated stamps, no magnetometer, no rest at the
+  start, and with hard iron that is estimated or not.
 
-Without recordings the unit is simulated: at rest for two seconds, then turned and moved about on smooth paths that are not the filter's own
-model. Run ``python sims/hand_held.py [--latency MS] [--out FOLDER] [RECORDING...]``, recordings being files of the BROAD data set.
+Without recordings the unit is simulated: at rest for two seconds, then rotated and moved on smooth paths that differ from the filter's
+model. Run ``python sims/hand_held.py [--latency MS] [--out FOLDER] [RECORDING...]``; the recordings are files of the BROAD data set.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ BOUNDED = replace(HAND_HELD, gyro_scale_sigma=0.0, velocity_from_record=False)
 COLOURED = GaussMarkov(
     sensor="accelerometer", noise_sigma=5.8, correlation_time=0.1, frame="fixed", unit="m/s²", name="acceleration"
 )
-"""Acceleration of the same σ and of the same spectrum at high frequency as that of the bounded velocity."""
+"""Acceleration with the σ and the high-frequency spectrum of that of the bounded velocity."""
 CANDIDATES = {
     "as released": HAND_HELD,
     "1 m/s for all": replace(HAND_HELD, velocity_from_record=False),
@@ -63,7 +63,7 @@ CANDIDATES = {
     "half the weight of its deviation": replace(HAND_HELD, field_deviation=0.05),
     "no deviation of the field": replace(HAND_HELD, field_deviation=1e3),
 }
-"""Sets of numbers that leave-one-out chooses from."""
+"""Parameter sets for leave-one-out."""
 PARTS = ("total", "heading", "inclination")
 COLOURS = {
     "strapdown": style.VERMILION,
@@ -75,22 +75,22 @@ COLOURS = {
     "Madgwick": "0.5",
 }
 RATE = 200.0
-"""Of the simulated unit, Hz."""
+"""Sample rate of the simulated unit, Hz."""
 
 SMALL = {"runs": 2, "duration": 12.0}
-"""Arguments of a run that only shows that the script works."""
+"""Arguments of a quick test run."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Score:
-    """What one filter made of one recording."""
+    """Result of one filter on one recording."""
 
     errors: tuple[float, ...]
     """RMS error over the movement: total, heading, inclination, rad."""
     time: float
-    """Processor time taken, s a sample."""
+    """Processor time per sample, s."""
     coverage: tuple[float, ...] | None = None
-    """Share of the movement in which the 95 % regions hold the error: of all angles, heading, inclination."""
+    """Fraction of the movement in which the 95 % regions contain the error: all angles, heading, inclination."""
     sigma: float = np.nan
     """RMS of σ, the root of the trace over the three angles, rad."""
     nis: tuple[float, ...] = ()
@@ -103,13 +103,13 @@ class Result:
 
     recordings: tuple[str, ...]
     scores: dict[str, dict[str, list[Score]]]
-    """By treatment ("as recorded", "compensated") and filter, one for each recording."""
+    """By treatment ("as recorded", "compensated") and filter, one per recording."""
     left_out: dict[str, Array]
-    """Total error on each recording by numbers chosen on the others, online and smoothed, rad."""
+    """Total error on each recording with parameters chosen on the others, online and smoothed, rad."""
     modified: dict[str, list[Score]]
-    """By modification, online, one for each recording."""
+    """By modification, online, one per recording."""
     latencies: Array
-    """Of the gyro beside the reference (recordings,), s."""
+    """Delay of the gyro relative to the reference (recordings,), s."""
     figures: tuple[Path, ...]
 
     def mean(self, name: str, treatment: str = "as recorded") -> Array:
@@ -118,7 +118,7 @@ class Result:
 
 
 def swelling(t: Array, w: float, phase: Array) -> tuple[Array, Array]:
-    """Return a sine that swells from nothing, ``sin(ωt + φ) (1 − exp(−t³/2))``, and its second derivative."""
+    """Return a sine that grows from zero, ``sin(ωt + φ) (1 − exp(−t³/2))``, and its second derivative."""
     fading = np.exp(-0.5 * t**3)
     swell, growth, bend = 1.0 - fading, 1.5 * t**2 * fading, (3.0 * t - 2.25 * t**4) * fading
     sine, cosine = np.sin(w * t + phase), np.cos(w * t + phase)
@@ -126,7 +126,7 @@ def swelling(t: Array, w: float, phase: Array) -> tuple[Array, Array]:
 
 
 def simulated(seed: int, run: int, duration: float) -> Recording:
-    """Return two seconds of rest, then a unit turned by some rad/s and moved by decimetres, as a consumer-grade unit gives it."""
+    """Return a recording of a consumer-grade unit: two seconds of rest, then rotation at some rad/s and movement by decimetres."""
     random = generator(seed, run, "hand")
     time = np.arange(round((2.0 + duration) * RATE) + 1) / RATE
     turns = HarmonicRates(
@@ -135,7 +135,7 @@ def simulated(seed: int, run: int, duration: float) -> Recording:
             for f in (0.23, 0.41, 0.67)
         )
     )
-    # Time since the movement began, as it is for a body that starts smoothly.
+    # Time since the start of the movement, for a body that starts smoothly.
     since = np.maximum(time - 2.0, 0.0)
     along, speed = since - np.tanh(since), np.tanh(since) ** 2
     attitude = turns.attitude(along)
@@ -161,7 +161,7 @@ def simulated(seed: int, run: int, duration: float) -> Recording:
 
 
 def coloured(recording: Recording, latency: float) -> tuple[Recording, Array]:
-    """Return the recording at the filter's steps, and the attitude there with the acceleration modelled as first-order coloured noise."""
+    """Return the recording at the filter's steps, and the attitude with the acceleration modelled as first-order coloured noise."""
     plain = ahrs.estimate(recording, replace(BOUNDED, velocity_sigma=0.0, specific_force_noise=0.06), latency=latency)
     found = estimation.run(plain.record, BOUNDED.setup.process_noise, plain.initial, (COLOURED,))
     used = plain.recording
@@ -171,10 +171,10 @@ def coloured(recording: Recording, latency: float) -> tuple[Recording, Array]:
 
 
 def gyro_latency(recording: Recording) -> tuple[float, float]:
-    """Return how long after the reference attitude's the gyro's samples show a rate, s, and the gyro's error left, RMS, rad/s.
+    """Return the delay of the gyro's samples after the reference attitude, s, and the RMS of the remaining rate difference, rad/s.
 
-    The turn of the reference over four samples, beside that of the gyro over as long an interval shifted by what is sought, scale,
-    misalignment and bias fitted; no filter has part in it.
+    The rate of the reference over four samples is compared with that of the gyro, shifted by the delay, with scale, misalignment and bias
+    fitted. No filter is involved.
     """
     assert recording.true_attitude is not None
     time, reach = recording.time, 2
@@ -200,7 +200,7 @@ def gyro_latency(recording: Recording) -> tuple[float, float]:
 
 
 def shifted(recording: Recording, latency: float) -> Recording:
-    """Return the recording with all samples moved forward by ``latency``, s, between their neighbours; the last ones are held."""
+    """Return the recording with all samples advanced by ``latency``, s, by interpolation; the last ones are held."""
     moved = {}
     for name in ("rate", "specific_force", "magnetic_field"):
         columns = getattr(recording, name).T
@@ -209,7 +209,7 @@ def shifted(recording: Recording, latency: float) -> Recording:
 
 
 def modified(recording: Recording, seed: int = 1) -> dict[str, Recording]:
-    """Return the recording as sensors at their limits would have given it."""
+    """Return the recording with several faults of the sensors and the data."""
     random = generator(seed, 0, "modified")
     n = len(recording.time)
     limit = 0.6 * np.abs(recording.rate[:, 0]).max()
@@ -239,7 +239,7 @@ def modified(recording: Recording, seed: int = 1) -> dict[str, Recording]:
 
 
 def _stamped_again(recording: Recording, rows: np.ndarray) -> Recording:
-    """Return the recording as a reader makes it of a file in which these rows have the stamps of the rows before."""
+    """Return the recording as read from a file in which these rows repeat the stamps of the rows before."""
     time = recording.time.copy()
     time[rows] = recording.time[rows - 1]
     names = ("specific_force", "magnetic_field", "true_attitude", "movement")
@@ -255,7 +255,7 @@ def _rows(recording: Recording, rows: np.ndarray) -> Recording:
 
 
 def scored(result: AhrsEstimate, taken: float) -> Score:
-    """Return errors, coverage and NIS of one of our estimates, which has whole covariances."""
+    """Return errors, coverage and NIS of one of our estimates, which has full covariances."""
     used, found = result.recording, result.estimate
     assert used.true_attitude is not None
     assert found.covariance is not None
@@ -273,7 +273,7 @@ def scored(result: AhrsEstimate, taken: float) -> Score:
         return float(np.mean(square <= chi2.ppf(0.95, e.shape[1])))
 
     errors = reference_errors(found.attitude, used.true_attitude).rms(used.movement)
-    if used.magnetic_field is None:  # of an arbitrary heading only the inclination can be right
+    if used.magnetic_field is None:  # with an arbitrary heading only the inclination is defined
         errors = {**errors, "total": np.nan, "heading": np.nan}
     return Score(
         errors=tuple(errors[part] for part in PARTS),
@@ -294,7 +294,7 @@ def ours(
 
 
 def peers(used: Recording) -> dict[str, tuple[Array, float]]:
-    """Return what the installed ones of other filters make of a recording whose samples are all there, and its processor time, s."""
+    """Return attitudes and processor time, s, of the installed peers on a recording without missing samples."""
     if used.magnetic_field is None or used.specific_force is None:
         return {}
     interval = float(np.median(np.diff(used.time)))
@@ -323,7 +323,7 @@ def peers(used: Recording) -> dict[str, tuple[Array, float]]:
     except ImportError:
         pass
     else:
-        # Its x axis points North: a quarter turn from East-North-Up.
+        # Its x axis points North: rotated by 90° from East-North-Up.
         quarter = quaternion.exp([0.0, 0.0, 0.5 * np.pi])
         begun = ahrs.start(used, slice(0, round(1.0 / interval)), HAND_HELD).attitude
         begun = quaternion.multiply(quaternion.conjugate(quarter), begun)
@@ -332,7 +332,7 @@ def peers(used: Recording) -> dict[str, tuple[Array, float]]:
 
 
 def _imufusion(imufusion, samples: Sequence[Array], interval: float) -> Array:  # type: ignore[no-untyped-def]
-    """Run imufusion sample by sample, East-North-Up, with the settings that its documentation gives."""
+    """Run imufusion sample by sample, East-North-Up, with the settings of its documentation."""
     filter_, settings = imufusion.Ahrs(), imufusion.AhrsSettings()
     settings.convention = imufusion.CONVENTION_ENU
     settings.gain, settings.gyroscope_range = 0.5, 2000.0
@@ -348,7 +348,7 @@ def _imufusion(imufusion, samples: Sequence[Array], interval: float) -> Array:  
 
 
 def compared(recording: Recording, latency: float | None) -> tuple[dict[str, Score], list[AhrsEstimate]]:
-    """Return the scores of every filter on a recording, and our estimates; ``latency`` in s, None as recorded."""
+    """Return the scores of every filter on a recording, and our estimates; ``latency`` in s; None: as recorded."""
     found, scores = [], {}
     for name, options in (
         ("strapdown", {}),
@@ -357,7 +357,7 @@ def compared(recording: Recording, latency: float | None) -> tuple[dict[str, Sco
     ):
         result, scores[name] = ours(recording, latency, **options)
         found.append(result)
-    # Others start where ours does.
+    # All filters start at the same time as ours.
     begin = int(np.searchsorted(recording.time, found[0].recording.time[0]))
     used = (recording if latency is None else shifted(recording, latency)).since(begin)
     for name, (attitude, taken) in peers(used).items():
@@ -367,7 +367,7 @@ def compared(recording: Recording, latency: float | None) -> tuple[dict[str, Sco
 
 
 def leave_one_out(read: Sequence[Recording], latency: float, smooth: bool) -> Array:
-    """Return the total error on each recording with the candidate that has the least mean error on the others (recordings,), rad."""
+    """Return the total error on each recording with the candidate of minimum mean error on the others (recordings,), rad."""
     errors = np.empty((len(read), len(CANDIDATES)))
     for k, one in enumerate(read):
         for c, candidate in enumerate(CANDIDATES.values()):
@@ -406,7 +406,7 @@ def draw(result: Result, path: Path) -> Path:
 
 
 def draw_worst(found: Sequence[AhrsEstimate], path: Path) -> Path:
-    """Draw heading error and inclination error over time inside ±2σ of the recordings given, and write the figure."""
+    """Draw heading and inclination errors over time with ±2σ for the given recordings, and write the figure."""
     figure, axes = plots.new_figure(2, len(found), size=(6.5 * len(found), 6.0))
     for column, result in zip(np.reshape(axes, (2, len(found))).T, found, strict=True):
         used, estimate = result.recording, result.estimate
@@ -425,14 +425,14 @@ def draw_worst(found: Sequence[AhrsEstimate], path: Path) -> Path:
 
 
 def _plain(score: Score) -> dict[str, object]:
-    """Return a score for JSON, which has no NaN: the error of an arbitrary heading is null."""
+    """Return a score for JSON, where NaN, the error of an arbitrary heading, is null."""
     plain = asdict(score)
     plain["errors"] = [None if np.isnan(one) else one for one in score.errors]
     return {**plain, "sigma": None if np.isnan(score.sigma) else score.sigma}
 
 
 def _heads(names: Sequence[str]) -> list[str]:
-    """Return short names: the number of a trial of BROAD, or of a simulated recording."""
+    """Return short names: the number of the BROAD trial or of the simulated recording."""
     return [name[:2] if name[:2].isdigit() else name.split()[-1][:8] for name in names]
 
 
@@ -488,8 +488,8 @@ def main(
 ) -> Result:
     """Compare the filters on recordings with a reference, or on ``runs`` simulated ones of ``duration`` s.
 
-    ``latency`` in ms is what *compensated* makes good; that of simulated recordings is 0. Table, JSON and figures are written to ``out`` if
-    it is given; ``progress`` is called with a line for each recording.
+    ``latency`` in ms is the delay that *compensated* removes; that of simulated recordings is 0. Table, JSON and figures are written to
+    ``out`` if it is given; ``progress`` is called with a line for each recording.
     """
     read = [recordings.read(file) for file in files] or [simulated(seed, k, duration) for k in range(runs)]
     for one in read:
@@ -546,9 +546,9 @@ def main(
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("files", nargs="*", metavar="RECORDING", help="BROAD files; none: simulated recordings")
-    parser.add_argument("--runs", type=int, default=12, help="simulated recordings")
-    parser.add_argument("--duration", type=float, default=60.0, help="of a simulated recording, s")
+    parser.add_argument("--runs", type=int, default=12, help="number of simulated recordings")
+    parser.add_argument("--duration", type=float, default=60.0, help="duration of a simulated recording, s")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--latency", type=float, default=4.1, help="of the gyro and the accelerometer, ms")
+    parser.add_argument("--latency", type=float, default=4.1, help="delay of the gyro and the accelerometer, ms")
     parser.add_argument("--out", type=Path, default=Path("results/hand_held"))
     print(table(main(**vars(parser.parse_args()), progress=lambda line: print(line, file=sys.stderr))))

@@ -1,8 +1,8 @@
-"""Attitude while it is measured: samples from a socket at 1 kHz, filtered and drawn as they come.
+"""Attitude in real time: samples from a socket at 1 kHz, filtered and drawn as they arrive.
 
-A thread plays an inertial unit: it sends each sample of a simulated hand motion as a datagram to the loopback at the time it is due, the
-magnetometer's at 100 Hz and 20 ms late. The main thread reads the socket, filters by :class:`strapdown.LiveFilter`, whose look-back takes
-the late ones at their time, and draws ten times a second: with ``--show`` in a window, else once, into ``--out``, at the end.
+A thread simulates an inertial unit: it sends each sample of a simulated hand motion as a datagram to the loopback interface when it is due,
+the magnetometer's at 100 Hz with 20 ms of delay. The main thread reads the socket and filters by :class:`strapdown.LiveFilter`, whose
+look-back processes delayed samples at their time, and draws: with ``--show`` ten times a second in a window, else once at the end.
 
 Run it: ``python sims/live.py --show --duration 30``.
 """
@@ -30,24 +30,24 @@ from strapdown.units import DEGREE
 
 RATE = 1000.0
 LATENCY = 0.02
-"""Of the magnetometer, s."""
+"""Delay of the magnetometer, s."""
 SAMPLE = struct.Struct("<Bd3d")
-"""Sensor, time of the sample in s, and its three numbers; the gyro's are its rate since the sample before."""
+"""Sensor, time of the sample in s, and its three components; those of the gyro are the mean rate since the last sample."""
 GYRO, ACCELEROMETER, MAGNETOMETER, END = range(4)
 NAMES = {ACCELEROMETER: "accelerometer", MAGNETOMETER: "magnetometer"}
 DRAWN = 0.1
-"""From one drawing to the next, s."""
+"""Interval between drawings, s."""
 
 SMALL = {"duration": 1.0}
-"""Arguments of a run that only shows that the script works."""
+"""Arguments of a quick test run."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Result:
-    """What was seen of the stream."""
+    """Estimates and timing of the stream."""
 
     time: Array
-    """Of the estimates (n,), s."""
+    """Times of the estimates (n,), s."""
     error: Array
     """Angle between estimated and true attitude (n,), rad."""
     sigma: Array
@@ -55,14 +55,14 @@ class Result:
     update: float
     """Median time of an update, s."""
     behind: float
-    """99th percentile of the time from when a gyro sample was due to when its estimate was there, s."""
+    """99th percentile of the time from when a gyro sample is due to its estimate, s."""
     late: int
-    """Measurements that came later than the look-back."""
+    """Number of measurements delayed beyond the look-back."""
     figure: Path | None
 
 
 def simulated(duration: float, seed: int) -> ImuRecord:
-    """Return what a hand-held unit measures."""
+    """Return a record of a hand-held unit."""
     motion = sd.motion.SpinCone(angle=0.4, precession_rate=2.0, spin_rate=-1.5)
     noise = sd.GyroSpec(angle_random_walk=1e-4, rate_random_walk=1e-5, turn_on_bias_sigma=5e-3)
     up = sd.VectorSensor(name="accelerometer", reference_f=[0.0, 0.0, 1.0], sigma=0.02, rate=RATE)
@@ -73,7 +73,7 @@ def simulated(duration: float, seed: int) -> ImuRecord:
 
 
 def datagrams(record: ImuRecord) -> list[tuple[float, bytes]]:
-    """Return the samples of a record, each with the time at which it is due, s."""
+    """Return the samples of a record, each with the time at which it is to be sent, s."""
     rates = record.increments / np.diff(record.time)[:, None]
     due = [(t, GYRO, t, value) for t, value in zip(record.time[1:].tolist(), rates.tolist(), strict=True)]
     for sensor, series in zip(NAMES, record.vectors, strict=True):
@@ -84,7 +84,7 @@ def datagrams(record: ImuRecord) -> list[tuple[float, bytes]]:
 
 
 def send(due: list[tuple[float, bytes]], address: tuple[str, int], begin: float) -> None:
-    """Send each sample when it is due; the clock that started at ``begin`` is :func:`time.perf_counter`."""
+    """Send each sample when it is due; ``begin`` is the start by :func:`time.perf_counter`."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
         for at, sample in due:
             wait = begin + at - time.perf_counter()
@@ -95,7 +95,7 @@ def send(due: list[tuple[float, bytes]], address: tuple[str, int], begin: float)
 
 
 class Screen:
-    """Error and ±1σ over the last ten seconds, or over all."""
+    """Plot of error and σ over the last ten seconds, or over the whole stream."""
 
     def __init__(self, *, show: bool) -> None:
         self.show = show
@@ -123,7 +123,7 @@ class Screen:
 
 
 def receive(inlet: socket.socket, live: LiveFilter, record: ImuRecord, begin: float, screen: Screen) -> Any:
-    """Filter what comes until the stream ends; return time, error and σ (n, 3), and the times that updates and samples took."""
+    """Filter the stream until its end; return time, error and σ (n, 3), and the durations of updates and samples."""
     assert record.truth is not None
     truth, rows, took, behind, drawn = record.truth.attitude, [], [], [], 0.0
     while True:
@@ -194,6 +194,6 @@ if __name__ == "__main__":
     parser.add_argument("--show", action="store_true", help="draw in a window while it runs")
     found = main(**vars(parser.parse_args()))
     print(
-        f"{1e6 * found.update:.1f} µs an update, {1e3 * found.behind:.2f} ms behind at most (99 %), {found.late} too late; "
-        f"at the end {found.error[-1] / DEGREE:.2f}° of error, σ {found.sigma[-1] / DEGREE:.2f}°"
+        f"{1e6 * found.update:.1f} µs per update, {1e3 * found.behind:.2f} ms behind at most (99 %), {found.late} too late; "
+        f"at the end error {found.error[-1] / DEGREE:.2f}°, σ {found.sigma[-1] / DEGREE:.2f}°"
     )

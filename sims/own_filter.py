@@ -1,11 +1,11 @@
-"""Is my own filter right? A filter that is no part of the package, judged as the package judges its own.
+"""Is a user-defined filter consistent? A filter that is not part of the package, judged like the package's own.
 
-The filter below is the textbook's MEKF in twenty lines of NumPy: one vector at a time, the covariance propagated to first order.
-It is a function of a record and an initial state; an object with such a method ``run`` does as well. Put into a setup, it goes wherever the
-package's own filter goes: a Monte Carlo in threads or on Dask, resumed after a kill, replayed run by run, and into ``filters.compare``.
+The filter below is the textbook's MEKF in twenty lines of NumPy: one vector at a time, the covariance propagated to first order. It is a
+function of a record and an initial state; an object with such a method ``run`` works too. In a setup, it can be used like the package's
+filter: in a Monte Carlo in threads or on Dask, resumed after a kill, replayed run by run, and in ``filters.compare``.
 
-``python sims/own_filter.py`` runs it and the package's filter on the same runs, and then one with a fault that is made on purpose:
-the reference of the second sensor turned by 0.3°.
+``python sims/own_filter.py`` runs it and the package's filter on the same runs, and then one with a deliberate fault: the reference of the
+second sensor rotated by 0.3°.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from strapdown.records import Estimate, ImuRecord
 from strapdown.units import DEGREE, DEGREE_PER_HOUR_PER_ROOT_HOUR, DEGREE_PER_ROOT_HOUR
 
 SMALL = {"runs": 6, "duration": 20.0}
-"""Arguments of a run that only shows that the script works."""
+"""Arguments of a quick test run."""
 
 GYRO = GyroSpec(angle_random_walk=0.3 * DEGREE_PER_ROOT_HOUR, rate_random_walk=20.0 * DEGREE_PER_HOUR_PER_ROOT_HOUR)
 
 
 # [example]
 def textbook(record: ImuRecord, initial: State) -> Estimate:
-    """Return attitude and bias by a multiplicative Kalman filter, one vector after the other (Markley & Crassidis 2014, section 6.2)."""
+    """Return attitude and bias by a multiplicative Kalman filter, one vector at a time (Markley & Crassidis 2014, section 6.2)."""
     q, b, P = initial.attitude, initial.bias, initial.covariance
     Q = np.kron(np.diag([GYRO.angle_random_walk**2, GYRO.rate_random_walk**2]), np.eye(3))
     rows = [(q, b, P)]
@@ -59,7 +59,7 @@ def textbook(record: ImuRecord, initial: State) -> Estimate:
 
 
 def turned_reference(record: ImuRecord, initial: State) -> Estimate:
-    """Return what the same filter makes of a wrong reference: the second sensor's, turned by 0.3° about z."""
+    """Return the estimate of the same filter with a wrong reference: the second sensor's, rotated by 0.3° about z."""
     turn = quaternion.exp(np.array([0.0, 0.0, 0.3 * DEGREE]))
     first, second = record.vectors
     wrong = replace(second, reference_f=quaternion.rotate(turn, second.reference_f))
@@ -67,7 +67,7 @@ def turned_reference(record: ImuRecord, initial: State) -> Estimate:
 
 
 def scenario(duration: float) -> scenarios.Scenario:
-    """Return a body that tumbles slowly, and two sensors of directions once a second."""
+    """Return a slowly tumbling body with two direction sensors at 1 Hz."""
     references = {"sun": (0.0, 0.6, 0.8), "field": (0.8, 0.0, -0.6)}
     return scenarios.Scenario(
         motion=motion.ConstantRate(rate=(0.02, -0.03, 0.05)),
@@ -83,7 +83,7 @@ def scenario(duration: float) -> scenarios.Scenario:
 
 @dataclass(frozen=True, kw_only=True)
 class Result:
-    """What the package says of each filter."""
+    """Verdicts on each filter."""
 
     statistics: dict[str, montecarlo.Statistics]
     verdicts: dict[str, str]

@@ -1,24 +1,24 @@
-"""Are other people's filters consistent? Three of them, run as they come and judged over many runs.
+"""Are the filters of other packages consistent? Three of them, run unmodified and judged over many runs.
 
-Each is put into a setup as a filter of one's own: a class with a method ``run``. It gets the same simulated records as any filter here
-(gyro, accelerometer, attitude sensor), and beside them a velocity that is measured to 0.1 m/s, all noises given to it as they are:
+Each is used in a setup as a user-defined filter: a class with a method ``run``. It gets the same simulated records as any filter here
+(gyro, accelerometer, attitude sensor), and in addition velocity measurements with a σ of 0.1 m/s, and the true noise parameters:
 
 - smsfusion (4Subsea), aided INS, a multiplicative EKF: velocity and heading;
 - AttiPy (V. R. Solum), AHRS, a multiplicative EKF: velocity and heading;
 - GTSAM (Georgia Tech), ``NavStateImuEKF``, on a manifold and without a gyro bias: velocity and attitude, the gyro without a bias.
 
-And what it makes of them where something is wrong, which the verdict must find:
+In addition, cases with a fault that the verdict must detect:
 
-- smsfusion with the noise parameters that the package has for a sensor of this class, not those of the simulated one;
-- its covariance, right as it is, read as one about fixed axes, as ROS has it: the commonest mistake in judging a filter;
-- GTSAM's filter with a gyro that has the bias which it does not model.
+- smsfusion with the package's noise parameters for a sensor of this class instead of those of the simulated one;
+- its covariance, which is correct, read as one about fixed axes, as in ROS: the most common mistake in judging a filter;
+- GTSAM's filter with a gyro that has a bias, which it does not model.
 
-What it found besides: smsfusion and AttiPy take the yaw's derivative by the whole Gibbs vector of the attitude for that by a small rotation
-(:func:`heading_gradient`). It is too small by cos²(ψ/2): half at 90°, none at 180°, so that σ about the vertical is too large; with the
-right one AttiPy's filter is consistent.
+A further finding: smsfusion and AttiPy use the yaw's derivative with respect to the whole Gibbs vector of the attitude in place of that
+with respect to a small rotation (:func:`heading_gradient`). It is too small by cos²(ψ/2): half at 90°, zero at 180°, so that σ about the
+vertical is too large; with the correct one AttiPy's filter is consistent.
 
-``pip install smsfusion attipy gtsam``, then ``python sims/peer_judged.py [--out docs/_data]`` (some minutes): it writes
-``peer_judged.json``, which the page *Comparison* of the documentation prints. Peers that are not installed are left out.
+``pip install smsfusion attipy gtsam``, then ``python sims/peer_judged.py [--out docs/_data]`` (some minutes). It writes
+``peer_judged.json``, which the page *Comparison* of the documentation prints. Peers that are not installed are skipped.
 """
 
 from __future__ import annotations
@@ -47,16 +47,16 @@ from strapdown.records.outputs import euler
 from strapdown.units import DEGREE, DEGREE_PER_ROOT_HOUR, STANDARD_GRAVITY
 
 SMALL = {"runs": 3, "duration": 4.0}
-"""Arguments of a run that only shows that the script works."""
+"""Arguments of a quick test run."""
 
 RATE = 50.0
 ACCELEROMETER = 2e-3
 """White noise of the specific force, m/s²/√Hz."""
 BIAS, MEMORY = 60.0 * DEGREE / 3600.0, 200.0
-"""σ, rad/s, and correlation time, s, of the gyro's bias: a Gauss–Markov process, as the peer models it."""
+"""σ, rad/s, and correlation time, s, of the gyro's bias, a Gauss–Markov process as in the peer's model."""
 HEADING = 1.0 * DEGREE
 VELOCITY = 0.1
-"""σ of the velocity that aids the peer, m/s."""
+"""σ of the velocity measurements, m/s."""
 GYRO = GyroSpec(
     angle_random_walk=0.5 * DEGREE_PER_ROOT_HOUR,
     markov_noise=BIAS * np.sqrt(2.0 / MEMORY),
@@ -65,45 +65,45 @@ GYRO = GyroSpec(
 
 
 class Samples(NamedTuple):
-    """What a peer is fed: readings at the edges 0 … n − 1, and aids at some of them."""
+    """Input of a peer: readings at the edges 0 … n − 1, and aiding measurements at some of them."""
 
     number: int
     rates: Array
-    """(n, 3), rad/s, over the interval after each edge."""
+    """Rates (n, 3), rad/s, over the interval after each edge."""
     force: Array
-    """(n, 3), m/s²."""
+    """Specific force (n, 3), m/s²."""
     velocity: Array
-    """(n, 3), m/s: what the velocity sensor gives of a unit at rest."""
+    """Measured velocity (n, 3), m/s, of a unit at rest."""
     attitude: Array
-    """(m, 4), of the attitude sensor."""
+    """Measurements of the attitude sensor (m, 4)."""
     aided: dict[int, int]
     """Row of the attitude sensor by edge; the velocity is measured there too."""
 
 
 def samples(record: ImuRecord) -> Samples:
-    """Return a record as peers take it."""
+    """Return a record as the input of peers."""
     force, attitude = record.vectors
     assert attitude.attitude is not None
     n = len(record.increments)
-    # The velocity sensor of this run: its noise is drawn anew for each record, and is the same whenever the record is.
+    # The velocity sensor of this run: its noise depends only on the record.
     noise = generator(int(record.increments.view(np.uint64).sum() % 2**32), 0, "velocity").standard_normal((n, 3))
-    felt = STANDARD_GRAVITY * np.concatenate([force.vector_b[:1], force.vector_b])  # the record holds directions
+    felt = STANDARD_GRAVITY * np.concatenate([force.vector_b[:1], force.vector_b])  # the record contains directions
     aided = {round(t * RATE): k for k, t in enumerate(attitude.time)}
     return Samples(n, record.increments * RATE, felt[:n], VELOCITY * noise, attitude.attitude, aided)
 
 
 @dataclass(frozen=True)
 class AidedIns:
-    """smsfusion's AidedINS. Its error state: position, velocity, attitude, gyro bias."""
+    """smsfusion's AidedINS, with the error states position, velocity, attitude, gyro bias."""
 
     gyro: dict[str, float]
     """N, rad/s/√Hz; B, rad/s; tau_cb, s."""
     read_as: str = "body"
-    """What its covariance is taken to be of."""
+    """Definition by which its covariance is read."""
     name: str = "smsfusion"
 
     def run(self, record: ImuRecord, initial: State) -> Estimate:
-        """Return its attitude and gyro bias at all edges but the last."""
+        """Return its attitude and gyro bias at all edges except the last."""
         import smsfusion
 
         P0 = 1e-6 * np.eye(12)
@@ -134,23 +134,23 @@ class AidedIns:
 
 
 def heading_gradient(attitude: Array) -> Array:
-    """Return the derivative (3,) of the yaw angle by a small rotation in body axes: (0, sin φ, cos φ)/cos θ."""
+    """Return the derivative (3,) of the yaw angle with respect to a small rotation in body axes: (0, sin φ, cos φ)/cos θ."""
     _, pitch, roll = euler(attitude[None]).angles[0]
     return np.array([0.0, np.sin(roll), np.cos(roll)]) / np.cos(pitch)
 
 
 @dataclass(frozen=True)
 class AttiPy:
-    """AttiPy's AHRS. Its error state: attitude, gyro bias, velocity."""
+    """AttiPy's AHRS, with the error states attitude, gyro bias, velocity."""
 
     gyro: dict[str, float]
     """N, rad/s/√Hz; B, rad/s; tau_cb, s."""
     mended: bool = False
-    """With :func:`heading_gradient` instead of its own."""
+    """Whether to use :func:`heading_gradient` instead of its own derivative."""
     name: str = "attipy"
 
     def run(self, record: ImuRecord, initial: State) -> Estimate:
-        """Return its attitude and gyro bias at all edges but the last."""
+        """Return its attitude and gyro bias at all edges except the last."""
         import attipy
 
         given = samples(record)
@@ -177,11 +177,11 @@ class AttiPy:
                 return own
 
             ahrs._dhdx_yaw = row
-        ahrs._dx = np.zeros(9)  # version 0.0.7 has one for all objects of the class, and runs go on in several threads
+        ahrs._dx = np.zeros(9)  # version 0.0.7 shares it among all objects, and runs are in several threads
         angles = euler(given.attitude).angles
         q, b, P = np.empty((given.number, 4)), np.empty((given.number, 3)), np.empty((given.number, 6, 6))
         q[0], b[0], P[0] = initial.attitude, initial.bias, initial.covariance
-        for k in range(1, given.number):  # a call goes on to this edge with the reading before, and keeps this one
+        for k in range(1, given.number):  # a call propagates to this edge by the last reading, and stores this one
             aid: dict[str, Any] = {"v_n": None}
             if (j := given.aided.get(k)) is not None:
                 aid = {"v_n": given.velocity[k], "v_var": np.full(3, VELOCITY**2)}
@@ -193,14 +193,14 @@ class AttiPy:
 
 @dataclass(frozen=True)
 class Gtsam:
-    """GTSAM's NavStateImuEKF. Its error state: attitude, position, velocity, all in body axes."""
+    """GTSAM's NavStateImuEKF, with the error states attitude, position, velocity, all in body axes."""
 
     angle_random_walk: float
-    """rad/√s."""
+    """Angle random walk of the gyro, rad/√s."""
     name: str = "gtsam"
 
     def run(self, record: ImuRecord, initial: State) -> Estimate:
-        """Return its attitude at all edges but the last."""
+        """Return its attitude at all edges except the last."""
         import gtsam
 
         given = samples(record)
@@ -229,7 +229,7 @@ class Gtsam:
 
 
 def flight(duration: float, gyro: GyroSpec = GYRO) -> scenarios.Scenario:
-    """Return a unit that rocks about all its axes at one place, its attitude measured five times a second."""
+    """Return a unit that rocks about all its axes at one place, with attitude measurements at 5 Hz."""
     return scenarios.Scenario(
         motion=HarmonicRates(
             mean=(0.0, 0.0, 0.1),
@@ -251,7 +251,7 @@ def flight(duration: float, gyro: GyroSpec = GYRO) -> scenarios.Scenario:
 
 
 def cases(duration: float) -> dict[str, tuple[str, scenarios.Scenario, Any]]:
-    """Return by name what is judged: the package that it needs, the scenario, the filter."""
+    """Return the cases by name: required package, scenario, filter."""
     datasheet_noise = {"N": float(GYRO.angle_random_walk), "B": BIAS, "tau_cb": MEMORY}
     noise = float(GYRO.angle_random_walk)
     scene, steady = flight(duration), flight(duration, GyroSpec(angle_random_walk=noise))
@@ -278,12 +278,12 @@ def cases(duration: float) -> dict[str, tuple[str, scenarios.Scenario, Any]]:
 
 @dataclass(frozen=True, kw_only=True)
 class Result:
-    """The peers' σ against their errors."""
+    """The peers' verdicts and statistics."""
 
     judgements: dict[str, consistency.Judgement]
     statistics: dict[str, montecarlo.Statistics]
     frame_probability: dict[str, float] = field(default_factory=dict)
-    """Of each reading of smsfusion's covariance, found from its errors."""
+    """Probability of each definition of smsfusion's covariance, from its errors."""
 
 
 def main(*, runs: int = 200, duration: float = 40.0, seed: int = 1, out: Path | str | None = None) -> Result:
@@ -348,7 +348,7 @@ def table(result: Result) -> str:
 
 
 def _frames(plan: montecarlo.Plan, runs: int) -> dict[str, float]:
-    """Return the probability of each reading of the covariance, by the errors at the ends of some runs, which are independent."""
+    """Return the probability of each definition of the covariance, from the independent errors at the ends of some runs."""
     errors: list[Array] = []
     covariances: list[Array] = []
     attitudes: list[Array] = []
@@ -379,4 +379,4 @@ if __name__ == "__main__":
         print(f"\n{name}: {one.words}")
     if result.frame_probability:
         said = ", ".join(f"{name} {100.0 * p:.3g} %" for name, p in result.frame_probability.items())
-        print(f"\nsmsfusion's covariance is of the attitude error read as: {said}.")
+        print(f"\nDefinition of the attitude error in smsfusion's covariance: {said}.")

@@ -1,4 +1,4 @@
-"""Does a simulated gyro have the noise that its specification says? One preset, its spectrum and its parts over time.
+"""Does a simulated gyro have the specified noise? One preset, its spectrum by noise term, and its bias over time.
 
 Run ``python sims/simulate_imu.py [--out FOLDER]``.
 """
@@ -27,27 +27,27 @@ PARTS = {
 
 @dataclass(frozen=True, kw_only=True)
 class Result:
-    """A record at rest: spectra by part and whole, theory beside them, and the bias over time."""
+    """A record at rest: spectra by noise term and in total, the theoretical ones, and the bias over time."""
 
     preset: str
     frequency: np.ndarray
-    """Middle of the bands (m,), Hz."""
+    """Centres of the bands (m,), Hz."""
     spectra: dict[str, np.ndarray]
     """Two-sided PSD of the mean rate by part and ``"whole"``, (rad/s)²/Hz, averaged over axes and bands."""
     theory: dict[str, np.ndarray]
     worst: dict[str, float]
-    """Largest departure from theory, in standard deviations of the estimate."""
+    """Largest deviation from theory, in standard deviations of the estimate."""
     time: np.ndarray
     bias: np.ndarray
-    """Bias of the three axes, less its turn-on part, rad/s."""
+    """Bias of the three axes minus the turn-on bias, rad/s."""
 
 
 SMALL = {"samples": 1 << 14}
-"""Arguments of a run that only shows that the script works."""
+"""Arguments of a quick test run."""
 
 
 def main(*, preset="stim300", samples=1 << 20, rate=100.0, seed=1, out=None):
-    """Simulate a preset at rest and compare spectra; ``out`` is the folder to draw into.
+    """Simulate a preset at rest and compare spectra; figures are written to the folder ``out``.
 
     Returns
     -------
@@ -67,7 +67,7 @@ def main(*, preset="stim300", samples=1 << 20, rate=100.0, seed=1, out=None):
     theory = {
         "angle random walk": np.full_like(x, whole.angle_random_walk**2),
         "flicker": whole.bias_instability**2 / (2.0 * np.pi * lines),
-        # Of means over the sample interval, aliases and all: σ_u² dt² (2 + cos 2x)/(12 sin² x).
+        # Of means over the sample interval, with aliasing: σ_u² dt² (2 + cos 2x)/(12 sin² x).
         "rate random walk": whole.rate_random_walk**2 / rate**2 * (2.0 + np.cos(2.0 * x)) / (12.0 * np.sin(x) ** 2),
     }
     theory = {name: in_bands(np.concatenate([[0.0], values]))[2] for name, values in theory.items()}
@@ -92,9 +92,9 @@ def main(*, preset="stim300", samples=1 << 20, rate=100.0, seed=1, out=None):
 
 
 def spectrum(rates, rate):
-    """Return bands, independent values in each, and the PSD averaged over axes and bands; a half sine as window.
+    """Return bands, the number of independent values in each, and the PSD averaged over axes and bands, with a half-sine window.
 
-    The half sine leaks as f⁻⁴, which a spectrum of f⁻² needs; of three neighbouring lines two count as independent.
+    The half sine leaks as f⁻⁴, as needed for a spectrum of f⁻²; of three neighbouring lines two count as independent.
     """
     n = len(rates)
     window = np.sin(np.pi * (np.arange(n) + 0.5) / n)[:, None]
@@ -104,7 +104,7 @@ def spectrum(rates, rate):
 
 
 def in_bands(lines):
-    """Return the middle (in lines), the number of lines, and the mean of logarithmic bands of the lines of a spectrum."""
+    """Return centre (in lines), number of lines and mean of logarithmic bands of the lines of a spectrum."""
     edges = np.unique(np.geomspace(4, len(lines) - 1, 60).astype(int))
     counts = np.diff(edges)
     values = np.array([lines[a:b].mean() for a, b in itertools.pairwise(edges)])
@@ -112,12 +112,10 @@ def in_bands(lines):
 
 
 def draw_spectra(result, *, ax):
-    """Draw the spectra over their theory; return the axes."""
+    """Draw the spectra with the theoretical ones; return the axes."""
     scale = units.DEGREE_PER_HOUR**2
     for number, (name, values) in enumerate(result.spectra.items()):
-        rings = (
-            {"ms": 6, "mfc": "none"} if name == "whole" else {"ms": 3}
-        )  # around the points of what makes nearly all of it
+        rings = {"ms": 6, "mfc": "none"} if name == "whole" else {"ms": 3}  # around the points of the dominant term
         colour = style.CYCLE[number]
         ax.loglog(result.frequency, values / scale, "o", color=colour, label=f"{name}, simulated", **rings)
         ax.loglog(result.frequency, result.theory[name] / scale, "-", color=colour, lw=1.0)
@@ -129,7 +127,7 @@ def draw_spectra(result, *, ax):
 
 
 def draw_bias(result, *, ax):
-    """Draw the drifting bias of the three axes, each in a band of its own; return the axes."""
+    """Draw the drifting bias of the three axes, each in a separate band; return the axes."""
     bias = result.bias / units.DEGREE_PER_HOUR
     band = 2.2 * np.abs(bias).max()
     for number, (axis, values) in enumerate(zip("xyz", bias.T, strict=True)):
@@ -138,8 +136,8 @@ def draw_bias(result, *, ax):
     ax.set_xlabel("time, s")
     step = float(f"{0.5 * np.abs(bias).max():.0e}")
     marks = [(k * step - number * band, f"{k * step:g}") for number in range(3) for k in (-1, 0, 1)]
-    ax.set_yticks(*zip(*marks, strict=True))  # each axis about a zero of its own
-    ax.set_ylabel("bias less its turn-on part, °/h")
+    ax.set_yticks(*zip(*marks, strict=True))  # each axis about its own zero
+    ax.set_ylabel("bias minus turn-on bias, °/h")
     ax.set_ylim(-2.6 * band, 0.6 * band)
     style.legend_above(ax)
     return ax
@@ -148,10 +146,10 @@ def draw_bias(result, *, ax):
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("results/simulate_imu"))
-    parser.add_argument("--preset", default="stim300", help="name of a gyro's data sheet")
+    parser.add_argument("--preset", default="stim300", help="name of a gyro's datasheet")
     parser.add_argument("--seed", type=int, default=1)
     arguments = parser.parse_args()
     outcome = main(**vars(arguments))
     for part, score in outcome.worst.items():
-        print(f"{part:18s} largest departure from theory {score:.2f} standard deviations")
+        print(f"{part:18s} largest deviation from theory {score:.2f} standard deviations")
     print(f"figure: {arguments.out}")

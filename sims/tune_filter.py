@@ -1,4 +1,4 @@
-"""Does tuning find the truth from parameters wrong by 30 either way? One simulated record, many searches, and a look at held-out data.
+"""Does tuning converge to the truth from parameters wrong by a factor of 30? One simulated record, many searches, held-out data.
 
 Run ``python sims/tune_filter.py [--out FOLDER]``.
 """
@@ -23,22 +23,22 @@ class Result:
     """Two tunings of one record, from values too large and too small."""
 
     truth: dict[str, float]
-    """Right values, SI."""
+    """True values, SI."""
     too_large: Tuning
     too_small: Tuning
     plan: Plan
-    """Standard errors predicted before there was a record."""
+    """Standard errors predicted without a record."""
     held_out: Comparison
-    """The optimistic filter, before and after, on the end of the record."""
+    """The optimistic filter before and after tuning, on the end of the record."""
     record: scenarios.ImuRecord
 
 
 SMALL = {"duration": 300.0, "starts": 4}
-"""Arguments of a run that only shows that the script works."""
+"""Arguments of a quick test run."""
 
 
 def main(*, duration=1800.0, rate=20.0, wrong=30.0, starts=20, seed=1, out=None):
-    """Tune from ``wrong`` times and a ``wrong``-th of the right values, each search from random starts as far off again.
+    """Tune from ``wrong`` times and 1/``wrong`` of the true values, with random starts that differ by the same factor again.
 
     Returns
     -------
@@ -104,9 +104,7 @@ def draw(result, folder, objective):
         folder / "tune_filter-likelihood.png",
     )
     plots.save(
-        drawing.before_and_after(
-            result.held_out, title="On what was held out, from a filter whose σ were 30 times too small"
-        ),
+        drawing.before_and_after(result.held_out, title="Held-out data, from a filter whose σ were 30 times too small"),
         folder / "tune_filter-heldout.png",
     )
 
@@ -129,7 +127,7 @@ def searches(tuned, shown, ax, *, label):
 
 
 def values(result, ax):
-    """Draw tuned values over the truth with their intervals, beside the predicted spread."""
+    """Draw tuned values relative to the truth with their intervals, and the predicted spread."""
     from strapdown.plots.style import legend_above
 
     place = np.arange(len(FREE))
@@ -146,7 +144,7 @@ def values(result, ax):
     )
     ax.axhline(1.0, lw=0.8, color="k")
     ax.set_xticks(place, FREE)
-    ax.set_ylabel("tuned value over the right one")
+    ax.set_ylabel("tuned value over the true one")
     ax.set_yscale("log")
     ticks = (0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.5)
     ax.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
@@ -157,7 +155,7 @@ def values(result, ax):
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("results/tune_filter"))
-    parser.add_argument("--starts", type=int, default=20, help="searches, each from a random start")
+    parser.add_argument("--starts", type=int, default=20, help="number of searches, each from a random start")
     parser.add_argument("--seed", type=int, default=1)
     found = main(**vars(parser.parse_args()))
     for start, one in (("30 times", found.too_large), ("a 30th", found.too_small)):

@@ -1,13 +1,13 @@
-"""Where am I looking? Attitude from a magnetometer alone, from an unknown start.
+"""Which attitude is it? Attitude from a magnetometer only, from an unknown initial state.
 
-The built-in scenario ``magnetometer-only``: a satellite in a low orbit that turns once an orbit, a good gyro of unknown bias, a
-magnetometer every ten seconds. One direction at a time leaves the turn about it open until the field has turned. Starts are uniform over
-all attitudes, gyro biases normal of 20 °/h. On the same records run
+The built-in scenario ``magnetometer-only``: a satellite in a low orbit that rotates once per orbit, a good gyro of unknown bias, a
+magnetometer every ten seconds. One direction at a time leaves the rotation about it unobserved until the field has rotated. Initial
+attitudes are uniform over all attitudes, gyro biases normal with 20 °/h. On the same records run
 
-- the bank of hypotheses (:mod:`strapdown.estimation.multiple_model`), by numbers of hypotheses;
-- single filters of the family from the middle of nowhere, with the covariance that such a start has: mekf, usque.
+- the bank of hypotheses (:mod:`strapdown.estimation.multiple_model`), for several numbers of hypotheses;
+- single filters of the family from the identity, with the covariance of an unknown attitude: mekf, usque.
 
-Run it: ``python sims/unknown_start.py --out unknown-start-results`` (minutes, nearly all of them the unscented filter's).
+Run ``python sims/unknown_start.py --out unknown-start-results`` (minutes, nearly all for the unscented filter).
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ from strapdown.randomness import generator
 from strapdown.units import DEGREE, DEGREE_PER_HOUR
 
 CONVERGED = 1.0 * DEGREE
-"""An attitude error below which a run counts as converged, if it stays below, rad."""
+"""Attitude error below which a run is converged if it stays below, rad."""
 BIAS_SIGMA = 20.0 * DEGREE_PER_HOUR
 ANYWHERE = float(np.sqrt((np.pi**2 / 3.0 + 2.0) / 3.0))
-"""Root mean square error of each axis of an attitude uniform over all attitudes, rad: the angle has the density (1 − cos θ)/π."""
+"""RMS error per axis of an attitude uniform over all attitudes, rad: the angle has the density (1 − cos θ)/π."""
 EVERY = 10
-"""Kept edges: one a measurement."""
+"""Interval of the kept edges: one per measurement."""
 FILTERS = ("bank of 24", "bank of 48", "bank of 96", "mekf", "usque")
 
 SMALL = {"runs": 3, "unscented_runs": 1, "duration": 900.0}
-"""Arguments of a run that only shows that the script works."""
+"""Arguments of a quick test run."""
 
 COLOURS = {
     "bank of 24": style.SKY,
@@ -53,7 +53,7 @@ COLOURS = {
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """One filter from many starts."""
+    """Result of one filter from many initial states."""
 
     filter: str
     time: Array
@@ -63,7 +63,7 @@ class Outcome:
     nees: Array
     """NEES of all six states of each run (runs, m), per degree of freedom."""
     became_one: Array
-    """When the hypotheses of each run became one (runs,), s; 0 for a single filter."""
+    """Time at which one hypothesis is left in each run (runs,), s; 0 for a single filter."""
 
     @property
     def runs(self) -> int:
@@ -72,12 +72,12 @@ class Outcome:
 
     @property
     def convergence(self) -> Array:
-        """Time of each run after which its error stays below one degree (runs,), s; NaN if it does not."""
+        """Time of each run after which its error stays below 1° (runs,), s; NaN if it does not."""
         return np.array([consistency.convergence_time(self.time, error, CONVERGED) for error in self.error])
 
     @property
     def anees(self) -> Array:
-        """Mean NEES over the runs (m,), 1 for a right filter."""
+        """Mean NEES over the runs (m,), 1 for a consistent filter."""
         return np.asarray(self.nees.mean(axis=0))
 
     @property
@@ -88,7 +88,7 @@ class Outcome:
 
 @dataclass(frozen=True, kw_only=True)
 class Result:
-    """What the study found."""
+    """Results of the study."""
 
     outcomes: tuple[Outcome, ...]
     figures: tuple[Path, ...]
@@ -99,7 +99,7 @@ class Result:
 
 
 def anywhere(random: np.random.Generator) -> Array:
-    """Return an attitude (4,), uniform over all of them."""
+    """Return an attitude (4,), uniform over all attitudes."""
     return quaternion.normalize(random.standard_normal(4))
 
 
@@ -111,7 +111,7 @@ def study(name: str, *, runs: int, duration: float, seed: int) -> Outcome:
     errors, nees, became_one = [], [], []
     first = 0
     for run in range(runs):
-        # The motion's own attitude is turned at random, so that a start at the identity is a start anywhere.
+        # The motion's initial attitude is random, so that the identity is a random initial estimate.
         random = generator(seed, run, "start")
         turned = dataclasses.replace(scenario.motion, initial_attitude=anywhere(random))  # type: ignore[type-var]
         record = scenarios.simulate(dataclasses.replace(scenario, motion=turned), seed, run)
@@ -165,7 +165,7 @@ def draw(outcomes: Sequence[Outcome], path: Path) -> Path:
     middle.set(yscale="log", xlabel="time, h", ylabel="ANEES / 6")
     middle.set_title("Consistency, log scale; 1: consistent")
     right.set(xlabel="time, h", ylabel="ANEES / 6")
-    right.set_title("Banks alone, linear scale; 99 % bounds")
+    right.set_title("Banks only, linear scale; 99 % bounds")
     figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False)
     return plots.save(figure, path)
 

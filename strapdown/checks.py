@@ -27,6 +27,10 @@ class InputError(ValueError):
     """Bad input: the message names the value, the place and the remedy."""
 
 
+OF_YOUR_OWN = "a filter of your own"
+"""In the note of an exception that such a filter raised."""
+
+
 def _place(name: str, index: tuple[np.intp, ...]) -> str:
     return f"{name}[{', '.join(str(int(i)) for i in index)}]" if index else name
 

@@ -1,15 +1,15 @@
-"""Covariance analysis: what a filter will achieve on a scenario, and which source of error makes how much of it, without a Monte Carlo.
+"""Covariance analysis: predicted errors of a filter on a scenario, with the contribution of each source, without a Monte Carlo.
 
-One pass along the true trajectory. The filter's own covariance gives its gains; the actual error, linear about the truth, goes through
-the same gains source by source (Maybeck 1979, section 6.8; Gelb 1974, section 7.2):
+One pass along the true trajectory. The filter's covariance defines its gains; the actual error, linearised about the truth, is propagated
+through the same gains source by source (Maybeck 1979, section 6.8; Gelb 1974, section 7.2):
 
-- white and coloured noise, and the initial error, give a covariance each. They add up. For a matched filter the sum is its own P, which
-  linearised at the truth is also the posterior Cramér–Rao bound; for a mismatched one it is not, and the expected NEES shows by how much;
-- errors that are the same in every run of the scenario (its scale factor, its hard iron, what the integration of the gyro leaves) give a
-  mean error each;
-- errors that the scenario leaves out may be *considered*: a standard deviation each, a contribution each (:class:`Consider`).
+- white and coloured noise, and the initial error, each contribute a covariance. These add up. For a matched filter the sum is its own P,
+  which linearised at the truth is also the posterior Cramér–Rao bound; for a mismatched one they differ, and the expected NEES shows it;
+- errors that are the same in every run of the scenario (scale factor, hard iron, residual error of the gyro's integration) each contribute
+  a mean error;
+- errors outside the scenario may be *considered*: each with a standard deviation and a contribution (:class:`Consider`).
 
-Gates, robust updates and everything else that depends on the data are not part of it.
+Gates, robust updates and other operations that depend on the data are not included.
 """
 
 from __future__ import annotations
@@ -45,17 +45,17 @@ __all__ = [
 AXES = ("x", "y", "z")
 
 MIN_ERROR = 1e-12
-"""Errors of each step and measurement below this are rounding, rad."""
+"""Errors of a step or measurement below this are treated as rounding, rad."""
 LARGEST_SIZE = 1e12
-"""No considered or initial error is larger, in the units of :class:`Consider`: its square would leave the range of doubles."""
+"""Maximum considered or initial error, in the units of :class:`Consider`; keeps its square in the range of doubles."""
 LARGEST_LINEAR = 0.15
-"""Errors of attitude or direction above this, rad, are reported as beyond linear: their squares are a tenth of them."""
+"""Errors of attitude or direction above this are reported as beyond linear, rad; their squares are above a tenth of them."""
 MIN_NEES, MAX_NEES = 0.9, 1.1
-"""Expected NEES per state of a filter that will be consistent."""
+"""Limits of the expected NEES per state of a consistent filter."""
 
 
 def _size(name: str, value: float, *, unit: str = "") -> float:
-    """Return the size of an error: zero or more, and not beyond all that is."""
+    """Return the size of an error, checked to be zero or more and at most :data:`LARGEST_SIZE`."""
     size = non_negative(name, value, unit=unit)
     if size > LARGEST_SIZE:
         raise InputError(
@@ -70,7 +70,7 @@ def _no_sensors() -> dict[str, float]:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Consider(ByValue):
-    """Errors beyond the scenario and the filter's model: one standard deviation each, independent on every axis.
+    """Errors that neither the scenario nor the filter models: a standard deviation each, independent on every axis.
 
     Parameters
     ----------
@@ -81,12 +81,12 @@ class Consider(ByValue):
     g_sensitivity : float, default 0.0
         σ of the nine entries of the gyro's g-sensitivity, rad/s per m/s².
     sensor_bias : mapping of str to float, default empty
-        By sensor, σ of a constant on each component, body axes, in the unit of its own σ: hard iron, T; of a direction
-        rad.
+        By sensor, σ of a constant error of each component, body axes, in the unit of the sensor's σ: T for a hard iron, rad for a
+        direction.
     mounting : mapping of str to float, default empty
-        By sensor, σ of a rotation on the body about each axis, rad.
+        By sensor, σ of the mounting rotation about each body axis, rad.
     time_offset : mapping of str to float, default empty
-        By sensor, σ of the time by which it measures later than its stamps, s.
+        By sensor, σ of the delay of its measurements after their stamps, s.
     """
 
     scale_factor: float = 0.0
@@ -118,7 +118,7 @@ class Analysis(Listed):
     time : ndarray (m,)
         Epochs, s.
     filter_covariance : ndarray (m, 6, 6)
-        P as the filter reports it: rad², rad²/s, (rad/s)².
+        P reported by the filter: rad², rad²/s, (rad/s)².
     sources : tuple of str (s,)
         Names of the sources of random error.
     contributions : ndarray (m, s, 6, 6)
@@ -126,17 +126,17 @@ class Analysis(Listed):
     fixed : tuple of str (f,)
         Names of the errors that are the same in every run.
     fixed_errors : ndarray (m, f, 6)
-        Mean error that each of them makes, rad and rad/s.
+        Mean error due to each of them, rad and rad/s.
     considered : tuple of str (c,)
         Names of the considered errors.
     considered_errors : ndarray (m, c, 6)
-        Error that each of them makes at one standard deviation, rad and rad/s.
+        Error due to one standard deviation of each of them, rad and rad/s.
     expected_nis : mapping of str to float
         Mean NIS per degree of freedom over the whole time, by sensor; 1 for a consistent filter.
     left_out : tuple of str
-        Errors of the scenario that the analysis leaves out.
+        Errors of the scenario that the analysis does not include.
     beyond_linear : tuple of str
-        Errors too large for an analysis that is linear about the truth, in words: use a Monte Carlo there.
+        Errors too large for an analysis linear about the truth, in words; use a Monte Carlo for them.
     """
 
     _drawn_by = "error_budget"
@@ -154,7 +154,7 @@ class Analysis(Listed):
     beyond_linear: tuple[str, ...]
 
     def listing(self) -> Listing:
-        """Return the error budget at the last epoch, the largest attitude error first, and what follows from it, as a table."""
+        """Return the error budget at the last epoch as a table, the largest attitude error first, with the expected NEES and NIS."""
         rms, sigma = self.rms[-1], self.filter_sigma[-1]
         unit, size = units.angle_unit([*rms[:3], *sigma[:3]])
         rate_name, rate = units.rate_unit([*rms[3:], *sigma[3:]])
@@ -169,14 +169,14 @@ class Analysis(Listed):
         nis = ", ".join(f"{sensor} {value:.3g}" for sensor, value in self.expected_nis.items())
         notes = [
             "random: squares add. fixed: the same in every run, adds as an error. considered: 1σ of an error that neither the scenario nor "
-            "the filter has.",
+            "the filter models.",
             f"Expected NEES per state: {state:.3g} (attitude {attitude:.3g}, bias {bias:.3g}); NIS: {nis or 'none'}.",
             self.words,
             *([f"Left out: {', '.join(self.left_out)}."] if self.left_out else []),
-            *(f"Beyond linear: {one}; take a Monte Carlo (`strapdown montecarlo`)." for one in self.beyond_linear),
+            *(f"Beyond linear: {one}; use a Monte Carlo (`strapdown montecarlo`)." for one in self.beyond_linear),
         ]
         columns = ("source", "kind", f"attitude, {unit}", f"bias, {rate_name}")
-        return Listing(f"Error budget an axis at {self.time[-1]:.6g} s", columns, rows, notes, left=2)
+        return Listing(f"Error budget per axis at {self.time[-1]:.6g} s", columns, rows, notes, left=2)
 
     @property
     def words(self) -> str:
@@ -197,7 +197,7 @@ class Analysis(Listed):
 
     @property
     def covariance(self) -> Array:
-        """Covariance of the actual error (m, 6, 6), what is considered included."""
+        """Covariance of the actual error (m, 6, 6), including the considered errors."""
         return np.asarray(
             self.contributions.sum(axis=1) + np.einsum("mci,mcj->mij", self.considered_errors, self.considered_errors)
         )
@@ -220,7 +220,7 @@ class Analysis(Listed):
 
     @property
     def filter_sigma(self) -> Array:
-        """The filter's own σ (m, 6): rad, rad/s."""
+        """The filter's σ (m, 6): rad, rad/s."""
         return np.sqrt(np.diagonal(self.filter_covariance, axis1=1, axis2=2))
 
     @property
@@ -239,31 +239,31 @@ class Analysis(Listed):
 
     @property
     def cramer_rao(self) -> Array:
-        """Posterior Cramér–Rao bound (m, 6, 6) of a matched filter's analysis: no filter's mean square error is less, whoever wrote it.
+        """Posterior Cramér–Rao bound (m, 6, 6) of a matched filter's analysis: lower bound of the mean square error of any filter.
 
         The Riccati recursion along the true trajectory, for small errors (Tichavský, Muravchik & Nehorai, IEEE Trans. Signal Processing
-        46(5), 1998). Fixed errors of the scenario (scale factor, hard iron) are left out: knowing them could only help.
+        46(5), 1998). Fixed errors of the scenario (scale factor, hard iron) are treated as known, which can only lower the bound.
 
         Raises
         ------
         InputError
-            If the filter's noise is not that of the scenario, or the scenario's not white: the recursion is not the bound then.
+            If the filter's noise is not that of the scenario, or the scenario's is not white, so that the bound does not hold.
         """
         P = self.filter_covariance
         sigma = self.filter_sigma
-        # Where the filter's model of the noise is the true one, all sources together make just what it says.
+        # If the filter's model of the noise is the true one, the contributions sum to P.
         off = np.abs(self.contributions.sum(axis=1) - P) / (sigma[:, :, None] * sigma[:, None, :])
         if off.max() > 1e-6:
             raise InputError(
-                "the filter's noise is not that of the scenario, and the Cramér–Rao bound of attitude and bias is of white noise and a "
+                "the filter's noise is not that of the scenario, and the Cramér–Rao bound of attitude and bias assumes white noise and a "
                 "random walk of the bias, the same on each axis; analyse a matched filter, without flicker, correlated noise and outliers"
             )
         return P
 
     def budget(self, epoch: int = -1) -> list[tuple[str, str, float, float]]:
-        """Return the error budget at an epoch, one row a source.
+        """Return the error budget at an epoch, one row per source.
 
-        Squares of all rows but the fixed ones add up; the fixed ones add as errors. The axes of one considered error are one row.
+        Rows add as squares, except the fixed ones, which add as errors. The axes of a considered error share one row.
 
         Parameters
         ----------
@@ -297,25 +297,25 @@ class _Rows(NamedTuple):
 
     time: Array
     h: Array
-    """(r, 3)."""
+    """Measurement matrix of each row for the attitude error (r, 3)."""
     noise: Array
-    """How the sensor's noise, in the unit of its own σ, comes into the row (r, 3)."""
+    """Derivative of each row with respect to the sensor's noise, in the unit of its σ (r, 3)."""
     filter_variance: Array
     variance: Array
     error: Array
-    """Innovation at the truth without noise (r,): what the sensor's fixed errors make."""
+    """Innovation at the truth without noise (r,), due to the sensor's fixed errors."""
     moving: Array
-    """Change of the row per second of delay, by the motion of the reference (r,)."""
+    """Change of the row per second of delay, due to the motion of the reference (r,)."""
 
     @staticmethod
     def of(time: Array, h: Array, noise: Array, *numbers: Array | float) -> _Rows:
-        """Return k rows of each measurement (m, k, 3) one after the other; numbers of each row are spread over them."""
+        """Return the k rows of each measurement (m, k, 3) in sequence, with the numbers broadcast over them."""
         each = (np.broadcast_to(one, h.shape[:2]).ravel() for one in numbers)
         return _Rows(np.repeat(time, h.shape[1]), h.reshape(-1, 3), noise.reshape(-1, 3), *each)
 
 
 def _exact(sensor: Any) -> Any:
-    """Return the sensor without any noise."""
+    """Return the sensor without noise."""
     zero = {name: 0.0 for name in ("sigma", "sigma_across", "sigma_about") if hasattr(sensor, name)}
     faults = dataclasses.replace(sensor.faults, correlated_sigma=0.0, outlier_probability=0.0)
     return dataclasses.replace(sensor, **zero, faults=faults)
@@ -333,7 +333,7 @@ def _rows(
     if own.attitude is not None:
         if own.covariance is not None:
             raise InputError(
-                f"{own.sensor}: its noise is correlated between body axes, which this analysis does not take; point its boresight along one"
+                f"{own.sensor}: noise correlated between body axes is not supported; point the boresight of the sensor along one"
             )
         assert own.sigma_axes is not None
         assert held.sigma_axes is not None
@@ -353,7 +353,7 @@ def _rows(
         tilt = -z_f[:, 2] / level**2
         h = np.einsum("mij,mi->mj", R, np.stack([tilt * z_f[:, 0], tilt * z_f[:, 1], np.ones(m)], axis=1))[:, None]
         across = np.stack([z_f[:, 1], -z_f[:, 0], np.zeros(m)], axis=1) / level[:, None]
-        # The noise of a heading pair is that of its line in the fixed frame.
+        # The noise of a heading pair is that of its baseline, in the fixed frame.
         own_axes = -across if isinstance(sensor, vectors.HeadingPair) else np.einsum("mij,mi->mj", R, across)
         noise = own_axes[:, None]
         cosine = z_f[:, 0] * reference[:, 0] + z_f[:, 1] * reference[:, 1]
@@ -388,9 +388,9 @@ def _all_rows(scenario: Scenario, setup: FilterSetup) -> list[_Rows]:
         )
         if not isinstance(sensor, kinds):
             raise InputError(
-                f"{sensor.name} is a {type(sensor).__name__}, whose noise the analysis does not know; leave it out"
+                f"{sensor.name} is a {type(sensor).__name__}, whose noise the analysis does not support; remove it"
             )
-        # A generator for each, so that the same samples are lost.
+        # The same seed for each, so that the same samples are lost.
         for one, found in ((sensor, own), (_exact(sensor), exact)):
             found.append(one.observe(scenario.motion, start, end, generator(scenario.seed, 0, sensor.name)))
     step = dataclasses.replace(setup, integration=coning.ALGORITHMS["one-sample"])
@@ -399,7 +399,7 @@ def _all_rows(scenario: Scenario, setup: FilterSetup) -> list[_Rows]:
     for series in held:
         if series.anisotropic:
             raise InputError(
-                f"{series.sensor}: the analysis takes one sigma of a {series.kind}, not one an axis; give one number in [filter.sigma]"
+                f"{series.sensor}: the analysis takes one sigma for a {series.kind}, not one per axis; give one number in [filter.sigma]"
             )
         if not np.all(series.sigma > 0.0):
             raise InputError(
@@ -419,11 +419,11 @@ _FIXED_PARTS = {
     "bandwidth": ("bandwidth", "damping"),
     "range": ("range",),
 }
-"""Errors of a gyro that are the same in every run, by name, and the fields of the specification that make them."""
+"""Errors of a gyro that are the same in every run, by name, and their fields in the specification."""
 
 
 def _fixed_rates(scenario: Scenario) -> dict[str, Array]:
-    """Return errors of the measured rate that are the same in every run, by name, over each gyro interval (n, 3), rad/s."""
+    """Return the errors of the measured rate that are the same in every run, by name, in each gyro interval (n, 3), rad/s."""
     spec, edges, motion = scenario.gyro, scenario.edges, scenario.motion
     true = motion.increments(edges)
     dt = np.diff(edges)[:, None]
@@ -444,10 +444,10 @@ def _fixed_rates(scenario: Scenario) -> dict[str, Array]:
 
 
 def _integration_rate(scenario: Scenario, setup: FilterSetup, stamps: Array, attitude: Array, phi: Array) -> Array:
-    """Return the rate error (segments, 3), rad/s, of taking each step of the integration algorithm for a turn at constant rate.
+    """Return the rate error (segments, 3), rad/s, of treating each step of the integration algorithm as a rotation at constant rate.
 
-    It holds what the algorithm leaves of coning, and that a measurement inside a step meets a share of the step's turn. Inside a step the
-    error ``e(t) = Log(exp(−share φ) ⊗ q_true(t))`` from the step's start is exact; the rate is the one that drives it so.
+    It contains the algorithm's residual coning error, and the error of a measurement inside a step, at a fraction of the step's rotation.
+    Inside a step the error ``e(t) = Log(exp(−share φ) ⊗ q_true(t))`` from its start is exact; the result is the rate that generates it.
     """
     n = setup.integration.samples
     need_mekf(setup, "the covariance analysis")
@@ -455,7 +455,7 @@ def _integration_rate(scenario: Scenario, setup: FilterSetup, stamps: Array, att
     steps = (len(edges) - 1) // n
     turns = coning.rotation_vectors(scenario.motion.increments(edges[: steps * n + 1]), setup.integration)
     begins = edges[: steps * n + 1 : n]
-    step = np.clip(np.searchsorted(begins, stamps[1:], side="left") - 1, 0, steps - 1)  # of the segment that ends there
+    step = np.clip(np.searchsorted(begins, stamps[1:], side="left") - 1, 0, steps - 1)  # of each segment's end
     first = np.searchsorted(stamps, begins[:-1])[step]
     length = np.diff(begins)[step]
     share = (stamps[1:] - begins[step]) / length
@@ -487,7 +487,7 @@ def _left_out(scenario: Scenario, setup: FilterSetup) -> tuple[str, ...]:
 
 
 def _beyond_linear(attitude_sigma: float, columns: list[_Column], consider: Consider) -> list[str]:
-    """Return what goes into the analysis and is too large for it, in words."""
+    """Return the errors that are too large for the analysis, in words."""
     found = []
     if attitude_sigma > LARGEST_LINEAR:
         found.append(f"initial attitude, 1σ {attitude_sigma / DEGREE:.3g}°")
@@ -498,7 +498,7 @@ def _beyond_linear(attitude_sigma: float, columns: list[_Column], consider: Cons
     largest: dict[str, float] = {}
     for column in columns:
         if column.rows is not None:
-            name = column.name.partition(",")[0]  # of the parts of one considered error, its axes, the largest
+            name = column.name.partition(",")[0]  # the largest over the axes of a considered error
             largest[name] = max(largest.get(name, 0.0), float(np.abs(column.rows).max(initial=0.0)))
     return found + [f"{name}, up to {size / DEGREE:.3g}°" for name, size in largest.items() if size > LARGEST_LINEAR]
 
@@ -516,20 +516,20 @@ def _diagonal(attitude_sigma: float, bias_sigma: float) -> Array:
 
 
 class _Path(NamedTuple):
-    """The trajectory cut at every gyro edge and every measurement, and the rows of all sensors in order."""
+    """The trajectory divided at every gyro edge and measurement, and the rows of all sensors in order of time."""
 
     stamps: Array
-    """Stations (n + 1,), s."""
+    """Times of the divisions (n + 1,), s."""
     attitude: Array
     dt: Array
-    """Durations of the segments between them (n,), s."""
+    """Durations of the segments (n,), s."""
     phi: Array
-    """True turns (n, 3), rad."""
+    """True rotation vectors over the segments (n, 3), rad."""
     interval: np.ndarray
-    """Gyro interval that each lies in (n,)."""
+    """Gyro interval of each segment (n,)."""
     rows: _Rows
     sensor: np.ndarray
-    """Number of the sensor of each row."""
+    """Index of the sensor of each row."""
     kept: np.ndarray
     """Gyro edges at the epochs."""
 
@@ -538,9 +538,7 @@ def _path(scenario: Scenario, setup: FilterSetup, epochs: int) -> _Path:
     edges = scenario.edges
     steps = (len(edges) - 1) // setup.integration.samples
     if steps < count("epochs", epochs):
-        raise InputError(
-            f"{steps} filter steps are fewer than {epochs} epochs; take fewer epochs, or a longer scenario"
-        )
+        raise InputError(f"{steps} filter steps are fewer than {epochs} epochs; use fewer epochs, or a longer scenario")
     parts = _all_rows(scenario, setup)
     none = _Rows(np.empty(0), *np.empty((2, 0, 3)), *np.empty((4, 0)))
     joined = [np.concatenate(part) for part in zip(none, *parts, strict=True)]
@@ -562,7 +560,7 @@ def _path(scenario: Scenario, setup: FilterSetup, epochs: int) -> _Path:
 
 
 class _Random:
-    """Sources of random error, as the kernel takes them; the filter itself comes first."""
+    """Sources of random error, as the kernel takes them; the filter's model is the first."""
 
     def __init__(self, setup: FilterSetup) -> None:
         noise = setup.process_noise
@@ -572,12 +570,12 @@ class _Random:
         self.sensor = [-2]
         self.blocks = [_diagonal(setup.attitude_sigma, setup.bias_sigma)]
         self.shapes: list[tuple[int, Array, Array, Array, Array]] = []
-        """Source, amplitude (3,), gains, poles, X g of a coloured bias."""
+        """Source, amplitude (3,), gains, poles and X g of each coloured bias."""
         self.coloured: list[tuple[int, int, float, float]] = []
-        """Source, sensor, σ, correlation time of a coloured noise."""
+        """Source, sensor, σ and correlation time of each coloured noise."""
 
     def add(self, name: str, *, angle: Any = 0.0, rate: Any = 0.0, sensor: int = -1, block: Array | None = None) -> int:
-        """Add a source: white densities of rate and bias, or the rows of a sensor, or a covariance at the start."""
+        """Add a source: white densities of angle and bias, or the noise of a sensor, or an initial covariance."""
         self.names.append(name)
         self.angle.append(_axes(angle))
         self.rate.append(_axes(rate))
@@ -586,7 +584,7 @@ class _Random:
         return len(self.names) - 1
 
     def add_gyro(self, spec: GyroSpec, sample_interval: float, samples: int) -> None:
-        """Add the noises of a gyro."""
+        """Add the noise terms of a gyro."""
         markov, tau = _axes(spec.markov_noise), spec.markov_correlation_time
         walk = _axes(spec.rate_random_walk) ** 2 + (0.0 if np.isfinite(tau) else markov**2)
         if np.any(_axes(spec.angle_random_walk) > 0.0):
@@ -605,7 +603,7 @@ class _Random:
             )
 
     def add_sensor(self, number: int, sensor: Any) -> None:
-        """Add the noises of a sensor."""
+        """Add the noise terms of a sensor."""
         self.add(sensor.name, sensor=number)
         faults = sensor.faults
         if faults.correlated_sigma > 0.0:
@@ -613,9 +611,9 @@ class _Random:
             self.coloured.append((source, number, faults.correlated_sigma, faults.correlation_time))
 
     def shaping(self) -> covariance_loop.Shapes:
-        """Return the coloured biases, for the kernel, and give their sources the covariance at the start.
+        """Return the coloured biases for the kernel, and give their sources the initial covariance.
 
-        The filter starts from a bias that is off by its prior from the *whole* true bias, so that what it calls its error holds −f.
+        The filter's initial bias differs by its prior from the *whole* true bias, so its initial bias error contains −f.
         """
         number, most = len(self.shapes), max([1, *(len(gains) for _, _, gains, _, _ in self.shapes)])
         table = np.zeros((3, number, most))
@@ -633,7 +631,7 @@ class _Random:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Column:
-    """An error without noise: a rate error in each segment (n, 3), an error in each row (r,), a bias that grows (3,)."""
+    """A deterministic error: a rate error in each segment (n, 3), an error in each row (r,), a rate ramp (3,)."""
 
     name: str
     rate: Array | None = None
@@ -657,7 +655,7 @@ def _fixed_columns(scenario: Scenario, setup: FilterSetup, path: _Path) -> list[
 
 
 def _considered_columns(scenario: Scenario, consider: Consider, path: _Path) -> list[_Column]:
-    """Return the considered errors at one standard deviation, one column an independent parameter."""
+    """Return the considered errors at one standard deviation, one column per independent parameter."""
     unit, axes = np.eye(3), range(3)
     turn_rate = path.phi / path.dt[:, None]
     force = turn_rate
@@ -710,26 +708,26 @@ def analyse(
     Parameters
     ----------
     scenario : Scenario, str or path
-        As of :func:`strapdown.scenarios.simulate`.
+        See :func:`strapdown.scenarios.simulate`.
     setup : FilterSetup, optional
-        The filter. Default: matched to the scenario (:meth:`strapdown.estimation.setup.FilterSetup.for_scenario`).
+        Filter to analyse. Default: matched to the scenario (:meth:`strapdown.estimation.setup.FilterSetup.for_scenario`).
     consider : Consider, optional
-        Errors besides those of the scenario.
+        Errors in addition to those of the scenario.
     initial_attitude_sigma, initial_bias_sigma : float, optional
         Actual standard deviations of the initial errors, each axis, rad and rad/s. Default: those of the setup.
     epochs : int, default 100
-        Intervals between the epochs of the result; they end on filter steps, as those of :func:`strapdown.montecarlo.run` do.
+        Number of intervals between the epochs of the result; they end at filter steps, as in :func:`strapdown.montecarlo.run`.
 
     Returns
     -------
     Analysis
-        Covariance as the filter reports it, and that of the actual error by source, at every epoch.
+        Covariance reported by the filter, and that of the actual error by source, at every epoch.
 
     Raises
     ------
     InputError
-        If a considered sensor is not in the scenario, a considered time offset is longer than the scenario, or a sensor is of a class of
-        your own or without noise.
+        If a considered sensor is not in the scenario, a considered time offset exceeds the scenario's duration, or a sensor has a
+        user-defined class or no noise.
 
     References
     ----------
@@ -787,7 +785,7 @@ def analyse(
 
 
 def _check_considered(scenario: Scenario, consider: Consider) -> None:
-    """Refuse considered errors that the scenario cannot have."""
+    """Raise if the scenario cannot have a considered error."""
     names = [sensor.name for sensor in scenario.sensors]
     for part in ("sensor_bias", "mounting", "time_offset"):
         known_keys(f"consider: {part}", getattr(consider, part), names)
@@ -797,15 +795,15 @@ def _check_considered(scenario: Scenario, consider: Consider) -> None:
     for name, offset in consider.time_offset.items():
         if offset >= scenario.duration:
             raise InputError(
-                f"consider: time_offset of {name} is {offset:g} s, and the scenario lasts {scenario.duration:g} s; nothing is measured "
-                "outside of it: give seconds of this scenario"
+                f"consider: time_offset of {name} is {offset:g} s, and the scenario lasts {scenario.duration:g} s; "
+                "give an offset shorter than the scenario, in seconds"
             )
 
 
 def _propagated(
     path: _Path, edges: Array, random: _Random, columns: list[_Column], fixed: int, sensors: int
 ) -> covariance_loop.Outputs:
-    """Propagate the covariance of each random source and each error without noise through the filter's gains."""
+    """Propagate the covariance of each random source and each deterministic error through the filter's gains."""
     rows, coloured = path.rows, random.coloured
     with_rate = [k for k, column in enumerate(columns) if column.rate is not None]
     place = np.full(len(columns), -1)
@@ -819,7 +817,7 @@ def _propagated(
             row_error[:, k] = column.rows
 
     stations = np.searchsorted(path.stamps, edges[path.kept])
-    shapes = random.shaping()  # before the blocks are read
+    shapes = random.shaping()  # must precede reading of the blocks
     new_sample = np.concatenate([[False], np.diff(path.interval) > 0])
     row_bounds = np.append(np.searchsorted(rows.time, path.stamps, side="left"), len(rows.time))
     out = covariance_loop.Outputs(

@@ -109,6 +109,14 @@ def test_a_fault_of_the_program_is_no_verdict(run, monkeypatch):
     assert error.splitlines()[-1].startswith(f"error: internal error of strapdown {strapdown.__version__}")
 
 
+def test_a_fault_of_a_filter_of_ones_own_is_not_the_programs(run, tmp_path):
+    (tmp_path / "mine.py").write_text("def mine(record, initial):\n    return record.nothing\n")
+    status, _, error = run("montecarlo", "two-stars", "--runs", 2, "--filter", "mine.py:mine")
+    assert status == 2
+    assert "    return record.nothing" in error.splitlines()
+    assert error.splitlines()[-1].startswith("error: mine, a filter of your own, failed (AttributeError)")
+
+
 def test_an_output_that_cannot_hold_every_letter_gets_question_marks():
     environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
     command = [sys.executable, "-c", "from strapdown import cli; cli.main()", "algorithms", "--no-time"]
@@ -409,6 +417,14 @@ def test_estimate_on_broad(run, broad, tmp_path):
     assert errors["heading_rmse_deg"] <= errors["total_rmse_deg"]
     assert errors["inclination_rmse_deg"] <= errors["total_rmse_deg"]
     assert f"{errors['total_rmse_deg']:.2f}" in said
+    assert "RMS error over the movement phase, degrees" in said
+
+
+def test_errors_against_a_reference_alone_are_over_the_whole_recording(run, tmp_path):
+    columns = np.column_stack([walk()[:, :7], np.tile([1.0, 0.0, 0.0, 0.0], (800, 1))])
+    header = UNITS.removesuffix(",mx,my,mz") + ",reference_qw,reference_qx,reference_qy,reference_qz"
+    _, said, _ = run("estimate", write_csv(tmp_path / "walk.csv", columns, header), "--out", tmp_path / "out")
+    assert "RMS error over the whole recording, degrees" in said
 
 
 def bad_csv(folder: Path, case: str) -> Path:
@@ -437,7 +453,7 @@ def bad_csv(folder: Path, case: str) -> Path:
     [
         (
             "undeclared",
-            "does not say the unit of its gyro columns; declare it in the header, as in gx [rad/s], or by --gyro-unit",
+            "does not declare the unit of its gyro columns; declare it in the header, as in gx [rad/s], or by --gyro-unit",
         ),
         ("unsorted", "time[11] goes back to 0.1 s after 0.11 s; sort the stamps"),
         ("infinite", "rate[7, 1] is inf"),

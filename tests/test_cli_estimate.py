@@ -389,7 +389,7 @@ def test_directions_that_contradict_each_other_start_nothing(run, tmp_path):
     write_record(path, specified(dataclasses.replace(whole, vectors=(wrong, *others))))
     status, _, error = run("estimate", path, "--out", tmp_path / "out")
     assert status == 2
-    assert "look for a mixed-up pair" in error
+    assert "check for a mixed-up pair" in error
     assert "--attitude" in error
     assert not (tmp_path / "out").exists()
 
@@ -536,7 +536,7 @@ def test_a_recording_that_is_not_what_it_says_is_doubted(run, recording, tmp_pat
     status, said, error = run("estimate", recording, "--out", tmp_path / "out")
     assert (status, error) == (0, "")
     words = (
-        "warning: probably gyro rates are 57.3 times too small (rad/s taken for deg/s: --gyro-unit rad/s; units={'gyro': 'rad/s'} in "
+        "warning: probably gyro rates are 57.3 times too small (rad/s read as deg/s: --gyro-unit rad/s; units={'gyro': 'rad/s'} in "
         "Python); specific force is 9.81"
     )
     assert words in said

@@ -43,6 +43,13 @@ def test_a_line_says_what_is_done_of_how_much(said):
     assert all(line.startswith("runs: 10 of 30, ") for line in lines)
 
 
+def test_a_search_says_what_it_is_at(said):
+    with progress.progress_bar("searches") as advance:
+        advance("searches: 1 of 4, 23 evaluations")
+        time.sleep(0.15)
+    assert set(lines_of(said)) == {"searches: 1 of 4, 23 evaluations: 0 s"}
+
+
 def test_a_step_of_unknown_length_prints_its_time(said):
     with progress.progress_bar("smoothing"):
         time.sleep(0.15)

@@ -13,7 +13,7 @@ import scipy.stats
 from strapdown import consistency, montecarlo, motion, records, scenarios, vectors
 from strapdown.checks import InputError
 from strapdown.consistency.judgement import Finding, holm
-from strapdown.estimation import setup
+from strapdown.estimation import ProcessNoise, setup
 from strapdown.gyro import GyroSpec
 from strapdown.montecarlo import campaign
 from strapdown.records import Estimate, Innovations, Truth
@@ -82,7 +82,7 @@ def test_a_bias_error_shows_in_the_errors_alone():
     assert not any(name == "NIS" for name, _ in rejected)
     blind = consistency.judge(estimate(bias_error=10.0)[0])
     assert blind.verdict == "consistent"
-    assert "bias error that the start hides" in blind.limits[0]  # and it says what it cannot show
+    assert "bias error that the initial state hides" in blind.limits[0]  # and it says what it cannot show
 
 
 def test_an_error_that_hardly_moves_is_not_averaged_over_the_run_and_that_is_reported():
@@ -248,7 +248,7 @@ def scenario():
 @pytest.fixture(scope="module")
 def plan():
     filter_setup = setup.FilterSetup(
-        process_noise=setup.ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-6),
+        process_noise=ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-6),
         attitude_sigma=2e-3,
         bias_sigma=1e-4,
     )

@@ -192,6 +192,29 @@ def test_correlated_noise_runs_from_white_to_a_constant():
         assert np.allclose(coloured, white_noise if tau < 1.0 else constant, rtol=1e-6, atol=1e-24)
 
 
+def test_correlated_noise_of_a_heading_pair_is_that_of_its_line_in_fixed_axes():
+    """Noise that never changes: what a line a little longer to the East, and one to the North, make of a filter on a body that turns."""
+    pair = vectors.HeadingPair(name="gnss", baseline_b=np.array([1.0, 0.2, 0.0]), sigma=1e-12, rate=1.0, phase=0.5)
+    scenario = dataclasses.replace(still_scenario(), sensors=(*plain_sensors(), pair))
+    scenario, belief = quiet(scenario, {**SIGMA, "gnss": 1e-4})
+    record, size = simulate(scenario), 1e-5
+    *others, series = record.vectors
+    level = np.linalg.norm(quaternion.rotate(TUMBLE.attitude(series.time), pair.baseline_b)[:, :2], axis=1)
+    errors = []
+    for offset in np.eye(3):
+        line = level[:, None] * series.reference_f + size * offset * [1.0, 1.0, 0.0]
+        moved = dataclasses.replace(series, reference_f=line / np.linalg.norm(line, axis=1, keepdims=True))
+        errors.append(run_quiet(dataclasses.replace(record, vectors=(*others, moved)), belief, every=60)[1])
+    errors = np.array(errors[:2]) - errors[2]
+    faults = Faults(correlated_sigma=size, correlation_time=1e18)
+    noisy = dataclasses.replace(scenario, sensors=(*scenario.sensors[:-1], dataclasses.replace(pair, faults=faults)))
+    found = covariance.analyse(noisy, belief, epochs=10)
+    coloured = found.contributions[:, found.sources.index("gnss, correlated")]
+    sigma = np.sqrt(np.einsum("mii->mi", coloured))[1:]
+    ratio = (np.einsum("cmi,cmj->mij", errors, errors) - coloured)[1:] / (sigma[:, :, None] * sigma[:, None, :])
+    assert np.abs(ratio).max() < 2e-3
+
+
 def test_a_wrong_gain_obeys_the_lyapunov_equation():
     """At rest with an attitude once a step everything is constant: P by the Riccati equation, the actual covariance by Lyapunov's."""
     dt, true_sigma, held_sigma = 1.0, 3e-4, 1e-3

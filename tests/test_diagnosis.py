@@ -437,7 +437,7 @@ def test_an_axis_that_is_flipped_while_the_rate_is_constant_may_be_a_bias(run):
     assert status == 1
     assert "One of these causes" in said
     assert "axes should be read as (−x, y, z)" in said
-    assert "the bias at the start was off" in said
+    assert "the initial bias was in error" in said
 
 
 def test_of_two_directions_it_is_undecided_whose_reference_is_off():
@@ -449,7 +449,7 @@ def test_of_two_directions_it_is_undecided_whose_reference_is_off():
         ("reference direction", "star"),
         ("reference direction", "magnetometer"),
     }
-    assert "One of these causes, which the data do not tell apart:" in found.words
+    assert "One of these causes, which the data do not distinguish:" in found.words
     alternatives = {
         row["of"]: row["alternative"] for row in found.summary()["causes"] if row["name"] == "reference direction"
     }
@@ -501,7 +501,7 @@ def test_the_verdict_is_that_of_all_evidence(run, tmp_path):
     status, said, error = run("check", "out/estimate.h5", "--record", "record.h5", "--json", "check.json")
     said = " ".join(said.split())
     assert (status, error) == (1, "")
-    assert "Likeliest cause: the gyro's rate random walk of the bias is" in said
+    assert "Most likely cause: the gyro's rate random walk of the bias is" in said
     assert "not consistent: the filter's model does not hold" in said
     assert ": consistent" not in said.replace("not consistent", "")
     saved = json.loads((tmp_path / "check.json").read_text())
@@ -549,7 +549,7 @@ def test_of_a_robust_filter_the_causes_are_no_part_of_the_verdict(run, tmp_path)
     status, said, error = run("check", "out/estimate.h5", "--record", "record.h5", "--json", "check.json")
     assert (status, error) == (alone, "")
     assert "therefore the verdict is based on the statistics only" in " ".join(said.split())
-    assert "Likeliest cause: the gyro's rate random walk" in said
+    assert "Most likely cause: the gyro's rate random walk" in said
     saved = json.loads((tmp_path / "check.json").read_text())
     assert len(saved["findings"]) < len(saved["diagnosis"]["judgement"]["findings"])
 

@@ -752,16 +752,19 @@ def test_a_gyro_scale_needs_a_turn_about_each_axis():
     assert ranks == {"still": 6, "about z": 9, "about all": 15}
 
 
-def test_singular_values_are_those_of_the_stacked_rows():
-    """Without process noise the information is a plain sum of squares: rows of a direction over σ, in prior σ."""
+@pytest.mark.parametrize("off", [0.0, 0.4])
+def test_singular_values_are_those_of_the_stacked_rows(off):
+    """Without process noise the information is a plain sum of squares: rows of a direction over σ, in prior σ, whatever its bias is."""
     edges = np.array([0.0, 1.0])
-    r = np.array([0.0, 0.0, 1.0])
+    r, bias = np.array([0.0, 0.0, 1.0]), np.array([off, 0.0, 0.0])
+    z = (r + bias) / np.linalg.norm(r + bias)
     series = VectorMeasurements(
-        sensor="star", kind="direction", time=np.array([0.0]), vector_b=[r], reference_f=r, sigma=np.array([0.01])
+        sensor="star", kind="direction", time=np.array([0.0]), vector_b=[z], reference_f=r, sigma=np.array([0.01])
     )
     record = ImuRecord(time=edges, increments=np.zeros((1, 3)), vectors=(series,))
     initial = estimation.initial_state(quaternion.IDENTITY, attitude_sigma=[0.2, 0.1, 0.3], bias_sigma=1e-3)
     blocks = (error_states.VectorBias(sensor="star", bias_sigma=0.05),)
+    initial = dataclasses.replace(estimation.with_error_states(initial, blocks), values=bias)
     found = estimation.observability(record, NOISE, initial, blocks)
     # Across z, the measured (x, y) is (−δθ_y + c_x, δθ_x + c_y).
     rows = np.zeros((2, 9))
@@ -770,6 +773,22 @@ def test_singular_values_are_those_of_the_stacked_rows():
     np.testing.assert_allclose(found.singular_values[:2], expected, rtol=1e-9)
     np.testing.assert_allclose(found.singular_values[2:], 0.0, atol=1e-6)
     assert found.rank == 2
+
+
+def test_a_heading_shows_the_tilt_by_the_dip_that_was_measured():
+    """Of m = (0.6, 0, 0.8) a turn φ shifts the heading by φ_z − (m_z/m_x) φ_x, though its reference is given level."""
+    compass = VectorMeasurements(
+        sensor="compass",
+        kind="heading",
+        time=[0.0],
+        vector_b=[[0.6, 0.0, 0.8]],
+        reference_f=[1.0, 0.0, 0.0],
+        sigma=0.01,
+    )
+    record = ImuRecord(time=np.array([0.0, 1.0]), increments=np.zeros((1, 3)), vectors=(compass,))
+    initial = estimation.initial_state(quaternion.IDENTITY, attitude_sigma=[0.2, 0.1, 0.3], bias_sigma=1e-3)
+    found = estimation.observability(record, NOISE, initial)
+    np.testing.assert_allclose(found.singular_values[:2], [np.hypot(0.3, 0.2 / 0.75) / 0.01, 0.0], rtol=1e-9, atol=1e-6)
 
 
 def test_what_is_left_along_each_direction_is_reported_in_the_units_of_the_states():
@@ -897,3 +916,21 @@ def test_a_start_that_is_moved_takes_its_covariance_along(option):
     J = carried_by(blocks, turn_to(before.attitude, after.attitude))
     J[:3, :3] = kinematics.right_jacobian(move)
     np.testing.assert_allclose(after.covariance, J @ before.covariance @ J.T, rtol=1e-12, atol=1e-20)
+
+
+@pytest.mark.parametrize("option", ["none", "gyro scale"])
+@pytest.mark.parametrize("angle", [0.9, 1.1, 3.0])
+def test_a_correction_of_any_size_carries_attitude_and_covariance(angle, option):
+    """A measured attitude: the Kalman gain in closed form, and the right Jacobian of the correction."""
+    turn, wide, sigma = angle * np.array([0.48, -0.6, 0.64]), 2.0, 0.5
+    seen = VectorMeasurements(
+        sensor="tracker", kind="attitude", time=[0.0], attitude=quaternion.exp(turn)[None], sigma=sigma
+    )
+    record = ImuRecord(time=np.array([0.0, 1.0]), increments=np.zeros((1, 3)), vectors=(seen,))
+    initial = estimation.initial_state(quaternion.IDENTITY, attitude_sigma=wide, bias_sigma=1e-3)
+    found = estimation.run(record, NOISE, initial, OPTIONS[option], full_covariance=True)
+    correction = wide**2 / (wide**2 + sigma**2) * turn
+    assert quaternion.angle_between(found.attitude[0], quaternion.exp(correction)) < 1e-7
+    J = kinematics.right_jacobian(correction)
+    P = J @ J.T / (wide**-2.0 + sigma**-2.0)
+    np.testing.assert_allclose(found.covariance[0, :3, :3], P, rtol=0, atol=1e-12)

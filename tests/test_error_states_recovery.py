@@ -679,17 +679,6 @@ def test_the_step_face_says_what_it_took():
         assert np.array_equal(now, before)
 
 
-def test_the_smoother_does_not_smooth_across_a_recovery():
-    one = made("hard iron", 0, duration=3.0)
-    astray = estimation.smooth(one.record, NOISE, lost(one.initial, 0), (IRON,), gate=Gate())
-    (event,) = recoveries(astray)
-    first = int(np.searchsorted(one.record.time, event.start))
-    assert np.max(quaternion.angle_between(astray.attitude, one.record.truth.attitude)[first:]) < 0.05
-    smoothed = estimation.smooth(one.record, NOISE, one.initial, (IRON,), gate=Gate())
-    assert not smoothed.events
-    assert np.max(quaternion.angle_between(smoothed.attitude, one.record.truth.attitude)) < 0.05
-
-
 # ------------------------------------------------------------------------------------------------------------------------- setups
 
 

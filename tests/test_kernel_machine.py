@@ -216,6 +216,7 @@ BODIES = [
     (gate, root_form),
     (likelihood,),
     (likelihood_outliers, likelihood),
+    (likelihood_outliers, root_form),
     (hypotheses,),
     *(
         (importlib.import_module(f"{filters.__name__}.{name}"), extended, body_side)

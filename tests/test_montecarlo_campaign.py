@@ -321,7 +321,7 @@ def test_a_plan_without_a_form_in_a_file_is_refused_before_anything_is_computed(
         def __getattr__(self, name):
             return getattr(SCENARIO.motion, name)
 
-    with pytest.raises(InputError, match="has no form in a file"):
+    with pytest.raises(InputError, match="cannot be written to a file"):
         go(tmp_path / "c.h5", 8, plan=replace(PLAN, scenario=replace(SCENARIO, motion=Own())))
     assert not list(tmp_path.iterdir())
 

@@ -162,7 +162,7 @@ def test_each_run_is_what_the_factor_makes_of_it(name, monkeypatch):
 
 @pytest.mark.parametrize("name", ["gyro, star tracker", "heading"])
 def test_a_run_has_the_same_bits_whatever_runs_beside_it(name):
-    """Full groups, short ones, runs in another order, and beside one that is lost or has other times."""
+    """Full groups, short ones, runs in another order, and beside one that is lost or has other times, noise or references."""
     records, initials = runs(name, 9)
     chosen = plan(name).setup
 
@@ -178,6 +178,14 @@ def test_a_run_has_the_same_bits_whatever_runs_beside_it(name):
     mixed = setup.run_together([shorter, records[1], *records[2:4]], chosen, [initials[0], lost, *initials[2:4]], 10)
     assert [bits(one) for one in mixed[2:]] == alone[2:4]
     assert bits(mixed[0]) == bits(setup.run_together([shorter], chosen, initials[:1], 10)[0])
+    for change in (
+        lambda series: series.noise_scaled(2.0),
+        lambda series: series if series.attitude is not None else replace(series, reference_f=-series.reference_f),
+    ):
+        other = replace(records[0], vectors=tuple(change(series) for series in records[0].vectors))
+        pair = setup.run_together([records[2], other], chosen, [initials[2], initials[0]], 10)
+        assert bits(pair[0]) == alone[2]
+        assert bits(pair[1]) == bits(setup.run_together([other], chosen, initials[:1], 10)[0])
     one = setup.run(records[1], chosen, lost, every=10, full_covariance=True)
     assert bits(mixed[1]) == bits(one)  # a turn beyond the range of the polynomials: the factor's
     # What is kept does not change what is kept of it.

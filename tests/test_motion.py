@@ -288,7 +288,7 @@ def test_bad_times_are_refused(truth):
         (lambda: TorqueFree(inertia=(1.0, 2.0, 4.0), initial_rate=(1.0, 0.0, 0.0)), r"inertia\[2\] is 4, more than the sum"),
         (lambda: TorqueFree(inertia=(1.0, -2.0, 2.0), initial_rate=(1.0, 0.0, 0.0)), r"inertia\[1\] is -2 kg m²; it must be greater"),
         (lambda: Harmonic(amplitude=(1.0, 0.0), frequency=1.0), "amplitude has shape"),
-        (lambda: HarmonicRates(harmonics=(3.0,)), r"harmonics\[0\] is 3.0; pass motion.Harmonic"),
+        (lambda: HarmonicRates(harmonics=(3.0,)), r"harmonics\[0\] is 3.0; give motion.Harmonic"),
         (lambda: HarmonicRates(harmonics=elliptic_vibration(100.0, 1.0)).attitude([0.0, 1e9]), r"time\[1\] is 1e\+09 s from time 0"),
         (lambda: SampledAttitude(time=[0, 1, 2], attitudes=wandering_attitudes(3)), "time has 3 stamps; at least 6"),
         (lambda: SampledAttitude(time=np.arange(7.0), attitudes=wandering_attitudes(6)), "6 rows for 7 stamps"),
@@ -297,7 +297,7 @@ def test_bad_times_are_refused(truth):
         (lambda: waypoints([0.0, 1.0], [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0]]), r"attitudes\[1\] is 180° from the one before"),
         (lambda: MOTIONS["sampled"].body_rate([1.0, 2.5]), "time 2.5 s is outside the samples, 0 s to 2 s"),
         (lambda: MOTIONS["sampled"].increments([-1.0, 0.5]), "time -1 s is outside"),
-        (lambda: Composed(base=1.0, vibration=rest()), "base is 1.0; pass a motion"),
+        (lambda: Composed(base=1.0, vibration=rest()), "base is 1.0; give a motion"),
     ],
 )  # fmt: skip
 def test_bad_parameters_are_refused(make, message):

@@ -470,17 +470,22 @@ def test_wild_first_directions_do_not_mislead_it(number, size, option):
     assert np.all((low < np.mean(nees, axis=0) / 6.0) & (np.mean(nees, axis=0) / 6.0 < high))
 
 
-def test_a_wild_first_attitude_is_no_attitude_yet():
-    """One hypothesis is not accepted before a second attitude has been measured, which shows that one of them lies off."""
+@pytest.mark.parametrize("headings", [0, 6])
+def test_a_wild_first_attitude_is_no_attitude_yet(headings):
+    """One hypothesis is not accepted before a second attitude has been measured, which shows that one of them lies off. Headings between
+    the two, which fit a tilt as well, do not speak against the second: they are no directions to doubt.
+    """
     time = np.arange(11.0)
     attitude = quaternion.exp(1e-3 * np.random.default_rng(4).standard_normal((11, 3)))
-    attitude[0] = quaternion.exp(np.array([0.3, -0.5, 0.8]))
-    record = resting(tracker(time, attitude, 1e-3))
+    attitude[0] = quaternion.exp(np.array([0.5, 0.0, 0.0] if headings else [0.3, -0.5, 0.8]))
+    at, north = np.linspace(0.1, 0.9, headings), np.array([1.0, 0.0, 0.0])
+    compass = series("compass", at, np.tile(north, (headings, 1)), north, 1e-2, "heading")
+    record = resting(*([compass] if headings else []), tracker(time, attitude, 1e-3))
     found = multiple_model.run(record, QUIET, bias_sigma=1e-4, gate=Gate())
     assert not found.estimate.events
-    assert 2.0 <= found.became_one <= 3.0
-    assert quaternion.angle_between(found.estimate.attitude[3:], np.array([1.0, 0.0, 0.0, 0.0])).max() < 5e-3
-    later = dataclasses.replace(record, vectors=(record.vectors[0].taken(time > 0.0),))
+    assert 2.0 <= found.became_one <= (4.0 if headings else 3.0)
+    assert quaternion.angle_between(found.estimate.attitude[4:], np.array([1.0, 0.0, 0.0, 0.0])).max() < 5e-3
+    later = dataclasses.replace(record, vectors=(*record.vectors[:-1], record.vectors[-1].taken(time > 0.0)))
     right = multiple_model.run(later, QUIET, bias_sigma=1e-4)
     assert np.all(np.abs(found.estimate.sigma[-1] / right.estimate.sigma[-1] - 1.0) < 0.01)
 
@@ -498,12 +503,15 @@ def test_from_more_wild_directions_than_it_doubts_it_recovers(size):
         e, nees = judged(found, record)
         assert np.linalg.norm(e[-1, :3]) < 1.0 * DEGREE
         assert nees[-1] < 30.0
-        for event in found.estimate.events:
+        for nth, event in enumerate(found.estimate.events, start=1):
             assert (event.kind, event.sensor, event.value) == ("recovery", "magnetometer", 10.0)
-            if event.end < found.became_one:  # the bank's own: it is as if there had been nothing before
+            if (
+                event.end < found.became_one
+            ):  # the bank's own: but for the bias's σ it is as if there had been nothing before
                 assert event.end - event.start == pytest.approx(90.0)
                 assert found.estimate.time[0] >= event.start
                 assert found.estimate.skipped["magnetometer"] == np.sum(record.vectors[0].time < event.start)
+                np.testing.assert_allclose(found.estimate.sigma[0, 3:], 3.0**nth * 20.0 * DEGREE_PER_HOUR, rtol=0.01)
                 recovered += 1
     assert recovered > 10
 
@@ -558,7 +566,8 @@ def test_for_small_errors_its_weights_are_the_plain_filters(kind, robust, monkey
     noise = size * random.standard_normal((40, 3))
     r = np.array([0.6, 0.0, 0.8])
     if kind == "attitude":
-        second = dataclasses.replace(tracker(at, quaternion.exp(noise), 1e-3), sensor="second")
+        axes = np.array([1.0, 1.0, 0.3])
+        second = dataclasses.replace(tracker(at, quaternion.exp(axes * noise), 1e-3 * axes), sensor="second")
     else:
         seen = r + noise
         if kind != "vector":

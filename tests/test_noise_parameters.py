@@ -145,7 +145,7 @@ def test_a_magnetometer_without_a_unit_is_refused(run, tmp_path):
     whole = replace(at_rest(200), magnetic_unit="")
     recordings.write(whole, tmp_path / "x.csv")
     status, _, error = run("allan", tmp_path / "x.csv", "--sensor", "magnetometer")
-    assert (status, "does not say the unit of its magnetometer" in error) == (2, True)
+    assert (status, "does not declare the unit of its magnetometer" in error) == (2, True)
     assert run("allan", tmp_path / "x.csv", "--sensor", "magnetometer", "--magnetometer-unit", "uT")[0] == 0
 
 
@@ -173,10 +173,10 @@ def test_stamps_that_stray_are_taken_for_even_and_said():
     from strapdown.recordings import samples
 
     found = samples._of_recording(replace(whole, time=late), "gyro", True)
-    assert "stray by up to" in found.remarks[0]
+    assert "deviate by up to" in found.remarks[0]
     assert abs(found.sample_interval - DT) < 1e-4
     assert abs(np.isnan(found.values[:, 0]).sum() - 100) <= 2
-    with pytest.raises(InputError, match="cut the recording to where its samples lie at even intervals"):
+    with pytest.raises(InputError, match="cut the recording to a part with equal sample intervals"):
         samples._of_recording(replace(whole, time=late), "gyro", False)
 
 
@@ -225,7 +225,7 @@ def test_the_bias_over_temperature_is_subtracted_and_its_error_becomes_a_walk():
     np.testing.assert_allclose(
         gyro_temperature.applied(replace(warm, temperature=slow), table).rate, expected, atol=1e-15
     )
-    with pytest.raises(InputError, match="warm has no temperature, over which"):
+    with pytest.raises(InputError, match="warm has no temperature; leave out"):
         gyro_temperature.applied(replace(warm, temperature=None), table)
     with pytest.raises(InputError, match="file: gyro lacks bias_rad_per_s"):
         from_table({k: v for k, v in given.items() if k != "bias_rad_per_s"}, "file: gyro")

@@ -210,11 +210,11 @@ def test_a_data_frame(case):
 
 def test_what_an_ending_has_no_room_for_is_refused(case, tmp_path):
     estimate, _ = case
-    with pytest.raises(InputError, match=r"ends in '.xls', and an estimate is written as .bag, "):
+    with pytest.raises(InputError, match=r"ends in '.xls', but an estimate is written as .bag, "):
         recordings.write(estimate, tmp_path / "x.xls")
-    with pytest.raises(InputError, match=r"x.tum \(TUM trajectory\) has no sequence"):
+    with pytest.raises(InputError, match=r"x.tum \(TUM trajectory\) has no option sequence"):
         recordings.write(estimate, tmp_path / "x.tum", sequence="ZYX")
-    with pytest.raises(InputError, match="holds the samples too; give the recording"):
+    with pytest.raises(InputError, match="needs the samples too; give the recording"):
         recordings.write(estimate, tmp_path / "x.bag")
     assert not list(tmp_path.iterdir())
 

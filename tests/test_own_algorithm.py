@@ -1,5 +1,6 @@
 """Coning algorithms of one's own: coefficients as textbooks write them, their orders derived, studied beside the package's."""
 
+import dataclasses
 import json
 import math
 from fractions import Fraction
@@ -121,7 +122,7 @@ def test_a_setup_with_it_is_read_back(tmp_path):
     from strapdown import montecarlo, scenarios
 
     scenario = scenarios.load_scenario("two-stars")
-    chosen = setup.replace(setup.FilterSetup.for_scenario(scenario), integration=MILLER)
+    chosen = dataclasses.replace(setup.FilterSetup.for_scenario(scenario), integration=MILLER)
     assert setup.from_toml(setup.to_toml(chosen)) == chosen
     plan = montecarlo.Plan(scenario=scenario, setup=chosen, epochs=1)
     assert montecarlo.from_table(json.loads(json.dumps(plan.to_table()))).digest == plan.digest
@@ -169,7 +170,7 @@ def test_several_algorithms_need_names_of_their_own(tmp_path):
     path.write_text(2 * '[[algorithm]]\nname = "x"\ncoefficients = ["2/3"]\n')
     with pytest.raises(InputError, match="two algorithms of the name x"):
         coning.read_algorithms(path)
-    with pytest.raises(InputError, match="already; give it another"):
+    with pytest.raises(InputError, match="give it another name"):
         coning_study.ConingParameters(own=(MILLER, MILLER))
     path.write_text("x = 1\n")
     with pytest.raises(InputError, match="x"):

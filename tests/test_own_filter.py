@@ -407,7 +407,7 @@ def test_arrays_that_make_no_estimate_are_refused():
         ({"covariance": P[0]}, "a matrix for each time"),
         ({"attitude": 2.0 * q}, "attitude"),
         ({"time": time[::-1]}, "time"),
-        ({"bias": np.zeros((3, 3))}, "covariance is of the attitude alone"),
+        ({"bias": np.zeros((3, 3))}, "covariance is of the attitude only"),
     ):
         with pytest.raises(InputError, match=message):
             Estimate.from_arrays(**{"time": time, "attitude": q, "covariance": P, **change})

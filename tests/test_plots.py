@@ -18,6 +18,7 @@ from strapdown.estimation import setup
 from strapdown.montecarlo.coning_study import Drift, FilterOutcome
 from strapdown.montecarlo.statistics import BINS_PER_OCTAVE
 from strapdown.plots import decimation, estimates, style
+from strapdown.records.estimate import ErrorStateEstimate
 
 pytestmark = pytest.mark.draws
 
@@ -283,6 +284,14 @@ def figures(run, statistics, outcomes):
     innovations = next(iter(estimate.innovations.values()))
     reference = consistency.reference_errors(estimate.attitude, truth.attitude)
 
+    pairs = [(a, b) for a in "xyz" for b in "xyz"]
+    block = ErrorStateEstimate(
+        components=tuple(a if a == b else a + b for a, b in pairs),
+        units=tuple("1" if a == b else "rad" for a, b in pairs),
+        values=np.zeros((len(estimate.time), 9)),
+        variance=np.ones((len(estimate.time), 9)),
+    )
+
     def single(draw):
         figure, ax = plots.new_figure()
         draw(ax)
@@ -292,6 +301,9 @@ def figures(run, statistics, outcomes):
         "errors": plots.error_overview(estimate, truth, title="record.h5"),
         "estimate": plots.estimate_overview(estimate, title="record.h5"),
         "recording": plots.recording_errors(estimate.time, reference),
+        "states": plots.states_over_time(
+            dataclasses.replace(estimate, error_states={"gyro scale": block}), title="record.h5"
+        ),
         "coning errors": plots.coning_errors(outcomes),
         "coning consistency": plots.coning_consistency(outcomes),
         "fan": single(lambda ax: plots.fan(statistics, 0, ax)),
@@ -333,6 +345,8 @@ def test_no_legend_covers_a_curve_and_ticks_are_plain(run, statistics, outcomes)
         for ax in figure.axes:
             for title in (ax.title, ax._left_title, ax._right_title):
                 assert title.get_window_extent().x1 <= figure.bbox.x1 + 1.0, f"{name}: {title.get_text()}"
+                own = ax.get_legend().get_window_extent() if title.get_text() and ax.get_legend() else None
+                assert own is None or not own.overlaps(title.get_window_extent()), f"{name}: {title.get_text()}"
             with matplotlib.rc_context(style.STYLE):
                 for axis in (ax.xaxis, ax.yaxis):
                     labels = axis.get_major_formatter().format_ticks([0.001, 0.01, 1.0, 1000.0])

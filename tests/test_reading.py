@@ -74,11 +74,11 @@ def test_what_is_no_regular_file_is_refused_at_once(known, tmp_path, name):
         known[name].read(path)
     path.rmdir()
     os.mkfifo(path)
-    with pytest.raises(InputError, match=rf"{name} is no regular file but a pipe or a device"):
+    with pytest.raises(InputError, match=rf"{name} is not a regular file but a pipe or a device"):
         known[name].read(path)
     path.unlink()
     path.symlink_to("/dev/zero")
-    with pytest.raises(InputError, match=rf"{name} is no regular file but a pipe or a device"):
+    with pytest.raises(InputError, match=rf"{name} is not a regular file but a pipe or a device"):
         known[name].read(path)
     path.unlink()
     path.symlink_to(path)
@@ -138,7 +138,7 @@ def test_an_array_that_declares_more_than_it_holds_is_refused_before_memory_is_t
     def refused():
         with pytest.raises(
             InputError,
-            match=r"bomb\.npy cannot be read \(its header declares 7200000000 bytes of float64, and 0 follow",
+            match=r"bomb\.npy cannot be read \(its header declares 7200000000 bytes of float64, but 0 follow",
         ):
             recordings.read_samples(path, "gyro", rate=100.0, units=UNITS)
 
@@ -157,7 +157,7 @@ def test_a_dataset_that_declares_more_than_the_file_holds_is_refused(tmp_path, s
         _old(path)
 
     def refused():
-        with pytest.raises(InputError, match=r"bomb\.h5: increments declares 7200 MB and the file holds 0 MB of it"):
+        with pytest.raises(InputError, match=r"bomb\.h5: increments declares 7200 MB, but the file has 0 MB of it"):
             recordfiles.read_record(path)
 
     seconds, megabytes = spent(refused)
@@ -171,7 +171,7 @@ def test_the_limit_is_on_what_is_unpacked_and_a_user_can_raise_it(tmp_path, monk
     assert path.stat().st_size < 200_000
     monkeypatch.setenv("STRAPDOWN_MAX_MB", "1")
     with pytest.raises(
-        InputError, match=r"zeros\.h5 holds 1\.92 MB, more than the 1 MB that may be read.*STRAPDOWN_MAX_MB \(1 now\)"
+        InputError, match=r"zeros\.h5 has 1\.92 MB, more than the maximum of 1 MB.*STRAPDOWN_MAX_MB \(1 now\)"
     ):
         recordfiles.read_record(path)
     monkeypatch.setenv("STRAPDOWN_MAX_MB", "2")
@@ -188,7 +188,7 @@ def test_a_large_file_is_refused_before_it_is_read(known, tmp_path, name):
         file.truncate(5_000_000_000)  # of holes, which take no place on the disk
 
     def refused():
-        with pytest.raises(InputError, match=rf"{name} holds 5000 MB, more than"):
+        with pytest.raises(InputError, match=rf"{name} has 5000 MB, more than"):
             known[name].read(path)
 
     seconds, megabytes = spent(refused)
@@ -280,8 +280,8 @@ def _external_storage(file):
     [
         (_external, "truth/bias is an external link, which is not followed"),
         (_soft, "truth/bias is a soft link, which is not followed"),
-        (_virtual, "truth/bias lies in other files, which are not followed"),
-        (_external_storage, "truth/bias lies in other files, which are not followed"),
+        (_virtual, "truth/bias is stored in other files, which are not read"),
+        (_external_storage, "truth/bias is stored in other files, which are not read"),
     ],
 )
 def test_data_of_other_files_are_refused(tmp_path, refer, words, sealed):
@@ -384,12 +384,12 @@ def test_a_zeroed_sector_is_an_error_within_a_second_wherever_it_is(known, tmp_p
             continue
         path.write_bytes(damaged)
         begun = time.process_time()  # the library would loop, not wait
-        with pytest.raises(InputError, match=rf"{name} cannot be read: its content does not fit its digest"):
+        with pytest.raises(InputError, match=rf"{name} cannot be read: its content does not match its digest"):
             known[name].read(path)
         assert time.process_time() - begun < 1.0
     for front in (bytes(512), bytes(512) + content[:512]):
         path.write_bytes(front + content[512:])
-        with pytest.raises(InputError, match=rf"{name} is damaged: its digest is gone"):
+        with pytest.raises(InputError, match=rf"{name} is damaged: its digest is missing"):
             known[name].read(path)
 
 
@@ -403,7 +403,7 @@ def test_every_bit_counts(tmp_path):
     for bit in places:
         content[bit // 8] ^= 1 << bit % 8
         path.write_bytes(content)
-        with pytest.raises(InputError, match=r"flipped\.h5 cannot be read: its content does not fit its digest"):
+        with pytest.raises(InputError, match=r"flipped\.h5 cannot be read: its content does not match its digest"):
             recordfiles.read_record(path)
         content[bit // 8] ^= 1 << bit % 8
 
@@ -417,7 +417,7 @@ def test_a_file_changed_on_purpose_gets_a_new_digest(tmp_path):
     files.seal(path)
     assert records.read_attributes(path)["place"] == 5.0
     _old(path)
-    with pytest.raises(InputError, match=r"record\.h5 has no digest; only a file that this version wrote has one"):
+    with pytest.raises(InputError, match=r"record\.h5 has no digest; only a file written by this version has one"):
         files.seal(path)
 
 
@@ -426,7 +426,7 @@ def test_an_old_file_is_read_and_said_to_have_no_digest(tmp_path, run):
     new = recordfiles.read_record(path)
     _old(path)
     assert b"GCOL" in path.read_bytes()
-    with pytest.warns(reading.NoDigestWarning, match=r"record\.h5 has no digest, so damage to it may pass unseen"):
+    with pytest.warns(reading.NoDigestWarning, match=r"record\.h5 has no digest; damage to it may not be detected"):
         old = recordfiles.read_record(path)
     assert np.array_equal(old.increments, new.increments)
     assert (old.origin.scenario, old.origin.seed) == (new.origin.scenario, new.origin.seed)
@@ -469,7 +469,7 @@ def _is_killed(*_):
 @pytest.mark.parametrize(
     ("end", "words"),
     [
-        (_aborts, r"unit\.h5 is damaged: the HDF5 library crashes on it; take a copy, or make it again"),
+        (_aborts, r"unit\.h5 is damaged: the HDF5 library crashes on it; restore a copy, or make it again"),
         (_is_killed, r"unit\.h5 is damaged: the HDF5 library does not come to an end"),
     ],
     ids=["crash", "limit"],
@@ -541,9 +541,9 @@ def test_a_missing_library_is_no_damage_of_the_file(known, tmp_path, monkeypatch
         ("rate_hz = 1.0", "rate_hz = true", "rate_hz is True; it must be a number"),
         ("rate_hz = 1.0", f"rate_hz = {'9' * 400}", "rate_hz"),
         ("rate_hz = 1.0", "rate_hz = [1.0, 2.0]", "rate"),
-        ("outages_s = [[1.0, 2.0]]", "outages_s = [[1.0], [2.0, 3.0]]", "outages_s is .*rows of one length"),
+        ("outages_s = [[1.0, 2.0]]", "outages_s = [[1.0], [2.0, 3.0]]", "outages_s is .*rows of equal length"),
         ("outages_s = [[1.0, 2.0]]", "outages_s = 1.0", "outages"),
-        ("[motion]", "name = 5\n[motion]", "name is 5; it must be a text"),
+        ("[motion]", "name = 5\n[motion]", "name is 5; it must be a string"),
         ("[motion]", "sensor = 5\n[motion]", "key 'sensor' is not known"),
     ],
 )

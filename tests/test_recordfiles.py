@@ -253,7 +253,7 @@ def test_csv_cut_at_the_end_of_a_line_is_refused(made, tmp_path):
         for cut in (lines[:-1], lines[:-2], [*lines, lines[-1].replace(lines[-1].split(",")[0], "1e3", 1)]):
             path.write_text("\n".join(cut) + "\n")
             with pytest.raises(
-                InputError, match=rf"{path.name} ends at .* s, its first line states .* s; it was truncated or"
+                InputError, match=rf"{path.name} ends at .* s, but its first line states .* s; it was truncated or"
             ):
                 read_record(written[0])
         path.write_text(whole)
@@ -281,7 +281,7 @@ def test_csv_says_how_it_was_made_as_hdf5_does(made, tmp_path):
     assert scenarios.scenario_to_toml(back.scenario) == scenarios.scenario_to_toml(scenario)
     first, rest = path.read_text().split("\n", 1)
     path.write_text(first.replace('"seed"', '"sead"') + "\n" + rest)
-    with pytest.raises(InputError, match="line 1: how it was made cannot be read"):
+    with pytest.raises(InputError, match="line 1: the origin of the record cannot be read"):
         read_record(path)
     export_csv(path, dataclasses.replace(record, origin=None))
     assert read_record(path).origin is None
@@ -290,9 +290,9 @@ def test_csv_says_how_it_was_made_as_hdf5_does(made, tmp_path):
 @pytest.mark.parametrize(
     ("where", "name", "value", "words"),
     [
-        ("increments", "unit", "deg", r"increments is in 'deg', and read in 'rad'; convert it"),
-        ("truth/bias", "unit", b"deg/h", r"truth/bias is in 'deg/h', and read in 'rad/s'"),
-        ("vectors/0/time", "unit", "ms", r"vectors/0/time is in 'ms', and read in 's'"),
+        ("increments", "unit", "deg", r"increments is in 'deg', but must be in 'rad'; convert it"),
+        ("truth/bias", "unit", b"deg/h", r"truth/bias is in 'deg/h', but must be in 'rad/s'"),
+        ("vectors/0/time", "unit", "ms", r"vectors/0/time is in 'ms', but must be in 's'"),
         ("/", "conventions", "quaternions scalar last", r"follows other conventions \(quaternions scalar last\)"),
     ],
 )
@@ -313,5 +313,5 @@ def test_a_series_without_sigma_is_reported_so(made, tmp_path):
     write_record(path, made[1])
     with changed(path) as file:
         del file["vectors/0/sigma"]
-    with pytest.raises(InputError, match=r"vectors/0 \(.*\) lacks sigma; give each"):
+    with pytest.raises(InputError, match=r"vectors/0 \(.*\) has no sigma; give each"):
         read_record(path)

@@ -55,7 +55,7 @@ def test_usual_headers_are_understood_and_said(table, header):
     np.testing.assert_array_equal(recording.magnetic_field, VALUES[:, 7:])
     assert recording.magnetic_unit == "uT"
     (remark,) = recording.remarks
-    assert remark.startswith("Columns taken by their names: ")
+    assert remark.startswith("Columns assigned by their names: ")
     for role in ("gx gy gz from", "ax ay az from", "mx my mz from"):
         assert role in remark
 
@@ -73,7 +73,7 @@ def test_a_flight_log_as_csv_has_its_axes_in_brackets(table):
     header = "timestamp,gyro_rad[0],gyro_rad[1],gyro_rad[2],accelerometer_m_s2[0],accelerometer_m_s2[1],accelerometer_m_s2[2]"
     values = VALUES[:, :7] * [4000.0, 1, 1, 1, 1, 1, 1]
     path = table(header, values=values)
-    with pytest.raises(InputError, match=r"stamps of timestamp are 4000 apart.*hardly seconds.*\[us\]"):
+    with pytest.raises(InputError, match=r"stamps of timestamp are 4000 apart.*not plausible in seconds.*\[us\]"):
         read(path)
     recording = read(path, units={"time": "us"})
     np.testing.assert_allclose(recording.time, values[:, 0] * 1e-6, rtol=1e-15)
@@ -132,7 +132,7 @@ def test_a_mapping_names_columns_and_units(table):
 @pytest.mark.parametrize(
     ("mapping", "words"),
     [
-        ("time", "'time' is no ROLE=NAME"),
+        ("time", "'time' is not ROLE=NAME"),
         ("tme=when", "role 'tme' is not known; did you mean 'time'"),
         ("time=when,time=u1", "time is given twice"),
         ("time=then", "has no column 'then' for time"),
@@ -149,7 +149,7 @@ def test_two_sensors_that_fit_are_refused_not_chosen(table):
     header = "time,gyro_x [dps],gyro_y,gyro_z,gyr_x,gyr_y,gyr_z,mx,my,mz"
     path = table(header)
     with pytest.raises(
-        InputError, match=r"the gyro may be that of gyro_x \[dps\] or gyr_x; say which, as in --columns gx="
+        InputError, match=r"the gyro may be that of gyro_x \[dps\] or gyr_x; select one, as in --columns gx="
     ):
         read(path)
     chosen = read(path, columns={"gx": "gyr_x[deg/s]", "gy": "gyr_y", "gz": "gyr_z"})
@@ -261,7 +261,7 @@ def test_commands_take_columns_and_say_what_they_guessed(table, tmp_path):
     for command in ("estimate", "integrate", "doctor"):
         out = ["--out", str(tmp_path / f"{command}.h5")] if command != "doctor" else []
         said = CliRunner().invoke(app, [command, str(guessed), *out])
-        assert "Columns taken by their names: time from 't'" in said.output, said.output
+        assert "Columns assigned by their names: time from 't'" in said.output, said.output
         other = CliRunner().invoke(app, [command, str(odd), *out, "--columns", mapping])
         assert other.exit_code == said.exit_code, other.output
-        assert "Columns taken" not in other.output
+        assert "Columns assigned" not in other.output

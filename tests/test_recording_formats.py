@@ -107,7 +107,7 @@ def test_a_data_frame_is_a_recording():
     with pytest.raises(InputError, match=r"frame: .*lacks gy"):
         recordings.from_table(frame.drop(columns="gy"), source="frame")
     frame["gx [dps]"] = ["fast", "slow", "still"]
-    with pytest.raises(InputError, match=r"frame: column gx \[dps\] holds .*, no numbers"):
+    with pytest.raises(InputError, match=r"frame: column gx \[dps\] has .*, not numbers"):
         recordings.from_table(frame, source="frame")
 
 
@@ -133,6 +133,10 @@ def test_arrays_by_name_are_a_recording():
     columns = {"time": np.arange(3.0), "gx": [1, 2, 3], "gy": np.zeros(3), "gz": np.zeros(3)}
     assert recordings.from_table(columns, units={"gyro": "rad/s"}).rate[2, 0] == 3.0
     assert sd.read(columns, units={"gyro": "rad/s"}).rate[2, 0] == 3.0
+    values = np.arange(12.0).reshape(4, 3)
+    recording = sd.read({"time": np.arange(4.0), "gyro [deg/s]": values, "acc": values}, units={"accelerometer": "g"})
+    np.testing.assert_allclose(recording.rate, np.radians(values), rtol=1e-15)
+    np.testing.assert_allclose(recording.specific_force, values * 9.80665, rtol=1e-15)
     with pytest.raises(InputError, match=r"path is 3, .*give a path, a DataFrame"):
         sd.read(3)
     with pytest.raises(InputError, match=r"table: column gz has shape \(2,\), the first \(3,\)"):
@@ -161,7 +165,7 @@ def test_a_flight_log_is_read(ulog):
     assert known.all()
     assert quaternion.angle_between(quaternion.normalize(back.true_attitude), whole.true_attitude).max() < 1e-6
     assert back.remarks[0] == "Topic sensor_combined: 60 messages."
-    assert "vehicle_attitude, the vehicle's own estimate" in " ".join(back.remarks)
+    assert "vehicle_attitude, the vehicle's estimate" in " ".join(back.remarks)
 
 
 def test_the_library_reads_the_attitude_as_px4_has_it(ulog):
@@ -185,10 +189,10 @@ def test_a_truncated_flight_log_gives_what_is_whole(ulog):
     recording = read(path)
     n = len(recording.time)
     assert 30 < n < 50
-    assert "theirs.ulg is truncated: read is what is whole." in recording.remarks
+    assert "theirs.ulg is truncated: only complete messages are read." in recording.remarks
     np.testing.assert_array_equal(recording.rate, whole.rate[:n])
     path.write_bytes(content[:200])
-    with pytest.raises(InputError, match=r"theirs.ulg (holds no message of sensor_combined|cannot be read)"):
+    with pytest.raises(InputError, match=r"theirs.ulg (has no message of sensor_combined|cannot be read)"):
         read(path)
 
 
@@ -212,7 +216,7 @@ def test_what_a_flight_log_cannot_hold_is_refused(tmp_path):
     whole = walk(single=True)
     for bad, words in (
         (replace(whole, specific_force=None), "no accelerometer"),
-        (replace(whole, magnetic_unit=""), "holds Gauss"),
+        (replace(whole, magnetic_unit=""), "uses Gauss"),
         (replace(whole, time=np.arange(60) * 1e-7), "less than 1 µs apart"),
         (replace(whole, time=np.arange(60) - 5.0, epoch_ns=0), "no negative times"),
     ):
@@ -268,7 +272,7 @@ def test_a_cameras_log_is_read(tmp_path):
     assert recording.magnetic_field is None
     assert "potatocam custom logger name" in recording.remarks[0]
     (tmp_path / "none.mp4").write_bytes(b"\0\0\0\x18ftypmp42" + bytes(200))
-    with pytest.raises(InputError, match=r"none.mp4 (cannot be read by telemetry-parser|.*holds no gyro samples)"):
+    with pytest.raises(InputError, match=r"none.mp4 (cannot be read by telemetry-parser|.*has no gyro samples)"):
         read(tmp_path / "none.mp4")
 
 
@@ -277,7 +281,7 @@ def test_a_cameras_log_without_gyro_samples_is_refused(tmp_path, monkeypatch, ro
     parser = types.SimpleNamespace(camera="GoPro", model="H9", normalized_imu=lambda: rows)
     monkeypatch.setitem(sys.modules, "telemetry_parser", types.SimpleNamespace(Parser=lambda path: parser))
     (tmp_path / "video.log").write_text(GCSV)
-    with pytest.raises(InputError, match=r"video.log \(GoPro\) holds no gyro samples; give a log with raw"):
+    with pytest.raises(InputError, match=r"video.log \(GoPro\) has no gyro samples; give a log with raw"):
         read(tmp_path / "video.log")
 
 
@@ -359,9 +363,9 @@ def test_a_trajectory_is_a_reference(tmp_path):
     np.testing.assert_allclose(found, q[:, [3, 0, 1, 2]], atol=1e-15)
     joined = recordings.with_reference(whole, path)
     assert not np.isnan(joined.true_attitude).any()
-    with pytest.raises(InputError, match="is a TUM trajectory, which holds no inertial samples"):
+    with pytest.raises(InputError, match="is a TUM trajectory, which has no inertial samples"):
         read(path)
-    with pytest.raises(InputError, match=r"truth.txt goes from .* give both of one clock"):
+    with pytest.raises(InputError, match=r"truth.txt goes from .* both must have the same clock"):
         recordings.with_reference(replace(whole, epoch_ns=0), path)
     path.write_text("1 2 3\n")
     with pytest.raises(InputError, match=r"data row 1 has 3 numbers; a TUM trajectory has time tx"):
@@ -425,7 +429,7 @@ def test_what_is_there_is_not_replaced_by_default(tmp_path):
     (tmp_path / "b.csv").write_text("precious")
     for target, words in (
         ("b.csv", "exists; move it, choose another name, or give --force"),
-        ("a.csv", "the very file that is read"),
+        ("a.csv", "the same file that is read"),
     ):
         status, said = convert(tmp_path / "a.csv", tmp_path / target)
         assert (status, words in said) == (1, True), said

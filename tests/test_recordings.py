@@ -103,10 +103,16 @@ def test_empty_fields_of_accelerometer_and_magnetometer_are_missing_samples(csv)
 # ---------------------------------------------------------------------------------------------------- CSV: what is refused
 
 
+def test_a_sensor_without_any_sample_is_left_out_and_reported(csv):
+    recording = read(csv(HEADER + ",mx,my,mz", ["0,1,2,3,,,,4,5,6", "1,1,2,3,,,,4,5,6"]))
+    assert recording.specific_force is None
+    assert recording.remarks[-1] == "The accelerometer has no sample from 0 s on."
+
+
 def test_undeclared_units_are_refused_not_guessed(csv):
     refused(
         csv("time,gx,gy,gz,ax [m/s2],ay,az"),
-        "does not say the unit of its gyro",
+        "does not declare the unit of its gyro",
         "gx [rad/s]",
         "rad/s, deg/s, mrad/s, mdeg/s",
     )
@@ -137,7 +143,13 @@ def test_unknown_units_are_refused(csv):
 
 def test_contradicting_units_are_refused(csv):
     refused(csv("time,gx [rad/s],gy [deg/s],gz,ax [g],ay,az"), "column gy is in deg/s", "rad/s", "same unit")
-    refused(csv(), "the header says rad/s", "the option deg/s", "drop one", units={"gyro": "deg/s"})
+    refused(csv(), "the header declares rad/s", "the option is deg/s", "drop one", units={"gyro": "deg/s"})
+
+
+def test_units_and_columns_are_mappings_of_what_is_known(csv):
+    refused(csv(), "units is 'deg/s'", "{'gyro': 'deg/s'}", units="deg/s")
+    refused(csv(), "columns is 'gx'", columns="gx")
+    refused(csv(), "role 'gyro' is not known", "did you mean 'gy'", columns={"gyro": "gx"})
 
 
 def test_units_of_an_unknown_sensor_are_refused(csv):
@@ -166,7 +178,7 @@ def test_other_separators_are_read_and_their_decimals_may_have_commas(csv, mark)
 
 def test_decimal_commas_between_commas_are_reported(csv):
     commas = "0,00,0,1,0,2,0,3,1,0,2,0,9,8"
-    refused(csv(rows=[commas]), "data row 1 has 14 fields, the header 7", "decimals seem to have commas: write points")
+    refused(csv(rows=[commas]), "data row 1 has 14 fields, the header 7", "seems to have decimal commas: write points")
     refused(csv(rows=[ROWS[0] + ",1.5"]), "8 fields", "truncated or damaged")
 
 
@@ -313,7 +325,7 @@ def test_what_is_no_text_or_no_file_is_refused(tmp_path):
     refused(tmp_path / "none.csv", "does not exist")
     other = tmp_path / "walk.mat"
     other.write_bytes(b"\0" * 100)
-    refused(other, "suffix '.mat'", ".csv")
+    refused(other, "extension '.mat'", ".csv")
 
 
 # ---------------------------------------------------------------------------------------------------- HDF5
@@ -483,7 +495,7 @@ def test_stamps_that_stray_by_more_than_a_quarter_of_the_interval_are_assumed_ev
     assert interval == pytest.approx(0.01, rel=1e-3)
     np.testing.assert_array_equal(place, np.delete(np.arange(200), np.s_[150:160]))
     assert [word.split()[0] for word in words] == (["Intervals", "10"] if even else ["10"])
-    assert not even or f"stray by up to {10.0 * shift:.3g} ms" in words[0]
+    assert not even or f"deviate by up to {10.0 * shift:.3g} ms" in words[0]
 
 
 def test_samples_of_a_simulated_record_are_its_increments_and_what_its_sensors_measured(tmp_path):

@@ -77,7 +77,7 @@ def test_records_are_frozen_and_lists_are_welcome():
         ({"time": [0.0, 1.0, 1.0]}, r"time\[2\] repeats"),
         ({"increments": np.zeros((3, 3))}, r"increments has shape \(3, 3\), wanted \(2, 3\)"),
         ({"increments": [[0, 0, 0], [0, np.nan, 0]]}, r"increments\[1, 1\] is nan"),
-        ({"vectors": (series("sun", np.arange(2.0)), series("sun", np.arange(2.0)))}, "two series of one name"),
+        ({"vectors": (series("sun", np.arange(2.0)), series("sun", np.arange(2.0)))}, "two series of the same name"),
         ({"truth": Truth(attitude=random_attitudes(2), bias=np.zeros((3, 3)))}, r"truth.attitude has shape \(2, 4\)"),
         (
             {"truth": Truth(attitude=2.0 * random_attitudes(3), bias=np.zeros((3, 3)))},
@@ -280,7 +280,7 @@ def test_foreign_files_are_refused(tmp_path):
             lambda x: np.where(np.arange(6) == 4, 0.0, x),
             r"variance\[0, 4\] is 0, and a variance must be greater than zero",
         ),
-        ("variance", lambda x: -x, r"variance\[0, 0\] is -.*make the estimate again"),
+        ("variance", lambda x: -x, r"variance\[0, 0\] is -.*repeat the estimate"),
         ("covariance", lambda x: -x, r"covariance, diagonal\[0, 0\] is -"),
         ("innovations/0/variance", lambda x: x - 1e3, r"innovations/0/variance\[0, 0\] is -.*give each a sigma"),
         ("innovations/0/variance", lambda x: x[:, :1], r"innovations/0/variance has shape"),

@@ -51,14 +51,14 @@ def refused(command):
 def test_an_estimate_does_not_replace_its_record(folder, tmp_path):
     shutil.copy(folder / "record.h5", tmp_path / "estimate.h5")
     before = (tmp_path / "estimate.h5").read_bytes()
-    assert "the very file that is read" in refused(["estimate", tmp_path / "estimate.h5", "--out", tmp_path])
+    assert "the same file that is read" in refused(["estimate", tmp_path / "estimate.h5", "--out", tmp_path])
     assert (tmp_path / "estimate.h5").read_bytes() == before
 
 
 def test_a_budget_does_not_replace_its_spectrum(tmp_path):
     spectrum = tmp_path / "lines.json"
     spectrum.write_text("frequency_hz,angle_deg\n10,0.1\n")
-    assert "the very file" in refused(["coning-budget", "--psd", spectrum, "--rate", 1000, "--json", spectrum])
+    assert "the same file" in refused(["coning-budget", "--psd", spectrum, "--rate", 1000, "--json", spectrum])
     assert "choose such a suffix" in refused(
         ["coning-budget", "--psd", spectrum, "--rate", 1000, "--json", tmp_path / "out.csv"]
     )
@@ -66,7 +66,7 @@ def test_a_budget_does_not_replace_its_spectrum(tmp_path):
 
 @pytest.mark.parametrize("name", ["../evil", "a/b", ".hidden", "two\nlines"])
 def test_a_scenario_is_not_named_like_a_path(short, name):
-    with pytest.raises(InputError, match="files are called after it"):
+    with pytest.raises(InputError, match="which is used in file names"):
         dataclasses.replace(short, name=name)
 
 
@@ -335,7 +335,7 @@ def test_a_place_that_cannot_be_written_is_reported_before_the_work(there, tmp_p
     else:  # reported by the system, whoever runs the tests
         monkeypatch.setattr("os.access", lambda path, mode, **_: not mode & os.W_OK)
         said = refused_at_once([*command, tmp_path / "b" / target])
-        assert f"{tmp_path} may not be written" in said
+        assert f"no permission to write to {tmp_path}" in said
         assert not list(tmp_path.iterdir())
 
 

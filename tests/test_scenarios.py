@@ -160,7 +160,7 @@ def test_every_motion_and_sensor_survives_a_file(body):
         (REST + "[[sensors]]\ntype='magnetometer'\norbit={altitude=3}", "did you mean 'altitude_"),
         (REST + "[sensors]\ntype='direction'", "two brackets"),
         (FIRST.replace("10.0", "-1.0") + "[motion]\ntype='rest'", "rate is -1"),
-        ("rate_hz = = 3", "no TOML"),
+        ("rate_hz = = 3", "not TOML"),
     ],
 )
 def test_wrong_files_are_refused_with_the_nearest_key(text, message):
@@ -193,7 +193,7 @@ def test_what_has_no_form_in_a_file_is_refused():
             )
         },
     ):
-        with pytest.raises(InputError, match="no form in a file"):
+        with pytest.raises(InputError, match="cannot be written to a file"):
             scenario_to_toml(dataclasses.replace(base, **change))
 
 

@@ -196,7 +196,7 @@ def test_a_hard_iron_is_named_where_the_innovations_are_not_white():
     assert found.causes
     assert found.causes[0].name == "hard iron"
     assert not found.moves_with_the_rate
-    assert any("Likeliest cause" in words for words in found.words)
+    assert any("Most likely cause" in words for words in found.words)
 
 
 # ------------------------------------------------------------------------------------------------ gyros of two kinds

@@ -16,6 +16,7 @@ from strapdown.vectors import (
     AttitudeSensor,
     Faults,
     HeadingPair,
+    HorizonSensor,
     Magnetometer,
     VectorMeasurements,
     VectorSensor,
@@ -48,6 +49,7 @@ EVERY = [
     Accelerometer(name="vertical", sigma=0.01, rate=4.0),
     Accelerometer(name="whole force", sigma=0.01, rate=4.0, kind="vector"),
     HeadingPair(name="antennas", baseline_b=[2.0, 0.0, 0.0], sigma=0.01, rate=4.0),
+    HorizonSensor(name="horizon", orbit=orbit.CircularOrbit(), sigma=1e-3, rate=4.0),
 ]
 
 
@@ -69,10 +71,13 @@ def test_without_noise_a_sensor_measures_its_reference_in_body_axes(sensor):
 
 @pytest.mark.parametrize("sensor", EVERY, ids=lambda sensor: sensor.name)
 def test_noise_has_the_sigma_that_the_series_states(sensor):
-    series = observe(sensor, body=motion.rest(), end=5000.0)
-    n = len(series.time)
+    """Beside it noise so quick that it is white, of twice the σ, in the same unit."""
+    size = 2.0 * getattr(sensor, "sigma", 1e-4)
+    quick = dataclasses.replace(sensor, faults=Faults(correlated_sigma=size, correlation_time=1e-6))
+    series = observe(quick, body=motion.rest(), end=5000.0)
+    n, ratio = len(series.time), 2.0 * np.ones(3)
     if series.kind == "attitude":
-        score = quaternion.log(series.attitude) / series.sigma_axes
+        score, ratio = quaternion.log(series.attitude) / series.sigma_axes, size / sensor.sigma_axes
     elif series.kind == "vector":
         score = (series.vector_b - series.references_f) / series.sigma[:, None]
     elif series.kind == "heading":
@@ -83,9 +88,9 @@ def test_noise_has_the_sigma_that_the_series_states(sensor):
         rows = [triad(r)[:2] @ z for r, z in zip(series.references_f, series.vector_b, strict=True)]
         score = np.array(rows) / series.sigma[:, None]
     assert score.shape[1] == vectors.KINDS[series.kind]
-    for column in score.T:
-        assert abs(column.mean()) < 4.5 / math.sqrt(n)
-        assert abs(column.var() - 1.0) < 4.5 * math.sqrt(2.0 / n) + 1e-3
+    for column, variance in zip(score.T, 1.0 + ratio**2, strict=False):
+        assert abs(column.mean()) < 4.5 * math.sqrt(variance / n)
+        assert abs(column.var() / variance - 1.0) < 4.5 * math.sqrt(2.0 / n) + 1e-3
     correlation = np.atleast_2d(np.corrcoef(score.T)) - np.eye(score.shape[1])
     assert np.max(np.abs(correlation)) < 4.5 / math.sqrt(n)
 

@@ -284,7 +284,7 @@ REFUSED = {
     ),
     "closer than the noise": (
         ([EYE[0], EYE[0] + 1e-4 * EYE[1]],) * 2 + (1e-3,),
-        "1σ of its worst known turn is 1[0-9.]* rad.*0.005729",
+        "1σ of its least determined rotation is 1[0-9.]* rad.*0.005729",
     ),
     "nearly opposite": (([EYE[0], 1e-4 * EYE[1] - EYE[0]],) * 2 + (1e-3,), "179.99"),
     "parallel in the body only": (

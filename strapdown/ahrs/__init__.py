@@ -1,8 +1,8 @@
-"""Attitude and heading from a recording: accelerometer as the vertical, magnetometer as the heading only, one filter for both.
+"""Attitude and heading from a recording: one filter, with the accelerometer for the vertical and the magnetometer for the heading only.
 
-The fixed frame is East-North-Up with magnetic North. The disturbances of both vectors last much longer than a sample, so little is lost by
-updating less often than the sensors sample: the samples of a step are turned by the gyro into one frame and averaged there
-(:mod:`strapdown.ahrs.preparing`). The filter is that of :mod:`strapdown.estimation`; its estimate is carried to every stamp.
+The fixed frame is East-North-Up with magnetic North. The disturbances of both vectors last much longer than a sample interval, so little is
+lost by updating at a lower rate than the sensors': the samples of a step are rotated by the gyro into one frame and averaged
+(:mod:`strapdown.ahrs.preparing`). The filter is that of :mod:`strapdown.estimation`; its estimate is propagated to every time stamp.
 """
 
 from __future__ import annotations

@@ -1,17 +1,17 @@
-"""Check of conventions: which discrete mistake explains a recording? Conjugated quaternions, swapped axes, wrong frames and units.
+"""Check of conventions of a recording: conjugated quaternions, swapped axes, wrong frames and units.
 
-A recording that follows the conventions of :mod:`strapdown` satisfies a few plain relations, whatever the motion:
+A recording that follows the conventions of :mod:`strapdown` satisfies these relations, whatever the motion:
 
 - the rotation measured by the gyro over a short window is that of the reference attitude, log(q₁⁻¹ ⊗ q₂);
-- the specific force, rotated to the fixed frame by the reference, is gravity's reaction on average over some seconds, for no body
-  accelerates one way for long; the magnetic field points North and up or down;
-- without a reference: rotated by the integrated gyro, both stay constant over some seconds, and so keep their strength in the mean;
-  and the angle between both means is always the same.
+- the specific force, rotated to the fixed frame by the reference, is the reaction to gravity on average over some seconds, because no body
+  accelerates in one direction for long; the magnetic field points North and up or down;
+- without a reference: specific force and field, rotated by the integrated gyro, are constant over some seconds, so their means keep their
+  magnitude, and the angle between both means is always the same.
 
-Each hypothesis (order and direction of the quaternions, fixed frame, which of the 48 permutations and inversions of a sensor's
-axes, which unit) is applied, and its misfit m of each relation computed: 0 of a perfect fit, 1 of unrelated data, 2 of opposite
-data. The score is a log-likelihood, ``−½ 3K ln(m + m₀)`` summed over the relations, K = 20, m₀ the misfit of a good recording, less
-5 for each change from what the recording declares: of two explanations that fit alike the simpler one is named.
+Each hypothesis (order and direction of the quaternions, fixed frame, one of the 48 permutations and inversions of a sensor's axes, unit)
+is applied, and the misfit m of each relation computed: 0 for a perfect fit, 1 for unrelated data, 2 for opposite data. The score is a
+log-likelihood, ``−½ 3K ln(m + m₀)`` summed over the relations, with K = 20 and m₀ the misfit of a good recording, less 5 for each change
+from the declared conventions: of two explanations that fit equally well, the simpler one is reported.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ AXES: tuple[Array, ...] = tuple(
     for order in itertools.permutations(range(3))
     for signs in itertools.product((1.0, -1.0), repeat=3)
 )
-"""All 48 ways to swap and invert axes, the identity first."""
+"""All 48 permutations and inversions of the axes, the identity first."""
 _ALL = np.stack(AXES)
 
 ATTITUDE_READINGS: dict[str, Callable[[Array], Array]] = {
@@ -49,54 +49,53 @@ ATTITUDE_READINGS: dict[str, Callable[[Array], Array]] = {
     "scalar-last": lambda q: np.roll(q, 1, axis=-1),
     "scalar-last and conjugated": lambda q: quaternion.conjugate(np.roll(q, 1, axis=-1)),
 }
-"""Conversions of quaternions in other conventions to body to fixed, scalar first."""
+"""Conversions of quaternions in other conventions to q_fb (body to fixed), scalar first."""
 
 FRAMES: dict[str, Array] = {
     "East-North-Up": np.eye(3),
     "North-East-Down": np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]),
     "North-West-Up": np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
 }
-"""Fixed frames, and what takes their components to East-North-Up."""
+"""Fixed frames, with the matrices that transform their components to East-North-Up."""
 
 
 def _unit(fault: str, taken: str, sensor: str, unit: str) -> str:
-    """Return a wrong unit with its remedy."""
+    """Return the description of a wrong unit, with its remedy."""
     return f"{fault} ({taken}: --{sensor}-unit {unit}; units={{{sensor!r}: {unit!r}}} in Python)"
 
 
 GYRO_UNITS: dict[str, float] = {
     "": 1.0,
-    _unit("gyro rates are 57.3 times too large", "deg/s taken for rad/s", "gyro", "deg/s"): math.pi / 180.0,
-    _unit("gyro rates are 57.3 times too small", "rad/s taken for deg/s", "gyro", "rad/s"): 180.0 / math.pi,
+    _unit("gyro rates are 57.3 times too large", "deg/s read as rad/s", "gyro", "deg/s"): math.pi / 180.0,
+    _unit("gyro rates are 57.3 times too small", "rad/s read as deg/s", "gyro", "rad/s"): 180.0 / math.pi,
 }
 FORCE_UNITS: dict[str, float] = {
     "": 1.0,
-    _unit("specific force is 9.81 times too small", "g taken for m/s²", "accelerometer", "g"): STANDARD_GRAVITY,
-    _unit("specific force is 9.81 times too large", "m/s² taken for g", "accelerometer", "m/s2"): 1.0
-    / STANDARD_GRAVITY,
+    _unit("specific force is 9.81 times too small", "g read as m/s²", "accelerometer", "g"): STANDARD_GRAVITY,
+    _unit("specific force is 9.81 times too large", "m/s² read as g", "accelerometer", "m/s2"): 1.0 / STANDARD_GRAVITY,
 }
 
 PENALTY = 5.0
 FLOORS = {"reference": 0.003, "vectors": 0.04}
-"""m₀ of relations to a reference, and of those between sensors alone, which accelerations and the gyro's bias disturb."""
+"""m₀ of relations to a reference, and of those between sensors only, which accelerations and the gyro's bias disturb."""
 WINDOWS = 50
-"""Windows evaluated."""
+"""Maximum number of windows evaluated."""
 INDEPENDENT = 20
 """Effective number of windows: their disturbances are not independent."""
 MARGIN = 5.0
-"""Difference in score that separates one explanation from another."""
+"""Minimum difference in score between distinguishable explanations."""
 MAX_EQUAL = 8
-"""Largest number of equally good explanations that can be symmetries of the relations; with more the recording is too poor."""
+"""Maximum number of equally good explanations, which may be symmetries of the relations; above it the recording has too little motion."""
 POOR = 0.4
-"""Misfit of the gyro above which even the best explanation is rejected."""
+"""Misfit above which the best explanation is rejected, if every relation exceeds it."""
 MIN_TURN = 0.5
-"""Rotation, rad, summed over the windows used, below which nothing can be decided."""
+"""Minimum rotation, rad, summed over the windows used, for a decision."""
 FASTEST = 4000.0 * DEGREE
 """Rate, rad/s, beyond the range of nearly all gyros."""
 
 
 def axes_words(matrix: Array) -> str:
-    """Return a signed permutation as the axes that it makes of x, y, z, such as "x, −z, y"."""
+    """Return a signed permutation in words, such as "x, −z, y"."""
     names = []
     for row in matrix:
         k = int(np.argmax(np.abs(row)))
@@ -111,7 +110,7 @@ class Candidate:
     Parameters
     ----------
     changes : tuple of str
-        Departures from what the recording declares; empty: none.
+        Changes of the declared conventions; empty: none.
     score : float
         Log-likelihood less the penalty for changes.
     misfit : mapping of str to float
@@ -139,13 +138,13 @@ class Examination:
     verdict : {"as declared", "wrong convention", "cannot tell"}
         Verdict.
     reason : str
-        Why, in one sentence.
+        Reason of the verdict, in one sentence.
     candidates : tuple of Candidate
         The best explanations, by score.
     notes : tuple of str, default empty
-        What this recording cannot show.
+        Conventions that cannot be checked with this recording.
     doubts : tuple of str, default empty
-        Implausible values, whatever the convention.
+        Values that are implausible under any convention.
     """
 
     source: str
@@ -182,12 +181,12 @@ class Examination:
 
 
 def examine(recording: Recording) -> Examination:
-    """Return which conventions a recording follows, by comparison with the alternatives.
+    """Check which conventions a recording follows, by comparison with the alternatives.
 
     Parameters
     ----------
     recording : Recording
-        Recording with a reference attitude, an accelerometer or a magnetometer; each of them adds to what can be found.
+        Recording with a reference attitude, an accelerometer or a magnetometer; each of them allows more checks.
 
     Returns
     -------
@@ -197,14 +196,15 @@ def examine(recording: Recording) -> Examination:
     Raises
     ------
     InputError
-        If the recording holds a gyro alone, with which nothing can be compared.
+        If the recording has only a gyro, with which nothing can be compared.
     """
     if all(value is None for value in (recording.true_attitude, recording.specific_force, recording.magnetic_field)):
         raise InputError(
-            f"{recording.source} holds a gyro alone; a reference attitude, an accelerometer or a magnetometer is needed too"
+            f"{recording.source} has only a gyro; a reference attitude, an accelerometer or a magnetometer is needed too"
         )
     unit_changes, doubts = _force_unit(recording)
     doubts += _too_fast(recording)
+    unsaid = [f"as it seems, {words}" for words in unit_changes]  # gravity alone shows it, whatever the turns do
     upright = at_rest(recording)
     found = list(_with_reference(recording) if recording.true_attitude is not None else _without_reference(recording))
     notes = _unseen(recording)
@@ -212,10 +212,10 @@ def examine(recording: Recording) -> Examination:
         return Examination(
             source=recording.source,
             verdict="cannot tell",
-            reason="the recording hardly turns, or has too few samples",
+            reason="the recording has hardly any rotation, or too few samples",
             candidates=(),
             notes=tuple(notes),
-            doubts=tuple(upright + doubts),
+            doubts=tuple(upright + unsaid + doubts),
         )
     candidates = [
         Candidate(
@@ -231,7 +231,7 @@ def examine(recording: Recording) -> Examination:
         result = replace(
             result, verdict="cannot tell", reason="the sensors agree with each other; see the warning on their sign"
         )
-    return replace(result, doubts=tuple(upright + doubts))
+    return replace(result, doubts=tuple(upright + (unsaid if result.verdict == "cannot tell" else []) + doubts))
 
 
 def _concluded(source: str, candidates: list[Candidate], sure: tuple[str, ...], notes: list[str]) -> Examination:
@@ -243,12 +243,12 @@ def _concluded(source: str, candidates: list[Candidate], sure: tuple[str, ...], 
     verdict: Literal["as declared", "wrong convention", "cannot tell"]
     if min(best.misfit.values()) > POOR:
         verdict = "cannot tell"
-        reason = "no explanation tried fits: the best leaves " + ", ".join(
-            f"{name} with a misfit of {value:.2f}" for name, value in best.misfit.items()
+        reason = "no explanation tried fits; misfits of the best one: " + ", ".join(
+            f"{name} {value:.2f}" for name, value in best.misfit.items()
         )
     elif len(equal) > MAX_EQUAL:
         verdict = "cannot tell"
-        reason = f"{len(equal)} other explanations fit as well as “{named.words}”: the recording turns too little, or about one axis only"
+        reason = f"{len(equal)} other explanations fit as well as “{named.words}”: the rotation is too small, or about one axis only"
     elif named is plain:
         verdict = "wrong convention" if sure else "as declared"
         reason = "; ".join(sure) if sure else "no change explains the recording better than its declared conventions"
@@ -262,20 +262,20 @@ def _concluded(source: str, candidates: list[Candidate], sure: tuple[str, ...], 
 
 
 REST_SPREAD = 0.05
-"""σ of the specific force over the quiet second, as a share of its mean, above which the unit does not rest."""
+"""Maximum σ of the specific force over the quiet second, relative to its mean, of a unit at rest."""
 REST_STRENGTH = 0.15
-"""Deviation of the mean specific force from gravity, as a share of it, above which it is not gravity alone."""
+"""Maximum relative deviation of the mean specific force from gravity, of a unit at rest."""
 DOWN = 0.7
 """Share of gravity along the body's −z axis above which z points down."""
 MIN_DIP = 10.0 * DEGREE
-"""Angle of the field to the horizontal below which it does not distinguish up from down."""
+"""Minimum angle of the field to the horizontal for it to distinguish up from down."""
 
 
 def at_rest(recording: Recording) -> list[str]:
-    """Return what gravity and the field at rest say against body axes with z up and an accelerometer that reads +g upward.
+    """Return warnings if gravity and the field at rest contradict body axes with z up or an accelerometer that reads +g upward.
 
     The sensors of a body whose z axis points down agree with each other, and so do those of a unit with an inverted accelerometer; the
-    attitude is then half a turn off what is expected. A reference attitude shows it, and is compared by :func:`examine`.
+    attitude is then in error by 180°. With a reference attitude the error is found by :func:`examine`.
     """
     seen = None if recording.true_attitude is not None else _resting(recording)
     if seen is None:
@@ -303,18 +303,18 @@ def at_rest(recording: Recording) -> list[str]:
 
 
 def _resting(recording: Recording) -> tuple[float, float, float | None] | None:
-    """Return the share of gravity along the body's z axis, the reading there, m/s², and the field's dip, rad; None without rest."""
+    """Return the share of gravity along the body's z axis, the reading there, m/s², and the field's dip, rad; None if not at rest."""
     force = recording.specific_force
     try:
         quiet = quiet_span(recording)
-    except InputError:  # too short to say
+    except InputError:  # too short
         return None
     if force is None or not (known := np.isfinite(force[quiet]).all(axis=1)).any():
         return None
     samples = force[quiet][known]
     mean = samples.mean(axis=0)
     strength = float(np.linalg.norm(mean))
-    unit = STANDARD_GRAVITY if strength > math.sqrt(STANDARD_GRAVITY) else 1.0  # m/s², or g taken for m/s²
+    unit = STANDARD_GRAVITY if strength > math.sqrt(STANDARD_GRAVITY) else 1.0  # m/s², or g read as m/s²
     moving = np.linalg.norm(samples.std(axis=0)) >= REST_SPREAD * strength
     if moving or abs(strength / unit - 1.0) > REST_STRENGTH:
         return None
@@ -341,7 +341,7 @@ def _force_unit(recording: Recording) -> tuple[tuple[str, ...], list[str]]:
     distances = {words: abs(math.log(strength * factor / STANDARD_GRAVITY)) for words, factor in FORCE_UNITS.items()}
     words = min(distances, key=lambda name: distances[name])
     if distances[words] > 0.5:
-        return (), [f"the specific force of {strength:.3g} m/s² in the median fits neither m/s² nor g"]
+        return (), [f"the median specific force, {strength:.3g} m/s², fits neither m/s² nor g"]
     return ((words,) if words else ()), []
 
 
@@ -351,8 +351,8 @@ def _too_fast(recording: Recording) -> list[str]:
     if speed[k] <= FASTEST:
         return []
     return [
-        f"the gyro reads {speed[k] / DEGREE:.3g} °/s at {recording.time[k]:.6g} s and in {np.mean(speed > FASTEST):.2%} of its samples "
-        f"of more than {FASTEST / DEGREE:g} °/s, which hardly any gyro measures"
+        f"the gyro reads {speed[k] / DEGREE:.3g} °/s at {recording.time[k]:.6g} s, and {np.mean(speed > FASTEST):.2%} of its samples "
+        f"exceed {FASTEST / DEGREE:g} °/s, the range of nearly all gyros"
     ]
 
 
@@ -360,15 +360,15 @@ def _unseen(recording: Recording) -> list[str]:
     notes = []
     if recording.true_attitude is None:
         notes.append(
-            "without a reference attitude nothing reveals an accelerometer (or magnetometer) inverted on all axes, "
-            "axes swapped alike on all sensors, nor the fixed frame"
+            "without a reference attitude these cannot be checked: an accelerometer (or magnetometer) inverted on all axes, "
+            "axes swapped alike on all sensors, the fixed frame"
         )
         if recording.specific_force is None or recording.magnetic_field is None:
-            notes.append("with one sensor beside the gyro nothing shows which of the two has its axes wrong")
+            notes.append("with only one sensor besides the gyro, it cannot be decided which of the two has wrong axes")
     elif recording.magnetic_field is None:
-        notes.append("without a magnetometer nothing separates a wrong frame from an inverted accelerometer")
+        notes.append("without a magnetometer a wrong frame cannot be distinguished from an inverted accelerometer")
     elif recording.specific_force is None:
-        notes.append("without an accelerometer nothing shows which way is up")
+        notes.append("without an accelerometer the vertical cannot be checked")
     return notes
 
 
@@ -377,18 +377,18 @@ def _score(misfit: float, kind: str = "reference") -> float:
 
 
 SPAN = 4.0
-"""Length of the windows over which vectors are averaged, s: accelerations average out, a gyro's bias does not turn far."""
+"""Duration of the windows over which vectors are averaged, s: accelerations average out, and the gyro's bias causes a small rotation."""
 MIN_INTERVAL = 0.02
-"""Vectors are taken at most so often, s."""
+"""Minimum interval of the samples of a vector used, s."""
 
 
 class _Windows(NamedTuple):
-    """Windows in which the body turns most, and the samples of a vector there."""
+    """Windows with the fastest rotation, and the samples of a vector there."""
 
     rows: np.ndarray
-    """Their rows in the recording (m,)."""
+    """Rows of the samples in the recording (m,)."""
     vectors: Array
-    """Over their strength (m, 3)."""
+    """Vectors relative to their median magnitude (m, 3)."""
     begin: np.ndarray
     """First sample of each window but the first."""
     counts: np.ndarray
@@ -431,7 +431,7 @@ def _windows(recording: Recording, vectors: Array | None, known: np.ndarray | bo
 # ------------------------------------------------------------------------------------------------------------------ with a reference
 
 REFERENCE_SPAN = 0.1
-"""Length of the windows over which the turns of gyro and reference are compared, s."""
+"""Duration of the windows over which the rotations of gyro and reference are compared, s."""
 
 
 def _with_reference(recording: Recording) -> Iterator[Candidate]:
@@ -472,9 +472,9 @@ def _with_reference(recording: Recording) -> Iterator[Candidate]:
 
 
 def _turns(recording: Recording, known: np.ndarray) -> tuple[np.ndarray, np.ndarray, Array]:
-    """Return first and last samples of the short windows with the largest turns, and the rotations (k, 3) that the gyro measured over them.
+    """Return first and last samples of the short windows with the largest rotations, and the rotations (k, 3) measured there by the gyro.
 
-    ``known`` masks the samples that a window may begin and end at.
+    ``known`` masks the samples at which a window may begin and end.
     """
     total = np.concatenate([np.zeros((1, 3)), np.cumsum(increments(recording), axis=0)])
     step = max(1, round(REFERENCE_SPAN / float(np.median(np.diff(recording.time)))))
@@ -486,7 +486,7 @@ def _turns(recording: Recording, known: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 _Fits = dict[tuple[int, str], float]
-"""Misfit by number of the axes in AXES, and words of the unit."""
+"""Misfit by index of the axes in AXES and description of the unit."""
 
 
 def _gyro_fits(turn: Array, reference: Array) -> _Fits:
@@ -507,7 +507,7 @@ def _force_fits(v: Array) -> _Fits:
 
 
 def _field_fits(v: Array) -> _Fits:
-    """Return misfits of the mean field, likewise, with the best one that points North, of any dip."""
+    """Return misfits of the mean field with the best-fitting field that points North, of any dip."""
     _, north, up = v.mean(axis=1).T
     along = np.where(north > 0.0, np.hypot(north, up), np.abs(up))
     misfit = 1.0 - 2.0 * along / (np.mean(np.sum(v**2, axis=2), axis=1) + 1.0)
@@ -515,7 +515,7 @@ def _field_fits(v: Array) -> _Fits:
 
 
 def _combined(common: tuple[str, ...], parts: dict[str, _Fits]) -> Iterator[Candidate]:
-    """Yield the best few settings of all sensors together, and those that swap the axes of all of them alike."""
+    """Yield combinations of the best settings of each sensor, and those that change the axes of all sensors alike."""
 
     def penalised(item: tuple[tuple[int, str], float]) -> float:
         (k, unit), misfit = item
@@ -558,10 +558,10 @@ def _candidate(changes: tuple[str, ...], misfit: dict[str, float], kind: str = "
 
 
 def _without_reference(recording: Recording) -> Iterator[Candidate]:
-    """Yield explanations with one sensor at fault: two at once could not be separated from a third.
+    """Yield explanations with one wrong sensor: two wrong sensors could not be distinguished from the third one being wrong.
 
-    Increments P Δθ of proper axes P integrate to P R Pᵀ, so gyro axes P do to a vector's mean what axes Pᵀ of its own sensor do; improper
-    ones are those of the inverted gyro, which is integrated by itself.
+    For a proper rotation P of the gyro's axes, increments P Δθ integrate to P R Pᵀ. P therefore has the same effect on a vector's mean as
+    axes Pᵀ of the vector's sensor. An improper P is a proper one of the inverted gyro, which is integrated separately.
     """
     windows = {
         name: found
@@ -592,7 +592,7 @@ def _without_reference(recording: Recording) -> Iterator[Candidate]:
 
 
 def _fixed_misfits(means: dict[str, Array], axes: dict[str, Array]) -> dict[str, float]:
-    """Return by how much the means fall short of the vectors' strength, and the spread of the angle between two of them."""
+    """Return the relative loss of magnitude of the means, and the spread of the angle between two of them."""
     vectors = {name: _turned(mean, axes[name]) for name, mean in means.items()}
     length = {name: np.linalg.norm(v, axis=1) for name, v in vectors.items()}
     misfit = {f"gyro and {name}": max(0.0, 1.0 - float(np.mean(size))) for name, size in length.items()}

@@ -1,4 +1,4 @@
-"""The filter over a recording, and its estimate at every stamp."""
+"""Estimation over a recording, with the estimate at every time stamp."""
 
 from __future__ import annotations
 
@@ -29,31 +29,31 @@ from strapdown.records import ErrorStateEstimate, Estimate, ImuRecord, Innovatio
 from strapdown.records.recording import sampled
 
 LEVEL_TIME = 5.0
-"""Time constant over which the level of the acceleration is found, s."""
+"""Time constant of the average that gives the level of the acceleration, s."""
 OWN_SHARE = 0.1
-"""Share of the modelled variance, of the tilt or an innovation, that does not follow the acceleration's level: the sensor's own errors."""
+"""Share of the modelled variance of the tilt or an innovation that comes from the sensor's errors, whatever the acceleration's level."""
 ACCELERATION_SHARE = 0.7
-"""Share of the tilt's that follows the root of that level: the steady-state variance goes as the σ of the acceleration."""
+"""Share of the tilt variance that is proportional to the root of that level, as the steady-state variance is to σ of the acceleration."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class AhrsEstimate:
-    """An estimate beside the samples that it was made from, one row for one row.
+    """An estimate with the samples that it was made from, row by row.
 
     Parameters
     ----------
     recording : Recording
         The recording from its first quiet second on, clipped gyro samples restored.
     estimate : Estimate
-        Attitude and gyro bias at the stamps of the recording; the covariance of the tilt and the variance of the
-        accelerometer's innovations follow the acceleration's level so far, and the former includes timing and constant
-        iron, which the filter does not estimate.
+        Attitude and gyro bias at the stamps of the recording. The covariance of the tilt and the variance of the accelerometer's
+        innovations follow the level of the acceleration up to each stamp; the covariance includes timing errors and constant iron,
+        which the filter does not estimate.
     record : ImuRecord
-        What the filter processed: increments and vectors averaged over its steps.
+        Input of the filter: increments and vectors averaged over its steps.
     initial : State
-        Where the filter started.
+        Initial state of the filter.
     parameters : AhrsParameters
-        The filter's model, with the velocity that the recording shows.
+        Parameters of the filter, with the velocity found from the recording.
     delays : Delays
         Delays of the sensors' samples, s, for which the estimate is corrected.
     faults : Faults
@@ -61,7 +61,7 @@ class AhrsEstimate:
     hard_iron : ndarray (3,)
         Hard iron subtracted from the magnetometer's samples at the end, body axes, in their unit; 0: none was found.
     calibration : UnitCalibration or None
-        What the recording shows of the unit, for its next recording; None where the filter has no states for it.
+        Calibration of the unit found from the recording, for its next recording; None if the filter has no states for it.
     """
 
     recording: Recording
@@ -86,35 +86,35 @@ def estimate(
     full_covariance: bool = False,
     smooth: bool = False,
 ) -> AhrsEstimate:
-    """Return attitude and gyro bias over a recording, at its time stamps from the first quiet second on.
+    """Return attitude and gyro bias at the time stamps of a recording, from its first quiet second on.
 
     Parameters
     ----------
     recording : Recording or Begun
-        Samples of gyro, accelerometer and, if there is one, magnetometer; as :func:`strapdown.ahrs.begin` returns it, where
-        :func:`strapdown.ahrs.motions.chosen` needs that too.
+        Samples of a gyro, an accelerometer and optionally a magnetometer. The result of :func:`strapdown.ahrs.begin` can be given
+        instead, for example one that :func:`strapdown.ahrs.motions.chosen` has used.
     parameters : AhrsParameters
         The filter's model of the unit and of its motion.
     latency : float, optional
         Delay of the gyro's and the accelerometer's samples, s: the group delay of the sensors; 0: point samples at their stamps. By
-        default each sample is taken for the mean over the interval before its stamp, half of which is its delay. That of the
-        magnetometer beside the gyro is found by :func:`strapdown.recordings.sensor_delays.magnetometer_delay`.
+        default each sample is treated as the mean over the interval before its stamp, so its delay is half the interval. The delay of
+        the magnetometer relative to the gyro is found by :func:`strapdown.recordings.sensor_delays.magnetometer_delay`.
     calibration : UnitCalibration, optional
-        What an earlier recording of the same unit showed: scale and misalignment of its gyro, the magnetometer's delay.
+        Calibration from an earlier recording of the same unit: scale and misalignment of its gyro, the magnetometer's delay.
     gate : Gate, optional
-        Refuse measurements that the filter's model does not explain.
+        Rejects measurements whose innovation is too large for its predicted covariance.
     robust : Robust, optional
-        Weigh measurements by how far they lie off, each sensor by itself.
+        Reduces the weight of measurements with large innovations, separately for each sensor.
     full_covariance : bool
-        Keep whole covariance matrices too.
+        Whether to keep whole covariance matrices too.
     smooth : bool
-        From all samples, by the fixed-interval smoother, instead of those up to each stamp.
+        Whether to use all samples, with the fixed-interval smoother, instead of those up to each stamp.
 
     Returns
     -------
     AhrsEstimate
-        Without ``smooth`` each row depends on the samples up to its stamp alone, but for the choice of the quiet second and, with
-        ``velocity_from_record``, of the velocity: both are from the whole recording.
+        Without ``smooth``, each row depends only on the samples up to its stamp, except for the choice of the quiet second and, with
+        ``velocity_from_record``, for the velocity: both are from the whole recording.
 
     Raises
     ------
@@ -160,9 +160,9 @@ def _run(
 ) -> Estimate:
     """Return the filter's or the smoother's estimate at the steps.
 
-    Where the gyro does not show how the unit turned, the record is run in parts, each with an angle random walk of its own: that of the
-    gyro, or as much more as makes up ``turn_variance`` (n,), rad², of the sample intervals. Each part is smoothed by itself, for samples
-    after such a part say little about what was before it.
+    If the rotation over some sample intervals is uncertain (``turn_variance`` (n,), rad², is positive), the record is run in parts. The
+    angle random walk of each part is that of the gyro plus that variance spread over the part. Each part is smoothed separately, because
+    samples after an interval of unknown rotation have little information about the attitude before it.
     """
     record, own = prepared.record, parameters.setup
     kinds = {series.sensor: series.kind for series in record.vectors}
@@ -202,7 +202,7 @@ def _at_stamps(
     smooth: bool,
     full_covariance: bool,
 ) -> Estimate:
-    """Return the estimate at the recording's stamps: carried on by the gyro from the step before each, and over the delay of the gyro."""
+    """Return the estimate at the recording's stamps: propagated by the gyro from the step before each stamp, and over the gyro's delay."""
     edge, n = prepared.edge, len(used.time)
     attitude, bias, variance = side_by_side(*(((n, width), float) for width in (4, 3, 6)))
     (P,) = side_by_side(((n if full_covariance else 0, 6, 6), float))
@@ -240,7 +240,7 @@ def _at_stamps(
 
 
 class _OfRows(Mapping[str, ErrorStateEstimate]):
-    """Error states at the rows that ``row`` returns (n,), each gathered when it is asked for."""
+    """Error states at the rows that ``row`` returns (n,), each gathered on access."""
 
     def __init__(self, states: Mapping[str, ErrorStateEstimate], row: Callable[[], np.ndarray]) -> None:
         self.states, self.row = states, row
@@ -257,10 +257,10 @@ class _OfRows(Mapping[str, ErrorStateEstimate]):
 
 
 def _level(filtered: Estimate, uncertain: np.ndarray) -> Array:
-    """Return the level (k + 1,) of the acceleration so far at the edges of the steps: its variance, as a share of that modelled.
+    """Return the level (k + 1,) of the acceleration up to each edge of the steps: its variance, relative to that modelled.
 
-    One model holds for slow and fast motion, so most motion is slower than modelled. Without a measurement, and at first and in steps
-    whose turn is ``uncertain`` (k,), the level is taken for that modelled.
+    The same model serves slow and fast motion, so most motion is slower than modelled. The level is set to 1 at the start, without a
+    measurement, and in steps whose rotation is ``uncertain`` (k,).
     """
     seen = filtered.innovations["accelerometer"]
     nis = np.ones((len(filtered.time), 1))
@@ -272,7 +272,7 @@ def _level(filtered: Estimate, uncertain: np.ndarray) -> Array:
 
 
 def _innovations(filtered: Estimate, level: Array) -> dict[str, Innovations]:
-    """Return the innovations, the variance of the accelerometer's by the level before each, as that of the tilt."""
+    """Return the innovations; the variance of the accelerometer's is scaled, as that of the tilt, by the level before each."""
     own = filtered.innovations["accelerometer"]
     before = level[np.searchsorted(filtered.time, own.time) - 1]
     share = OWN_SHARE + (1.0 - OWN_SHARE) * before

@@ -1,7 +1,7 @@
 """Heading measurements from a magnetometer.
 
-What disturbs the heading, iron in the unit and in the surroundings, shows in the strength and the dip of the field too. The heading's noise
-follows their deviation, and is the larger the steeper the field.
+Iron in the unit and in the surroundings disturbs the heading, and the magnitude and the dip of the field too. The noise of the heading is
+computed from their deviation, and is larger for a steeper field.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ from strapdown.vectors import VectorMeasurements
 
 NORTH = np.array([0.0, 1.0, 0.0])
 VERTICAL_TIME = 1.0
-"""Time constant of the low-pass that gives the vertical beside which the field's dip is judged, s."""
+"""Time constant of the low-pass filter for the vertical from which the field's dip is measured, s."""
 
 
 class FieldSteps(NamedTuple):
-    """Samples averaged over the filter's steps, in the frame that the gyro keeps."""
+    """Samples averaged over the filter's steps, in the frame fixed by the integrated gyro."""
 
     field: Array
     """Field (k, 3)."""
     frame: Array
     """Attitude by the gyro in the middle of each step (k, 4)."""
     length: Array
-    """Time that the field's samples of each step stand for, s; 0: none (k,)."""
+    """Duration that the field's samples of each step cover, s; 0: none (k,)."""
     force: Array
     """Specific force (k, 3)."""
     at_edge: Array
@@ -42,7 +42,7 @@ class FieldSteps(NamedTuple):
 
 
 def measured(steps: FieldSteps, parameters: AhrsParameters, *, causal: bool) -> tuple[VectorMeasurements, float, Array]:
-    """Return the heading measurements, the dip at the start, and the hard iron taken off (k, 3), body axes, in the unit of the field."""
+    """Return the heading measurements, the dip at the start, and the hard iron subtracted (k, 3), body axes, in the unit of the field."""
     known = steps.length > 0.0
     first = known & (np.arange(len(known)) < steps.start)
     first = first if first.any() else known
@@ -55,12 +55,13 @@ def measured(steps: FieldSteps, parameters: AhrsParameters, *, causal: bool) -> 
     iron = hard_iron.find(steps.field, steps.frame, steps.time[1:], known, reference[0], causal=causal)
     field = steps.field
     if iron.any():
-        # Iron is taken off where strength and dip do not come farther from those at the start by it: it may have been attached or removed.
+        # Iron may have been attached or removed: it is subtracted only where that does not increase the deviation of magnitude and dip.
         without = _deviation(
             _strength_and_dip(field - quaternion.rotate(steps.frame, iron), vertical), reference, known, memory
         )
         odds = np.clip((as_measured - without) / (2.0 * parameters.field_deviation**2), -50.0, 0.0)
         iron *= (2.0 / (1.0 + np.exp(-odds)))[:, None]
+        iron[np.linalg.norm(iron, axis=1) < hard_iron.NEGLIGIBLE * reference[0]] = 0.0
         field = field - quaternion.rotate(steps.frame, iron)
         level = _strength_and_dip(field, vertical)
         reference = level[first].mean(axis=0)
@@ -72,7 +73,7 @@ def measured(steps: FieldSteps, parameters: AhrsParameters, *, causal: bool) -> 
 
 
 def _gathered(steps: FieldSteps, direction: Array, information: Array, heading_interval: float) -> VectorMeasurements:
-    """Return heading measurements from directions (k, 3) gathered over the heading interval, each with its own information (k,)."""
+    """Return heading measurements: directions (k, 3) averaged over the heading interval, weighted by their information (k,)."""
     time = steps.time
     edge = np.flatnonzero(np.diff(np.floor((time[1:] - time[0]) / heading_interval - 1e-6), append=np.inf))
     begin = np.append(0, edge[:-1] + 1)
@@ -91,14 +92,14 @@ def _gathered(steps: FieldSteps, direction: Array, information: Array, heading_i
 
 
 def _vertical(force: Array, interval: float) -> Array:
-    """Return the vertical (k, 3) from specific force twice passed through a low-pass."""
+    """Return the vertical (k, 3) from specific force passed twice through a low-pass filter."""
     share = interval / VERTICAL_TIME
     vertical = low_pass(low_pass(_held(force, np.asarray(force.any(axis=1))), share), share)
     return np.asarray(vertical / np.linalg.norm(vertical, axis=1, keepdims=True))
 
 
 def _strength_and_dip(field: Array, vertical: Array) -> Array:
-    """Return the strength of a field, and its angle below the level, rad (k, 2)."""
+    """Return the magnitude of a field, and its angle below the horizontal, rad (k, 2)."""
     strength = np.linalg.norm(field, axis=1)
     strength[strength == 0.0] = 1.0
     return np.column_stack(
@@ -107,12 +108,12 @@ def _strength_and_dip(field: Array, vertical: Array) -> Array:
 
 
 def _deviation(level: Array, reference: Array, known: np.ndarray, memory: float) -> Array:
-    """Return the mean square deviation of strength (share) and dip (rad) from those at the start (k,), ``memory`` intervals long."""
+    """Return the square deviation of magnitude (relative) and dip (rad) from the start, low-passed (k,); ``memory``: step/time constant."""
     square = (level[:, 0] / reference[0] - 1.0) ** 2 + (level[:, 1] - reference[1]) ** 2
     return low_pass(_held(square[:, None], known), memory)[:, 0]
 
 
 def _held(values: Array, known: np.ndarray) -> Array:
-    """Return rows (k, …) with each that is not known replaced by the last before it that is, or the first of all."""
+    """Return rows (k, …) with each unknown row replaced by the last known one before it, or by the first known one."""
     last = np.maximum.accumulate(np.where(known, np.arange(len(values)), -1))
     return np.asarray(values[np.where(last < 0, int(np.argmax(known)), last)])

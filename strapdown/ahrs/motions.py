@@ -1,7 +1,7 @@
-"""What moves a unit, from its recording: whether acceleration lasts.
+"""Kind of motion of a recorded unit, by a hand or by a vehicle: whether its acceleration lasts.
 
-The likelihood of the filter's innovations does not show it. At the filter's steps a smooth movement of the hand is predicted best by the
-acceleration of a vehicle, with which the heading and the tilt are lost; so what matters is compared, means over seconds.
+The likelihood of the filter's innovations does not distinguish them. Over a filter step a smooth movement of the hand is predicted best by
+the acceleration model of a vehicle, with which tilt and heading drift. Therefore means of the acceleration over seconds are compared.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from strapdown.recordings import Recording, increments
 from strapdown.units import STANDARD_GRAVITY
 
 AUTO = "auto"
-"""Word for the likelier of a hand and a vehicle."""
+"""Selects the maximum-likelihood kind of motion, hand or vehicle."""
 SPAN = 4.0
-"""Spans whose mean accelerations are compared, s: independent for a hand."""
+"""Duration of the spans whose mean accelerations are compared, s; those of a hand are independent."""
 MIN_ACCELERATION = 0.5
-"""RMS acceleration, m/s², of the models of a unit that hardly moves."""
+"""Minimum RMS acceleration of the models, m/s², for a unit that hardly moves."""
 
 
 def chosen(recording: Recording | Begun, motion: str = AUTO, *, name: str = "motion") -> tuple[str, float]:
-    """Return the motion named, or the likelier one, and its log-likelihood beyond that of the other; infinite of the one named.
+    """Return the motion named, or for "auto" the maximum-likelihood one, and its log-likelihood less that of the other (∞ if named).
 
-    ``name`` is what the caller calls it.
+    ``name`` is the name of the argument in error messages.
     """
     if one_of(name, motion, (AUTO, *MOTIONS)) != AUTO:
         return motion, math.inf
@@ -39,11 +39,11 @@ def chosen(recording: Recording | Begun, motion: str = AUTO, *, name: str = "mot
 
 
 def likelihoods(recording: Recording | Begun) -> dict[str, float]:
-    """Return the log-likelihoods of motion by a hand and by a vehicle: of the changes of mean specific force from span to span.
+    """Return the log-likelihoods of motion by a hand and by a vehicle, from the changes of mean specific force between adjacent spans.
 
-    In the frame that the gyro keeps, gravity changes with the error of the gyro alone: of its bias, of its scale, and where it was clipped.
-    What else changes is mean acceleration. That of a hand with a velocity of σ_v is of the order of σ_v over the span, that of a vehicle
-    hardly less than the acceleration itself.
+    In the frame fixed by the integrated gyro, gravity changes only by the gyro's errors: bias, scale factor, clipping. Any other change is
+    one of mean acceleration. For a hand with velocity σ_v it is of the order of σ_v over the span, for a vehicle hardly less than the
+    acceleration itself.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ def likelihoods(recording: Recording | Begun) -> dict[str, float]:
     Returns
     -------
     dict of str to float
-        By names of :data:`strapdown.ahrs.MOTIONS`.
+        Log-likelihoods by names of :data:`strapdown.ahrs.MOTIONS`.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""The filter's model of a unit and of what moves it."""
+"""The filter's model of a unit and of its motion."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from strapdown.estimation.setup.states import SensorStates, States
 from strapdown.units import DEGREE
 
 MIN_VELOCITY = 0.1
-"""σ of the velocity, m/s, of a unit that a recording shows at rest: it may have been moved slowly."""
+"""Minimum σ of the velocity, m/s: a unit that appears at rest in a recording may have been moved slowly."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class AhrsParameters:
-    """The filter's model of a unit and of what moves it. The defaults hold for consumer and industrial MEMS units under any motion.
+    """The filter's model of a unit and of its motion. The defaults hold for consumer and industrial MEMS units under any motion.
 
     Noises of the vectors are densities: σ of a mean over one second, whatever the recording's rate. They are much larger than the sensors'
-    own noise, because what disturbs them lasts over many samples. With ``velocity_sigma`` the acceleration has states
-    (:class:`strapdown.error_states.BoundedVelocity`), and ``specific_force_noise`` is what is left beside it.
+    own noise, because disturbances last over many samples. With ``velocity_sigma`` the acceleration has states
+    (:class:`strapdown.error_states.BoundedVelocity`), and ``specific_force_noise`` is the remaining noise.
 
     Parameters
     ----------
@@ -32,19 +32,18 @@ class AhrsParameters:
     rate_random_walk : float, default 1e-5
         Rate random walk σ_u, rad/s/√s.
     specific_force_noise : float, default 0.6
-        Noise density of the acceleration without states, each component, m/s²/√Hz.
+        Noise density of the part of the acceleration that has no states, each component, m/s²/√Hz.
     field_disturbance : float, default 0.05
-        Noise density of a field that is as strong and as steep as at the start, across it, as a share of its strength,
-        1/√Hz. That of the heading, rad/√Hz, is this over the cosine of the dip.
+        Noise density across the field, relative to its magnitude, 1/√Hz, while magnitude and dip are those at the start. The noise
+        density of the heading, rad/√Hz, is this divided by the cosine of the dip.
     field_deviation : float, default 0.025
-        Deviation of the field's strength (share) and dip (rad), as a root sum of squares, that doubles the variance of
-        that noise.
+        Deviation of the field's magnitude (relative) and dip (rad), as a root sum of squares, that doubles the variance of that noise.
     field_memory : float, default 0.5
-        Time constant over which that deviation is averaged, s: a disturbance does not end where the field happens to
-        look right.
+        Time constant of the average of that deviation, s: a field that momentarily has the expected magnitude and dip may still be
+        disturbed.
     iron_sigma : float, default 0.012
-        σ of a constant disturbance of the field that cannot be observed, as a share of its strength: part of the
-        reported σ, and not estimated.
+        σ of a constant, unobservable disturbance of the field, relative to its magnitude. It is part of the reported σ and is not
+        estimated.
     step : float, default 0.03
         Interval of the filter's steps, s.
     heading_interval : float, default 0.15
@@ -58,16 +57,16 @@ class AhrsParameters:
     velocity_sigma : float, default 0.0
         σ of the velocity of the unit, each component, m/s; 0: no states, all its acceleration is white.
     velocity_from_record : bool, default False
-        Whether a recording's own acceleration gives ``velocity_sigma`` (:attr:`strapdown.ahrs.Prepared.acceleration`); the
-        value here then stands only where there is no recording.
+        Whether ``velocity_sigma`` is computed from the acceleration of the recording (:attr:`strapdown.ahrs.Prepared.acceleration`);
+        the value given here is then used only without a recording.
     velocity_time : float, default 0.3
         Time constant of that velocity, s.
     acceleration_time : float, default 0.1
         Time constant of the acceleration, s.
     gyro_scale_sigma : float, default 0.0
-        σ of each of the gyro's scale factors, dimensionless, and misalignments, rad; 0: no states.
+        σ of each of the gyro's scale factor errors, dimensionless, and misalignments, rad; 0: no states.
     gyro_temperature_sigma : float or tuple (3,), default 0.0
-        σ of the slope of the gyro's bias over temperature, rad/s/K, by axis; 0: no states.
+        σ of the slope of the gyro's bias over temperature, each axis, rad/s/K; 0: no states.
     """
 
     angle_random_walk: float = 3e-3
@@ -112,7 +111,7 @@ class AhrsParameters:
         Returns
         -------
         AhrsParameters
-            With the ``velocity_sigma`` of that acceleration where ``velocity_from_record`` is set; unchanged else.
+            With the ``velocity_sigma`` of that acceleration if ``velocity_from_record`` is set, otherwise unchanged.
         """
         if not self.velocity_from_record:
             return self
@@ -121,7 +120,7 @@ class AhrsParameters:
 
     @property
     def setup(self) -> FilterSetup:
-        """The filter of this model."""
+        """Setup of the filter with this model."""
         sensors = {}
         if self.velocity_sigma > 0.0:
             sensors["accelerometer"] = SensorStates(
@@ -152,11 +151,11 @@ HAND_HELD = AhrsParameters(
     velocity_from_record=True,
     gyro_scale_sigma=2e-3,
 )
-"""A unit in the hand: its velocity is bounded, by as much as the recording shows, and of its gyro, whose turns are large, scale factors
+"""A unit in the hand: its velocity is bounded, with σ found from the recording; because its rotations are large, the gyro's scale factors
 and misalignments are states."""
 VEHICLE = replace(
     HAND_HELD, specific_force_noise=0.15, field_disturbance=0.1, velocity_time=10.0, acceleration_time=2.0
 )
-"""A unit in a car, a boat or an aircraft: its acceleration lasts for seconds and would pass for tilt, and iron is near."""
+"""A unit in a car, a boat or an aircraft: its acceleration lasts for seconds and could be mistaken for tilt, and iron is near."""
 MOTIONS = {"hand": HAND_HELD, "vehicle": VEHICLE, "any": AhrsParameters()}
-"""The model by what moves the unit."""
+"""Parameters by kind of motion."""

@@ -1,4 +1,4 @@
-"""A recording as the filter takes it: increments, specific force and heading over the filter's steps, and the start."""
+"""Input of the filter from a recording: increments, specific force and heading over the filter's steps, and the initial state."""
 
 from __future__ import annotations
 
@@ -20,25 +20,25 @@ from strapdown.vectors import VectorMeasurements
 
 UP = np.array([0.0, 0.0, 1.0])
 LIVELY_SPAN = 5.0
-"""Span over which the acceleration is averaged to find how lively a unit is moved, s."""
+"""Duration of the spans whose RMS acceleration is compared, s; the largest value describes the motion."""
 
 
 class Prepared(NamedTuple):
-    """A recording as the filter takes it."""
+    """Input of the filter from a recording."""
 
     record: ImuRecord
     """Increments and vectors at the filter's steps."""
     initial: estimation.State
     edge: np.ndarray
-    """Sample at which each step ends, the first at the start (k + 1,)."""
+    """Sample at which each step ends, preceded by the first sample (k + 1,)."""
     turned: Array
-    """Attitude by the gyro alone at every sample, from the identity at the first one (n, 4)."""
+    """Attitude from the gyro only at every sample, identity at the first one (n, 4)."""
     dip: float | None
-    """Angle of the field below the level at the start, rad; None without a magnetometer."""
+    """Angle of the field below the horizontal at the start, rad; None without a magnetometer."""
     iron: Array
-    """Hard iron that is taken off the field at the end, body axes, in its unit (3,)."""
+    """Hard iron subtracted from the field at the end, body axes, in its unit (3,)."""
     acceleration: float
-    """Acceleration over the liveliest :data:`LIVELY_SPAN`, RMS of each component, m/s²."""
+    """Largest acceleration over any :data:`LIVELY_SPAN`, RMS of each component, m/s²."""
 
 
 def prepare(
@@ -50,23 +50,23 @@ def prepare(
     causal: bool = True,
     turned: Array | None = None,
 ) -> Prepared:
-    """Return the record that the filter runs on, and its start.
+    """Return the record that the filter runs on, and its initial state.
 
     Parameters
     ----------
     recording : Recording
         From its first quiet second on.
     quiet : slice
-        The samples of that second, over which gravity and the field are those of the start.
+        The samples of that second, from which gravity and the field at the start are computed.
     parameters : AhrsParameters
     field_delay : float or array_like, (n,)
-        Delay of the magnetometer's samples beside the gyro's, s: each is turned forward by the gyro.
+        Delay of the magnetometer's samples relative to the gyro's, s; each is rotated forward by the gyro.
     causal : bool
-        Find hard iron from the samples up to each step alone; otherwise from all of them, for the start too.
+        Whether to find hard iron only from the samples up to each step; otherwise from all samples, for the initial state too.
     turned : ndarray (n, 4), optional
-        Attitude by the gyro alone at the samples, if it is at hand.
+        Attitude from the gyro only at the samples, if already computed.
     """
-    initial = starting.start(recording, quiet, parameters)  # first, for it refuses a sensor without samples
+    initial = starting.start(recording, quiet, parameters)  # first, because it rejects a sensor without samples
     if turned is None:
         turned = sensor_delays.gyro_attitude(recording)
     edge = edges(recording.time, parameters.step)
@@ -119,9 +119,9 @@ def prepare(
 def without_temperature(
     recording: Recording, parameters: AhrsParameters, warm: BiasOverTemperature, *, walks: bool
 ) -> tuple[Recording, AhrsParameters]:
-    """Return a recording without the gyro's bias over temperature, and the model with the error of its slope.
+    """Return a recording with the gyro's bias over temperature subtracted, and the parameters with the error of its slope.
 
-    The error is a state that the temperature drives, or where the estimator has none (``walks``) covered by a random walk.
+    That error is an error state driven by the temperature; if the estimator has none (``walks``), a rate random walk covers it.
     """
     used = gyro_temperature.applied(recording, warm)
     if not walks:
@@ -138,7 +138,7 @@ def edges(time: Array, step: float) -> np.ndarray:
 
 
 def averages(samples: Array, frame: Array, edge: Array) -> tuple[Array, Array]:
-    """Return the mean of each step's samples in the axes that ``frame`` (n, 4) turns them to (k, 3), and their number; 0 where none."""
+    """Return the mean of each step's samples, rotated by ``frame`` (n, 4), as (k, 3), and their number; 0 if there are none."""
     total, number = np.empty((len(edge) - 1, 3)), np.empty(len(edge) - 1)
     compiled(recording_steps.average_samples)(read_only(samples), read_only(frame), edge, total, number)
     return total / np.maximum(number, 1.0)[:, None], number
@@ -147,7 +147,7 @@ def averages(samples: Array, frame: Array, edge: Array) -> tuple[Array, Array]:
 def liveliest(force: Array, shown: np.ndarray, step: float) -> float:
     """Return the largest RMS deviation, each component, of the specific force (k, 3) from its mean over spans of :data:`LIVELY_SPAN`.
 
-    In the frame that the gyro keeps gravity is constant, so what varies is acceleration, or at the level of the sensor's noise nothing.
+    In the frame fixed by the integrated gyro gravity is constant, so any variation above the sensor's noise is acceleration.
     """
     own = force[shown]
     spans = max(1, len(own) // round(LIVELY_SPAN / step))

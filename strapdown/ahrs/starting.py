@@ -1,4 +1,4 @@
-"""Where the filter of a recording starts: attitude, gyro bias and their σ from the first quiet second."""
+"""Initial state of the filter of a recording: attitude, gyro bias and their σ from the first quiet second."""
 
 from __future__ import annotations
 
@@ -14,27 +14,30 @@ from strapdown.recordings.sensor_faults import Faults
 from strapdown.vectors import wahba
 
 QUIET_SPAN = 1.0
-"""Length of the quiet span that the filter starts from, s."""
+"""Duration of the quiet span from which the filter is initialised, s."""
 
 
 def need_accelerometer(recording: Recording) -> None:
-    """Refuse a recording that does not show the vertical."""
+    """Reject a recording without an accelerometer."""
     if recording.specific_force is None:
-        raise InputError(f"{recording.source} has no accelerometer, which shows the vertical; add columns ax, ay, az")
+        raise InputError(
+            f"{recording.source} has no accelerometer samples from {recording.time[0]:.3g} s on, which show the vertical; add columns "
+            "ax, ay, az"
+        )
 
 
 class Begun(NamedTuple):
-    """A recording, and what every use of it begins with."""
+    """A recording with its first quiet second and its faults, which every use of it needs."""
 
     recording: Recording
     quiet: slice
-    """Samples of the first quiet second, counted from its first."""
+    """Samples of the first quiet second, counted from its first sample."""
     faults: Faults
-    """Faults of the samples from there on."""
+    """Faults of the samples from the quiet second on."""
 
 
 def begin(recording: Recording | Begun) -> Begun:
-    """Return the recording with its first quiet second and the faults from there on; one begun before as it is.
+    """Return the recording with its first quiet second and the faults from there on; a ``Begun`` is returned unchanged.
 
     Raises
     ------
@@ -45,16 +48,18 @@ def begin(recording: Recording | Begun) -> Begun:
         return recording
     need_accelerometer(recording)
     span = quiet_span(recording)
-    return Begun(recording, slice(0, span.stop - span.start), sensor_faults.find(recording.since(span.start)))
+    faults = sensor_faults.find(recording.since(span.start))
+    need_accelerometer(faults.recording)  # it may have had samples before the quiet second alone
+    return Begun(recording, slice(0, span.stop - span.start), faults)
 
 
 def quiet_span(recording: Recording) -> slice:
-    """Return the samples of the first quiet second: the first whose rate is no more than twice as restless as in the quietest.
+    """Return the samples of the first quiet second: the first whose measure of motion is at most twice that of the quietest.
 
     Raises
     ------
     InputError
-        If the recording is shorter than that.
+        If the recording is shorter than a second, or its first second holds one sample.
     """
     length = int(np.searchsorted(recording.time, recording.time[0] + QUIET_SPAN))
     lasts = recording.time[-1] - recording.time[0]
@@ -71,7 +76,7 @@ def quiet_span(recording: Recording) -> slice:
     axes = recording.rate[: blocks * length].T.reshape(3, blocks, length)
     mean = axes.mean(axis=2)
     varying = axes - mean[:, :, None]
-    # The mean counts beside the spread, so that a steady turn is not taken for rest; half of it may be bias.
+    # The mean is added to the spread so that a constant rate is not mistaken for rest; half weight, because it may be bias.
     restless = np.sqrt(np.einsum("abk,abk->b", varying, varying) / length) + 0.5 * lengths(mean.T)
     first = int(np.argmax(restless <= 2.0 * restless.min()))
     return slice(first * length, (first + 1) * length)
@@ -80,16 +85,15 @@ def quiet_span(recording: Recording) -> slice:
 def start(
     recording: Recording, quiet: slice, parameters: AhrsParameters, iron: Array | float = 0.0
 ) -> estimation.State:
-    """Return the state at the first of the quiet samples: attitude by TRIAD from the mean vertical and field, any North without a field.
+    """Return the state at the first of the quiet samples: attitude by TRIAD from the mean vertical and field, any heading without a field.
 
-    The means are formed in the frame that the gyro keeps over those samples, and σ grows with the acceleration that is left there.
-    ``iron`` (3,) is the hard iron to be taken off the field, body axes. With
-    ``rest_bias_sigma`` the bias is that of :func:`resting_bias`.
+    The means are formed in the frame fixed by the integrated gyro, and the acceleration remaining there is added to σ. ``iron`` (3,) is the
+    hard iron to be subtracted from the field, body axes. If ``rest_bias_sigma`` is positive, the bias is that of :func:`resting_bias`.
     """
     assert recording.specific_force is not None
     force, spread = mean_at_first(recording, recording.specific_force, quiet, "accelerometer")
     if recording.magnetic_field is None:
-        # Any horizontal direction will do for a heading that nothing measures.
+        # Without a magnetometer the heading is arbitrary: any horizontal direction will do.
         across = np.eye(3)[np.argmin(np.abs(force))]
     else:
         across = mean_at_first(recording, recording.magnetic_field, quiet, "magnetometer")[0] - iron
@@ -105,7 +109,7 @@ def start(
 
 
 def mean_at_first(recording: Recording, samples: Array, quiet: slice, sensor: str) -> tuple[Array, float]:
-    """Return the mean of the quiet samples in the body axes of their first (3,), and how far they spread about it."""
+    """Return the mean of the quiet samples in the body axes of the first (3,), and the norm of their standard deviation."""
     turn = 0.5 * (recording.rate[quiet][1:] + recording.rate[quiet][:-1]) * np.diff(recording.time[quiet])[:, None]
     own = samples[quiet]
     known = np.isfinite(own).all(axis=1)
@@ -115,10 +119,10 @@ def mean_at_first(recording: Recording, samples: Array, quiet: slice, sensor: st
 
 
 def resting_bias(recording: Recording, quiet: slice, parameters: AhrsParameters) -> tuple[Array, float]:
-    """Return the gyro bias (3,), rad/s, at quiet samples, and its σ: the mean rate weighed with the prior, zero and ``bias_sigma``.
+    """Return the gyro bias (3,), rad/s, and its σ: the mean rate of the quiet samples weighted with the prior, 0 with ``bias_sigma``.
 
-    The mean rate is the bias to within ``rest_bias_sigma`` and what the rate still changes from tenth to tenth of the samples, the hand's
-    turning. Where it is beyond any bias that the prior expects, and the vertical and the field turn as it says, it is a turn and no bias.
+    σ of the mean rate is the root sum of squares of ``rest_bias_sigma`` and the spread of the rate between tenths of the samples, which is
+    motion of the hand. If the mean rate exceeds 3 σ of the prior and the vertical and the field rotate with it, it is added to σ as motion.
     """
     rate, prior = recording.rate[quiet], parameters.bias_sigma
     mean = rate.mean(axis=0)
@@ -131,7 +135,7 @@ def resting_bias(recording: Recording, quiet: slice, parameters: AhrsParameters)
 
 
 def _turns(recording: Recording, quiet: slice, rate: Array) -> bool:
-    """Return whether vertical and field turn at more than half this rate from the first half of the samples to the second."""
+    """Return whether vertical and field rotate at more than half this rate from the first half of the samples to the second."""
     expected, seen = [], []
     for samples in (recording.specific_force, recording.magnetic_field):
         known = np.empty((0, 3)) if samples is None else samples[quiet][np.isfinite(samples[quiet]).all(axis=1)]
@@ -144,15 +148,15 @@ def _turns(recording: Recording, quiet: slice, rate: Array) -> bool:
 
 
 def _mean(samples: Array, source: str, sensor: str) -> Array:
-    """Return the mean of samples (k, 3) of the quiet second, which must show a direction."""
+    """Return the mean of samples (k, 3) of the quiet second, which must not be zero."""
     if len(samples) == 0:
         raise InputError(
-            f"{source}: the {sensor} has no valid sample in the first quiet second; cut the recording to where it has"
+            f"{source}: the {sensor} has no valid sample in the first quiet second; cut the recording to a part where it has"
         )
     mean = np.asarray(samples.mean(axis=0))
     if norm(mean) == 0.0:
         raise InputError(
-            f"{source}: the {sensor} is zero over the first quiet second and shows no direction; cut the recording to where it has one"
+            f"{source}: the {sensor} is zero over the first quiet second and gives no direction; cut the recording to a part where it does"
         )
     return mean
 

@@ -32,7 +32,7 @@ from typing import Any
 
 import typer
 
-from strapdown.checks import InputError
+from strapdown.checks import OF_YOUR_OWN, InputError
 from strapdown.cli.layout import register as register
 from strapdown.cli.progress import be_quiet
 from strapdown.cli.terminal import app, console, errors
@@ -95,6 +95,12 @@ def main() -> None:
         import strapdown
 
         traceback.print_exc()
+        for note in getattr(error, "__notes__", ()):
+            if OF_YOUR_OWN in note:
+                errors.print(
+                    f"error: {note} ({type(error).__name__}); its lines end the traceback above", soft_wrap=True
+                )
+                sys.exit(2)
         errors.print(
             f"error: internal error of strapdown {strapdown.__version__} ({type(error).__name__}), not a verdict and not bad input; "
             "please report the traceback above with the command",

@@ -501,7 +501,8 @@ def _estimate_recording(
     if shared.observability:
         paths.append(_observability(out, used.source, result.record, parameters.setup, result.initial))
     if rms is not None:
-        paths.append(_rms(out, used.source, rms))
+        over = "the whole recording" if used.movement is None else "the movement phase"
+        paths.append(_rms(out, used.source, rms, over))
     paths += _export(exports, result.estimate, begun.recording)
     if output.drawn_as is not None:
         frame = _fixed_frame(used)
@@ -600,7 +601,7 @@ def _say_recording(result: AhrsEstimate, parameters: AhrsParameters, motion: str
     if result.hard_iron.any():
         iron = ", ".join(f"{value:.3g}" for value in result.hard_iron)
         console.print(
-            f"Hard iron of {iron} (unit of the magnetometer, body axes, at the end) is subtracted from its samples."
+            f"Hard iron of ({iron}) {used.magnetic_unit or '(unit of the magnetometer)'}, body axes, at the end, is subtracted."
         )
     for begin, length in recordings.gaps(used.time):
         console.print(f"Gap of {length:.3g} s after {begin:.3f} s.")
@@ -612,10 +613,10 @@ def _say_recording(result: AhrsEstimate, parameters: AhrsParameters, motion: str
     _print_result(replace(found, skipped={}))
 
 
-def _rms(out: Path, source: str, rms: dict[str, float]) -> Path:
+def _rms(out: Path, source: str, rms: dict[str, float], over: str) -> Path:
     """Print and write the RMS errors relative to the reference, degrees; return the file."""
     write_json(out / "errors.json", {"source": source, **{f"{name}_rmse_deg": value for name, value in rms.items()}})
-    rows = table("RMS error over the movement phase, degrees", *rms, left=0)
+    rows = table(f"RMS error over {over}, degrees", *rms, left=0)
     rows.add_row(*(f"{value:.2f}" for value in rms.values()))
     show(rows)
     return out / "errors.json"
@@ -635,7 +636,7 @@ def _model(moved_by: str, odds: float, parameters: AhrsParameters, result: AhrsE
     bias, sigma = result.initial.bias / DEGREE, np.sqrt(result.initial.covariance[3, 3]) / DEGREE
     shown = " (from the recording)" if parameters.velocity_from_record else ""
     likelier = (
-        f" (log-likelihood larger by {odds:.3g} than for a {'hand' if moved_by == 'vehicle' else 'vehicle'})"
+        f" (log-likelihood larger by {odds:.0f} than for a {'hand' if moved_by == 'vehicle' else 'vehicle'})"
         if odds < np.inf
         else ""
     )

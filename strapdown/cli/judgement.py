@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -46,7 +47,7 @@ class _Foreign:
 
     truth: Path | None = typer.Option(
         None,
-        help="Reference attitudes in any clock and frames: a simulated record, TUM, EuRoC, CSV, ROS bag. Differences are printed.",
+        help="Reference attitudes in any clock and frames: a simulated record, TUM, EuRoC, BROAD, CSV, ROS bag. Differences are printed.",
     )
     error_frame: str = typer.Option(
         "find",
@@ -343,7 +344,7 @@ def doctor(
         )
         for one in found.candidates[:8]:
             rows.add_row(
-                one.words.partition(" (--")[0].partition(" (deg")[0],
+                re.sub(r" \([^()]*--[^()]*\)", "", one.words),  # without the options, which the verdict has
                 f"{one.score:.1f}",
                 *(f"{one.misfit[name]:.3f}" for name in names),
             )

@@ -55,9 +55,13 @@ class _Rate(ProgressColumn):
         return Text("" if speed is None else f"{rate_text(speed)} {self._unit}")
 
 
+Advance = Callable[[int | str], None]
+"""Advances a progress by a number of units, or says what is done now."""
+
+
 @contextmanager
-def progress_bar(what: str, total: int | None = None, *, rate: str = "") -> Iterator[Callable[[int], None]]:
-    """Yield a function that advances the progress by a number of units; without ``total`` only the time is shown."""
+def progress_bar(what: str, total: int | None = None, *, rate: str = "") -> Iterator[Advance]:
+    """Yield a function that advances the progress; without ``total`` only the time is shown."""
     if _quiet:
         yield lambda done: None
         return
@@ -78,7 +82,7 @@ Say = Callable[[str, float], None]
 
 
 @contextmanager
-def _terminal(what: str, total: int | None, rate: str) -> Iterator[tuple[Callable[[int], None], Say]]:
+def _terminal(what: str, total: int | None, rate: str) -> Iterator[tuple[Advance, Say]]:
     known = (MofNCompleteColumn(), *([_Rate(rate)] if rate else []))
     columns = (TextColumn("{task.description}"), BarColumn(), *(known if total is not None else ()))
     left = (TextColumn("left"), TimeRemainingColumn()) if total is not None else ()
@@ -88,16 +92,26 @@ def _terminal(what: str, total: int | None, rate: str) -> Iterator[tuple[Callabl
         def say(compiling: str, seconds: float) -> None:
             progress.update(task, description=compiling or what)
 
-        yield lambda done: progress.advance(task, done), say
+        def advance(step: int | str) -> None:
+            nonlocal what
+            if isinstance(step, str):
+                what = step
+            else:
+                progress.advance(task, step)
+
+        yield advance, say
 
 
 @contextmanager
-def _lines(what: str, total: int | None) -> Iterator[tuple[Callable[[int], None], Say]]:
+def _lines(what: str, total: int | None) -> Iterator[tuple[Advance, Say]]:
     done, next_line, announced = 0, LINE_INTERVAL, False
 
-    def advance(number: int) -> None:
-        nonlocal done
-        done += number
+    def advance(step: int | str) -> None:
+        nonlocal done, what
+        if isinstance(step, str):
+            what = step
+        else:
+            done += step
 
     def say(compiling: str, seconds: float) -> None:
         nonlocal next_line, announced

@@ -185,6 +185,8 @@ class _Found(NamedTuple):
     examined: Sequence[Unmodelled]
     """Tests of each record for errors that the tuned filter does not model."""
     worst: Unmodelled | None
+    attitude_rms: tuple[float, float] | None
+    """Before and after, rad, where it was minimised."""
 
 
 @command
@@ -226,6 +228,9 @@ def tune(
         )
     found = _tuned(cases, before, gyros, start, goal, search, workers)
     show_listing(found.result.listing(), notes=True)
+    if found.attitude_rms is not None:
+        old, new = np.degrees(found.attitude_rms)
+        console.print(f"RMS attitude error: {old:.4g}° before, {new:.4g}° after.")
     if found.gate is not None:
         _print_gate(found.gate)
     for sentence in () if found.worst is None else found.worst.words:
@@ -251,7 +256,7 @@ def _tuned(
     wanted = start.wanted(cases, gyros)
     gated = goal.gate or any(name in tuning.GATED for name in start.names or [])
     priors = start.priors(train[0].record, wanted)
-    with progress_bar("searches, intervals", search.starts + len(wanted)) as advance:
+    with progress_bar("searches") as advance:
         result, objective, gate = tuning.tune(
             train,
             before,
@@ -271,7 +276,11 @@ def _tuned(
     examined, worst = _examined(train, before, result)
     if worst is not None:
         result = tuning.doubted(result, worst)
-    return _Found(result, objective, gate, comparison, examined, worst)
+    rms = None
+    if goal.rmse:
+        before_and_after = objective.rms(np.stack([objective.start, result.point - np.log(result.scale)]))  # type: ignore[attr-defined]
+        rms = tuple(before_and_after.tolist())
+    return _Found(result, objective, gate, comparison, examined, worst, rms)
 
 
 def _check_files(records: Sequence[Path], filter_file: Path | None, output: _Output) -> None:
@@ -416,7 +425,8 @@ def _write(found: _Found, paths: Sequence[Path], of: str, output: _Output) -> No
     write_json(report, content)
     answer, reason, _ = tunings.verdict(content)
     console.print(f"{answer}: {reason}.")
-    figures = {places["likelihood"]: drawing.likelihood_slices(tuning.slices(found.objective, result), result)}
+    with progress_bar("figure of the likelihood"):
+        figures = {places["likelihood"]: drawing.likelihood_slices(tuning.slices(found.objective, result), result)}
     if found.comparison is not None:
         figures[places["heldout"]] = drawing.before_and_after(
             found.comparison, title="Held-out part of the first record"
@@ -433,7 +443,12 @@ def _report(found: _Found, paths: Sequence[Path], of: str) -> dict[str, Any]:
             for one in result.parameters
         ],
         "units": "SI: rad, s, and the units of whole vectors; divide by si_per_unit for the unit of a parameter",
-        "objective": {"name": of, "before": result.before, "after": result.after},
+        "objective": {
+            "name": of,
+            "before": result.before,
+            "after": result.after,
+            "attitude_rms_rad": found.attitude_rms,
+        },
         "searches": {"number": len(result.starts), "at_the_best_point": result.agreeing},
         "innovations_fit": not result.misfit,
         "unmodelled": [one.summary() for one in found.examined],
@@ -466,7 +481,9 @@ def _plan(
     if len(sources) != 1:
         raise InputError(f"--plan needs one scenario, but {len(sources)} are given; give one")
     lengths = None if length is None else _numbers(length)
-    scenario = _scenario_of(sources[0]) if recordfiles.is_record(sources[0]) else scenarios.load_scenario(sources[0])
+    (source,) = sources
+    of_record = source.is_file() and recordfiles.is_record(source)
+    scenario = _scenario_of(source) if of_record else scenarios.load_scenario(source)
     modelled = chosen or setup.FilterSetup.for_scenario(scenario, states=start.states)
     wanted = start.names or list(tuning.default_names([scenarios.simulate(scenario)]))
     with progress_bar("simulated records", 4) as advance:

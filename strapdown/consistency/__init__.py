@@ -2,11 +2,11 @@
 
 - ``manifold``: The error of an estimate and its normalised square (NEES), for any subset of the states.
 - ``bounds``: Exact two-sided bounds of averages over independent runs: ANEES and NIS, log-NEES, coverage.
-- ``whiteness``: What innovations should be: white, normal, of mean zero, independent of other sensors'.
-- ``timeaverage``: Averages over the time of one run, whose errors are correlated: the effective sample size.
-- ``accuracy``: How large errors are: against a reference, against the Cramér–Rao bound, when they have settled, how they are distributed.
-- ``foreign``: The verdict on an estimate from elsewhere: clocks, frames and the reading of its covariance.
-- ``judgement``: The verdict in words, with its evidence, at one stated probability of a false alarm. That on independent runs is
+- ``whiteness``: Tests of the innovations: white, normal, of mean zero, independent of those of other sensors.
+- ``timeaverage``: Averages over the time of one run, whose errors are correlated, and their effective sample size.
+- ``accuracy``: Errors against a reference, their convergence time and distribution.
+- ``foreign``: The verdict on the estimate of another program: alignment of clocks and frames, definition of its covariance.
+- ``judgement``: The verdict in words, with its evidence, at a stated probability of a false alarm. For independent runs see
   :meth:`strapdown.montecarlo.Statistics.judge`.
 """
 

@@ -1,4 +1,4 @@
-"""How large the errors are: against a reference, against the Cramér–Rao bound, when they have settled, how they are distributed."""
+"""Errors of an estimate: against a reference, convergence time, distribution."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from strapdown.checks import Array, InputError, array, count, increasing, positi
 
 
 def convergence_time(time: ArrayLike, magnitude: ArrayLike, threshold: float) -> float:
-    """Return the first time, s, from which on ``magnitude`` (n,) stays at or below ``threshold`` to the end; NaN if it never does."""
+    """Return the time, s, from which on ``magnitude`` (n,) stays at or below ``threshold`` to the end; NaN if it never does."""
     stamps = increasing("time", time)
     size = array("magnitude", magnitude, (len(stamps),))
     above = np.flatnonzero(np.abs(size) > positive("threshold", threshold))
@@ -26,17 +26,17 @@ class Distribution:
     """The empirical distribution of error magnitudes."""
 
     values: Array
-    """Sorted (n,)."""
+    """Sorted error magnitudes (n,)."""
     probability: Array
-    """Fraction of the errors at or below each (n,)."""
+    """Fraction of the errors at or below each value (n,)."""
 
     def quantile(self, fraction: float) -> float:
-        """Return the error that ``fraction`` of all do not exceed: 0.5 is the median, 0.95 the 95 % error."""
+        """Return the quantile of the errors at ``fraction``: 0.5 is the median, 0.95 the 95 % error."""
         return float(np.quantile(self.values, fraction, method="inverted_cdf"))
 
 
 def distribution(error: ArrayLike) -> Distribution:
-    """Return the distribution of errors (n,); NaN, where there is no reference, is left out."""
+    """Return the distribution of errors (n,); NaN (no reference) is left out."""
     given = np.asarray(error, np.float64).ravel()
     values = np.sort(given[np.isfinite(given)])
     count("the number of errors", len(values))
@@ -48,14 +48,14 @@ class ReferenceErrors:
     """Errors of an estimated attitude against a reference, as defined by the BROAD benchmark, rad; NaN where there is no reference."""
 
     total: Array
-    """Angle of the whole rotation between both (n,)."""
+    """Angle of the rotation between estimate and reference (n,)."""
     heading: Array
-    """Its part about the vertical (n,)."""
+    """Angle of its part about the vertical (n,)."""
     inclination: Array
-    """Remaining error, the angle between the two verticals (n,)."""
+    """Angle of the remaining rotation, between the two verticals (n,)."""
 
     def rms(self, movement: np.ndarray | None = None) -> dict[str, float]:
-        """Return the RMS of each error, rad, over the samples with a reference, and only those of the ``movement`` mask if given."""
+        """Return the RMS of each error, rad, over the samples with a reference; if given, only those of the ``movement`` mask."""
         judged = np.isfinite(self.total) if movement is None else np.isfinite(self.total) & movement
         if not judged.any():
             raise InputError(
@@ -71,14 +71,14 @@ def reference_errors(attitude: ArrayLike, reference: ArrayLike) -> ReferenceErro
     """Return the attitude errors against a reference whose fixed frame has its z axis vertical.
 
     With ``d = q_est ⊗ q_ref⁻¹`` in the fixed frame: total 2 acos |d_w|, heading 2 atan |d_z / d_w|, inclination 2 acos √(d_w² + d_z²), in
-    forms that keep their digits where errors are small.
+    forms that are accurate for small errors.
 
     Parameters
     ----------
     attitude : array_like (n, 4)
         Estimated q_fb.
     reference : array_like (n, 4)
-        Rows of NaN are unknown.
+        Reference q_fb; rows of NaN are unknown.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Bounds of averages over independent samples: two-sided, exact, and what a verdict on several epochs needs."""
+"""Exact two-sided bounds and p-values of averages over independent samples, and the verdict over several epochs."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from numpy.typing import ArrayLike
 from strapdown.checks import Array, InputError, count
 
 SIGMAS = (1.0, 2.0, 3.0)
-"""Multiples of σ whose coverage is counted."""
+"""Multiples of σ at which the coverage is evaluated."""
 
 
 def tail(probability: float) -> float:
-    """Return the probability outside either of two-sided bounds."""
+    """Return the probability beyond each of two-sided bounds that hold with ``probability``."""
     if not 0.0 < probability < 1.0:
         raise InputError(f"probability is {probability}; it must lie between 0 and 1")
     return 0.5 * (1.0 - probability)
@@ -37,14 +37,14 @@ def mean_bounds(degrees: int, samples: float, probability: float = 0.99) -> tupl
     degrees : int
         Degrees of freedom of one value.
     samples : float
-        Number of independent values; an effective number need not be whole.
+        Number of independent values; an effective number need not be an integer.
     probability : float, default 0.99
         Probability that the mean lies between the bounds.
 
     Returns
     -------
     low, high : float
-        Bounds of the mean, one half of the remaining probability beyond each.
+        Bounds of the mean, with half of the remaining probability beyond each.
 
     References
     ----------
@@ -65,7 +65,7 @@ def mean_bounds(degrees: int, samples: float, probability: float = 0.99) -> tupl
 
 
 def mean_p_value(mean: float, degrees: int, samples: float) -> float:
-    """Return the two-sided p-value of a mean per degree, as :func:`mean_bounds` takes it."""
+    """Return the two-sided p-value of a mean of independent χ² values per degree of freedom (see :func:`mean_bounds`)."""
     from scipy.special import chdtr, chdtrc
 
     total = _total(degrees, samples)
@@ -96,7 +96,7 @@ def _log_mean_characteristic(degrees: int, samples: int) -> tuple[Array, np.ndar
 
     mean, variance = log_moments(degrees)
     spread = math.sqrt(variance / samples)
-    # The function falls as exp(−t²/2) for many samples and as exp(−0.7 t) for one: gone at 60. The spacing folds the tails beyond 60 σ.
+    # |φ| falls as exp(−t²/2) for many samples and as exp(−0.7 t) for one: negligible at t = 60. The step in t aliases tails beyond 60 σ.
     t = (np.arange(1200) + 0.5) * 0.05
     u = t / (spread * samples)
     half = 0.5 * degrees
@@ -107,7 +107,7 @@ def _log_mean_characteristic(degrees: int, samples: int) -> tuple[Array, np.ndar
 def log_mean_distribution(value: float, degrees: int, samples: int) -> float:
     """Return the probability that the mean of ``samples`` independent values of ln χ² lies at or below ``value``.
 
-    ``E exp(i u ln χ²) = 2^{iu} Γ(n/2 + iu)/Γ(n/2)``, inverted after Gil-Pelaez (1951) by the midpoint rule; good to 1e-12.
+    ``E exp(i u ln χ²) = 2^{iu} Γ(n/2 + iu)/Γ(n/2)``, inverted after Gil-Pelaez (1951) by the midpoint rule; accurate to 1e-12.
     """
     mean, variance = log_moments(degrees)
     z = (value - mean) / math.sqrt(variance / samples)
@@ -118,7 +118,7 @@ def log_mean_distribution(value: float, degrees: int, samples: int) -> float:
 
 
 def log_mean_bounds(degrees: int, samples: int, probability: float = 0.99) -> tuple[float, float]:
-    """Return two-sided bounds of the mean of ``samples`` independent values of ln χ² of ``degrees`` degrees of freedom, exact."""
+    """Return exact two-sided bounds of the mean of ``samples`` independent values of ln χ² with ``degrees`` degrees of freedom."""
     from scipy.optimize import brentq
 
     outside = tail(probability)
@@ -132,7 +132,7 @@ def log_mean_bounds(degrees: int, samples: int, probability: float = 0.99) -> tu
 
 
 def log_mean_p_value(mean: float, degrees: int, samples: int) -> float:
-    """Return the two-sided p-value of a mean of ln χ²."""
+    """Return the two-sided p-value of a mean of independent values of ln χ²."""
     if not np.isfinite(mean):
         return 0.0
     below = log_mean_distribution(mean, degrees, samples)
@@ -140,7 +140,7 @@ def log_mean_p_value(mean: float, degrees: int, samples: int) -> float:
 
 
 def coverage_p_values(inside: ArrayLike, samples: int) -> Array:
-    """Return the two-sided binomial p-values of fractions (..., 3) of independent errors inside 1, 2, 3 σ."""
+    """Return two-sided binomial p-values of the fractions (..., 3) of ``samples`` independent errors inside 1, 2 and 3 σ."""
     from scipy.special import erf
     from scipy.stats import binom
 
@@ -152,14 +152,14 @@ def coverage_p_values(inside: ArrayLike, samples: int) -> Array:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Verdict:
-    """The mean over independent runs of a χ² statistic, per degree of freedom, at several epochs, against its two-sided bounds."""
+    """Mean over independent runs of a χ² statistic per degree of freedom at several epochs, with its two-sided bounds."""
 
     mean: Array
     """Mean over the runs at each epoch, per degree of freedom (epochs,); 1 for a consistent filter."""
     degrees: int
     runs: int
     probability: float
-    """Probability that one epoch of a consistent filter lies inside the bounds."""
+    """Probability that the mean at one epoch lies inside the bounds for a consistent filter."""
 
     @property
     def bounds(self) -> tuple[float, float]:
@@ -168,10 +168,10 @@ class Verdict:
 
     @property
     def simultaneous_bounds(self) -> tuple[float, float]:
-        """Two-sided bounds that all epochs of a consistent filter keep together with at least ``probability`` (Bonferroni).
+        """Two-sided bounds that the means at all epochs of a consistent filter keep jointly with at least ``probability`` (Bonferroni).
 
-        Errors at different epochs of one run are correlated, a bias error above all, so the number of epochs outside :attr:`bounds` is
-        not binomial; this holds however they depend on each other.
+        Errors at different epochs of one run are correlated, bias errors most of all, so the number of epochs outside :attr:`bounds` is
+        not binomial. The Bonferroni bounds hold under any dependence.
         """
         return mean_bounds(self.degrees, self.runs, 1.0 - (1.0 - self.probability) / len(self.mean))
 

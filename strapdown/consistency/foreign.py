@@ -1,9 +1,9 @@
-"""The verdict on an estimate from elsewhere: its attitudes and covariances against a truth of another clock and other axes.
+"""The verdict on the estimate of another program, against a truth that may have another clock and other frames.
 
-:func:`check_arrays` does it all: clocks and frames are compared, what differs grossly is removed (and said, and its uncertainty added to
-the covariance), the reading of the covariance is found or taken as given, and :func:`strapdown.consistency.judge` judges the rest. Every
-small difference that would explain the errors is reported beside the verdict and not removed, unless it is asked for: a constant rotation
-between frames and a constant error of the filter look the same.
+:func:`check_arrays` aligns clocks and frames: gross differences are removed, reported, and their uncertainty added to the covariance. The
+definition of the attitude covariance is given or found from the errors, and :func:`strapdown.consistency.judge` judges the result. Small
+differences that would explain the errors are reported with the verdict and not removed unless requested, because a constant rotation
+between frames and a constant error of the filter are indistinguishable.
 """
 
 from __future__ import annotations
@@ -26,45 +26,45 @@ from strapdown.records.outputs import euler_axes
 from strapdown.units import DEGREE
 
 ERROR_FRAMES = ("body", "fixed", "euler")
-"""Readings of an attitude covariance: of δθ with ``q_true = q ⊗ exp(δθ)``; of δφ with ``q_true = exp(δφ) ⊗ q``, as ROS has it for poses; of
-the errors of roll, pitch and yaw, in this order (ZYX)."""
+"""Definitions of an attitude covariance: of δθ with ``q_true = q ⊗ exp(δθ)``; of δφ with ``q_true = exp(δφ) ⊗ q``, as ROS defines it for
+poses; of the errors of roll, pitch and yaw, in this order (ZYX)."""
 DECIDED = 0.9
-"""Probability above which the errors decide how the covariance is meant; below, it is taken for the body side, this package's own."""
+"""Probability above which the errors decide the definition of the covariance; below, "body" is used, this package's own."""
 ALIGNED = ("time", "fixed", "body")
 """Parts of an alignment: clocks, fixed frames, body frames."""
 GROSS = 5.0 * DEGREE
-"""A constant rotation beyond this is one of frames and not of a filter."""
+"""A constant rotation above this is a difference of frames and not an error of a filter, rad."""
 BRIDGED = 0.1
-"""Largest interval of a truth that is interpolated over, s; of a truth that is as slow as the estimate, its own."""
+"""Maximum interval of the truth to interpolate over, s; for a slower truth 1.5 times its median interval."""
 SCALE = "σ wrong by one factor"
 LIKELY = 1e-3
 """p-value below which an explanation is likely."""
 LONGEST_OFFSET = 30.0
-"""Offsets between clocks are looked for up to this, s, where the records overlap as they are."""
+"""Maximum offset of the clocks to search for if the records overlap without one, s."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Alignment:
-    """Difference between an estimate's clock and frames and a truth's: ``q_true(t + offset) = exp(fixed) ⊗ q(t) ⊗ exp(body)``."""
+    """Differences of clock and frames between an estimate and a truth: ``q_true(t + offset) = exp(fixed) ⊗ q(t) ⊗ exp(body)``."""
 
     offset: float
-    """s, to be added to the estimate's times."""
+    """Offset, s, to be added to the estimate's times."""
     fixed: Array
     """Rotation vector (3,), rad, from the estimate's fixed frame to the truth's."""
     body: Array
     """Rotation vector (3,), rad, from the truth's body frame to the estimate's."""
     sigma: Array
-    """Standard deviations of fixed (3), body (3), rad, and offset, s: (7,); 0 of what was not estimated."""
+    """Standard deviations of fixed (3), body (3), rad, and offset, s: (7,); 0 for those not estimated."""
     covariance: Array
     """Their covariance (7, 7)."""
     estimated: tuple[str, ...]
     """Which of :data:`ALIGNED` were estimated and removed."""
     residual: float
-    """Root mean square of the angle that is left, rad."""
+    """RMS of the remaining angle, rad."""
 
     @property
     def words(self) -> tuple[str, ...]:
-        """Differences that were removed, a sentence each."""
+        """Differences that were removed, one sentence each."""
         found = []
         if "time" in self.estimated:
             found.append(
@@ -83,24 +83,24 @@ class Alignment:
 
 @dataclass(frozen=True, kw_only=True)
 class Explanation:
-    """Something that would explain errors beyond the covariance, and was not removed."""
+    """A difference that would explain errors beyond the covariance and was not removed."""
 
     name: str
     value: str
     nees: float
-    """NEES of the attitude per state that it would leave."""
+    """NEES of the attitude per state if it were removed."""
     p_value: float
-    """Probability that a right filter gains as much from it by chance; small if it is likely."""
+    """Probability of as large a reduction by chance for a consistent filter; small if the explanation is likely."""
 
     @property
     def likely(self) -> bool:
-        """Whether chance hardly gains as much."""
+        """Whether so large a reduction is improbable by chance."""
         return self.p_value < LIKELY
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Checked:
-    """The verdict on an estimate from elsewhere, and how it was come to.
+    """The verdict on the estimate of another program, with the alignment and definitions it rests on.
 
     Parameters
     ----------
@@ -111,16 +111,15 @@ class Checked:
     truth : Truth or None
         The truth at the estimate's times.
     alignment : Alignment or None
-        What of clocks and frames was estimated and removed.
+        Differences of clocks and frames that were estimated and removed.
     error_frame : str
-        Reading of the covariance that was judged, one of ``ERROR_FRAMES``; empty where there is no covariance.
+        Definition of the covariance that was judged, one of ``ERROR_FRAMES``; empty if there is no covariance.
     frame_probability : mapping of str to float
-        Probability of each reading, all equally likely beforehand; empty where the reading was given, or there is no
-        truth.
+        Probability of each definition, all equally probable beforehand; empty if it was given or there is no truth.
     explanations : tuple of Explanation
-        Differences that would explain the errors and were not removed, the likeliest first.
+        Differences that would explain the errors and were not removed, the most likely first.
     remarks : tuple of str
-        What was removed, and how the covariance was read, a sentence each.
+        Differences removed and the definition of the covariance used, one sentence each.
     """
 
     judgement: Judgement
@@ -138,7 +137,7 @@ class Checked:
         Returns
         -------
         dict
-            The verdict as of :meth:`Judgement.summary`, with reading of the covariance, explanations, remarks and
+            The verdict as of :meth:`Judgement.summary`, with the definition of the covariance, explanations, remarks and
             alignment (degrees, s).
         """
         table: dict[str, Any] = {
@@ -181,29 +180,29 @@ def check_arrays(
     Parameters
     ----------
     time : array_like (m,)
-        s.
+        Times of the estimate, s, increasing.
     attitude : array_like (m, 4)
-        q_fb, scalar first.
+        Estimated q_fb, scalar first.
     covariance : array_like (m, 3, 3) or (m, 6, 6), or None
-        Of the attitude error, rad², or of attitude and bias error; its rows as ``error_frame`` says. None: there is none, and errors are
-        reported but not judged.
+        Covariance of the attitude error, rad², or of attitude and bias error, defined as ``error_frame``. If None, errors are reported but
+        not judged.
     true_time, true_attitude : array_like (n,), (n, 4)
-        The truth, of a clock and frames of its own.
+        The truth, in its own clock and frames.
     bias, true_bias : array_like (m, 3), (n, 3), optional
-        Gyro bias, rad/s, body axes; judged where both are given.
+        Gyro bias, rad/s, body axes; judged if both are given.
     innovations : mapping, optional
         :class:`strapdown.records.Innovations` by sensor.
     error_frame : {"find", "body", "fixed", "euler"}
-        How the covariance is meant (:data:`ERROR_FRAMES`). "find" takes the reading that the errors are likeliest under.
+        Definition of the covariance (:data:`ERROR_FRAMES`). "find" takes the one of maximum likelihood given the errors.
     align : "auto", "none", or any of "time", "fixed", "body"
-        What is estimated and removed. "auto": an offset of the clocks that stands out of its σ, and rotations beyond 5°.
+        Differences to estimate and remove. "auto": a clock offset beyond three times its σ, and rotations above 5°.
     probability : float
-        Of all tests together: a right filter is called wrong with at most 1 − ``probability``.
+        A consistent filter is rejected with probability at most 1 − ``probability``, all tests together.
 
     Returns
     -------
     Checked
-        The verdict, and the alignment and the reading of the covariance that it rests on.
+        The verdict, with the alignment and the definition of the covariance that it rests on.
 
     Examples
     --------
@@ -262,13 +261,13 @@ def check_arrays(
 
 
 def _chosen_frame(given: str, found: Mapping[str, float]) -> tuple[str, list[str]]:
-    """Return the frame that the covariance is read in, given or found, and what to say of it."""
+    """Return the definition of the covariance, given or found, and the remark on it."""
     best = max(found, key=lambda name: found[name])
     if given == "find":
         chosen = best if found[best] >= DECIDED else "body"
         return chosen, [_frame_words(chosen, found)]
     if found[given] < 0.01:
-        return given, [f"the covariance is read as {given}, as given; as {best} the errors would fit it better by far"]
+        return given, [f"the covariance is read as {given}, as given; the errors fit far better read as {best}"]
     return given, []
 
 
@@ -280,7 +279,7 @@ class _Series:
     bias: Array | None = None
 
     def at(self, rows: np.ndarray, time: Array, attitude: Array) -> _Series:
-        """Return other times and attitudes with the covariances and biases of these rows."""
+        """Return the given times and attitudes with the covariances and biases of these rows."""
         P, bias = (None if one is None else one[rows] for one in (self.covariance, self.bias))
         return _Series(time, attitude, P, bias)
 
@@ -288,7 +287,7 @@ class _Series:
 def _series(
     prefix: str, time: ArrayLike, attitude: ArrayLike, covariance: ArrayLike | None, bias: ArrayLike | None
 ) -> _Series:
-    """Return a history, checked; ``prefix`` is that of its names in messages."""
+    """Return a checked history; ``prefix`` precedes its names in messages."""
     stamps = increasing(f"{prefix}time", time, minimum=2)
     m = len(stamps)
     q = unit_quaternions(f"{prefix}attitude", array(f"{prefix}attitude", attitude, (m, 4)))
@@ -299,7 +298,7 @@ def _series(
 
 
 def _wanted(align: str | Iterable[str]) -> tuple[str, ...] | None:
-    """Return what is to be aligned; None: as the data say."""
+    """Return the differences to remove; None if the data decide."""
     if align == "auto":
         return None
     if align == "none":
@@ -309,7 +308,7 @@ def _wanted(align: str | Iterable[str]) -> tuple[str, ...] | None:
 
 
 def without_truth(time: Array, attitude: Array, innovations: Mapping[str, Innovations]) -> Estimate:
-    """Return an estimate of which the innovations alone can be judged."""
+    """Return an estimate without covariances, so that only its innovations can be judged."""
     return Estimate.from_arrays(time, attitude, np.full((len(time), 3, 3), np.nan), innovations=innovations)
 
 
@@ -317,11 +316,11 @@ def without_truth(time: Array, attitude: Array, innovations: Mapping[str, Innova
 
 
 def read_as(frame: str, covariance: Array, attitude: Array) -> Array:
-    """Return covariances (m, n, n), n ≥ 3, of the body-side error, given as of one of :data:`ERROR_FRAMES` in their first three rows."""
+    """Return covariances (m, n, n), n ≥ 3, of the body-side error; their first three rows are given as one of :data:`ERROR_FRAMES`."""
     if frame == "body":
         return covariance
     R = quaternion.to_matrix(attitude)
-    # δθ_b = Rᵀ δφ; δθ_b = E (yaw, pitch, roll), the columns the other way round for (roll, pitch, yaw).
+    # δθ_b = Rᵀ δφ; δθ_b = E (yaw, pitch, roll), with the columns reversed for (roll, pitch, yaw).
     turn = np.swapaxes(R, 1, 2) if frame == "fixed" else euler_axes(attitude)[:, :, ::-1]
     T = np.tile(np.eye(covariance.shape[1]), (len(R), 1, 1))
     T[:, :3, :3] = turn
@@ -329,17 +328,17 @@ def read_as(frame: str, covariance: Array, attitude: Array) -> Array:
 
 
 def frame_probabilities(error: Array, readings: Mapping[str, Array]) -> dict[str, float]:
-    """Return the probability of each reading of the covariance (m, 3, 3), given errors (m, 3), all equally likely beforehand.
+    """Return the probability of each definition of the covariance (m, 3, 3) given errors (m, 3), all equally probable beforehand.
 
-    The scale of the covariance is free in each, so that a filter that is optimistic in general does not hide how its covariance is meant.
-    Errors follow each other, so they count as the effective samples that they are.
+    The scale of each covariance is free, so that the definition is found for an optimistic filter too. The log-likelihood is weighted by
+    the effective number of samples, because errors are correlated in time.
     """
     scores = {}
     weight = 1.0
     for name, P in readings.items():
         try:
             white = whitened(error, P)
-        except InputError:  # Euler angles at their singularity
+        except InputError:  # singular Euler angles
             scores[name] = -np.inf
             continue
         scale = max(float(np.mean(white * white)), 1e-300)
@@ -354,7 +353,7 @@ def _frame_words(chosen: str, found: Mapping[str, float]) -> str:
     said = ", ".join(f"{name} {100.0 * p:.3g} %" for name, p in found.items())
     if found[chosen] < DECIDED:
         return (
-            f"the errors do not decide how the covariance is meant ({said}): it is judged as {chosen}; "
+            f"the errors do not decide how the covariance is defined ({said}): it is read as {chosen}; "
             "--error-frame (error_frame= in Python) names another"
         )
     return f"the covariance is read as {chosen} ({said}, found from the errors)"
@@ -376,14 +375,14 @@ def _turns(one: Array, other: Array) -> Array:
 
 
 def interpolated(time: Array, stamps: Array, attitude: Array, bridged: float) -> Array:
-    """Return attitudes (n, 4) at ``time`` along the shortest turn; NaN outside, and in gaps longer than ``bridged``, s."""
+    """Return attitudes (n, 4) at ``time`` along the shortest rotation; NaN outside, and in gaps longer than ``bridged``, s."""
     k = np.clip(np.searchsorted(stamps, time, side="right") - 1, 0, len(stamps) - 2)
     width = stamps[k + 1] - stamps[k]
     share = (time - stamps[k]) / width
     usable = (share >= -1e-9 / width) & (share <= 1.0 + 1e-9 / width) & (width <= bridged)
     turn = _turns(attitude[k], attitude[k + 1])
     result = quaternion.multiply(attitude[k], quaternion.exp(share[:, None] * turn))
-    for end in (0, 1):  # what is no interpolation keeps its digits
+    for end in (0, 1):  # at the truth's own times the attitude is copied exactly
         exact = time == stamps[k + end]
         result[exact] = attitude[k[exact] + end]
         usable |= exact
@@ -395,7 +394,7 @@ def _bridged(series: _Series) -> float:
 
 
 def _at_common_times(own: _Series, theirs: _Series, offset: float) -> tuple[_Series, Truth]:
-    """Return the estimate where there is a truth, and the truth there: at the estimate's times, or at those of a truth that is sparser."""
+    """Return the estimate and the truth at common times: those of the estimate, or of the truth if it is sparser."""
     sparser = np.median(np.diff(theirs.time)) > 1.5 * np.median(np.diff(own.time))
     if sparser:
         inside = (theirs.time - offset >= own.time[0]) & (theirs.time - offset <= own.time[-1])
@@ -414,7 +413,7 @@ def _at_common_times(own: _Series, theirs: _Series, offset: float) -> tuple[_Ser
     if good.sum() < 2:
         raise InputError(
             f"the estimate goes from {own.time[0] + offset:.6g} to {own.time[-1] + offset:.6g} s of the truth's clock, and the truth from "
-            f"{theirs.time[0]:.6g} to {theirs.time[-1]:.6g} s: they have no two times in common; "
+            f"{theirs.time[0]:.6g} to {theirs.time[-1]:.6g} s: they have fewer than two times in common; "
             "give both of one clock, or --align time (align= in Python)"
         )
     return (
@@ -424,13 +423,13 @@ def _at_common_times(own: _Series, theirs: _Series, offset: float) -> tuple[_Ser
 
 
 def _rates(series: _Series) -> tuple[Array, Array]:
-    """Return middles of the intervals (m − 1,) and the mean body rate over each (m − 1, 3)."""
+    """Return the midpoints of the intervals (m − 1,) and the mean body rate over each (m − 1, 3)."""
     turn = _turns(series.attitude[:-1], series.attitude[1:])
     return 0.5 * (series.time[1:] + series.time[:-1]), turn / np.diff(series.time)[:, None]
 
 
 def coarse_offset(own_time: Array, own_speed: Array, true_time: Array, true_speed: Array) -> float:
-    """Return the offset, s, to be added to the first times, at which two series of angular speeds agree best; 0 if nothing stands out."""
+    """Return the offset, s, to add to the first times for the best correlation of two angular speeds; 0 if none is above 0.5."""
     step = max(float(np.median(np.diff(own_time))), float(np.median(np.diff(true_time))))
     apart = own_time[-1] < true_time[0] or true_time[-1] < own_time[0]
     base = true_time[0] - own_time[0] if apart else 0.0
@@ -454,7 +453,7 @@ def coarse_offset(own_time: Array, own_speed: Array, true_time: Array, true_spee
 
 
 def _initial_rotations(own: _Series, theirs: _Series, offset: float) -> list[tuple[Array, Array]]:
-    """Return (fixed, body) quaternions to begin from: none, that of the fixed frames alone, that of the bodies by their rates too."""
+    """Return (fixed, body) quaternions to start from: identity, the fixed frame's, and with the body frame's from the rates."""
     matched, truth = _at_common_times(own, theirs, offset)
     identity = np.array([1.0, 0.0, 0.0, 0.0])
 
@@ -475,7 +474,7 @@ def _initial_rotations(own: _Series, theirs: _Series, offset: float) -> list[tup
 
 
 def fit(own: _Series, theirs: _Series, names: tuple[str, ...], offset: float) -> Alignment:
-    """Return offset and rotations by least squares of the angle that is left, σ by how long the residuals remember each other."""
+    """Return offset and rotations by least squares of the remaining angle; σ from the effective number of residuals."""
     free = np.array([name in names for name in ("fixed",) * 3 + ("body",) * 3 + ("time",)])
     starts = _initial_rotations(own, theirs, offset) if free[:6].any() else [(np.array([1.0, 0, 0, 0]),) * 2]
     best: Alignment | None = None
@@ -506,7 +505,7 @@ def _descended(
         information = np.einsum("mij,mik->jk", J, J)
         scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
         value, vector = np.linalg.eigh(information * np.outer(scale, scale))
-        seen = value > 1e-6 * value[-1]  # what the motion does not part stays as it is
+        seen = value > 1e-6 * value[-1]  # directions that the motion does not determine are left unchanged
         inverse = (vector[:, seen] / value[seen]) @ vector[:, seen].T * np.outer(scale, scale)
         step = np.zeros(7)
         step[free] = inverse @ np.einsum("mij,mi->j", J, r)
@@ -532,7 +531,7 @@ def _descended(
 
 
 def _jacobian(time: Array, aligned: Array, truth: Truth) -> Array:
-    """Return the derivatives (m, 3, 7) of the attitude error by rotations of the fixed and body frames and an offset of the clock."""
+    """Return the derivatives (m, 3, 7) of the attitude error with respect to fixed rotation, body rotation and clock offset."""
     middle, rate = _rates(_Series(time, truth.attitude))
     J = np.zeros((len(time), 3, 7))
     J[:, :, :3] = np.swapaxes(quaternion.to_matrix(aligned), 1, 2)
@@ -544,7 +543,7 @@ def _jacobian(time: Array, aligned: Array, truth: Truth) -> Array:
 def _aligned(
     own: _Series, theirs: _Series, wanted: tuple[str, ...] | None, remarks: list[str]
 ) -> tuple[_Series, Alignment]:
-    """Return the estimate, its quaternions as they must be meant, and its alignment with the truth."""
+    """Return the estimate, its quaternions in the convention that fits, and its alignment with the truth."""
     offset = 0.0
     if wanted is None or "time" in wanted:
         own_at, own_rate = _rates(own)
@@ -559,7 +558,7 @@ def _aligned(
         fits = {words: fit(other, theirs, ALIGNED, offset) for words, other in others.items()}
         words = min(fits, key=lambda words: _gross(fits[words]))
         if _gross(fits[words]) < _gross(whole):
-            remarks.append(f"the quaternions fit the truth best if they are {words}: they are read so")
+            remarks.append(f"the quaternions fit the truth best if read as {words}, so they are read as such")
             own, whole = others[words], fits[words]
     moved = ("time",) if abs(whole.offset) > 3.0 * whole.sigma[6] + 1e-9 else ()
     base = whole.offset if moved else 0.0
@@ -572,7 +571,7 @@ def _aligned(
 
 
 def _gross(found: Alignment) -> int:
-    """Return how much must be put down to frames: the number of gross rotations, and more than all if even these do not help."""
+    """Return the number of gross rotations, plus 3 if even with them the residual is gross."""
     turned = sum(float(np.linalg.norm(vector)) > GROSS for vector in (found.fixed, found.body))
     return turned + (3 if found.residual > GROSS else 0)
 
@@ -585,7 +584,7 @@ _CONVENTIONS = {
 
 
 def _in_truth_axes(P: Array, own: _Series, truth: Truth, alignment: Alignment) -> Array:
-    """Return covariances in the truth's body axes, the uncertainty of the alignment added."""
+    """Return covariances in the truth's body axes, with the uncertainty of the alignment added."""
     turn = quaternion.to_matrix(quaternion.exp(alignment.body)).T
     size = P.shape[1]
     T = np.kron(np.eye(size // 3), turn)
@@ -608,7 +607,7 @@ def explanations(
     time: Array,
     attitude: Array,
 ) -> tuple[Explanation, ...]:
-    """Return what would explain the attitude errors (m, 3) better than the covariance as it is read, the likeliest first."""
+    """Return differences that would explain the attitude errors (m, 3) better than the covariance, the most likely first."""
     from scipy.special import chdtrc
 
     P = readings[chosen][:, :3, :3]
@@ -632,7 +631,7 @@ def explanations(
         x = np.linalg.solve(N, np.einsum("mij,mi->j", A, white))
         left = white - np.einsum("mij,j->mi", A, x)
         after = float(np.mean(left**2))
-        # Beside a scale of σ: the gain is a ratio of variances, so that an optimistic filter does not make everything significant.
+        # The scale of σ is free: the gain is a ratio of variances, so that an optimistic filter does not make everything significant.
         samples = effective_samples(left / math.sqrt(max(after, 1e-300))) if m > 10 else 1.0
         gain = 3.0 * samples * math.log(max(before, 1e-300) / max(after, 1e-300))
         size = f"{1e3 * x[0]:.4g} ms" if len(x) == 1 else f"{', '.join(f'{v / DEGREE:.3g}' for v in x)}°"

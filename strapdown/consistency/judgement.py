@@ -1,7 +1,7 @@
 """The verdict: does the filter's covariance agree with its errors? In words, with the evidence, at one stated probability of a false alarm.
 
-Every statistic gives a p-value, exact or nearly so, and Holm's procedure (1979) takes them together: whatever their dependence, the
-probability that a right filter is called wrong by any of them is at most 1 − ``probability``.
+Every statistic gives a p-value, exact or nearly so. Holm's procedure (1979) combines them: whatever their dependence, the probability that
+a consistent filter is rejected by any of them is at most 1 − ``probability``.
 """
 
 from __future__ import annotations
@@ -31,20 +31,20 @@ from strapdown.results import Listed, Listing, figure
 Answer = Literal["consistent", "not consistent", "cannot tell"]
 
 MIN_SAMPLES = 50
-"""Fewer innovations of one sensor are not judged for whiteness, normality and mean."""
+"""Minimum number of innovations of a sensor for the tests of whiteness, normality and mean."""
 
 FEWEST_TO_AVERAGE = 20
-"""Epochs of an estimate below which its errors are judged at the end only."""
+"""Minimum number of epochs for errors to be judged over the run and not only at the end."""
 
 RESOLUTION = 1.5
-"""A filter that passes is "consistent" if a σ wrong by this factor would have been seen; else the verdict is "cannot tell"."""
+"""A filter that passes is "consistent" if the tests would have detected a σ wrong by this factor; else "cannot tell"."""
 
 STATES = ("attitude", "bias")
 """States of every filter."""
 
 WITHOUT_TRUTH = (
     "without a truth only the innovations are judged: they do not show an attitude error that all sensors share, "
-    "nor a bias error that the start hides, such as commutation of coning"
+    "nor a bias error that the initial state hides, such as commutation of coning"
 )
 """A limit of a judgement."""
 
@@ -54,12 +54,12 @@ _LEANINGS = {
     frozenset({False}): "the filter is pessimistic (its σ are too large)",
     frozenset({True, False}): "the filter's σ are too small in part and too large in part",
 }
-"""What it means whether the ratios that contradict the filter are greater than 1."""
+"""Reason by whether the ratios that contradict the filter are greater than 1."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
-    """One statistic against what it is of a right filter.
+    """One statistic with its bounds for a consistent filter.
 
     Parameters
     ----------
@@ -67,28 +67,28 @@ class Finding:
         Statistic: "NIS", "whiteness", "normality", "mean innovation", "cross-correlation", "NEES at the end",
         "time-averaged NEES", "ANEES", …
     of : str
-        The sensor, or the subset of the states.
+        Sensor or subset of the states.
     value : float
         Value of the statistic; NIS and NEES per degree of freedom, 1 for a consistent filter.
     low : float, default nan
-        Lower of the two-sided bounds that decide, all findings taken together: the value is outside where ``rejected``. NaN where a
-        statistic has none, and before a judgement.
+        Lower of the two-sided bounds, all findings together: the value is outside them if ``rejected``. NaN for a statistic without
+        bounds and before the judgement.
     high : float, default nan
         Upper of these bounds.
     p_value : float
-        Probability that a consistent filter shows as much or more.
+        Probability of a value at least as extreme for a consistent filter.
     samples : float
-        Samples that the value rests on; effective ones where they are correlated.
+        Number of samples of the statistic; the effective number if they are correlated.
     degrees : int, default 1
         Degrees of freedom of one sample.
     epochs : int, default 1
-        Number of epochs of which the value is that of the worst (Bonferroni).
+        Number of epochs, of which the value is that of the worst (Bonferroni).
     at : str, default ""
-        That epoch in words.
+        The worst epoch in words.
     rejected : bool, default False
-        Whether it contradicts the filter after all findings are taken together (Holm).
+        Whether it contradicts the filter, all findings together (Holm).
     means : str, default ""
-        What it says of the filter if it is rejected, in words.
+        Explanation in words, valid if it is rejected.
     """
 
     name: str
@@ -106,12 +106,12 @@ class Finding:
 
     @property
     def is_ratio(self) -> bool:
-        """Whether the value is that of a χ² per degree of freedom: its root is the factor by which σ is too small."""
+        """Whether the value is a mean χ² per degree of freedom, whose root is the factor by which σ is too small."""
         return self.name in _RATIOS
 
     @property
     def label(self) -> str:
-        """Sensor or states, with the epoch."""
+        """Sensor or states, with the epoch if there is one."""
         return f"{self.of}, {self.at}" if self.at else self.of
 
     def _with_bounds(self, error: float) -> Finding:
@@ -133,16 +133,16 @@ _RATIOS = ("NIS", "NEES at the end", "time-averaged NEES", "ANEES")
 
 @dataclass(frozen=True, kw_only=True)
 class Power:
-    """How wrong a σ must be for the tests to show it."""
+    """Smallest error of a σ that the tests detect."""
 
     of: str
     """"innovations of SENSOR", or a state: "attitude", "bias", an error state."""
     factor: float
-    """A σ too small or too large by this factor is found with a probability of about the verdict's; infinite where nothing tests it."""
+    """A σ too small or large by this factor is detected with about the verdict's probability; infinite if no test covers it."""
 
     @property
     def seen(self) -> bool:
-        """Whether it is one that the verdict may speak of."""
+        """Whether the factor is at most :data:`RESOLUTION`."""
         return self.factor <= RESOLUTION
 
 
@@ -155,15 +155,15 @@ class Judgement(Listed):
     verdict : {"consistent", "not consistent", "cannot tell"}
         Whether the covariance agrees with the errors.
     reason : str
-        One sentence that says why.
+        Reason for the verdict, one sentence.
     findings : tuple of Finding
         Every statistic with its bounds and p-value.
     limits : tuple of str
-        What this evidence cannot show.
+        Limitations of the evidence, in words.
     probability : float
-        Probability that a consistent filter is not rejected, at least.
+        Minimum probability that a consistent filter is not rejected.
     power : tuple of Power, default empty
-        For the innovations of each sensor and for each state, the factor on σ that the tests would have shown.
+        For the innovations of each sensor and for each state, the smallest factor on σ that the tests would have detected.
     unmodelled : tuple of str, default empty
         Specified errors that the filter has no state for.
     """
@@ -202,7 +202,7 @@ class Judgement(Listed):
 
     @property
     def words(self) -> str:
-        """The verdict and what contradicts the filter, for people."""
+        """The verdict and the findings that contradict the filter, as text."""
         lines = [f"{self.verdict}: {self.reason}"]
         lines += [f"  - {finding.means}" for finding in self.findings if finding.rejected and finding.means]
         return "\n".join(lines)
@@ -213,7 +213,7 @@ class Judgement(Listed):
         Returns
         -------
         dict
-            Verdict, reason, probability, findings, limits, power and unmodelled errors by these names.
+            Verdict, reason, probability, findings, limits, power and unmodelled, by these names.
         """
         table = {
             "verdict": self.verdict,
@@ -241,25 +241,24 @@ def judge(
     Parameters
     ----------
     estimate : Estimate
-        With innovations; with whole covariances if a truth is given.
+        Estimate with innovations; if a truth is given, with full covariances.
     truth : Truth, optional
-        Attitude and bias at the estimate's own times, NaN where a reference has none. Without it only the innovations are judged.
+        Attitude and bias at the estimate's times, NaN if unknown. Without it only the innovations are judged.
     probability : float, default 0.99
-        A consistent filter is rejected with at most 1 − ``probability``, all tests together.
+        A consistent filter is rejected with probability at most 1 − ``probability``, all tests together.
     upper_bounds : bool, default False
-        The filter's noise covers disturbances that last over many samples, as that of :mod:`strapdown.ahrs` does: its innovations are
-        neither white nor as large as their variance, and only larger ones contradict it.
+        Whether the filter's noise covers disturbances that last over many samples, as that of :mod:`strapdown.ahrs` does. Its innovations
+        are then neither white nor as large as their variance, and only larger ones contradict it.
     error_states : sequence of str, optional
-        Names of the filter's error states, where the estimate does not hold them.
+        Names of the filter's error states. Default: those of the estimate.
     unmodelled : sequence of str, default empty
-        Errors that are specified and that the filter has no state for (:func:`strapdown.estimation.setup.unmodelled_errors`); the verdict
-        names them.
+        Specified errors that the filter has no state for (:func:`strapdown.estimation.setup.unmodelled_errors`); named in the verdict.
 
     Returns
     -------
     Judgement
-        Its ``power`` says for each state how wrong a σ the tests would have shown. An error state has no truth here, and is not
-        tested.
+        The verdict; its ``power`` is the error of each state's σ that the tests would have detected. Error states have no truth here and
+        are not tested.
 
     References
     ----------
@@ -293,7 +292,7 @@ def judge(
 def _bounded(
     findings: Sequence[Finding], limits: Sequence[str], probability: float, unmodelled: Sequence[str]
 ) -> Judgement:
-    """Return the verdict on a filter whose σ are upper bounds: one-sided, by ratios alone."""
+    """Return the verdict on a filter whose σ are upper bounds: one-sided tests of the ratios only."""
     ratios = [
         replace(one, p_value=mean_p_value(one.value, one.degrees, one.samples) if one.value > 1.0 else 1.0)
         for one in findings
@@ -306,7 +305,7 @@ def _bounded(
         return judged
     sizes = ", ".join(f"{math.sqrt(one.value):.2g} σ of {one.of}" for one in ratios if one.name == "NIS")
     reason = (
-        "the filter's σ are upper bounds, its noise covering disturbances that last, and nothing exceeds them"
+        "the filter's σ are upper bounds, because its noise covers lasting disturbances, and no error exceeds them"
         f"{f' (RMS innovations {sizes})' if sizes else ''}"
     )
     if not errors_judged:
@@ -333,8 +332,8 @@ def _of_sensor(sensor: str, white: Array, nis: Array) -> list[Finding]:
     mean_vector, p_mean = mean_innovation_p_value(white)
     off = float(np.linalg.norm(mean_vector))
     which = f"innovations of {sensor} are"
-    late = f"{which} correlated in time: they hold what the filter could have known"
-    odd = f"{which} not normal: outliers, or noise that is not what the filter takes it for"
+    late = f"{which} correlated in time: they contain information that the filter has not used"
+    odd = f"{which} not normal: outliers, or noise that differs from the filter's model"
     shape = (
         ("whiteness", statistic / number, p_white, late),
         ("normality", square, p_normal, odd),
@@ -344,7 +343,7 @@ def _of_sensor(sensor: str, white: Array, nis: Array) -> list[Finding]:
 
 
 def innovation_words(sensor: str, mean: float) -> str:
-    """Say what a NIS per degree of freedom means."""
+    """Return the meaning of a NIS per degree of freedom in words."""
     return f"innovations of {sensor} are {math.sqrt(mean):.3g} times their σ (NIS {mean:.4g} per degree of freedom)"
 
 
@@ -358,7 +357,7 @@ def _of_pairs(estimate: Estimate) -> list[Finding]:
         if math.isnan(p):
             continue
         largest = float(np.max(np.abs(correlation)))
-        means = f"innovations of {one} and {other} are correlated: they share an error that the filter does not know of"
+        means = f"innovations of {one} and {other} are correlated: they share an error that the filter does not model"
         of = f"{one} and {other}"
         found.append(Finding(name="cross-correlation", of=of, value=largest, p_value=p, samples=pairs, means=means))
     return found
@@ -380,10 +379,10 @@ def _of_errors(estimate: Estimate, truth: Truth, limits: list[str], beside: Sequ
     variance = estimate.variance[seen]
     if estimate.covariance is None:
         limits.append(
-            "the estimate holds variances only, so errors are judged axis by axis at the end; keep whole covariances"
+            "the estimate holds variances only, so errors are judged axis by axis at the end; keep full covariances"
         )
         return [_largest_at_end(e[-1], variance[-1])]
-    # Neither a filter nor a reference need have a bias.
+    # The filter or the reference may have no bias.
     known = 6 if np.isfinite(e[:, 3:]).any() and np.isfinite(variance[:, 3:]).any() else 3
     e, P = e[:, :known], estimate.covariance[seen][:, :known, :known]
     found: list[Finding] = []
@@ -402,14 +401,14 @@ def _of_errors(estimate: Estimate, truth: Truth, limits: list[str], beside: Sequ
             hidden.append(subset)
     if hidden:
         limits.append(
-            f"the {' and '.join(hidden)} errors of a filter with further error states are not averaged over one run: how slowly they "
-            "change is not known"
+            f"the {' and '.join(hidden)} errors of a filter with further error states are not averaged over one run, because their "
+            "correlation time is not known"
         )
     return found
 
 
 def _largest_at_end(error: Array, variance: Array) -> Finding:
-    """Return what the largest error at the end says, of one axis; the p-value is that of the largest among so many (Bonferroni)."""
+    """Return the finding of the largest error at the end over the axes; its p-value includes their number (Bonferroni)."""
     squares = (error**2 / variance)[np.isfinite(error)]
     name = state_name(int(np.argmax(squares)))
     ratio = math.sqrt(float(np.max(squares)))
@@ -424,7 +423,7 @@ def _largest_at_end(error: Array, variance: Array) -> Finding:
 
 
 def _over_the_run(subset: str, e: Array, P: Array, states: tuple[int, ...], limits: list[str]) -> list[Finding]:
-    """Return the time-averaged NEES of a subset of the states; where its error changes too slowly, none, and the reason to the limits."""
+    """Return the time-averaged NEES of a subset of the states; none, and a limit, if its error changes too slowly."""
     average = time_average(e, P, states)
     if not average.reliable:
         limits.append(
@@ -436,17 +435,17 @@ def _over_the_run(subset: str, e: Array, P: Array, states: tuple[int, ...], limi
 
 
 def _averages(subset: str, beside: Sequence[str]) -> bool:
-    """Return whether the error of a subset of the states may be averaged over one run of a filter with these error states beside them.
+    """Return whether the error of a subset of the states may be averaged over one run of a filter with these further error states.
 
-    The run shows the correlation of the six errors alone. An error state adds a part that may last longer than the run; where that part
-    happens to be small, what is left looks both quick and too small, and a consistent filter would be called pessimistic (20 % of single
-    runs with states for flicker). Through gyro states that part reaches the bias; the attitude has it only from states of the sensors.
+    The correlation is estimated from the six errors only. An error state adds a part that may last longer than the run; if that part
+    happens to be small, the rest appears both fast and too small, and a consistent filter would be called pessimistic (20 % of single
+    runs with states for flicker). Gyro states add such a part to the bias; only states of the sensors add one to the attitude.
     """
     return not beside or (subset == "attitude" and all(name.startswith(("gyro ", "gyro.")) for name in beside))
 
 
 def error_words(what: str, ratio: float) -> str:
-    """Say what a NEES per state means."""
+    """Return the meaning of a NEES per state in words."""
     return f"{what} is {math.sqrt(ratio):.3g} times the filter's σ (NEES {ratio:.4g} per state)"
 
 
@@ -459,14 +458,14 @@ def concluded(
     needed: Sequence[str] = (),
     unmodelled: Sequence[str] = (),
 ) -> Judgement:
-    """Return the verdict that findings lead to, all taken together; what each was before, rejected or not, does not count.
+    """Return the verdict that findings lead to, all taken together; their ``rejected`` is ignored and evaluated again.
 
-    ``states`` are those of the filter, whose power is reported; ``needed`` those of them whose σ the tests must be able to see for
-    "consistent" (without any the sharpest test decides); ``unmodelled`` errors that the filter has no state for.
+    ``states`` are the filter's states, whose power is reported; ``needed`` those whose σ the tests must be able to check for "consistent"
+    (if empty, the most powerful test decides); ``unmodelled`` errors that the filter has no state for.
     """
     marked = holm(findings, 1.0 - probability)
     kept = sum(not one.rejected for one in marked)
-    # Bounds where Holm's procedure has stopped.
+    # Bounds at the significance level at which Holm's procedure has stopped.
     marked = [one._with_bounds((1.0 - probability) / max(kept, 1)) for one in marked]
     power = powers(marked, probability, states)
     rejected = [finding for finding in marked if finding.rejected]
@@ -501,7 +500,7 @@ def concluded(
 
 
 def powers(findings: Sequence[Finding], probability: float, states: Sequence[str]) -> tuple[Power, ...]:
-    """Return what the tests would have shown of a wrong σ: of the innovations of each sensor, and of each state."""
+    """Return the smallest error of σ that the tests would have detected, by sensor (innovations) and by state."""
     best = {f"{_INNOVATIONS}{one.of}": math.inf for one in findings if one.name == "NIS"}
     best |= dict.fromkeys(states, math.inf)
     for one, factor in _factors(findings, probability):
@@ -512,7 +511,7 @@ def powers(findings: Sequence[Finding], probability: float, states: Sequence[str
 
 
 def _factors(findings: Sequence[Finding], probability: float) -> Iterator[tuple[Finding, float]]:
-    """Yield the ratios with the factor on σ that each distinguishes from 1: the root of the ratio of its bounds, Bonferroni included."""
+    """Yield the ratios with the factor on σ that each detects: the root of the ratio of its bounds, with Bonferroni's correction."""
     within = (1.0 - probability) / max(len(findings), 1)
     for one in findings:
         if one.is_ratio:
@@ -521,7 +520,7 @@ def _factors(findings: Sequence[Finding], probability: float) -> Iterator[tuple[
 
 
 def power_words(power: Sequence[Power]) -> str:
-    """Return in words which wrong σ would have been seen, and which not."""
+    """Return in words which errors of σ would have been detected."""
     seen = [one for one in power if one.seen]
     coarse = [one for one in power if not one.seen and math.isfinite(one.factor)]
     untested = [one.of for one in power if math.isinf(one.factor)]
@@ -555,5 +554,5 @@ def holm(findings: Iterable[Finding], error: float) -> list[Finding]:
 
 
 def state_name(state: int) -> str:
-    """Return "attitude x" … "bias z" of the number of an error state."""
+    """Return the name, "attitude x" … "bias z", of a state by its index."""
     return f"{('attitude', 'bias')[state // 3]} {'xyz'[state % 3]}"

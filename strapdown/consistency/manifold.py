@@ -13,8 +13,8 @@ SUBSETS: dict[str, tuple[int, ...]] = {
     "attitude": (0, 1, 2),
     "bias": (3, 4, 5),
 }
-"""Subsets of the error state by name. Any other is a tuple of indices; of errors in the fixed frame (:func:`fixed_frame`) 2 is the
-heading and (0, 1) the inclination where the fixed z axis is vertical."""
+"""Subsets of the error state by name; any other is a tuple of indices. For errors in the fixed frame (:func:`fixed_frame`) with a vertical
+z axis, 2 is the heading and (0, 1) the inclination."""
 
 
 def errors(attitude: ArrayLike, bias: ArrayLike, true_attitude: ArrayLike, true_bias: ArrayLike) -> Array:
@@ -55,7 +55,7 @@ def errors(attitude: ArrayLike, bias: ArrayLike, true_attitude: ArrayLike, true_
 
 
 def whitened(error: ArrayLike, covariance: ArrayLike) -> Array:
-    """Return L⁻¹ e (..., n) with P = L Lᵀ: independent standard normals if the covariance is right."""
+    """Return L⁻¹ e (..., n) with P = L Lᵀ: independent standard normal if the covariance is right."""
     e = array("error", error, (..., "n"))
     P = array("covariance", covariance, (..., e.shape[-1], e.shape[-1]))
     try:
@@ -64,7 +64,7 @@ def whitened(error: ArrayLike, covariance: ArrayLike) -> Array:
         least = np.linalg.eigvalsh(P)[..., 0]
         place = [int(i) for i in np.unravel_index(np.argmin(least), least.shape)]
         raise InputError(
-            f"covariance{place or ''} is not positive definite (least eigenvalue {least.min():.3g})"
+            f"covariance{place or ''} is not positive definite (smallest eigenvalue {least.min():.3g})"
         ) from None
     return np.asarray(np.linalg.solve(factor, e[..., None])[..., 0])
 
@@ -75,17 +75,17 @@ def nees(error: ArrayLike, covariance: ArrayLike, states: tuple[int, ...] | None
     Parameters
     ----------
     error : array_like (..., n)
-        Errors of the states, such as of :func:`errors`.
+        Errors of the states, for instance of :func:`errors`.
     covariance : array_like (..., n, n)
         The filter's covariance of these errors, in their units.
     states : tuple of int, optional
-        A subset of the states (values of ``strapdown.consistency.manifold.SUBSETS`` or any indices), whose marginal covariance is the
+        Subset of the states (a value of ``strapdown.consistency.manifold.SUBSETS`` or any indices), whose marginal covariance is that
         block of P. Default: all.
 
     Returns
     -------
     ndarray (...,)
-        χ² with as many degrees of freedom as states, if the filter is consistent.
+        χ² with the number of states as degrees of freedom if the filter is consistent.
 
     Raises
     ------

@@ -1,8 +1,8 @@
-"""Averages over the time of one run. Errors at different epochs of one run are correlated, so they count for fewer than they are.
+"""Averages over the time of one run. Errors at different epochs are correlated, so the effective number of samples is smaller.
 
 The error of a consistent filter is a Gauss–Markov process: ``e_{k+1} = (I − K H) Φ e_k + noise``. Whitened by the filter's own covariance
 it is a vector autoregression of first order, z_{k+1} = A z_k + …, of covariance I, and the correlation of |z_k|² with |z_{k+τ}|² is
-‖A^τ‖²/n. That gives the variance of the average, and with it the number of independent samples that would have the same.
+‖A^τ‖²/n. This gives the variance of the average, and the number of independent samples with the same variance.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from strapdown.checks import InputError, array
 from strapdown.consistency.manifold import whitened
 
 MIN_EFFECTIVE = 50.0
-"""Below this many effective samples the correlation is not known well enough from the run itself for a p-value that holds."""
+"""Minimum effective samples: with fewer, the correlation estimated from the run is too uncertain for a valid p-value."""
 
 MARKOV = 0.6
-"""Where the correlation of the NEES itself leaves less than this share of the samples that the vector autoregression does, it counts."""
+"""The autocorrelation of the NEES replaces the vector autoregression if it leaves less than this fraction of its effective samples."""
 
 POWERS = 256
-"""Powers of the matrix that are made at once."""
+"""Number of powers of the matrix computed at once."""
 MAX_EPOCHS = 4000
 
 
@@ -37,15 +37,15 @@ class TimeAverage:
 
     @property
     def reliable(self) -> bool:
-        """Whether the run is long against the correlation of its errors; if not, the p-value does not hold."""
+        """Whether the run is long compared with the correlation time of its errors; if not, the p-value is not valid."""
         return self.effective >= MIN_EFFECTIVE
 
 
 def time_average(error: ArrayLike, covariance: ArrayLike, states: tuple[int, ...] | None = None) -> TimeAverage:
-    """Return the NEES averaged over the even epochs of one run, with as many effective samples as its correlation leaves.
+    """Return the NEES averaged over the evenly spaced epochs of one run, with its number of effective samples.
 
-    Error (epochs, n) and covariance (epochs, n, n); ``states`` is the subset judged. All states are used to learn the correlation, because
-    no subset is a Markov process by itself.
+    Error (epochs, n) and covariance (epochs, n, n); ``states`` is the subset judged. The correlation is estimated from all states, because
+    a subset is no Markov process.
     """
     e = array("error", error, ("epochs", "n"))
     P = array("covariance", covariance, (len(e), e.shape[1], e.shape[1]))
@@ -64,25 +64,25 @@ def time_average(error: ArrayLike, covariance: ArrayLike, states: tuple[int, ...
 
 
 def _effective(white: np.ndarray, first: int) -> float:
-    """Return the effective samples, by the memory from one epoch to the next, unless that from one to a later one shows too few.
+    """Return the effective samples by the autoregression from one epoch to the next, unless that over longer intervals shows too few.
 
-    An error that is the sum of a quick and of a slow part is no Markov process: from one epoch to the next the quick part hides the slow.
+    A sum of a fast and a slow error is no Markov process: from one epoch to the next the fast part hides the correlation of the slow.
     """
-    # Fewer epochs than that could not show that there are enough effective samples.
+    # A series of fewer epochs could not show that there are enough effective samples.
     least = max(8 * (white.shape[1] + 1), 2 * int(MIN_EFFECTIVE))
     most = max(1, len(white) // least)
     found = [effective_samples(white[:: 2**k], first) for k in range(most.bit_length())]
     by_model = found[0] if min(found) >= MIN_EFFECTIVE else min(found)
-    # Nor are the six states alone where the filter has error states beside them.
+    # The six states of a filter with further error states are no Markov process either.
     direct = squares_effective(white[:, :first])
     return direct if direct < MARKOV * by_model else by_model
 
 
 def squares_effective(white: ArrayLike) -> float:
-    """Return how many independent samples would average |z|² of a series (m, n) as well, by the autocorrelation of |z|² itself.
+    """Return the number of independent samples with the same variance of the mean of |z|², by the autocorrelation of |z|² (m, n).
 
-    The sum over the lags ends where that of two neighbours is negative (Geyer 1992, initial positive sequence). The mean is that of the
-    series: with the nominal one, n, a wrong σ would count as correlation.
+    The sum over the lags ends where that of two neighbours is negative (Geyer 1992, initial positive sequence). The mean of the series is
+    subtracted, because a wrong σ would count as correlation if the nominal one, n, were.
     """
     z = array("white", white, ("m", "n"))
     m = len(z)
@@ -99,7 +99,7 @@ def squares_effective(white: ArrayLike) -> float:
 
 
 def effective_samples(white: ArrayLike, first: int | None = None) -> float:
-    """Return how many independent samples would average |z|² of the first components as well as this series (m, n) of them does.
+    """Return the number of independent samples with the same variance of the mean of |z|² of the first components of the series (m, n).
 
     ``m/(1 + 2 Σ_τ (1 − τ/m) ‖(A^τ)_first‖²/first)``, A by least squares.
     """
@@ -107,7 +107,7 @@ def effective_samples(white: ArrayLike, first: int | None = None) -> float:
     m, n = z.shape
     k = n if first is None else first
     A = np.linalg.lstsq(z[:-1], z[1:], rcond=None)[0].T
-    # Least squares makes the memory of a series of known mean too short by 2/m of itself (Kendall 1954).
+    # Least squares underestimates the autoregression of a series of known mean by a fraction 2/m (Kendall 1954).
     A = A * (1.0 + 2.0 / m)
     powers, lags = A[None], np.arange(1, POWERS + 1)
     while len(powers) < POWERS:

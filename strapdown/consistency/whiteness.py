@@ -1,7 +1,7 @@
-"""Tests of what the innovations of a consistent filter are: white, normal, of mean zero, independent of those of other sensors.
+"""Tests of the innovations of a consistent filter: white, normal, of mean zero, independent of those of other sensors.
 
-All take whitened innovations (m, dof), :attr:`strapdown.records.Innovations.whitened`. Every test is of the shape only: a factor on all
-of them, which NIS shows, changes none.
+All take whitened innovations (m, dof), :attr:`strapdown.records.Innovations.whitened`. All are invariant to a common factor on the
+innovations, which the NIS shows.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ MAX_LAGS = 20
 
 
 def usual_lags(samples: int) -> int:
-    """Return the number of lags that a whiteness test takes by default: a fiftieth of the samples, from 1 to 20."""
+    """Return the default number of lags of a whiteness test: a fiftieth of the samples, from 1 to 20."""
     return max(1, min(MAX_LAGS, samples // 50))
 
 
@@ -28,21 +28,21 @@ class Autocorrelation:
     """Autocorrelation of each component of a series."""
 
     lags: Array
-    """From 1 on (L,)."""
+    """Lags (L,), from 1."""
     values: Array
-    """(L, dof)."""
+    """Autocorrelation at each lag (L, dof)."""
     bounds: Array
-    """Half-width of the two-sided bounds of one value (L,)."""
+    """Half-width of the two-sided bounds of a single value (L,)."""
     simultaneous_bounds: Array
-    """Half-width that all values keep together (L,)."""
+    """Half-width of the bounds that hold for all values jointly (L,) (Bonferroni)."""
     probability: float
 
 
 def autocorrelation(whitened: ArrayLike, lags: int | None = None, probability: float = 0.99) -> Autocorrelation:
-    """Return the autocorrelation of whitened innovations (n,) or (n, m) at lags 1 to ``lags``, each component by itself.
+    """Return the autocorrelation of whitened innovations (n,) or (n, m) at lags 1 to ``lags``, of each component.
 
-    By default 20 lags, or a fiftieth of the samples. The mean is known to be zero and is not subtracted. For white noise the value at lag l
-    is nearly normal with variance (N − l)/(N(N + 2)) (Ljung & Box 1978, Biometrika 65).
+    Default: a fiftieth of the samples, at most 20 lags. The mean is known to be zero and is not subtracted. For white noise the value at
+    lag l is approximately normal with variance (N − l)/(N(N + 2)) (Ljung & Box 1978, Biometrika 65).
     """
     from scipy.special import ndtri
 
@@ -68,8 +68,8 @@ def autocorrelation(whitened: ArrayLike, lags: int | None = None, probability: f
 def ljung_box(whitened: ArrayLike, lags: int | None = None) -> tuple[float, int, float]:
     """Return the multivariate Ljung–Box statistic of whitened innovations (n,) or (n, m), its degrees of freedom and its p-value.
 
-    ``Q = N(N + 2/m) Σ_l tr(C_lᵀ C_0⁻¹ C_l C_0⁻¹)/(N − l)`` is χ² with m² L degrees of freedom if the innovations are white; the test is
-    one-sided, large is not white. No parameters have been fitted, so no degrees of freedom are subtracted; the factor N(N + 2/m), instead
+    ``Q = N(N + 2/m) Σ_l tr(C_lᵀ C_0⁻¹ C_l C_0⁻¹)/(N − l)`` is χ² with m² L degrees of freedom if the innovations are white. The test is
+    one-sided: large values reject. No parameters are fitted, so no degrees of freedom are subtracted; the factor N(N + 2/m), instead
     of N², gives the right mean in small samples where the mean is known (Hosking 1980, J. American Statistical Association 75).
     """
     from scipy.special import chdtrc
@@ -79,7 +79,7 @@ def ljung_box(whitened: ArrayLike, lags: int | None = None) -> tuple[float, int,
     number = count("lags", lags if lags is not None else usual_lags(n))
     if number >= n or n <= m:
         raise InputError(f"{n} samples are too few for {number} lags of {m} components")
-    # Components of unit covariance: then the traces are sums of squares.
+    # With components of unit covariance the traces are sums of squares.
     u = _decorrelated(z)
     total = 0.0
     for lag in range(1, number + 1):
@@ -96,19 +96,19 @@ def _decorrelated(z: Array) -> Array:
 
 
 def anderson_darling(whitened: ArrayLike) -> tuple[float, float]:
-    """Return the Anderson–Darling statistic A²* of normality, mean and variance not known, and its p-value.
+    """Return the Anderson–Darling statistic A²* of normality, with mean and variance unknown, and its p-value.
 
-    The components are standardised each by itself and judged together. p-values by D'Agostino & Stephens (1986), table 4.9: 0.752 is 5 %,
-    1.035 is 1 %.
+    The components are standardised separately and pooled. p-values after D'Agostino & Stephens (1986), table 4.9: 0.752 is 5 %, 1.035 is
+    1 %.
     """
     from scipy.special import log_ndtr
 
     z = _series(whitened)
     if len(z) < 8:
-        raise InputError(f"{len(z)} samples are too few to judge normality; 8 or more")
+        raise InputError(f"{len(z)} samples are too few to judge normality; at least 8 are needed")
     spread = z.std(axis=0, ddof=1)
     if np.any(spread == 0.0):
-        raise InputError("the innovations do not vary; they are no measurements")
+        raise InputError("the innovations do not vary; check that they are from measurements")
     x = np.sort(((z - z.mean(axis=0)) / spread).ravel())
     n = len(x)
     weight = 2.0 * np.arange(1, n + 1) - 1.0
@@ -127,13 +127,13 @@ def anderson_darling(whitened: ArrayLike) -> tuple[float, float]:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class QuantilePairs:
-    """Sorted values beside the quantiles of the standard normal: a Q–Q plot."""
+    """Sorted values and the quantiles of the standard normal: a Q–Q plot."""
 
     theoretical: Array
     observed: Array
-    """Sorted, all components together."""
+    """Sorted values of all components together."""
     low: Array
-    """Lower end of the pointwise band of each sorted value (order statistics are beta distributed)."""
+    """Lower limit of the pointwise band of each sorted value (from the beta distribution of order statistics)."""
     high: Array
     probability: float
 
@@ -142,7 +142,7 @@ MAX_PAIRS = 2000
 
 
 def quantile_pairs(whitened: ArrayLike, probability: float = 0.99) -> QuantilePairs:
-    """Return what a Q–Q plot against the standard normal needs; of more than 2000 values evenly spread ranks and both ends."""
+    """Return the points of a Q–Q plot against the standard normal; for more than 2000 values both ends and evenly spread ranks."""
     from scipy.special import betaincinv, ndtri
 
     outside = tail(probability)
@@ -161,7 +161,7 @@ def quantile_pairs(whitened: ArrayLike, probability: float = 0.99) -> QuantilePa
 
 
 def mean_innovation_p_value(whitened: ArrayLike) -> tuple[Array, float]:
-    """Return the mean of the whitened innovations (dof,) and the p-value that it is zero: Hotelling's T², exact for normal ones."""
+    """Return the mean of the whitened innovations (dof,) and the p-value that it is zero: Hotelling's T², exact for normal innovations."""
     from scipy.special import fdtrc
 
     z = _series(whitened)
@@ -179,15 +179,15 @@ def cross_correlation_p_value(
 ) -> tuple[Array, int, float]:
     """Return the correlation of two sensors' whitened innovations (dof, dof), the number of pairs, and the p-value that it is zero.
 
-    Each innovation of the one is paired with the next of the other at the same time or later, no other of the one lying between: whatever
-    their times, those of a consistent filter are independent. Bartlett's test of canonical correlations, −(N − (p + q + 1)/2) Σ ln(1 − ρ²)
-    as χ² with p q degrees of freedom; too few pairs give NaN.
+    Each innovation of the other is paired with the last of the one at or before it, and each is used once at most. For a consistent filter
+    they are independent whatever their times. Bartlett's test of canonical correlations, −(N − (p + q + 1)/2) Σ ln(1 − ρ²), is χ² with p q
+    degrees of freedom; if there are too few pairs, it is NaN.
     """
     from scipy.special import chdtrc
 
     a, b = _series(one), _series(other)
     ta, tb = np.asarray(one_time), np.asarray(other_time)
-    before = np.searchsorted(ta, tb, side="right") - 1  # the last of the one at or before each of the other
+    before = np.searchsorted(ta, tb, side="right") - 1  # index of the last of the one at or before each of the other
     first = np.ones(len(tb), bool)
     first[1:] = before[1:] != before[:-1]
     used = first & (before >= 0)

@@ -33,7 +33,7 @@ from strapdown.estimation.states import (
     pack,
     restart_bias_variance,
 )
-from strapdown.kernels import covariance_form, gate, gate_rules, iterated_update, root_form
+from strapdown.kernels import covariance_form, gate, gate_rules, iterated_update, likelihood_outliers, root_form
 from strapdown.kernels.chains import LINKS
 from strapdown.kernels.error_state_step import OFFSET
 from strapdown.kernels.lane_values import WIDTH
@@ -86,6 +86,9 @@ class Options:
     states."""
     factor: bool = False
     """Carry the triangular factor even without error states."""
+    outliers: tuple[float, float] | None = None
+    """Share of outliers and their variance over that of the others: of a factor, without a gate. As ``weight`` each measurement then has
+    minus its log likelihood, the probability that it is one, and the mean share of its own noise in its innovations' variances (m, 3)."""
 
     def __post_init__(self) -> None:
         """Check the classes of gate and robust."""
@@ -600,7 +603,8 @@ def factor_body(problem: Problem, units: Mapping[str, float], *, together: bool 
     """Return the filter as the kernels take it."""
     model, initial = problem.model, problem.initial
     size = 6 + model.states
-    attitude, x, F = np.zeros((2, 4)), np.zeros((2, size - 3)), np.zeros((2, size + model.noise_rows, padded(size)))
+    rows = size + max(model.noise_rows, size + 1)
+    attitude, x, F = np.zeros((2, 4)), np.zeros((2, size - 3)), np.zeros((2, rows, padded(size)))
     attitude[0], x[0] = initial.attitude, np.concatenate([initial.bias, initial.values[model.order]])
     F[0, :size, :size] = modelling.triangle(initial, model)
     if initial.gate is not None and initial.gate.candidate is not None:
@@ -641,7 +645,7 @@ def _in_factor(problem: Problem, options: Options) -> Passed:
         (rows if options.full_covariance and not options.whole_bias else 0, kept, kept),
         (whole_rows, 6),
         (whole_rows if options.full_covariance else 0, 6, 6),
-        _innovations(events, judged=options.judged),
+        _innovations(events, judged=options.judged) if options.outliers is None else (len(events.time), 9),
     )
     written = side_by_side(*((shape, float) for shape in shapes))
     out = root_form.Outputs._make((*written, stored[: options.segments]))
@@ -654,7 +658,10 @@ def _in_factor(problem: Problem, options: Options) -> Passed:
         number, recovered, locked = compiled(walk, gate, root_form)(*arguments, judge.body(body, restart), judged)
         weight, happened = judged.weight, judge.events(judged, recovered, locked)
     else:
-        number = compiled(walk, root_form)(*arguments, body, out)
+        if options.outliers is not None:
+            body, weight = body._replace(outliers=options.outliers), out.innovation[:, 6:]
+        bodies = (root_form,) if options.outliers is None else (likelihood_outliers, root_form)
+        number = compiled(walk, *bodies)(*arguments, body, out)
     if number < 0:  # rows from there on are not written
         raise RuntimeError("the triangular factor lost its last digits; please report this with the record")
     if options.segments:

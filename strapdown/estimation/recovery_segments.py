@@ -95,7 +95,7 @@ def restarted(gate: Gate, memory: GateMemory) -> tuple[Array, Array, Array]:
     sigma = restart_attitude(gate.restart_attitude_sigma, memory.counts)
     bias, variance = memory.counts[FIRST_BIAS : FIRST_BIAS + 3], memory.counts[FIRST_BIAS + 3 : FIRST_BIAS + 6]
     counts = memory.counts.copy()
-    counts[CANDIDATE], counts[PASSES] = 0.0, WIDE_PASSES
+    counts[PASSES] = WIDE_PASSES
     return bias.copy(), np.concatenate([np.full(3, sigma**2), variance]), counts
 
 

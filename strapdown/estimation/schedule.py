@@ -283,14 +283,20 @@ def innovations_by_sensor(
     for i, (sensor, kind) in enumerate(zip(events.sensors, events.kinds, strict=True)):
         mine = slice(events.bounds[i], events.bounds[i + 1])
         e, s = rows[mine, 0 : 2 * KINDS[kind] : 2], rows[mine, 1 : 2 * KINDS[kind] : 2]
-        time, share = events.series_time[i], None if weight is None else weight[mine]
+        share = None if weight is None else weight[mine]
+        one = Innovations(time=events.series_time[i], innovation=e, variance=s, weight=share)
         shown = None if processed is None else processed[mine]
         if kind == "heading" and np.isnan(np.sum(e)):
             shown = ~np.isnan(e[:, 0]) if shown is None else shown & ~np.isnan(e[:, 0])
-        if shown is not None:
-            time, e, s, share = time[shown], e[shown], s[shown], None if share is None else share[shown]
-        result[sensor] = Innovations(time=time, innovation=e, variance=s, weight=share)
+        result[sensor] = one if shown is None else selected(one, shown)
     return result
+
+
+def selected(innovations: Innovations, which: np.ndarray) -> Innovations:
+    """Return the innovations of some of the measurements, given by a mask (m,)."""
+    return replace(
+        innovations, **{name: value[which] for name, value in vars(innovations).items() if value is not None}
+    )
 
 
 def skipped_too(events: Schedule, innovations: Mapping[str, Innovations]) -> dict[str, int]:

@@ -216,9 +216,7 @@ class _Smoother:
         """
         record, gate = self.problem.record, self.options.gate
         assert gate is not None
-        # Parts of the record keep the units of the whole.
-        units = forward.unit_sigmas(record, self.problem.model, self.problem.initial.unit_sigma)
-        state = replace(self.problem.initial, unit_sigma=units)
+        state = self.problem.initial
         breaks: list[Break] = []
         reruns: list[Rerun] = []
         begin = float(record.time[0])

@@ -1,7 +1,7 @@
-"""Files: every one that is read passes ``reading``, every one that is written passes ``writing``.
+"""Files: every file is read through ``reading`` and written through ``writing``.
 
-- ``reading``: Limits, names of files in errors, digests.
-- ``writing``: Files that are never half written, locked while written, sealed with a digest.
+- ``reading``: Limits of size, errors that name the file, digests.
+- ``writing``: Atomic writing, locks, digests.
 - ``tables``: Frozen dataclasses as TOML and JSON tables with the unit in each key.
 """
 

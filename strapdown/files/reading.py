@@ -1,13 +1,13 @@
-"""Reading files: the one layer that opens every input file, whatever its format.
+"""Reading files: all input files, of any format, are opened by this module.
 
-A file may be damaged, of another kind, or made to do harm. So each format has one function here that opens it: no other module opens a
-file to read it. Every fault of a file is an :class:`~strapdown.checks.InputError` that names it, raised within
-:func:`from_file`, and sizes are checked before memory is allocated.
+A file may be damaged, of another kind, or malicious. Each format therefore has one function here that opens it, and no other module opens a
+file for reading. Every fault of a file is an :class:`~strapdown.checks.InputError` that names the file, raised within :func:`from_file`,
+and sizes are checked before memory is allocated.
 
-HDF5 files of this package begin with a block of 512 bytes (a *user block*, which other programs skip) that holds the SHA-256 of all that
-follows. It is compared before the HDF5 library sees the file, because that library may loop for ever, or crash, on damaged ones. A file
-without such a digest is first read by a child process with a limit of its time. A digest shows damage; it is no signature, and does not
-show who wrote a file.
+HDF5 files of this package begin with a block of 512 bytes (a *user block*, which other programs skip) with the SHA-256 digest of the rest
+of the file. It is checked before the HDF5 library opens the file, because that library may hang or crash on damaged files. A file without
+such a digest is first read by a child process with a time limit. A digest detects damage; it is not a signature and does not authenticate
+the author.
 """
 
 from __future__ import annotations
@@ -37,24 +37,24 @@ from strapdown.checks import InputError
 Name = str | os.PathLike[str]
 
 LIMIT = "STRAPDOWN_MAX_MB"
-"""Environment variable: most megabytes that one file may hold, unpacked."""
+"""Environment variable: maximum uncompressed size of one file, MB."""
 DEFAULT_LIMIT = 4096
 TABLE_SHARE = 64
-"""Factor by which TOML and JSON must be smaller than the limit: parsed, they need that much more memory than their text."""
+"""Factor by which TOML and JSON must be smaller than the limit: when parsed, they need that much more memory than their text."""
 PACKING = 1100
-"""Greatest ratio of an array to its compressed form: deflate reaches 1032."""
+"""Maximum compression ratio of an array; that of deflate is 1032."""
 DOTTED_KEYS = 32
-"""Most parts of a dotted key in TOML: the time to read one grows with the square of their number."""
+"""Maximum number of parts of a dotted key in TOML; the time to parse one grows with the square of that number."""
 LONGEST_MESSAGE = 2000
 
 SEAL = b"strapdown file, SHA-256 of the bytes from 512 on: "
 """Beginning of the user block."""
 BLOCK = 512
-"""Bytes of the user block."""
+"""Size of the user block, bytes."""
 
 
 class NoDigestWarning(UserWarning):
-    """A file of this package has no digest, as those of earlier versions have none, so that damage to it may pass unseen."""
+    """A file of this package has no digest, as files of earlier versions, so that damage to it may not be detected."""
 
 
 # ------------------------------------------------------------------------------------------------------------------ any file
@@ -62,7 +62,7 @@ class NoDigestWarning(UserWarning):
 
 @contextlib.contextmanager
 def from_file(path: Name) -> Iterator[None]:
-    """Raise any exception within as an InputError that names the file: its fault, but for a library that is not installed."""
+    """Raise any exception within as an InputError that names the file and blames it, except for a missing library."""
     try:
         yield
     except InputError as error:
@@ -85,13 +85,13 @@ def from_file(path: Name) -> Iterator[None]:
 
 
 def _short(text: str) -> str:
-    """Return a message without the middle of what a hostile file makes endless."""
+    """Return a message, shortened in the middle if it is too long, as a malicious file may make it."""
     half = LONGEST_MESSAGE // 2
     return text if len(text) <= LONGEST_MESSAGE else f"{text[:half]} … {text[-half:]}"
 
 
 def limit() -> int:
-    """Return how many bytes one file may hold, unpacked: 4 GB, or the environment variable ``STRAPDOWN_MAX_MB``."""
+    """Return the maximum uncompressed size of one file, bytes: 4 GB, or the environment variable ``STRAPDOWN_MAX_MB``."""
     value = os.environ.get(LIMIT, str(DEFAULT_LIMIT))
     if not value.isdecimal() or int(value) == 0:
         raise InputError(f"the environment variable {LIMIT} is {value!r}; it must be a whole number of megabytes")
@@ -99,29 +99,29 @@ def limit() -> int:
 
 
 def existing_file(path: Name) -> None:
-    """Refuse an input that is missing, or no regular file: a folder, a pipe, a device."""
+    """Reject an input that is missing or not a regular file, such as a folder, a pipe or a device."""
     with opened(path):
         pass
 
 
 @contextlib.contextmanager
 def opened(path: Name, *, link: bool = True, maximum: int | None = None) -> Iterator[io.BufferedReader]:
-    """Yield a regular file of at most ``maximum`` bytes (by default :func:`limit`), open for reading.
+    """Yield a regular file of at most ``maximum`` bytes (default: :func:`limit`), open for reading.
 
-    ``link`` False refuses a symbolic link: of a file that the user did not name, it could expose another file in the result.
+    If ``link`` is False, a symbolic link is rejected: for a file not named by the user, it could expose another file in the result.
     """
     maximum = limit() if maximum is None else maximum
     if not link and Path(path).is_symlink():
         raise InputError(f"{path} is a symbolic link, which is not followed here; put the file itself there")
     try:
-        # Without blocking, so that a pipe without a writer is opened and then refused.
+        # Non-blocking, so that a pipe without a writer is opened and then rejected.
         handle = os.fdopen(os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)), "rb")
     except FileNotFoundError:
         raise InputError(f"{path} does not exist; check the path") from None
     except IsADirectoryError:
         raise InputError(f"{path} is a folder; name the file in it") from None
     except (OSError, ValueError) as error:
-        if Path(path).is_dir():  # Windows refuses to open a folder as it does a file without permission
+        if Path(path).is_dir():  # on Windows, opening a folder fails like a file without permission
             raise InputError(f"{path} is a folder; name the file in it") from None
         raise InputError(f"{path} cannot be read ({error}); check the path and its permissions") from None
     with handle:
@@ -129,7 +129,7 @@ def opened(path: Name, *, link: bool = True, maximum: int | None = None) -> Iter
         if stat.S_ISDIR(status.st_mode):
             raise InputError(f"{path} is a folder; name the file in it")
         if not stat.S_ISREG(status.st_mode):
-            raise InputError(f"{path} is no regular file but a pipe or a device; write its content to a file first")
+            raise InputError(f"{path} is not a regular file but a pipe or a device; write its content to a file first")
         _need_size(path, status.st_size, maximum)
         yield handle
 
@@ -137,7 +137,7 @@ def opened(path: Name, *, link: bool = True, maximum: int | None = None) -> Iter
 def _need_size(path: Name, size: float, maximum: int) -> None:
     if size > maximum:
         raise InputError(
-            f"{path} holds {size / 1e6:.4g} MB, more than the {maximum / 1e6:.4g} MB that may be read; if it is meant, raise the limit "
+            f"{path} has {size / 1e6:.4g} MB, more than the maximum of {maximum / 1e6:.4g} MB; if that is intended, raise the limit "
             f"with the environment variable {LIMIT} ({limit() // 1_000_000} now)"
         )
 
@@ -147,7 +147,7 @@ def content(path: Name, *, link: bool = True, maximum: int | None = None) -> byt
     with from_file(path), opened(path, link=link, maximum=maximum) as handle:
         maximum = limit() if maximum is None else maximum
         found = handle.read(maximum + 1)
-        _need_size(path, len(found), maximum)  # one without a stated size (/proc), or that grows
+        _need_size(path, len(found), maximum)  # again, for a file without a stated size (/proc) or a growing one
         return found
 
 
@@ -155,7 +155,7 @@ def text(path: Name, *, link: bool = True, maximum: int | None = None) -> str:
     """Return the text of a file in UTF-8."""
     found = content(path, link=link, maximum=maximum)
     if b"\0" in found:
-        raise InputError(f"{path} cannot be read as text (it holds zero bytes); the file is damaged or of another kind")
+        raise InputError(f"{path} cannot be read as text (it has zero bytes); the file is damaged or of another kind")
     try:
         return found.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -169,15 +169,15 @@ _DOTTED = re.compile(rf"(?<![\w-])(?:{_PART}[ \t]*+\.[ \t]*+){{{DOTTED_KEYS}}}")
 
 
 def from_toml(content: str, place: str) -> dict[str, Any]:
-    """Return the table of a TOML text; ``place`` is what it is called in errors."""
+    """Return the table of a TOML text; ``place`` is its name in errors."""
     if _DOTTED.search(content):
         raise InputError(
-            f"{place} has a key of more than {DOTTED_KEYS} parts joined by dots; it is no file of this kind"
+            f"{place} has a key of more than {DOTTED_KEYS} parts joined by dots; it is not a file of this kind"
         )
     try:
         return tomllib.loads(content)
     except (tomllib.TOMLDecodeError, RecursionError, ValueError) as error:
-        raise InputError(f"{place} is no TOML ({_short(str(error))})") from None
+        raise InputError(f"{place} is not TOML ({_short(str(error))})") from None
 
 
 def toml(path: Name) -> dict[str, Any]:
@@ -186,24 +186,24 @@ def toml(path: Name) -> dict[str, Any]:
 
 
 def from_json(content: str, place: str) -> Any:
-    """Return what a JSON text holds; NaN and infinities, for which JSON has no word, are refused."""
+    """Return the content of a JSON text; NaN and infinities, which are not part of JSON, are rejected."""
 
     def refuse(word: str) -> Any:
-        raise ValueError(f"it holds {word}")
+        raise ValueError(f"it has {word}")
 
     try:
         return json.loads(content, parse_constant=refuse)
     except (RecursionError, ValueError) as error:
-        raise InputError(f"{place} is no JSON ({_short(str(error))}); it is truncated or of another kind") from None
+        raise InputError(f"{place} is not JSON ({_short(str(error))}); it is truncated or of another kind") from None
 
 
 def json_file(path: Name) -> Any:
-    """Return what a JSON file holds."""
+    """Return the content of a JSON file."""
     return from_json(text(path, maximum=limit() // TABLE_SHARE), str(path))
 
 
 def npy(path: Name) -> np.ndarray[Any, Any]:
-    """Return the array of an NPY file, which holds exactly what its header declares; objects (pickles) are refused."""
+    """Return the array of an NPY file, whose size must be that declared in its header; objects (pickles) are rejected."""
     with from_file(path), opened(path) as handle:
         version = np.lib.format.read_magic(handle)
         read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
@@ -211,7 +211,7 @@ def npy(path: Name) -> np.ndarray[Any, Any]:
         declared = functools.reduce(lambda a, b: a * b, shape, dtype.itemsize)
         held = os.fstat(handle.fileno()).st_size - handle.tell()
         if dtype.hasobject or declared != held:
-            raise ValueError(f"its header declares {declared} bytes of {dtype}, and {held} follow")
+            raise ValueError(f"its header declares {declared} bytes of {dtype}, but {held} follow")
         handle.seek(0)
         return np.lib.format.read_array(handle, allow_pickle=False)
 
@@ -221,10 +221,10 @@ def npy(path: Name) -> np.ndarray[Any, Any]:
 
 @contextlib.contextmanager
 def hdf5(path: Name) -> Iterator[Any]:
-    """Yield an HDF5 file, open for reading, that is whole and holds all its data itself, unpacked no more than :func:`limit`.
+    """Yield an HDF5 file, open for reading, that is complete and self-contained, with at most :func:`limit` bytes uncompressed.
 
-    Refused is one that does not fit its digest, makes the HDF5 library hang or crash, refers to other files (external links, virtual
-    datasets, external storage), or declares more data than it holds.
+    A file is rejected if it does not match its digest, makes the HDF5 library hang or crash, refers to other files (external links, virtual
+    datasets, external storage), or declares more data than it contains.
     """
     import h5py
 
@@ -238,15 +238,15 @@ def hdf5(path: Name) -> Iterator[Any]:
             _need_readable(path)
         with h5py.File(path, "r") as file:
             if not sealed and str(attributes(file).get("kind", "")).startswith("strapdown "):
-                if file.userblock_size:  # which files of earlier versions have not
-                    raise InputError(f"{path} is damaged: its digest is gone; make it again, or take a copy")
-                warnings.warn(NoDigestWarning(f"{path} has no digest, so damage to it may pass unseen"), stacklevel=1)
+                if file.userblock_size:  # which files of earlier versions do not have
+                    raise InputError(f"{path} is damaged: its digest is missing; make it again, or restore a copy")
+                warnings.warn(NoDigestWarning(f"{path} has no digest; damage to it may not be detected"), stacklevel=1)
             _need_plain(path, file)
             yield file
 
 
 def is_hdf5(path: Name) -> bool:
-    """Return whether a file has the signature of HDF5, at its beginning or behind a user block."""
+    """Return whether a file has the signature of HDF5, at its beginning or after a user block."""
     with opened(path) as handle:
         place, size = 0, os.fstat(handle.fileno()).st_size
         while place < size:
@@ -258,7 +258,7 @@ def is_hdf5(path: Name) -> bool:
 
 
 def has_digest(path: Name) -> bool:
-    """Return whether a file begins with the digest of what follows; one that does not fit is refused."""
+    """Return whether a file begins with a digest; if the digest does not match the rest of the file, it is rejected."""
     with opened(path) as handle:
         block = handle.read(BLOCK)
         if not block.startswith(SEAL):
@@ -266,14 +266,14 @@ def has_digest(path: Name) -> bool:
         found = hashlib.file_digest(handle, "sha256").hexdigest()
     if block.removeprefix(SEAL)[:64] != found.encode():
         raise InputError(
-            f"{path} cannot be read: its content does not fit its digest, so it is damaged or truncated; take a copy, or make it "
-            "again (if you changed it on purpose, strapdown.files.seal gives it a new digest)"
+            f"{path} cannot be read: its content does not match its digest, so it is damaged or truncated; restore a copy, or make it "
+            "again (if you changed it on purpose, strapdown.files.seal writes a new digest)"
         )
     return True
 
 
 def _need_plain(path: Name, file: Any) -> None:
-    """Refuse an HDF5 file that refers to others, or declares more than it holds."""
+    """Reject an HDF5 file that refers to other files, or declares more data than it contains."""
     import h5py
 
     links: list[tuple[bytes, int]] = []
@@ -283,7 +283,7 @@ def _need_plain(path: Name, file: Any) -> None:
         if kind != h5py.h5l.TYPE_HARD:
             place = f"{path}: {name.decode(errors='replace')}"
             raise InputError(
-                f"{place} is {kinds.get(kind, 'a link')}, which is not followed; put the data itself there"
+                f"{place} is {kinds.get(kind, 'a link')}, which is not followed; store the data itself there"
             )
     total = 0
     for name, _ in links:
@@ -292,38 +292,38 @@ def _need_plain(path: Name, file: Any) -> None:
             continue
         place = f"{path}: {name.decode(errors='replace')}"
         if dataset.is_virtual or dataset.external:
-            raise InputError(f"{place} lies in other files, which are not followed; put the data there")
+            raise InputError(f"{place} is stored in other files, which are not read; store the data there")
         declared, held = (dataset.size or 0) * dataset.dtype.itemsize, dataset.id.get_storage_size()
         if declared > max(PACKING * held, 65536):
             raise InputError(
-                f"{place} declares {declared / 1e6:.4g} MB and the file holds {held / 1e6:.3g} MB of it; it is damaged or of another kind"
+                f"{place} declares {declared / 1e6:.4g} MB, but the file has {held / 1e6:.3g} MB of it; it is damaged or of another kind"
             )
         total += declared
     _need_size(path, total, limit())
 
 
 def _need_readable(path: Name) -> None:
-    """Refuse a file on which the HDF5 library hangs or crashes: try it in a child process."""
+    """Reject a file on which the HDF5 library hangs or crashes, by reading it in a child process first."""
     status = os.stat(path)
     fault = _fault_of_child(os.fspath(path), status.st_ino, status.st_size, status.st_mtime_ns)
     if fault:
-        raise InputError(f"{path} is damaged: the HDF5 library {fault}; take a copy, or make it again")
+        raise InputError(f"{path} is damaged: the HDF5 library {fault}; restore a copy, or make it again")
 
 
 @functools.lru_cache(maxsize=64)
 def _fault_of_child(path: str, *identity: int) -> str:
     seconds = 2 + identity[1] // 20_000_000
-    # A fork has imported everything already. Beside other threads a lock that one of them holds would be locked in it for ever.
+    # A fork is fast, because all modules are imported. With other threads it could deadlock: a lock held by one would never be released.
     alone = sys.platform == "linux" and threading.active_count() == 1
     status = _status_of_fork(path, seconds) if alone else _status_of_process(path, seconds)
-    if status is None or status in (-9, -24):  # SIGKILL and SIGXCPU, which the limits of :func:`probe` send
+    if status is None or status in (-9, -24):  # SIGKILL and SIGXCPU, sent by the limits of :func:`probe`
         return "does not come to an end"
     return "crashes on it" if status < 0 else ""
 
 
 def _status_of_fork(path: str, seconds: int) -> int | None:
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # of idle threads of libraries, such as OpenBLAS's
+        warnings.simplefilter("ignore", DeprecationWarning)  # about idle threads of libraries, such as OpenBLAS
         child = multiprocessing.get_context("fork").Process(target=_silent_probe, args=(path, seconds))
         child.start()
     child.join(30 * seconds)
@@ -341,7 +341,7 @@ def _silent_probe(path: str, seconds: int) -> None:
 
 
 def _status_of_process(path: str, seconds: int) -> int | None:
-    # Python itself may be frozen into a program, or the child lack h5py: then it ends with a status of its own, and the file is read here.
+    # If Python is frozen into a program, or h5py is missing in the child, it ends with another status, and the file is read here.
     child = "import sys; sys.path[:0] = [sys.argv[1]]; from strapdown.files import reading; reading.probe(sys.argv[2], int(sys.argv[3]))"
     command = [sys.executable, "-c", child, str(Path(__file__).parents[2]), path, str(seconds)]
     try:
@@ -352,7 +352,7 @@ def _status_of_process(path: str, seconds: int) -> int | None:
 
 
 def probe(path: str, seconds: int) -> None:
-    """Read all of an HDF5 file, with limits of time and memory on the process: what the child of :func:`hdf5` does."""
+    """Read all of an HDF5 file, with limits of time and memory on the process; run in the child process of :func:`hdf5`."""
     import h5py
 
     with contextlib.suppress(ImportError, ValueError, OSError):  # Windows has no such limits
@@ -375,13 +375,13 @@ def probe(path: str, seconds: int) -> None:
 
 
 def attributes(node: Any) -> dict[str, Any]:
-    """Return the attributes of an HDF5 file, group or dataset as Python's own values: texts, numbers, lists."""
+    """Return the attributes of an HDF5 file, group or dataset as Python strings, numbers and lists."""
     return {name: _plain(value) for name, value in node.attrs.items()}
 
 
 def _plain(value: Any) -> Any:
     if isinstance(value, bytes):
-        return value.decode("utf-8", "replace")  # another program's may be in another encoding
+        return value.decode("utf-8", "replace")  # another program may use another encoding
     if isinstance(value, (np.ndarray, np.generic)):
         return _plain(value.tolist()) if value.dtype.kind in "SO" else value.tolist()
     return [_plain(one) for one in value] if isinstance(value, list) else value
@@ -398,5 +398,5 @@ def numbers(group: Any, name: str) -> np.ndarray[Any, Any]:
     if isinstance(node, h5py.Group):
         raise InputError(f"{place} is a group and not an array; the file is damaged, make it again")
     if not isinstance(node, h5py.Dataset) or node.dtype.kind not in "fiub" or node.shape is None:
-        raise InputError(f"{place} is no array of numbers; the file is damaged, make it again")
+        raise InputError(f"{place} is not an array of numbers; the file is damaged, make it again")
     return np.asarray(node[()])

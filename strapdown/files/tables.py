@@ -1,8 +1,8 @@
-"""Frozen dataclasses as tables for TOML and JSON, with the unit in the name of each key, exact both ways.
+"""Frozen dataclasses as tables for TOML and JSON, with the unit in the name of each key, exact in both directions.
 
-A *form* says for each field of a class which units its key may have: ``{"angle": DEGREES, "frequency": HERTZ}`` reads and writes
-``angle_deg`` and ``frequency_hz``. The first unit of a choice is written; a value that no number in that unit tells to the last bit is
-written in the last, which is SI.
+A *form* gives for each field of a class the units that its key may have: ``{"angle": DEGREES, "frequency": HERTZ}`` reads and writes
+``angle_deg`` and ``frequency_hz``. A value is written in the first unit in which it is represented exactly; the last unit of a choice is
+SI.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ Form = Mapping[str, Choice]
 
 PLAIN: Choice = (("", 1.0),)
 TEXT: Choice = (("", 0.0),)
-"""Words and names; what has this choice holds no number."""
+"""A string."""
 FLAG: Choice = (("", 2.0),)
-"""What is true or false."""
+"""True or false."""
 RATIO: Choice = (("ratio", 1.0),)
 PPM: Choice = (("ppm", 1e-6), ("ratio", 1.0))
 SECONDS: Choice = (("s", 1.0),)
@@ -44,7 +44,7 @@ NANOTESLAS: Choice = (("nt", 1e-9), ("t", 1.0))
 
 
 def keys(form: Form) -> dict[str, tuple[str, float]]:
-    """Return every key that a form knows: its field and factor."""
+    """Return field and factor by key, for every key of a form."""
     return {
         f"{name}_{suffix}" if suffix else name: (name, factor)
         for name, choice in form.items()
@@ -53,7 +53,7 @@ def keys(form: Form) -> dict[str, tuple[str, float]]:
 
 
 def encode(value: Any, form: Form) -> dict[str, Any]:
-    """Return a dataclass as a table; fields at their default, and None, are left out."""
+    """Return a dataclass as a table; fields that are None or equal to their default are left out."""
     table: dict[str, Any] = {}
     for field in dataclasses.fields(value):
         content, default = getattr(value, field.name), field.default
@@ -80,7 +80,7 @@ def _entry(name: str, content: Any, choice: Choice) -> dict[str, Any]:
 
 
 def _exact_quotient(value: Array, factor: float) -> Array | None:
-    """Return x, of few digits where that will do, with x · factor equal to ``value`` to the last bit; None if there is no such x."""
+    """Return x, if possible of few digits, with x · factor bitwise equal to ``value``; None if there is no such x."""
     quotient = value / factor
     short = np.array([float(f"{x:.12g}") for x in quotient.ravel()]).reshape(quotient.shape)
     result = np.full(value.shape, np.nan)
@@ -90,7 +90,7 @@ def _exact_quotient(value: Array, factor: float) -> Array | None:
 
 
 def decode(table: Mapping[str, Any], form: Form, place: str) -> dict[str, Any]:
-    """Return the fields of a table, in SI; unknown keys are refused with the nearest known one."""
+    """Return the fields of a table, in SI; the error for an unknown key names the nearest known one."""
     known = keys(form)
     known_keys(place, table, known)
     values: dict[str, Any] = {}
@@ -105,7 +105,7 @@ def decode(table: Mapping[str, Any], form: Form, place: str) -> dict[str, Any]:
 def _number(content: Any, factor: float, choice: Choice, place: str) -> Any:
     if choice == TEXT:
         if not isinstance(content, str):
-            raise InputError(f"{place} is {content!r}; it must be a text in quotes")
+            raise InputError(f"{place} is {content!r}; it must be a string in quotes")
         return content
     if choice == FLAG:
         if not isinstance(content, bool):
@@ -121,11 +121,11 @@ def _number(content: Any, factor: float, choice: Choice, place: str) -> Any:
         number = float(content) * factor
         return number if choice != PLAIN else content
     except (InputError, OverflowError):
-        raise InputError(f"{place} is {content!r}; it must be a list of numbers, rows of one length") from None
+        raise InputError(f"{place} is {content!r}; it must be a list of numbers, rows of equal length") from None
 
 
 def build(kind: type, table: Mapping[str, Any], form: Form, place: str, **more: Any) -> Any:
-    """Return ``kind(**fields)`` of a table; a missing field is named by its key."""
+    """Return ``kind(**fields)`` from a table; the error for a missing field names its key."""
     values = {**decode(table, form, place), **more}
     for field in dataclasses.fields(kind):
         if (
@@ -140,10 +140,10 @@ def build(kind: type, table: Mapping[str, Any], form: Form, place: str, **more: 
 
 
 def made(make: Callable[..., Any], values: Mapping[str, Any], table: Mapping[str, Any], form: Form, place: str) -> Any:
-    """Return ``make(**values)``; what is refused is reported with its place in the file, and the key and the number that stand there.
+    """Return ``make(**values)``; its errors are reported with the place in the file, the key and the number there.
 
-    The values have the type of a file's (text, number, list), not always that of the field: what ``make`` cannot even compare or convert is
-    refused too.
+    The values have the type of the file (string, number, list), which may not be that of the field, so type errors of ``make`` are reported
+    too.
     """
     try:
         return make(**values)
@@ -166,7 +166,7 @@ Kind = TypeVar("Kind")
 
 
 def read(path: str | os.PathLike[str], name: str, remedy: str, make: Callable[[Mapping[str, Any], str], Kind]) -> Kind:
-    """Return what ``make`` makes of the table ``[name]`` of a TOML file; ``remedy`` says what to do where there is none."""
+    """Return ``make(table, place)`` for the table ``[name]`` of a TOML file; ``remedy`` is the advice in the error if there is none."""
     with reading.from_file(path):
         table = reading.toml(path).get(name)
         if not isinstance(table, dict):

@@ -1,4 +1,4 @@
-"""Writing files so that a reader never sees half of one: written beside, then renamed over."""
+"""Atomic writing of files: to a temporary file in the same folder, which then replaces the target."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ def written_beside(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def whole_hdf5(path: str | os.PathLike[str]) -> Iterator[Any]:
-    """Yield an HDF5 file in memory; at the end its bytes go to ``path`` as those of any file, with their digest before them.
+    """Yield an HDF5 file in memory; at the end it is written to ``path``, preceded by its digest.
 
-    A disk that is full is then an ordinary OSError: HDF5 itself, stopped in the middle of a write, ends the whole program when it closes.
+    A full disk then raises an ordinary OSError; the HDF5 library, if interrupted while writing to disk, aborts the program at closing.
     """
     import h5py
 
@@ -55,9 +55,9 @@ def whole_hdf5(path: str | os.PathLike[str]) -> Iterator[Any]:
 
 @contextlib.contextmanager
 def locked(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Keep other processes from writing the same output for a while; where one has it already, refuse and say which.
+    """Prevent other processes from writing the same output; if one is writing it already, raise an InputError that names it.
 
-    The lock is a file ``.NAME.lock`` beside the output, and ends with the process, however that ends. Windows has no such lock.
+    The lock is a file ``.NAME.lock`` in the folder of the output; it is released when the process ends in any way. Not on Windows.
     """
     try:
         import fcntl
@@ -78,7 +78,7 @@ def locked(path: str | os.PathLike[str]) -> Iterator[None]:
                 ) from None
             try:
                 if not os.path.samestat(os.fstat(handle.fileno()), os.stat(lock)):
-                    continue  # another process had it and took it away in between
+                    continue  # another process has removed the lock file in the meantime
             except FileNotFoundError:
                 continue
             try:
@@ -98,19 +98,19 @@ def _user_block(content: bytes | memoryview) -> bytes:
 
 
 def seal(path: str | os.PathLike[str]) -> None:
-    """Give an HDF5 file of this package a new digest, after it was changed on purpose by another program."""
+    """Write a new digest to an HDF5 file of this package that was changed on purpose by another program."""
     with open(path, "r+b") as file:
         content = file.read()
         if not content.startswith(SEAL):
-            raise InputError(f"{path} has no digest; only a file that this version wrote has one")
+            raise InputError(f"{path} has no digest; only a file written by this version has one")
         file.seek(0)
         file.write(_user_block(content[BLOCK:]))
 
 
 def set_attributes(node: Any, values: Mapping[str, Any]) -> None:
-    """Set attributes of an HDF5 file, group or dataset; texts have a fixed length.
+    """Set attributes of an HDF5 file, group or dataset; strings have a fixed length.
 
-    The HDF5 library keeps texts of variable length in a heap, where damage makes it loop for ever.
+    The HDF5 library stores strings of variable length in a heap, where damage may make it hang.
     """
     import h5py
 
@@ -125,31 +125,31 @@ def set_attributes(node: Any, values: Mapping[str, Any]) -> None:
 
 
 def usable_folder(name: str, folder: str | os.PathLike[str]) -> None:
-    """Refuse a folder that results cannot go to, before they are computed: one below a file, or that may not be written."""
+    """Reject a folder to which results cannot be written, before they are computed: one below a file, or without permission."""
     place = Path(folder).absolute()
     while not place.exists():
         place = place.parent
     if not place.is_dir():
         raise InputError(f"{name} is {folder}, but {place} is a file; choose another folder")
     if not os.access(place, os.W_OK | os.X_OK):
-        raise InputError(f"{name} is {folder}, but {place} may not be written; choose another folder")
+        raise InputError(f"{name} is {folder}, but there is no permission to write to {place}; choose another folder")
 
 
 def output_file(
     name: str, path: str | os.PathLike[str], suffixes: tuple[str, ...], *sources: str | os.PathLike[str]
 ) -> None:
-    """Refuse an output file of another kind than its suffix says, or one that would replace a file that is read."""
+    """Reject an output file whose suffix is not in ``suffixes``, or that would replace a file that is read."""
     target = Path(path)
     if target.suffix.lower() not in suffixes:
-        raise InputError(f"{name} is {target}, but what is written is {' or '.join(suffixes)}; choose such a suffix")
+        raise InputError(f"{name} is {target}, but it is written as {' or '.join(suffixes)}; choose such a suffix")
     for source in sources:
         if target.exists() and Path(source).exists() and target.samefile(source):
-            raise InputError(f"{name} is {target}, the very file that is read; choose another name")
+            raise InputError(f"{name} is {target}, the same file that is read; choose another name")
     usable_folder(name, target.parent)
 
 
 def plain(value: Any) -> Any:
-    """Return a value as JSON holds it: arrays as lists, numbers that are not finite as null."""
+    """Return a value for JSON: arrays as lists, numbers that are not finite as null."""
     if isinstance(value, (np.ndarray, np.generic)):
         value = value.tolist()
     if isinstance(value, Mapping):
@@ -160,12 +160,12 @@ def plain(value: Any) -> Any:
 
 
 def json_text(content: Any) -> str:
-    """Return ``content`` as indented JSON; NaN and infinities are refused because JSON has no word for them."""
+    """Return ``content`` as indented JSON; NaN and infinities, which are not part of JSON, are rejected."""
     return json.dumps(content, indent=2, allow_nan=False) + "\n"
 
 
 def write_json(path: str | os.PathLike[str], content: Any) -> None:
-    """Write ``content`` as indented JSON; NaN and infinities are refused because JSON has no word for them."""
-    text = json_text(content)  # before any folder is made
+    """Write ``content`` as indented JSON; NaN and infinities, which are not part of JSON, are rejected."""
+    text = json_text(content)  # before any folder is created
     with written_beside(path) as temporary:
         temporary.write_text(text, encoding="utf-8")

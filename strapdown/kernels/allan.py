@@ -6,8 +6,8 @@ from __future__ import annotations
 def accumulate(rate, mean, phase):
     """Fill phase (n + 1,) with the running sum of rate (n,) − mean, from 0.
 
-    The sum carries its rounding error (Knuth's two-sum) in a second word, so that every stored value is the exact sum rounded once,
-    whatever the length of the record; the plain running sum loses √n to n units in the last place.
+    The rounding error of the sum is accumulated in a second word (Knuth's two-sum), so every stored value is the exact sum, rounded once; a
+    plain running sum loses √n to n units in the last place.
     """
     high = 0.0
     low = 0.0
@@ -24,10 +24,9 @@ def accumulate(rate, mean, phase):
 def second_difference_squares(phase, multiples, lanes, carries, squares):
     """Fill squares with Σ (x[k + 2m] − 2 x[k + m] + x[k])² over all k, for each m of multiples.
 
-    ``lanes`` and ``carries``, one a multiple, are scratch. The record is passed once in stretches that stay in the cache while every m
-    works on them. Every lane sums every len(lanes)-th square of a stretch, so that the inner loop has no order to keep and runs at
-    vector width; the stretches are summed with compensation (Kahan). The rounding error stays at a few units in the last place for any
-    length.
+    ``lanes`` and ``carries``, one per multiple, are scratch. The record is read once, in blocks that stay in the cache for all m. Each lane
+    sums every len(lanes)-th square of a block, so the inner loop runs at vector width; the blocks are summed with compensation (Kahan). The
+    rounding error is a few units in the last place for any length.
     """
     width = lanes.shape[0]
     stretch = 32 * width

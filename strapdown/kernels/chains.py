@@ -1,12 +1,9 @@
-"""Optional states in chains, each fed by the next: what shapes the white noise of a chain's last state by any real poles.
+"""Error states in chains, each driven by the next: shaping filters with real poles for the white noise of a chain's last state.
 
-``ċₖ = −λₖ cₖ + gₖ cₖ₊₁``, the last one of a chain driven by white noise of PSD q besides: ``decay`` λ, and ``chains`` (states, 3) with g
-and q; the last column is what :func:`strapdown.kernels.error_state_step.turn_values` wants. Chains have up to :data:`CHAIN` states and do
-not enter the gyro. :mod:`strapdown.kernels.error_state_step` lets each state decay by itself; what is here comes after it, as
-``Φ = (I + U) diag(e^{−λ dt})`` with U strictly upper triangular. Triangular factors stay triangular, and where there is no chain nothing is
-called.
-
-Plain arithmetic on arrays, for both faces.
+``ċₖ = −λₖ cₖ + gₖ cₖ₊₁``; the last state of a chain is also driven by white noise of PSD q. ``decay`` holds λ and ``chains`` (states, 3) g
+and q; its last column is for :func:`strapdown.kernels.error_state_step.turn_values`. A chain has at most :data:`CHAIN` states, and these do
+not enter the gyro. :mod:`strapdown.kernels.error_state_step` applies the decay of each state; the coupling follows here, as ``Φ = (I + U)
+diag(e^{−λ dt})`` with U strictly upper triangular, so triangular factors stay triangular. Without chains nothing is called.
 """
 
 from __future__ import annotations
@@ -18,21 +15,21 @@ import numpy as np
 from strapdown.kernels.lane_values import WIDTH, load, spread, total
 
 CALLED = ("chain_step", "step_chains", "carry_chains_back")
-"""Not inlined where other kernels use them: their work is far more than a call, and each copy would be compiled anew."""
+"""Called, not inlined, by other kernels: a call costs little compared with their work, and each copy would be compiled again."""
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(WIDTH)
 CHAIN = 3
-"""Most states of a chain."""
+"""Maximum number of states of a chain."""
 TERMS = 14
-"""Of the series of a chain's transition: to rounding for λ dt ≤ 1/2."""
+"""Number of terms in the series of a chain's transition: accurate to rounding for λ dt ≤ 1/2."""
 NODES = np.concatenate([0.5 * (1.0 + _NODES), 0.5 * _WEIGHTS])
-"""Nodes and weights of Gauss's rule of eight on [0, 1], a lane a node."""
+"""Nodes and weights of Gauss's rule with eight nodes on [0, 1], one lane per node."""
 LINKS = 8
-"""Width of the scratch that a step's shares and root of noise are kept in."""
+"""Width of the scratch for the coupling and the root of the noise of a step."""
 
 
 def chain_start(chains, k):
-    """Return the first state of the chain that state k ends or belongs to."""
+    """Return the first state of the chain that contains state k or ends with it."""
     first = k
     while first > 0 and chains[first - 1, 0] != 0.0:
         first -= 1
@@ -40,11 +37,11 @@ def chain_start(chains, k):
 
 
 def chain_step(decay, chains, k, first, dt):
-    """Return what state k of a chain makes in dt of the states k − 2, k − 1 and k, and a root of what unit white noise on it makes of them.
+    """Return the effect over dt of state k of a chain on states k − 2, k − 1 and k, and a root of their process noise for unit PSD.
 
-    First its column of Φ, (φ_{k−2}, φ_{k−1}, φ_k), by the series of the exponential of the chain's matrix: equal poles, and those at zero,
-    are no special case. Then N with ``Q = Nᵀ N`` as (n20, n21, n22, n10, n11, n00), by rows from that of state k up, what is not there 0:
-    the same series at the nodes of Gauss's rule, exact to 3e-14 for λ dt ≤ 1/2.
+    The first is column k of Φ, (φ_{k−2}, φ_{k−1}, φ_k), by the series of the matrix exponential, also valid for equal or zero poles. The
+    second is N with ``Q = Nᵀ N`` as (n20, n21, n22, n10, n11, n00), rows from that of state k upwards, zero if absent: the same series at
+    the nodes of Gauss's rule, accurate to 3e-14 for λ dt ≤ 1/2.
     """
     own = -decay[k] * dt
     middle, to_middle, far, to_far = 0.0, 0.0, 0.0, 0.0
@@ -80,7 +77,7 @@ def chain_step(decay, chains, k, first, dt):
 
 
 def alike(decay, chains, k, number):
-    """Return whether the so many states up to k are a chain of the same numbers as the chain of so many before them."""
+    """Return whether the ``number`` states up to k form a chain with the same parameters as the ``number`` states before them."""
     begin = k - 2 * number + 1
     if begin < 0 or chains[k - number, 0] != 0.0 or (begin > 0 and chains[begin - 1, 0] != 0.0):
         return False
@@ -91,7 +88,7 @@ def alike(decay, chains, k, number):
 
 
 def link_chains(decay, chains, dt, links):
-    """Write for each state U's share of the next and of the next but one, and the root of its unit white noise, to ``links``."""
+    """Write the entries of U for each state, for the next and the next but one, and the root of its noise for unit PSD, to ``links``."""
     for k in range(len(chains)):
         links[k, 0] = 0.0
         links[k, 1] = 0.0
@@ -114,7 +111,7 @@ def link_chains(decay, chains, dt, links):
 
 
 def feed_states(values, first, links):
-    """Let each state that has decayed be fed; states stand in ``values`` from ``first`` on."""
+    """Apply I + U to the states, which start at ``first`` in ``values``."""
     for k in range(len(links)):
         if links[k, 0] != 0.0:
             values[first + k] += links[k, 0] * values[first + k + 1]
@@ -123,7 +120,7 @@ def feed_states(values, first, links):
 
 
 def carry_chains(F, first, end, links):
-    """Let the columns of rows of F be fed likewise: ``S ← (I + U) S``."""
+    """Apply I + U to the columns of rows of F: ``S ← (I + U) S``."""
     for k in range(len(links)):
         if links[k, 0] != 0.0:
             near, far = links[k, 0], links[k, 1]
@@ -147,7 +144,7 @@ def carry_chains_back(F, first, end, links):
 
 
 def fill_chain_noise(F, row, columns, chains, links):
-    """Write the rows of noise of driven chains from a row of F on; ``error_state_step.fill_noise`` writes those before."""
+    """Write the noise rows of driven chains, starting at a row of F, after those of ``error_state_step.fill_noise``."""
     for k in range(len(chains)):
         if chains[k, 1] > 0.0:
             number = k - chain_start(chains, k) + 1
@@ -167,7 +164,7 @@ def fill_chain_noise(F, row, columns, chains, links):
 
 
 def step_chains(F, size, row, x, dt, decay, chains, links):
-    """Take states, factor and rows of noise, which go on at ``row``, over a chain's part of a step; return the row after them."""
+    """Apply the chains' part of a step to states, factor and noise rows, starting at ``row``; return the row after them."""
     link_chains(decay, chains, dt, links)
     feed_states(x, 3, links)
     carry_chains(F, 0, size, links)

@@ -1,11 +1,11 @@
 """numba compilers for kernels, and for the helpers that only kernels call.
 
-numba takes each function for one that might be called from Python: it optimises it with all that it calls and makes machine code of it, and
-looks in it for generators, closures, ``with`` and array expressions. Helpers are never called from Python: their LLVM code is optimised as
-part of the kernel's. And types of operators are resolved once, not at each place. All three together halve the time.
+numba treats each function as callable from Python: it optimises it together with its callees, generates machine code, and runs passes for
+generators, closures, ``with`` and array expressions. Helpers are never called from Python, so here their LLVM code is optimised only as
+part of the kernel's, those passes are left out, and the types of operators are resolved once. This halves the compile time.
 
-A third of the rest goes by writing less for LLVM to read: numba reaches an element of an array by thirty instructions, through a copy of
-all that it knows of the array, and hands an array to a function as nine numbers. Here it is five instructions and three numbers.
+A third of the remaining time is saved by shorter LLVM code: numba needs thirty instructions for an element of an array and passes an array
+to a function as nine numbers; here it is five instructions and three numbers.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from numba.core.lowering import Lower
 
 
 class _Lower(Lower):  # type: ignore[misc]
-    """Writes operators by the types found before: numba finds each again, four times where an operand is a constant."""
+    """Lowers operators with the types already inferred; numba infers each again, four times if an operand is a constant."""
 
     def _apply(self, function: Any, signature: Any, variables: tuple[Any, ...]) -> Any:
         implementation = self.context.get_function(self.context.typing_context.resolve_value_type(function), signature)
@@ -77,12 +77,12 @@ PASSES = (
     _Lowering,
     typed_passes.NoPythonBackend,
 )
-"""Those of numba's passes that kernels need."""
+"""The passes of numba that kernels need."""
 
 
 @contextmanager
 def _uncollected() -> Iterator[None]:
-    """Leave Python's garbage until later: the collector would go through all that numba has made a hundred times in vain."""
+    """Disable garbage collection: the collector would search all objects of numba a hundred times and find nothing."""
     if not gc.isenabled():
         yield
         return
@@ -94,7 +94,7 @@ def _uncollected() -> Iterator[None]:
 
 
 class _Typing:
-    """A typing context that resolves a builtin function for the same types of arguments once."""
+    """A typing context that resolves a builtin function only once for each set of argument types."""
 
     _known: ClassVar[dict[int, tuple[types.Function, dict[tuple[types.Type, ...], Any]]]] = {}
     """By the function's identity, which new overloads change."""
@@ -122,7 +122,7 @@ class _Typing:
 
 
 class _Target(CPUContext):  # type: ignore[misc]
-    """The machine, with short code for elements and lengths of contiguous arrays. An index counts from the front."""
+    """The CPU target, with short code for elements and lengths of contiguous arrays. Indices must not be negative."""
 
     def get_function(self, function: Any, signature: Any, _firstcall: bool = True) -> Any:
         given = signature.args
@@ -141,17 +141,17 @@ class _Target(CPUContext):  # type: ignore[misc]
 
 
 NITEMS, ITEMSIZE, DATA, SHAPE, STRIDES = range(2, 7)
-"""Where numba's array has what it is made of."""
+"""Places of the members in numba's array structure."""
 
 
 def _counts(index: types.Type, dimensions: int) -> bool:
-    """Return whether an index is a whole number for each dimension."""
+    """Return whether an index is one integer for each dimension."""
     kinds = index.types if isinstance(index, types.BaseTuple) else (index,)
     return len(kinds) == dimensions and all(isinstance(one, types.Integer) for one in kinds)
 
 
 def _element(target: Any, given: tuple[types.Type, ...], builder: Any, values: Any, *_: Any) -> Any:
-    """Read an element of an array, or write it where there is a third value."""
+    """Read an element of an array, or write it if a third value is given."""
     array, index = values[:2]
     several = isinstance(given[1], types.BaseTuple)
     counts = cgutils.unpack_tuple(builder, index) if several else [index]
@@ -169,7 +169,7 @@ def _element(target: Any, given: tuple[types.Type, ...], builder: Any, values: A
 
 
 class _Array(models.ArrayModel):  # type: ignore[misc]
-    """An array, handed to a function as its address and shape if it is contiguous: the rest follows, or serves counting."""
+    """An array, passed to a function as address and shape if it is contiguous; the other members follow from these or are not needed."""
 
     def get_argument_type(self) -> Any:
         whole = super().get_argument_type()
@@ -201,7 +201,7 @@ class _Array(models.ArrayModel):  # type: ignore[misc]
 _MODELS = datamodel.DataModelManager().chain(datamodel.default_manager)
 _MODELS.register(types.Array, _Array)
 _INTERNAL: dict[Any, Any] = {}
-"""numba's own functions that take arrays so."""
+"""Functions of numba compiled for arrays passed in this way."""
 
 
 class KernelCompiler(Compiler):  # type: ignore[misc]
@@ -213,7 +213,7 @@ class KernelCompiler(Compiler):  # type: ignore[misc]
             library.enable_object_caching()
         super().__init__(typing, target, library, *rest)
         self.state.typingctx = _Typing(typing)
-        self.state.targetctx.__class__ = _Target  # a copy of its own
+        self.state.targetctx.__class__ = _Target  # of this compiler only
         self.state.targetctx.data_model_manager = _MODELS
         self.state.targetctx.cached_internal_func = _INTERNAL
 
@@ -223,7 +223,7 @@ class KernelCompiler(Compiler):  # type: ignore[misc]
             return super().compile_extra(function)
 
     def define_pipelines(self) -> list[PassManager]:
-        """Return the one pipeline there is."""
+        """Return the only pipeline."""
         passes = PassManager("kernel")
         for one in PASSES:
             passes.add_pass(one, one.__name__)
@@ -232,7 +232,7 @@ class KernelCompiler(Compiler):  # type: ignore[misc]
 
 
 class _Library(JITCodeLibrary):  # type: ignore[misc]
-    """LLVM code whose vectors are written out: loops are neither vectorised nor unrolled, which took half of LLVM's time."""
+    """LLVM code with explicit vectors: loops are neither vectorised nor unrolled, which took half of the time of LLVM."""
 
     def _passes(self, level: int) -> tuple[Any, Any]:
         tuning = llvm.create_pipeline_tuning_options(level)
@@ -241,7 +241,7 @@ class _Library(JITCodeLibrary):  # type: ignore[misc]
         return builder.getModulePassManager(), builder
 
     def _optimize_final_module(self) -> None:
-        first, builder = self._passes(0)  # puts the functions into each other
+        first, builder = self._passes(0)  # inlines
         first.add_loop_rotate_pass()
         first.add_instruction_combine_pass()
         first.add_jump_threading_pass()
@@ -251,14 +251,14 @@ class _Library(JITCodeLibrary):  # type: ignore[misc]
 
 
 class HelperCompiler(KernelCompiler):
-    """The compiler of what only kernels call."""
+    """The compiler of functions that only kernels call."""
 
     def __init__(self, typing: Any, target: Any, library: Any, *rest: Any) -> None:
         super().__init__(typing, target, library or _HelperLibrary(target.codegen(), "helper"), *rest)
 
 
 class _HelperLibrary(_Library):
-    """LLVM code for callers: of one function alone, simplified, and never machine code."""
+    """LLVM code of one function for its callers, without machine code."""
 
     @property
     def codegen(self) -> Any:
@@ -275,7 +275,7 @@ class _HelperLibrary(_Library):
 
 
 class _Nowhere:
-    """A code generator for what has no address: nothing can be stored there."""
+    """A code generator for functions without an address, in which no environment can be stored."""
 
     def __init__(self, codegen: Any) -> None:
         self._codegen = codegen

@@ -3,8 +3,9 @@
 The first functions are the filter without options, whose state stays in registers. Those under *for the gate* let
 :mod:`strapdown.kernels.gate` wrap it.
 
-A covariance in doubles keeps sixteen digits. Where a measurement is far sharper than the state, or attitude and bias have become one in an
-outage, too few are left (Bierman 1977, chapter V): the walk stops, and :mod:`strapdown.kernels.root_form` goes on.
+A covariance in double precision has sixteen digits. If a measurement is much more precise than the state, or attitude and bias errors are
+almost fully correlated after an outage, too few are left (Bierman 1977, chapter V): the walk stops, and :mod:`strapdown.kernels.root_form`
+continues.
 """
 
 from __future__ import annotations
@@ -63,35 +64,35 @@ CALLED = ("least_share",)
 
 
 class Body(NamedTuple):
-    """What the filter is made of."""
+    """State, noise and numerical limits of the filter."""
 
     states: np.ndarray
-    """Packed states (2, 28): the filter, and a gate's restart candidate; left at the end state."""
+    """Packed states (2, 28): the filter and the restart candidate of a gate; at return, the end state."""
     angle_variance: float
     """σ_v², rad²/s."""
     rate_variance: float
     """σ_u², rad²/s³."""
     sharpness: float
-    """Largest ratio of an innovation's variance to the measurement's own; beyond it the covariance keeps too few digits."""
+    """Maximum ratio of innovation variance to measurement variance; above it the covariance keeps too few digits."""
     least_share: float
-    """Smallest value of :func:`least_share`, likewise."""
+    """Minimum of :func:`least_share`, for the same reason."""
     check: int
-    """Rows of the outputs from one check of the covariance to the next."""
+    """Number of output rows between checks of the covariance."""
     good: np.ndarray
-    """Row and number of measurements of the last check passed (2,), to which ``states[0]`` belongs where the walk stopped."""
+    """Row and number of measurements at the last check passed (2,); if the walk stopped, ``states[0]`` is the state there."""
     work: np.ndarray
     """Scratch (7, 6)."""
 
 
 class Restart(NamedTuple):
-    """What a restart candidate starts from."""
+    """Initial values of a restart candidate."""
 
     bias_variance: np.ndarray
     """Added to the bias's variance (3,), (rad/s)²."""
 
 
 class Outputs(NamedTuple):
-    """Arrays that a run writes: a row for each kept edge (m), and of innovations for each measurement, by place."""
+    """Output arrays: a row for each stored edge (m); innovations by measurement."""
 
     attitude: np.ndarray
     bias: np.ndarray
@@ -101,14 +102,14 @@ class Outputs(NamedTuple):
     innovation: np.ndarray
     """e₁, s₁, e₂, s₂, e₃, s₃ (events, 4 or 6): independent innovations and their variances, as many as there are degrees of freedom."""
     segments: np.ndarray
-    """What a smoother needs of each prediction (k, 32), or (0, 32): dt, increment (3), state (28) that it starts from."""
+    """Each prediction, for a smoother (k, 32), or (0, 32): dt, increment (3), state before it (28)."""
 
 
 def least_share(state, work):
-    """Return the smallest part that is left of any state's variance when the states after it are known; 1 of a state without variance.
+    """Return the smallest ratio of a state's variance given the states after it to its variance; 1 for a state without variance.
 
-    It is the square of the diagonal of the covariance's triangular factor over the variance, and falls to the rounding of a double, or
-    below zero, where the covariance has lost its digits. ``state`` holds (q, b, A, B, C), ``work`` (7, 6) is scratch.
+    It is the squared diagonal of the triangular factor over the variance. If the covariance has lost its digits, it is at the level of
+    rounding or negative. ``state`` holds (q, b, A, B, C), ``work`` (7, 6) is scratch.
     """
     k = 0
     for i in range(3):
@@ -163,7 +164,7 @@ def longest_step(state, part, dt, body):
 
 
 def predict(state, part, dt, body, out):
-    """Propagate, and store what a smoother needs."""
+    """Store the prediction for a smoother, and propagate."""
     q, b, A, B, C, segments, lost = state
     if segments < len(out.segments):
         store_segment(out.segments, segments, dt, part, q, b, A, B, C)
@@ -194,7 +195,7 @@ def update(state, e, now, measured, body, out):
         u = (triads[t, 0], triads[t, 1], triads[t, 2])
         v = (triads[t, 3], triads[t, 4], triads[t, 5])
         if kind == VECTOR:
-            # Its length says nothing of the attitude, but belongs to the innovation.
+            # The length has no information about the attitude but is part of the innovation.
             r = (triads[t, 6], triads[t, 7], triads[t, 8])
             out.innovation[at, 4] = dot(transpose_times_vector(R, r), z) - 1.0
             out.innovation[at, 5] = variance
@@ -214,7 +215,7 @@ def update(state, e, now, measured, body, out):
 
 
 def keep(state, row, e, body, out):
-    """Write a row; every ``check`` rows make sure that the covariance has digits left, and remember the state."""
+    """Write a row; every ``check`` rows, check that the covariance has enough digits, and store the state."""
     q, b, A, B, C, segments, lost = state
     keep_state(out, row, q, b, A, B, C)
     if row > 0 and row % body.check == 0:
@@ -223,7 +224,7 @@ def keep(state, row, e, body, out):
 
 
 def checked(q, b, A, B, C, row, e, body):
-    """Remember a state at a row as good, unless its covariance has lost its digits; return whether it has."""
+    """Return whether the covariance of a state has lost its digits; if not, store the state as the last good one."""
     store_state(body.states[1], q, b, A, B, C)
     if not least_share(body.states[1], body.work) >= body.least_share:
         return True
@@ -239,7 +240,7 @@ def stopped(state):
 
 
 def finish(state, row, e, body):
-    """Leave the end state and return the number of segments; −1 where the covariance has lost its digits."""
+    """Store the end state and return the number of segments; −1: the covariance has lost its digits."""
     q, b, A, B, C, segments, lost = state
     if lost or checked(q, b, A, B, C, row, e, body):
         return -1
@@ -255,13 +256,13 @@ def load(form, i):
 
 
 def save(form, i, state):
-    """Keep state i."""
+    """Store state i."""
     q, b, A, B, C = state
     store_state(form.states[i], q, b, A, B, C)
 
 
 def become(form):
-    """Let the filter be what the restart candidate is."""
+    """Replace the filter by the restart candidate."""
     for j in range(SIZE):
         form.states[0, j] = form.states[1, j]
 
@@ -278,7 +279,7 @@ def bias_at(form, i):
 
 
 def step_limit(form):
-    """Return the longest step, s, that states other than the attitude bear."""
+    """Return the longest step, s, allowed by states other than the attitude."""
     return math.inf
 
 
@@ -295,7 +296,7 @@ def propagate(form, i, state, part, dt):
 
 
 def store_prediction(form, i, state, k, part, dt, out):
-    """Write what a smoother needs of a prediction."""
+    """Store a prediction for a smoother."""
     q, b, A, B, C = state
     store_segment(out.segments, k, dt, part, q, b, A, B, C)
 
@@ -306,13 +307,13 @@ def attitude_covariance(form, i, state):
 
 
 def start_update(form, i):
-    """Begin the linearisation at the state itself."""
+    """Start the linearisation at the state."""
 
 
 def linearised(form, i, e, now_q, q, M, z, frame, noise, kind, sensor, prior):
-    """Return rows, y (3,), what of y the prior predicts (3,), variances (3,), θ/sin θ and cos θ of a direction's angle; seen from now_q.
+    """Return rows, y (3,), its prediction by the prior (3,), variances (3,), and θ/sin θ and cos θ of a direction's angle, all at now_q.
 
-    The rows (h1, h2, h3) are turned to the prior's tangent space by Mᵀ.
+    The rows (h1, h2, h3) are transformed to the tangent space of the prior by Mᵀ.
     """
     R = rotation_matrix(now_q)
     h1, h2, h3, y1, y2, y3, covariance = measurement_rows(kind, now_q, R, z, frame, noise)
@@ -337,7 +338,7 @@ def innovation_covariance(form, i, state, rows):
 
 
 def step_of(form, i, state, rows, u, M, prior, q, now_q):
-    """Return the step (3,) from the linearisation that P Hᵀ u leads to, and the square of what it changes in the rows."""
+    """Return the step (3,) from the linearisation given by P Hᵀ u, and its squared size as seen by the rows."""
     h1, h2, h3 = rows
     back = add(combine(u[0], h1, u[1], h2), scale(u[2], h3))
     step = add(prior, matrix_times_vector(M, symmetric_times_vector(state[2], back)))
@@ -345,7 +346,7 @@ def step_of(form, i, state, rows, u, M, prior, q, now_q):
 
 
 def relinearise(form, i, q, old_q, now_q, prior, fresh):
-    """Go to another point of linearisation."""
+    """Change the point of linearisation."""
 
 
 def correct(form, i, state, rows, e, variance):
@@ -360,26 +361,26 @@ def correct(form, i, state, rows, e, variance):
 
 
 def turn_tangent(form, i, state, M):
-    """Carry the covariance to another tangent space by M."""
+    """Transform the covariance to another tangent space by M."""
     q, b, A, B, C = state
     return q, b, congruent(M, A), multiply(M, B), C
 
 
 def set_attitude(form, i, state, q, before):
-    """Return the state at an attitude, in place of that ``before`` the measurement."""
+    """Return the state with the attitude q in place of ``before``."""
     return q, state[1], state[2], state[3], state[4]
 
 
 def keep_row(form, state, row, out):
-    """Write the state at a kept edge."""
+    """Write the state at a stored edge."""
     q, b, A, B, C = state
     keep_state(out, row, q, b, A, B, C)
 
 
 def start_candidate(form, memory, now, attitude_sigma, restart):
-    """Write row 1: the filter's state, as uncertain as a fresh start; ``restart.bias_variance`` (3,) is added to that of the bias.
+    """Write row 1: the state of the filter with an initial covariance; ``restart.bias_variance`` (3,) is added to that of the bias.
 
-    Both are widened by how many candidates have been before it.
+    Both increase with the number of candidates before it.
     """
     states, bias_variance = form.states, restart.bias_variance
     sigma = restart_attitude(attitude_sigma, memory)
@@ -397,7 +398,7 @@ def start_candidate(form, memory, now, attitude_sigma, restart):
 
 
 def widen(form, memory):
-    """Make the candidate what it would be had its bias started wider, if that holds it back."""
+    """Increase the initial bias variance of the candidate retroactively, if that start still determines its bias."""
     q, b, A, B, C = load_state(form.states[1])
     if not may_widen((C[0], C[3], C[5]), memory):
         return
@@ -421,6 +422,6 @@ def widen(form, memory):
 
 
 def corrected(q, A, B, correction):
-    """Return q, A and B moved by a correction (3,), rad, as :func:`strapdown.kernels.iterated_update.seen_from` has it."""
+    """Return q, A and B after a correction (3,), rad, as in :func:`strapdown.kernels.iterated_update.seen_from`."""
     turn, M = seen_from(correction, A)
     return quaternion_multiply(q, turn), congruent(M, A), multiply(M, B)

@@ -1,7 +1,7 @@
-"""Covariance analysis over one trajectory: what each source of error, sent through the filter's own gains, makes of the estimate.
+"""Covariance analysis over one trajectory: contribution of each error source to the covariance of the estimate, with the filter's gains.
 
-Everything is linear about the truth. The error state is that of the filter, (δθ, δb); a measurement enters as scalar rows
-``y = h · δθ + v`` one after the other. A covariance is 21 numbers (blocks A, B, C), as the filter holds its own.
+Everything is linearised about the truth. The error state is that of the filter, (δθ, δb); measurements are processed as scalar rows
+``y = h · δθ + v``, one after the other. A covariance is stored as 21 numbers (blocks A, B, C), as in the filter.
 """
 
 from __future__ import annotations
@@ -57,9 +57,9 @@ def axis_vector(i):
 
 
 def driven(phi, phi12, dt, angle, rate):
-    """Return Q11, Q12, Q22 over a turn φ of white noise of densities ``angle`` and ``rate``, one an axis (rad²/s, rad²/s³).
+    """Return Q11, Q12, Q22 over a rotation φ for white noise of densities ``angle`` and ``rate`` by axis (rad²/s, rad²/s³).
 
-    What the axes have in common is exact; what an axis has above the least is taken to act at the middle of the turn.
+    The part common to all axes is exact; the excess of an axis is approximated as acting at the middle of the rotation.
     """
     least_angle = min(angle[0], angle[1], angle[2])
     least_rate = min(rate[0], rate[1], rate[2])
@@ -89,7 +89,7 @@ def carried(A, B, C, phi11, phi12):
 
 
 def corrected(A, B, C, h, ka, kb, variance):
-    """Return the blocks of (I − k h) Σ (I − k h)ᵀ + r k kᵀ, any gain k, and h Σ hᵀ."""
+    """Return the blocks of (I − k h) Σ (I − k h)ᵀ + r k kᵀ for any gain k, and h Σ hᵀ."""
     pa = symmetric_times_vector(A, h)
     pb = transpose_times_vector(B, h)
     seen = dot(h, pa)
@@ -103,9 +103,9 @@ def corrected(A, B, C, h, ka, kb, variance):
 
 
 def shaped_rate(A, B, C, cross, gains, phi11, phi12, variance):
-    """Return the blocks after a stretch with a coloured rate f on top, constant over it: Φ Σ Φᵀ + Φ F Γᵀ + Γ Fᵀ Φᵀ + Γ V Γᵀ, Γ = (Φ12, 0).
+    """Return the blocks after a segment with an additional constant coloured rate f: Φ Σ Φᵀ + Φ F Γᵀ + Γ Fᵀ Φᵀ + Γ V Γᵀ, Γ = (Φ12, 0).
 
-    ``cross`` (6, 3, n) is the covariance of the error and the states that make f, ``variance`` (3,) is V.
+    ``cross`` (6, 3, n) is the covariance of the error and the states of f, ``variance`` (3,) is V.
     """
     A, B, C = carried(A, B, C, phi11, phi12)
     for a in range(3):
@@ -123,7 +123,7 @@ def shaped_rate(A, B, C, cross, gains, phi11, phi12, variance):
 
 
 def reported(A, B, C, cross, gains, poles, variance, edge_variance, first):
-    """Return the blocks of (δθ, δb + f): the truth of the bias holds the coloured rate, at an edge the mean of both its intervals'."""
+    """Return the blocks of (δθ, δb + f): the true bias includes the coloured rate, at an edge the mean of both adjacent intervals."""
     for a in range(3):
         ft = (0.0, 0.0, 0.0)
         fb = (0.0, 0.0, 0.0)
@@ -143,9 +143,9 @@ class Path(NamedTuple):
 
     dt: np.ndarray
     phi: np.ndarray
-    """Turns (segments, 3), rad."""
+    """Rotation vectors (segments, 3), rad."""
     new_sample: np.ndarray
-    """Whether a gyro sample begins."""
+    """Whether a gyro sample interval starts."""
     row_bounds: np.ndarray
     """Station j, which lies after j segments, has the rows ``row_bounds[j]`` to ``row_bounds[j + 1]`` (segments + 2,)."""
 
@@ -158,7 +158,7 @@ class Rows(NamedTuple):
     """Weights of the three components of a sensor's coloured noise (rows, 3)."""
     filter_variance: np.ndarray
     variance: np.ndarray
-    """What the filter assumes and what is true."""
+    """Variances assumed by the filter, and true."""
     sensor: np.ndarray
     time: np.ndarray
     error: np.ndarray
@@ -166,31 +166,31 @@ class Rows(NamedTuple):
 
 
 class White(NamedTuple):
-    """Sources of white noise, the first the filter's own P (1 + s,)."""
+    """Sources of white noise (1 + s,); the first is the filter's P."""
 
     angle_density: np.ndarray
     rate_density: np.ndarray
-    """One an axis (1 + s, 3), rad²/s and rad²/s³."""
+    """By axis (1 + s, 3), rad²/s and rad²/s³."""
     sensor: np.ndarray
-    """Sensor whose rows have the noise, −1 for none."""
+    """Sensor with this noise; −1: none."""
     blocks: np.ndarray
-    """Covariances (1 + s, 21); coloured sources have a place here too."""
+    """Covariances (1 + s, 21), including those of coloured sources."""
 
 
 class Shapes(NamedTuple):
-    """Coloured rates of the gyro, each of n first-order states an axis (c,)."""
+    """Coloured rates of the gyro (c,), each with n first-order states per axis."""
 
     amplitude: np.ndarray
     gains: np.ndarray
     poles: np.ndarray
     states: np.ndarray
     cross: np.ndarray
-    """Covariances of the error and the states that make the rate (c, 6, 3, n)."""
+    """Covariances of the error and the states of the rate (c, 6, 3, n)."""
     source: np.ndarray
 
 
 class Coloured(NamedTuple):
-    """Coloured noise of sensors, of first order (c,)."""
+    """First-order coloured noise of sensors (c,)."""
 
     sensor: np.ndarray
     sigma: np.ndarray
@@ -204,31 +204,31 @@ class Coloured(NamedTuple):
 
 
 class Columns(NamedTuple):
-    """Errors without noise (k,), of which the first ``fixed`` are the same in every run and the others have unit variance."""
+    """Deterministic errors (k,): the first ``fixed`` are the same in every run, the others have unit variance."""
 
     rate: np.ndarray
     """Rates of each segment (segments, r, 3), rad/s."""
     place: np.ndarray
-    """Which of the rates is the column's, −1 for none."""
+    """Index of the rate of each column; −1: none."""
     ramp: np.ndarray
-    """Bias that grows (k, 3), rad/s²."""
+    """Bias ramp (k, 3), rad/s²."""
     fixed: int
     value: np.ndarray
     """The errors (k, 6)."""
 
 
 class Outputs(NamedTuple):
-    """What is written: at ``stations`` in order, and by sensor."""
+    """Outputs at ``stations``, in order, and by sensor."""
 
     stations: np.ndarray
     blocks: np.ndarray
     columns: np.ndarray
     nis: np.ndarray
-    """Sum of the expected squares of normalized innovations, and their number (sensors, 2)."""
+    """Sum of the expected NIS, and the number of rows (sensors, 2)."""
 
 
 def shape_of(shapes, source):
-    """Return which coloured rate is this source, or −1."""
+    """Return the index of the coloured rate of a source, or −1."""
     for c in range(len(shapes.source)):
         if shapes.source[c] == source:
             return c
@@ -236,7 +236,7 @@ def shape_of(shapes, source):
 
 
 def shape_powers(shapes, c):
-    """Return the variances (3,) of a coloured rate over an interval and at the edge between two."""
+    """Return the variances (3,) of a coloured rate over an interval and at an edge."""
     inside, edge = 0.0, 0.0
     for n in range(shapes.gains.shape[1]):
         power = shapes.gains[c, n] * shapes.states[c, n]
@@ -323,7 +323,7 @@ def gain_at(ka, kb, r):
 
 
 def update_coloured(A, B, C, e, h, ka, kb, rows, coloured, c):
-    """Return the blocks after row e of a source that is coloured noise, and what it adds to the expected square of the innovation."""
+    """Return the blocks of a coloured source after row e, and its contribution to the expected squared innovation."""
     cross = coloured.cross[c]
     sigma = coloured.sigma[c]
     mine = coloured.sensor[c] == rows.sensor[e]
@@ -340,7 +340,7 @@ def update_coloured(A, B, C, e, h, ka, kb, rows, coloured, c):
     for r in range(6):
         for a in range(3):
             cross[r, a] -= gain_at(ka, kb, r) * seen[a]
-    # The rest of the cross-covariance, times the noise's weight: the new error and the noise in this row.
+    # Covariance of the error after the update and the noise of this row.
     lt = (dot(vector_at(cross, 0), weight), dot(vector_at(cross, 1), weight), dot(vector_at(cross, 2), weight))
     lb = (dot(vector_at(cross, 3), weight), dot(vector_at(cross, 4), weight), dot(vector_at(cross, 5), weight))
     power = sigma * sigma * dot(weight, weight)
@@ -403,7 +403,7 @@ def update(e, rows, white, shapes, coloured, columns, nis):
 
 
 def keep(row, first, white, shapes, columns, out):
-    """Write the covariances and errors at a station; ``first`` says that no segment lies before it."""
+    """Write the covariances and errors at a station; ``first``: whether no segment precedes it."""
     for s in range(len(white.blocks)):
         A, B, C = load_blocks(white.blocks[s])
         c = shape_of(shapes, s)

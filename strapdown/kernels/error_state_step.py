@@ -50,7 +50,7 @@ CALLED = (
     "turn_columns",
     "turn_values",
 )
-"""Not inlined where other kernels use them: their work is far more than a call, and each copy would be compiled anew."""
+"""Called, not inlined, by other kernels: a call costs little compared with their work, and each copy would be compiled again."""
 
 OFFSET = 1
 SCALE = 2

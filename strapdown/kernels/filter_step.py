@@ -3,11 +3,11 @@
 State: attitude ``q_fb``, gyro bias ``b`` (rad/s) and the covariance ``P`` of the error (δθ, δb) in three blocks: ``A`` = P_θθ (6-tuple),
 ``B`` = P_θb (9-tuple), ``C`` = P_bb (6-tuple). The error is body side, ``q_true = q ⊗ exp(δθ)``, ``δb = b_true − b``.
 
-A measurement of any kind enters as scalar rows ``y = h · δθ + noise``. Rows of one measurement share a correction: each row's innovation
-takes off what the rows before it corrected, and the attitude is moved, and the covariance reset, once at the end.
+A measurement of any kind is processed as scalar rows ``y = h · δθ + noise``. The rows of one measurement share a correction: the innovation
+of each row is reduced by the corrections of the rows before it, and attitude update and covariance reset follow once, at the end.
 
-Every function takes floats or lanes (:mod:`strapdown.kernels.lane_values`). Where runs in one group of lanes want different forms of a
-formula, both are computed and chosen lane by lane, so that a run's bits do not depend on its neighbours.
+Every function takes floats or lanes (:mod:`strapdown.kernels.lane_values`). If runs in one group of lanes need different forms of a
+formula, both are computed and selected by lane, so the bits of a run do not depend on its neighbours.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ from strapdown.kernels.rotation import far_turn, logarithm, quaternion_multiply,
 from strapdown.kernels.series import fifth, fourth, second, sinc, third
 
 SHORT_FORM = 1000.0
-"""Where an innovation's variance is less than this many times the measurement's, the short form loses no more than three digits."""
+"""Maximum ratio of innovation variance to measurement variance for the short form, which then loses at most three digits."""
 
 
 def transition(phi, dt):
-    """Return Φ11 and Φ12 of the error state over a turn φ = ω dt at constant rate ω (6×6 Φ = [[Φ11, Φ12], [0, I]]).
+    """Return Φ11 and Φ12 of the error state over a rotation φ = ω dt at constant rate ω (6×6 Φ = [[Φ11, Φ12], [0, I]]).
 
     ``Φ11 = exp(−[φ])``, ``Φ12 = −dt J_r(φ)``: the exact solution of δθ̇ = −[ω] δθ − δb (Markley & Crassidis 2014, eq. (6.83)).
     """
@@ -54,7 +54,7 @@ def transition(phi, dt):
 
 
 def process_noise(phi, dt, angle_variance, rate_variance):
-    """Return Q11 (symmetric), Q12 and the diagonal of Q22 over a turn φ = ω dt, exact at constant ω.
+    """Return Q11 (symmetric), Q12 and the diagonal of Q22 over a rotation φ = ω dt, exact at constant ω.
 
     ``angle_variance`` is σ_v² (rad²/s), ``rate_variance`` σ_u² (rad²/s³). With x = |φ|, n = φ/x:
     ``Q11 = σ_v² dt I + σ_u² dt³ {n nᵀ/3 + 2 (x − sin x)/x³ (I − n nᵀ)}``,
@@ -98,16 +98,16 @@ def predict(q, b, A, B, C, delta_theta, dt, angle_variance, rate_variance):
 
 
 def chosen_parts(condition, a, b):
-    """Return the tuple a in the lanes where the condition holds, b in the others."""
+    """Return the tuple a in lanes in which the condition holds, b in the others."""
     return tuple(chosen(condition, x, y) for x, y in zip(a, b, strict=True))
 
 
 def update_row(b, A, B, C, h, innovation, variance):
     """Update with one scalar row ``innovation = h · δθ + v``, Var v = ``variance``.
 
-    Returns the attitude correction, b, A, B, C and the innovation's variance. Joseph's form, written as the short form plus the vector
-    ``d = (P − k p) h − r k`` which is nothing but the short form's rounding error: it keeps P positive definite when the measurement is
-    many orders better than the prior (Bierman 1977, ch. V), and can be left out where it is not.
+    Returns the attitude correction, b, A, B, C and the innovation's variance. Joseph's form, written as the short form with a correction by
+    ``d = (P − k p) h − r k``, its rounding error: it keeps P positive definite if the measurement is much more precise than the prior
+    (Bierman 1977, ch. V), and is left out otherwise.
     """
     pa = symmetric_times_vector(A, h)
     pb = transpose_times_vector(B, h)
@@ -133,10 +133,10 @@ def update_row(b, A, B, C, h, innovation, variance):
 
 
 def reset(q, A, B, correction):
-    """Move the attitude by the correction and carry the covariance to the new tangent space: G = J_r(correction) on the attitude side.
+    """Correct the attitude and transform the covariance to the new tangent space by G = J_r(correction).
 
-    ``A ← G A Gᵀ``, ``B ← G B`` (conventions of :mod:`strapdown`; Markley & Crassidis 2014, section 6.2.1). Without it the filter is
-    conservative or optimistic by second-order terms, and differs from its fixed-side twin.
+    ``A ← G A Gᵀ``, ``B ← G B`` (conventions of :mod:`strapdown`; Markley & Crassidis 2014, section 6.2.1). Without this the filter is
+    conservative or optimistic by second-order terms, and differs from the filter with the error in fixed axes.
     """
     G = right_jacobian(correction)
     moved = turned(q, correction)
@@ -153,9 +153,9 @@ def reset(q, A, B, correction):
 
 
 def rows_at_once(b, A, B, C, pa1, pa2, h1, e1, h2, y2, S):
-    """Update with two rows of covariance S (s1, s12, s22), the second freed of the first: the divisions do not wait for each other.
+    """Update with two rows of innovation covariance S (s1, s12, s22) at once, so that the divisions are independent.
 
-    Returns the correction, b, A, B, C, the second row's innovation freed of the first with its variance, and the NIS.
+    Returns the correction, b, A, B, C, the second innovation decorrelated from the first with its variance, and the NIS.
     """
     s1, s12, s22 = S
     determinant = s1 * s22 - s12 * s12
@@ -166,7 +166,7 @@ def rows_at_once(b, A, B, C, pa1, pa2, h1, e1, h2, y2, S):
     pa2 = combine(1.0, pa2, -share, pa1)
     pb1 = transpose_times_vector(B, h1)
     pb2 = combine(1.0, transpose_times_vector(B, h2), -share, pb1)
-    # The correction, on which all that follows waits, comes straight from the divisions, not by way of the gains.
+    # The correction is on the critical path: it is computed directly from the divisions, not through the gains.
     g1 = inverse1 * e1
     g2 = inverse * (s1 * e2)
     correction = combine(g1, pa1, g2, pa2)
@@ -181,9 +181,9 @@ def rows_at_once(b, A, B, C, pa1, pa2, h1, e1, h2, y2, S):
 
 
 def row_after_row(b, A, B, C, h1, e1, h2, y2, variance):
-    """Update with two rows one after the other, each by :func:`update_row`; return what :func:`rows_at_once` does."""
+    """Update with two rows in sequence by :func:`update_row`; return the same as :func:`rows_at_once`."""
     first, b, A, B, C, s1 = update_row(b, A, B, C, h1, e1, variance)
-    e2 = y2 - dot(h2, first)  # what the first row has corrected is taken off the second
+    e2 = y2 - dot(h2, first)  # the second innovation is reduced by the correction of the first
     second, b, A, B, C, s2 = update_row(b, A, B, C, h2, e2, variance)
     return add(first, second), b, A, B, C, e2, s2, e1 * e1 / s1 + e2 * e2 / s2
 
@@ -198,7 +198,7 @@ def update_direction(q, b, A, B, C, R, u, v, z, variance):
 
 
 def update_direction_and_judge(q, b, A, B, C, R, u, v, z, variance):
-    """Do as :func:`update_direction` and return the NIS too; who needs only that saves the divisions of the innovations."""
+    """Return the results of :func:`update_direction` and the NIS; without the innovations, their divisions are saved."""
     h1, e1, h2, y2 = direction_rows(R, u, v, z)
     pa1 = symmetric_times_vector(A, h1)
     pa2 = symmetric_times_vector(A, h2)
@@ -239,8 +239,8 @@ def update_residual(q, b, A, B, C, y, variance):
 def update_attitude(q, b, A, B, C, measured, variance):
     """Update with a measured attitude q_fb: three degrees of freedom, ``variance`` (3,) about the body axes, rad².
 
-    The residual is Log(q⁻¹ ⊗ measured), the error state itself. Scalar machine only: lanes take their own logarithm
-    (:func:`strapdown.kernels.lane_angles.rotation_vector`) and :func:`update_residual`.
+    The residual is Log(q⁻¹ ⊗ measured), a measurement of the error state. Scalar only: lanes use
+    :func:`strapdown.kernels.lane_angles.rotation_vector` and :func:`update_residual`.
     """
     y = logarithm(quaternion_multiply((q[0], -q[1], -q[2], -q[3]), measured))
     return update_residual(q, b, A, B, C, y, variance)

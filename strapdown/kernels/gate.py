@@ -1,8 +1,8 @@
 """A gate and robust weights around a filter: a body of :mod:`strapdown.kernels.walk` over either form of the covariance.
 
-What a gate makes of refusals is in :mod:`strapdown.kernels.gate_rules`. The form (:mod:`strapdown.kernels.covariance_form` or
-:mod:`strapdown.kernels.root_form`) defines the functions in ``OPEN``. Row 0 of its states is the filter, row 1 the restart candidate
-beside it while there is one, so that both go through one piece of code.
+The consequences of refusals are in :mod:`strapdown.kernels.gate_rules`. The form (:mod:`strapdown.kernels.covariance_form` or
+:mod:`strapdown.kernels.root_form`) defines the functions in ``OPEN``. Row 0 of its states is the filter, row 1 the restart candidate, if
+there is one; both are processed by the same code.
 """
 
 from __future__ import annotations
@@ -101,61 +101,61 @@ OPEN = (
     "widen",
     "keep_row",
 )
-"""What a form defines; here they are those of :mod:`strapdown.kernels.covariance_form`."""
+"""Functions that a form defines; in this module those of :mod:`strapdown.kernels.covariance_form`."""
 
 LENIENT = 1e3
-"""A candidate, which starts with next to nothing known, may lose so many times more of its covariance's digits than the filter."""
+"""Factor on the loss of digits of the covariance allowed for a candidate, which starts with a very large covariance."""
 
 
 class Options(NamedTuple):
-    """A gate and a robust update as the kernels take them."""
+    """Gate and robust update, in the form of the kernels."""
 
     thresholds: np.ndarray
-    """Largest NIS accepted of 1, 2, 3 degrees of freedom (3,)."""
+    """Maximum NIS accepted for 1, 2, 3 degrees of freedom (3,)."""
     robust: int
-    """0, or a kind of :mod:`strapdown.kernels.iterated_update`."""
+    """Kind of robust weight (:mod:`strapdown.kernels.iterated_update`); 0: none."""
     parameters: np.ndarray
-    """Of the robust weight, a row for each number of degrees of freedom (3, 2)."""
+    """Parameters of the robust weight, a row for each number of degrees of freedom (3, 2)."""
     iterations: int
-    """Of the robust weight."""
+    """Number of iterations of the robust weight."""
     recovery: int
-    """Refusals in a row that lead to recovery; 0: none."""
+    """Number of consecutive refusals that lead to recovery; 0: never."""
     lock_out: int
-    """A sensor refused more often than accepted by more than this is reported."""
+    """Excess of refusals over acceptances of a sensor above which a lock-out is reported."""
     attitude_sigma: float
     """σ of the first candidate's attitude, rad."""
 
 
 class Body(NamedTuple):
-    """A filter in one form, and what judges it."""
+    """A filter in one form, with its gate."""
 
     form: NamedTuple
     options: Options
     restart: NamedTuple
-    """What a candidate of the form starts from."""
+    """Initial values of a candidate of the form."""
     standing: np.ndarray
-    """(sensors, ``STANDING``), what the gate remembers of each sensor; left at the end."""
+    """Counters of each sensor (sensors, ``STANDING``); at return, their final values."""
     memory: np.ndarray
-    """(``MEMORY``,), of the candidate; left at the end. At the start of a record zeros, but for ``PASSES``, 1, and ``REPORTED``, −1."""
+    """Counters of the candidate (``MEMORY``,); at return, final values. Initially zero, except ``PASSES`` = 1 and ``REPORTED`` = −1."""
 
 
 class Outputs(NamedTuple):
-    """What a run writes beside the form's own outputs."""
+    """Outputs of a run in addition to those of the form."""
 
     form: NamedTuple
     weight: np.ndarray
-    """(events,) by place, 0 where refused."""
+    """Weight of each measurement (events,), by place; 0: refused."""
     recoveries: np.ndarray
-    """(rows, 4): time, sensor, time of the first refusal and refusals in a row of each recovery."""
+    """(rows, 4): time, sensor, time of the first refusal and number of consecutive refusals of each recovery."""
     lock_outs: np.ndarray
-    """(rows, 4): times of the first and of the last refusal, sensor and number of refusals, 0 of one that a recovery reports."""
+    """(rows, 4): times of the first and last refusal, sensor, number of refusals; 0 for a lock-out that is reported as a recovery."""
 
 
 # ------------------------------------------------------------------------------------------------------------------ the body of the walk
 
 
 def begin(body):
-    """Return how many states run, the numbers of lock-outs, recoveries and segments, and whether digits are lost."""
+    """Return the numbers of states, lock-outs, recoveries and segments, and whether digits are lost."""
     # From an array, and not literals: numba would compile the body for that type too.
     none = 0 * len(body.memory)
     running = none + 1
@@ -174,7 +174,7 @@ def lost_digits(running, body):
 
 
 def largest_turn(running, part, dt, body):
-    """Return the largest squared turn of the states that run."""
+    """Return the largest squared rotation angle of the states."""
     squared = 0.0
     for i in range(running):
         squared = max(squared, turn_squared(part, dt, bias_at(body.form, i)))
@@ -182,7 +182,7 @@ def largest_turn(running, part, dt, body):
 
 
 def longest_step(state, part, dt, body):
-    """Return the longest step, s; all states that run take the same ones."""
+    """Return the longest step, s, common to all states."""
     return min(step_within(largest_turn(state[0], part, dt, body), dt), step_limit(body.form))
 
 
@@ -200,7 +200,7 @@ def predict(state, part, dt, body, out):
 
 
 def update(state, e, now, measured, body, out):
-    """Judge a measurement by the filter, and by the candidate if there is one, and update."""
+    """Test a measurement with the filter and the candidate, if there is one, and update."""
     running, lock_outs, recoveries, segments, lost = state
     form, options, memory, standing = body.form, body.options, body.memory, body.standing
     place = measured.place[e]
@@ -240,7 +240,7 @@ def update(state, e, now, measured, body, out):
 
 
 def keep(state, row, e, body, out):
-    """Write a row; every ``check`` rows make sure that the covariances have digits left."""
+    """Write a row; every ``check`` rows, check that the covariances have enough digits."""
     running, lock_outs, recoveries, segments, lost = state
     keep_row(body.form, load(body.form, 0), row, out.form)
     if row % body.form.check == 0:
@@ -254,7 +254,7 @@ def stopped(state):
 
 
 def finish(state, row, e, body):
-    """Return the numbers of segments, of recoveries and of lock-outs; of segments −1 where a covariance has lost its digits."""
+    """Return the numbers of segments (−1: a covariance has lost its digits), recoveries and lock-outs."""
     running, lock_outs, recoveries, segments, lost = state
     if lost or lost_digits(running, body):
         segments = -1
@@ -265,19 +265,19 @@ def finish(state, row, e, body):
 
 
 def judged_update(form, i, e, measured, passes, options):
-    """Test a measurement against state i and update with it if its NIS is not above the threshold, and a direction not behind.
+    """Test a measurement with state i, and update if its NIS does not exceed the threshold and a direction is within 90° of the predicted.
 
-    With ``passes`` above one the update is linearised anew, up to so many times, at the estimate that it leads to, while its correction
-    exceeds ``RELINEARIZED``; the rows are turned to the prior's tangent space, and the covariance in the end to that of the estimate, as
-    :func:`strapdown.kernels.iterated_update.tangent_at` says. Where that ends above the threshold and the attitude is hardly known, it is
-    tried again from a third of a turn to either side about the least certain axis.
+    If ``passes`` is above one, the update is relinearised at its own result, at most that number of times, while the correction exceeds
+    ``RELINEARIZED``. Rows are transformed to the tangent space of the prior, and the final covariance to that of the estimate
+    (:func:`strapdown.kernels.iterated_update.tangent_at`). If the result exceeds the threshold and the attitude is nearly unknown, the
+    update is repeated from 120° to either side about the least certain axis.
 
-    With ``passes`` above one a heading is passed over while the tilt is not known: its row depends on it. That of a vertical vector, which
-    shows none, always is, and its innovation is NaN.
+    If ``passes`` is above one, a heading is skipped while the tilt, on which its row depends, is unknown. The heading of a vertical vector
+    is undefined: it is always skipped, with an innovation of NaN.
 
-    Returns ``ACCEPTED``, ``REFUSED`` or ``PASSED_OVER``, the weight, independent innovations (3,) and their variances (3,) under the
-    nominal noise, of the last linearisation; where these do not come to rest, of the first. At last the smallest share that the noise has
-    in such a variance where the measurement was accepted: its inverse is what the covariance loses by it.
+    Returns ``ACCEPTED``, ``REFUSED`` or ``PASSED_OVER``, the weight, and independent innovations (3,) with their variances (3,) under the
+    nominal noise, from the last linearisation or, without convergence, from the first. The last value is the smallest ratio of measurement
+    noise to innovation variance of an accepted measurement; its inverse is the loss of precision of the covariance.
     """
     place = measured.place[e]
     sensor = measured.sensor[e]
@@ -299,7 +299,7 @@ def judged_update(form, i, e, measured, passes, options):
     tolerance = SETTLED if unknown else RELINEARIZED
     now_q = q
     M = IDENTITY
-    prior = (0.0, 0.0, 0.0)  # where the prior's mean lies, seen from the attitude of the linearisation
+    prior = (0.0, 0.0, 0.0)  # prior mean relative to the attitude of the linearisation
     start_update(form, i)
     first_e = prior
     first_F = (0.0, 0.0, 0.0, 1.0, 1.0, 1.0)
@@ -315,7 +315,7 @@ def judged_update(form, i, e, measured, passes, options):
         e3 = innovation[2] - F[1] * e1 - F[2] * e2
         accepted = e1 * e1 * F[3] + e2 * e2 * F[4] + e3 * e3 * F[5] <= threshold
         if kind == DIRECTION and along < 0.0 and threshold < math.inf:
-            accepted = False  # beyond a right angle from the predicted one, which the rows across it do not see
+            accepted = False  # more than 90° from the predicted one, which the transverse rows cannot detect
         if passes == 1:
             break
         if done == 1 and trials == 0:

@@ -221,7 +221,7 @@ def takes_over(sensor, recovery, standing, memory):
 def recover(now, sensor, limit, standing, memory, row, lock_outs):
     """Report a recovery in ``row`` (4,): time, sensor, time of the first refusal, refusals in a row; reset the counters.
 
-    It stands for the short lock-outs that it ends: their number is set to zero.
+    It replaces the short lock-outs that it ends: their number of refusals is set to zero.
     """
     row[0] = now
     row[1] = sensor

@@ -10,10 +10,10 @@ import numpy as np
 from strapdown.kernels.noise import fill_normals
 
 BLOCK = 512
-"""Samples a block; part of what defines the streams."""
+"""Number of samples in a block; a change of it changes the random numbers of a seed."""
 
 WALK, MARKOV, FLICKER, WHITE = 0, 1, 2, 3
-"""Streams of an axis: each noise term has its own, so that one more term changes no other."""
+"""Random streams of an axis: one for each noise term, so an additional term changes no other."""
 
 
 def bridge_remainder(u):
@@ -25,11 +25,11 @@ def bridge_remainder(u):
 
 
 def markov_step(dt, correlation_time):
-    """Return φ, variance of a step over q, mean factor and variance of the integral over q, of a Gauss–Markov process of driving PSD q.
+    """Return φ, variance of a step over q, mean factor and variance of the integral over q, for a Gauss–Markov process with driving PSD q.
 
-    Over dt, u = dt/(2τ): ``x₁ = φ x₀ + n`` with φ = e^(−2u) and ``var n = q dt (1 − e^(−4u))/(4u)``; given both ends the integral has the
-    mean ``½ dt (x₀ + x₁) tanh(u)/u`` and the variance ``q dt³ (1 − tanh(u)/u)/(4u²)``. An infinite τ gives 1, q dt, ½ dt and q dt³/12: a
-    random walk.
+    Over dt, u = dt/(2τ): ``x₁ = φ x₀ + n`` with φ = e^(−2u) and ``var n = q dt (1 − e^(−4u))/(4u)``; given both ends, the integral has mean
+    ``½ dt (x₀ + x₁) tanh(u)/u`` and variance ``q dt³ (1 − tanh(u)/u)/(4u²)``. For an infinite τ, a random walk, these are 1, q dt, ½ dt and
+    q dt³/12.
     """
     u = 0.5 * dt / correlation_time
     step = dt
@@ -41,14 +41,14 @@ def markov_step(dt, correlation_time):
 
 
 def gauss_markov(decay, steps, values):
-    """Fill values (n + 1, 3) from the first row on: x ← φ x + w of decays φ (n,) and steps w (n, 3)."""
+    """Fill values (n + 1, 3), starting from the first row: x ← φ x + w with decays φ (n,) and steps w (n, 3)."""
     for k in range(len(decay)):
         for i in range(3):
             values[k + 1, i] = decay[k] * values[k, i] + steps[k, i]
 
 
 def flicker_block(poles, gains, states, scale, normals, out):
-    """Fill out (m,) with flicker of 16 states, which go on: x ← p x + w, out = scale g · x."""
+    """Fill out (m,) with flicker noise, and update its 16 states: x ← p x + w, out = scale g · x."""
     a = poles
     c = gains
     x = states
@@ -64,10 +64,10 @@ def flicker_block(poles, gains, states, scale, normals, out):
 
 
 class Errors(NamedTuple):
-    """Errors of a gyro; those by axis are (3,)."""
+    """Errors of a gyro; values by axis are (3,)."""
 
     matrix: np.ndarray
-    """Scale factors and misalignments with the identity (3, 3)."""
+    """Identity plus scale factors and misalignments (3, 3)."""
     asymmetry: np.ndarray
     constant: np.ndarray
     """Bias, rad/s."""
@@ -80,21 +80,21 @@ class Errors(NamedTuple):
     markov: np.ndarray
     """√q of the Markov bias, rad/s/√s."""
     correlation_time: np.ndarray
-    """Of the Markov bias, s."""
+    """Correlation time of the Markov bias, s."""
     flicker: np.ndarray
     """Bias instability B, rad/s."""
     poles: np.ndarray
     gains: np.ndarray
-    """Of the flicker (16,)."""
+    """Gains of the flicker states (16,)."""
 
 
 class Drift(NamedTuple):
-    """The drift's state, which goes on, by axis."""
+    """State of the drift by axis, updated by each call."""
 
     flicker_states: np.ndarray
     """(3, 16)."""
     flicker_before: np.ndarray
-    """Flicker of the interval before (3,), rad/s."""
+    """Flicker of the previous interval (3,), rad/s."""
     walk: np.ndarray
     markov: np.ndarray
     """Random walk and Markov bias (3,), rad/s."""
@@ -104,7 +104,7 @@ class Draws(NamedTuple):
     """Generators and scratch."""
 
     streams: np.ndarray
-    """(3, terms, 2, 4), by axis and term."""
+    """State of each generator (3, terms, 2, 4), by axis and noise term."""
     words: np.ndarray
     """(2, BLOCK / 2)."""
     normals: np.ndarray
@@ -114,7 +114,7 @@ class Draws(NamedTuple):
 def drift_and_noise(edges, true_increments, errors, drift, draws, increments, bias):
     """Fill increments (n, 3) and bias (n + 1, 3) from the true increments.
 
-    The bias at an edge holds the mean of the flicker of the intervals beside it.
+    The bias at an edge includes the mean flicker of the two adjacent intervals.
     """
     matrix, asymmetry, constant, ramp, white, walk, markov, correlation_time, flicker, poles, gains = errors
     flicker_states, flicker_before, walk_now, markov_now = drift
@@ -187,9 +187,9 @@ def drift_and_noise(edges, true_increments, errors, drift, draws, increments, bi
 def low_pass(dt, transition, factor, white, state, streams, words, normals, increments, out):
     """Fill out (n, 3) with the increments of a second-order low-pass, from those of its input.
 
-    In each interval the input rate is the straight line with the interval's own area and the slope between its neighbours' means.
-    ``transition`` (3, 4) takes (y, ẏ, mean, slope) to (y, ẏ, ∫y) at the end; white noise of σ_v enters in continuous time, its share of the
-    three through the Cholesky factor (3, 3). ``state`` (3, 2) goes on.
+    In each interval the input rate is linear, with the area of the interval and the slope between the means of the adjacent intervals.
+    ``transition`` (3, 4) maps (y, ẏ, mean, slope) to (y, ẏ, ∫y) at the end; white noise of σ_v enters in continuous time, through the
+    Cholesky factor (3, 3) of its effect on the three. ``state`` (3, 2) is updated.
     """
     n = increments.shape[0]
     for first in range(0, n, BLOCK):
@@ -225,7 +225,7 @@ def low_pass(dt, transition, factor, white, state, streams, words, normals, incr
 
 def digitize(edges, limit, step, resolution, carried, increments):
     """Clip the rate of increments (n, 3) at ± ``limit``, then round: increments to ``step`` with the remainder carried, rates to
-    ``resolution``, each by axis and 0 where there is none (an infinite limit for none).
+    ``resolution``, each by axis; 0: not rounded; an infinite limit: not clipped.
     """  # noqa: D205
     for axis in range(3):
         most = limit[axis]

@@ -1,9 +1,9 @@
-"""Several attitude filters with weights, until their mixture is one Gaussian: a body of :mod:`strapdown.kernels.walk`.
+"""A weighted set of attitude filters, until their mixture is close to one Gaussian: a body of :mod:`strapdown.kernels.walk`.
 
-Each hypothesis is the filter of :mod:`strapdown.kernels.filter_step` with two changes that a wide covariance asks for. Directions are
-processed by Gauss–Newton passes (the iterated filter), so that row and evidence belong to the attitude that the measurement leads to. And a
-correction a carries the covariance by ``exp(−[a])`` instead of J_r(a): that keeps its axes in the *fixed* frame (the right-invariant
-error), where the turn about a reference that never changes stays exactly as unknown as it was.
+Each hypothesis is the filter of :mod:`strapdown.kernels.filter_step` with two changes for a large covariance. Directions are processed by
+an iterated update (Gauss–Newton), so row and likelihood are those at the updated attitude. A correction a transforms the covariance by
+``exp(−[a])`` instead of J_r(a): its axes remain constant in the *fixed* frame (right-invariant error), so the variance of the rotation
+about a constant reference is unchanged by its measurements.
 """
 
 from __future__ import annotations
@@ -60,19 +60,19 @@ from strapdown.kernels.walk import step_within, turn_squared
 CALLED = ("updated", "moment_match", "normalized_weights")
 
 PASSES = 5
-"""Most Gauss–Newton passes of one update."""
+"""Maximum number of Gauss–Newton iterations of an update."""
 SETTLED = 1e-6
-"""Square of a step, rad², below which no further pass is made: what it leaves is half of it."""
+"""Squared step, rad², below which the iteration ends."""
 NEVER = -1
 LOST = -2
-"""Instead of the edge at which hypotheses became one: they did not; most of them, by weight, refuse one measurement after the other."""
+"""Values in place of the edge of convergence: not converged; lost, as successive measurements were refused by more than half the weight."""
 
 
 def update_iterated(q, b, A, B, C, u, v, z, variance):
-    """Update with a unit direction ``z`` (body), its reference in the triad u × v = r, by Gauss–Newton passes.
+    """Update with a unit direction ``z`` (body), its reference r = u × v, by Gauss–Newton iteration.
 
-    Pass by pass the point q moves towards the most probable attitude. At each the prior has the mean ``m`` (body axes of that point) and
-    the covariance carried there; rows are those of the point. Returns (q, b, A, B, C) and both innovations with their variances.
+    The point of linearisation q converges to the most probable attitude. At each point the prior has the mean ``m`` (body axes of that
+    point) and the covariance transformed to it. Returns (q, b, A, B, C) and both innovations with their variances.
     """
     m = (0.0, 0.0, 0.0)
     e1 = e2 = s1 = s2 = 1.0
@@ -100,9 +100,9 @@ def update_iterated(q, b, A, B, C, u, v, z, variance):
 def updated(kind, q, b, A, B, C, z, frame, variance, weight):
     """Update with one measurement of any kind, its variance divided by ``weight``.
 
-    ``frame`` is the row of the triads. Returns (q, b, A, B, C), the innovations with their variances (e₁, s₁, e₂, s₂, e₃, s₃), of a
-    measurement with fewer filled up by (0, 1), and the mean square of its residual after the update over its own variance:
-    rᵀR⁻¹r and tr R⁻¹HP⁺Hᵀ, R not divided.
+    ``frame`` is the row of the triads. Returns (q, b, A, B, C), the innovations with their variances (e₁, s₁, e₂, s₂, e₃, s₃), padded by
+    (0, 1), and the two parts of the mean square of the residual after the update over the undivided noise variance R: rᵀR⁻¹r and
+    tr R⁻¹HP⁺Hᵀ.
     """
     e1, s1, e2, s2, e3, s3 = 0.0, 1.0, 0.0, 1.0, 0.0, 1.0
     if kind == ATTITUDE:
@@ -131,7 +131,7 @@ def updated(kind, q, b, A, B, C, z, frame, variance, weight):
         distance = (y1 * y1 + y2 * y2) / variance
         spread = (dot(h1, symmetric_times_vector(A, h1)) + dot(h2, symmetric_times_vector(A, h2))) / variance
         if kind == VECTOR:
-            # Its length says nothing of the attitude, but belongs to the innovation.
+            # The length has no information about the attitude but is part of the innovation.
             e3 = dot(transpose_times_vector(R, (frame[6], frame[7], frame[8])), z) - 1.0
             s3 = variance / weight
             distance += e3 * e3 / variance
@@ -139,7 +139,7 @@ def updated(kind, q, b, A, B, C, z, frame, variance, weight):
 
 
 def heavy_tailed(robust, parameter, numerator, nis):
-    """Return what stands for the NIS in −2 log of the likelihood under a robust update: Huber's function, or that of Student's t."""
+    """Return the term that replaces the NIS in −2 log likelihood for a robust update: Huber's function, or that of Student's t."""
     if robust == STUDENT:
         return numerator * math.log(1.0 + nis / parameter)
     if robust == HUBER and nis > parameter:
@@ -148,7 +148,7 @@ def heavy_tailed(robust, parameter, numerator, nis):
 
 
 def mean_attitude(states, weight):
-    """Return the weighted mean attitude, Σ w Log(q̄⁻¹ ⊗ q_i) = 0, nearest to the heaviest hypothesis."""
+    """Return the weighted mean attitude, Σ w Log(q̄⁻¹ ⊗ q_i) = 0, nearest to the hypothesis of the largest weight."""
     heaviest = 0
     for i in range(len(weight)):
         if weight[i] > weight[heaviest]:
@@ -169,10 +169,10 @@ def mean_attitude(states, weight):
 
 
 def moment_match(states, weight, between, out):
-    """Write the Gaussian of the mixture's first two moments to ``out`` (28,), and how far its members lie apart to ``between`` (12,).
+    """Write the first two moments of the mixture to ``out`` (28,), and the covariance between its members to ``between`` (12,).
 
-    About the mean q̄ a member lies at d_i = Log(q̄⁻¹ ⊗ q_i), b_i − b̄, and its covariance is carried there by J_r⁻¹(d_i):
-    ``P = Σ w_i (G_i P_i G_iᵀ + d_i d_iᵀ)``. ``between`` gets the second part's attitude and bias blocks.
+    Relative to the mean (q̄, b̄) a member is at d_i = Log(q̄⁻¹ ⊗ q_i), b_i − b̄; its covariance is transformed by G_i = J_r⁻¹(d_i):
+    ``P = Σ w_i (G_i P_i G_iᵀ + d_i d_iᵀ)``. ``between`` holds the attitude and bias blocks of the second term.
     """
     q = mean_attitude(states, weight)
     mean = (0.0, 0.0, 0.0)
@@ -207,9 +207,9 @@ def moment_match(states, weight, between, out):
 
 
 def share_between(total, part):
-    """Return tr(T⁻¹ S) of symmetric T > 0 and S: the part of a covariance that lies between the members, summed over its axes.
+    """Return tr(T⁻¹ S) for symmetric T > 0 and S: the fraction of a covariance due to differences between members, summed over the axes.
 
-    By Cholesky's factor T = L Lᵀ, a column of L⁻¹ at a time: T may have one axis open and two known a hundred thousand times better.
+    By the Cholesky factor T = L Lᵀ, a column of L⁻¹ at a time: the standard deviations of T may differ by a factor of 1e5.
     """
     a = math.sqrt(total[0])
     b, c = total[1] / a, total[2] / a
@@ -229,7 +229,7 @@ def share_between(total, part):
 
 
 def normalized_weights(log_weight, least, weight):
-    """Write the weights, those below ``least`` as 0 for good; return what was taken from each logarithm, so that the largest is 0."""
+    """Write normalised weights, permanently 0 below ``least``; return the value subtracted from each logarithm to make the largest 0."""
     best = -math.inf
     for i in range(len(log_weight)):
         best = max(best, log_weight[i])
@@ -249,11 +249,11 @@ def normalized_weights(log_weight, least, weight):
 
 
 class Body(NamedTuple):
-    """The hypotheses, and what weighs them.
+    """Hypotheses and options.
 
-    There may be further sets of hypotheses, of no weight at first: what the measurements ``later`` leave open, each on its own. A set is
-    given, at its measurement, the weight that those before would have had they refused all directions until then at a NIS of ``charge``:
-    the first ones may be outliers, and nothing else shows which. Hypotheses are not one before the first of these.
+    Further sets of hypotheses, of zero weight at first, may start from the measurements ``later``, each from one of them, in case earlier
+    measurements are outliers. At its measurement, a set is given the weight that the earlier sets would have if they had refused all
+    directions until then at a NIS of ``charge``. Hypotheses are not merged before the first of these measurements.
     """
 
     angle_variance: float
@@ -261,32 +261,32 @@ class Body(NamedTuple):
     rate_variance: float
     """σ_u², rad²/s³."""
     states: np.ndarray
-    """(h, 28); row 0 is the Gaussian that they have become, where they have."""
+    """(h, 28); after convergence, row 0 is the merged Gaussian."""
     log_weight: np.ndarray
-    """(h,), and so ``weight``, left at the last weights."""
+    """(h,), as ``weight``; at return, the final values."""
     weight: np.ndarray
     later: np.ndarray
-    """Measurements whose sets come later (k,), counted from the first of the walk."""
+    """Measurements at which further sets start (k,), counted from the first of the walk."""
     sets: np.ndarray
-    """Where these sets begin, and the number of all hypotheses (k + 1,)."""
+    """First hypothesis of each further set, and the total number of hypotheses (k + 1,)."""
     charge: float
     options: Options
-    """Gate and robust weights. ``recovery``: hypotheses of more than half the weight that refuse so many in a row are lost; 0: never."""
+    """Gate and robust weights. ``recovery``: consecutive refusals by more than half the weight after which all are lost; 0: never."""
     min_weight: float
-    """Hypotheses of less weight than this relative to the heaviest are dropped."""
+    """Minimum weight relative to the largest; hypotheses below it are dropped."""
     max_share: float
-    """They are one when less than this part of the attitude's and the bias's covariance lies between them."""
+    """Maximum fraction of the covariance of attitude and of bias due to differences between hypotheses, below which these are merged."""
     first_edge: int
-    """Number of the walk's first edge in the record."""
+    """Index in the record of the first edge of the walk."""
     on_edge: bool
-    """Whether that is an edge, and not a time between two."""
+    """Whether that is an edge, not a time between two."""
     every: int
     room: np.ndarray
     """Scratch (40,)."""
 
 
 class Outputs(NamedTuple):
-    """Arrays that a run writes: a row for each kept edge, and of innovations for each measurement, by place."""
+    """Output arrays: a row for each stored edge; innovations by measurement."""
 
     attitude: np.ndarray
     bias: np.ndarray
@@ -294,13 +294,13 @@ class Outputs(NamedTuple):
     weights: np.ndarray
     """(rows, h), or (0, h)."""
     innovation: np.ndarray
-    """Innovations of the heaviest hypothesis (events, 6)."""
+    """Innovations of the hypothesis of the largest weight (events, 6)."""
     share: np.ndarray
-    """Its weights of the measurements (events,)."""
+    """Its weight of each measurement (events,)."""
 
 
 def begin(body):
-    """Return the sets started, the log weight of having refused all, refusals in a row, rows written, and the edge where all became one."""
+    """Return number of sets started, log weight of refusing all, consecutive refusals, rows written, and edge of convergence."""
     normalized_weights(body.log_weight, body.min_weight, body.weight)
     refused = 0.0
     for i in range(len(body.weight)):
@@ -311,7 +311,7 @@ def begin(body):
 
 
 def largest_turn(part, dt, body):
-    """Return the largest squared turn of the hypotheses."""
+    """Return the largest squared rotation angle of the hypotheses."""
     squared = 0.0
     for i in range(len(body.weight)):
         if body.weight[i] > 0.0:
@@ -335,7 +335,7 @@ def predict(state, part, dt, body, out):
 
 
 def update(state, e, now, measured, body, out):
-    """Update every hypothesis with a measurement, and weigh it by its likelihood."""
+    """Update every hypothesis with a measurement, and its weight by the likelihood."""
     started, refused, streak, row, one_at = state
     options, weight, log_weight = body.options, body.weight, body.log_weight
     place = measured.place[e]
@@ -374,7 +374,7 @@ def update(state, e, now, measured, body, out):
 
 
 def update_one(i, place, sensor, kind, threshold, measured, body):
-    """Update hypothesis i; return its weight of the measurement (0: refused), what counts as its NIS, and e₁, s₁, e₂, s₂, e₃, s₃."""
+    """Update hypothesis i; return its weight of the measurement (0: refused), the NIS for the likelihood, and e₁, s₁, e₂, s₂, e₃, s₃."""
     options = body.options
     degrees = degrees_of_freedom(kind)
     parameter, numerator = options.parameters[degrees - 1, 0], options.parameters[degrees - 1, 1]
@@ -401,12 +401,12 @@ def update_one(i, place, sensor, kind, threshold, measured, body):
             done = updated(kind, q, b, A, B, C, z, frame, variance, share)
     if share > 0.0:
         store_state(body.states[i], done[0], done[1], done[2], done[3], done[4])
-    # What a hypothesis refuses counts against it as if it lay at the threshold: else none would outlive an outlier.
+    # A refused measurement counts as one at the threshold: otherwise no hypothesis would survive an outlier.
     return share, min(heavy_tailed(options.robust, parameter, numerator, nis), threshold), e_s
 
 
 def keep(state, row, e, body, out):
-    """Write the mixture at a kept edge, and see whether the hypotheses are one."""
+    """Write the mixture at a stored edge, and check whether the hypotheses have converged."""
     started, refused, streak, written, one_at = state
     edge = body.first_edge + row
     if one_at == NEVER and edge % body.every == 0 and (row > 0 or body.on_edge):
@@ -431,14 +431,14 @@ def keep(state, row, e, body, out):
 
 
 def stopped(state):
-    """Return whether the hypotheses are one, or lost."""
+    """Return whether the hypotheses have converged or are lost."""
     return state[4] != NEVER
 
 
 def finish(state, row, e, body):
-    """Return the rows written, the edge at which the hypotheses became one (``NEVER``, ``LOST``), and the number of the next measurement.
+    """Return the number of rows written, the edge of convergence (or ``NEVER``, ``LOST``), and the index of the next measurement.
 
-    Of hypotheses that are lost it is the first of those that they refused in a row.
+    If the hypotheses are lost, the index is that of the first of the consecutive refusals.
     """
     _, _, streak, written, one_at = state
     return written, one_at, e - streak if one_at == LOST else e

@@ -2,11 +2,10 @@
 
 One accumulator serves every algorithm. Arrays are preallocated by the caller; where speed counts they are flat (``a.reshape(-1)``).
 
-A product of quaternions waits for the one before it, about 16 cycles, in which the machine could do some three hundred multiplications.
-So a block is cut into ``WIDTH`` segments of equal length that advance together, one a lane, each from the identity; the attitudes at
-their starts are the products of the segments' ends; and each lane's products are turned by its start. A step costs one product more,
-the rounding is that of one chain (as many products lie between the first attitude and any other, but for the blocks' eight), and no
-lane's order of operations depends on the machine.
+A chain of quaternion products is limited by latency, about 16 cycles per product, enough for some three hundred multiplications. A block is
+therefore divided into ``WIDTH`` segments of equal length, processed together, one per lane, each starting from the identity. The attitudes
+at their starts are the products of the segments' ends; each lane's products are then multiplied by its start. A step needs one more
+product; the number of roundings is that of a single chain plus eight per block, and the order of operations does not depend on the CPU.
 """
 
 from __future__ import annotations
@@ -29,22 +28,22 @@ from strapdown.kernels.series import LARGEST_ANGLE
 from strapdown.kernels.state import load_quaternion, store_several
 
 SEGMENT = 48
-"""Steps of a lane in a block, at most."""
+"""Maximum number of steps of a lane in a block."""
 
 BLOCK = WIDTH * SEGMENT
-"""Steps of a block, which ends in a renormalisation of the running attitude: its norm is then still within as many roundings of one."""
+"""Maximum number of steps of a block; the attitude is normalised at its end, when its norm is within that number of roundings of one."""
 
 FEWEST = 4 * WIDTH
-"""Fewer steps than this are left to one chain."""
+"""Minimum number of steps for lanes; fewer are processed in one chain."""
 
 WORK = 4 * (BLOCK + WIDTH) + WIDTH
-"""Numbers of work space: the lanes' products and their starts, and room to begin at a cache line."""
+"""Length of the work space: products and starts of the lanes, and alignment to a cache line."""
 
 _LARGEST_SQUARE = LARGEST_ANGLE * LARGEST_ANGLE
 
 
 def large_exponential(phi):
-    """Return exp(φ) of any rotation vector: halved until the series holds, then squared as often; NaN if |φ|² is not finite."""
+    """Return exp(φ) of any rotation vector, by repeated halving, series and squaring; NaN if |φ|² is not finite."""
     halvings = 0
     s = 1.0
     x = dot(phi, phi)
@@ -65,7 +64,7 @@ def accumulate_vectors(vectors, initial, work, attitude):
     """
     q = (initial[0], initial[1], initial[2], initial[3])
     attitude[0], attitude[1], attitude[2], attitude[3] = q
-    # From a cache line on, which vectors then do not cross: a fifth of the time. Not in a function, which may return no part of an array.
+    # Aligned to a cache line (saves a fifth of the time). Not in a function: kernels must not return arrays.
     work = work[-(work.ctypes.data // 8) % WIDTH :]
     m = len(vectors) // 3
     start = 0
@@ -83,7 +82,7 @@ def accumulate_quaternions(steps, initial, work, attitude):
     """Write q_fb after each step into ``attitude`` (m + 1, 4) from the step quaternions (m, 4); otherwise as accumulate_vectors."""
     q = (initial[0], initial[1], initial[2], initial[3])
     attitude[0], attitude[1], attitude[2], attitude[3] = q
-    # From a cache line on, which vectors then do not cross: a fifth of the time. Not in a function, which may return no part of an array.
+    # Aligned to a cache line (saves a fifth of the time). Not in a function: kernels must not return arrays.
     work = work[-(work.ctypes.data // 8) % WIDTH :]
     m = len(steps) // 4
     start = 0

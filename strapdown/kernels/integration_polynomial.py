@@ -1,4 +1,4 @@
-"""Steps that solve q̇ = ½ q ⊗ w on a rate polynomial: to rounding by a power series, or by Magnus, commutator-free, Runge–Kutta, Euler."""
+"""Solution of q̇ = ½ q ⊗ w for a rate polynomial: to rounding by a power series, or by Magnus, commutator-free, Runge–Kutta, Euler."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from strapdown.kernels.rotation import quaternion_multiply, renormalized, unit
 from strapdown.kernels.state import store_row
 
 NEGLIGIBLE = 2.0**-56
-"""rad; powers of the rate that together turn less are left out, and the series ends when all terms to come turn less."""
+"""rad; powers of the rate with a smaller total angle are omitted, and the series ends when the remaining terms are below this."""
 
 LARGEST_RATE = 4.0
-"""rad a sample interval, for a bound of the polynomial's rate: beyond it the polynomial is no description of the motion."""
+"""Maximum bound of the polynomial's rate, rad per sample interval; above it the polynomial does not describe the motion."""
 
 TERMS_PER_SAMPLE = 2
-"""With ``EXTRA_TERMS``, the room for the power series: a series that has not ended there belongs to data too rough for the polynomial."""
+"""With ``EXTRA_TERMS``, the maximum length of the power series; data for which it is not sufficient are too rough for the polynomial."""
 
 EXTRA_TERMS = 24
-"""For a steady rate of ``LARGEST_RATE`` the terms fall as 1/n!, below rounding at n = 18."""
+"""At a constant rate of ``LARGEST_RATE`` the terms decrease as 1/n!, to below rounding at n = 18."""
 
 MAGNUS_4 = 0
 MAGNUS_6 = 1
@@ -60,7 +60,7 @@ def sized(rates, window):
     bound = 0.0
     kept = 1
     power = 0.5 ** (window - 1)
-    for m in range(window - 1, -1, -1):  # from the least, so that ``bound`` is the tail's until it counts
+    for m in range(window - 1, -1, -1):  # from the highest power, so that ``bound`` is that of the tail
         bound += power * (abs(rates[0, m]) + abs(rates[1, m]) + abs(rates[2, m]))
         rates[3, m] = bound
         power *= 2.0
@@ -75,7 +75,7 @@ def interval_quaternion(rates, kept, series):
     With s ∈ [−½, ½] measured from the interval's middle, w = Σ Ω_m sᵐ and q = Σ q_n sⁿ, equation (17) is
     2(n + 1) q_{n+1} = Σ_m q_{n−m} ⊗ Ω_m. The series from the middle gives both ends at once: δq = q(−½)* ⊗ q(½).
 
-    ``rates`` (4, M) is that of fitted_rates, its first ``kept`` powers count; ``series`` (terms, 4) is work.
+    ``rates`` (4, M) is that of fitted_rates, with ``kept`` powers; ``series`` (terms, 4) is scratch.
     """
     series[0, 0] = 1.0
     series[0, 1] = 0.0
@@ -122,10 +122,10 @@ def interval_quaternion(rates, kept, series):
 
 
 def terms_to_come(rates, kept, series, n):
-    """Return a bound of the turn in all terms of the series after the n-th, from the last ``kept`` ones.
+    """Return a bound of the angle of all terms of the series after the n-th, from the last ``kept`` terms.
 
-    Term n − m reaches later ones through the powers m and higher only, whose bounds sum to ``rates[3, m]``, and is divided by 2(n + 1)
-    or more, and by 2 for the half interval; what those terms add in turn is less again.
+    Term n − m enters later terms only through powers m and higher, whose bounds sum to ``rates[3, m]``, divided by at least 2(n + 1), and
+    by 2 for the half interval; the contributions of those terms are smaller.
     """
     total = 0.0
     for m in range(min(kept, n + 1)):
@@ -138,9 +138,9 @@ def terms_to_come(rates, kept, series, n):
 def polynomial_steps(increments, samples, previous, fits, correction, rates, series, steps):
     """Write the step quaternions (m, 4): the equation on the polynomial, then exp(Σ C_ij Δθ_i × Δθ_j).
 
-    ``fits`` (M, M, M) is indexed by the interval's place in the window, increments, powers. Near the ends of the record the window stays
-    inside it and the step sits elsewhere in the window, without the correction, which is made for one place only. Where the data are too
-    rough for the polynomial, the interval's increment alone is its rotation vector.
+    ``fits`` (M, M, M) is indexed by the position of the interval in the window, increments, powers. Near the ends of the record the window
+    is shifted to stay inside; the position of the step then differs, and the correction, valid for one position, is omitted. If the data
+    are too rough for the polynomial, the increment of the interval is its rotation vector.
     """
     window = len(fits)
     latest = len(increments) - window

@@ -8,15 +8,15 @@ from strapdown.kernels.rotation import quaternion_multiply, renormalized
 from strapdown.kernels.state import store_row
 
 ROWS = 7
-"""Rows of work space: nodes, divided differences and the polynomial's powers, the last two by axis."""
+"""Number of rows of the work space: nodes, and by axis divided differences and powers of the polynomial."""
 
 
 def uneven_rates(increments, edges, first, number, interval, work, rates):
     """Write the powers of s of the rate polynomial through ``number`` increments from row ``first`` on; return (bound, powers kept).
 
-    s ∈ [−½, ½] runs over row ``interval``, from its middle and in its length; the rate is in rad over that length. The angle's polynomial
-    has Newton's form on the edges, whose first divided differences are the increments over their intervals. ``work`` is (``ROWS``, number
-    + 1 or more), ``rates`` (4, number or more).
+    s ∈ [−½, ½] is the time from the middle of row ``interval`` in units of its length; the rate is in rad per that length. The polynomial
+    of the angle has Newton's form on the edges, whose first divided differences are the increments over their intervals. ``work`` is
+    (``ROWS``, number + 1 or more), ``rates`` (4, number or more).
     """
     middle = 0.5 * (edges[interval] + edges[interval + 1])
     scale = 1.0 / (edges[interval + 1] - edges[interval])
@@ -43,15 +43,15 @@ def uneven_rates(increments, edges, first, number, interval, work, rates):
 
 
 def alike(length, other, ratio):
-    """Return whether two intervals are less than ``ratio`` times as long as each other."""
+    """Return whether the ratio of two intervals is below ``ratio``, either way."""
     return length < ratio * other and other < ratio * length
 
 
 def stretch(edges, interval, start, end, ratio, lopsided):
-    """Return the rows (first, end) of those within [start, end) that the polynomial for an interval goes through.
+    """Return the rows (first, end) within [start, end) used in the polynomial for an interval.
 
-    On either side it ends before the first interval that is ``ratio`` times as long or as short, and goes at most ``lopsided`` further than
-    on the other: far to one side a polynomial of high degree through uneven points is made of noise.
+    On each side they end before the first interval longer or shorter by ``ratio``, with at most ``lopsided`` more than on the other side: a
+    one-sided polynomial of high degree through uneven points amplifies noise.
     """
     length = edges[interval + 1] - edges[interval]
     first = interval
@@ -68,8 +68,8 @@ def stretch(edges, interval, start, end, ratio, lopsided):
 def uneven_steps(increments, edges, chosen, samples, previous, window, ratio, lopsided, work, rates, series, steps):
     """Write the step quaternions (m, 4) of the steps ``chosen`` (m,), each through the increments of its window.
 
-    The window is that of :func:`strapdown.kernels.integration_polynomial.polynomial_steps`, of which each interval sees its
-    :func:`stretch`. Where the data are too rough for the polynomial, the interval's increment alone is its rotation vector.
+    The window is that of :func:`strapdown.kernels.integration_polynomial.polynomial_steps`, reduced to the :func:`stretch` of each
+    interval. If the data are too rough for the polynomial, the increment of the interval is its rotation vector.
     """
     latest = len(increments) - window
     for j in range(len(chosen)):

@@ -1,6 +1,6 @@
-"""Pieces of an update that is tested, weighed and iterated, on tuples; :mod:`strapdown.kernels.gate` puts them together.
+"""Functions for a gated, robust and iterated update, on tuples; :mod:`strapdown.kernels.gate` combines them.
 
-State and error as in :mod:`strapdown.kernels.filter_step`. Scalar machine only.
+State and error as in :mod:`strapdown.kernels.filter_step`. Scalar only.
 """
 
 from __future__ import annotations
@@ -23,37 +23,36 @@ from strapdown.kernels.rotation import logarithm, moved, quaternion_multiply, ro
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 HUBER = 1
-"""Kind of weight: 1 within a distance, then falling as its inverse."""
+"""Huber's weight: 1 up to a threshold of the residual, then inversely proportional to it."""
 STUDENT = 2
-"""Kind of weight: that of Student's t by the variational mean."""
+"""Weight of Student's t distribution, variational mean."""
 RELINEARIZED = 0.05
-"""rad; an iterated update is linearised anew until its correction is smaller."""
+"""Tolerance of an iterated update, rad: it is relinearised until the correction is smaller."""
 SETTLED = 1e-4
-"""rad; the same of an attitude that is hardly known: the turn that is not known must stand on the axis that was measured. Off by half the
-last correction, a radian about it would pass for that share of a radian across."""
+"""The same for a nearly unknown attitude, rad. The unknown rotation must stay about the measured axis: an axis in error by half the last
+correction would let an uncertainty of a radian about it appear as that fraction of a radian across it."""
 
 UNKNOWN = 1.0
-"""rad²; with more attitude variance than this in all it is hardly known, and an update that fails is tried again from elsewhere."""
+"""Trace of the attitude covariance, rad², above which the attitude is nearly unknown; a failed update is then tried from another start."""
 KNOWN = 1e-2
-"""rad²; with less attitude variance than this in all an iterated update ends as the plain filter's does: both are one to first order."""
+"""Trace of the attitude covariance, rad², below which an iterated update ends like that of the plain filter, equal to first order."""
 UNKNOWN_TILT = 4.0
-"""rad²; with more variance of the tilt than this nothing is known of it (one direction leaves at most half of that), and a heading tells
-nothing."""
+"""Variance of the tilt, rad², above which it is unknown (after one direction it is at most half of this), and headings are not used."""
 REFUSED = 0
 ACCEPTED = 1
 PASSED_OVER = 2
 ONE_AXIS = 5.0
-"""The least certain axis stands alone if its variance is so many times the sum of the others'."""
+"""Ratio of the largest variance to the sum of the other two above which the least certain axis is treated separately."""
 TURN_ASIDE = 2.0 * math.pi / 3.0
-"""rad; how far elsewhere is."""
+"""Rotation about the least certain axis of a repeated update, rad."""
 
 
 def robust_weight(kind, parameter, numerator, passes, S, y, variance):
     """Return the weight of a measurement with innovation ``y`` (3,) and independent rows, by iteration from 1.
 
-    ``S`` is H P Hᵀ (6-tuple), ``variance`` (3,) the rows' own. With R = D/w the residual after the update is ``R (S + R)⁻¹ y`` and the
-    uncertainty of the estimate in it ``H P⁺ Hᵀ = R − R (S + R)⁻¹ R``. Huber's ``parameter`` is k²; Student's weight is ``numerator`` over
-    ``parameter`` plus the mean square.
+    ``S`` is H P Hᵀ (6-tuple), ``variance`` (3,) that of the measurement noise, the diagonal of D. With R = D/w the residual after the
+    update is ``R (S + R)⁻¹ y`` and its part of the estimate's covariance ``H P⁺ Hᵀ = R − R (S + R)⁻¹ R``. Huber's ``parameter`` is k²;
+    Student's weight is ``numerator`` over the sum of ``parameter`` and the mean square.
     """
     w = 1.0
     for _ in range(passes):
@@ -80,15 +79,15 @@ def robust_weight(kind, parameter, numerator, passes, S, y, variance):
 
 
 def arc_over_chord(sine, along):
-    """Return θ/sin θ of the angle θ between a measured and a predicted direction, of its sine and cosine times the length.
+    """Return θ/sin θ for the angle θ between a measured and a predicted direction, from its sine and cosine times the length.
 
-    With it the residual of a direction is the angle itself, so that an update from afar neither creeps nor stops at the opposite.
+    With this factor the residual of a direction is the angle, so an iteration from a large error converges quickly and not at 180°.
     """
     return 1.0 if sine < 1e-9 else math.atan2(sine, along) / sine
 
 
 def least_certain_axis(A):
-    """Return the unit vector along which a symmetric matrix is largest, near enough: powers of it applied to a vector."""
+    """Return the eigenvector of the largest eigenvalue of a symmetric matrix, approximately, by power iteration."""
     v = (0.6, 0.48, 0.64)
     for _ in range(20):
         v = symmetric_times_vector(A, v)
@@ -97,15 +96,16 @@ def least_certain_axis(A):
 
 
 def tangent_at(q, A):
-    """Return M, which carries a prior's attitude error to the attitude the turn q away, and where the mean lies from there.
+    """Return M, which transforms a prior's attitude error to the tangent space at a rotation q from it, and the prior mean there (3,), rad.
 
-    A Gaussian that knows an axis n far less than the others stands for attitudes ``exp(α n) ⊗ exp(ε)``, ε across n: what one direction has
-    shown of the tilt ε, and of the gyro's bias by it, holds in body axes whatever the turn α about it. With ``q = exp(α₀ n) ⊗ exp(ε₀)`` the
-    error seen from there is ``exp(−[ε₀]) n (α − α₀) + J_r(ε₀) (ε − ε₀)``: the least certain axis goes the whole way with the reference, and
-    no later measurement of that sees anything of the turn about it. Without such an axis it is ``J_r(ε₀) (ε − ε₀)``, ε₀ the rotation vector
-    of q. Of J_r the turn alone is used, ``exp(−[ε₀]/2)``: its stretch would count as knowledge where nothing is known.
+    A Gaussian whose variance about one axis n is much larger than about the others represents attitudes ``exp(α n) ⊗ exp(ε)``, ε ⊥ n: one
+    measured direction determines the tilt ε, and through it the gyro bias, in body axes, independently of the rotation α about it. With
+    ``q = exp(α₀ n) ⊗ exp(ε₀)`` the error at q is ``exp(−[ε₀]) n (α − α₀) + J_r(ε₀) (ε − ε₀)``: the least certain axis follows the reference
+    exactly, so no later measurement of that reference gains information about the rotation about it. Without such an axis the error is
+    ``J_r(ε₀) (ε − ε₀)``, ε₀ the rotation vector of q. Only the rotation ``exp(−[ε₀]/2)`` of J_r is used: its scaling would appear as
+    information.
 
-    ``A`` is the covariance of the attitude; the mean (3,) is in rad.
+    ``A`` is the covariance of the attitude.
     """
     axis = least_certain_axis(A)
     largest = dot(axis, symmetric_times_vector(A, axis))
@@ -133,14 +133,14 @@ def tangent_at(q, A):
 
 
 def seen_from(correction, A):
-    """Return the turn q of a correction (3,), rad, and M of :func:`tangent_at` for it."""
+    """Return the quaternion of a correction (3,), rad, and its M of :func:`tangent_at`."""
     turn, _ = moved((1.0, 0.0, 0.0, 0.0), correction)
     M, _ = tangent_at(turn, A)
     return turn, M
 
 
 def tilt_variance(R, A):
-    """Return the variance of the turns about the two horizontal fixed axes, rad²."""
+    """Return the sum of the variances of the rotations about the two horizontal fixed axes, rad²."""
     x = (R[0], R[1], R[2])
     y = (R[3], R[4], R[5])
     return dot(x, symmetric_times_vector(A, x)) + dot(y, symmetric_times_vector(A, y))

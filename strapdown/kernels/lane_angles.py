@@ -1,6 +1,6 @@
-"""Angles over lanes: an arctangent of +, −, ×, / and choices, good to rounding, and the rotation vector of a quaternion.
+"""Angles over lanes: an arctangent by arithmetic and selection, accurate to rounding, and the rotation vector of a quaternion.
 
-The scalar machine has libm and branches for these (:mod:`strapdown.kernels.rotation`).
+Scalar code uses libm and branches (:mod:`strapdown.kernels.rotation`).
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from strapdown.kernels.algebra import square_root
 from strapdown.kernels.lane_values import chosen, narrowed
 
 _QUARTER_ARM = math.sqrt(2.0) - 1.0
-"""tan 22.5°: beyond it the angle is taken from 45°."""
+"""tan 22.5°: above it the angle is computed relative to 45°."""
 _A = tuple((-1.0) ** k / (2 * k + 1) for k in range(20))
 _A00, _A01, _A02, _A03, _A04, _A05, _A06, _A07, _A08, _A09 = _A[:10]
 _A10, _A11, _A12, _A13, _A14, _A15, _A16, _A17, _A18, _A19 = _A[10:]
@@ -23,9 +23,9 @@ _SINGLE = np.float32(0.0)
 
 
 def inverse_root(x):
-    """Return 1/√x for 1e-30 < x < 1e30, good to some roundings: an estimate in single precision and two of Newton's steps.
+    """Return 1/√x for 1e-30 < x < 1e30, accurate to a few roundings: an estimate in single precision and two Newton steps.
 
-    A root and a division of doubles take the machine four times as long as these.
+    A square root and a division in double precision take four times as long.
     """
     y = narrowed(1.0 / square_root(narrowed(x, _SINGLE)), x)
     h = 0.5 * x
@@ -34,7 +34,7 @@ def inverse_root(x):
 
 
 def arctangent_series(t):
-    """Return atan t for |t| ≤ tan 22.5°: the power series, of which the twentieth term is below 1e-16 there."""
+    """Return atan t for |t| ≤ tan 22.5° by the power series, whose twentieth term is below 1e-16."""
     w = t * t
     ww = w * w
     p = (_A19 * w + _A18) * ww + (_A17 * w + _A16)
@@ -45,7 +45,7 @@ def arctangent_series(t):
     p = p * ww + (_A07 * w + _A06)
     p = p * ww + (_A05 * w + _A04)
     p = p * ww + (_A03 * w + _A02)
-    # The leading 1 is kept out of the product, whose rounding then is that of a term half a digit smaller.
+    # The leading 1 is not part of the product, which halves a digit of its rounding error.
     return t + t * (p * ww + _A01 * w)
 
 

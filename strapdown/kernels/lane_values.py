@@ -1,15 +1,14 @@
-"""Lanes: several scalars in one value, so that one call of a kernel advances eight runs, or eight stretches of one record.
+"""Lanes: several scalars in one value (SIMD), so that one call of a kernel processes eight runs, or eight segments of one record.
 
-A kernel reads and writes lanes by the functions below and computes with them by the same arithmetic as with floats. As plain Python they
-work on NumPy arrays of ``WIDTH``; compiled, :mod:`strapdown.kernels.lanes` puts machine vectors in their place. Nothing is checked:
-the caller answers for every row being inside its array. Arrays are contiguous.
+A kernel reads and writes lanes with the functions below and computes with the same arithmetic as for floats. In plain Python lanes are
+NumPy arrays of ``WIDTH``; compiled, :mod:`strapdown.kernels.lanes` replaces them by SIMD vectors. Nothing is checked: rows must be inside
+their arrays, which are contiguous.
 
-``WIDTH`` is the number of lanes where nothing else is said. A kernel for any number of them takes a ``pattern``, a tuple of as many
-floats: :func:`lanes_of` makes zeros of its count and type, and ``like`` such a value :func:`load_like` and the rest fill theirs. One lane
-is a scalar.
+``WIDTH`` is the default number of lanes. A kernel for any number of lanes takes a ``pattern``, a tuple of that many floats:
+:func:`lanes_of` returns zeros of its length and type, and :func:`load_like` and others take such a value as ``like``. One lane is a scalar.
 
-There is no ``if`` on lanes; a kernel that must choose asks :func:`everywhere` or :func:`anywhere`, and :func:`chosen` lane by lane. These
-three take plain conditions and floats too.
+There is no ``if`` on lanes: branch with :func:`everywhere` or :func:`anywhere`, and select by lane with :func:`chosen`. These three take
+plain conditions and floats too.
 """
 
 from __future__ import annotations

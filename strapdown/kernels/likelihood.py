@@ -34,6 +34,8 @@ from strapdown.kernels.series import LARGEST_ANGLE
 from strapdown.kernels.state import load_lanes, load_quaternion, store_lanes, store_several
 from strapdown.kernels.walk import MAX_TURN, SQUARED_RANGE
 
+REPLACEABLE = ("counted",)
+
 HALF_RANGE = 0.25 * SQUARED_RANGE
 """The square of half the turn that the polynomials bear."""
 FOUND = 12 * WIDTH
@@ -72,19 +74,15 @@ class Outputs(NamedTuple):
 
     minus_log: np.ndarray
     """Σ ½ (log s + e²/s) of the innovations (parts × WIDTH)."""
-    squares: np.ndarray
-    """Σ e²/s (parts × WIDTH)."""
     score: np.ndarray
     """Derivatives of lane 0 (parts, free)."""
     information: np.ndarray
-    """Lower triangles (parts, free, free), and so ``outer``, the sums of the outer products of each measurement's gradient."""
-    outer: np.ndarray
+    """Lower triangles (parts, free, free): of a mixture, the sums of the outer products of each measurement's gradient."""
     states: np.ndarray
     """States at the epochs (epochs × 28 × WIDTH)."""
-    innovations: np.ndarray
-    """e and s of each measurement in order of time (events × 6 × WIDTH, or nothing), one row after the other."""
     probability: np.ndarray
-    """Of lane 0, that each measurement is an outlier, and its NIS were it none (events, 2), or (0, 2)."""
+    """Of lane 0, that each measurement is an outlier, and the mean share of its own noise in its innovations' variances (events, 2), or
+    (0, 2)."""
 
 
 def begin(body):
@@ -157,8 +155,8 @@ def measured_rows(q, z, kind, t, triads, rows):
     return 2
 
 
-def add_derivatives(room, number, free, step, score, information, outer):
-    """Add one event to the score Σ ∂ℓ/∂θ, the information and the outer product of the score; ℓ = ½ (log s + e²/s).
+def add_derivatives(room, number, free, step, score, information):
+    """Add one event to the score Σ ∂ℓ/∂θ and the information; ℓ = ½ (log s + e²/s).
 
     The work space holds e and s of ``number`` innovations in lanes; lane i is lane 0 with parameter i moved by ``step``. The information is
     Fisher's by sensitivities, ``ė_j ė_k/s + ½ ṡ_j ṡ_k/s²`` (Segal & Weinstein 1989): positive semidefinite whatever the data.
@@ -187,8 +185,6 @@ def add_derivatives(room, number, free, step, score, information, outer):
                 information[j, k] += a * work[WIDTH + k] + c * work[2 * WIDTH + k]
     for j in range(free):
         score[j] += work[j]
-        for k in range(j + 1):
-            outer[j, k] += work[j] * work[k]
 
 
 def variance_of(measured, place, sensor, kind, z, r):
@@ -203,28 +199,29 @@ def update(state, e, now, measured, body, out):
     """Update all lanes with a measurement, and add to the sums of its part of the record."""
     q, b, A, B, C, span, kept = state
     span = part_at(span, now, body.cuts)
-    room = body.room
     place = measured.place[e]
     sensor = measured.sensor[e]
-    kind = measured.series[sensor, KIND]
     z = value_of(measured, place, sensor)
-    factor = load(body.factors, WIDTH * sensor)
-    number = measured_rows(q, z, kind, frame_row(measured, place, sensor), measured.triads, room)
-    correction, b, A, B, C = updated(b, A, B, C, number, measured, place, sensor, z, factor, room, FOUND)
+    kind = measured.series[sensor, KIND]
+    number = measured_rows(q, z, kind, frame_row(measured, place, sensor), measured.triads, body.room)
+    correction, b, A, B, C = counted(b, A, B, C, e, span, number, measured, z, body, out)
     q, A, B = reset(q, A, B, correction)
-    if kind == VECTOR:
+    return q, b, A, B, C, span, kept
+
+
+def counted(b, A, B, C, e, span, number, measured, z, body, out):
+    """Update with the rows in the work space, and add to the sums; return the attitude correction, b, A, B, C."""
+    room, place, sensor = body.room, measured.place[e], measured.sensor[e]
+    factor = load(body.factors, WIDTH * sensor)
+    correction, b, A, B, C = updated(b, A, B, C, number, measured, place, sensor, z, factor, room, FOUND)
+    if measured.series[sensor, KIND] == VECTOR:
         number = 3
     for i in range(WIDTH):
         deviance, product = deviance_of(room, FOUND, number, i)
         out.minus_log[WIDTH * span + i] += 0.5 * (math.log(product) + deviance)
-        out.squares[WIDTH * span + i] += deviance
-    if len(out.innovations) > 0:
-        start = 6 * WIDTH * e
-        for i in range(2 * WIDTH * number):
-            out.innovations[start + i] = room[FOUND + i]
     if body.free > 0:
-        add_derivatives(room, number, body.free, body.step, out.score[span], out.information[span], out.outer[span])
-    return q, b, A, B, C, span, kept
+        add_derivatives(room, number, body.free, body.step, out.score[span], out.information[span])
+    return correction, b, A, B, C
 
 
 def updated(b, A, B, C, number, measured, place, sensor, z, factor, room, found):

@@ -1,11 +1,11 @@
-"""Compiling kernels: plain functions in, numba dispatchers out, with a disk cache that notices every edit.
+"""Compilation of kernels: plain functions to numba dispatchers, with a disk cache that is invalidated by every edit.
 
-A kernel names its helpers as ordinary module globals. :func:`compiled` follows those names, compiles each helper once, and binds the
-compiled twins together, so that the source needs no decorator and stays plain Python.
+A kernel refers to its helpers as ordinary module globals. :func:`compiled` follows those names, compiles each helper once, and binds the
+compiled copies ("twins") together, so the source needs no decorator and remains plain Python.
 
-A kernel may leave functions open: it names them in ``OPEN`` of its module, where they stand without a body, or are those of one of the
-modules that define them. :func:`compiled` takes the modules that do; so :func:`strapdown.kernels.walk.walk` is the loop of every filter.
-Those in ``REPLACEABLE`` are its own where no other defines them.
+A kernel may leave functions open: their names are in ``OPEN`` of its module, which has only their signatures or one of the definitions.
+:func:`compiled` is given the modules that define them; in this way :func:`strapdown.kernels.walk.walk` is the loop of every filter. A name
+in ``REPLACEABLE`` has a default, which is used if no module defines it.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ PACKAGE = __package__
 
 @functools.cache
 def sources_digest(parts: tuple[ModuleType, ...] = ()) -> str:
-    """Return a digest of all kernel sources and of ``parts``: numba's own stamp misses an edited helper module or constant."""
+    """Return a digest of all kernel sources and of ``parts``; numba's own key misses edits of helper modules and constants."""
     digest = hashlib.sha256()
     own = sorted(Path(__file__).parent.glob("**/*.py"))
     for path in (*own, *(Path(module.__file__ or "") for module in parts)):
@@ -38,32 +38,32 @@ def _is_kernel(value: object) -> bool:
 
 
 def _names(code: CodeType) -> tuple[str, ...]:
-    """Return the names that a function's code asks for, and those of generator expressions in it."""
+    """Return the global names in a function's code and in its generator expressions."""
     inner = (_names(one) for one in code.co_consts if isinstance(one, CodeType))
     return sum(inner, code.co_names)
 
 
 def _kernels_named(function: FunctionType) -> dict[str, FunctionType]:
-    """Return the kernel functions that a function names, by name."""
+    """Return the kernel functions that a function refers to, by name."""
     named = {name: function.__globals__.get(name) for name in _names(function.__code__)}
     return {name: value for name, value in named.items() if isinstance(value, FunctionType) and _is_kernel(value)}
 
 
 @functools.cache
 def _depends_on_parts(function: FunctionType) -> bool:
-    """Return whether a function names, directly or not, one that its module leaves open."""
+    """Return whether a function refers, directly or indirectly, to an open one."""
     named = _kernels_named(function)
     return any(name in _open(function) or _depends_on_parts(value) for name, value in named.items())
 
 
 def _open(one: FunctionType | ModuleType) -> tuple[str, ...]:
-    """Return the names that a module, or that of a function, leaves open."""
+    """Return the names that a module, or the module of a function, leaves open."""
     names = one.__globals__ if isinstance(one, FunctionType) else vars(one)
     return (*names.get("OPEN", ()), *names.get("REPLACEABLE", ()))
 
 
 def _defined(name: str, value: FunctionType, function: FunctionType, parts: tuple[ModuleType, ...]) -> FunctionType:
-    """Return what a name in a function stands for: its value, or where it is open that of the first among ``parts`` that has it."""
+    """Return the value of a name in a function; if the name is open, its definition in the first of ``parts`` that has one."""
     if name not in _open(function):
         return value
     for module in parts:
@@ -80,7 +80,7 @@ def _defined(name: str, value: FunctionType, function: FunctionType, parts: tupl
 def _checked(
     function: FunctionType, parts: tuple[ModuleType, ...]
 ) -> dict[str, tuple[FunctionType, tuple[ModuleType, ...]]]:
-    """Return what defines each kernel that a function names, by name, with its own parts; wrong names, those of theirs too, are refused."""
+    """Return definition and parts of each kernel that a function refers to, by name; invalid references are refused, recursively."""
     found = {}
     for name in _names(function.__code__):
         value = function.__globals__.get(name)
@@ -106,13 +106,13 @@ def _twin(function: FunctionType, parts: tuple[ModuleType, ...]) -> FunctionType
 
 def _options() -> dict[str, Any]:
     # Only 'contract' (fused multiply-add): full fastmath silently breaks isnan and isfinite.
-    # Kernels neither make nor return arrays, and so do not count references to them: counting costs more than the arithmetic of a hot
-    # loop, and a third of all instructions to compile.
+    # Kernels neither create nor return arrays, so references are not counted: that would cost more than the arithmetic of a hot loop, and a
+    # third of all instructions to compile.
     return {"fastmath": {"contract"}, "error_model": "numpy", "nogil": True, "_nrt": False}
 
 
 def _without_literals(dispatcher: Any) -> Any:
-    """Return a dispatcher that takes a literal number for any number of its type: numba would compile it anew for each literal."""
+    """Return a dispatcher that ignores the value of a literal number; numba would compile it again for each literal."""
     from numba import types
 
     resolve = dispatcher.get_call_template
@@ -124,9 +124,9 @@ def _without_literals(dispatcher: Any) -> Any:
 
 @functools.cache
 def helper(function: FunctionType, parts: tuple[ModuleType, ...] = ()) -> Any:
-    """Return ``function`` compiled for use inside another kernel, inlined: a call costs more than a 3-vector's work.
+    """Return ``function`` compiled for use inside another kernel, inlined: a call costs more than an operation on a 3-vector.
 
-    A module names in ``CALLED`` those of its functions that are long enough to be called. ``parts`` define open functions.
+    Functions in ``CALLED`` of their module are long enough to be called instead. ``parts`` define open functions.
     """
     import numba
 
@@ -138,7 +138,7 @@ def helper(function: FunctionType, parts: tuple[ModuleType, ...] = ()) -> Any:
 
         return INTRINSICS[function.__name__]
     called = function.__name__ in function.__globals__.get("CALLED", ())
-    # Nothing calls it from Python or C: without those two wrappers it compiles in two thirds of the time.
+    # It is not called from Python or C: without the two wrappers it compiles in two thirds of the time.
     options = {"forceinline": not called, "no_cpython_wrapper": True, "no_cfunc_wrapper": True, **_options()}
     twin = _twin(function, parts)
     plain = _without_literals(numba.njit(pipeline_class=HelperCompiler, **options)(twin))
@@ -149,8 +149,8 @@ def helper(function: FunctionType, parts: tuple[ModuleType, ...] = ()) -> Any:
 def compiled(function: Callable[..., Any], *parts: ModuleType) -> Any:
     """Return ``function`` compiled for calls from Python, cached on disk under the digest of all kernel sources and those of ``parts``.
 
-    ``parts`` are the modules that define the functions left open, the first that has one of them. It releases the GIL, so records can be
-    spread over threads.
+    ``parts`` are the modules that define the open functions; of several definitions the first is used. The compiled function releases the
+    GIL, so records can be distributed over threads.
     """
     import numba
     from numba.core.caching import FunctionCache
@@ -160,7 +160,7 @@ def compiled(function: Callable[..., Any], *parts: ModuleType) -> Any:
     if not isinstance(function, FunctionType) or not _is_kernel(function):
         raise TypeError(f"{function!r} does not live in {PACKAGE}; move it there before compiling it")
     _checked(function, parts)
-    # Twins are built only to compile: a tenth of a warm `strapdown estimate`.
+    # Built only if something is compiled: it takes a tenth of a warm `strapdown estimate`.
     twin = functools.partial(_twin, function, parts)
 
     class KernelCache(FunctionCache):  # type: ignore[misc]
@@ -169,7 +169,7 @@ def compiled(function: Callable[..., Any], *parts: ModuleType) -> Any:
             return (*super()._index_key(signature, codegen), names, sources_digest(parts))
 
         def load_overload(self, signature: Any, target: Any) -> Any:
-            # Not numba's own, which first imports and declares all that might be compiled, SciPy's linear algebra included.
+            # Not numba's own, which first imports everything that compilation might need, including SciPy's linear algebra.
             found = None
             with self._guard_against_spurious_io_errors():
                 found = self._load_overload(signature, target)
@@ -181,15 +181,15 @@ def compiled(function: Callable[..., Any], *parts: ModuleType) -> Any:
     dispatcher = numba.njit(**options)(function)
     try:
         dispatcher._cache = KernelCache(function)
-    except RuntimeError:  # no writable place for a cache: compile in every process
+    except RuntimeError:  # no writable directory for a cache: compile in every process
         dispatcher._compiler.py_func = twin()
     return dispatcher
 
 
 def read_only(array: np.ndarray) -> np.ndarray:
-    """Return an array as the kernels that only read it are compiled for: contiguous, aligned, and a read-only view.
+    """Return an array in the form for which kernels that only read it are compiled: a contiguous, aligned, read-only view.
 
-    numba compiles a kernel anew for each layout and for arrays that may be written to.
+    numba compiles a kernel again for each layout, and for writable arrays.
     """
     view = np.require(array, requirements=("C", "A")).view()
     view.flags.writeable = False
@@ -197,7 +197,7 @@ def read_only(array: np.ndarray) -> np.ndarray:
 
 
 def has_vectors() -> bool:
-    """Return whether the machine has vectors of doubles with fused multiply-add: where not, lanes are taken one at a time."""
+    """Return whether the CPU has SIMD vectors of doubles with fused multiply-add; if not, lanes are processed one at a time."""
     from numba.core.codegen import get_host_cpu_features
 
     features = set(get_host_cpu_features().split(","))
@@ -207,7 +207,7 @@ def has_vectors() -> bool:
 
 
 def describe() -> dict[str, str]:
-    """Return what the kernels run on: CPU, numba and LLVM, for `strapdown info` and benchmark headings."""
+    """Return CPU, numba and LLVM versions, for `strapdown info` and the headings of benchmarks."""
     import llvmlite.binding
     import numba
 

@@ -1,12 +1,12 @@
 """Random numbers on tuples of 64-bit words: counter-hashed seeds, a fast generator, and normals without libm.
 
-A stream is named by a key of two words and a number: :func:`stream_state` hashes them with Threefry (Salmon et al. 2011) into the state of
-a xoshiro256++ generator (Blackman & Vigna 2021), and :func:`normal_pair` makes two normals of two of its words by Box and Muller, or
-:func:`single_normals` two of one word, in single precision. So a stream depends on its name alone, never on what else is drawn.
+A stream is identified by a key of two words and a number: :func:`stream_state` hashes them with Threefry (Salmon et al. 2011) into the
+state of a xoshiro256++ generator (Blackman & Vigna 2021). :func:`normal_pair` returns two normals from two of its words (Box & Muller),
+:func:`single_normals` two from one word, in single precision. A stream therefore depends only on its key and number.
 
 Words are unsigned 64-bit integers that wrap: NumPy scalars in plain Python (silence ``over`` with ``numpy.errstate``), numba's ``uint64``,
-or lanes of them (:mod:`strapdown.kernels.lane_values`), one stream a lane. All constants are such words, because a signed literal beside an
-unsigned word would make a float.
+or lanes of them (:mod:`strapdown.kernels.lane_values`), one stream per lane. All constants are such words, because an operation of a signed
+literal and an unsigned word gives a float.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ _S31, _S32, _S33, _S40, _S41, _S42, _S43, _S45, _S48, _S52 = (
     np.uint64(k) for k in (31, 32, 33, 40, 41, 42, 43, 45, 48, 52)
 )
 _UNIT = np.uint64(0x3FF0000000000000)
-"""Bits of 1.0: a mantissa or-ed to it is a number in [1, 2)."""
+"""Bits of 1.0: with a mantissa in its low bits, a number in [1, 2)."""
 _SIGN = np.uint64(0x8000000000000000)
 _SWAP = np.uint64(0x4000000000000000)
 _W1, _W16, _W31, _LOW, _SCARCE = (np.uint32(k) for k in (1, 16, 31, 0xFFFF, 1 << 16))
 _WORD, _TWO_WORDS, _HALF = 2.0**-32, 2.0**-31, 2.0**-33
 _INTEGER = np.uint64(0x4330000000000000)
-"""Bits of 2^52: a whole number below 2^52 or-ed to it is that number above 2^52."""
+"""Bits of 2^52: with an integer n < 2^52 in its low bits, the number 2^52 + n."""
 _TO_ROOT_HALF = np.uint64(0x3FF0000000000000 - 0x3FE6A09E667F3BCD)
-"""Moves the binade limits to √½, so that the mantissa left lies in [√½, √2)."""
+"""Offset that shifts the range of the mantissa from [1, 2) to [√½, √2)."""
 _EXPONENT_BIAS = 4503599627370496.0 + 1023.0
 _MINUS_TWO_LOG_TWO = -2.0 * math.log(2.0)
 _TWO_LOG_TWO = 2.0 * math.log(2.0)
@@ -59,11 +59,11 @@ _R0, _R1, _R2, _R3, _R4, _R5, _R6, _R7, _R8 = (
     -3.39162233952,
     -2.88221501974,
 )
-"""−2 ln(1 + d)/d for −1/2 ≤ d ≤ 0, to 2.3e-8 of it: the polynomial whose largest error is the smallest."""
+"""−2 ln(1 + d)/d for −1/2 ≤ d ≤ 0, relative error 2.3e-8: minimax polynomial."""
 _P0, _P1, _P2, _P3, _P4 = (1.57079631845, -0.6459637106, 0.0796896789479, -0.00467376661258, 0.000151485130816)
-"""sin(πx/2)/x in x² for |x| ≤ 1, to 5.4e-9 of it."""
+"""sin(πx/2)/x in x² for |x| ≤ 1, relative error 5.4e-9."""
 _Q0, _Q1, _Q2, _Q3, _Q4 = (0.999999999129, -0.233700506445, 0.01996860716, -0.000893537025977, 2.3601451754e-05)
-"""cos(πx/2)/(1 − x²) in x² for |x| ≤ 1, to 1.2e-9 of it."""
+"""cos(πx/2)/(1 − x²) in x² for |x| ≤ 1, relative error 1.2e-9."""
 
 
 def rotated(x, left, right):
@@ -78,7 +78,7 @@ def mixed(x0, x1, left, right):
 
 
 def threefry(k0, k1, c0, c1):
-    """Return the two words that Threefry-2x64 with 20 rounds makes of a key and a counter (Salmon et al. 2011, section 3.3)."""
+    """Return the two words of Threefry-2x64 with 20 rounds for a key and a counter (Salmon et al. 2011, section 3.3)."""
     k2 = k0 ^ k1 ^ _PARITY
     x0 = c0 + k0
     x1 = c1 + k1
@@ -135,7 +135,7 @@ def uniform(word):
 
 
 def minus_two_log(u):
-    """Return −2 ln u for u in (0, 1], or any normal number: exponent and the series of 2 artanh((m − 1)/(m + 1)), |.| ≤ 0.172."""
+    """Return −2 ln u for u in (0, 1], or any normal number, from the exponent and the series of 2 artanh((m − 1)/(m + 1)), |.| ≤ 0.172."""
     bits = bits_of(u)
     exponent = (bits + _TO_ROOT_HALF) >> _S52
     d = number_of_bits(bits - (exponent << _S52) + _UNIT) - 1.0
@@ -148,9 +148,9 @@ def minus_two_log(u):
 
 
 def normal_pair(word0, word1):
-    """Return two independent standard normals of two words (Box & Muller 1958); they reach 8.49 σ.
+    """Return two independent standard normals from two words (Box & Muller 1958), of at most 8.49 σ.
 
-    The angle is a multiple of 2^−52 within ±45°, its cosine gets a random sign, and the two are swapped or not: all eight octants.
+    The angle is a multiple of 2^−52 within ±45°; a random sign of the cosine and a random swap cover all eight octants.
     """
     radius = square_root(minus_two_log(uniform(word0)))
     x = number_of_bits(((word1 << _TWO) >> _S12) | _UNIT) - 1.5
@@ -166,11 +166,11 @@ def normal_pair(word0, word1):
 
 
 def single_normals(radius_word, angle_word):
-    """Return two independent standard normals, singles, of two words of 32 (Box & Muller 1958); they reach 8.1 σ.
+    """Return two independent standard normals in single precision, from two words of 32 bits (Box & Muller 1958), of at most 8.1 σ.
 
-    The radius is √(−2 ln u) of a u that is spread evenly over (0, 1] to 2^−32, and below 2^−16 to 2^−48, by half of the angle's bits.
-    With k the leading zeros of u, what is left is 2^−k (1 + d), −1/2 ≤ d < 0. The angle lies within ±90°, and the cosine gets a sign. They
-    are good to 3e-7, and the same to the last bit whatever the precision of a run.
+    The radius is √(−2 ln u), u uniform on (0, 1] with resolution 2^−32, and 2^−48 below 2^−16, by half of the bits of the angle. With k the
+    number of leading zeros of u, u = 2^−k (1 + d), −1/2 ≤ d < 0. The angle lies within ±90°, and the cosine has a random sign. The error is
+    below 3e-7; the bits do not depend on the precision of the run.
     """
     zeros = leading_zeros(radius_word)
     d = signed_number(radius_word << zeros) * _WORD + _HALF
@@ -192,15 +192,15 @@ def single_normals(radius_word, angle_word):
 
 
 def seed_stream(k0, k1, number, state):
-    """Fill state (2, 4) with two generators, of radius words and of angle words: stream ``number`` under the key (k0, k1)."""
+    """Fill state (2, 4) with the generators of radius and angle words of stream ``number`` under the key (k0, k1)."""
     state[0, 0], state[0, 1], state[0, 2], state[0, 3] = stream_state(k0, k1, number + number)
     state[1, 0], state[1, 1], state[1, 2], state[1, 3] = stream_state(k0, k1, number + number + _ONE)
 
 
 def fill_normals(state, words, out):
-    """Fill out (2m,) with standard normals from a stream's state (2, 4), which goes on; words (2, m) is scratch.
+    """Fill out (2m,) with standard normals from a stream's state (2, 4), which is updated; words (2, m) is scratch.
 
-    First all words, then all normals: the second loop carries nothing from turn to turn, so it runs at vector width.
+    All words are drawn first, so the iterations of the second loop are independent and run at vector width.
     """
     a0, a1, a2, a3 = state[0, 0], state[0, 1], state[0, 2], state[0, 3]
     b0, b1, b2, b3 = state[1, 0], state[1, 1], state[1, 2], state[1, 3]

@@ -1,13 +1,11 @@
-"""Products of 3×3 matrices in machine vectors, for one run at a time.
+"""Products of 3×3 matrices in SIMD registers, for one run at a time.
 
-A matrix stays a tuple of nine numbers to whoever reads the source. Compiled for doubles, a few functions of
-:mod:`strapdown.kernels.algebra` work on its rows as vectors: a row of the result is a sum of rows, each times one number, so nine
-instructions do what else takes 27. LLVM sees that a number taken out of a vector only to be put back at its place need not move, so
-products in a row stay in vectors. The order of operations is that of the source: bits are those of each lane of
+In the source a matrix is a tuple of nine numbers. Compiled for doubles, a few functions of :mod:`strapdown.kernels.algebra` use its rows as
+vectors: a row of the result is a sum of rows, each times a scalar, so nine instructions replace 27. LLVM removes moves between scalars and
+vectors in a chain of products. The order of operations is that of the source, so the bits are those of each lane of
 :mod:`strapdown.kernels.lanes`.
 
-Only what was measured to gain is here: products with vectors, symmetric products and symmetric rank-one terms lose in moving numbers
-about what they gain.
+Products with vectors, symmetric products and symmetric rank-one terms are not here: moving the numbers costs about as much as it saves.
 """
 
 from __future__ import annotations
@@ -18,7 +16,7 @@ from typing import Any
 from llvmlite import ir
 
 _ROW = ir.VectorType(ir.DoubleType(), 4)
-"""Three numbers and a spare."""
+"""Three numbers and one unused."""
 _INDEX = ir.IntType(32)
 _NOWHERE = ir.Constant(_ROW, ir.Undefined)
 _FUSED = ("contract",)
@@ -75,4 +73,4 @@ EMIT: dict[str, Callable[..., list[Any]]] = {
     "multiply_add": _multiply_add,
     "minus_outer": _minus_outer,
 }
-"""By name of a function of :mod:`strapdown.kernels.algebra` what emits it, of lists of doubles."""
+"""Emitter of each function of :mod:`strapdown.kernels.algebra` by name, for lists of doubles."""

@@ -1,4 +1,4 @@
-"""Samples of a recording to averages over filter steps, and an estimate at the steps to every stamp."""
+"""Averages of a recording's samples over filter steps, and propagation of the estimate from the steps to every time stamp."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from strapdown.kernels.series import LARGEST_ANGLE
 
 
 def average_samples(samples, frame, edge, total, number):
-    """Add up the samples (n, 3) of each step in the axes that ``frame`` (n, 4) turns them to, in ``total`` (k, 3), and count them.
+    """Sum the samples (n, 3) of each step, rotated by ``frame`` (n, 4), in ``total`` (k, 3), and count them.
 
-    Step i has the samples after ``edge[i]`` up to ``edge[i + 1]``. Samples that are not finite, or 0, are missing.
+    Step i has the samples after ``edge[i]`` up to ``edge[i + 1]``. Samples that are not finite, or zero, are missing.
     """
     for i in range(len(edge) - 1):
         sx, sy, sz, count = 0.0, 0.0, 0.0, 0
@@ -44,7 +44,7 @@ def average_samples(samples, frame, edge, total, number):
 
 
 def turned_by(q, v):
-    """Return q ⊗ exp(v) of norm one, the rotation vector v being of any length."""
+    """Return q ⊗ exp(v), normalised, for a rotation vector v of any length."""
     square = dot(v, v)
     if square < LARGEST_ANGLE * LARGEST_ANGLE:
         return unit(quaternion_multiply(q, exponential(v)))
@@ -54,9 +54,9 @@ def turned_by(q, v):
 
 
 def turn_over(time, rate, late, sums, turn):
-    """Write the rotation vector (n, 3) by which a unit turned over ``late`` (n,), s, before each stamp, by the trapezoids of its rates.
+    """Write the rotation vector (n, 3) over the interval ``late`` (n,), s, before each stamp, by the trapezoidal rule.
 
-    Before the first and after the last sample it turns on at their rates. ``sums`` (n, 3) is work space.
+    Before the first and after the last sample the rate is constant. ``sums`` (n, 3) is scratch.
     """
     n = len(time)
     for c in range(3):
@@ -81,7 +81,7 @@ def turn_over(time, rate, late, sums, turn):
 
 
 def turn_back(attitude, turn, result):
-    """Write the attitudes (n, 4) before the unit turned by ``turn`` (n, 3)."""
+    """Write the attitudes (n, 4) before the rotations ``turn`` (n, 3)."""
     for i in range(len(turn)):
         q = (attitude[i, 0], attitude[i, 1], attitude[i, 2], attitude[i, 3])
         result[i, 0], result[i, 1], result[i, 2], result[i, 3] = turned_by(q, (-turn[i, 0], -turn[i, 1], -turn[i, 2]))
@@ -91,7 +91,7 @@ class Steps(NamedTuple):
     """Estimate at the filter's steps."""
 
     edge: np.ndarray
-    """Sample at which each step is (k,), the first at the start."""
+    """Sample index of each step (k,), the first at the start."""
     attitude: np.ndarray
     bias: np.ndarray
     variance: np.ndarray
@@ -103,16 +103,16 @@ class Steps(NamedTuple):
 
 
 class Stamps(NamedTuple):
-    """What is known at every sample."""
+    """Values at every sample."""
 
     time: np.ndarray
     rate: np.ndarray
     turned: np.ndarray
-    """Attitude by the gyro alone (n, 4)."""
+    """Attitude from the gyro only (n, 4)."""
     late: np.ndarray
-    """Delay of the stamp behind the motion (n,), s."""
+    """Delay of the stamp relative to the motion (n,), s."""
     ahead: np.ndarray
-    """Rotation vector (n, 3) over that delay, by the gyro."""
+    """Rotation vector (n, 3) over that delay, from the gyro."""
 
 
 class Carried(NamedTuple):
@@ -127,7 +127,7 @@ class Carried(NamedTuple):
 
 
 def carry_to_stamps(steps, stamps, timing, iron, out):
-    """Carry the estimate at each step by the gyro to the stamps up to the next one, and over their delay.
+    """Propagate the estimate at each step with the gyro to the stamps before the next step, and over their delay.
 
     The covariance includes a timing error of variance ``timing``, s², along the rate, and ``iron``, rad², about the vertical.
     """
@@ -184,7 +184,7 @@ def carry_to_stamps(steps, stamps, timing, iron, out):
 
 
 def low_pass(values, share, result):
-    """Pass rows (k, m) through ``y += share (x − y)``, from the first row on."""
+    """Filter rows (k, m) by ``y += share (x − y)``, starting with the first row."""
     for j in range(values.shape[1]):
         y = values[0, j]
         for i in range(len(values)):

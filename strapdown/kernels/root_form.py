@@ -1,8 +1,8 @@
 """The filter with optional error states, its covariance as a triangular factor: a body of :mod:`strapdown.kernels.walk`.
 
-State: attitude; ``x`` = (b, c): gyro bias and error states; the factor ``F`` (:mod:`strapdown.kernels.triangle`). What the error
-states are, arrays say (:mod:`strapdown.kernels.error_state_step`). It keeps its digits however sharp a measurement is, so without error
-states it is also what :mod:`strapdown.kernels.covariance_form` gives way to.
+State: attitude; ``x`` = (b, c): gyro bias and error states; the factor ``F`` (:mod:`strapdown.kernels.triangle`). Error states are defined
+by arrays (:mod:`strapdown.kernels.error_state_step`). No digits are lost, however precise a measurement is, so this is also the fallback of
+:mod:`strapdown.kernels.covariance_form` without error states.
 
 The first functions are the filter without a gate. Those under *for the gate* let :mod:`strapdown.kernels.gate` wrap it.
 """
@@ -77,15 +77,16 @@ from strapdown.kernels.triangle import (
 )
 from strapdown.kernels.walk import step_within, turn_squared
 
+REPLACEABLE = ("take",)
 CALLED = ("store_segment", "age_chains", "aged_chain")
-"""Not inlined. Only functions of few arrays are: each array of a NamedTuple is handed over by itself."""
+"""Called, not inlined; only functions of few arrays, because each array of a NamedTuple is a separate argument."""
 
 SHORT = 0.5
-"""Of λ dt of a state in a chain: its series is exact."""
+"""Maximum λ dt of a state in a chain, for which its series is accurate to rounding."""
 
 
 class Model(NamedTuple):
-    """Noise of the gyro, and the error states as :mod:`strapdown.kernels.error_state_step` has them (m states)."""
+    """Noise of the gyro, and the m error states in the form of :mod:`strapdown.kernels.error_state_step`."""
 
     angle_variance: float
     """σ_v², rad²/s."""
@@ -94,9 +95,9 @@ class Model(NamedTuple):
     decay: np.ndarray
     density: np.ndarray
     changing: int
-    """How many states come first that change by themselves."""
+    """Number of leading error states that are not constant."""
     limit: float
-    """Longest step, s, of the states that decay."""
+    """Maximum step of states that decay, s."""
     gyro: np.ndarray
     gyro_use: np.ndarray
     sensors: np.ndarray
@@ -106,15 +107,15 @@ class Model(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """Work space of a step and of an update, in few arrays: each one more costs a kernel's compiling. n states in all, m error states."""
+    """Work space of a step and an update, for n states and m error states; in few arrays, because each costs compile time."""
 
     rows: np.ndarray
-    """(3, 3, width of F): H of a measurement, H turned to the prior's tangent space, and F Hᵀ."""
+    """(3, 3, width of F): H of a measurement, H in the prior's tangent space, and F Hᵀ."""
     lines: np.ndarray
-    """(``LINES``, width of F): in the order of the constants below."""
+    """(``LINES``, width of F), in the order of the constants below."""
     steps: np.ndarray
-    """(2, 2, n, 4): of the steps since the factor's, and of the next, Φ and Q as :func:`strapdown.kernels.error_state_step.move` and
-    :func:`strapdown.kernels.error_state_step.step_noise` leave them."""
+    """(2, 2, n, 4): Φ and Q of the steps that the factor is behind by, and of the next, as written by
+    :func:`strapdown.kernels.error_state_step.move` and :func:`strapdown.kernels.error_state_step.step_noise`."""
     links: np.ndarray
     """(chained states, ``LINKS``)"""
     six: np.ndarray
@@ -122,21 +123,21 @@ class Scratch(NamedTuple):
 
 
 PRIOR = 0
-"""Where the prior's mean lies (n,), seen from the state of the linearisation."""
+"""Prior mean (n,) relative to the state of the linearisation."""
 STEP = 1
 """A correction (n,)."""
 NOW_X = 2
 """Bias and error states at the linearisation (n − 3,)."""
 FACTOR = 3
-"""What of each error state is left after those steps, and after the next (m,) each."""
+"""Decay factor of each error state (m,) over those steps, and over the next."""
 WORK = 5
 ROWS = 6
-"""From here on those of :func:`strapdown.kernels.triangle.take_rows`."""
+"""From here, the scratch rows of :func:`strapdown.kernels.triangle.take_rows`."""
 LINES = 6 + TAKEN
 
 
 class Body(NamedTuple):
-    """What the filter is made of; rows of the states: the filter, and a gate's restart candidate, left at the end state."""
+    """State, model and limits. Row 0 of the states is the filter, row 1 the restart candidate of a gate; at return, the end states."""
 
     model: Model
     attitude: np.ndarray
@@ -144,26 +145,29 @@ class Body(NamedTuple):
     x: np.ndarray
     """(2, n − 3)"""
     F: np.ndarray
-    """(2, rows, width), the triangle at the top and room for rows of noise below, each :func:`strapdown.kernels.triangle.padded`."""
+    """(2, rows, width): the triangle, and below it scratch for noise rows, or n + 1 rows of outliers, each
+    :func:`strapdown.kernels.triangle.padded`."""
     length: np.ndarray
-    """What each measurement's effects are divided by, in order of time (events,)."""
+    """Divisor of the effects of error states on each measurement, in order of time (events,)."""
     turning: np.ndarray
-    """Measured rate, angular acceleration and the latter's variances at each measurement (events, 9); (0, 9) without lever arms."""
+    """Measured rate, angular acceleration and variances of the latter at each measurement (events, 9); (0, 9) without lever arms."""
     scratch: Scratch
     together: bool
     """Whether the factor takes all steps between two measurements at once."""
     sharpness: float
-    """Infinite: no measurement is too sharp."""
+    """Infinite: no limit to the precision of a measurement."""
     least_share: float
-    """0: no digit is lost."""
+    """0: no digits are lost."""
     check: int
+    outliers: tuple[float, float] = (0.0, 1.0)
+    """Share of the measurements that are outliers, and their variance over that of the others, where they are modelled."""
 
 
 class Restart(NamedTuple):
-    """What a restart candidate starts from."""
+    """Initial values of a restart candidate."""
 
     bias_sigma: np.ndarray
-    """Added to the bias's (3,), rad/s."""
+    """Increase of the σ of the bias (3,), rad/s."""
     values: np.ndarray
     """Error states (m,) at ``time``."""
     root: np.ndarray
@@ -174,26 +178,26 @@ class Restart(NamedTuple):
 
 
 class Outputs(NamedTuple):
-    """Arrays that a run writes: a row for each kept edge, and of innovations for each measurement, by place."""
+    """Output arrays: a row for each stored edge; innovations by measurement."""
 
     attitude: np.ndarray
     x: np.ndarray
     variance: np.ndarray
     covariance: np.ndarray
-    """(rows, m, m), of the first m states, or (0, m, m)."""
+    """Covariance of the first m states (rows, m, m), or (0, m, m)."""
     whole_variance: np.ndarray
-    """Of attitude and whole gyro bias (rows, 6), or (0, 6)."""
+    """Variances of attitude and whole gyro bias (rows, 6), or (0, 6)."""
     whole_covariance: np.ndarray
     """(rows, 6, 6), or (0, 6, 6)."""
     innovation: np.ndarray
     segments: np.ndarray
-    """What a smoother needs of each prediction: dt, increment (3), attitude (4), x and the rows of the triangle."""
+    """Each prediction, for a smoother: dt, increment (3), attitude (4), x and the rows of the triangle."""
 
 
 def store_segment(out, k, dt, part, q, x, F, loose):
-    """Write row k of the segments: dt, increment (3), attitude (4), x, and the rows of the factor, of which the first are loose.
+    """Write row k of the segments: dt, increment (3), attitude (4), x, and the rows of the factor, the first of them loose.
 
-    A row has room for ``WIDTH`` − 1 numbers more.
+    A row has ``WIDTH`` − 1 unused numbers at its end.
     """
     out[k, 0] = dt
     out[k, 1], out[k, 2], out[k, 3] = part
@@ -204,18 +208,18 @@ def store_segment(out, k, dt, part, q, x, F, loose):
     place += len(x) + k * out.shape[1]
     for j in range(len(x) + 3):
         end = row_end(j, loose)
-        for c in range(0, end, WIDTH):  # the next row goes over what is too much
+        for c in range(0, end, WIDTH):  # the next row overwrites the excess
             store(out, place + c, read(F, F.shape[1] * j + c))
         place += end
 
 
 def row_end(j, loose):
-    """Return how many columns of row j of a factor are stored: those of attitude and bias have nothing beyond."""
+    """Return the number of stored columns of row j of a factor; rows of attitude and bias are zero beyond them."""
     return 6 if j < 6 else max(j + 1, loose)
 
 
 def keep_row(form, q, row, out):
-    """Write the filter's state to a row of the outputs, covariances and the whole bias where there is room."""
+    """Write the state of the filter to a row of the outputs, with covariances and the whole bias if these are requested."""
     write_row(form, 0, q, row, out)
 
 
@@ -244,7 +248,7 @@ def advance(model, scratch, q, x, F, dt, part):
 
 
 def step(model, scratch, q, x, dt, part, more):
-    """Propagate attitude and ``x`` alone, and add the step to those that the factor is behind by, where there are ``more``; return q."""
+    """Propagate attitude and ``x`` only; with ``more``, combine the step with those that the factor is behind by; return q."""
     now = 1 if more else 0
     top, noise, factor = scratch.steps[now, 0], scratch.steps[now, 1], scratch.lines[FACTOR + now]
     q, _, rate, D = move(q, x, dt, part, model, top, factor)
@@ -256,7 +260,7 @@ def step(model, scratch, q, x, dt, part, more):
 
 
 def absorb(model, scratch, x, F, dt):
-    """Take the factor over the steps that it is behind by. With states in chains that is one step, over dt, which takes those along."""
+    """Propagate the factor over the steps that it is behind by; with states in chains, a single step of dt that includes these."""
     size, noisy = len(x) + 3, 6 + model.changing
     carry(F, size, loose(model), scratch.steps[0, 0], scratch.lines[FACTOR], model.changing)
     rows = fill_noise(F, size, scratch.steps[0, 1], noisy)
@@ -266,12 +270,12 @@ def absorb(model, scratch, x, F, dt):
 
 
 def loose(model):
-    """Return how many rows of a factor come first that a correction leaves loose."""
+    """Return the number of leading rows of a factor that are loose after a correction."""
     return 3 if len(model.chains) == 0 else 6 + model.changing
 
 
 def settle(model, F, before, after, x):
-    """Turn what goes along with a corrected attitude."""
+    """Rotate the states that follow a correction of the attitude."""
     if len(model.chains) > 0:
         A = fixed_turn(before, after)
         turn_values(model.chains, A, x, 3)
@@ -282,7 +286,7 @@ def settle(model, F, before, after, x):
 
 
 def begin(body):
-    """Return the attitude, the number of segments, and how many steps the factor is behind by."""
+    """Return the attitude, the number of segments, and the number of steps that the factor is behind by."""
     # From an array, and not the literal 0: numba would compile the body for that type too.
     none = 0 * len(body.length)
     return load(body, 0), none, none
@@ -294,7 +298,7 @@ def longest_step(state, part, dt, body):
 
 
 def predict(state, part, dt, body, out):
-    """Propagate, and store what a smoother needs."""
+    """Store the prediction for a smoother, and propagate."""
     q, segments, behind = state
     model, scratch, x, F = body.model, body.scratch, body.x[0], body.F[0]
     if segments < len(out.segments):
@@ -311,11 +315,10 @@ def predict(state, part, dt, body, out):
 def update(state, e, now, measured, body, out):
     """Update with a measurement."""
     q, segments, behind = state
-    model, scratch, x, F = body.model, body.scratch, body.x[0], body.F[0]
-    H, step = scratch.rows[0], scratch.lines[STEP]
+    model, x, F, step = body.model, body.x[0], body.F[0], body.scratch.lines[STEP]
     size = len(x) + 3
     if behind > 0:
-        absorb(model, scratch, x, F, 0.0)
+        absorb(model, body.scratch, x, F, 0.0)
     place = measured.place[e]
     sensor = measured.sensor[e]
     kind = measured.series[sensor, KIND]
@@ -333,12 +336,12 @@ def update(state, e, now, measured, body, out):
         if kind == DIRECTION:
             u, v = dot(axes[0], axes[0]), dot(axes[1], axes[1])
         spread = (variance * u, variance * v, variance)
-    errors, s = take_rows(F, size, loose(model), H, rows, y, spread, step, scratch.lines[ROWS:])
+    errors, s = take(body, place, rows, y, spread, out)
     for r in range(rows):
         out.innovation[place, 2 * r] = errors[r]
         out.innovation[place, 2 * r + 1] = s[r]
     if kind == HEADING and not shown:
-        out.innovation[place, 0] = math.nan  # of a vertical vector, which shows none: skipped
+        out.innovation[place, 0] = math.nan  # a vertical vector has no heading: skipped
     a = (step[0], step[1], step[2])
     before = q
     if dot(a, a) > 1.0:
@@ -354,8 +357,15 @@ def update(state, e, now, measured, body, out):
     return q, segments, 0 * behind
 
 
+def take(form, place, rows, y, variance, out):
+    """Update the factor with the rows in the scratch; return innovations and variances, and leave the correction in ``step``."""
+    scratch, size = form.scratch, len(form.x[0]) + 3
+    step, work = scratch.lines[STEP], scratch.lines[ROWS:]
+    return take_rows(form.F[0], size, loose(form.model), scratch.rows[0], rows, y, variance, step, work)
+
+
 def seen_rows(form, e, q, x, kind, z, frame, sensor):
-    """Write H of a measurement seen from a state to the scratch; return what :func:`strapdown.kernels.sensor_rows.fill_rows` does."""
+    """Write H of a measurement at a state to the scratch; return the same as :func:`strapdown.kernels.sensor_rows.fill_rows`."""
     model, H = form.model, form.scratch.rows[0]
     W = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     t = form.turning
@@ -371,14 +381,14 @@ def seen_rows(form, e, q, x, kind, z, frame, sensor):
 
 
 def arm_variance(form, e):
-    """Return the variances of the angular acceleration at a measurement by a lever arm; zeros at any other."""
+    """Return the variances of the angular acceleration at a measurement with a lever arm, otherwise zeros."""
     if len(form.turning) > 0:
         return (form.turning[e, 6], form.turning[e, 7], form.turning[e, 8])
     return (0.0, 0.0, 0.0)
 
 
 def independent(form, e, x, sensor, rows, y, axes, C, arm):
-    """Make the rows in the scratch independent; return y and the variances."""
+    """Decorrelate the rows in the scratch; return y and the variances."""
     model = form.model
     if arm[0] > 0.0:
         C = arm_noise(x, sensor, model.sensors, model.sensor_use, form.length[e], arm, C, 0.0)
@@ -386,7 +396,7 @@ def independent(form, e, x, sensor, rows, y, axes, C, arm):
 
 
 def keep(state, row, e, body, out):
-    """Write a row; the factor stays as far behind, so that what it becomes does not depend on the rows that are kept."""
+    """Write a row. The factor is not brought up to date, so its bits do not depend on which rows are stored."""
     q, _, behind = state
     if behind > 0:
         for j in range(len(body.x[0]) + 3):
@@ -398,7 +408,7 @@ def keep(state, row, e, body, out):
 
 
 def finish(state, row, e, body):
-    """Leave the end state and return the number of segments."""
+    """Store the end state and return the number of segments."""
     q, segments, behind = state
     if behind > 0:
         absorb(body.model, body.scratch, body.x[0], body.F[0], 0.0)
@@ -410,19 +420,19 @@ def finish(state, row, e, body):
 
 
 def load(form, i):
-    """Return the attitude of state i; the rest stays in its arrays."""
+    """Return the attitude of state i; the other parts remain in their arrays."""
     a = form.attitude
     return (a[i, 0], a[i, 1], a[i, 2], a[i, 3])
 
 
 def save(form, i, q):
-    """Keep the attitude of state i."""
+    """Store the attitude of state i."""
     a = form.attitude
     a[i, 0], a[i, 1], a[i, 2], a[i, 3] = q
 
 
 def become(form):
-    """Let the filter be what the restart candidate is."""
+    """Replace the filter by the restart candidate."""
     size = form.x.shape[1] + 3
     save(form, 0, load(form, 1))
     for j in range(size - 3):
@@ -443,12 +453,12 @@ def bias_at(form, i):
 
 
 def step_limit(form):
-    """Return the longest step, s, that states other than the attitude bear."""
+    """Return the longest step, s, allowed by states other than the attitude."""
     return form.model.limit
 
 
 def digits_left(form, i):
-    """Return 1: a factor loses none."""
+    """Return 1: a factor loses no digits."""
     return 1.0
 
 
@@ -458,7 +468,7 @@ def propagate(form, i, q, part, dt):
 
 
 def store_prediction(form, i, q, k, part, dt, out):
-    """Write what a smoother needs of a prediction."""
+    """Store a prediction for a smoother."""
     store_segment(out.segments, k, dt, part, q, form.x[i], form.F[i], loose(form.model))
 
 
@@ -472,18 +482,18 @@ def attitude_covariance(form, i, q):
 
 
 def start_update(form, i):
-    """Begin the linearisation at the state itself."""
+    """Start the linearisation at the state."""
     scratch, x = form.scratch, form.x[i]
     for j in range(len(x)):
         scratch.lines[NOW_X][j] = x[j]
     for j in range(len(x) + 3):
-        scratch.lines[PRIOR][j] = 0.0  # where the prior's mean lies, seen from the state of the linearisation
+        scratch.lines[PRIOR][j] = 0.0  # prior mean relative to the state of the linearisation
 
 
 def linearised(form, i, e, now_q, q, M, z, frame, noise, kind, sensor, prior):
-    """Return the number of rows, y (3,), what of y the prior predicts (3,), variances (3,), θ/sin θ and cos θ of a direction's angle.
+    """Return the number of rows, y (3,), its prediction by the prior (3,), variances (3,), θ/sin θ and cos θ of a direction's angle.
 
-    The rows stand in ``prior_H``, turned to the prior's tangent space, and as they are in ``H``.
+    The rows are written to ``H``, and in the prior's tangent space to ``prior_H``.
     """
     model, scratch = form.model, form.scratch
     H, prior_H = scratch.rows[0], scratch.rows[1]
@@ -508,10 +518,10 @@ def linearised(form, i, e, now_q, q, M, z, frame, noise, kind, sensor, prior):
 
 
 def seen_from_afar(kind, z, rows, y, axes):
-    """Return θ/sin θ of the angle θ between a measured and a predicted vector, and its cosine times their length; of other kinds 1, 1.
+    """Return θ/sin θ for the angle θ between a measured and a predicted vector, and cos θ times their length; for other kinds 1, 1.
 
-    The rows of a direction measure across what is predicted with the error states, those of a vector across the reference, along which
-    the third row has the length.
+    The rows of a direction are transverse to its prediction with the error states. Those of a vector are transverse to the reference; the
+    third row is along it.
     """
     if kind in (ATTITUDE, HEADING):
         return 1.0, 1.0
@@ -524,7 +534,7 @@ def seen_from_afar(kind, z, rows, y, axes):
 
 
 def innovation_covariance(form, i, q, rows):
-    """Return H P Hᵀ (6-tuple), rows that are not there as zeros; leave ``F Hᵀ`` in ``seen``."""
+    """Return H P Hᵀ (6-tuple), zero for absent rows; write ``F Hᵀ`` to ``seen``."""
     F, H, seen = form.F[i], form.scratch.rows[1], form.scratch.rows[2]
     size = form.x.shape[1] + 3
     S = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -536,9 +546,9 @@ def innovation_covariance(form, i, q, rows):
 
 
 def step_of(form, i, state, rows, u, M, prior, q, now_q):
-    """Return the attitude's step (3,) from the linearisation that P Hᵀ u leads to; leave all of it in ``step``.
+    """Return the attitude part (3,) of the step from the linearisation given by P Hᵀ u, and write the whole step to ``step``.
 
-    Also return the square of what it changes in the rows: the attitude's part, and the error states' seen in the rows.
+    Also return its squared size: of the attitude part, and of the effect of the error states on the rows.
     """
     scratch, F = form.scratch, form.F[i]
     step, seen, H = scratch.lines[STEP], scratch.rows[2], scratch.rows[0]
@@ -564,7 +574,7 @@ def step_of(form, i, state, rows, u, M, prior, q, now_q):
 
 
 def relinearise(form, i, q, old_q, now_q, prior, fresh):
-    """Go to another point of linearisation; ``fresh``: the states beside the attitude go back to the state itself."""
+    """Change the point of linearisation; ``fresh``: reset all states except the attitude to the prior."""
     scratch, x, chains = form.scratch, form.x[i], form.model.chains
     now_x, all_prior = scratch.lines[NOW_X], scratch.lines[PRIOR]
     all_prior[0], all_prior[1], all_prior[2] = prior
@@ -579,7 +589,7 @@ def relinearise(form, i, q, old_q, now_q, prior, fresh):
 
 
 def correct(form, i, q, rows, e, variance):
-    """Update with independent rows of innovations e (3,), prior's tangent space; return q and the attitude's correction."""
+    """Update with independent rows of innovations e (3,) in the prior's tangent space; return q and the correction of the attitude."""
     scratch, x, F = form.scratch, form.x[i], form.F[i]
     step = scratch.lines[STEP]
     size = form.x.shape[1] + 3
@@ -590,22 +600,22 @@ def correct(form, i, q, rows, e, variance):
 
 
 def turn_tangent(form, i, q, M):
-    """Carry the factor to another tangent space by M, no triangle then."""
+    """Transform the factor to another tangent space by M, after which it is not triangular."""
     turn_rows(form.F[i], form.x.shape[1] + 3, M)
     return q
 
 
 def set_attitude(form, i, state, q, before):
-    """Turn what goes along with the corrected attitude."""
+    """Rotate the states that follow the correction of the attitude."""
     settle(form.model, form.F[i], before, q, form.x[i])
     return q
 
 
 def start_candidate(form, memory, now, attitude_sigma, restart):
-    """Write row 1: the filter's attitude and bias, as uncertain as a fresh start, and the error states as the prior has them by now.
+    """Write row 1: attitude and bias of the filter with initial covariances, and the error states with their prior, propagated to now.
 
-    Whatever led the filter astray has gone into the error states too, and what they are still worth cannot be known; their prior is right
-    all the same. Attitude and bias are widened by how many candidates have been before it.
+    The error states of the filter may be in error too, by an unknown amount; their prior remains valid. The covariances of attitude and
+    bias increase with the number of candidates before it.
     """
     model, scratch, x, F = form.model, form.scratch, form.x, form.F
     decay, density, chains, fresh = model.decay, model.density, model.chains, restart.fresh
@@ -622,7 +632,7 @@ def start_candidate(form, memory, now, attitude_sigma, restart):
     for k in range(m):
         kept = math.exp(-decay[k] * age)
         if len(chains) > 0 and (chains[k, 0] != 0.0 or (k > 0 and chains[k - 1, 0] != 0.0)):
-            kept = 1.0  # age_chains has all of it
+            kept = 1.0  # propagated by age_chains
         x[1, 3 + k] = kept * restart.values[k]
         for r in range(k, m):
             fresh[3 + r, 3 + k] = kept * restart.root[r, k]
@@ -650,7 +660,7 @@ def start_candidate(form, memory, now, attitude_sigma, restart):
 
 
 def bias_variances(F, size):
-    """Return the variances of the bias (3,) of a factor's covariance."""
+    """Return the variances of the bias (3,) from a factor."""
     variances = (0.0, 0.0, 0.0)
     for j in range(size):
         b = (F[j, 3], F[j, 4], F[j, 5])
@@ -659,9 +669,9 @@ def bias_variances(F, size):
 
 
 def aged_chain(decay, chains, first, k, age):
-    """Return Φ (9-tuple) of the states ``first`` to k of a chain, two or three, over any time, and Q (6-tuple) of what drives them.
+    """Return Φ (9-tuple) and Q (6-tuple) of the states ``first`` to k of a chain, two or three, over any time.
 
-    :func:`strapdown.kernels.chains.chain_step` over a step short enough, doubled as often as it takes.
+    By :func:`strapdown.kernels.chains.chain_step` over a short step, and repeated doubling.
     """
     fastest = 0.0
     for j in range(first, k + 1):
@@ -672,7 +682,7 @@ def aged_chain(decay, chains, first, k, age):
         h *= 0.5
         doublings += 1
     _, _, own0, n20, n21, n22, n10, n11, n00 = chain_step(decay, chains, first, first, h)
-    # What drives the first state, which feeds none, is not the chain's.
+    # The driving noise of the first state, which drives no other, is not part of the chain.
     _, near1, own1, n20, n21, n22, n10, n11, n00 = chain_step(decay, chains, first + 1, first, h)
     d = chains[first + 1, 1]
     q00 = d * (n21 * n21 + n11 * n11)
@@ -699,7 +709,7 @@ def aged_chain(decay, chains, first, k, age):
 
 
 def age_chains(x, fresh, decay, chains, age):
-    """Take the mean and the root of the optional states' prior over ``age``, of those in chains; the rows of their noise likewise."""
+    """Propagate mean and root of the prior of error states in chains over ``age``, and write the rows of their noise."""
     m = len(decay)
     for k in range(1, m):
         if chains[k - 1, 0] != 0.0 and chains[k, 0] == 0.0 and age > 0.0:
@@ -717,7 +727,7 @@ def age_chains(x, fresh, decay, chains, age):
                 fresh[r, 4 + first] = phi[4] * b + phi[5] * c
                 if last:
                     fresh[r, 5 + first] = phi[8] * c
-            # A root of Q by rows from the last state up; what drives the first by itself stands in its row already.
+            # A root of Q by rows from the last state upwards; the driving noise of the first is in its row already.
             n22 = math.sqrt(Q[5])
             n21 = Q[4] / n22 if n22 > 0.0 else 0.0
             n20 = Q[2] / n22 if n22 > 0.0 else 0.0
@@ -732,10 +742,10 @@ def age_chains(x, fresh, decay, chains, age):
 
 
 def widen(form, memory):
-    """Make the candidate what it would be had its bias started wider, if that holds it back.
+    """Increase the initial bias variance of the candidate retroactively, if that start still determines its bias.
 
-    The start is given back as a measurement of negative variance, beyond that of the bias, which only adds to P: |1/s| P e (P e)ᵀ, a row
-    more of the factor.
+    The start is removed by a measurement of negative variance, of magnitude above that of the bias, which only adds |1/s| P e (P e)ᵀ to P:
+    one more row of the factor.
     """
     scratch, x, F = form.scratch, form.x[1], form.F[1]
     size = len(x) + 3

@@ -31,7 +31,7 @@ from strapdown.kernels.walk import SQUARED_RANGE
 
 REPLACEABLE = ("state_at", "row_entry", "set_row_entry", "turned_by", "turn_vector", "angle_of")
 CALLED = ("fill_rows", "decorrelate", "arm_noise")
-"""Not inlined where other kernels use them: their work is far more than a call, and each copy would be compiled anew."""
+"""Called, not inlined, by other kernels: a call costs little compared with their work, and each copy would be compiled again."""
 
 
 def state_at(x, i, like):

@@ -1,10 +1,10 @@
 """The smoother over whole records: backward passes over the segments that the filter stored.
 
-A pass takes the segments in groups of ``WIDTH``, counted from the end of the record. What depends on the filter alone is computed for a
-group at once, a segment a lane, and left as rows of matrices (``prepare_…``), which the chain then reads segment by segment: one row in a
-machine vector, times a number spread over it. Two chains run in step, the covariances a group behind the errors, because each covariance
-wants the Jacobians at both errors of its segment, which are again taken for a group at once (:func:`fold_jacobians`); neither chain waits
-for the other, and one works while the other waits for itself. The group that comes next is prepared in four parts between their links.
+A pass processes the segments in groups of ``WIDTH``, counted from the end of the record. Quantities that depend only on the filter are
+computed for a group at once, one segment per lane, and stored as rows of matrices (``prepare_…``), which the recursion reads segment by
+segment: a row in a SIMD register, times a scalar. Two recursions run together, the covariances one group behind the errors, because each
+covariance needs the Jacobians at both errors of its segment, computed for a group at once (:func:`fold_jacobians`). They do not depend on
+each other, so each hides the latency of the other. The next group is prepared in four parts between their steps.
 """
 
 from __future__ import annotations
@@ -45,69 +45,69 @@ from strapdown.kernels.state import (
 )
 
 ROW = 32
-"""Numbers of a stored segment: dt, increment (3), state (28)."""
+"""Length of a stored segment: dt, increment (3), state (28)."""
 
-# Places in a prepared group. Of each segment first ``MATRICES`` numbers: the columns of G, six numbers each, without gaps (36 and 4 more),
-# the upper triangle of D by rows (21 and 3 more), and what the updates at its end did (13 and 3 more). Read as a vector, a column of G ends
-# in two lanes of the next, and row i of D begins with i lanes of the row before: lanes of which no use is made. Then, a lane a segment,
-# whether anything was measured there, and the filtered state at its start.
+# Offsets in a prepared group. For each segment ``MATRICES`` numbers: the columns of G, six numbers each, contiguous (36 and 4 more), the
+# upper triangle of D by rows (21 and 3 more), and the corrections at its end (13 and 3 more). Loaded as a vector, a column of G includes
+# two numbers of the next, and row i of D starts with i numbers of the row before; these lanes are not used. Then, one segment per lane,
+# whether there was a measurement, and the filtered state at the start.
 MATRICES = 80
 NOISE = 40
 TURN = 64
-"""(−r3, r0, r1, r2, r3) of the quaternion r from the predicted attitude to that of the next segment, the three numbers that the bias is
-stepped by, and (r2, −r1, r0, r3, −r2): the columns of r0 I + [r1, r2, r3] are three of each five."""
+"""(−r3, r0, r1, r2, r3) of the quaternion r from the predicted attitude to that of the next segment, the correction of the bias (3), and
+(r2, −r1, r0, r3, −r2): the columns of r0 I + [r1, r2, r3] are three consecutive numbers of these."""
 MOVED = MATRICES * WIDTH
-"""0 where nothing was measured: then the turn is rounding, and (a, d) = (ε, β). 1 where the turn is short, 2 where it is not."""
+"""0: no measurement, so (a, d) = (ε, β); 1: small rotation; 2: large rotation."""
 ATTITUDE = MOVED + WIDTH
 BIAS = ATTITUDE + 4 * WIDTH
 GROUP = BIAS + 3 * WIDTH
-"""Numbers of a prepared group."""
+"""Length of a prepared group."""
 
-# Places in the work space.
+# Offsets in the work space.
 COLUMNS = 0
-"""G, D and turns of the group in preparation, a lane a segment."""
+"""G, D and rotations of the group in preparation, one segment per lane."""
 SHARE = COLUMNS + MATRICES * WIDTH
 """Its N and Q̄."""
 STEP = SHARE + 52 * WIDTH
-"""Its dt and turns."""
+"""Its dt and rotation vectors."""
 ERRORS = STEP + 4 * WIDTH
-"""Smoothed errors (ε, β) of two groups in turn, a row of eight for each segment, and one for the state that the group ends in."""
+"""Smoothed errors (ε, β) of two groups alternately, a row of eight for each segment and one for the end of the group."""
 SEEN = ERRORS + 2 * (WIDTH + 1) * WIDTH
-"""Of a group's segments a, but for a factor that stands in ``FACTOR``, a row of eight each."""
+"""a of each segment of a group, without the factor in ``FACTOR``, a row of eight each."""
 STEPPED = SEEN + WIDTH * WIDTH
 """Three numbers and d, a row of eight."""
 FACTOR = STEPPED + WIDTH
 JACOBIAN = FACTOR + WIDTH
 FOLDED = JACOBIAN + 9 * WIDTH
-"""The first three columns of each G J, as they lie in the group, and where they end."""
+"""The first three columns of each G J, in the layout of the group."""
 FOLDED_ROW = 24
 COVARIANCE = FOLDED + FOLDED_ROW * WIDTH
-"""P_s of a group's segments and of the state that it ends in: six rows of eight each, of which only the upper triangle holds."""
+"""P_s of each segment of a group and of its end: six rows of eight each, of which only the upper triangle is valid."""
 COVARIANCE_ROW = 48
 SMOOTHED = COVARIANCE + COVARIANCE_ROW * (WIDTH + 1)
 """A group's smoothed states in lanes: attitude, bias, A, B."""
 GROUPS = SMOOTHED + 22 * WIDTH
-"""From here on the group in preparation, that of the errors, and that of the covariances, in turn."""
+"""From here the group in preparation, that of the errors, and that of the covariances, alternately."""
 _ROOM = 3
 WORK_SIZE = GROUPS + GROUP * _ROOM + WIDTH
-"""Numbers of work space, with room to begin at a cache line."""
+"""Length of the work space, including alignment to a cache line."""
 
 FEWEST_ROWS = WIDTH + 1
-"""Rows that the array of segments must have; any that follow the end state are not looked at."""
+"""Minimum number of rows of the array of segments; rows after the end state are not read."""
 
 _NOTHING = 1e-30
 _LARGEST_SQUARE = LARGEST_ANGLE * LARGEST_ANGLE
 _NOT_NEGATIVE = 2**62 - 1
 _LANE = WIDTH - 1
 SIX = (0, 1, 2, 3, 4, 5)
-# An index and one of these: the same index, and the compiler sees that it is not negative, which it otherwise tests at each number read.
+# An index AND this is unchanged, and known to the compiler as not negative, which it would otherwise test at each read.
 
 
 def locate_edges(edges, event_time, segments, number, starts_out):
     """Write for each edge the number of the segment that starts there; for the last edge, ``number``.
 
-    Follows the filter's own steps (:func:`strapdown.kernels.filter_loop.run_filter`) in its own arithmetic, so nothing is compared within
-    a tolerance: a stored dt that reaches the next event or edge is *equal* to the difference of the times.
+    It repeats the steps of the filter (:func:`strapdown.kernels.walk.walk`) in the same arithmetic, so comparisons are exact: a stored dt
+    that reaches the next event or edge is *equal* to the difference of the times.
     """
     e = 0
     k = 1
@@ -134,7 +134,7 @@ def store_columns(work, place, M):
 
 
 def prepare_turns(segments, start, work, group):
-    """Write the states of the eight segments from ``segments[start]`` on and what the updates at their ends did; keep dt and turn."""
+    """Write the states of the eight segments from ``segments[start]`` and the corrections at their ends; store dt and rotation."""
     w = WIDTH
     dt, x, y, z = load_quadruples(segments, start, ROW)
     b0, b1, b2, _ = load_quadruples(segments, start + 8, ROW)
@@ -149,7 +149,7 @@ def prepare_turns(segments, start, work, group):
     p = turned(q, phi)
     r = quaternion_multiply((p[0], -p[1], -p[2], -p[3]), load_quadruples(segments, start + ROW + 4, ROW))
     squared = r[1] * r[1] + r[2] * r[2] + r[3] * r[3]
-    # Without an update the bias stays to the bit, the attitude to rounding.
+    # Without an update the bias is unchanged to the bit, the attitude to rounding.
     seen = chosen(dot(step_b, step_b) > 0.0, spread(1.0), squared) > _NOTHING
     if anywhere(seen):
         turn = (-r[3], *r, *step_b, r[2], -r[1], r[0], r[3], -r[2])
@@ -162,7 +162,7 @@ def prepare_turns(segments, start, work, group):
 
 
 def prepare_shares(segments, start, work, angle_variance, rate_variance):
-    """Keep N and Q̄ of the segments of :func:`prepare_turns`."""
+    """Store N and Q̄ of the segments of :func:`prepare_turns`."""
     w = WIDTH
     dt = load(work, STEP)
     phi = load_triple(work, STEP + w)
@@ -175,13 +175,13 @@ def prepare_shares(segments, start, work, angle_variance, rate_variance):
 
 
 def load_covariance(segments, start):
-    """Return the blocks of eight segments' covariance, of which the first number is the fourth from ``segments[start]`` on."""
+    """Return the covariance blocks of eight segments, which start at the fourth number after ``segments[start]``."""
     n = sum((load_quadruples(segments, start + 4 * i, ROW) for i in range(6)), ())[3:]
     return n[:6], n[6:15], n[15:]
 
 
 def prepare_gains(work):
-    """Keep G and D of the segments of :func:`prepare_shares`, a lane a segment."""
+    """Store G and D of the segments of :func:`prepare_shares`, one segment per lane."""
     w = WIDTH
     N = load_share(work)
     q = load_matrix(work, SHARE + 36 * w)[:6]
@@ -196,12 +196,12 @@ def prepare_gains(work):
 
 
 def load_share(work):
-    """Return the blocks of N that :func:`prepare_shares` keeps."""
+    """Return the blocks of N stored by :func:`prepare_shares`."""
     return tuple(load_matrix(work, SHARE + 9 * WIDTH * i) for i in range(4))
 
 
 def prepare_rows(work, group):
-    """Write the matrices of :func:`prepare_gains` a row a segment, eight numbers of four segments at a time."""
+    """Write the matrices of :func:`prepare_gains`, one row per segment, eight numbers of four segments at a time."""
     group &= _NOT_NEGATIVE
     blocks = MATRICES // WIDTH if anywhere(load(work, group + MOVED) > 0.5) else TURN // WIDTH
     for k in range(blocks):
@@ -215,7 +215,7 @@ def prepare_rows(work, group):
 
 
 def times_columns(work, places, columns):
-    """Return the sum of six columns, each times the number at its place."""
+    """Return the sum of six columns, each times its number."""
     a, b, c, d, e, f = places
     return (work[a] * columns[0] + work[b] * columns[1] + work[c] * columns[2]) + (
         work[d] * columns[3] + work[e] * columns[4] + work[f] * columns[5]
@@ -223,15 +223,15 @@ def times_columns(work, places, columns):
 
 
 def load_columns(work, first, last):
-    """Return the six columns of a gain, three from each place."""
+    """Return the six columns of a gain, three from each offset."""
     return tuple(load(work, place + column) for place in (first, last) for column in (0, 6, 12))
 
 
 def carry_error(work, group, errors, i):
-    """Take the smoothed error from the end of segment i of a group to its start: (ε, β) ← G (a, d).
+    """Propagate the smoothed error from the end of segment i of a group back to its start: (ε, β) ← G (a, d).
 
-    The chain of all smoothed states hangs on it. For small angles, which are the rule, a = f v with v = sin(|a|/2) a/|a|, and f follows
-    from the cosine, while v is already multiplied by G.
+    Its latency limits the speed of the recursion. For small angles, the usual case, a = f v with v = sin(|a|/2) a/|a|, and f is computed
+    from the cosine in parallel with G v.
     """
     w = WIDTH
     i &= _LANE
@@ -248,7 +248,7 @@ def carry_error(work, group, errors, i):
         turn = load(work, t + 2)
         store(work, d, turn + load(work, e))
         if moved_there < 1.5 and x < SHORT:
-            # The product r ⊗ exp(ε), with its series to the fourth term. z, the squared sine, needs no more digits than 1 − w² has.
+            # The product r ⊗ exp(ε), by a series of four terms. The precision of 1 − w² is sufficient for z, the squared sine.
             c = 1.0 + x * (x * (1.0 / 384.0) - 0.125)
             h = 0.5 + x * (x * (1.0 / 3840.0) - 1.0 / 48.0)
             u = work[e] * load(work, t + 10) + work[e + 1] * load(work, t) + work[e + 2] * load(work, t + 8)
@@ -315,14 +315,14 @@ def fold_jacobians(work, group, errors):
 
 
 def row_times(work, f, g, z, start):
-    """Return ``start`` plus the sum of six rows z, times the numbers of one row of the gain, three from column to column at f and at g."""
+    """Return ``start`` plus the sum of six rows z times one row of the gain (entries a column apart, three at f and three at g)."""
     return (start + work[f] * z[0] + work[f + 6] * z[1] + work[f + 12] * z[2]) + (
         work[g] * z[3] + work[g + 6] * z[4] + work[g + 12] * z[5]
     )
 
 
 def carry_covariance(work, group, i):
-    """Take the smoothed covariance from the end of segment i of a group to its start: P_s ← (G J) P_s (G J)ᵀ + D."""
+    """Propagate the smoothed covariance from the end of segment i of a group back to its start: P_s ← (G J) P_s (G J)ᵀ + D."""
     i &= _LANE
     g = (group & _NOT_NEGATIVE) + MATRICES * i
     f = FOLDED + FOLDED_ROW * i
@@ -330,16 +330,16 @@ def carry_covariance(work, group, i):
     d = g + NOISE
     g += 18
     columns = load_columns(work, f, g)
-    # Rows of P_s (G J)ᵀ, of which P_s is read from its upper triangle.
+    # Rows of P_s (G J)ᵀ; P_s is read from its upper triangle.
     z = tuple(times_columns(work, tuple(p + 8 * min(r, c) + max(r, c) for c in SIX), columns) for r in SIX)
     for r, begin in enumerate((0, 5, 9, 12, 14, 15)):
         store(work, p - COVARIANCE_ROW + 8 * r, row_times(work, f + r, g + r, z, load(work, d + begin)))
 
 
 def move_states(work, group, errors, whole):
-    """Write a group's smoothed states: each filtered one moved by its error, the covariance carried to the new tangent space.
+    """Write the smoothed states of a group: the filtered states corrected by the errors, with the covariance in the new tangent space.
 
-    B only where the ``whole`` covariance is wanted; C stays as it is.
+    B is written only for the ``whole`` covariance; C is unchanged.
     """
     w = WIDTH
     group &= _NOT_NEGATIVE
@@ -375,12 +375,12 @@ def move_states(work, group, errors, whole):
 
 
 def lane_numbers(work, start):
-    """Return 13 numbers of a lane, of which the first stands at ``start``."""
+    """Return 13 numbers of a lane, starting at ``start``."""
     return tuple(work[start + WIDTH * i] for i in range(13))
 
 
 def diagonal_block(work, start):
-    """Return the upper triangle of the 3×3 block that begins at ``start`` of rows of eight."""
+    """Return the upper triangle of the 3×3 block at ``start``, in rows of eight."""
     return tuple(work[start + WIDTH * i + j] for i in range(3) for j in range(i, 3))
 
 
@@ -431,13 +431,13 @@ def smooth_back(
     variance_out,
     covariance_out,
 ):
-    """Go back from the filtered state at the last edge to edge ``first``, and write all between.
+    """Smooth from the last edge back to edge ``first``, and write the results of all edges.
 
-    ``segments`` holds the filter's rows (dt, increment, state at its start), flat, the last one the end state, ``FEWEST_ROWS`` at least;
-    ``starts[k]`` is the row that starts at edge k. ``work`` has room for ``WORK_SIZE``.
+    ``segments`` holds the filter's rows (dt, increment, state at the start), flat, at least ``FEWEST_ROWS``, with the end state in the
+    last; ``starts[k]`` is the row that starts at edge k. ``work`` has ``WORK_SIZE`` numbers.
     """
     w = WIDTH
-    # From a cache line on, which vectors then do not cross. Not in a function, which may return no part of an array.
+    # Aligned to a cache line, so that vectors do not cross one. Not in a function, because kernels must not return arrays.
     work = work[-(work.ctypes.data // 8) % WIDTH :]
     lanes_of((0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
     for i in range(GROUPS):
@@ -448,12 +448,12 @@ def smooth_back(
     k -= 1
     if k < first:
         return
-    # Group t ends t groups before this row; the last begins with row 0, however many it shares with the one before.
+    # Group t ends t groups before this row; the last starts with row 0 and may overlap the one before it.
     end = len(segments) // ROW - 1
     top = (end - j) // w
     bottom = (end - 1 - starts[first]) // w
     count, group, place = 0, GROUPS, GROUPS
-    # Each turn prepares a group, takes the errors over the one before, and the covariances over the one before that.
+    # Each iteration prepares a group, propagates errors over the previous one, and covariances over the one before that.
     for n in range(top, bottom + 3):
         group_before, group = group, place
         place = GROUPS + GROUP * (n % _ROOM)

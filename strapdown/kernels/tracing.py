@@ -1,8 +1,8 @@
-"""Helpers that are formulas are not compiled by numba but traced: run in Python on symbols that write LLVM instructions.
+"""Helpers that are formulas are not compiled by numba but traced: executed in Python on symbols, which emit LLVM instructions.
 
-Most helpers have neither long loops nor branches on what is computed. Traced, they cost numba no function, no typing and no lowering, which
-take it a millisecond an operation. Each operation is still numba's: its types, its instructions, its lanes. A function that asks a symbol
-for its value is no formula, and numba compiles it.
+Most helpers have neither long loops nor branches on computed values. Tracing them saves numba's typing and lowering, about a millisecond
+for each operation. Types, instructions and lanes of each operation are still those of numba. A function that needs the value of a symbol is
+not a formula; numba compiles it.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ from numba.extending import intrinsic
 from strapdown.kernels.packed import EMIT
 
 LONGEST = 4
-"""Turns of a loop that a trace writes out; those of a generator expression it writes out all."""
+"""Maximum number of iterations of a loop that a trace unrolls; generator expressions are always unrolled."""
 
 
-class NotAFormula(Exception):  # noqa: N818 - says what a function is, and never leaves this module
-    """A function asks for the value of a symbol."""
+class NotAFormula(Exception):  # noqa: N818 - caught in this module, no error
+    """A function needs the value of a symbol."""
 
 
 class Trace:
-    """Writes instructions; without a builder only types are found."""
+    """Emits instructions; without a builder only types are inferred."""
 
     now: ClassVar[Trace]
     _signatures: ClassVar[dict[Any, Any]] = {}
@@ -44,7 +44,7 @@ class Trace:
 
     @contextmanager
     def running(self) -> Iterator[None]:
-        """Let operations of symbols go here."""
+        """Direct the operations of symbols to this trace."""
         before = getattr(Trace, "now", self)
         Trace.now = self
         try:
@@ -62,7 +62,7 @@ class Trace:
         return known
 
     def apply(self, function: Any, *arguments: Any) -> Any:
-        """Return what a function that numba knows makes of symbols and numbers."""
+        """Return the result of a function known to numba for symbols and numbers."""
         given = tuple(map(type_of, arguments))
         kind, signature = self.signature(function, given)
         if self.builder is None:
@@ -74,7 +74,7 @@ class Trace:
         return symbols(signature.return_type, self._implementations[key](self.builder, values))
 
     def value(self, argument: Any, wanted: Any) -> Any:
-        """Return the LLVM value of a symbol, number, or tuple of such, as of type ``wanted``."""
+        """Return the LLVM value of a symbol, number, or tuple of these, cast to type ``wanted``."""
         kind = type_of(argument)
         if isinstance(argument, Symbol):
             value = argument.value
@@ -89,7 +89,7 @@ class Trace:
 
 
 def type_of(value: Any) -> Any:
-    """Return numba's type of a symbol, number, or tuple of such."""
+    """Return numba's type of a symbol, number, or tuple of these."""
     if isinstance(value, Symbol):
         return value.type
     if isinstance(value, tuple):
@@ -101,7 +101,7 @@ def type_of(value: Any) -> Any:
 
 
 def symbols(kind: Any, value: Any = None) -> Any:
-    """Return a value as a symbol, and a tuple's as a tuple of such."""
+    """Return a value as a symbol, a tuple as a tuple of symbols."""
     if isinstance(kind, types.NoneType):
         return None
     if not isinstance(kind, types.BaseTuple):
@@ -112,7 +112,7 @@ def symbols(kind: Any, value: Any = None) -> Any:
 
 
 class Symbol:
-    """A value that the machine will know."""
+    """A value computed at run time."""
 
     __slots__ = ("type", "value")
 
@@ -150,7 +150,7 @@ for _name in ("bool", "int", "float", "index", "iter", "getattr", "pow", "rpow",
 
 
 class _Mathematics:
-    """``math``, of symbols too."""
+    """``math``, extended to symbols."""
 
     def __getattr__(self, name: str) -> Any:
         known = getattr(math, name)
@@ -168,7 +168,7 @@ def _shape(argument: Any) -> Any:
 
 
 class Formula:
-    """A helper in a trace: run on symbols if it is a formula, else called as numba has it (``plain``)."""
+    """A helper in a trace: executed on symbols if it is a formula, otherwise called as compiled by numba (``plain``)."""
 
     def __init__(self, function: FunctionType, plain: Any, *, called: bool) -> None:
         self.function, self.plain = function, plain
@@ -178,7 +178,7 @@ class Formula:
         self.known: dict[Any, bool] = {}
 
     def __call__(self, *arguments: Any, **named: Any) -> Any:
-        """Return what the helper makes of symbols and numbers."""
+        """Return the result of the helper for symbols and numbers."""
         trace = Trace.now
         if named:
             arguments = self.signature.bind(*arguments, **named).args
@@ -191,7 +191,7 @@ class Formula:
         if trace.builder is None and key not in self.known and not self.never:
             try:
                 result = self.function(*arguments)
-            except (NotAFormula, TypeError):  # what Python cannot do with symbols, numba may
+            except (NotAFormula, TypeError):  # not possible with symbols, perhaps with numba
                 self.known[key] = False
             else:
                 self.known[key] = True
@@ -202,18 +202,18 @@ class Formula:
 
 
 def _short_range(*bounds: Any) -> range:
-    """Return a range that a trace writes out; of one that is longer, or unknown, numba makes a loop."""
+    """Return a range to unroll; if it is longer, or not a constant, numba compiles a loop."""
     if any(isinstance(one, Symbol) for one in bounds) or len(range(*bounds)) > LONGEST:
         raise NotAFormula
     return range(*bounds)
 
 
 def _global(value: Any) -> Any:
-    """Return what a global name stands for in a trace."""
+    """Return the value of a global name in a trace."""
     if value is math:
         return _Mathematics()
     if isinstance(value, ModuleType):
-        return Symbol(None, None)  # refuses its attributes
+        return Symbol(None, None)  # its attributes are refused
     if hasattr(value, "formula"):
         return value.formula
     if isinstance(value, numba.core.dispatcher.Dispatcher | numba.extending._Intrinsic):
@@ -222,9 +222,9 @@ def _global(value: Any) -> Any:
 
 
 def traced(twin: FunctionType, plain: Any, *, called: bool) -> Any:
-    """Return what kernels call for a helper: its formula if it is one, else ``plain``, its dispatcher.
+    """Return the object that kernels call for a helper: its formula if it is one, else its dispatcher ``plain``.
 
-    ``twin`` is the function with globals that are compiled or traced; ``called``: it is long enough to be called by itself.
+    ``twin`` is the function with compiled or traced globals; ``called``: whether it is long enough not to be inlined.
     """
     names = {name: _global(value) for name, value in twin.__globals__.items()}
     if any(step.opname.startswith("JUMP_BACKWARD") for step in dis.get_instructions(twin)):

@@ -1,11 +1,11 @@
-"""Triangular factors of a covariance, on arrays: the square-root filter's two operations.
+"""Triangular factors of a covariance: the two operations of a square-root filter.
 
-A covariance is ``P = S Sᵀ`` with S *upper* triangular, held as its columns: row j of the array ``F`` is column j of S, so ``P = Fᵀ F`` and
-F is lower triangular. A state without process noise that comes last then costs the prediction nothing but its share of the attitude: a
-lower row of S has no noise to absorb and stays as it is.
+A covariance is ``P = S Sᵀ`` with S *upper* triangular, stored by columns: row j of the array ``F`` is column j of S, so ``P = Fᵀ F`` and F
+is lower triangular. With states without process noise last, the prediction does not change their rows of S, so they cost only their effect
+on the attitude.
 
-The first rows may be *loose*, full up to as many columns: a correction turns columns, and the next prediction brings them back to a
-triangle together with its noise. Rows are worked on eight columns at a time, so they are :func:`padded`, with zeros.
+The first rows may be *loose*, with as many full columns: a correction rotates columns, and the next prediction triangularises them together
+with its noise. Rows are processed eight columns at a time and therefore :func:`padded` with zeros.
 """
 
 from __future__ import annotations
@@ -17,25 +17,24 @@ import numpy as np
 from strapdown.kernels.lane_values import WIDTH, load, spread, store
 
 CALLED = ("triangularise", "take_rows", "variances", "covariances", "whole_bias")
-"""Not inlined where other kernels use them: their work is far more than a call, and each copy would be compiled anew."""
+"""Called, not inlined, by other kernels: a call costs little compared with their work, and each copy would be compiled again."""
 
 TAKEN = 7
-"""Rows of the work space of :func:`take_rows`."""
+"""Number of scratch rows of :func:`take_rows`."""
 _UNIT = np.repeat([0.0, 1.0, 0.0], [WIDTH, 1, WIDTH])
 
 
 def padded(n):
-    """Return the length of rows with room for n columns."""
+    """Return the length of rows with n columns."""
     return n + (WIDTH - 1) - (n + WIDTH - 1) % WIDTH
 
 
 def triangularise(F, last, loose, first_noise, end_noise, first_extra, end_extra, work):
-    """Bring the loose rows and the noise rows into the triangle, by Householder reflections: ``Fᵀ F`` stays.
+    """Triangularise F with its loose rows and noise rows by Householder reflections, which leave ``Fᵀ F`` unchanged.
 
-    Row i of the triangle absorbs, for i from ``last`` − 1 down to 0, column i of the loose rows above it and of the rows from
-    ``first_noise`` to ``end_noise``, which have nothing beyond column ``last``. The columns from ``first_extra``, a multiple of
-    ``WIDTH``, to ``end_extra`` go along: with the identity there beside the noise rows they end as the orthogonal matrix's own rows.
-    ``work`` is scratch as long as F is wide.
+    For i from ``last`` − 1 down to 0, column i of the loose rows above row i and of the rows from ``first_noise`` to ``end_noise``, which
+    are zero from column ``last``, is eliminated into row i. The columns from ``first_extra``, a multiple of ``WIDTH``, to ``end_extra`` are
+    transformed too: with an identity there in the noise rows, they end as rows of the orthogonal matrix. ``work`` is scratch of a row of F.
     """
     width = F.shape[1]
     for i in range(last - 1, -1, -1):
@@ -62,7 +61,7 @@ def triangularise(F, last, loose, first_noise, end_noise, first_extra, end_extra
         for c in range(first_extra, end_extra, WIDTH):
             w = scale * (column_products(F, i, c, begin, above, first, end_noise) + v * load(F, width * i + c))
             reflect(F, i, c, begin, above, first, end_noise, v, w)
-        # At last the eight with column i itself, which the others needed: its own share is 1, and then it ends as zeros to the bit.
+        # Last the eight with column i, which the others needed: with a factor of 1 it becomes exactly zero.
         w = scale * (seen + v * load(F, width * i + own))
         there = load(_UNIT, WIDTH - i % WIDTH)
         reflect(F, i, own, begin, above, first, end_noise, v, (w - there * w) + there)
@@ -91,12 +90,12 @@ def reflect(F, i, c, begin, above, first, end, v, w):
 
 
 def first_row(c, loose):
-    """Return the first row that may have something in the eight columns from c on: the six of attitude and bias have nothing beyond."""
+    """Return the first row that may be nonzero in the eight columns from c; rows of attitude and bias end before them."""
     return min(c, 6) if c < loose else c
 
 
 def seen_columns(H, size):
-    """Return the columns, beyond the attitude's, between which three rows have something."""
+    """Return the range of nonzero columns of three rows, beyond those of the attitude."""
     first, end = 3, size
     while end > first and H[0, end - 1] == 0.0 and H[1, end - 1] == 0.0 and H[2, end - 1] == 0.0:
         end -= 1
@@ -106,7 +105,7 @@ def seen_columns(H, size):
 
 
 def seen_by(F, j, H, first, end):
-    """Return the products of row j of F with three rows: columns of the attitude and from ``first`` to ``end``."""
+    """Return the products of row j of F with three rows, over the columns of the attitude and from ``first`` to ``end``."""
     a, b, c = F[j, 0], F[j, 1], F[j, 2]
     f0 = a * H[0, 0] + b * H[0, 1] + c * H[0, 2]
     f1 = a * H[1, 0] + b * H[1, 1] + c * H[1, 2]
@@ -121,12 +120,12 @@ def seen_by(F, j, H, first, end):
 def take_rows(F, size, loose, H, rows, y, variance, step, scratch):
     """Update with up to three independent measurements ``y[r] = H[r] · x + v``, Var v = ``variance[r]``: Carlson (1973), one after another.
 
-    Returns the innovations, each with what those before it corrected taken off, and their variances; ``step`` is left at the correction.
-    No difference of squares is formed, so the factor stays one however sharp the measurement (Bierman 1977, section V.3). Loose rows stay
-    loose. Rows of H (3, n or more) beyond ``rows`` are zero. ``scratch`` has ``TAKEN`` rows as long as F's.
+    Returns the innovations, each after the corrections by those before it, and their variances; writes the correction to ``step``. No
+    difference of squares is formed, so the factor is valid for any precision of the measurement (Bierman 1977, section V.3). Loose rows
+    stay loose. Rows of H (3, n or more) beyond ``rows`` are zero. ``scratch`` has ``TAKEN`` rows of the length of F's.
 
-    A measurement makes ``√k_j (F_j − t_j Σ w_i F_i)``, i < j, of row j of F. All go through F together, and the roots of the k_j are taken
-    at the end: what a measurement sees of rows that those before it have changed follows from what it sees of them unchanged.
+    A measurement replaces row j of F by ``√k_j (F_j − t_j Σ w_i F_i)``, i < j. All measurements are processed in one pass over F, with the
+    roots of the k_j at the end: the products of a measurement with updated rows follow from those with the original rows.
     """
     width = F.shape[1]
     first, end = seen_columns(H, size)
@@ -189,7 +188,7 @@ def take_rows(F, size, loose, H, rows, y, variance, step, scratch):
 
 
 def variances(F, size, out, row, work):
-    """Write the diagonal of ``Fᵀ F`` to a row of ``out``. ``work`` is scratch as long as F is wide."""
+    """Write the diagonal of ``Fᵀ F`` to a row of ``out``. ``work`` is scratch of a row of F."""
     width = F.shape[1]
     for c in range(0, width, WIDTH):
         products = spread(0.0)
@@ -202,7 +201,7 @@ def variances(F, size, out, row, work):
 
 
 def covariances(F, size, out, row, work):
-    """Write the first rows and columns of ``Fᵀ F``, as many as ``out`` has room for, to out[row]. ``work`` is scratch likewise."""
+    """Write the leading block of ``Fᵀ F``, of the size of out[row], to it. ``work`` is scratch of a row of F."""
     width = F.shape[1]
     first = out.shape[1]
     for a in range(first):
@@ -217,10 +216,10 @@ def covariances(F, size, out, row, work):
 
 
 def whole_bias(F, size, gyro, gyro_use, mark, variance_out, covariance_out, row, work):
-    """Write variances (6,), and the covariance (6, 6) where there is room for it, of attitude and *whole* gyro bias to a row.
+    """Write the variances (6,) and, if requested, the covariance (6, 6) of attitude and *whole* gyro bias to a row.
 
-    The whole bias is ``b + Σ c e`` over the states that are an offset of the gyro, those with the bit ``mark``; what else the gyro gets
-    wrong, by its scale or by the specific force, is none. ``work`` (6, 6) is scratch.
+    The whole bias is ``b + Σ c e`` over the states that are an offset of the gyro (bit ``mark``); errors by scale or specific force are not
+    part of it. ``work`` (6, 6) is scratch.
     """
     for a in range(6):
         for b in range(6):

@@ -1,15 +1,15 @@
 """Monte Carlo: many independent runs of one scenario through one filter, and sums over runs at each epoch.
 
-Memory grows with the number of epochs, not with the number of runs: runs are computed in chunks, and the chunks' sums are merged in their
+Memory grows with the number of epochs, not of runs: runs are computed in chunks, and the sums of the chunks are merged in their
 order, so the statistics do not depend on the number of threads, processes or hosts.
 
-- ``plan``: What is computed: :class:`Plan`, :class:`Dispersions`.
-- ``statistics``: Mergeable sums over runs: :class:`Statistics`; what a machine must return.
-- ``scalar``, ``lanes``: The machines: the general one, and the fast one over vectors of runs.
+- ``plan``: Definition of the computation: :class:`Plan`, :class:`Dispersions`.
+- ``statistics``: Mergeable sums over runs: :class:`Statistics`; requirements on a machine.
+- ``scalar``, ``lanes``: The machines that compute runs: the general one, and the fast one over SIMD vectors of runs.
 - ``engine``: Choosing a machine, threads, merging: :func:`run_plan`, :func:`run`, :func:`replay`.
 - ``verdicts``: Verdict and numbers from statistics, as a table: :func:`summary`.
-- ``campaign``: A run that survives being killed, and its file.
-- ``cluster``: Chunks on other processes and hosts, through Dask.
+- ``campaign``: A run with a checkpoint file, from which it can be resumed.
+- ``cluster``: Chunks on other processes and hosts, by Dask.
 - ``coning_study``: Integration error and consistency of the filter in coning motion: the command ``strapdown coning``.
 """
 
@@ -49,6 +49,6 @@ if TYPE_CHECKING:
 
 
 def __getattr__(name: str) -> Any:
-    if name in ("campaign", "cluster", "coning_study"):  # files and Dask load when they are needed
+    if name in ("campaign", "cluster", "coning_study"):  # imported on first use, for HDF5 and Dask
         return import_module(f"{__name__}.{name}")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,13 +1,11 @@
-"""A campaign and its file: a Monte Carlo that survives being killed, and goes on to the same bits.
+"""A campaign and its file: a Monte Carlo that can be resumed after being killed, with bitwise identical results.
 
-The file is HDF5 and whole at every moment: it is written beside and renamed over, so whoever opens it, during the campaign or after it was
-killed in the middle of writing, finds the statistics of the runs finished so far. It holds sums, not runs, so it does not grow with their
-number.
+The file is HDF5 and always complete: each version is written to a temporary file and renamed. A reader, during the campaign or after it was
+killed, finds the statistics of the runs finished until then. The file holds sums, not runs, so its size does not depend on their number.
 
-What is merged is a left fold over whole chunks in the order of their runs, which is a function of (plan, machine, chunk) alone. What a file
-needs beyond the merged statistics to go on is in its group ``resume``: chunks that were finished before others in front of them,
-``resume/<first run>``, and, where the last chunk is short, the fold without it, ``resume/whole``. So a finished campaign can be extended,
-and has the bits of one that was as long from the start.
+The statistics are a left fold over whole chunks in the order of their runs, which depends only on plan, machine and chunk. The group
+``resume`` holds what is needed to continue: chunks finished before earlier ones, ``resume/<first run>``, and, if the last chunk is short,
+the fold without it, ``resume/whole``. So an extended campaign is bitwise identical to one that was as long from the start.
 """
 
 from __future__ import annotations
@@ -44,20 +42,20 @@ __all__ = [
 KIND = "strapdown montecarlo"
 """The attribute ``kind`` of a campaign's file."""
 FORMAT = 1
-"""Version of the layout; a reader refuses a newer one."""
+"""Version of the layout; a newer one is refused."""
 SHARE = 0.1
-"""Largest share of the time that is spent writing the file; chunks that finish faster are written several at a time."""
+"""Maximum fraction of the time spent writing the file; fast chunks are written several at a time."""
 
 
 class _Array(NamedTuple):
     """An array of the statistics in the file."""
 
     shape: tuple[int | str, ...]
-    """Lengths that the plan gives are named."""
+    """Lengths; those defined by the plan are named."""
     meaning: str
     unit: str = "1"
     counts: bool = False
-    """Whether it holds whole numbers."""
+    """Whether it holds integers."""
 
 
 _ERROR, _PRODUCT = "rad (columns 0-2), rad/s (columns 3-5)", "rad^2, rad^2/s, (rad/s)^2"
@@ -67,7 +65,7 @@ _ARRAYS = {
     "finite": _Array(("epochs",), "runs whose error and covariance are finite numbers, by epoch", counts=True),
     "error_sum": _Array(("epochs", 6), "sum over runs of the error (dtheta, db)", _ERROR),
     "error_product_sum": _Array(("epochs", 6, 6), "sum over runs of error times its transpose", _PRODUCT),
-    "covariance_sum": _Array(("epochs", 6, 6), "sum over runs of the filter's own covariance", _PRODUCT),
+    "covariance_sum": _Array(("epochs", 6, 6), "sum over runs of the filter's covariance", _PRODUCT),
     "nees_sum": _Array(
         ("epochs", 3), "sum over runs of the NEES of the state (6 degrees of freedom), the attitude (3), the bias (3)"
     ),
@@ -82,7 +80,7 @@ _ARRAYS = {
     "worst_score": _Array(("worst",), "their largest NEES of the state"),
     "example_run": _Array(("examples",), "numbers of the example runs", counts=True),
     "example_error": _Array(("examples", "epochs", 6), "errors of the example runs by epoch", _ERROR),
-    "example_sigma": _Array(("examples", "epochs", 6), "the filter's own standard deviations in them", _ERROR),
+    "example_sigma": _Array(("examples", "epochs", 6), "the filter's standard deviations in the example runs", _ERROR),
 }
 """Arrays of the statistics by name."""
 
@@ -96,19 +94,19 @@ class Campaign(Listed):
     plan : Plan
         Scenario, filter and seed of the campaign.
     machine : {"lanes", "scalar"}
-        Machine that computes it.
+        Machine that computes the runs.
     reason : str
-        Why the lanes cannot compute it; empty where they do, or where the machine was chosen by name.
+        Why the lanes cannot compute it; empty if they do, or if the machine was chosen by name.
     chunk : int
-        Runs between merges.
+        Number of runs per chunk.
     runs : int
-        Number of runs wanted.
+        Total number of runs.
     statistics : Statistics or None
-        Of the runs finished so far, in their order without a gap; None if there is none.
+        Statistics of the finished runs from the first without a gap; None if there are none.
     version : str, optional
-        Version of this package that computed it. Default: the one that runs.
+        Version of this package that computed it. Default: the running one.
     arithmetic : str, default ""
-        Processor features that the bits depend on (:func:`strapdown.montecarlo.engine.arithmetic`); empty in files of earlier versions.
+        Processor features that the rounding depends on (:func:`strapdown.montecarlo.engine.arithmetic`); empty for earlier versions.
     seconds : float, default 0.0
         Time spent computing, s, over all resumptions.
     """
@@ -124,20 +122,20 @@ class Campaign(Listed):
     seconds: float = 0.0
 
     def listing(self) -> Listing:
-        """Return the statistics of the runs finished so far as a table."""
+        """Return the statistics of the finished runs as a table."""
         if self.statistics is None:
             return Listing(f"Monte Carlo of {self.runs} runs, none of them finished", (), ())
         return self.statistics.listing()
 
     @property
     def finished(self) -> bool:
-        """Whether all runs wanted are in the statistics."""
+        """Whether the statistics contain all runs."""
         return self.statistics is not None and self.statistics.runs == self.runs
 
 
 @dataclass
 class _Progress:
-    """Finished chunks: the fold over whole chunks from the first on, and chunks finished early, by their first run."""
+    """Finished chunks: the fold over whole chunks from the first, and chunks finished before earlier ones, by first run."""
 
     whole: Statistics | None
     early: dict[int, Statistics]
@@ -145,11 +143,11 @@ class _Progress:
 
     @property
     def merged(self) -> int:
-        """Runs in the fold."""
+        """Number of runs in the fold."""
         return 0 if self.whole is None else self.whole.runs
 
     def take(self, first_run: int, part: Statistics) -> None:
-        """Take a finished chunk."""
+        """Add a finished chunk."""
         self.early[first_run] = part
         while self.merged in self.early and self.early[self.merged].runs == self.chunk:
             first = self.merged
@@ -165,7 +163,7 @@ class _Progress:
         return last if self.whole is None else merge(self.whole, last)
 
     def missing(self, runs: int) -> Chunks:
-        """Return the chunks that are left to compute, and forget a short one that is to be a longer one now."""
+        """Return the chunks left to compute; a short last chunk is dropped if it is to be longer now."""
         for first in [first for first, part in self.early.items() if part.runs != min(self.chunk, runs - first)]:
             del self.early[first]
         left = range(self.merged, runs, self.chunk)
@@ -185,43 +183,43 @@ def run(
     workers: Workers | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Campaign:
-    """Run a plan and keep what is finished in a file, so that it survives interruptions.
+    """Run a plan with a checkpoint file, from which an interrupted run can be resumed.
 
     Parameters
     ----------
     plan : Plan
         Scenario, filter and seed.
     path : path
-        HDF5 file. Finished chunks are written at intervals that keep the time spent on writing below a tenth; Ctrl-C writes all.
+        HDF5 file. Finished chunks are written at intervals, so that writing takes below a tenth of the time, and on Ctrl-C.
     runs : int
-        Total number of runs; more than a file holds extends it.
+        Total number of runs; if more than the file holds, it is extended.
     resume : bool, default False
-        Continue from the file if it exists; it must be of the same plan, machine, chunk and version.
+        Continue from the file if it exists; plan, machine, chunk and version must be the same.
     overwrite : bool, default False
-        Start anew although the file exists.
+        Overwrite the file if it exists.
     chunk : int, optional
-        Runs between merges; default the file's, or the machine's.
+        Number of runs per chunk. Default: that of the file, or of the machine.
     machine, threads, workers : optional
-        As of :func:`strapdown.montecarlo.run_plan`.
+        See :func:`strapdown.montecarlo.run_plan`.
     progress : callable, optional
-        Called with the number of runs just finished, first with those that the file held.
+        Called with the number of runs just finished, first with the number in the file.
 
     Returns
     -------
     Campaign
-        All runs finished, as the file holds it.
+        The finished campaign, as stored in the file.
 
     Raises
     ------
     InputError
-        If the file exists and is neither to be resumed nor overwritten, or is of another plan, or is no campaign.
+        If the file exists without ``resume`` or ``overwrite``, is of another plan, or is no campaign.
     """
     target = Path(path)
     count("runs", runs)
     table = plan.to_table()
     if target.exists() and not resume and not overwrite:
         raise InputError(
-            f"{target} exists; go on with it (--resume; resume=True in Python), write over it (--overwrite; overwrite=True), or choose "
+            f"{target} exists; continue it (--resume; resume=True in Python), overwrite it (--overwrite; overwrite=True), or choose "
             "another name"
         )
     chosen = choose(plan, machine)
@@ -262,11 +260,11 @@ def _compute(
     write: Callable[[], Campaign],
     progress: Callable[[int], None] | None,
 ) -> Campaign:
-    """Compute the chunks that are missing; write at once, then at intervals, and whatever ends the work; return what was written last."""
+    """Compute the missing chunks; write at once, at intervals, and at the end or an exception; return the last written state."""
     missing = state.missing(runs)
     if progress is not None and (done := runs - sum(n for _, n in missing)):
         progress(done)
-    written = write()  # so that a file that cannot be written is found before anything is computed
+    written = write()  # fails before anything is computed if the file cannot be written
     due, unwritten = 0.0, False
     try:
         for place, (part,) in hands(work, missing):
@@ -284,7 +282,7 @@ def _compute(
 
 
 def _need_same(target: Path, held: Campaign, plan: Plan, machine: str, chunk: int, runs: int) -> None:
-    """Refuse to go on with a file of another plan; name the first difference."""
+    """Raise if the file is of another plan, naming the first difference."""
     given = {**_flat(plan.to_table()), "machine": machine, "chunk": chunk, "version": strapdown.__version__}
     there = {**_flat(held.plan.to_table()), "machine": held.machine, "chunk": held.chunk, "version": held.version}
     if held.arithmetic:
@@ -292,16 +290,16 @@ def _need_same(target: Path, held: Campaign, plan: Plan, machine: str, chunk: in
     for name in sorted(given.keys() | there.keys()):
         if given.get(name) != there.get(name):
             raise InputError(
-                f"{target} is of another campaign: {name} is {there.get(name, 'not given')} there and {given.get(name, 'not given')} here; "
-                "give what it was begun with, or choose another file"
+                f"{target} is of another campaign; {name} is {there.get(name, 'not given')} there and {given.get(name, 'not given')} here; "
+                "give the value in the file, or choose another file"
             )
     finished = 0 if held.statistics is None else held.statistics.runs
     if runs < finished:
-        raise InputError(f"{target} holds {finished} runs already, more than the {runs} wanted; ask for more of them")
+        raise InputError(f"{target} holds {finished} runs already, more than the {runs} wanted; give more runs")
 
 
 def _flat(table: Mapping[str, Any], place: str = "") -> dict[str, Any]:
-    """Return nested tables and lists of tables as one, names joined by dots."""
+    """Return nested tables and lists of tables flattened, names joined by dots."""
     result: dict[str, Any] = {}
     for name, value in table.items():
         inner = f"{place}{name}"
@@ -319,10 +317,10 @@ def _flat(table: Mapping[str, Any], place: str = "") -> dict[str, Any]:
 
 @contextlib.contextmanager
 def _replacing(path: Path) -> Iterator[Path]:
-    """Yield a temporary file that replaces ``path`` on success, safe on the disk before.
+    """Yield a temporary file that replaces ``path`` on success, flushed to disk before.
 
-    Its name is always the same, unlike that of :func:`strapdown.files.written_beside`: of many commits, killed at any moment, at most one
-    such file is left, and the next commit takes it. The lock that :func:`run` holds keeps other processes from it.
+    Its name is always the same, unlike that of :func:`strapdown.files.written_beside`: a process killed while writing leaves at most one
+    such file, which the next write overwrites. The lock that :func:`run` holds keeps other processes away.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.part")
@@ -393,7 +391,7 @@ def _put_statistics(group: Any, statistics: Statistics) -> None:
 
 
 def _statistics_of(group: Any, plan: Plan) -> Statistics:
-    """Return the statistics in a group, whose shapes must be those of a plan with these epochs and sensors."""
+    """Return the statistics in a group; their shapes must be those of the plan."""
     attributes = reading.attributes(group)
     arrays = {name: reading.numbers(group, name) for name in _ARRAYS}
     place = f"{group.file.filename}: {group.name.lstrip('/')}"
@@ -407,16 +405,16 @@ def _statistics_of(group: Any, plan: Plan) -> Statistics:
     }
     for name, value in arrays.items():
         wanted = tuple(lengths[n] if isinstance(n, str) else n for n in _ARRAYS[name].shape)
-        sums = _ARRAYS[name].shape[0] == "epochs" and name != "time"  # over runs whose numbers are finite
+        sums = _ARRAYS[name].shape[0] == "epochs" and name != "time"  # sums over finite runs
         if value.shape != wanted or (sums and not np.isfinite(value).all()):
             raise InputError(
-                f"{place}: {name} has shape {value.shape}, wanted {wanted}, or is not finite; it is damaged: run the campaign anew"
+                f"{place}: {name} has shape {value.shape}, wanted {wanted}, or is not finite; it is damaged: run the campaign again"
             )
         if value.dtype.kind != ("i" if _ARRAYS[name].counts else "f"):
-            raise InputError(f"{place}: {name} is of type {value.dtype}; the file is damaged: run the campaign anew")
+            raise InputError(f"{place}: {name} is of type {value.dtype}; the file is damaged: run the campaign again")
     names = tuple(reading.from_json(attributes["sensors"], f"{place}: sensors"))
     if names != plan.sensors:
-        raise InputError(f"{place}: sensors are {names}, those of the plan {plan.sensors}; run the campaign anew")
+        raise InputError(f"{place}: sensors are {names}, those of the plan {plan.sensors}; run the campaign again")
     return Statistics(runs=count(f"{place}: runs", attributes["runs"]), sensors=names, **arrays)
 
 
@@ -431,7 +429,7 @@ def read(path: str | os.PathLike[str]) -> Campaign:
     Returns
     -------
     Campaign
-        With the statistics of the runs finished so far.
+        The campaign with the statistics of the finished runs.
     """
     return _stored(Path(path))[0]
 
@@ -443,11 +441,11 @@ def _stored(path: Path) -> tuple[Campaign, _Progress]:
             raise InputError(f"{path} is no Monte Carlo campaign; `strapdown montecarlo` writes one")
         if count("format", attributes["format"]) > FORMAT:
             raise InputError(
-                f"{path} has format {attributes['format']}, newer than this package knows; install strapdown {attributes['version']}"
+                f"{path} has format {attributes['format']}, newer than this package supports; install strapdown {attributes['version']}"
             )
         plan = from_table(reading.from_json(attributes["plan"], f"{path}: plan"))
         if attributes["digest"] != plan.digest:
-            raise InputError(f"{path}: digest is not that of the plan; the file is damaged: run the campaign anew")
+            raise InputError(f"{path}: digest is not that of the plan; the file is damaged: run the campaign again")
         campaign = Campaign(
             plan=plan,
             machine=one_of("machine", attributes["machine"], MACHINES),
@@ -468,7 +466,7 @@ def _stored(path: Path) -> tuple[Campaign, _Progress]:
 
 
 def _whole(campaign: Campaign, early: Mapping[str, Any]) -> Statistics | None:
-    """Return the fold over whole chunks where the file does not hold it by itself: the statistics, unless they are one short chunk."""
+    """Return the fold over whole chunks if the file has no ``resume/whole``: the statistics, unless they are one short chunk."""
     if campaign.statistics is None or "0" in early:
         return None
     return campaign.statistics

@@ -1,13 +1,12 @@
 """Chunks on other processes and hosts, through Dask distributed (the extra ``cluster``).
 
-The same chunks give the same bits on processors of one kind (:func:`strapdown.montecarlo.engine.arithmetic`); Dask gives a chunk that was
-lost with its worker to another one.
+Chunks are bitwise identical on processors of one kind (:func:`strapdown.montecarlo.engine.arithmetic`); Dask reassigns the chunk of a lost
+worker.
 
-Trust: client, scheduler and workers send each other pickles, so each of them can run any code on the others. Name only a scheduler that you
-would let log in to your account. Plain ``tcp://`` is neither encrypted nor authenticated; across a network that others share use
-``tls://`` with Dask's own configuration of certificates, which passes through: ``distributed.comm.tls.ca-file``, ``.client.cert`` and
-``.client.key`` in a file of ``~/.config/dask``, or the environment variables ``DASK_DISTRIBUTED__COMM__TLS__CA_FILE``,
-``DASK_DISTRIBUTED__COMM__TLS__CLIENT__CERT`` and ``…__CLIENT__KEY``.
+Security: client, scheduler and workers exchange pickles, so each can run any code on the others. Use only a scheduler that you trust with
+your account. Plain ``tcp://`` is neither encrypted nor authenticated; on a shared network use ``tls://`` with Dask's own configuration of
+certificates: ``distributed.comm.tls.ca-file``, ``.client.cert`` and ``.client.key`` in a file of ``~/.config/dask``, or the environment
+variables ``DASK_DISTRIBUTED__COMM__TLS__CA_FILE``, ``DASK_DISTRIBUTED__COMM__TLS__CLIENT__CERT`` and ``…__CLIENT__KEY``.
 """
 
 from __future__ import annotations
@@ -33,15 +32,15 @@ CONNECT_SECONDS = 15
 
 @contextlib.contextmanager
 def dask_client(*, workers: int | None = None, address: str | None = None) -> Iterator[Any]:
-    """Yield a Dask client: of worker processes on this host, one thread each, or of the scheduler at an address.
+    """Yield a Dask client: with worker processes of one thread each on this host, or of the scheduler at an address.
 
     Parameters
     ----------
     workers : int, optional
         Number of processes on this host.
     address : str, optional
-        Of a running scheduler, ``tcp://HOST:8786`` or ``tls://HOST:8786``. Scheduler and workers can run any code here: name only one that
-        you trust.
+        Address of a running scheduler, ``tcp://HOST:8786`` or ``tls://HOST:8786``. Scheduler and workers can run any code here: use only
+        one that you trust.
 
     Yields
     ------
@@ -50,12 +49,12 @@ def dask_client(*, workers: int | None = None, address: str | None = None) -> It
     Raises
     ------
     InputError
-        If both are given, Dask is not installed, or nothing answers at the address.
+        If both are given, Dask is not installed, or no scheduler answers at the address.
     """
     distributed = _distributed()
     if address is not None:
         if workers is not None:
-            raise InputError("workers and cluster exclude each other: the cluster has workers of its own; give one")
+            raise InputError("workers and cluster exclude each other: the cluster has its own workers; give only one")
         try:
             client = distributed.Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
         except (OSError, ValueError, TypeError) as error:
@@ -72,7 +71,7 @@ def dask_client(*, workers: int | None = None, address: str | None = None) -> It
         threads_per_worker=1,
         processes=True,
         memory_limit=0,
-        dashboard_address="127.0.0.1:0",  # the port that is free; there is no turning it off
+        dashboard_address="127.0.0.1:0",  # any free port; the dashboard cannot be turned off
         silence_logs="ERROR",
     )
     with cluster, distributed.Client(cluster, set_as_default=False) as client:
@@ -82,12 +81,12 @@ def dask_client(*, workers: int | None = None, address: str | None = None) -> It
 def on_dask(client: Any) -> Workers:
     """Return workers that compute chunks of runs through a Dask client.
 
-    Workers may come and go meanwhile. At most two chunks are submitted ahead for each thread.
+    Workers may join and leave during the work. At most two chunks per thread are submitted ahead.
 
     Parameters
     ----------
     client : distributed.Client
-        Connected to the workers, such as :func:`dask_client` yields it.
+        Client connected to the workers, for instance of :func:`dask_client`.
 
     Returns
     -------
@@ -102,7 +101,7 @@ def on_dask(client: Any) -> Workers:
     distributed = _distributed()
 
     def work_through(work: Work, chunks: Chunks) -> Iterator[tuple[int, Parts]]:
-        payload = distributed.protocol.pickle.dumps(work)  # by value where a class or function is the user's own
+        payload = distributed.protocol.pickle.dumps(work)  # the user's classes and functions are pickled by value
         window = Window(len(chunks), 2 * max(1, sum(client.nthreads().values())))
         places: dict[Any, int] = {}
         finished = distributed.as_completed(loop=client.loop)
@@ -121,7 +120,7 @@ def on_dask(client: Any) -> Workers:
                     )
                 if features != arithmetic():
                     raise InputError(
-                        f"a worker computes on {features}, this process on {arithmetic()}, which round differently; take workers "
+                        f"a worker computes on {features}, this process on {arithmetic()}, which round differently; use workers "
                         "of one kind and start the campaign on such a machine"
                     )
                 window.finish(place)
@@ -138,7 +137,7 @@ def _result(distributed: Any, future: Any, chunk: tuple[int, int]) -> tuple[str,
         result: tuple[str, str, Parts] = future.result()
     except distributed.KilledWorker:
         raise InputError(
-            f"{runs} were lost with one worker after the other: they end where this chunk runs; look at their logs, memory first"
+            f"{runs} were lost because every worker that computed them died; check the workers' logs and memory"
         ) from None
     except ModuleNotFoundError as error:
         raise InputError(
@@ -148,13 +147,13 @@ def _result(distributed: Any, future: Any, chunk: tuple[int, int]) -> tuple[str,
 
 
 def _chunk(payload: bytes, first_run: int, runs: int) -> tuple[str, str, Parts]:
-    """Compute a chunk on a worker; return it with the version and arithmetic that it was computed with."""
+    """Compute a chunk on a worker; return it with the worker's version and arithmetic."""
     return strapdown.__version__, arithmetic(), _work(payload)(first_run, runs)
 
 
 @functools.lru_cache(maxsize=4)
 def _work(payload: bytes) -> Work:
-    """Return what was sent, one object for all its chunks, so that a machine prepares a plan once a worker."""
+    """Return the unpickled work, one object for all chunks of a worker, so that a plan is prepared once per worker."""
     work: Work = pickle.loads(payload)
     return work
 

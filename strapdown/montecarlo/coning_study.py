@@ -1,7 +1,8 @@
-"""The coning study: what commutation error does to integration, and what a filter makes of it.
+"""The coning study: effect of the commutation error on integration and on a filter.
 
-Under coning motion, equation (18), an integration algorithm errs by a constant rate along the cone's axis. A filter that estimates gyro
-bias cannot distinguish that rate from a bias: its attitude stays good, its bias is wrong by the drift, and only the bias NEES says so.
+Under coning motion, equation (18), the error of an integration algorithm is a constant rate along the cone's axis. A filter that estimates
+gyro bias cannot distinguish that rate from a bias: its attitude is accurate, its bias is in error by the drift, and only the bias NEES
+shows it.
 """
 
 from __future__ import annotations
@@ -39,10 +40,10 @@ ALGORITHMS = ("one-sample", "two-sample", "three-sample", "four-sample", "matche
 """Integration algorithms that the study compares, by name in :data:`strapdown.coning.ALGORITHMS`."""
 
 STEP_MULTIPLE = 12
-"""Samples between measurements and epochs are a multiple of this, so that they end on whole steps of 1, 2, 3, 4, 6 or 12 samples; of a step
-of one's own the least common multiple.
+"""The number of samples between measurements, and between epochs, is a multiple of this, so that they are at the ends of steps of 1, 2, 3,
+4, 6 or 12 samples; for user-defined steps the least common multiple.
 
-A compressed step split in its middle would be taken for a turn at constant rate, which under coning it is not."""
+A coning-compensated step divided in its middle would be treated as a rotation at constant rate, which it is not under coning."""
 
 EPOCHS = 100
 VERDICT_EPOCHS = 20
@@ -50,7 +51,7 @@ VERDICT_EPOCHS = 20
 
 @dataclass(frozen=True, kw_only=True)
 class ConingParameters:
-    """Parameters of the study, SI and radians. The defaults show its point: the gyro is sampled only ten times a cycle.
+    """Parameters of the study, SI and radians. By default the gyro is sampled only ten times per coning cycle.
 
     Parameters
     ----------
@@ -59,11 +60,11 @@ class ConingParameters:
     frequency : float, default 10.0
         Coning frequency, Hz.
     rate : float, default 100.0
-        Gyro samples a second, Hz.
+        Gyro sample rate, Hz.
     duration : float, default 240.0
-        Length of each run, s; rounded to whole epochs.
+        Duration of each run, s; rounded to whole epochs.
     runs : int, default 100
-        Runs of the Monte Carlo.
+        Number of Monte Carlo runs.
     seed : int, default 1
         Seed of the Monte Carlo.
     angle_random_walk : float, default 0.08 °/√h
@@ -71,15 +72,15 @@ class ConingParameters:
     rate_random_walk : float, default 1 °/h/√h
         Rate random walk σ_u of the gyro, rad/s/√s.
     direction_sigma : float, default 20″
-        Noise of each component of two measured directions, rad, about once a second.
+        σ of each component of two measured directions, rad, about once per second.
     attitude_sigma : float, default 200″
         σ of the initial attitude error, each body axis, rad.
     bias_sigma : float, default 20 °/h
         σ of the initial bias error, each body axis, rad/s.
     probability : float, default 0.99
-        Probability content of all bounds.
+        Probability of all bounds for a consistent filter.
     own : tuple of Algorithm, default ()
-        Algorithms of one's own, compared beside those of the package.
+        User-defined algorithms, compared with those of the package.
     """
 
     angle: float = 0.7 * DEGREE
@@ -119,28 +120,28 @@ class ConingParameters:
         names = [one.name for one in self.algorithms]
         if len(set(names)) < len(names):
             raise InputError(
-                f"own holds an algorithm of a name that is among {', '.join(names)} already; give it another"
+                f"own has an algorithm whose name is already one of {', '.join(names)}; give it another name"
             )
 
     @property
     def algorithms(self) -> tuple[coning.Algorithm, ...]:
-        """Algorithms compared: the package's (:data:`ALGORITHMS`), then one's own."""
+        """Algorithms compared: the package's (:data:`ALGORITHMS`), then ``own``."""
         return (*(coning.ALGORITHMS[name] for name in ALGORITHMS), *self.own)
 
     @property
     def step_multiple(self) -> int:
-        """Least common multiple of :data:`STEP_MULTIPLE` and one's own steps."""
+        """Least common multiple of :data:`STEP_MULTIPLE` and the steps of ``own``."""
         return math.lcm(STEP_MULTIPLE, *(one.samples for one in self.own))
 
     @property
     def samples(self) -> int:
-        """Gyro samples in a run: the duration, rounded to a multiple of ``EPOCHS`` times :attr:`step_multiple`."""
+        """Gyro samples in a run: the duration rounded to a multiple of ``EPOCHS`` times :attr:`step_multiple`."""
         block = EPOCHS * self.step_multiple
         return block * max(1, round(self.duration * self.rate / block))
 
     @property
     def measurement_interval(self) -> float:
-        """Interval of the direction measurements, s: about a second, in whole steps."""
+        """Interval of the direction measurements, s: about one second, in whole steps."""
         return self.step_multiple * max(1, round(self.rate / self.step_multiple)) / self.rate
 
     @property
@@ -168,7 +169,7 @@ class Drift:
     measured: float
     """Measured drift of a long noise-free run against the closed form."""
     predicted: float
-    """Drift by the formula; NaN where it does not apply."""
+    """Drift by the formula; NaN if it does not apply."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -195,7 +196,7 @@ class FilterOutcome:
         """Return the outcome in degrees and hours, as in ``coning.json``. ANEES and NIS are per degree of freedom.
 
         RMS errors are over the judged epochs and axes; ``anees`` is the mean over the judged epochs and its bounds are those of one epoch.
-        The verdict holds every epoch against simultaneous bounds.
+        The verdict compares every epoch with simultaneous bounds.
         """
         statistics = self.statistics
         verdicts = {
@@ -240,7 +241,7 @@ class ConingStudy:
     drifts : tuple of Drift
         Drift of each algorithm, measured and predicted, rad/s along the cone's axis.
     outcomes : tuple of FilterOutcome
-        Statistics of the filter on the increments of each algorithm.
+        Statistics of the filter with each algorithm.
     """
 
     parameters: ConingParameters
@@ -248,12 +249,12 @@ class ConingStudy:
     outcomes: tuple[FilterOutcome, ...]
 
     def summary(self) -> dict[str, Any]:
-        """Return the study as ``coning.json`` holds it: degrees, hours, arcseconds, with the unit in each key.
+        """Return the study as in ``coning.json``: degrees, hours, arcseconds, with the unit in each key.
 
         Returns
         -------
         dict
-            Plain values for JSON: ``scenario``, ``integration`` (drifts), ``filter`` (outcomes), and ``own`` where there is any.
+            Plain values for JSON: ``scenario``, ``integration`` (drifts), ``filter`` (outcomes), and ``own`` if there is any.
         """
         p = self.parameters
         return {
@@ -287,10 +288,10 @@ class ConingStudy:
 
 
 def own_summary(algorithm: coning.Algorithm) -> dict[str, Any]:
-    """Return what follows from the coefficients of an algorithm of one's own, beside the best that as many increments allow.
+    """Return properties of the coefficients of a user-defined algorithm, with the best possible for its number of increments.
 
-    ``drift_constant`` is C of the leading drift −C β² ω λ^``drift_order``, as a fraction and as a number; the best has drift order 2M and
-    the constant (M!)²/(2 (2M+1)!), M increments in the window.
+    ``drift_constant`` is C of the leading drift −C β² ω λ^``drift_order``, as a fraction and as a number. The best has drift order 2M and
+    the constant (M!)²/(2 (2M+1)!), where M is the number of increments in the window.
     """
     m = algorithm.window
     return {
@@ -305,10 +306,10 @@ def own_summary(algorithm: coning.Algorithm) -> dict[str, Any]:
 
 
 def predicted_drift(motion: Coning, rate: float, algorithm: coning.Algorithm) -> float:
-    """Return the drift that theory predicts, rad/s along the cone's axis.
+    """Return the theoretical drift, rad/s along the cone's axis.
 
-    Of one sample a step exactly; else the whole power series of the part in β², which begins with ``−c_M β² ω λ^{2M}``, λ = ω/rate.
-    What is left out is the floor in β⁴ of rotation-vector forms. NaN where the series does not serve, λ > 1.
+    Exact for one sample per step; otherwise the full power series of the part in β², which begins with ``−c_M β² ω λ^{2M}``, λ = ω/rate.
+    The term in β⁴ of rotation-vector forms is neglected. NaN where the series does not apply, λ > 1.
     """
     ratio = 2.0 * np.pi * motion.frequency / rate
     if algorithm.name == "one-sample":
@@ -321,8 +322,8 @@ def predicted_drift(motion: Coning, rate: float, algorithm: coning.Algorithm) ->
 def measured_drift(motion: Coning, rate: float, algorithm: coning.Algorithm, steps: int = 60_000) -> float:
     """Return the drift of noise-free integration against the closed form, rad/s along the cone's axis: estimated minus true.
 
-    Drift turns the estimate about the fixed z axis at a constant rate; the run ends where coning cycles and steps have come closest
-    together, so that the periodic error does not enter, or earlier if the estimate would turn by more than a radian.
+    Drift rotates the estimate about the fixed z axis at a constant rate. The run ends where coning cycles and steps most nearly coincide,
+    so that the periodic error cancels, or earlier if the estimate would rotate by more than a radian.
     """
     expected = abs(coning.predicted_coning_drift(algorithm, motion.angle, motion.frequency, 1.0 / rate))
     step = algorithm.samples / rate
@@ -338,11 +339,11 @@ def measured_drift(motion: Coning, rate: float, algorithm: coning.Algorithm, ste
 def step_drift(motion: Coning, rate: float, algorithm: coning.Algorithm) -> float:
     """Return the drift of noise-free integration at any coning frequency, rad/s along the cone's axis: estimated minus true.
 
-    One step seen from axes that turn with the coning, ``F = δq ⊗ R_z(ωT)``, is the same for all steps, so the error over many is that of
-    its angle, ωT for the truth. No run is averaged over, and the periodic error does not enter.
+    One step in axes that rotate with the coning, ``F = δq ⊗ R_z(ωT)``, is the same for all steps, so the error over many follows from its
+    angle, ωT for the truth. No averaging over a run is needed, and the periodic error does not enter.
     """
     n, h = algorithm.samples, 1.0 / rate
-    # A step far enough from the ends of a short record for its window to lie inside it, and for the record not to count as short.
+    # A step whose window lies inside the record, in a record long enough not to be treated as short.
     place = -(-algorithm.window // n)
     steps = 2 * place + 1
     edges = np.arange(steps * n + 1) * h
@@ -369,7 +370,7 @@ MANOEUVRES: dict[str, Motion] = {
     ),
     "tumble free of torque": TorqueFree(inertia=(1.0, 2.0, 2.5), initial_rate=(1.0, 2.0, 0.5)),
 }
-"""Motions other than coning over which integration errs, 2 s of each (:func:`manoeuvre_error`)."""
+"""Motions other than coning with integration errors, 2 s of each (:func:`manoeuvre_error`)."""
 MANOEUVRE_SECONDS = 2.0
 
 
@@ -382,7 +383,7 @@ def manoeuvre_error(motion: Motion, rate: float, algorithm: coning.Algorithm) ->
 
 
 def run(parameters: ConingParameters, *, progress: Callable[[int], None] | None = None) -> ConingStudy:
-    """Run the coning study: drift by algorithm, and the same filter on the increments of each.
+    """Run the coning study: drift of each algorithm, and the same filter with each.
 
     Parameters
     ----------
@@ -394,7 +395,7 @@ def run(parameters: ConingParameters, *, progress: Callable[[int], None] | None 
     Returns
     -------
     ConingStudy
-        Drift of each algorithm, and the statistics of the filter with it on the same runs.
+        Drift of each algorithm, and statistics of the filter with it over the same runs.
 
     References
     ----------
@@ -426,7 +427,7 @@ def run(parameters: ConingParameters, *, progress: Callable[[int], None] | None 
     statistics = montecarlo.run(
         scenario, setups, runs=parameters.runs, seed=parameters.seed, epochs=EPOCHS, progress=progress
     )
-    # The first verdict epoch comes late enough for the bias to have been seen.
+    # The first judged epoch is late enough for the bias to have been observed.
     epochs = np.linspace(EPOCHS // VERDICT_EPOCHS, EPOCHS, VERDICT_EPOCHS).astype(int)
     outcomes = tuple(
         FilterOutcome(integration=algorithm.name, statistics=part, probability=parameters.probability, epochs=epochs)

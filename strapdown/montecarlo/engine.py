@@ -19,38 +19,38 @@ from strapdown.records import Origin
 from strapdown.scenarios import Scenario
 
 Parts = tuple[Statistics, ...]
-"""Statistics of the same runs, one a plan."""
+"""Statistics of the same runs, one per plan."""
 
 MACHINES = ("lanes", "scalar")
 """Machines, the fast one first."""
 
 AHEAD = 4
-"""Chunks a worker may be ahead of the first unfinished one: what bounds the memory where chunks finish out of order."""
+"""Maximum number of chunks per worker ahead of the first unfinished one; bounds the memory."""
 
 
 def machine_named(name: str) -> Any:
-    """Return a machine by name: a module as :mod:`strapdown.montecarlo.statistics` describes it."""
+    """Return a machine by name: a module as described in :mod:`strapdown.montecarlo.statistics`."""
     one_of("machine", name, MACHINES)
     return scalar if name == "scalar" else importlib.import_module("strapdown.montecarlo.lanes")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Choice:
-    """The machine that computes a plan, and why not a faster one."""
+    """The machine that computes a plan, and the reason for not using a faster one."""
 
     machine: str
     reason: str = ""
-    """What the lanes do not cover; empty where they cover all, or where the machine was asked for."""
+    """Terms that the lanes do not cover; empty if they cover all, or if the machine was given."""
 
     def __str__(self) -> str:
-        """Return it as one line."""
+        """Return the choice as one line."""
         return f"{self.machine} (lanes do not cover {self.reason})" if self.reason else self.machine
 
 
 def choose(plan: Plan, machine: str = "auto") -> Choice:
-    """Return the machine that computes a plan: the lanes if every term is among theirs, else the scalar one.
+    """Return the machine that computes a plan: the lanes if they cover all its terms, else the scalar one.
 
-    The choice depends on the plan alone, because the machines draw different noise.
+    The choice depends only on the plan, because the machines draw different noise.
     """
     one_of("machine", machine, ("auto", *MACHINES))
     reasons: dict[str, str] = {}
@@ -64,14 +64,14 @@ def choose(plan: Plan, machine: str = "auto") -> Choice:
         reasons[name] = reason
     refusals = "; ".join(f"{name}: {reason}" for name, reason in reasons.items())
     raise InputError(
-        f"no machine covers this plan ({refusals}); take a plainer filter or scenario, or precision float64"
+        f"no machine covers this plan ({refusals}); use a simpler filter or scenario, or precision float64"
     )
 
 
 def arithmetic() -> str:
-    """Return what the bits of a result depend on besides the plan: the processor's family, its vectors and fused multiply-add.
+    """Return the processor features that rounding depends on: its family, vectors and fused multiply-add.
 
-    Numba contracts products and sums where the processor can, and lanes follow the width of its vectors.
+    Numba contracts products and sums if the processor can, and the number of lanes follows the width of its vectors.
     """
     import platform
 
@@ -85,14 +85,14 @@ def arithmetic() -> str:
 
 
 def replay(plan: Plan, run: int, *, machine: str = "auto") -> Replay:
-    """Compute one run of a plan again, in full detail; it is bitwise what it was in the campaign.
+    """Compute one run of a plan again in full detail, bitwise identical to that of the campaign.
 
     Parameters
     ----------
     plan : Plan
         Plan of the campaign.
     run : int
-        Number of the run, from 0.
+        Index of the run, from 0.
     machine : {"auto", "lanes", "scalar"}
 
     Returns
@@ -103,7 +103,7 @@ def replay(plan: Plan, run: int, *, machine: str = "auto") -> Replay:
     found: Replay = machine_named(choose(plan, machine).machine).replay(plan, count("run", run, minimum=0))
     spec = scalar.dispersed(plan.scenario.gyro, plan.dispersions, plan.seed, run)
     of_this_run = plan.scenario
-    if spec is not plan.scenario.gyro:  # dispersed, and so no preset any more
+    if spec is not plan.scenario.gyro:  # dispersed, so no longer a preset
         of_this_run = replace(plan.scenario, gyro=spec, gyro_preset="")
     origin = Origin(gyro=spec, scenario=of_this_run, seed=plan.seed, run=run)
     return replace(found, record=replace(found.record, origin=origin))
@@ -111,12 +111,12 @@ def replay(plan: Plan, run: int, *, machine: str = "auto") -> Replay:
 
 @dataclass(frozen=True)
 class Chunks:
-    """Chunks as (first run, runs), worked out when asked for: a list of them would grow with the number of runs."""
+    """Chunks as (first run, runs), computed on access, because a list would grow with the number of runs."""
 
     firsts: Sequence[int]
-    """First run of each."""
+    """First run of each chunk."""
     runs: int
-    """Runs of the whole campaign, at which the last chunk ends."""
+    """Total number of runs."""
     chunk: int
 
     def __len__(self) -> int:
@@ -140,11 +140,11 @@ class Work:
     """Function that computes a chunk; picklable, for other processes."""
 
     plans: tuple[Plan, ...]
-    """Plans that differ in the filter alone: the runs' sensors give the same to all."""
+    """Plans that differ only in the filter; the simulated measurements are the same for all."""
     machine: str
 
     def __call__(self, first_run: int, runs: int) -> Parts:
-        """Return the statistics of a chunk, one a plan."""
+        """Return the statistics of a chunk, one per plan."""
         if self.machine == scalar.NAME:  # simulates each run once
             return scalar.run_chunks(self.plans, first_run, runs)
         chosen = machine_named(self.machine)
@@ -152,12 +152,12 @@ class Work:
 
 
 Workers = Callable[[Work, Chunks], Iterator[tuple[int, Parts]]]
-"""Computes chunks and yields (place among them, result) as they finish: in any order, but never further ahead of the first unfinished one
-than :data:`AHEAD` allows."""
+"""Function that computes chunks and yields (index, result) in the order in which they finish, at most :data:`AHEAD` chunks per worker
+ahead of the first unfinished one."""
 
 
 class Window:
-    """Which chunk may be begun next, so that few wait for one before them."""
+    """Order in which chunks are started, with a limited number ahead of the first unfinished one."""
 
     def __init__(self, chunks: int, workers: int) -> None:
         self._next, self._end, self._ahead = 0, chunks, AHEAD * workers
@@ -165,7 +165,7 @@ class Window:
         self._most = workers
 
     def begin(self) -> int | None:
-        """Return the place of a chunk to be begun now; None if there is none."""
+        """Return the index of the next chunk to start; None if there is none now."""
         first = min(self._running, default=self._next)
         if self._next >= self._end or len(self._running) >= self._most or self._next >= first + self._ahead:
             return None
@@ -174,17 +174,17 @@ class Window:
         return self._next - 1
 
     def finish(self, place: int) -> None:
-        """Take note that a chunk is done."""
+        """Mark a chunk as finished."""
         self._running.remove(place)
 
     @property
     def open(self) -> bool:
-        """Whether there is anything left."""
+        """Whether any chunk is unfinished."""
         return bool(self._running) or self._next < self._end
 
 
 def in_threads(threads: int | None = None) -> Workers:
-    """Return workers that are threads of this process; default one a core."""
+    """Return workers that are threads of this process. Default: one per core."""
     number = os.cpu_count() or 1 if threads is None else count("threads", threads)
 
     def work_through(work: Work, chunks: Chunks) -> Iterator[tuple[int, Parts]]:
@@ -219,7 +219,7 @@ def in_threads(threads: int | None = None) -> Workers:
 
 
 def merged_in_order(finished: Iterator[tuple[int, Parts]]) -> Parts:
-    """Return the statistics of all chunks, which come in any order, merged in that of their places."""
+    """Return the statistics of all chunks, which come in any order, merged in the order of their indices."""
     early: dict[int, Parts] = {}
     total: Parts = ()
     place = 0
@@ -232,7 +232,7 @@ def merged_in_order(finished: Iterator[tuple[int, Parts]]) -> Parts:
 
 
 def merge_parts(total: Parts, parts: Parts) -> Parts:
-    """Return both merged, plan by plan; an empty total is nothing yet."""
+    """Return both merged, plan by plan; ``total`` is empty at the start."""
     return tuple(merge(a, b) for a, b in zip(total, parts, strict=True)) if total else parts
 
 
@@ -251,23 +251,23 @@ def run_plan(
     Parameters
     ----------
     plan : Plan
-        Scenario, filter and seed, and where statistics are computed.
+        Scenario, filter, seed and epochs of the statistics.
     runs : int
-        Run k is the same to the bit whatever their number, the chunks, threads and workers.
+        Number of runs. Run k is bitwise identical for any number of runs, chunk, threads and workers.
     chunk : int, optional
-        Runs between merges; default the machine's. The statistics depend on it by rounding only.
+        Number of runs per chunk. Default: that of the machine. It affects only the rounding of the statistics.
     threads : int, optional
-        Default: one a core.
+        Number of threads. Default: one per core.
     machine : {"auto", "lanes", "scalar"}
     workers : Workers, optional
-        What computes the chunks instead of threads (:func:`strapdown.montecarlo.cluster.on_dask`).
+        Workers that compute the chunks instead of threads (:func:`strapdown.montecarlo.cluster.on_dask`).
     progress : callable, optional
         Called with the number of runs just finished.
 
     Returns
     -------
     Statistics
-        Sums over all the runs, merged in the order of the chunks.
+        Sums over all runs, merged in the order of the chunks.
     """
     chosen = choose(plan, machine).machine
     size = machine_named(chosen).CHUNK if chunk is None else count("chunk", chunk)
@@ -289,12 +289,12 @@ def run(
 ) -> list[Statistics]:
     """Run several filter setups on the same simulated runs and return the statistics of each.
 
-    As :func:`run_plan` for each setup; the scalar machine simulates each run once for all of them.
+    Equivalent to :func:`run_plan` for each setup; the scalar machine simulates each run once for all setups.
 
     Parameters
     ----------
     scenario : Scenario
-        Motion, gyro and sensors that are simulated.
+        Simulated motion, gyro and sensors.
     setups : sequence of FilterSetup
         Filters to compare.
     runs : int
@@ -302,18 +302,18 @@ def run(
     seed : int
         Seed of all random streams.
     chunk, threads : int, optional
-        As of :func:`run_plan`.
+        See :func:`run_plan`.
     machine : {"scalar", "auto", "lanes"}
         "auto": the lanes if they support every setup.
     progress : callable, optional
-        As of :func:`run_plan`.
+        See :func:`run_plan`.
     **options
         Other fields of :class:`Plan`, such as ``epochs``.
 
     Returns
     -------
     list of Statistics
-        One a setup.
+        One per setup.
     """
     count("runs", runs)
     plans = tuple(Plan(scenario=scenario, setup=one, seed=seed, **options) for one in setups)

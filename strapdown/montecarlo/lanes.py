@@ -1,16 +1,16 @@
-"""The lane machine: eight runs at once in double precision, sixteen in single, noise, sensors, filter and statistics compiled together.
+"""The lane machine: noise, sensors and filter of 8 runs (double precision) or 16 (single) at once, one per SIMD lane, compiled together.
 
-The motion, the times of the measurements and all that does not differ from run to run is worked out once a plan; a run is its noise. Runs
-are named by (seed, run, source) alone, and the filter is the scalar machine's own source, so run k has the same bits whatever the chunk,
-the number of lanes, the threads and the host (with fused multiply-add). The noise is that of the simulator in distribution, not in its
-numbers.
+The motion, the times of the measurements and all else common to the runs are computed once per plan; only the noise differs. Its random
+streams depend only on (seed, run, source), and the filter is the scalar machine's source, so run k is bitwise identical for any chunk,
+number of lanes, threads and host (with fused multiply-add). The noise has the distribution of the simulator's, not its numbers.
 
-Two things are simpler than in the simulator. With a coning algorithm of N samples the noise is drawn a filter step, exactly as the sum of
-N samples is distributed, and does not pass through the cross products, whose share is below the turn of a sample times the noise. Flicker
-is shaped at the filter's steps, not at the gyro's samples.
+Two things are simpler than in the simulator. With a coning algorithm of N samples the noise is drawn once per filter step, with exactly the
+distribution of the sum of N samples, and does not enter the cross products; their contribution is below the rotation over a sample times
+the noise. Flicker is generated at the filter's steps, not at the gyro's samples.
 
-In single precision the attitude has a grain of 6e-8 rad that the filter's steps add up to a random walk, so error and covariance are
-those of double precision where both are above some 1e-5 rad; :func:`supports` refuses plans with finer sensors.
+In single precision the attitude is rounded to 6e-8 rad, which over the filter's steps adds up to a random walk. Error and covariance
+therefore agree with those of double precision only if both are above about 1e-5 rad; :func:`supports` refuses plans with more precise
+sensors.
 """
 
 from __future__ import annotations
@@ -56,11 +56,11 @@ NAME = "lanes"
 CHUNK = 200
 
 GROUP = 8
-"""Runs that are added up together: the same for every number of lanes."""
+"""Number of runs summed together: the same for every number of lanes."""
 LARGEST_START = 0.5
-"""rad; σ of the initial attitude error up to which its rotation is good to rounding."""
+"""Maximum σ of the initial attitude error for which its rotation is accurate to rounding, rad."""
 FINEST_SINGLE = 2e-5
-"""rad; σ of the finest sensor that single precision serves."""
+"""Minimum σ of the most precise sensor for single precision, rad."""
 
 _SOURCES = ("gyro", "gyro flicker", "gyro markov", "gyro turn-on", "initial error", "dispersions")
 _NOT_OF_THE_GYRO = {
@@ -83,7 +83,7 @@ def supports(plan: Plan) -> str | None:
 def _reasons(plan: Plan) -> Iterator[str]:
     spec = plan.scenario.gyro
     if spec.temperature is not None:
-        yield "the gyro's bias over temperature is not among the lanes' terms"
+        yield "the gyro's bias over temperature is not supported by the lanes"
     for name, none in _NOT_OF_THE_GYRO.items():
         if np.any(np.asarray(getattr(spec, name)) != none):
             yield f"the gyro's {name}"
@@ -91,13 +91,13 @@ def _reasons(plan: Plan) -> Iterator[str]:
         if type(sensor) not in _SENSORS:
             yield f"{sensor.name}: a sensor of class {type(sensor).__name__}"
         elif isinstance(sensor, AttitudeSensor) and sensor.covariance is not None:
-            yield f"{sensor.name}: a boresight that is no body axis"
+            yield f"{sensor.name}: a boresight other than a body axis"
         elif sensor.faults.latency > 0.0:  # type: ignore[attr-defined]
             yield f"{sensor.name}: latency"
         elif sensor.faults.drop_probability > 0.0:  # type: ignore[attr-defined]
             yield f"{sensor.name}: lost samples"
         elif isinstance(plan.setup.sigma.get(sensor.name), tuple) and not isinstance(sensor, AttitudeSensor):
-            yield f"{sensor.name}: a sigma of its own for each axis"
+            yield f"{sensor.name}: a different sigma for each axis"
     if plan.setup.estimator != setup.MEKF:
         yield f"the estimator {plan.setup.estimator_name}"
     if plan.individuals:
@@ -111,28 +111,28 @@ def _reasons(plan: Plan) -> Iterator[str]:
         yield "gyro parameters that differ from run to run with several gyro samples a filter step"
     prepared = _prepared(plan)
     if prepared.saturates:
-        yield "a gyro range so near to the motion's rates that it may saturate"
+        yield "a gyro range so close to the motion's rates that the gyro may saturate"
     if plan.precision == "float32" and prepared.finest < FINEST_SINGLE:
         yield f"float32 with a sensor of {prepared.finest:.2g} rad, finer than {FINEST_SINGLE:g} rad"
 
 
-# ---------------------------------------------------------------------------------------------- what all runs share
+# ---------------------------------------------------------------------------------------------- common to all runs
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Prepared:
-    """What all runs of a plan share, as the kernels take it."""
+    """Data common to all runs of a plan, as the kernels take them."""
 
     gyro: montecarlo_run.Gyro
     start: montecarlo_run.Start
     events_of_runs: montecarlo_run.Events
     record: ImuRecord
-    """The filter's steps without any noise; its series have nominal σ."""
+    """Record of the filter's steps without noise; its series have nominal σ."""
     events: Schedule
     truth: Array
     """True attitudes at the epochs (m, 4)."""
     degrees: Counts
-    """Degrees of freedom of one run by sensor and span of time (s, k)."""
+    """Degrees of freedom of one run by sensor and time bin (s, k)."""
     keys: np.ndarray
     saturates: bool
     finest: float
@@ -150,7 +150,7 @@ def _prepared(plan: Plan) -> _Prepared:
 
 
 def _quiet(spec: GyroSpec) -> GyroSpec:
-    """Return the gyro without what differs from run to run."""
+    """Return the gyro without the errors that differ from run to run."""
     none = ("angle_random_walk", "rate_random_walk", "bias_instability", "markov_noise", "turn_on_bias_sigma")
     silent: dict[str, Any] = dict.fromkeys(none, 0.0)
     return replace(spec, **silent, range=np.inf)
@@ -172,7 +172,7 @@ def _prepare(plan: Plan) -> _Prepared:
     )
     steps = quiet if algorithm.name == "one-sample" else compress(quiet, algorithm)
     n = algorithm.samples
-    # Of some run: times, kinds, references and nominal σ are those of all runs.
+    # From one run: times, kinds, references and nominal σ are common to all runs.
     ends = scenario.motion, scenario.edges[0], scenario.edges[-1]
     series = tuple(one.observe(*ends, generator(plan.seed, 0, one.name)) for one in scenario.sensors)
     record = replace(steps, vectors=series)
@@ -220,18 +220,18 @@ def _prepare(plan: Plan) -> _Prepared:
 
 
 def _substeps(record: ImuRecord) -> Array:
-    """Return the longest time over which the polynomials of the filter hold in each step of a record (n,), s: at most the step."""
+    """Return, for each step of a record (n,), the longest time, s, over which the filter's polynomials hold: at most the step."""
     angle = np.linalg.norm(record.increments, axis=1)
     return np.asarray(np.diff(record.time) * np.minimum(1.0, LARGEST_ANGLE / np.maximum(angle, LARGEST_ANGLE)))
 
 
 def _real(plan: Plan) -> Any:
-    """Return the type of the runs' numbers. What all runs share is given in it too: to narrow a number a step costs more than to use it."""
+    """Return the floating-point type of the runs. Common data have it too: converting a number at each step costs more than using it."""
     return np.float32 if plan.precision == "float32" else np.float64
 
 
 def _keys(plan: Plan) -> np.ndarray:
-    """Return two words a source, of the seed and the source's name."""
+    """Return two words per source, from the seed and the source's name."""
     names = [*_SOURCES, *(word for sensor in plan.sensors for word in (f"sensor {sensor}", f"faults of {sensor}"))]
     return np.array(
         [
@@ -242,7 +242,7 @@ def _keys(plan: Plan) -> np.ndarray:
 
 
 def _gyro_terms(plan: Plan, dt: float, steps: int) -> tuple[Any, ...]:
-    """Return what the kernel wants of the gyro: terms, noise a step, flicker, dispersions."""
+    """Return the kernel's gyro parameters: terms, noise per step, flicker, dispersions."""
     spec, given = plan.scenario.gyro, plan.dispersions
     axes = [
         np.broadcast_to(value, 3)
@@ -283,7 +283,7 @@ def _gyro_terms(plan: Plan, dt: float, steps: int) -> tuple[Any, ...]:
 
 
 def _exact(sensor: Any, scenario: Scenario, series: VectorMeasurements) -> tuple[Array, Array, Array]:
-    """Return the values of a sensor without noise (m, 4), its true σ (m, 3), and the scale of its noise (m,), as the filter takes them."""
+    """Return noise-free values of a sensor (m, 4), its true σ (m, 3) and the scale of its noise (m,), as the filter takes them."""
     silent = replace(sensor.faults, outlier_probability=0.0, correlated_sigma=0.0)
     changes: dict[str, Any] = {"faults": silent}
     if isinstance(sensor, AttitudeSensor):
@@ -349,7 +349,7 @@ def _event_terms(plan: Plan, events: Schedule, values: list[tuple[Array, Array, 
 
 
 def width_of(precision: str) -> int:
-    """Return how many runs go at once on this machine: 8 or 16, or 1 where it has no vectors."""
+    """Return the number of runs computed at once on this processor: 8 or 16, or 1 if it has no SIMD vectors."""
     if not _answered(machine.has_vectors):
         return 1
     return 16 if precision == "float32" else 8
@@ -357,12 +357,12 @@ def width_of(precision: str) -> int:
 
 @functools.cache
 def _answered(question: Callable[[], bool]) -> bool:
-    """Return the answer of the first time: the machine stays what it is, and to ask it takes as long as some thousand steps."""
+    """Return the cached answer about the processor: evaluating it takes as long as some thousand steps."""
     return question()
 
 
 class _Group:
-    """Memory of several runs at once, and the call that advances them."""
+    """Memory of several simultaneous runs, and the call that advances them."""
 
     def __init__(self, plan: Plan, width: int, *, every: int | None = None, detail: bool = False) -> None:
         self.prepared = _prepared(plan)
@@ -380,7 +380,7 @@ class _Group:
         )
         self.kept = np.empty(self.epochs * montecarlo_run.KEPT * width)
         self.nis = np.zeros(self.places * width, real)
-        # Without detail the kernel is compiled without it, and saves the divisions of the innovations.
+        # Without detail the kernel is compiled without the divisions that the innovations need.
         self.detail = (
             montecarlo_run.Detail(*(np.empty(size * width) for size in (3 * steps, 4 * events, 6 * events)))
             if detail
@@ -388,7 +388,7 @@ class _Group:
         )
 
     def advance(self, first: int) -> None:
-        """Run the runs from number ``first`` on."""
+        """Compute the runs from index ``first`` on."""
         self.nis[:] = 0.0
         prepared = self.prepared
         compiled(montecarlo_run.advance)(
@@ -406,7 +406,7 @@ class _Group:
 
 
 def run_chunk(plan: Plan, first_run: int, runs: int, *, width: int | None = None) -> Statistics:
-    """Return the statistics of runs ``first_run`` to ``first_run + runs − 1``; ``width`` runs go at once, the default is the machine's."""
+    """Return the statistics of runs ``first_run`` to ``first_run + runs − 1``, ``width`` runs at once (default: that of the processor)."""
     lanes = width_of(plan.precision) if width is None else width
     group = _Group(plan, lanes)
     m, s = plan.epochs + 1, len(plan.sensors)
@@ -490,14 +490,14 @@ def _total(lanes: Array) -> Array:
 
 
 def _example(kept: Array, truth: Array) -> tuple[Array, Array]:
-    """Return error and σ (m, 6) of one run's kept numbers (m, KEPT)."""
+    """Return error and σ (m, 6) from the stored values of one run (m, KEPT)."""
     error = quaternion.log(quaternion.multiply(quaternion.conjugate(kept[:, :4]), truth))
     diagonal = kept[:, [7, 10, 12, 22, 25, 27]]
     return np.concatenate([error, kept[:, 28:31] - kept[:, 4:7]], axis=1), np.sqrt(diagonal)
 
 
 def replay(plan: Plan, run: int, *, width: int = 1) -> Replay:
-    """Return one run in full detail, bitwise what it is among the others."""
+    """Return one run in full detail, bitwise identical to that of the campaign."""
     number = count("run", run, minimum=0)
     group = _Group(plan, width, every=1, detail=True)
     group.advance(number)
@@ -539,7 +539,7 @@ def replay(plan: Plan, run: int, *, width: int = 1) -> Replay:
 
 
 def _measured(series: VectorMeasurements, values: Array) -> VectorMeasurements:
-    """Return a series with the values of one run (m, 4), as the kernel took them."""
+    """Return a series with the values of one run (m, 4), as used by the kernel."""
     if series.attitude is not None:
         return replace(series, attitude=quaternion.normalize(values))
     if series.kind == "vector":

@@ -1,4 +1,4 @@
-"""Plan of a Monte Carlo campaign: scenario, filter, seed, dispersions from run to run, epochs of the statistics."""
+"""Plan of a Monte Carlo campaign: scenario, filter, seed, dispersions between runs, epochs of the statistics."""
 
 from __future__ import annotations
 
@@ -27,25 +27,25 @@ def _zeros() -> Array:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Dispersions:
-    """Normal, independent dispersions from run to run besides the noise. Default: initial errors from the filter's prior.
+    """Independent normal dispersions between runs besides the noise. Default: initial errors from the filter's prior.
 
     Parameters
     ----------
     attitude_sigma : float, optional
-        σ of the initial attitude error, each body axis, rad. Default: the filter's own, so that a matched filter is consistent.
+        σ of the initial attitude error, each body axis, rad. Default: that of the filter's prior, so that a matched filter is consistent.
     bias_sigma : float, optional
-        σ of the initial bias error, each body axis, rad/s. Default: the filter's own.
+        σ of the initial bias error, each body axis, rad/s. Default: that of the filter's prior.
     attitude_error : ndarray (3,), default zeros
         Fixed part of the initial attitude error δθ in all runs, rad, body axes.
     bias_error : ndarray (3,), default zeros
         Fixed part of the initial bias error δb in all runs, rad/s, body axes.
     scale_factor_sigma : float, default 0.0
-        σ of a scale-factor error of each gyro axis, dimensionless, added to the scenario's.
+        σ of the scale-factor error of each gyro axis, dimensionless, added to the scenario's.
     misalignment_sigma : float, default 0.0
         σ of each of the six misalignments of the gyro, rad, added to the scenario's.
     turn_on_bias_sigma : float, default 0.0
-        σ of a turn-on bias of each gyro axis, rad/s, added to the scenario's. The filter starts from the true bias less its initial error,
-        so this changes the bias over which the filter is tested, not its initial bias error.
+        σ of a turn-on bias of each gyro axis, rad/s, added to the scenario's. The filter starts from the true bias minus its initial error,
+        so this changes the true bias of the tests, not the initial bias error.
     """
 
     attitude_sigma: float | None = None
@@ -67,17 +67,17 @@ class Dispersions:
             object.__setattr__(self, name, non_negative(f"dispersions: {name}", getattr(self, name), unit=unit))
 
     def initial_sigmas(self, setup: FilterSetup) -> tuple[float, float]:
-        """Return the σ of the initial attitude error, rad, and bias error, rad/s: those of the filter's prior where none are given.
+        """Return the σ of the initial attitude error, rad, and bias error, rad/s: by default those of the filter's prior.
 
         Parameters
         ----------
         setup : FilterSetup
-            Filter whose prior counts.
+            Filter whose prior is the default.
 
         Returns
         -------
         tuple of float
-            σ of each axis of the attitude error, rad, and of the bias error, rad/s.
+            σ of the attitude error, rad, and of the bias error, rad/s, each axis.
         """
         return (
             setup.attitude_sigma if self.attitude_sigma is None else self.attitude_sigma,
@@ -90,12 +90,12 @@ class Dispersions:
         return max(self.scale_factor_sigma, self.misalignment_sigma, self.turn_on_bias_sigma) > 0.0
 
     def to_table(self) -> dict[str, Any]:
-        """Return what differs from the default, as the table that a file holds, with units in the keys.
+        """Return the values that differ from the default as a table for a file, with units in the keys.
 
         Returns
         -------
         dict
-            Values by key; the ending of a key is its unit (``attitude_sigma_deg``).
+            Values by key; the suffix of a key is its unit (``attitude_sigma_deg``).
         """
         return tables.encode(self, _FORM)
 
@@ -116,28 +116,28 @@ class Plan:
     """Definition of a campaign: everything that run number k depends on, and the epochs of the statistics.
 
     Filter and truth are separate: a ``setup`` that differs from :meth:`strapdown.estimation.setup.FilterSetup.for_scenario` is a mismatched
-    filter. Outages, outliers and correlated noise are the scenario's sensors'. A plan is compared and hashed by identity, so a machine may
-    keep what it derives from one in a ``weakref.WeakKeyDictionary``.
+    filter. Outages, outliers and correlated noise are properties of the scenario's sensors. Plans are compared and hashed by identity, so a
+    machine may cache data derived from one in a ``weakref.WeakKeyDictionary``.
 
     Parameters
     ----------
     scenario : Scenario
-        Motion, gyro and sensors that are simulated.
+        Simulated motion, gyro and sensors.
     setup : FilterSetup
-        The filter.
+        Filter to be tested.
     seed : int, default 0
-        Seed of all random streams, which are named by (seed, run, source).
+        Seed of all random streams, which depend on (seed, run, source).
     epochs : int, default 100
-        Number of equal intervals between the epochs at which errors are evaluated; each epoch ends a whole filter step.
+        Number of equal intervals between the epochs at which errors are evaluated; each epoch is at the end of a filter step.
     nis_bins : int, default 100
-        Number of equal spans of time over which NIS is summed.
+        Number of equal time bins over which the NIS is summed.
     dispersions : Dispersions, default Dispersions()
         Initial errors and gyro parameters that differ from run to run.
     individuals : bool, default False
         Whether each run draws its own gyro and sensors (:func:`strapdown.scenarios.drawn`): the errors of the specification are then
-        standard deviations, as a filter with states for them assumes. Otherwise every run has exactly those errors.
+        standard deviations, as in a filter with states for them. Otherwise every run has exactly those errors.
     precision : {"float64", "float32"}, default "float64"
-        Floating-point format of the filter and the noise; "float32" only on a machine that supports it.
+        Floating-point format of the filter and the noise; "float32" only with a machine that supports it.
     """
 
     scenario: Scenario
@@ -156,13 +156,13 @@ class Plan:
         one_of("precision", self.precision, PRECISIONS)
         if self.samples % (self.epochs * self.setup.integration.samples):
             raise InputError(
-                f"{self.samples} gyro samples cannot be cut into {self.epochs} epochs of whole {self.setup.integration.name} steps; choose "
+                f"{self.samples} gyro samples do not divide into {self.epochs} epochs of whole {self.setup.integration.name} steps; choose "
                 f"a duration whose sample count is a multiple of {self.epochs * self.setup.integration.samples}, or other epochs"
             )
 
     @property
     def samples(self) -> int:
-        """Gyro samples in a run (nominally: a scenario may lose some)."""
+        """Nominal number of gyro samples in a run, including lost ones."""
         return round(self.scenario.duration * self.scenario.rate)
 
     @property
@@ -172,12 +172,12 @@ class Plan:
 
     @property
     def time(self) -> Array:
-        """Epochs (m,), m = epochs + 1, s, the start included."""
+        """Epochs (m,), m = epochs + 1, s, including the start."""
         return np.linspace(0.0, self.samples / self.scenario.rate, self.epochs + 1)
 
     @property
     def nis_edges(self) -> Array:
-        """Edges of the spans of time over which NIS is summed (nis_bins + 1,), s. A measurement on an edge belongs to the span it ends."""
+        """Edges of the time bins of the NIS (nis_bins + 1,), s. A measurement at an edge belongs to the bin that ends there."""
         return np.linspace(0.0, self.samples / self.scenario.rate, self.nis_bins + 1)
 
     @property
@@ -192,7 +192,7 @@ class Plan:
         return setup.unmodelled_errors(scenario.gyro, scenario.sensors, self.setup.states, gravity_f=scenario.gravity_f)
 
     def to_table(self) -> dict[str, Any]:
-        """Return the plan as a table of texts and numbers, by which plans are compared and from which ``from_table`` restores it.
+        """Return the plan as a table of strings and numbers, for comparison and for :func:`from_table`.
 
         Returns
         -------
@@ -241,11 +241,11 @@ def _dispersions(table: Mapping[str, Any], place: str) -> Dispersions:
 
 
 def whole_epochs(scenario: Scenario, filter_setup: FilterSetup, most: int = 100) -> int:
-    """Return the largest number of epochs, at most ``most``, that cut the scenario into whole filter steps."""
+    """Return the largest number of epochs, at most ``most``, that divide the scenario into whole filter steps."""
     samples, step = round(scenario.duration * scenario.rate), filter_setup.integration.samples
     if samples % step:
         raise InputError(
-            f"{samples} gyro samples are no whole number of {filter_setup.integration.name} steps of {step}; choose a duration or rate "
+            f"{samples} gyro samples are not a whole number of {filter_setup.integration.name} steps of {step}; choose a duration or rate "
             f"that gives a multiple of {step}"
         )
     return max(n for n in range(1, most + 1) if (samples // step) % n == 0)

@@ -1,7 +1,7 @@
-"""The scalar machine: any scenario and any filter; each run goes through the simulator, and one after the other through the filter.
+"""The scalar machine: any scenario and any filter; each run is simulated, then filtered.
 
-Filters with error states run eight at once (:func:`strapdown.estimation.setup.run_together`). A run's bits depend neither on the runs
-beside it nor on whether it is one of a campaign or a replay.
+Filters with error states run eight at once (:func:`strapdown.estimation.setup.run_together`). A run is bitwise identical whatever other
+runs are computed with it, in a campaign or a replay.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def supports(plan: Plan) -> str | None:
 def start(
     record: ImuRecord, filter_setup: FilterSetup, seed: int, run: int, dispersions: Dispersions | None = None
 ) -> estimation.State:
-    """Return the initial state of one run: the truth, off by errors drawn from the filter's own prior, or as the dispersions say."""
+    """Return the initial state of one run: the truth with errors drawn from the dispersions, by default from the filter's prior."""
     given = Dispersions() if dispersions is None else dispersions
     fixed = given.attitude_error, given.bias_error
     return setup.drawn_state(
@@ -65,7 +65,7 @@ def start(
 
 
 def dispersed(spec: GyroSpec, dispersions: Dispersions, seed: int, run: int) -> GyroSpec:
-    """Return the gyro of one run: three scale factors, six misalignments row by row and three turn-on biases drawn, in this order."""
+    """Return the gyro of one run: three scale factors, six misalignments by rows and three turn-on biases are drawn, in this order."""
     if not dispersions.of_the_gyro:
         return spec
     draw = generator(seed, run, "dispersions").standard_normal(12)
@@ -80,7 +80,7 @@ def dispersed(spec: GyroSpec, dispersions: Dispersions, seed: int, run: int) -> 
 
 
 def record_of(plan: Plan, run: int) -> ImuRecord:
-    """Return what the sensors give in one run of a plan."""
+    """Return the record of one run of a plan."""
     remembered = _SCENARIOS.get(plan)
     if remembered is None:
         remembered = replace(plan.scenario, motion=_Remembered(plan.scenario.motion))
@@ -91,7 +91,7 @@ def record_of(plan: Plan, run: int) -> ImuRecord:
 
 
 class _Remembered:
-    """A motion that remembers what it was asked last: all runs ask it the same, and a closed form may cost more than the filter."""
+    """A motion that caches its last results: all runs evaluate it at the same times, at more cost than the filter's."""
 
     _MOST = 32
 
@@ -107,9 +107,9 @@ class _Remembered:
         answer = self._known.get(key)
         if answer is None:
             answer = np.array(getattr(self._motion, what)(times))
-            answer.flags.writeable = False  # it is everyone's
+            answer.flags.writeable = False  # shared by all runs
             self._known[key] = answer
-            if len(self._known) > self._MOST:  # times that are never asked again, of a jittered clock
+            if len(self._known) > self._MOST:  # times of a jittered clock, which do not recur
                 with contextlib.suppress(KeyError):
                     self._known.popitem(last=False)
         return answer
@@ -138,7 +138,7 @@ def run_chunk(plan: Plan, first_run: int, runs: int) -> Statistics:
 
 
 def run_chunks(plans: Sequence[Plan], first_run: int, runs: int) -> tuple[Statistics, ...]:
-    """Return the statistics of several plans that differ in the filter alone; each run is simulated once and given to all filters."""
+    """Return the statistics of several plans that differ only in the filter; each run is simulated once for all filters."""
     one, end = plans[0], first_run + runs
     sums = [Sums(plan, runs) for plan in plans]
     at_once = max(_at_once(plan) for plan in plans)
@@ -151,7 +151,7 @@ def run_chunks(plans: Sequence[Plan], first_run: int, runs: int) -> tuple[Statis
 
 
 def _at_once(plan: Plan) -> int:
-    """Return how many runs are filtered at once: more than one where all have the same times."""
+    """Return the number of runs filtered at once: more than one if all have the same times."""
     spec = plan.scenario.gyro
     losses = [getattr(getattr(one, "faults", None), "drop_probability", 0.0) for one in plan.scenario.sensors]
     differ = any((spec.sampling_jitter, spec.timestamp_error, spec.drop_probability, *losses))
@@ -169,7 +169,7 @@ def _estimates(
 
 
 class Sums:
-    """Statistics of one plan in the making, run by run."""
+    """Sums for the statistics of one plan, accumulated run by run."""
 
     def __init__(self, plan: Plan, runs: int) -> None:
         m, s, k = plan.epochs + 1, len(plan.sensors), plan.nis_bins
@@ -195,14 +195,13 @@ class Sums:
         self.examples: list[tuple[int, Array, Array]] = []
 
     def add(self, runs: Sequence[int], records: Sequence[ImuRecord]) -> None:
-        """Filter runs and add what comes of them."""
+        """Filter runs and add their results."""
         plan = self.plan
         initials = [
             start(record, plan.setup, plan.seed, run, plan.dispersions)
             for run, record in zip(runs, records, strict=True)
         ]
-        # A record that has lost samples has its epochs at no fixed step, so all steps are kept and the epochs picked; and so where a filter
-        # of one's own chooses its times.
+        # With lost samples, or a user's filter that chooses its times, the epochs are at no fixed step: all steps are kept, then selected.
         regular = [len(one.increments) == plan.samples and not isinstance(plan.setup.estimator, Own) for one in records]
         estimates = _estimates(plan, records, initials, plan.every if all(regular) else 1)
         for run, record, estimate, fixed in zip(runs, records, estimates, regular, strict=True):
@@ -227,9 +226,9 @@ class Sums:
         self._add_innovations(estimate)
 
     def _add_errors(self, run: int, error: Array, P: Array) -> None:
-        with np.errstate(invalid="ignore"):  # a filter that failed has anything there
+        with np.errstate(invalid="ignore"):  # not finite after a failure of the filter
             sigma = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
-        if np.isnan(P[:, 3:, 3:]).all():  # no bias is estimated: it adds nothing, and the state is the attitude
+        if np.isnan(P[:, 3:, 3:]).all():  # no bias is estimated: the state is the attitude, and the bias adds zero
             attitude = _nees(error[:, :3], P[:, :3, :3])
             nees = np.stack([attitude, attitude, np.zeros(len(P))], axis=1)
             error = np.where(np.arange(6) < 3, error, 0.0)
@@ -255,7 +254,7 @@ class Sums:
     def _add_innovations(self, estimate: Estimate) -> None:
         bins = self.plan.nis_bins
         for i, sensor in enumerate(self.plan.sensors):
-            if sensor not in estimate.innovations:  # a filter of one's own may give none
+            if sensor not in estimate.innovations:  # a user's filter may return no innovations
                 continue
             innovations = estimate.innovations[sensor]
             place = np.clip(np.searchsorted(self.sums.nis_edges, innovations.time, side="left") - 1, 0, bins - 1)
@@ -282,13 +281,13 @@ class Sums:
 
 
 def _at_epochs(time: Array, epochs: Array) -> np.ndarray:
-    """Return the last step not after each epoch, or the first; the tolerance is a millionth of the mean step."""
+    """Return the last step at or before each epoch, or the first; the tolerance is 1e-6 of the mean step."""
     slack = 1e-6 * (time[-1] - time[0]) / max(len(time) - 1, 1)
     return np.asarray(np.maximum(np.searchsorted(time, epochs + slack, side="right") - 1, 0))
 
 
 def _nees(error: Array, P: Array) -> Array:
-    """Return the NEES at each epoch, NaN where P is not positive definite."""
+    """Return the NEES at each epoch, NaN if P is not positive definite."""
     try:
         return consistency.nees(error, P)
     except InputError:

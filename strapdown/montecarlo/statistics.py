@@ -1,24 +1,24 @@
-"""Statistics over independent runs, of a size that does not depend on their number, and their merging.
+"""Statistics over independent runs, in memory that does not depend on their number, and their merging.
 
-What a machine must return
---------------------------
+Requirements on a machine
+-------------------------
 A *machine* is a module of this package with
 
 ``NAME``, ``CHUNK``
-    Its name in files and tables; runs a chunk where nobody says.
+    Its name in files and tables; its default number of runs per chunk.
 ``supports(plan) -> str | None``
-    None if it computes every term of the plan, else the reason why not, as a phrase ("the gyro's flicker is not among its terms").
+    None if it computes every term of the plan, else the reason, as a phrase ("the gyro's flicker is not among its terms").
 ``run_chunk(plan, first_run, runs) -> Statistics``
     Runs ``first_run`` … ``first_run + runs − 1`` of the plan.
 ``replay(plan, run) -> Replay``
-    One run in full detail, bitwise the same.
+    One run in full detail, bitwise identical to that in a chunk.
 
-Run k of a plan must be the same to the bit whatever the chunk that holds it, the threads, the width of vectors or the host; and the sums
-of a chunk are taken over its runs in the order of their numbers (or in any other order that depends on ``first_run`` and ``runs`` alone).
-Both have to be free to run in several threads at a time.
+Run k of a plan must be bitwise identical for any chunk that contains it, number of threads, vector width and host. The sums of a chunk are
+taken over its runs in the order of their numbers (or in another order that depends only on ``first_run`` and ``runs``). Both functions must
+be safe to run in several threads.
 
-With m = epochs + 1 epochs at the filter steps 0, every, 2·every, … (``plan.every``; after the update with measurements at that very
-time), error e = (δθ, δb) of :func:`strapdown.consistency.errors` and the filter's P there, the result is a :class:`Statistics`.
+With m = epochs + 1 epochs at the filter steps 0, every, 2·every, … (``plan.every``; after the update with measurements at that time),
+errors e = (δθ, δb) of :func:`strapdown.consistency.errors` and the filter's P there, the result is a :class:`Statistics`.
 """
 
 from __future__ import annotations
@@ -49,30 +49,30 @@ from strapdown.results import Listed, Listing, figure
 Counts = NDArray[np.int64]
 
 EXAMPLES = 8
-"""Runs of which whole error histories are kept, for pictures: those numbered below it."""
+"""Number of runs whose full error histories are kept for plots: those with a lower index."""
 WORST = 10
-"""Worst runs that are kept by number."""
+"""Number of worst runs that are recorded."""
 
 BINS_PER_OCTAVE = 8
-"""Bins of a histogram from a number to its double, equally wide among themselves: 12.5 to 6.7 % of the value."""
+"""Histogram bins of equal width between a number and its double: 12.5 to 6.7 % of the value."""
 OCTAVES = 43
 BINS = BINS_PER_OCTAVE * OCTAVES
 ERROR_EXPONENT = -40
-"""Bins of errors begin at 2⁻⁴⁰ (9.1e-13 rad or rad/s) and end at 8; what lies outside is counted in the first and last."""
+"""Bins of errors range from 2⁻⁴⁰ (9.1e-13 rad or rad/s) to 8; values outside are counted in the first and last."""
 NEES_EXPONENT = -16
-"""Bins of the NEES begin at 2⁻¹⁶ and end at 2²⁷."""
+"""Bins of the NEES range from 2⁻¹⁶ to 2²⁷."""
 SHIFT = 49
-"""Right shift of a double's bits that leaves the exponent and three bits of the mantissa: its bin, up to a constant."""
+"""Right shift of a double's bits that leaves the exponent and three bits of the mantissa: the bin, up to a constant."""
 
 COVERED = (0.6826894921370859, 0.9544997361036416, 0.9973002039367398)
-"""Share of a consistent filter's errors inside 1, 2, 3 σ."""
+"""Fraction of a consistent filter's errors inside 1, 2, 3 σ."""
 
 SUBSETS: dict[str, tuple[int, int]] = {"state": (0, 6), "attitude": (1, 3), "bias": (2, 3)}
-"""Column of the NEES and degrees of freedom, by what is judged."""
+"""Column of the NEES and degrees of freedom of each subset of the states."""
 
 
 def first_bin(exponent: int) -> int:
-    """Return what is taken off the shifted bits of a double: the number of the bin that begins at 2 to ``exponent``."""
+    """Return the offset subtracted from the shifted bits of a double, so that bin 0 begins at 2 to ``exponent``."""
     return (1023 + exponent) * BINS_PER_OCTAVE
 
 
@@ -95,60 +95,60 @@ class Replay:
     record: ImuRecord
     """Simulated measurements, with the truth."""
     initial: estimation.State
-    """Where the filter started."""
+    """Initial state of the filter."""
     estimate: Estimate
-    """Estimate at every filter step, with whole covariances."""
+    """Estimate at every filter step, with full covariances."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Statistics(Listed):
     """Sums over independent runs at each epoch.
 
-    Errors are e = (δθ, δb): rad in the body frame, rad/s. The sums of an epoch leave out runs whose numbers there are not finite.
+    Errors are e = (δθ, δb): rad in the body frame, rad/s. The sums at an epoch exclude runs that are not finite there.
 
     Parameters
     ----------
     time : ndarray (m,)
         Epochs, s.
     runs : int
-        Number of runs asked for.
+        Number of runs.
     finite : ndarray (m,) of int
-        Runs whose error, covariance P and three NEES are finite there, P positive definite.
+        Number of runs whose error, covariance P and three NEES are finite there, P positive definite.
     error_sum : ndarray (m, 6)
         Σ e.
     error_product_sum : ndarray (m, 6, 6)
         Σ e eᵀ.
     covariance_sum : ndarray (m, 6, 6)
-        Σ P, the filter's own covariance, symmetric.
+        Σ P, the filter's covariance, symmetric.
     nees_sum : ndarray (m, 3)
         Σ NEES of all six states, of the attitude, of the bias (by the marginal blocks of P); not divided by the degrees of freedom.
     log_nees_sum : ndarray (m, 3)
-        Σ ln NEES of the same; a NEES of 0 (the start of a run without error) adds the logarithm of the smallest normal number.
+        Σ ln NEES of the same; a NEES of 0 (a run that starts without error) adds the logarithm of the smallest normal number.
     coverage : ndarray (m, 6, 3) of int
-        Runs with |e_i| ≤ k √P_ii, k = 1, 2, 3.
+        Number of runs with |e_i| ≤ k √P_ii, k = 1, 2, 3.
     histogram : ndarray (m, 9, BINS) of int
         Counts of |e| (columns 0–5) in bin ``bin_of(|e|, ERROR_EXPONENT)``, of the three NEES (columns 6–8) in bin
-        ``bin_of(nees, NEES_EXPONENT)``. :func:`bin_of` is a shift of the double's bits, so no machine needs a logarithm.
+        ``bin_of(nees, NEES_EXPONENT)``. :func:`bin_of` shifts the double's bits, so no logarithm is needed.
     nis_edges : ndarray (k + 1,)
-        Edges of the spans of time of the NIS, s.
+        Edges of the time bins of the NIS, s.
     sensors : tuple of str
         Names of the s sensors, in the scenario's order.
     sensor_nis_sum : ndarray (s, k)
-        Σ NIS of the measurements used, by sensor and span of time.
+        Σ NIS of the measurements used, by sensor and time bin.
     sensor_degrees : ndarray (s, k) of int
         Their degrees of freedom.
     sensor_refused : ndarray (s, k) of int
-        Measurements refused by the gate; their NIS is left out.
+        Number of measurements refused by the gate; their NIS is excluded.
     worst_run : ndarray (w,) of int, w = min(WORST, runs)
-        Numbers of the runs of the largest score, the largest first, of equal ones the lower number first.
+        Indices of the runs of largest score, in descending order; equal scores in the order of their indices.
     worst_score : ndarray (w,)
-        Their scores: the largest NEES of the state over the epochs; infinite where the run was not finite at some epoch.
+        Their scores: the largest NEES of the state over the epochs; infinite if the run was not finite at some epoch.
     example_run : ndarray (x,) of int
-        Numbers of the runs, below EXAMPLES, whose whole error histories are kept, in order.
+        Indices of the runs, below EXAMPLES, whose full error histories are kept, in order.
     example_error : ndarray (x, m, 6)
         Errors of these runs, finite or not, rad and rad/s.
     example_sigma : ndarray (x, m, 6)
-        The filter's own σ in these runs, rad and rad/s.
+        The filter's σ in these runs, rad and rad/s.
     """
 
     _drawn_by = "runs_overview"
@@ -177,21 +177,21 @@ class Statistics(Listed):
     def judge(
         self, *, epochs: Iterable[int] | None = None, probability: float = 0.99, unmodelled: Sequence[str] = ()
     ) -> Judgement:
-        """Return the verdict on these runs, which are independent.
+        """Return the verdict on these independent runs.
 
         Parameters
         ----------
         epochs : iterable of int, optional
-            Indices of the epochs at which errors are judged. Default: 20 evenly spaced ones; the first, where all is prior, is left out.
+            Indices of the epochs at which errors are judged. Default: 20 evenly spaced ones without the first, which is the prior.
         probability : float, default 0.99
-            A consistent filter is rejected with at most 1 − ``probability``, all tests together.
+            A consistent filter is rejected with probability at most 1 − ``probability``, all tests together.
         unmodelled : sequence of str, default empty
-            Errors that are specified and that the filter has no state for; the verdict names them.
+            Specified errors that the filter has no state for; named in the verdict.
 
         Returns
         -------
         Judgement
-            "consistent" only where the runs would have shown a σ of attitude or bias wrong by
+            "consistent" only if the runs would have shown a σ of attitude or bias wrong by a factor of
             :data:`strapdown.consistency.judgement.RESOLUTION`.
         """
         tail(probability)
@@ -238,29 +238,29 @@ class Statistics(Listed):
             )
         ]
         if self.failed:
-            notes.append(f"{self.failed} runs failed: no finite error or covariance")
+            notes.append(f"{self.failed} runs failed: their errors or covariances are not finite")
         title = f"{self.runs} runs, per degree of freedom (1 expected); {100.0 * judgement.probability:g} % bounds of all together"
         return Listing(title, ("statistic", "value", "bounds", ""), rows, notes)
 
     @property
     def has_bias(self) -> bool:
-        """Whether the filter estimates a gyro bias; of one of one's own that does not, the bias adds zero to every sum."""
+        """Whether the filter estimates a gyro bias; if a user's filter does not, the bias adds zero to every sum."""
         return bool(self.covariance_sum[:, 3:, 3:].any()) or not self.finite.any()
 
     @property
     def subsets(self) -> tuple[str, ...]:
-        """Subsets of the states that are judged: "state", "attitude" and "bias", or "attitude" alone where no bias is estimated."""
+        """Subsets of the states that are judged: "state", "attitude" and "bias", or only "attitude" if no bias is estimated."""
         return tuple(SUBSETS) if self.has_bias else ("attitude",)
 
     @property
     def _runs_of_state(self) -> Array:
-        """Runs that the sums hold by epoch and state (m, 6)."""
+        """Number of runs in the sums by epoch and state (m, 6)."""
         estimated = np.where(self.has_bias | (np.arange(6) < 3), 1.0, 0.0)
         return np.asarray(self.finite[:, None] * estimated)
 
     @property
     def failed(self) -> int:
-        """Runs that were not finite at some epoch, at the least."""
+        """Minimum number of runs that were not finite at some epoch."""
         return int(self.runs - self.finite.min())
 
     @property
@@ -270,7 +270,7 @@ class Statistics(Listed):
 
     @property
     def mean_square_error(self) -> Array:
-        """Mean of e eᵀ at each epoch (m, 6, 6), which P claims to be."""
+        """Mean of e eᵀ at each epoch (m, 6, 6), to which P should be equal."""
         return _divided(
             self.error_product_sum, np.minimum(self._runs_of_state[:, :, None], self._runs_of_state[:, None])
         )
@@ -282,12 +282,12 @@ class Statistics(Listed):
 
     @property
     def covariance(self) -> Array:
-        """The filter's own covariance, mean over runs (m, 6, 6)."""
+        """The filter's covariance, mean over runs (m, 6, 6)."""
         return _divided(self.covariance_sum, np.minimum(self._runs_of_state[:, :, None], self._runs_of_state[:, None]))
 
     @property
     def sigma(self) -> Array:
-        """The filter's own standard deviation, root mean over runs (m, 6)."""
+        """The filter's standard deviation, root of the mean variance over runs (m, 6)."""
         return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
 
     @property
@@ -299,32 +299,32 @@ class Statistics(Listed):
 
     @property
     def covered(self) -> Array:
-        """Share of the runs whose error lies inside 1, 2, 3 σ (m, 6, 3); :data:`COVERED` for a consistent filter."""
+        """Fraction of the runs whose error lies inside 1, 2, 3 σ (m, 6, 3); :data:`COVERED` for a consistent filter."""
         return _divided(self.coverage, self._runs_of_state[:, :, None])
 
     @property
     def nis_time(self) -> Array:
-        """Middles of the NIS's spans of time (k,), s."""
+        """Midpoints of the time bins of the NIS (k,), s."""
         return 0.5 * (self.nis_edges[1:] + self.nis_edges[:-1])
 
     @property
     def nis_sum(self) -> Array:
-        """Σ over runs and sensors of the NIS in each span of time (k,)."""
+        """Σ over runs and sensors of the NIS in each time bin (k,)."""
         return np.asarray(self.sensor_nis_sum.sum(axis=0))
 
     @property
     def nis_degrees(self) -> Array:
-        """Degrees of freedom in each span of time of one run, mean over runs (k,)."""
+        """Degrees of freedom in each time bin of one run, mean over runs (k,)."""
         return np.asarray(self.sensor_degrees.sum(axis=0) / self.runs)
 
     @property
     def nis(self) -> Array:
-        """NIS per degree of freedom, mean over runs and each span of time (k,); 1 for a consistent filter, NaN without measurements."""
+        """NIS per degree of freedom, mean over runs in each time bin (k,); 1 for a consistent filter, NaN without measurements."""
         return _divided(self.nis_sum, self.sensor_degrees.sum(axis=0))
 
     @property
     def mean_nis(self) -> float:
-        """NIS per degree of freedom over the whole time and all runs; as innovations are white, no epochs are needed."""
+        """NIS per degree of freedom over the whole time and all runs; innovations are white, so no epochs are needed."""
         return float(_divided(self.nis_sum.sum(), self.sensor_degrees.sum()))
 
     @property
@@ -340,12 +340,12 @@ class Statistics(Listed):
         probability : float, default 0.99
             Probability that a consistent filter lies inside the bounds.
         sensor : str, optional
-            Default: all sensors together (:attr:`mean_nis`).
+            Name of a sensor. Default: all sensors together (:attr:`mean_nis`).
 
         Returns
         -------
         low, high : float
-            Per degree of freedom; a mean outside them rejects the filter.
+            Bounds per degree of freedom; a mean outside them rejects the filter.
         """
         rows = slice(None) if sensor is None else self.sensors.index(sensor)
         return consistency.mean_bounds(1, int(self.sensor_degrees[rows].sum()), probability)
@@ -353,7 +353,7 @@ class Statistics(Listed):
     def verdict(self, epochs: NDArray[Any], subset: str = "state", probability: float = 0.99) -> Verdict:
         """Return the two-sided χ² test of the ANEES at given epochs.
 
-        An epoch at which some run was not finite counts as infinite: a filter that fails in a run is not consistent.
+        The ANEES of an epoch at which some run was not finite is infinite: a filter that fails in a run is not consistent.
 
         Parameters
         ----------
@@ -361,7 +361,7 @@ class Statistics(Listed):
             Indices of epochs.
         subset : {"state", "attitude", "bias"}
         probability : float, default 0.99
-            Of the bounds at all epochs together.
+            Probability of the bounds at all epochs together.
 
         Returns
         -------
@@ -378,12 +378,12 @@ class Statistics(Listed):
         Parameters
         ----------
         probability : float
-            Of the quantile, from 0 to 1.
+            Probability of the quantile, from 0 to 1.
 
         Returns
         -------
         ndarray (m, 6)
-            rad, rad/s.
+            Quantiles, rad and rad/s.
         """
         found = _quantile(self.histogram[:, :6], probability, bin_edges(ERROR_EXPONENT))
         return np.asarray(np.where(self._runs_of_state > 0.0, found, np.nan))
@@ -431,12 +431,12 @@ def _log_nees(statistics: Statistics, epochs: Counts, subset: str) -> Finding:
 
 
 def _estimated(statistics: Statistics) -> slice:
-    """Return the states that are estimated: all, or those of the attitude."""
+    """Return the estimated states: all, or those of the attitude."""
     return slice(None) if "bias" in statistics.subsets else slice(3)
 
 
 def _mean_error(statistics: Statistics, epochs: Counts) -> Finding:
-    """Return whether any state's mean error over the runs is other than zero: Student's t, the worst of all epochs and states."""
+    """Return the finding on the mean error over the runs: Student's t, the worst of all epochs and states."""
     from scipy.special import stdtr
 
     runs = statistics.runs
@@ -451,12 +451,12 @@ def _mean_error(statistics: Statistics, epochs: Counts) -> Finding:
         value=float(t.max()),
         p_value=min(1.0, t.size * 2.0 * float(stdtr(runs - 1, -t.max()))),
         samples=runs,
-        means=f"the mean {name} error over the runs is not zero ({t.max():.3g} of its standard errors): it does not average out",
+        means=f"the mean {name} error over the runs is not zero ({t.max():.3g} times its standard error): it does not average out",
     )
 
 
 def _run_coverage(statistics: Statistics, epochs: Counts) -> Finding:
-    """Return whether the errors of any state lie within 1, 2 or 3 σ too often or too seldom, the worst of all epochs and states."""
+    """Return the finding on the fraction of errors within 1, 2 and 3 σ, the worst of all epochs and states."""
     inside = statistics.coverage[epochs][:, _estimated(statistics)] / statistics.runs
     p = coverage_p_values(inside, statistics.runs)
     _, state, k = np.unravel_index(int(np.argmin(p)), p.shape)
@@ -479,13 +479,13 @@ def _divided(total: Any, number: Any) -> Array:
 
 
 def _quantile(histogram: Counts, probability: float, edges: Array) -> Array:
-    """Return quantiles along the last axis, the counts spread evenly over their bins; NaN where there are none."""
+    """Return quantiles along the last axis, the counts evenly distributed over their bins; NaN if there are none."""
     if not 0.0 <= probability <= 1.0:
         raise InputError(f"probability is {probability}; it must lie between 0 and 1")
     before = np.concatenate([np.zeros((*histogram.shape[:-1], 1)), np.cumsum(histogram, axis=-1)], axis=-1)
     total = before[..., -1]
     wanted = probability * total
-    # The bin in which the wanted number is reached: the first whose end is not short of it, and that holds any.
+    # The bin in which the cumulative count reaches the wanted number: the first non-empty one.
     place = np.argmax((before[..., 1:] >= wanted[..., None]) & (histogram > 0), axis=-1)
     start = np.take_along_axis(before, place[..., None], axis=-1)[..., 0]
     held = np.take_along_axis(histogram, place[..., None], axis=-1)[..., 0]
@@ -500,7 +500,7 @@ _EXAMPLES = ("example_run", "example_error", "example_sigma")
 
 
 def merge(a: Statistics, b: Statistics) -> Statistics:
-    """Return the statistics of the runs of both. Sums are added, so the order of merging shows in the last bits."""
+    """Return the statistics of the runs of both. Sums are added, so the order of merging affects the last bits."""
     for name in _SAME:
         if not np.array_equal(getattr(a, name), getattr(b, name)):
             raise InputError(f"statistics of different {name} cannot be merged; they are of different plans")
@@ -515,11 +515,11 @@ def merge(a: Statistics, b: Statistics) -> Statistics:
 
 
 def worst(run: Counts, score: Array) -> tuple[Counts, Array]:
-    """Return the WORST runs and their scores, the largest first, of equal ones the lower number first."""
+    """Return the WORST runs and their scores, in descending order; equal scores in the order of the runs."""
     order = np.lexsort((run, -score))[:WORST]
     return run[order], score[order]
 
 
 def judged_epochs(epochs: int, most: int = 20) -> Counts:
-    """Return the indices of at most ``most`` equally spaced epochs, the start left out: there the error is drawn, not estimated."""
+    """Return the indices of at most ``most`` equally spaced epochs, without the start, where the error is drawn, not estimated."""
     return np.unique(np.linspace(max(1, epochs // most), epochs, min(most, epochs)).astype(np.int64))

@@ -19,9 +19,9 @@ QUANTILES = (0.5, 0.95, 0.997)
 
 
 def bound_of(plan: Plan) -> Array | None:
-    """Return the Cramér–Rao bound (m, 6, 6) at a plan's epochs for another estimator than the MEKF; None where it does not hold.
+    """Return the Cramér–Rao bound (m, 6, 6) at a plan's epochs; None for the MEKF and where the bound does not hold.
 
-    The σ of a matched MEKF is its root. It holds for scenarios of white noise whose initial errors have no fixed part.
+    The bound of a matched MEKF is its own covariance. It holds for scenarios with white noise whose initial errors have no fixed part.
     """
     given = plan.dispersions
     if plan.setup.estimator == MEKF or np.any(given.attitude_error) or np.any(given.bias_error):
@@ -35,7 +35,7 @@ def bound_of(plan: Plan) -> Array | None:
 
 
 def efficiency(statistics: Statistics, bound: Array) -> Array:
-    """Return the RMS error over the root of the Cramér–Rao bound at each epoch and state (m, 6)."""
+    """Return the ratio of the RMS error to the root of the Cramér–Rao bound at each epoch and state (m, 6)."""
     return np.asarray(statistics.rms_error / np.sqrt(np.diagonal(bound, axis1=1, axis2=2)))
 
 
@@ -44,19 +44,19 @@ def summary(
 ) -> dict[str, Any]:
     """Return verdict and numbers: ANEES and NIS per degree of freedom, coverage, errors, worst runs; units in the names.
 
-    The bounds are those that decide (:meth:`Statistics.judge`): all its tests together reject a consistent filter with at
+    The bounds are those of the verdict (:meth:`Statistics.judge`): all its tests together reject a consistent filter with at
     most 1 − ``probability``.
 
     Parameters
     ----------
     statistics : Statistics
-        Of a filter to be tested.
+        Statistics of the filter to be tested.
     epochs : array of int, optional
         Indices of the epochs judged. Default: 20 evenly spaced ones.
     probability : float, default 0.99
         Probability that a consistent filter passes all tests together.
     bound : ndarray (m, 6, 6), optional
-        Cramér–Rao bound at the epochs (:attr:`strapdown.covariance.Analysis.cramer_rao`), which the errors are compared with.
+        Cramér–Rao bound at the epochs (:attr:`strapdown.covariance.Analysis.cramer_rao`), with which the errors are compared.
 
     Returns
     -------
@@ -110,13 +110,13 @@ def summary(
 
 
 def _coverage(statistics: Statistics, epochs: Counts) -> dict[str, Any]:
-    """Return the share of errors inside 1, 2, 3 σ over the axes and the judged epochs."""
+    """Return the fraction of errors inside 1, 2, 3 σ over the axes and the judged epochs."""
     covered = statistics.covered[epochs]
     return {"attitude": covered[:, :3].mean(axis=(0, 1)), "bias": covered[:, 3:].mean(axis=(0, 1))}
 
 
 def _efficiency(statistics: Statistics, bound: Array, epochs: Counts) -> dict[str, Any]:
-    """Return the RMS over the judged epochs of the RMS error over the root of the bound, by axis, and its bounds at one epoch."""
+    """Return the RMS over the judged epochs of the ratio of RMS error to the root of the bound, by axis, and its bounds at one epoch."""
     ratio = np.sqrt(np.mean(efficiency(statistics, bound)[epochs] ** 2, axis=0))
     parts = {"attitude": ratio[:3], "bias": ratio[3:]}
     low, high = consistency.mean_bounds(1, statistics.runs)

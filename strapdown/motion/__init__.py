@@ -1,10 +1,10 @@
-"""Exact motions: attitude, rates and gyro increments known to rounding, the truth for integration algorithms and simulations.
+"""Exact motions: attitude, rates and gyro increments to rounding accuracy, the truth for integration algorithms and simulations.
 
 Every motion is a frozen dataclass that satisfies :class:`Motion`. None of them uses an integration algorithm under test, and no
-increment is a difference of attitudes or of angles: each is the integral of the body rate over its own interval, accurate to
-rounding relative to its own size, however short the interval and however far from the origin of time.
+increment is a difference of attitudes or of angles: each is the integral of the body rate over its interval, with a relative accuracy
+of rounding, however short the interval and however far from the origin of time.
 
-- ``protocol``: :class:`Motion`: the methods of a motion, and how one declares its breaks.
+- ``protocol``: :class:`Motion`: the methods of a motion, and the declaration of its breaks.
 
 Closed forms:
 
@@ -21,7 +21,7 @@ From given rates, attitudes or motions:
 - ``composed``: :class:`Composed`: a vibration on a base motion.
 
 Shared parts: ``parameters`` checks and stores the parameters; ``exact_phase`` forms ω t as exact products, so that an hour of a 100
-Hz motion is as accurate as its first second; ``quadrature`` integrates a rate that has no closed integral.
+Hz motion is as accurate as its first second; ``quadrature`` integrates a rate without a closed-form integral.
 """
 
 from strapdown.motion import orbit as orbit

@@ -16,9 +16,9 @@ from strapdown.motion.quadrature import interval_integrals
 
 @dataclass(frozen=True, kw_only=True)
 class Composed:
-    """A vibration on a base motion, ``q = q_base ⊗ q_vibration``: the body vibrates about the moving base and truly cones.
+    """A vibration on a base motion, ``q = q_base ⊗ q_vibration``: the body vibrates, and may cone, about the moving base.
 
-    The rate is ``w_b = R_vᵀ w_base + w_v``. The increments are those of the vibration, exact, plus the integral of ``R_vᵀ w_base``,
+    The rate is ``w_b = R_vᵀ w_base + w_v``. The increments are the exact ones of the vibration plus the integral of ``R_vᵀ w_base``,
     converged to rounding.
 
     Parameters
@@ -35,7 +35,7 @@ class Composed:
     def __post_init__(self) -> None:
         for name in ("base", "vibration"):
             if not isinstance(getattr(self, name), Motion):
-                raise checks.InputError(f"{name} is {getattr(self, name)!r}; pass a motion, such as motion.Coning(…)")
+                raise checks.InputError(f"{name} is {getattr(self, name)!r}; give a motion, such as motion.Coning(…)")
             break_times(name, getattr(self, name))
 
     @property

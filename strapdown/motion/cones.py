@@ -1,4 +1,4 @@
-"""Coning, equation (18) of *Quaternion differentiation*, and the spin-cone that generalises it."""
+"""Coning, equation (18) of *Quaternion differentiation*, and its generalisation, the spin-cone."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ class Coning:
     Parameters
     ----------
     angle : float
-        β, the half-angle of the cone that the body z axis sweeps, rad; 0 to π.
+        β, the half-angle of the cone swept by the body z axis, rad; 0 to π.
     frequency : float
-        Revolutions of the cone per second, Hz; negative runs it backwards.
+        Coning frequency, Hz; negative reverses the direction.
 
     Examples
     --------
@@ -78,14 +78,14 @@ class Coning:
 
 @dataclass(frozen=True, kw_only=True)
 class SpinCone:
-    """Spin-cone motion ``q = q_z(Ω_p t) q_x(β) q_z(Ω_s t)``: spin about body z, which itself precesses round a cone.
+    """Spin-cone motion ``q = q_z(Ω_p t) q_x(β) q_z(Ω_s t)``: spin about body z, which precesses on a cone.
 
     ``spin_rate = −precession_rate`` is coning, equation (18) of *Quaternion differentiation*.
 
     Parameters
     ----------
     precession_rate : float
-        Ω_p, rate at which the body z axis goes round the cone, rad/s.
+        Ω_p, precession rate of the body z axis, rad/s.
     spin_rate : float
         Ω_s, rate about the body z axis, rad/s.
     angle : float

@@ -59,7 +59,7 @@ class ConstantRate:
         return np.zeros((*times(time).shape, 3))
 
     def increments(self, edges: ArrayLike) -> Array:
-        """Return w_b h of each interval, rad."""
+        """Return w_b h for each interval of duration h, rad."""
         return np.asarray(np.diff(edge_stamps(edges))[:, None] * np.array(self.rate))
 
 

@@ -1,6 +1,6 @@
-"""Phases ω t free of rounding error: exact products of floats, constants to 60 digits, and cosines and integrals made of them.
+"""Phases ω t without rounding error: exact products of floats, constants to 60 digits, and cosines and integrals of them.
 
-ω and t are taken as the exact numbers that the floats are; the rounding error of their product is carried along.
+The floats ω and t are treated as exact; the rounding error of their product is computed and corrected.
 """
 
 from __future__ import annotations
@@ -15,19 +15,19 @@ import numpy as np
 from strapdown.checks import Array
 
 Pair = tuple[float, float]
-"""A number held as the unevaluated sum high + low of two floats: about 32 digits."""
+"""A number as the unevaluated sum high + low of two floats: about 32 digits."""
 
 DIGITS = 60
-"""Decimal digits in which constants are computed before they are rounded to a :data:`Pair`."""
+"""Number of decimal digits of constants before they are rounded to a :data:`Pair`."""
 
 
 def to_decimal(value: Fraction) -> Decimal:
-    """Return a fraction rounded to the digits in use."""
+    """Return a fraction rounded to the precision of the decimal context."""
     return Decimal(value.numerator) / Decimal(value.denominator)
 
 
 def to_pair(value: Decimal) -> Pair:
-    """Return a decimal number to 32 digits."""
+    """Return a decimal number as a pair, to 32 digits."""
     high = float(value)
     return high, float(value - Decimal(high))
 
@@ -38,7 +38,7 @@ def halved(rate: Pair) -> Pair:
 
 
 def exact_sum(a: Any, b: Any) -> tuple[Any, Any]:
-    """Return a + b exactly, as the rounded sum and what rounding cut off (Knuth's two-sum); numbers or arrays."""
+    """Return a + b exactly, as the rounded sum and its rounding error (Knuth's two-sum); numbers or arrays."""
     high = a + b
     part = high - a
     return high, (a - (high - part)) + (b - part)
@@ -57,7 +57,7 @@ def product_error(a: float, b: Array, product: Array) -> Array:
 
 
 def cosine_sine(rate: Pair, time: Array, phase: float = 0.0) -> tuple[Array, Array]:
-    """Return cos and sin of ω t + φ with the product ω t free of rounding error."""
+    """Return cos and sin of ω t + φ without rounding error of the product ω t."""
     angle = np.asarray(rate[0] * time)
     error = product_error(rate[0], time, angle) + rate[1] * time
     cosine, sine = np.cos(angle), np.sin(angle)
@@ -71,7 +71,7 @@ def cosine_sine(rate: Pair, time: Array, phase: float = 0.0) -> tuple[Array, Arr
 def harmonic_integrals(rate: Pair, edges: Array, phase: float = 0.0) -> tuple[Array, Array]:
     """Return ∫ cos(ω t + φ) dt and ∫ sin(ω t + φ) dt over each interval.
 
-    Written as products, ``h sin(ωh/2)/(ωh/2)`` times the cosine and sine at the middle: no difference of nearly equal terms.
+    Computed as ``h sin(ωh/2)/(ωh/2)`` times the cosine and sine at the middle, which avoids the difference of nearly equal terms.
     """
     step = np.diff(edges)
     cosine, sine = cosine_sine(rate, edges[:-1], phase)

@@ -1,4 +1,4 @@
-"""Body rates that are sums of harmonics: vibration as a spectrum gives it."""
+"""Body rates that are sums of harmonics, such as vibration given by a spectrum."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Harmonic:
     frequency : float
         Frequency f of this harmonic, Hz.
     phase : float, default 0.0
-        Phase φ, rad. Two harmonics of one frequency on different axes make an elliptic vibration, which cones.
+        Phase φ, rad. Two harmonics of equal frequency on different axes with different phases are an elliptic vibration, which cones.
     """
 
     amplitude: Sequence[float]
@@ -77,7 +77,7 @@ class HarmonicRates:
         for i, harmonic in enumerate(harmonics):
             if not isinstance(harmonic, Harmonic):
                 raise checks.InputError(
-                    f"harmonics[{i}] is {harmonic!r}; pass motion.Harmonic(amplitude=…, frequency=…)"
+                    f"harmonics[{i}] is {harmonic!r}; give motion.Harmonic(amplitude=…, frequency=…)"
                 )
         object.__setattr__(self, "harmonics", harmonics)
         store_vector(self, "mean")
@@ -111,10 +111,10 @@ class HarmonicRates:
 
     @functools.cached_property
     def _spacing(self) -> float:
-        """The node spacing, s: the largest, to three significant bits, that meets the truncation bound half a spacing away.
+        """Node spacing, s: the largest that meets the truncation bound half a spacing from a node.
 
-        Three bits, so that node times and offsets from them are exact. The coefficients of the attitude are majorised by those of
-        ``exp(½ ∫ Σ |a_j| exp(|ω_j| t))``.
+        It is rounded to three significant bits, so that node times and offsets from them are exact. The coefficients of the attitude are
+        majorised by those of ``exp(½ ∫ Σ |a_j| exp(|ω_j| t))``.
         """
         pace = self._largest_rate + max([abs(h.rate) for h in self.harmonics], default=0.0)
         if pace == 0.0:
@@ -124,7 +124,7 @@ class HarmonicRates:
         return next(step for step in steps if self._truncation(0.5 * step) <= _TRUNCATION)
 
     def _truncation(self, half: float) -> float:
-        """Return the bound on the terms neglected at ``half`` s from a node."""
+        """Return a bound of the neglected terms at a distance of ``half``, s, from a node."""
         terms = 2 * _TERMS
         rate = np.zeros(terms)
         rate[0] = np.linalg.norm(self.mean) * half
@@ -138,7 +138,7 @@ class HarmonicRates:
         return float(series[_TERMS + 1 :].sum())
 
     def attitude_error(self, duration: float) -> float:
-        """Return the error of the attitude: the truncation bound plus an estimate of the rounding.
+        """Return the error of the attitude: the truncation bound plus an estimate of the rounding error.
 
         Parameters
         ----------
@@ -152,9 +152,9 @@ class HarmonicRates:
 
         Notes
         -----
-        Rounding has a random part, of the deviations between nodes, and a part that can repeat at every node (a coning rate of
-        constant size does that), at most a quarter of a unit in the last place of the angle turned. It stays below 1e-13 rad as
-        long as the body turns through less than 1400 rad in all.
+        The rounding error has a random part, from the rotations between nodes, and a part that may be equal at every node (as for a
+        coning rate of constant magnitude), at most a quarter of a unit in the last place of the total angle. It is below 1e-13 rad if
+        the body rotates by less than 1400 rad in total.
         """
         time = abs(checks.finite("duration", duration, unit="s"))
         nodes = 1.0 + time / self._spacing
@@ -177,7 +177,7 @@ class HarmonicRates:
             k = int(np.argmax(np.abs(node)))
             raise checks.InputError(
                 f"time[{k}] is {flat[k]:g} s from time 0, more than {_MAX_NODES * self._spacing:g} s; "
-                "the attitude of harmonic rates is integrated from time 0, so use a nearer time origin"
+                "the attitude of harmonic rates is integrated from time 0; choose the origin of time closer to it"
             )
         order = np.argsort(node, kind="stable")
         used, which = np.unique(node[order], return_inverse=True)
@@ -216,7 +216,7 @@ class HarmonicRates:
 
 
 def _grown(nodes: float) -> int:
-    """Return a number of nodes rounded up to a power of two, so that near calls share one chain."""
+    """Return a number of nodes rounded up to a power of two, so that similar calls share one cached chain."""
     return 1 << max(4, math.ceil(math.log2(max(nodes, 0.0) + 1.0)))
 
 

@@ -14,16 +14,16 @@ __all__ = [
 ]
 
 EARTH_RADIUS = 6371.2e3
-"""m, mean; the reference radius of the geomagnetic field."""
+"""Mean radius of the earth, m; the reference radius of the geomagnetic field."""
 EARTH_GRAVITATION = 3.986004418e14
-"""m³/s² (WGS 84)."""
+"""Gravitational parameter of the earth, m³/s² (WGS 84)."""
 DIPOLE_STRENGTH = 2.98e-5
-"""T, at the magnetic equator (IGRF-13, epoch 2020)."""
+"""Field of the dipole at the magnetic equator, T (IGRF-13, epoch 2020)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CircularOrbit:
-    """A circular orbit in an inertial fixed frame, z to the north pole, its ascending node on the x axis.
+    """A circular orbit in an inertial fixed frame, with z to the north pole and the ascending node on the x axis.
 
     Parameters
     ----------

@@ -9,7 +9,7 @@ from strapdown import checks
 from strapdown.checks import Array
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
-"""The attitude in which body axes are the fixed axes."""
+"""Attitude of a body whose axes are the fixed axes."""
 
 
 def times(time: ArrayLike) -> Array:
@@ -23,21 +23,21 @@ def edge_stamps(edges: ArrayLike) -> Array:
 
 
 def store_number(motion: object, name: str, unit: str) -> float:
-    """Check a parameter of a frozen motion and keep it as a finite float."""
+    """Check a parameter of a frozen motion and store it as a finite float."""
     value = checks.finite(name, getattr(motion, name), unit=unit)
     object.__setattr__(motion, name, value)
     return value
 
 
 def store_vector(motion: object, name: str) -> tuple[float, ...]:
-    """Check a parameter of a frozen motion and keep it as three floats."""
+    """Check a parameter of a frozen motion and store it as three floats."""
     value = tuple(checks.array(name, getattr(motion, name), (3,)).tolist())
     object.__setattr__(motion, name, value)
     return value
 
 
 def store_attitude(motion: object, name: str) -> None:
-    """Check a parameter of a frozen motion and keep it as a unit quaternion."""
+    """Check a parameter of a frozen motion and store it as a unit quaternion."""
     value = checks.unit_quaternions(name, checks.array(name, getattr(motion, name), (4,)))
     object.__setattr__(motion, name, tuple(value.tolist()))
 

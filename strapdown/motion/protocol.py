@@ -18,8 +18,8 @@ class Motion(Protocol):
     Any object with these methods is a motion and may be the base or the vibration of a :class:`Composed`.
 
     A motion whose body rate is not smooth everywhere also has an attribute or property ``breaks``: the times (k,), s, at which the
-    rate or one of its derivatives jumps. It is optional and so no member of this protocol. An integral of the rate is then taken
-    from break to break (:class:`Composed` does so). A missing break costs accuracy and time; a superfluous one costs a little time.
+    rate or one of its derivatives is discontinuous. It is optional and therefore not a member of this protocol. The rate is then
+    integrated from break to break, as :class:`Composed` does. A missing break costs accuracy and time, an unnecessary one a little time.
     """
 
     def attitude(self, time: ArrayLike) -> Array:
@@ -84,5 +84,5 @@ class Motion(Protocol):
 
 
 def break_times(name: str, motion: Motion) -> Array:
-    """Return the ``breaks`` (k,), s, sorted, of the motion that the caller calls ``name``; none if it has no such attribute."""
+    """Return the sorted ``breaks`` (k,), s, of a motion, called ``name`` in errors; none if it has no such attribute."""
     return np.unique(checks.array(f"{name}.breaks", getattr(motion, "breaks", ()), ("k",)))

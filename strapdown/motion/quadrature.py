@@ -1,4 +1,4 @@
-"""Integrals of a body rate over intervals where no closed form is known, converged to rounding."""
+"""Integrals of a body rate without a closed form over intervals, converged to rounding."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ _QUADRATURE_CHUNK = 1 << 14
 def interval_integrals(rate: Callable[[Array], Array], edges: Array, breaks: Array) -> Array:
     """Return ∫ rate dt (n, 3) over each interval, converged to rounding relative to the integral of |rate|.
 
-    Eight-point Gauss–Legendre, exact to degree 15, on pieces bisected until the first neglected term, of degree 16, falls below 1e-16
-    of the largest value; it is extrapolated from the Legendre coefficients of degree 2 and 3 and those of degree 6 and 7, which fall
-    geometrically where the rate is smooth and slowly where it is not. ``breaks`` are the times, sorted, where it is known not to be
-    smooth; no piece straddles one (a kink that is not named can hide between two nodes). A float holds a node's time an hour from the
-    origin to 5e-13 s only: the values are carried over what rounding cuts off by their own derivative.
+    Eight-point Gauss–Legendre quadrature, exact to degree 15, on pieces that are bisected until the first neglected term, of degree 16, is
+    below 1e-16 of the largest value. That term is extrapolated from the Legendre coefficients of degrees 2 and 3 and of degrees 6 and 7,
+    which decrease geometrically if the rate is smooth and slowly if it is not. ``breaks`` are the sorted times at which the rate is known
+    not to be smooth; no piece extends across one (an undeclared kink may lie undetected between two nodes). An hour from the origin a float
+    represents a node's time only to 5e-13 s; the values are corrected for this rounding error to first order.
     """
     result = np.zeros((len(edges) - 1, 3))
     for first in range(0, len(edges) - 1, _QUADRATURE_CHUNK):
@@ -48,7 +48,7 @@ def interval_integrals(rate: Callable[[Array], Array], edges: Array, breaks: Arr
                 np.maximum.at(size, owner, np.abs(values).max(axis=(1, 2)))
             coefficients = np.abs(_TO_LEGENDRE @ values).max(axis=2)
             low, high = coefficients[:, 2:4].max(axis=1), coefficients[:, 6:].max(axis=1)
-            # A piece counts by its share of the interval, so bisection towards a kink ends.
+            # The error of a piece is weighted by its share of the interval, so that bisection towards a kink terminates.
             high_share = high * step / (part[owner + 1] - part[owner])
             decay = np.minimum(high / np.maximum(low, np.finfo(float).tiny), 1.0)
             rough = (high_share * decay**2 > _QUADRATURE_TOLERANCE * size[owner]) & (

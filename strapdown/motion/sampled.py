@@ -23,7 +23,7 @@ class SampledAttitude:
     """Smooth motion through given attitudes: a spline of the quaternions in four dimensions, scaled to the unit sphere.
 
     ``q = s/|s|`` with s a spline of degree 5 (four continuous derivatives) or 3 (two). Unlike a spline of rotation vectors it needs
-    no iteration and no small-angle switch, and rotating the body or the fixed axes rotates the motion with them. The rate
+    no iteration and no small-angle approximation, and the motion does not depend on the choice of body and fixed axes. The rate
     ``w_b = 2 vec(s* ⊗ ṡ)/|s|²`` is exact for this motion; increments are its integrals, converged to rounding.
 
     Parameters
@@ -31,11 +31,11 @@ class SampledAttitude:
     time : array_like (n,)
         Times, s, increasing; the motion is defined between the first and the last.
     attitudes : array_like (n, 4)
-        Unit quaternions q_fb, either sign, consecutive ones less than 170° apart.
+        Unit quaternions q_fb, of either sign, consecutive ones less than 170° apart.
     degree : {5, 3}, default 5
         Degree of the spline.
     ends : {"free", "rest"}, default "free"
-        No condition at the ends, or rate zero there (with degree 5 angular acceleration too).
+        Condition at the ends: none, or zero rate (for degree 5 also zero angular acceleration).
     """
 
     time: Array
@@ -51,14 +51,14 @@ class SampledAttitude:
         time = checks.increasing("time", self.time, minimum=least).copy()
         samples = checks.unit_quaternions("attitudes", checks.array("attitudes", self.attitudes, ("n", 4)))
         if len(samples) != len(time):
-            raise checks.InputError(f"attitudes has {len(samples)} rows for {len(time)} stamps; give one a stamp")
+            raise checks.InputError(f"attitudes has {len(samples)} rows for {len(time)} stamps; give one per stamp")
         turns = np.sum(samples[1:] * samples[:-1], axis=-1)
         wide = np.abs(turns) < math.cos(0.5 * math.radians(_WIDEST_DEGREES))
         if wide.any():
             k = int(np.argmax(wide))
             raise checks.InputError(
                 f"attitudes[{k + 1}] is {math.degrees(2.0 * math.acos(min(1.0, abs(turns[k])))):.0f}° from the one before; "
-                f"give samples less than {_WIDEST_DEGREES:g}° apart, so that the way between them is plain"
+                f"give samples less than {_WIDEST_DEGREES:g}° apart, so that the rotation between them is unambiguous"
             )
         samples[1:] *= np.cumprod(np.where(turns < 0.0, -1.0, 1.0))[:, None]
         time.flags.writeable = samples.flags.writeable = False
@@ -68,7 +68,7 @@ class SampledAttitude:
 
     @property
     def breaks(self) -> Array:
-        """The times of the samples, s: the spline changes polynomial there."""
+        """Times of the samples, s, at which the polynomial pieces of the spline meet."""
         return self.time
 
     @functools.cached_property

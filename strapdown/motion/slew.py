@@ -17,13 +17,13 @@ from strapdown.motion.parameters import IDENTITY, edge_stamps, store_attitude, s
 class Slew:
     """Rest-to-rest rotation about one axis, ``q = q_0 ⊗ exp(s(x) Φ)``, ``x = (t − start)/duration``; at rest before and after.
 
-    ``s = 35 x⁴ − 84 x⁵ + 70 x⁶ − 20 x⁷``: rate, angular acceleration and its derivative start and end at zero. The largest rate is
+    ``s = 35 x⁴ − 84 x⁵ + 70 x⁶ − 20 x⁷``: rate, angular acceleration and its derivative are zero at start and end. The maximum rate is
     ``35/16 |Φ|/duration``.
 
     Parameters
     ----------
     rotation_vector : array_like (3,)
-        Φ, the whole rotation in body axes, rad; may exceed π.
+        Φ, the total rotation in body axes, rad; may exceed π.
     duration : float
         Duration of the rotation, s.
     start : float, default 0.0
@@ -45,21 +45,21 @@ class Slew:
 
     @property
     def end(self) -> float:
-        """The time at which the slew ends, s."""
+        """Time at which the slew ends, s."""
         return self.start + self.duration
 
     @property
     def breaks(self) -> Array:
-        """Start and end, s: the third derivative of the rate jumps there."""
+        """Start and end, s, at which the third derivative of the rate is discontinuous."""
         return np.array([self.start, self.end])
 
     def _elapsed(self, time: Array) -> tuple[Array, Array]:
-        """Return the time since the start and until the end, s, held at both."""
+        """Return the time since the start and until the end, s, of the time clipped to the slew."""
         inside = np.clip(time, self.start, self.end)
         return inside - self.start, self.end - inside
 
     def _rate(self, since: Array, until: Array) -> Array:
-        """Return ds/dt = 140 x³ (1 − x)³/duration, with 1 − x from the time until the end, so that it keeps its digits there."""
+        """Return ds/dt = 140 x³ (1 − x)³/duration, with 1 − x computed from the time until the end to avoid cancellation."""
         length = self.end - self.start
         return np.asarray(140.0 * (since / length * (until / length)) ** 3 / length)
 
@@ -83,7 +83,7 @@ class Slew:
         return np.asarray(acceleration[..., None] * np.array(self.rotation_vector))
 
     def increments(self, edges: ArrayLike) -> Array:
-        """Return ∫ w_b dt over each interval, rad: the rate has degree 6, four Gauss points integrate it exactly."""
+        """Return ∫ w_b dt over each interval, rad; four Gauss points are exact, because the rate is a polynomial of degree 6."""
         since, until = self._elapsed(edge_stamps(edges))
         step = np.diff(np.clip(np.asarray(edges, dtype=np.float64), self.start, self.end))
         nodes, weights = np.polynomial.legendre.leggauss(4)

@@ -77,7 +77,7 @@ class SpinRock:
         return stacked(acceleration * cosine - spin * rate * sine, -acceleration * sine - spin * rate * cosine, 0.0)
 
     def increments(self, edges: ArrayLike) -> Array:
-        """Return ∫ w_b dt over each interval, rad; products of two harmonics as sums, the rates added exactly."""
+        """Return ∫ w_b dt over each interval, rad, with products of two harmonics written as sums and their rates added exactly."""
         stamps = edge_stamps(edges)
         up_cosine, up_sine = harmonic_integrals(exact_sum(self.rock_rate, self.spin_rate), stamps, self.rock_phase)
         down_cosine, down_sine = harmonic_integrals(exact_sum(self.rock_rate, -self.spin_rate), stamps, self.rock_phase)

@@ -22,21 +22,21 @@ from strapdown.motion.quadrature import interval_integrals
 
 _SMALLEST_SINE = 1e-140
 _SEPARATRIX = Decimal("1e-300")
-"""1 − m on the separatrix, where it is 0: the motions part only after 340 times the time constant of leaving the middle axis."""
+"""Value of 1 − m used on the separatrix instead of 0: the motions differ only after 340 time constants of leaving the middle axis."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TorqueFree:
     """Rigid body free of torque, by Jacobi elliptic functions (Landau and Lifshitz, *Mechanics*, §37).
 
-    Any moments and any initial rate: both energy branches, the separatrix between them, symmetric and spherical bodies, spin about
-    a principal axis. Constants are computed to 60 digits, so long times cost no accuracy: attitude, rates and increments are
-    accurate to a few 1e-16 relative. Very close to the separatrix 1 − m is exact, not 1 less a rounded m.
+    All moments and initial rates are allowed: both energy branches, the separatrix between them, symmetric and spherical bodies, spin
+    about a principal axis. Constants are computed to 60 digits, so accuracy does not decrease with time: attitude, rates and increments
+    have relative errors of a few 1e-16. Very close to the separatrix, 1 − m is computed directly and not from a rounded m.
 
     Parameters
     ----------
     inertia : array_like (3,)
-        Principal moments about the body axes x, y, z, kg m² (only their ratios matter); none may exceed the sum of the others.
+        Principal moments about the body axes x, y, z, kg m² (only their ratios matter); none may exceed the sum of the other two.
     initial_rate : array_like (3,)
         w_b at time 0, rad/s.
     initial_attitude : array_like (4,), default identity
@@ -61,7 +61,7 @@ class TorqueFree:
 
     @functools.cached_property
     def _steady(self) -> ConstantRate | None:
-        """The motion of a body that spins about a principal axis."""
+        """Motion of a body that spins about a principal axis; None if it does not."""
         moments, w = [Fraction(i) for i in self.inertia], [Fraction(r) for r in self.initial_rate]
         if any((moments[i] - moments[i - 1]) * w[i] * w[i - 1] for i in range(3)):
             return None
@@ -128,9 +128,10 @@ class TorqueFree:
 class _Solution(NamedTuple):
     """The solution in principal axes 1, 2, 3: ``w = (A_1 cn u, A_2 sn u, A_3 dn u)``, ``u = p t + u_0``; A_1 and A_3 are positive.
 
-    Axis 3 is the one that the angular momentum circles (largest or smallest moment), 2 the middle one. With n = h/|h| in these axes
-    the attitude is ``Z(χ) ⊗ a(n)``, a(n) the shortest rotation of n to axis 3 and ``χ̇ = L/I_3 + (2T/L − L/I_3)/(1 + n_3)``. As n_3 > 0
-    nothing here is singular. The integral of χ̇ is an elliptic integral of the third kind and an arc tangent.
+    Axis 3 is the one about which the angular momentum circulates (largest or smallest moment), axis 2 the middle one. With n = h/|h| in
+    these axes the attitude is ``Z(χ) ⊗ a(n)``, with a(n) the shortest rotation of n to axis 3 and
+    ``χ̇ = L/I_3 + (2T/L − L/I_3)/(1 + n_3)``. There is no singularity, because n_3 > 0. The integral of χ̇ is an elliptic integral of the
+    third kind and an arc tangent.
     """
 
     axes: Array
@@ -154,12 +155,12 @@ class _Solution(NamedTuple):
 
 
 def _solved(inertia: Sequence[float], rate: Sequence[float]) -> _Solution:
-    """Return the solution from principal moments and w_b at time 0, in exact fractions until the last roots."""
+    """Return the solution from principal moments and w_b at time 0, in exact fractions up to the final roots."""
     from scipy.special import elliprf
 
     moments, w = [Fraction(i) for i in inertia], [Fraction(r) for r in rate]
     small, middle, large = sorted(range(3), key=lambda axis: moments[axis])
-    # L² − 2T I_2 decides which axis is circled; on the separatrix either will do.
+    # The sign of L² − 2T I_2 decides which axis is axis 3; on the separatrix either will do.
     excess = sum((moments[i] * (moments[i] - moments[middle]) * w[i] ** 2 for i in range(3)), Fraction(0))
     first, third = (small, large) if excess > 0 or moments[small] == moments[middle] else (large, small)
     if excess == 0 and moments[third] == moments[middle]:
@@ -187,7 +188,7 @@ def _solved(inertia: Sequence[float], rate: Sequence[float]) -> _Solution:
         tilt = to_decimal(i3) * a3 / momentum / (1 - n).sqrt()
         turn = momentum / to_decimal(i3) * 2 * quarter / p + pitch / p * (2 * third_kind - tilt * decimal_pi())
         sine, cosine = float(to_decimal(w2) / a2), float(to_decimal(w1) / a1)
-        # u_0 in [−2K, 2K], of these sn and cn.
+        # u_0 in [−2K, 2K] from its sn and cn.
         start = sine * float(elliprf(cosine**2, float(complement + (1 - complement) * Decimal(cosine) ** 2), 1.0))
         if cosine < 0.0:
             start = math.copysign(2.0 * float(quarter), sine) - start
@@ -207,7 +208,7 @@ def _solved(inertia: Sequence[float], rate: Sequence[float]) -> _Solution:
 
 
 def _reduced(s: _Solution, time: Array) -> tuple[Array, Array]:
-    """Return the half-periods to leave out, j, and the time less j half-periods, free of rounding error."""
+    """Return the nearest number of half-periods, j, and the time less j half-periods without rounding error."""
     high, low = s.half_period
     j = np.rint((time + s.start / s.rate) / high)
     whole = high * j
@@ -215,7 +216,7 @@ def _reduced(s: _Solution, time: Array) -> tuple[Array, Array]:
 
 
 def _rate(s: _Solution, j: Array, sn: Array, cn: Array, dn: Array) -> Array:
-    """Return the rate in axes 1, 2, 3, j half-periods after that of these functions."""
+    """Return the rate in axes 1, 2, 3, j half-periods after the argument of these functions."""
     a1, a2, a3 = s.amplitudes
     sign = 1.0 - 2.0 * np.mod(j, 2.0)
     return stacked(sign * a1 * cn, sign * a2 * sn, a3 * dn)
@@ -224,7 +225,7 @@ def _rate(s: _Solution, j: Array, sn: Array, cn: Array, dn: Array) -> Array:
 def _third_angle(s: _Solution, u: Array, sn: Array, cn: Array, dn: Array) -> Array:
     """Return ``κ ∫ α du/(1 + n_3)`` from 0 to u, |u| ≤ K, with κ α = 2T/L − L/I_3.
 
-    Its integral of the third kind is ``Π = F + n/3 sn³ R_J(cn², dn², 1, 1 − n sn²)`` (DLMF 19.25.14), and F is u itself.
+    The integral of the third kind is ``Π = F + n/3 sn³ R_J(cn², dn², 1, 1 − n sn²)`` (DLMF 19.25.14) with F = u.
     """
     from scipy.special import elliprj
 
@@ -238,7 +239,7 @@ def _third_angle(s: _Solution, u: Array, sn: Array, cn: Array, dn: Array) -> Arr
 def _jacobi(s: _Solution, u: Array) -> tuple[Array, Array, Array]:
     """Return sn, cn and dn of u by the arithmetic-geometric mean (Bulirsch 1965, *sncndn*).
 
-    cn and dn keep their relative accuracy where they are small, near odd multiples of K for m near 1.
+    cn and dn keep their relative accuracy when they are small, near odd multiples of K for m near 1.
     """
     scale = s.means[-1][0]
     turned = scale * u

@@ -171,14 +171,12 @@ def states_over_time(estimate: Estimate, *, title: str = "") -> Figure:
         reach = 1.2 * float(np.max(np.abs(values[settled]) + spread[settled]))
         ax.set_ylim(-reach, reach)
         ax.set_ylabel(word)
-        edges = "band" if len(members) == 1 else "dotted"
         what = name.replace("scale", "misalignment") if (word, size) == ("mrad", 1e-3) else name
-        ax.set_title(f"{what}; {edges}: {THREE_SIGMA}", loc="left")
+        ax.set_title(what, loc="left")
         legend_above(ax, ncols=min(len(members), 9))
     axes[-1].set_xlabel("time, s")
     axes[-1].set_xlim(estimate.time[0], estimate.time[-1])
-    if title:
-        figure.suptitle(title)
+    figure.suptitle("; ".join([*([title] if title else []), f"dotted or shaded: {THREE_SIGMA}"]))
     return figure
 
 

@@ -1,10 +1,10 @@
-"""Recordings from the bench and the field, read from and written to many formats, with clear errors where a file is faulty.
+"""Recordings of devices, read from and written to many formats, with clear errors for faulty files.
 
-A recording holds point samples of rate, specific force and magnetic field of a device, on one time axis. :mod:`strapdown.ahrs`
+A recording has point samples of rate, specific force and magnetic field of a device, on one time axis. :mod:`strapdown.ahrs`
 estimates attitude from it.
 
-- ``formats``: The table of formats, :func:`read` by content, :func:`write` by ending.
-- ``body_axes``: Axes and signs that are not the package's: :func:`with_axes`.
+- ``formats``: The table of formats; :func:`read` by content, :func:`write` by file extension.
+- ``body_axes``: Axes and signs that differ from the package's: :func:`with_axes`.
 - ``columns``, ``delimited``, ``dataframes``: Tables: roles of columns; CSV and TSV; Parquet, pandas and xarray.
 - ``ros``: ROS bags.
 - ``ulog``: Flight logs of PX4.
@@ -17,7 +17,7 @@ estimates attitude from it.
 
 from __future__ import annotations
 
-# Imported as itself above and not listed here: for the package alone.
+# Names imported "as" themselves and not listed in __all__ are for use within the package only.
 from strapdown.recordings import unit_calibration as unit_calibration
 from strapdown.recordings.body_axes import SENSORS as SENSORS
 from strapdown.recordings.body_axes import axes_matrix as axes_matrix

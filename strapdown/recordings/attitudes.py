@@ -1,9 +1,9 @@
-"""Attitudes over time from files of any filter or reference, with their covariance where the file gives it: what a filter is judged by.
+"""Attitudes over time from files of any filter or reference, with their covariance if the file gives it; for judging filters.
 
-``read_attitudes`` distinguishes formats by content:
+``read_attitudes`` recognises formats by content:
 
 - results of this package (HDF5): estimate, simulated record (its truth), integrated attitude;
-- TUM trajectories (no covariance) and EuRoC's ground truth;
+- the reference of a BROAD trial, TUM trajectories (no covariance) and EuRoC's ground truth;
 - CSV and TSV with the columns of :data:`COLUMNS`, such as `strapdown convert estimate.h5 estimate.csv` writes;
 - ROS bags: ``sensor_msgs/Imu`` (orientation), ``nav_msgs/Odometry``, ``geometry_msgs/PoseWithCovarianceStamped``, ``PoseStamped``,
   ``QuaternionStamped``;
@@ -29,24 +29,25 @@ from strapdown import quaternion, records
 from strapdown.checks import Array, InputError, array, one_of
 from strapdown.files import reading
 from strapdown.recordings import delimited, recordfiles, ros, trajectories
+from strapdown.recordings.broad import read_broad
 from strapdown.recordings.extras import library
-from strapdown.records import Innovations, outputs
+from strapdown.records import Innovations, Recording, outputs
 from strapdown.units import DEGREE, DEGREE_PER_HOUR
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Attitudes:
-    """Attitudes of a file, in its own frames."""
+    """Attitudes of a file, in the frames of the file."""
 
     source: str
     stamps_ns: NDArray[np.int64]
-    """(m,), ns of the file's clock, increasing."""
+    """Time stamps (m,), ns of the file's clock, increasing."""
     attitude: Array
     """q_fb (m, 4), scalar first."""
     covariance: Array | None = None
-    """(m, 3, 3) of the attitude error, rad², or (m, 6, 6) with that of the bias."""
+    """Covariance of the attitude error (m, 3, 3), rad², or including the bias (m, 6, 6)."""
     error_frame: str = ""
-    """Error that the covariance describes (:data:`strapdown.consistency.foreign.ERROR_FRAMES`), where the format says; else empty."""
+    """Error described by the covariance (:data:`strapdown.consistency.foreign.ERROR_FRAMES`) if the format defines it; else empty."""
     bias: Array | None = None
     """Gyro bias (m, 3), rad/s, body axes."""
     innovations: Mapping[str, Innovations] = field(default_factory=dict)
@@ -59,19 +60,21 @@ class Attitudes:
 
 
 def read_attitudes(path: str | os.PathLike[str], *, topic: str = "") -> Attitudes:
-    """Read the attitudes of a file, or of the folder of a ROS 2 bag; of several topics with attitudes name one."""
+    """Read the attitudes of a file, or of the folder of a ROS 2 bag; ``topic`` selects one if several have attitudes."""
     file = Path(path)
     if ros.is_folder(file):
         return _bag(file, topic)
     reading.existing_file(file)
     if reading.is_hdf5(file):
-        return _own(file)
+        with reading.hdf5(file) as content:
+            own = "kind" in reading.attributes(content)
+        return _own(file) if own else _of_recording(read_broad(file))
     with reading.opened(file) as stream:
         head = stream.read(4096)
     if head.startswith(ros.MAGICS):
         return _bag(file, topic)
     if topic:
-        raise InputError(f"{file.name} is no bag; leave --topic out")
+        raise InputError(f"{file.name} is not a bag; leave --topic out")
     if head.startswith(b"ULog"):
         return _ulog(file)
     if trajectories.is_tum(head + b"\n"):
@@ -114,8 +117,17 @@ def _own(path: Path) -> Attitudes:
             time, q = reading.numbers(file, "time"), reading.numbers(file, "attitude")
         return Attitudes(source=path.name, stamps_ns=_whole_ns(time), attitude=q)
     raise InputError(
-        f"{path} is a {kind}, which holds no attitudes over time; give an estimate, a record or a trajectory"
+        f"{path} is a {kind}, which has no attitudes over time; give an estimate, a record or a trajectory"
     )
+
+
+def _of_recording(recording: Recording) -> Attitudes:
+    """Return the reference of a recording."""
+    if recording.true_attitude is None:
+        raise InputError(f"{recording.source} is a recording without a reference attitude; give another reference")
+    known = np.isfinite(recording.true_attitude).all(axis=1)
+    stamps = recording.epoch_ns + _whole_ns(recording.time[known])
+    return Attitudes(source=recording.source, stamps_ns=stamps, attitude=recording.true_attitude[known])
 
 
 # ------------------------------------------------------------------------------------------------------------ tables
@@ -128,9 +140,9 @@ COLUMNS: dict[str, str] = {
     "angle": r"(?P<axis>roll|pitch|yaw)_(sigma|std)_(?P<unit>rad|deg)",
     "bias": r"(gyro_)?bias_(?P<axis>[xyz])_(?P<unit>rad_per_s|deg_per_h|deg_per_s)",
 }
-"""Columns of a table by what they hold: patterns of whole names, in small letters. ``cov_xy_rad2`` is an element of the covariance of the
-attitude error, ``cov_xby`` one of attitude and bias, ``cov_fixed_xy_rad2`` one that says what it is of; ``sigma_x_deg`` and
-``yaw_sigma_deg`` give a diagonal, of rotation vector or angles."""
+"""Columns of a table by their content: patterns of whole names, in lower case. ``cov_xy_rad2`` is an element of the covariance of the
+attitude error, ``cov_xby`` one of attitude and bias, ``cov_fixed_xy_rad2`` one with its axes named; ``sigma_x_deg`` and
+``yaw_sigma_deg`` are standard deviations, of the rotation vector or of the angles."""
 _TIME = {"s": 10**9, "sec": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
 _SIZE = {"rad": 1.0, "deg": DEGREE, "rad_per_s": 1.0, "deg_per_h": DEGREE_PER_HOUR, "deg_per_s": DEGREE}
 _STATES = ("x", "y", "z", "bx", "by", "bz")
@@ -154,7 +166,7 @@ def _table(path: Path) -> Attitudes:
                     frames.add(parts["frame"])
                 if key in found[name]:
                     raise InputError(
-                        f"{path.name}: column {cell} says the same as column {table.header[found[name][key][0]]}"
+                        f"{path.name}: column {cell} has the same meaning as column {table.header[found[name][key][0]]}"
                     )
                 found[name][key] = (place, parts.get("unit") or "")
         if len(frames) > 1:
@@ -187,7 +199,7 @@ def _table(path: Path) -> Attitudes:
     if covariance is not None and covariance.shape[1] == 6 and bias is None:
         covariance = covariance[:, :3, :3]
     if covariance is not None and covariance.shape[1] == 3:
-        bias = None  # of which there is no covariance
+        bias = None  # its covariance is not given
     _need_order(path.name, stamps[known])
     return Attitudes(
         source=path.name,
@@ -203,7 +215,7 @@ def _table(path: Path) -> Attitudes:
 def _covariance(
     name: str, columns: Mapping[str, Mapping[str, tuple[Array, str]]], m: int
 ) -> tuple[Array | None, str, list[str]]:
-    """Return the covariance in columns, the states it is of where they are named, and remarks."""
+    """Return the covariance from the columns, the kind of angles it describes (empty if not named), and remarks."""
     given = columns["cov"]
     if given:
         size = 6 if any("b" in key for key in given) else 3
@@ -219,10 +231,10 @@ def _covariance(
         entries = columns[group]
         if set(entries) == set(axes):
             sigma = np.stack([entries[axis][0] * _SIZE[entries[axis][1]] for axis in axes], axis=1)
-            words = "The file has σ and no covariance: errors of different axes are taken for independent."
+            words = "The file has σ and no covariance: errors of different axes are treated as independent."
             return np.apply_along_axis(np.diag, 1, sigma**2), frame, [words]
     words = (
-        "The table has no covariance. Its columns are cov_body_xx_rad2, cov_body_xy_rad2, … (or cov_fixed_…), or sigma_x_deg, sigma_y_deg, "
+        "The table has no covariance. Columns for it: cov_body_xx_rad2, cov_body_xy_rad2, … (or cov_fixed_…), or sigma_x_deg, sigma_y_deg, "
         "sigma_z_deg of the rotation vector, or yaw_sigma_deg, pitch_sigma_deg, roll_sigma_deg."
     )
     return None, "", [words]
@@ -253,11 +265,11 @@ _ORIENTED = {
     "geometry_msgs/msg/PoseStamped": ("pose.orientation", ""),
     "geometry_msgs/msg/QuaternionStamped": ("quaternion", ""),
 }
-"""Where messages hold an orientation, and its covariance: 3 × 3, or the last rows and columns of 6 × 6."""
+"""Fields of an orientation and its covariance by message: 3 × 3, or the last rows and columns of 6 × 6."""
 
 
 def _bag(path: Path, topic: str) -> Attitudes:
-    """Read the orientations of a bag. Poses have their covariance about fixed axes by REP 103; drivers of Imu do as they like."""
+    """Read the orientations of a bag. By REP 103, covariances of poses are about fixed axes; drivers of Imu messages differ."""
     highlevel = library("rosbags.highlevel", f"{path.name} is a ROS bag, which")
     typesys = library("rosbags.typesys", f"{path.name} is a ROS bag, which")
     rows: list[tuple[int, list[float], Array | None]] = []
@@ -276,11 +288,11 @@ def _bag(path: Path, topic: str) -> Attitudes:
                     rows.append((stamp or logged, [q.w, q.x, q.y, q.z], P))
     except InputError:
         raise
-    except Exception as error:  # the library raises what its parsers do
+    except Exception as error:  # the library raises any exception of its parsers
         raise InputError(f"{path.name} cannot be read as a ROS bag ({' '.join(str(error).split())})") from None
     known = [row for row in rows if any(row[1]) and not (row[2] is not None and row[2][0] == -1.0)]
     if len(known) < 2:
-        raise InputError(f"{path.name}: topic {chosen} says nothing of the orientation in its {len(rows)} messages")
+        raise InputError(f"{path.name}: topic {chosen} has no orientation in its {len(rows)} messages")
     known.sort(key=lambda row: row[0])
     stamps = np.array([row[0] for row in known], np.int64)
     fresh = np.concatenate([[True], np.diff(stamps) > 0])
@@ -328,13 +340,13 @@ _INNOVATIONS, _VARIANCES = "estimator_innovations", "estimator_innovation_varian
 
 
 def _ulog(path: Path) -> Attitudes:
-    """Read PX4's own estimate of attitude, body axes forward, right, down, turned to East-North-Up, and its innovations."""
+    """Read the attitude estimated by PX4, body axes forward, right, down, transformed to East-North-Up, and its innovations."""
     pyulog = library("pyulog", f"{path.name} is a flight log of PX4, which")
     wanted = [_STATES_TOPIC, _ATTITUDE_TOPIC, _INNOVATIONS, _VARIANCES]
     try:
         with contextlib.redirect_stdout(io.StringIO()):
             log = pyulog.ULog(str(path), wanted)
-    except Exception as error:  # of a damaged log the library raises what its parsers do
+    except Exception as error:  # for a damaged log the library raises any exception of its parsers
         raise InputError(
             f"{path.name} cannot be read as ULog ({' '.join(str(error).split())}); the log is damaged"
         ) from None
@@ -354,21 +366,21 @@ def _ulog(path: Path) -> Attitudes:
             xi = np.stack([_quaternion_columns(one) for one in ned])
             covariance = 4.0 * np.einsum("mqi,mq,mqj->mij", xi, known, xi)
             remarks.append(
-                "The log holds the variances of the quaternion without their correlations: σ of the attitude is approximate."
+                "The log has the variances of the quaternion without their correlations: σ of the attitude is approximate."
             )
         elif number > 0:
             covariance = np.apply_along_axis(np.diag, 1, known[:, :3])
-            remarks.append("The log holds the variances of the attitude error without their correlations.")
+            remarks.append("The log has the variances of the attitude error without their correlations.")
     elif _ATTITUDE_TOPIC in data:
         rows = data[_ATTITUDE_TOPIC]
         stamps, kept = _fresh(rows)
         ned = _unit(path.name, np.stack([np.asarray(rows[f"q[{k}]"], np.float64) for k in range(4)], axis=1)[kept])
         remarks.append(f"{_ATTITUDE_TOPIC}: no covariance.")
     else:
-        raise InputError(f"{path.name} holds neither {_STATES_TOPIC} nor {_ATTITUDE_TOPIC}; log one of them")
+        raise InputError(f"{path.name} has neither {_STATES_TOPIC} nor {_ATTITUDE_TOPIC}; log one of them")
     if covariance is not None and not (np.diagonal(covariance, axis1=1, axis2=2) > 0.0).all():
         covariance = None
-        remarks.append("Its variances are not all above zero: left out.")
+        remarks.append("Its variances are not all above zero and are left out.")
     innovations: dict[str, Innovations] = {}
     if _INNOVATIONS in data and _VARIANCES in data:
         innovations = _ulog_innovations(data[_INNOVATIONS], data[_VARIANCES], int(stamps[0]))
@@ -384,7 +396,7 @@ def _ulog(path: Path) -> Attitudes:
 
 
 def _fresh(rows: Mapping[str, Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return stamps, µs, in order and once each, and the rows that they are of; of the sample where the file gives it."""
+    """Return stamps, µs, sorted and without duplicates, and their rows; the stamps are those of the samples if the file gives them."""
     stamps = np.asarray(rows.get("timestamp_sample", rows["timestamp"])).astype(np.int64)
     order = np.argsort(stamps, kind="stable")
     kept = order[np.concatenate([[True], np.diff(stamps[order]) > 0])]
@@ -398,7 +410,7 @@ def _quaternion_columns(q: Array) -> Array:
 
 
 def _ulog_innovations(values: Mapping[str, Any], variances: Mapping[str, Any], first: int) -> dict[str, Innovations]:
-    """Return innovations by field; a value that is held from the row before is no new measurement."""
+    """Return innovations by field; a value equal to that of the row before is not a new measurement."""
     at = np.asarray(values["timestamp"]).astype(np.int64)
     beside = {stamp: k for k, stamp in enumerate(np.asarray(variances["timestamp"]).astype(np.int64).tolist())}
     rows = np.array([k for k, stamp in enumerate(at.tolist()) if stamp in beside], np.int64)

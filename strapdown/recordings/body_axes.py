@@ -1,7 +1,7 @@
-"""Axes and signs of a recording's sensors, where they are not those of :mod:`strapdown`.
+"""Axes and signs of a recording's sensors, if they differ from those of :mod:`strapdown`.
 
-A rate gyro measures by the right-hand rule, an accelerometer the specific force (at rest +g upward), a magnetometer the field. Devices
-differ: bodies whose z axis points down, phones whose accelerometer reads the opposite sign, boards with a turned magnetometer.
+The gyro's sign is by the right-hand rule, the accelerometer measures the specific force (at rest +g upward), the magnetometer the field.
+Devices differ: bodies whose z axis points down, phones whose accelerometer has the opposite sign, boards with a rotated magnetometer.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from strapdown.checks import Array, InputError, one_of
 from strapdown.records.recording import Recording
 
 SENSORS = {"gyro": "rate", "accelerometer": "specific_force", "magnetometer": "magnetic_field"}
-"""Sensors of a recording, and their columns."""
+"""Columns by sensor of a recording."""
 
 
 def axes_matrix(text: str, name: str = "axes") -> Array:
@@ -39,10 +39,10 @@ def axes_matrix(text: str, name: str = "axes") -> Array:
 def with_axes(
     recording: Recording, axes: str | Mapping[str, str] | None = None, invert: str | Iterable[str] = ()
 ) -> Recording:
-    """Return a recording in other body axes, or with the axes of single sensors corrected; its ``remarks`` say what was changed.
+    """Return a recording in other body axes, or with the axes of single sensors corrected; its ``remarks`` list the changes.
 
-    ``axes`` are the recorded axes that become x, y, z, ``"x,-y,-z"`` from forward-right-down to forward-left-up, of the whole unit, its
-    reference attitude included; or by sensor, ``{"magnetometer": "y,x,-z"}``. ``invert`` names sensors whose sign is inverted on all axes.
+    ``axes`` are the recorded axes that become x, y, z, ``"x,-y,-z"`` from forward-right-down to forward-left-up, of the whole unit with its
+    reference attitude, or of single sensors, ``{"magnetometer": "y,x,-z"}``. ``invert`` lists sensors with inverted sign on all axes.
     """
     whole, single = (None, dict(axes)) if isinstance(axes, Mapping) else (axes, {})
     matrices = {sensor: axes_matrix(text, f"axes of the {sensor}") for sensor, text in single.items()}
@@ -74,7 +74,7 @@ def _turned(recording: Recording, matrix: Array) -> Recording:
     if recording.true_attitude is not None:
         if np.linalg.det(matrix) < 0.0:
             raise InputError(
-                f"{recording.source}: axes mirror the unit, which its reference attitude cannot follow; give the axes of single sensors"
+                f"{recording.source}: axes mirror the unit, but its reference attitude can only be rotated; give the axes of single sensors"
             )
         known = np.isfinite(recording.true_attitude).all(axis=1)
         changed["true_attitude"] = recording.true_attitude.copy()

@@ -2,7 +2,7 @@
 
 ``imu_gyr`` (n, 3) rad/s, ``imu_acc`` (n, 3) m/s², ``imu_mag`` (n, 3) µT, in the axes of the unit; ``opt_quat`` (n, 4), the optical
 reference q_fb, scalar first, East-North-Up with magnetic North; ``movement`` (n,) bool; the attribute ``sampling_rate``, Hz. There are no
-stamps: time begins at 0. :func:`write_broad` writes the same, and so only of even stamps.
+time stamps: time begins at 0. :func:`write_broad` writes the same layout and therefore needs equal sample intervals.
 """
 
 from __future__ import annotations
@@ -55,24 +55,24 @@ def read_broad(path: str | os.PathLike[str]) -> Recording:
 _READ = ("imu_gyr", "imu_acc", "imu_mag", "opt_quat", "movement")
 """Data sets that are read."""
 EVEN = 1e-3
-"""Largest relative departure of a sample interval from their mean that still counts as even."""
+"""Maximum relative deviation of a sample interval from the mean, for the intervals to count as equal."""
 
 
 def sample_interval(recording: Recording) -> float:
-    """Return the interval between the stamps of a recording, s; uneven ones are refused, the worst of them named."""
+    """Return the interval between the stamps of a recording, s; if the intervals differ, the error names the worst."""
     steps = np.diff(recording.time)
     mean = float(steps.mean())
     worst = int(np.argmax(np.abs(steps - mean)))
     if abs(steps[worst] - mean) > EVEN * mean:
         raise InputError(
             f"{recording.source}: the interval after {recording.time[worst]:.6g} s is {steps[worst]:.6g} s, the mean {mean:.6g} s; cut the "
-            "recording to where its samples lie at even intervals"
+            "recording to a part with equal sample intervals"
         )
     return mean
 
 
 def write_broad(recording: Recording, path: str | os.PathLike[str]) -> None:
-    """Write a recording of even stamps in the layout of BROAD; its clock is lost, for the layout has none."""
+    """Write a recording with equal sample intervals in the layout of BROAD, which has no clock."""
     interval = sample_interval(recording)
     content = {
         "imu_gyr": recording.rate,

@@ -1,14 +1,14 @@
-"""Which column of a table is what, and in which unit: by name, by a mapping, or guessed from the header with a remark.
+"""Roles and units of a table's columns: by name, by a mapping, or guessed from the header with a remark.
 
-The package's own names are ``time``, ``gx gy gz`` (gyro), ``ax ay az`` (specific force), ``mx my mz`` (magnetic field), ``temperature``
-(°C), and of a reference ``reference_qw … reference_qz`` (q_fb) and ``movement`` (0 or 1). Where a header has other names, complete triples
-whose names end in an axis and contain a usual name of a sensor are assigned to it: ``gyro_x``, ``GyrX``, ``angular_velocity.x``,
-``w_RS_S_x``, ``Gyroscope X (deg/s)``, ``accelerometer_m_s2[0]``. What was taken is among the recording's ``remarks``. Two triples that fit
-one sensor are refused, as is an acceleration without gravity.
+The package's names are ``time``, ``gx gy gz`` (gyro), ``ax ay az`` (specific force), ``mx my mz`` (magnetic field), ``temperature``
+(°C), and for a reference ``reference_qw … reference_qz`` (q_fb) and ``movement`` (0 or 1). If a header has other names, complete triples
+whose names end in an axis and contain a usual name of a sensor are assigned to that sensor: ``gyro_x``, ``GyrX``, ``angular_velocity.x``,
+``w_RS_S_x``, ``Gyroscope X (deg/s)``, ``accelerometer_m_s2[0]``. The recording's ``remarks`` list the columns assigned. If two triples fit
+one sensor, the table is rejected. An acceleration without gravity is not used.
 
-A unit stands in brackets after the name, in parentheses, or as the end of the name (``time_us``, ``gyro_x_dps``). A factor of 57.3 or 9.81
-is the commonest mistake there is, so a gyro or an accelerometer without a unit is refused rather than guessed. Time is in s unless declared
-otherwise; a magnetometer without a unit keeps the numbers it has.
+A unit is given in brackets after the name, in parentheses, or at the end of the name (``time_us``, ``gyro_x_dps``). Because a factor of
+57.3 or 9.81 is the most common mistake, a gyro or an accelerometer without a unit is rejected rather than guessed. Time is in s unless
+declared otherwise; the values of a magnetometer without a unit are kept unchanged.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from strapdown.checks import Array, InputError, known_keys, one_of
+from strapdown.checks import Array, InputError, instance, known_keys, one_of
 from strapdown.records.recording import (
     CLOCK_OFFSET,
     FORCE_UNITS,
@@ -40,7 +40,7 @@ GROUPS = {
     "reference": ("reference_qw", "reference_qx", "reference_qy", "reference_qz"),
     "movement": ("movement",),
 }
-"""Columns by what measures them."""
+"""Columns by group."""
 SENSORS = ("gyro", "accelerometer", "magnetometer")
 UNITS: Mapping[str, Mapping[str, float]] = {
     "time": TIME_UNITS,
@@ -49,7 +49,7 @@ UNITS: Mapping[str, Mapping[str, float]] = {
     "magnetometer": MAGNETIC_UNITS,
     "temperature": {"degC": 1.0},
 }
-"""Units by group, with their factor to SI."""
+"""Units by group, with their factors to SI."""
 
 _SPELLINGS = {
     "time": {"sec": "s", "secs": "s", "second": "s", "seconds": "s", "msec": "ms", "usec": "us", "nsec": "ns"}
@@ -61,7 +61,7 @@ _SPELLINGS = {
     | {"tesla": "T", "mga": "mG", "ut": "uT", "nt": "nT", "g": "G", "mg": "mG"},
     "temperature": {"c": "degC", "celsius": "degC", "degc": "degC"},
 }
-"""Other spellings of units, without spaces and in small letters."""
+"""Other spellings of units, without spaces and in lower case."""
 _WORDS = {
     "gyro": {"gyro", "gyr", "gyros", "gyroscope", "gyrometer", "g", "w", "omega", "angular", "angularvelocity"},
     "accelerometer": {"acc", "accel", "accl", "accelerometer", "acceleration", "a", "specific"},
@@ -69,7 +69,7 @@ _WORDS = {
 }
 _OTHER = {"linear", "user", "gravity", "free", "world", "earth", "global", "nav", "bias", "std", "sigma", "cov"}
 _OTHER |= {"covariance", "var", "variance", "offset", "delta", "filtered", "temperature", "temp"}
-"""Words of columns that are no plain sample of a sensor."""
+"""Words in names of columns that are not samples of a sensor."""
 _TIMES = ("time", "timestamp", "timestamps", "t", "stamp", "ts", "seconds elapsed")
 
 
@@ -103,7 +103,7 @@ def column(cell: str) -> Column:
 
 
 def unit_of(group: str, text: str) -> str:
-    """Return the package's name of a unit of that group, however it is spelt; empty where it is none."""
+    """Return the package's name of a unit of that group, in any spelling; empty if the text is not a unit."""
     plain = (text.strip().replace("²", "2").replace("^", "").replace("°", "deg").replace("⁻¹", "-1").replace("⁻2", "-2")
              .replace("µ", "u").replace("μ", "u"))  # fmt: skip
     if plain in UNITS[group]:
@@ -115,15 +115,13 @@ def unit_of(group: str, text: str) -> str:
 
 
 def parse_mapping(text: str) -> dict[str, str]:
-    """Return the columns of ``time=timestamp,gx=gyro_x[dps],…`` by role, as ``--columns`` takes them."""
-    roles = [role for members in GROUPS.values() for role in members]
+    """Return the columns by role from a text ``time=timestamp,gx=gyro_x[dps],…``, the format of ``--columns``."""
     found: dict[str, str] = {}
     for part in text.split(","):
         role, equals, name = part.partition("=")
         role = role.strip()
         if not equals or not name.strip():
-            raise InputError(f"columns: {part.strip()!r} is no ROLE=NAME; write time=timestamp,gx=gyro_x[dps],…")
-        one_of("columns: role", role, roles)
+            raise InputError(f"columns: {part.strip()!r} is not ROLE=NAME; write time=timestamp,gx=gyro_x[dps],…")
         if role in found:
             raise InputError(f"columns: {role} is given twice; keep one")
         found[role] = name.strip()
@@ -142,11 +140,13 @@ def recording(
 ) -> Recording:
     """Return the recording of a table.
 
-    ``load`` returns the numbers (n,) of columns, empty fields NaN, of their places and that of the time, and is called once; ``clock_ns``
-    returns (time, epoch_ns) of a loaded column that holds stamps as whole ns or dates, None of one that holds numbers. ``units`` serve
-    where the header declares none; ``mapping`` names columns by role, perhaps with a unit, ``{"gx": "gyro_x [dps]"}``, the others are found
-    by their names.
+    ``load`` returns the numbers (n,) of columns, empty fields NaN, from their indices and that of the time, and is called once.
+    ``clock_ns`` returns (time, epoch_ns) of a loaded column of stamps in integer ns or of dates, otherwise None. ``units`` are used if the
+    header declares none. ``mapping`` gives columns by role, optionally with a unit, ``{"gx": "gyro_x [dps]"}``; the others are found by
+    their names.
     """
+    for name, given in (("units", units or {}), ("columns", mapping or {})):
+        instance(name, given, Mapping, "give a mapping, such as units={'gyro': 'deg/s'} or columns={'gx': 'gyro_x'}")
     known_keys("units", units or {}, [group for group in UNITS if group != "temperature"])
     columns = [column(cell) for cell in header]
     _no_doubles(source, columns)
@@ -214,11 +214,12 @@ def _lacks(source: str, missing: Sequence[str], columns: Sequence[Column]) -> st
 def _roles(
     source: str, columns: Sequence[Column], mapping: Mapping[str, str]
 ) -> tuple[dict[str, int], dict[str, str], str]:
-    """Return the column of each role, the unit that each group's columns declare, and remarks on guesses."""
+    """Return the column of each role, the declared unit of each group, and a remark on guessed columns."""
     names = [one.name.lower() for one in columns]
     unit_by_role: dict[str, str] = {}
     roles: dict[str, int] = {}
     for role, cell in mapping.items():
+        one_of("columns: role", role, [role for members in GROUPS.values() for role in members])
         wanted = column(cell)
         cells = {one.said.lower(): k for k, one in enumerate(columns)} | {name: k for k, name in enumerate(names)}
         found = cells.get(cell.lower(), cells.get(wanted.name.lower()))
@@ -253,18 +254,18 @@ def _roles(
                     f"{source}: column {columns[k].name} is in {unit} but another {group} column in {declared[group]}; "
                     "give all axes of one sensor the same unit"
                 )
-    return roles, declared, f"Columns taken by their names: {'; '.join(guessed)}." if guessed else ""
+    return roles, declared, f"Columns assigned by their names: {'; '.join(guessed)}." if guessed else ""
 
 
 def _words(name: str) -> list[str]:
-    """Return the words of a name: parted where letters end, where small ones turn to capitals, and before digits in brackets."""
+    """Return the words of a name: split at other characters, between lower and upper case, and before an index in brackets."""
     name = re.sub(r"\[(\d)\]", r" axis\1 ", name)
     name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", " ", name)
     return [word.lower() for word in re.split(r"[^A-Za-z0-9µμ°²/]+", name) if word]
 
 
 def _guess(source: str, group: str, columns: Sequence[Column]) -> tuple[tuple[int, ...], str] | None:
-    """Return the columns that seem to be a group's, and the unit in their names; None where none do, an error where several do."""
+    """Return the columns that match a group and the unit in their names; None if there is no match, an error if there are several."""
     if group == "time":
         return _guess_time(columns)
     if group == "temperature":
@@ -284,7 +285,7 @@ def _guess(source: str, group: str, columns: Sequence[Column]) -> tuple[tuple[in
         said = " or ".join(columns[axes[0][0]].said for _, axes in whole)
         role = GROUPS[group][0]
         raise InputError(
-            f"{source}: the {group} may be that of {said}; say which, as in "
+            f"{source}: the {group} may be that of {said}; select one, as in "
             f"--columns {role}={columns[whole[0][1][0][0]].name},… (columns= in Python)"
         )
     if not whole:
@@ -294,7 +295,7 @@ def _guess(source: str, group: str, columns: Sequence[Column]) -> tuple[tuple[in
 
 
 def _axis(group: str, name: str) -> tuple[tuple[str, ...], int, str] | None:
-    """Return a column's name without its axis, the axis, and the unit in the name; None where it is no axis of that sensor."""
+    """Return a column's name without its axis, the axis, and the unit in the name; None if it is not an axis of that sensor."""
     words = _words(name)
     joined = re.fullmatch(r"([a-z]+)([xyz])", words[-1]) if words else None
     if joined and joined[1] in _WORDS[group]:
@@ -311,7 +312,7 @@ def _axis(group: str, name: str) -> tuple[tuple[str, ...], int, str] | None:
         return None
     known = before and (before[0] in _WORDS[group] or any(len(word) > 2 for word in _WORDS[group] & set(before)))
     foreign = set(before) & _OTHER
-    if "linear_acceleration" in name.lower():  # the field of a ROS message, which holds gravity
+    if "linear_acceleration" in name.lower():  # the field of a ROS message, which includes gravity
         foreign -= {"linear"}
     if not known or foreign or any(set(before) & _WORDS[o] - {"g", "a", "m", "w"} for o in SENSORS if o != group):
         return None
@@ -330,7 +331,7 @@ def _guess_time(columns: Sequence[Column]) -> tuple[tuple[int, ...], str] | None
                 unit = unit_of("time", "".join(words[size:])) if words[size:] else ""
                 if unit or not words[size:]:
                     return (k,), unit
-    # loggingTime(ms), Time since start in ms: where only one column is of a time
+    # loggingTime(ms), Time since start in ms: if only one column is a time
     hits = [k for k, one in enumerate(columns) if {"time", "timestamp"} & set(_words(one.name))]
     return ((hits[0],), unit_of("time", _end(columns[hits[0]].name))) if len(hits) == 1 else None
 
@@ -343,7 +344,7 @@ def _end(name: str) -> str:
 def _units(
     source: str, present: Collection[str], declared: Mapping[str, str], given: Mapping[str, str]
 ) -> dict[str, str]:
-    """Return the unit of each group of columns that the table has; empty of a magnetometer that declares none."""
+    """Return the unit of each group of columns in the table; empty for a magnetometer without a declared unit."""
     chosen: dict[str, str] = {}
     for group, units in UNITS.items():
         if group not in present:
@@ -353,24 +354,24 @@ def _units(
         unit = option or declared.get(group) or {"time": "s", "temperature": "degC"}.get(group, "")
         if not unit and group != "magnetometer":
             raise InputError(
-                f"{source} does not say the unit of its {group} columns; declare it in the header, as in "
+                f"{source} does not declare the unit of its {group} columns; declare it in the header, as in "
                 f"{GROUPS[group][0]} [{next(iter(units))}], or by "
                 f"--{group}-unit ({', '.join(units)}; units= in Python)"
             )
         if option and declared.get(group) and option != declared[group]:
             raise InputError(
-                f"{source}: the header says {declared[group]} for the {group}, the option {option}; drop one"
+                f"{source}: the header declares {declared[group]} for the {group}, but the option is {option}; drop one"
             )
         chosen[group] = one_of(f"{source}: unit of the {group}", unit, units) if unit else ""
     return chosen
 
 
 SHORT_STAMPS = 0.1
-"""Share of the rows with the stamp of the row before, above which stamps lack digits rather than that a row is wrong."""
+"""Share of rows with the stamp of the row before, above which the stamps have too few digits (below it, single rows are wrong)."""
 
 
 def _need_digits(source: str, values: Callable[[int], Array], roles: Mapping[str, int]) -> None:
-    """Refuse stamps, one in ten of which is that of the row before though the rows differ: they were written with too few digits."""
+    """Reject stamps if more than one in ten equals that of the row before although the rows differ: they have too few digits."""
     stamps = values(roles["time"])
     same = np.flatnonzero(stamps[1:] == stamps[:-1])
     if len(same) <= SHORT_STAMPS * len(stamps[1:]):
@@ -389,24 +390,24 @@ def _need_digits(source: str, values: Callable[[int], Array], roles: Mapping[str
 
 
 def _seconds(stamps: Array, factor: float) -> tuple[Array, int]:
-    """Return stamps as time in s and the clock's reading at its start, ns; those of a clock that counts from 1970 begin at 0."""
+    """Return stamps as time in s and the clock's reading at time 0, ns; for a clock that counts from 1970 the first time is 0."""
     beyond = len(stamps) > 0 and abs(stamps[0] * factor) > CLOCK_OFFSET
     origin = float(stamps[0]) if beyond else 0.0
-    # The product in integers: doubles since 1970 are good to 0.2 µs only.
+    # In integer arithmetic: seconds since 1970 have a resolution of only 0.2 µs in double precision.
     whole, scale = int(origin), round(1e9 * factor)
     return np.asarray((stamps - origin) * factor), whole * scale + round((origin - whole) * scale)
 
 
 USUAL_INTERVALS = (1e-6, 2.0)
-"""Sample intervals, s, outside which stamps of an undeclared unit cannot be seconds."""
+"""Minimum and maximum sample interval, s, for stamps of an undeclared unit to be seconds."""
 
 
 def _need_time_unit(source: str, name: str, time: Array) -> None:
-    """Refuse stamps of an undeclared unit that no inertial sensor has in seconds: those of flight logs are mostly microseconds."""
+    """Reject stamps of an undeclared unit that cannot be seconds of an inertial sensor; flight logs mostly have microseconds."""
     steps = np.abs(np.diff(time))
     usual = float(np.median(steps[steps > 0.0])) if np.any(steps > 0.0) else 1.0
     if not USUAL_INTERVALS[0] <= usual <= USUAL_INTERVALS[1]:
         raise InputError(
-            f"{source}: the stamps of {name} are {usual:g} apart, which are hardly seconds; declare their unit, as in {name} [us], or by "
+            f"{source}: the stamps of {name} are {usual:g} apart, not plausible in seconds; declare the unit, as in {name} [us], or by "
             f"--time-unit ({', '.join(TIME_UNITS)}; units= in Python)"
         )

@@ -1,8 +1,8 @@
-"""Recordings as columns in memory or in Parquet: pandas, xarray, pyarrow. Libraries: ``pandas``, ``xarray``, ``pyarrow``.
+"""Recordings as columns in memory or in Parquet. Libraries: ``pandas``, ``xarray``, ``pyarrow``.
 
-Which column is what, and in which unit: :mod:`strapdown.recordings.columns`, by the names of the columns; a column's unit may also be its
-attribute ``units`` (xarray) or the metadata ``unit`` of its field (Parquet). A time column, or an index named time, may hold dates: they
-are ns since 1970, UTC. Missing values are missing samples. Axes are those of the columns.
+Roles and units of the columns are found from their names (:mod:`strapdown.recordings.columns`); a column's unit may also be its
+attribute ``units`` (xarray) or the metadata ``unit`` of its field (Parquet). A time column, or an index named time, may contain dates:
+they are converted to ns since 1970, UTC. Missing values are missing samples. Axes are those of the columns.
 """
 
 from __future__ import annotations
@@ -36,16 +36,16 @@ def from_table(
     Parameters
     ----------
     table : DataFrame, Dataset or mapping of str to array_like
-        Columns named as those of a CSV file; variables of a Dataset with a second dimension of length 3 are x, y and z.
+        Columns named as those of a CSV file; arrays (n, 3) of a mapping or a Dataset hold x, y and z.
     source : str, default "table"
         Name of the recording, for messages.
     units : mapping of str to str, optional
-        Units of ``time``, ``gyro``, ``accelerometer`` and ``magnetometer`` where the header does not declare them.
+        Units of ``time``, ``gyro``, ``accelerometer`` and ``magnetometer`` if the header does not declare them.
     columns : mapping of str to str, optional
-        Names of columns by role, perhaps with a unit, ``{"time": "timestamp [us]", "gx": "gyro_x[dps]"}``; the others are found by
+        Names of columns by role, optionally with a unit, ``{"time": "timestamp [us]", "gx": "gyro_x[dps]"}``; the others are found by
         their names.
     gyro_alone : bool, default False
-        Whether to ignore the other sensors, whose units then need not be known.
+        Whether to ignore the other sensors, whose units are then not needed.
 
     Returns
     -------
@@ -55,12 +55,12 @@ def from_table(
     Raises
     ------
     InputError
-        As :func:`read` for a CSV file.
+        In the same cases as :func:`read` for a CSV file.
 
     Examples
     --------
     >>> import numpy as np
-    >>> rest = {"time": np.arange(3.0), "gx [dps]": np.zeros(3), "gy": np.zeros(3), "gz": np.zeros(3)}
+    >>> rest = {"time": np.arange(3.0), "gyro [dps]": np.zeros((3, 3))}
     >>> from_table(rest).rate.shape
     (3, 3)
     """
@@ -69,20 +69,21 @@ def from_table(
     for name, one in found.items():
         if np.shape(one) != np.shape(arrays[0]) or np.ndim(one) != 1:
             raise InputError(
-                f"{source}: column {name} has shape {np.shape(one)}, the first {np.shape(arrays[0])}; give rows of one length"
+                f"{source}: column {name} has shape {np.shape(one)}, the first {np.shape(arrays[0])}; give arrays (n,) or "
+                "(n, 3) of one length"
             )
 
     def values(k: int) -> Array:
         try:
             return np.asarray(arrays[k], np.float64)
         except (TypeError, ValueError):
-            raise InputError(f"{source}: column {names[k]} holds {arrays[k].dtype}, no numbers") from None
+            raise InputError(f"{source}: column {names[k]} has {arrays[k].dtype}, not numbers") from None
 
     def clock_ns(k: int) -> tuple[Array, int] | None:
         x = arrays[k]
         if x.dtype.kind in "mM":
             if np.isnat(x).any():
-                raise InputError(f"{source}: {names[k]}[{int(np.argmax(np.isnat(x)))}] is no date; drop such rows")
+                raise InputError(f"{source}: {names[k]}[{int(np.argmax(np.isnat(x)))}] is not a date; drop such rows")
             return relative_time(x.astype("M8[ns]" if x.dtype.kind == "M" else "m8[ns]").astype(np.int64))
         unit = naming.unit_of("time", naming.column(names[k]).unit) or (units or {}).get("time", "")
         if x.dtype.kind in "iu" and len(x) and unit in ("", "ns") and abs(int(x[0])) > CLOCK_OFFSET * 1e9:
@@ -101,7 +102,7 @@ def from_table(
 
 
 def _columns(source: str, table: Any) -> dict[str, NDArray[np.generic]]:
-    """Return names, with units where the table declares them, and arrays."""
+    """Return names, with their units if the table declares them, and arrays."""
     if hasattr(table, "data_vars"):
         return _of_dataset(table)
     found: dict[str, NDArray[np.generic]] = {}
@@ -113,14 +114,15 @@ def _columns(source: str, table: Any) -> dict[str, NDArray[np.generic]]:
             found[str(index.name or "time")] = _plain(index)
         found |= {str(name): _plain(table[name]) for name in table.columns}
     else:
-        found = {str(name): np.asarray(values) for name, values in dict(table).items()}
+        for name, values in dict(table).items():
+            found |= _by_axis(str(name), np.asarray(values))
     if not found:
         raise InputError(f"{source} has no columns; give time, gx, gy, gz, …")
     return found
 
 
 def _plain(series: Any) -> NDArray[np.generic]:
-    """Return a column as an array; dates with a zone as UTC, what is missing in a column of objects as NaN."""
+    """Return a column as an array; dates with a time zone as UTC, missing values of nullable types as NaN."""
     if getattr(getattr(series, "dt", series), "tz", None) is not None:
         series = (
             series.dt.tz_convert("UTC").dt.tz_localize(None)
@@ -137,16 +139,23 @@ def _plain(series: Any) -> NDArray[np.generic]:
     return np.asarray(series)
 
 
+def _by_axis(name: str, values: NDArray[np.generic]) -> dict[str, NDArray[np.generic]]:
+    """Return one column, or three of an array (n, 3), the unit behind the axis."""
+    if values.shape[1:] != (3,):
+        return {name: values}
+    said = naming.column(name)
+    unit = f" [{said.unit}]" if said.unit else ""
+    return {f"{said.name}_{axis}{unit}": values[:, k] for k, axis in enumerate("xyz")}
+
+
 def _of_dataset(table: Any) -> dict[str, NDArray[np.generic]]:
     found: dict[str, NDArray[np.generic]] = {}
     for name, variable in {**table.coords, **table.data_vars}.items():
         unit = str(variable.attrs.get("units", variable.attrs.get("unit", "")))
         values = np.asarray(variable.values)
         declared = f" [{unit}]" if unit and values.dtype.kind not in "mM" else ""
-        if values.ndim == 1 and values.dtype.kind not in "OSU" and name != "axis":
-            found[f"{name}{declared}"] = values
-        elif values.ndim == 2 and values.shape[1] == 3:
-            found |= {f"{name}_{axis}{declared}": values[:, k] for k, axis in enumerate("xyz")}
+        if (values.ndim == 1 and values.dtype.kind not in "OSU" and name != "axis") or values.shape[1:] == (3,):
+            found |= _by_axis(f"{name}{declared}", values)
     length = max((len(values) for values in found.values()), default=0)
     return {name: values for name, values in found.items() if len(values) == length}
 
@@ -158,12 +167,12 @@ def read_parquet(
     columns: Mapping[str, str] | None = None,
     gyro_alone: bool = False,
 ) -> Recording:
-    """Read a recording from Parquet; options as :func:`strapdown.recordings.read`."""
+    """Read a recording from Parquet; options as for :func:`strapdown.recordings.read`."""
     file = Path(path)
     parquet = library("pyarrow.parquet", f"{file.name} is Parquet, which")
     try:
         table = parquet.read_table(file)
-    except Exception as error:  # of a cut file the library raises several kinds
+    except Exception as error:  # for a truncated file the library raises several kinds
         raise InputError(
             f"{file.name} cannot be read as Parquet ({' '.join(str(error).split())}); the file is truncated or damaged"
         ) from None
@@ -175,7 +184,7 @@ def read_parquet(
 
 
 def write_parquet(recording: Recording, path: str | os.PathLike[str]) -> None:
-    """Write a recording as Parquet, its units as metadata of the fields."""
+    """Write a recording as Parquet, with its units as metadata of the fields."""
     found, unit = recording_columns(recording)
     write_parquet_columns(path, found, unit)
 
@@ -183,7 +192,7 @@ def write_parquet(recording: Recording, path: str | os.PathLike[str]) -> None:
 def write_parquet_columns(
     path: str | os.PathLike[str], found: Mapping[str, NDArray[np.generic]], units: Mapping[str, str] | None = None
 ) -> None:
-    """Write columns as Parquet, units as metadata of the fields."""
+    """Write columns as Parquet, with units as metadata of the fields."""
     arrow = library("pyarrow", f"writing {Path(path).name}")
     parquet = library("pyarrow.parquet", f"writing {Path(path).name}")
     arrays = [arrow.array(np.ascontiguousarray(values)) for values in found.values()]

@@ -1,13 +1,13 @@
-"""Recordings as text: CSV, TSV and their kin, with a header of any names.
+"""Recordings as delimited text (CSV, TSV and similar), with a header of any names.
 
-The separator is the one of ``, ; tab |`` that parts the header into most columns. Lines of ``#`` are comments; if no other header comes
-before the numbers, the last of them is it (EuRoC). Two header rows are joined, an empty cell of the first taking what stands before it
-(RepoIMU), and a second row of units goes into brackets. Where the separator is no comma, decimals may have commas. Which column is what:
-:mod:`strapdown.recordings.columns`. Axes, units and clock are those of the file's columns; stamps written as whole numbers are read as
-such, so that nanoseconds since 1970 keep all their digits; a time may be a date of ISO 8601, to the microsecond, UTC unless it names a
-zone.
+The separator is the one of ``, ; tab |`` that splits the header into most columns. Lines that begin with ``#`` are comments; if there is no
+other header before the numbers, the last comment is the header (EuRoC). Two header rows are joined: an empty cell of the first takes the
+value of the cell before it (RepoIMU), and a second row of units is put in brackets. If the separator is not a comma, decimal commas are
+accepted. Roles of the columns: :mod:`strapdown.recordings.columns`. Axes, units and clock are those of the file's columns. Integer stamps
+are read as integers, so that nanoseconds since 1970 keep all their digits. A time may be an ISO 8601 date, to the microsecond, UTC unless
+it has a time zone.
 
-:func:`write_csv` writes the package's own names with units in brackets, 17 digits a number; time in ns of the source's clock where that
+:func:`write_csv` writes the package's names with units in brackets and 17 digits per number; time is in ns of the source's clock if that
 counts from 1970, else in s.
 """
 
@@ -33,7 +33,7 @@ from strapdown.records.recording import CLOCK_OFFSET, Recording
 
 SEPARATORS = ",;\t|"
 _LARGE = 10**15
-"""Whole numbers from here on may lose digits as float64."""
+"""Integers above this may lose digits as float64."""
 
 
 def read_csv(
@@ -43,11 +43,11 @@ def read_csv(
     gyro_alone: bool = False,
     columns: Mapping[str, str] | None = None,
 ) -> Recording:
-    """Read a table of text, by default of columns ``time, gx, gy, gz[, ax, ay, az[, mx, my, mz]]`` in any order.
+    """Read a text table, by default with columns ``time, gx, gy, gz[, ax, ay, az[, mx, my, mz]]`` in any order.
 
-    Other columns are left alone. Empty fields of accelerometer and magnetometer are missing samples; rows with an empty field of the gyro
-    are left out and named in ``missing_gyro``, as are rows that repeat the row before, in ``repeated``. Options as
-    :func:`strapdown.recordings.read`; with ``gyro_alone`` the units of the other sensors need not be known.
+    Other columns are ignored. Empty fields of accelerometer and magnetometer are missing samples. Rows with an empty field of the gyro are
+    left out and listed in ``missing_gyro``; rows that repeat the row before are left out and listed in ``repeated``. Options as for
+    :func:`strapdown.recordings.read`; with ``gyro_alone`` the units of the other sensors are not needed.
     """
     file = Path(path)
     if recordfiles.is_record(file):
@@ -68,19 +68,19 @@ def read_csv(
 
 
 class Table:
-    """A header and rows of numbers, of which only the columns that are asked for are read: the others may hold anything."""
+    """A header and rows of numbers; only the requested columns are read, the others may have any content."""
 
     def __init__(self, source: str, lines: Iterator[str]) -> None:
         self.source = source
         head = _Head(source, lines)
         self.header = head.names
         self._separator = head.separator
-        self._whole: dict[int, list[int]] = {}  # columns of large whole numbers
+        self._whole: dict[int, list[int]] = {}  # columns of large integers
         self._rows_read = 0
         self._rows = csv.reader(_rest(head.first, lines), delimiter=head.separator)
 
     def load(self, places: Sequence[int], time: int) -> dict[int, Array]:
-        """Return the numbers (n,) of columns; empty fields are NaN, dates of the time are ns since 1970."""
+        """Return the numbers (n,) of columns; empty fields are NaN, dates in the time column are ns since 1970."""
         result: list[list[float]] = []
         width = len(self.header)
         for k, row in enumerate(self._rows):
@@ -107,7 +107,7 @@ class Table:
         return dict(zip(places, np.array(result).T.copy(), strict=True))
 
     def _number(self, row: int, place: int, cell: str, time: bool) -> float:
-        """Return a cell's number; its decimals may have a comma where that is not the separator, and a time may be a date."""
+        """Return a cell's number; it may have a decimal comma if that is not the separator, and a time may be a date."""
         date = _date(cell) if time else None
         if date is not None:
             return float(date)
@@ -119,7 +119,7 @@ class Table:
             ) from None
 
     def clock_ns(self, k: int) -> tuple[Array, int] | None:
-        """Return time and epoch of a column of large whole stamps, in ns, that was loaded; None of others."""
+        """Return time and epoch of a loaded column of large integer stamps, in ns; None for other columns."""
         whole = self._whole.get(k)
         unit = naming.unit_of("time", naming.column(self.header[k]).unit)
         if not whole or unit not in ("", "ns") or whole[0] < CLOCK_OFFSET * 1e9 or len(whole) != self._rows_read:
@@ -129,7 +129,7 @@ class Table:
 
 
 class _Head:
-    """The lines before the numbers: the names of the columns, the separator, and the first lines of numbers."""
+    """Header of a table: the names of the columns, the separator, and the first lines of numbers."""
 
     def __init__(self, source: str, lines: Iterator[str]) -> None:
         titles: list[str] = []
@@ -144,7 +144,7 @@ class _Head:
             if titles and _numeric(line):
                 self.first = [line]
                 break
-            if not titles and _numeric(line):  # numbers at once: the last comment may name them
+            if not titles and _numeric(line):  # no header line: the last comment may be the header
                 titles, self.first = [comment], [line]
                 break
             titles.append(line.rstrip("\r\n"))
@@ -160,19 +160,19 @@ class _Head:
             self.first, cells = (
                 [titles[1], *self.first],
                 cells[:1],
-            )  # a row of the data that is no number: said with its place
+            )  # a data row that is not numeric: the error names its place
         self.names = [cell.strip() for cell in cells[0]] if len(cells) == 1 else _joined(*cells)
         while self.names and not self.names[-1]:
             self.names.pop()
 
     @staticmethod
     def _second_row(first: Sequence[str], second: Sequence[str]) -> bool:
-        """Return whether a second row of words goes with the first: no number in it, and of the same width."""
+        """Return whether a second row belongs to the header: it has no number, and the width of the first."""
         return len(first) == len(second) and not any(_is_number(cell) and cell.strip() for cell in second)
 
 
 def _date(cell: str) -> int | None:
-    """Return a date and time of ISO 8601 in ns since 1970, UTC where it names no zone; None of other text."""
+    """Return an ISO 8601 date and time in ns since 1970, UTC if it has no time zone; None for other text."""
     if not re.match(r"\s*\d{4}-\d\d-\d\d[T ]", cell):
         return None
     try:
@@ -193,7 +193,7 @@ def _rest(first: Sequence[str], lines: Iterator[str]) -> Iterator[str]:
 
 
 def _joined(first: Sequence[str], second: Sequence[str]) -> list[str]:
-    """Return the names of two header rows: a second row of units goes into brackets, one of axes or names is put behind."""
+    """Return the names from two header rows: a second row of units is put in brackets, one of axes or names is appended."""
     if all(any(naming.unit_of(group, cell) for group in naming.UNITS) for cell in second if cell.strip()):
         return [f"{a.strip()} [{b.strip()}]" if b.strip() else a.strip() for a, b in zip(first, second, strict=True)]
     names, before = [], ""
@@ -206,7 +206,7 @@ def _joined(first: Sequence[str], second: Sequence[str]) -> list[str]:
 
 
 def _numeric(line: str) -> bool:
-    """Return whether a line is one of numbers: most of its filled fields are, of whatever separator."""
+    """Return whether at least half of the non-empty fields of a line are numbers, with any separator."""
     filled = [cell for part in re.split(r"[,;\t|]", line) if (cell := part.strip().strip('"'))]
     return bool(filled) and 2 * sum(map(_is_number, filled)) >= len(filled)
 
@@ -221,12 +221,12 @@ def _is_number(cell: str) -> bool:
 
 def _why(row: Sequence[str], width: int) -> str:
     if width < len(row) and all(re.fullmatch(r"\s*-?\d+(e-?\d+)?\s*", part) for part in row):
-        return "its decimals seem to have commas: write points"
+        return "it seems to have decimal commas: write points"
     return "the file is truncated or damaged there"
 
 
 def recording_columns(recording: Recording) -> tuple[dict[str, NDArray[np.generic]], dict[str, str]]:
-    """Return what a recording holds as columns by the package's names, and the unit of each that has one."""
+    """Return the data of a recording as columns by the package's names, and the units of the columns that have one."""
     clock = bool(recording.epoch_ns)
     found: dict[str, NDArray[np.generic]] = {"time": recording.clock_ns if clock else recording.time}
     unit = {"time": "ns" if clock else "s"}
@@ -246,14 +246,14 @@ def recording_columns(recording: Recording) -> tuple[dict[str, NDArray[np.generi
 
 
 def write_csv(recording: Recording, path: str | os.PathLike[str]) -> None:
-    """Write a recording as CSV (as TSV where the ending is ``.tsv``), so that :func:`read_csv` gives the same numbers back."""
+    """Write a recording as CSV (as TSV if the extension is ``.tsv``), so that :func:`read_csv` gives the same numbers."""
     found, unit = recording_columns(recording)
     names = [f"{name} [{unit[name]}]" if name in unit else name for name in found]
     write_columns(path, dict(zip(names, found.values(), strict=True)))
 
 
 def write_columns(path: str | os.PathLike[str], found: Mapping[str, NDArray[np.generic]]) -> None:
-    """Write columns of numbers as text, 17 digits a number, whole numbers whole; NaN is an empty field."""
+    """Write columns of numbers as text, with 17 digits per number, integers as integers; NaN is an empty field."""
     separator = "\t" if Path(path).suffix.lower() == ".tsv" else ","
     texts = []
     for column in found.values():

@@ -1,4 +1,4 @@
-"""Estimates in files: CSV and TSV, Parquet, TUM, HDF5, Rerun. What the columns are: :meth:`strapdown.records.Estimate.table`."""
+"""Estimates in files: CSV and TSV, Parquet, TUM, HDF5, Rerun. The columns are those of :meth:`strapdown.records.Estimate.table`."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ from strapdown.units import DEGREE
 def write_csv(
     estimate: Estimate, path: str | os.PathLike[str], *, recording: Recording | None = None, **options: Any
 ) -> None:
-    """Write an estimate as a table of text; ``sequence`` and ``frame`` as :meth:`strapdown.records.Estimate.table` takes them."""
+    """Write an estimate as a text table; options ``sequence`` and ``frame`` as for :meth:`strapdown.records.Estimate.table`."""
     write_columns(path, estimate.table(recording=recording, **options))
 
 
 def write_parquet(
     estimate: Estimate, path: str | os.PathLike[str], *, recording: Recording | None = None, **options: Any
 ) -> None:
-    """Write an estimate as Parquet; ``sequence`` and ``frame`` as :meth:`strapdown.records.Estimate.table` takes them."""
+    """Write an estimate as Parquet; options ``sequence`` and ``frame`` as for :meth:`strapdown.records.Estimate.table`."""
     write_parquet_columns(path, estimate.table(recording=recording, **options))
 
 
 def write_hdf5(estimate: Estimate, path: str | os.PathLike[str], *, recording: Recording | None = None) -> None:
-    """Write an estimate in the package's own layout, which `strapdown check` and `report` read."""
+    """Write an estimate in the HDF5 layout of this package, which `strapdown check` and `report` read."""
     write_result(path, estimate, {} if recording is None else {"source": recording.source})
 
 
@@ -55,8 +55,8 @@ def write_tum(
 def write_rerun(estimate: Estimate, path: str | os.PathLike[str], *, recording: Recording | None = None) -> None:
     """Write an estimate as a Rerun recording on the time line ``time``. Library: ``rerun-sdk`` (the extra ``rerun``).
 
-    ``body`` turns with the attitude, with its axes and, of a recording, its specific force and magnetic field (of unit length) as arrows;
-    ``angles``, ``bias`` (°/h) with ±3σ, ``innovations/SENSOR`` with ±3σ of their own, and ``rate`` without the bias, °/s, are curves.
+    ``body`` rotates with the attitude; its axes and, for a recording, its specific force and magnetic field (of unit length) are arrows.
+    ``angles`` and ``bias`` (°/h) with ±3σ, ``innovations/SENSOR`` with their ±3σ, and ``rate`` without the bias, °/s, are curves.
     """
     rr = library("rerun", f"writing {Path(path).name}", "rerun")
     found = estimate.table()
@@ -99,7 +99,7 @@ def write_rerun(estimate: Estimate, path: str | os.PathLike[str], *, recording: 
 
 
 def _log_samples(rr: Any, stream: Any, time: Any, recording: Recording, estimate: Estimate) -> None:
-    """Log what a recording holds at the estimate's times."""
+    """Log the samples of a recording at the estimate's times."""
     rows = recording.rows_of(estimate.time)
     rate = (recording.rate[rows] - estimate.bias) / DEGREE
     for k, axis in enumerate("xyz"):

@@ -1,4 +1,4 @@
-"""Libraries that only some formats need, and the words where one is missing."""
+"""Optional libraries of some formats, with an error that names a missing one."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from strapdown.checks import InputError
 
 
 def library(name: str, what: str, extra: str = "formats") -> Any:
-    """Return an optional module; where it is not installed, raise an InputError with its purpose and how to install it."""
+    """Return an optional module; if it is not installed, raise an InputError with its purpose and how to install it."""
     try:
         return import_module(name)
     except ImportError as error:
@@ -19,7 +19,7 @@ def library(name: str, what: str, extra: str = "formats") -> Any:
 
 
 def with_ending(path: Path, ending: str, folder: Path) -> Path:
-    """Return a path to the same file with that ending, by which some libraries distinguish formats: a link in ``folder`` if need be."""
+    """Return a path to the file with that extension, which some libraries require: if necessary, a link in ``folder``."""
     if path.suffix.lower() == ending:
         return path
     link = folder / f"{path.stem}{ending}"

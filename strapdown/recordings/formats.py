@@ -1,7 +1,7 @@
-"""The table of formats: how each is recognised, read and written, and what installs it.
+"""The table of formats: how each is recognised, read and written.
 
-A format is one entry of :data:`FORMATS` and the module of its family. Content decides: the first bytes of a file, the files of a folder.
-A file of no known content is read by its ending, whose reader reports its fault.
+A format is one entry of :data:`FORMATS` and the module of its family. A format is recognised by content: the first bytes of a file, the
+files of a folder. A file of unknown content is read according to its extension, and that reader reports its fault.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from strapdown.records import Estimate, ImuRecord
 from strapdown.records.recording import Recording, with_gyro
 
 HEAD = 4096
-"""Bytes of a file that its format is recognised by."""
+"""Number of bytes at the start of a file from which its format is recognised."""
 
 
 @dataclass(frozen=True)
@@ -33,21 +33,21 @@ class Format:
     name: str
     endings: tuple[str, ...]
     recognised: Callable[[Path, bytes], bool]
-    """Whether a file's path and first bytes (a folder: none) are of this format."""
+    """Whether a file's path and first bytes (none for a folder) are of this format."""
     read: str = ""
-    """``module:function`` below :mod:`strapdown.recordings`; empty: not read as a recording."""
+    """Reader of recordings, ``module:function`` below :mod:`strapdown.recordings`; empty: none."""
     write: str = ""
-    """The same for a recording."""
+    """Writer of recordings, likewise."""
     write_estimate: str = ""
-    """The same for an estimate."""
+    """Writer of estimates, likewise."""
     options: tuple[str, ...] = ()
-    """Keywords of :func:`read` that the reader takes."""
+    """Keywords of :func:`read` that the reader accepts."""
     estimate_options: tuple[str, ...] = ()
-    """Keywords that the writer of estimates takes."""
+    """Keywords that the writer of estimates accepts."""
     lacks: tuple[str, ...] = ()
-    """Contents of a recording that the format cannot hold: ``"temperature"``, ``"reference"``, ``"movement"``, ``"clock"``."""
+    """Contents of a recording that the format cannot store: ``"temperature"``, ``"reference"``, ``"movement"``, ``"clock"``."""
     with_samples: bool = False
-    """Whether an estimate is written with the recording's samples, and so never without a recording."""
+    """Whether an estimate is written with the recording's samples and therefore needs a recording."""
 
 
 def _starts(*signatures: bytes) -> Callable[[Path, bytes], bool]:
@@ -55,7 +55,7 @@ def _starts(*signatures: bytes) -> Callable[[Path, bytes], bool]:
 
 
 def _text(head: bytes) -> bool:
-    """Return whether a file begins as text of numbers and names does; a character cut in two at the end is none of its faults."""
+    """Return whether a file begins with UTF-8 text; an incomplete character at the end of ``head`` is accepted."""
     if not head.strip() or b"\0" in head:
         return False
     try:
@@ -142,11 +142,11 @@ FORMATS: tuple[Format, ...] = (
         estimate_options=("sequence", "frame"),
     ),
 )
-"""Formats in the order that they are tried."""
+"""Formats in the order in which they are tried."""
 
 
 def format_of(path: str | os.PathLike[str]) -> Format:
-    """Return the format of a file or folder by its content, or by its ending where the content is not conclusive."""
+    """Return the format of a file or folder by its content, or by its extension if the content is not conclusive."""
     file = Path(path)
     if not file.exists():
         raise InputError(f"{path} does not exist; check the path")
@@ -160,7 +160,7 @@ def format_of(path: str | os.PathLike[str]) -> Format:
         return found
     if file.is_dir():
         raise InputError(
-            f"{path} is a folder; name the file in it (a folder is read that is a ROS 2 bag, or holds imu0/data.csv as EuRoC)"
+            f"{path} is a folder; name the file in it (folders that can be read: a ROS 2 bag, or EuRoC with imu0/data.csv)"
         )
     by_ending = next((one for one in FORMATS if file.suffix.lower() in one.endings), None)
     if by_ending is not None:
@@ -168,7 +168,7 @@ def format_of(path: str | os.PathLike[str]) -> Format:
     if table.recognised(file, head):
         return table
     raise InputError(
-        f"{file} has the suffix {file.suffix!r} and the content of no known format; recordings are {_known()}"
+        f"{file} has the extension {file.suffix!r} and the content of no known format; known formats are {_known()}"
     )
 
 
@@ -201,29 +201,29 @@ def read(
     path : path-like
         A file, or the folder of a ROS 2 bag or of EuRoC.
     units : mapping of str to str, optional
-        For tables: units of ``time``, ``gyro``, ``accelerometer`` and ``magnetometer`` where the header does not declare them.
+        For tables: units of ``time``, ``gyro``, ``accelerometer`` and ``magnetometer`` if the header does not declare them.
     gyro_alone : bool, default False
-        Whether to ignore the other sensors, whose units then need not be known.
+        Whether to ignore the other sensors, whose units are then not needed.
     columns : mapping of str to str, optional
-        For tables: names of columns by role, perhaps with a unit, ``{"time": "timestamp [us]", "gx": "gyro_x[dps]"}``; the others
+        For tables: names of columns by role, optionally with a unit, ``{"time": "timestamp [us]", "gx": "gyro_x[dps]"}``; the others
         are found by their names.
     topic : str, default ""
-        For bags and flight logs: topic of the inertial unit, where there are several.
+        For bags and flight logs: topic of the inertial unit, if there are several.
     axes : str or mapping of str to str, optional
-        The recorded axes that become the body's x, y, z, ``"x,-y,-z"`` for a unit whose z axis points down; or of single sensors,
-        ``{"magnetometer": "y,x,-z"}``. See :func:`strapdown.recordings.with_axes`.
+        The recorded axes that become the body's x, y, z, for example ``"x,-y,-z"`` for a unit whose z axis points down; or those of
+        single sensors, ``{"magnetometer": "y,x,-z"}``. See :func:`strapdown.recordings.with_axes`.
     invert : str or iterable of str, default empty
-        Sensors of inverted sign: ``"accelerometer"`` for one that reads −g upward at rest.
+        Sensors with inverted sign: ``"accelerometer"`` for one that reads −g upward at rest.
 
     Returns
     -------
     Recording
-        The recording; its ``remarks`` state the choices of the reader.
+        The recording; its ``remarks`` list the choices of the reader.
 
     Raises
     ------
     InputError
-        If the file is missing, of no known format, truncated before anything is whole, or its units are unknown or undeclared.
+        If the file is missing, of no known format, truncated before the first complete sample, or its units are unknown or undeclared.
 
     Examples
     --------
@@ -233,9 +233,9 @@ def read(
     found = format_of(file)
     if not found.read:
         raise InputError(
-            f"{file.name} is a {found.name}, which holds no inertial samples; give the recording, and this as its reference"
+            f"{file.name} is a {found.name}, which has no inertial samples; give the recording, and this file as its reference"
         )
-    given = {"units": dict(units or {}), "columns": dict(columns or {}), "topic": topic}
+    given = {"units": units or {}, "columns": columns or {}, "topic": topic}
     for name, value in given.items():
         if value and name not in found.options:
             _refuse_option(file, found, name, value)
@@ -252,9 +252,7 @@ def _refuse_option(file: Path, found: Format, name: str, value: Any) -> None:
         raise InputError(
             f"{file.name} is {said}, whose layout defines its units; drop the option for {', '.join(value)}"
         )
-    what = {"columns": "columns go with a table (CSV, Parquet)", "topic": "a topic goes with a bag or a flight log"}[
-        name
-    ]
+    what = {"columns": "columns are for a table (CSV, Parquet)", "topic": "a topic is for a bag or a flight log"}[name]
     raise InputError(f"{file.name} ({found.name}): {what}; drop the option")
 
 
@@ -265,24 +263,24 @@ def write(
     recording: Recording | None = None,
     **options: Any,
 ) -> None:
-    """Write a recording or an estimate in the format of the ending; the file appears whole or not at all.
+    """Write a recording or an estimate in the format of the file extension; the file is created only when complete.
 
     Parameters
     ----------
     content : Recording, ImuRecord or Estimate
-        What to write. A simulated record is written as the recording of a device.
+        Data to write. A simulated record is written as the recording of a device.
     path : path-like
         File: ``.csv``, ``.tsv``, ``.parquet``, ``.h5``, ``.bag``, ``.mcap`` …
     recording : Recording, optional
-        With an estimate: the recording that it was made from, whose samples are written where the format has room (a ROS bag needs
+        With an estimate: the recording that it was made from, whose samples are written if the format supports them (a ROS bag needs
         it).
     **options : dict
-        Options of the format's own writer.
+        Options of the format's writer.
 
     Raises
     ------
     InputError
-        If no format of that ending holds such content, or the content lacks what the format needs.
+        If no format of that extension can store such content, or the content lacks data that the format needs.
     """
     if isinstance(content, ImuRecord):
         content = from_record(content, "record")
@@ -294,24 +292,24 @@ def write(
 
 
 def estimate_format(path: str | os.PathLike[str], options: Iterable[str] = (), *, recording: bool = True) -> Format:
-    """Return the format that an estimate's file is written in, so that what cannot be is refused before anything is computed.
+    """Return the format of an estimate's file, so that a file that cannot be written is rejected before the computation.
 
-    ``options`` are those of the writer that are to be used, ``recording`` whether there is one, whose samples some formats need.
+    ``options`` are the writer's options to be used; ``recording`` is whether there is a recording, whose samples some formats need.
     """
     found = _by_ending(path, "write_estimate")
     for name in options:
         if name not in found.estimate_options:
-            raise InputError(f"{path} ({found.name}) has no {name}; leave it out, or choose another ending")
+            raise InputError(f"{path} ({found.name}) has no option {name}; leave it out, or choose another extension")
     if found.with_samples and not recording:
         raise InputError(
-            f"{path} ({found.name}) holds the samples too; give the recording that the estimate was made from, or choose another "
-            "ending"
+            f"{path} ({found.name}) needs the samples too; give the recording that the estimate was made from, or choose another "
+            "extension"
         )
     return found
 
 
 def writers(kind: str) -> tuple[str, ...]:
-    """Return the endings that are written, of ``"write"`` (recordings) or ``"write_estimate"``."""
+    """Return the file extensions that can be written; ``kind`` is ``"write"`` (recordings) or ``"write_estimate"``."""
     return tuple(dict.fromkeys(ending for one in FORMATS if getattr(one, kind) for ending in one.endings))
 
 
@@ -322,15 +320,16 @@ def _by_ending(path: str | os.PathLike[str], kind: str) -> Format:
             return one
     what = "an estimate" if kind == "write_estimate" else "a recording"
     raise InputError(
-        f"{path} ends in {ending!r}, and {what} is written as {', '.join(writers(kind))}; choose such an ending"
+        f"{path} ends in {ending!r}, but {what} is written as {', '.join(writers(kind))}; choose one of these extensions"
     )
 
 
 def from_record(record: ImuRecord, source: str = "record") -> Recording:
-    """Return a simulated record of n intervals as a device would have recorded it: n samples.
+    """Return a simulated record of n intervals as a recording of n samples.
 
-    The rate at each stamp is the mean over the sample interval that ends there, as of an integrating gyro: half an interval late. Vector
-    series named accelerometer and magnetometer are included where they have samples at the stamps; the truth is the reference.
+    The rate at each stamp is the mean over the sample interval that ends there, as of an integrating gyro, and so delayed by half an
+    interval. Series of kind "vector" named accelerometer and magnetometer are included, at the stamps where they have samples; the truth is
+    the reference.
     """
     steps = np.diff(record.time)[:, None]
     own: dict[str, Any] = {}
@@ -347,7 +346,7 @@ def from_record(record: ImuRecord, source: str = "record") -> Recording:
         else:
             left_out.append(f"{series.sensor} ({series.kind})")
     words = (
-        f"Left out: {', '.join(left_out)}. Recordings hold whole vectors of an accelerometer and a magnetometer alone."
+        f"Left out: {', '.join(left_out)}. Recordings store only whole vectors of an accelerometer and a magnetometer."
     )
     return with_gyro(
         source=source,
@@ -361,12 +360,12 @@ def from_record(record: ImuRecord, source: str = "record") -> Recording:
 
 
 def not_held(path: str | os.PathLike[str]) -> tuple[str, ...]:
-    """Return what a recording may hold and the format of a path's ending has no room for."""
+    """Return the contents of a recording that the format of a path's extension cannot store."""
     return _by_ending(path, "write").lacks
 
 
 def is_estimate(path: str | os.PathLike[str]) -> bool:
-    """Return whether a path is an estimate of this package, in HDF5."""
+    """Return whether a path is an estimate of this package in HDF5."""
     file = Path(path)
     if not file.is_file() or format_of(file).name != "BROAD":
         return False
@@ -375,5 +374,5 @@ def is_estimate(path: str | os.PathLike[str]) -> bool:
 
 
 def is_record(path: str | os.PathLike[str]) -> bool:
-    """Return whether a path is a simulated record (:mod:`strapdown.recordings.recordfiles`); a folder is none."""
+    """Return whether a path is a simulated record (:mod:`strapdown.recordings.recordfiles`); a folder is not."""
     return not Path(path).is_dir() and recordfiles.is_record(path)

@@ -1,8 +1,8 @@
-"""Hard iron of a unit, from the recording itself.
+"""Hard iron of a unit, estimated from its recording.
 
-Turned back by the gyro, the field of the surroundings changes little over a second, while iron that is fixed in the unit turns with it.
-With R the attitude by the gyro and b the iron, the field there changes by ``(R − R') b`` from one time to another, which is linear in b. A
-field that varies along the path of a moved unit feigns some iron too, so that only what is well beyond that is taken for iron.
+In the frame fixed by the integrated gyro, the field of the surroundings changes little over a second, while that of iron in the unit
+rotates with it. With R the attitude by the gyro and b the iron, the measured field changes by ``(R − R') b`` from one time to another,
+which is linear in b. A field that varies along the path of the unit causes an apparent iron too, by which the estimate is reduced.
 """
 
 from __future__ import annotations
@@ -15,26 +15,26 @@ from strapdown.kernels import recording_steps
 from strapdown.kernels.machine import compiled
 
 SPAN = 1.0
-"""Span over which the change of the field is looked at, s."""
+"""Time difference over which the change of the field is computed, s."""
 MEMORY = 60.0
-"""Time constant with which earlier changes are forgotten, s."""
+"""Time constant of the exponential forgetting of earlier changes, s."""
 CHANGE_NOISE = 8e-3
-"""Change of the field over that span without iron, each component, share of its strength/√Hz."""
+"""Noise density of the change of the field without iron, each component, relative to its magnitude, 1/√Hz."""
 SIGMA = 0.04
-"""Iron that is expected, each component, share of the field's strength."""
+"""Prior σ of the iron, each component, relative to the magnitude of the field."""
 NEGLIGIBLE = 1e-3
-"""Iron below this is none, share of the field's strength."""
+"""Minimum iron that is not set to zero, relative to the magnitude of the field."""
 RISE = 3.0
-"""Time constant with which iron found so far is taken for iron, s: what lasts shorter is a disturbance of the surroundings."""
+"""Time constant of the low-pass filter of the iron found up to each time, s: shorter changes are disturbances of the surroundings."""
 FEIGNED = 0.028
-"""Iron that the field along a path feigns, share of its strength: as much is taken off the square of what is found."""
+"""Apparent iron of a field that varies along the path, relative to its magnitude: estimates are multiplied by 1 − (apparent/estimate)²."""
 
 
 def find(field: Array, frame: Array, time: Array, known: np.ndarray, strength: float, *, causal: bool) -> Array:
     """Return the hard iron at each row (k, 3), in the unit of the field and body axes.
 
-    ``field`` (k, 3) is in the frame that the gyro keeps, ``frame`` (k, 4) the attitude there by the gyro, ``time`` (k,) nearly even, s,
-    ``known`` (k,) the rows with a field. ``causal``: from the rows up to each alone; otherwise from those after it too.
+    ``field`` (k, 3) is in the frame fixed by the integrated gyro, ``frame`` (k, 4) the attitude by the gyro, ``time`` (k,), s, with nearly
+    equal intervals, ``known`` (k,) the rows with a field. ``causal``: only rows up to each are used; otherwise those after it too.
     """
     interval = float(np.median(np.diff(time)))
     lag = max(1, round(SPAN / interval))
@@ -42,11 +42,11 @@ def find(field: Array, frame: Array, time: Array, known: np.ndarray, strength: f
         return np.zeros((len(time), 3))
     now, then = quaternion.conjugate(frame[lag:]), quaternion.conjugate(frame[:-lag])
     change = (field[lag:] - field[:-lag]) / strength
-    # With A = R − R' and v the vector part of the quaternion of the turn between, AᵀA = 4 (|v|² I − v vᵀ).
+    # With A = R − R' and v the vector part of the quaternion of the rotation between them, AᵀA = 4 (|v|² I − v vᵀ).
     x, y, z = quaternion.multiply(now, quaternion.conjugate(then))[:, 1:].T
     normal = 4.0 * np.stack([y * y + z * z, x * x + z * z, x * x + y * y, -x * y, -x * z, -y * z], axis=1)
     right = quaternion.rotate(now, change) - quaternion.rotate(then, change)
-    # Over a gap the gyro does not show the turn.
+    # Over a gap the gyro does not measure the rotation.
     pair = known[lag:] & known[:-lag] & (np.abs(time[lag:] - time[:-lag] - SPAN) < 2.0 * interval)
     own = np.column_stack([normal, right]) * pair[:, None]
     before = np.zeros((lag, own.shape[1]))
@@ -64,13 +64,13 @@ def find(field: Array, frame: Array, time: Array, known: np.ndarray, strength: f
 
 
 def _integral(rows: Array, interval: float) -> Array:
-    """Return the integral over time, s, of rows (k, m) up to each, forgotten with :data:`MEMORY`."""
+    """Return the integral over time, s, of rows (k, m) up to each, with exponential forgetting (:data:`MEMORY`)."""
     share = interval / MEMORY
     return np.asarray(low_pass(rows, share) * (interval / -np.expm1(-share)))
 
 
 def low_pass(rows: np.ndarray, step: float) -> Array:
-    """Return rows (k, m) after a first-order low-pass from the first one on, ``step`` being the interval over the time constant; causal."""
+    """Return rows (k, m) after a causal first-order low-pass filter that starts at the first; ``step``: interval over time constant."""
     result = np.empty(rows.shape)
     compiled(recording_steps.low_pass)(np.ascontiguousarray(rows), -np.expm1(-step), result)
     return result

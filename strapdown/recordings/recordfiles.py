@@ -1,7 +1,7 @@
-"""IMU records in files: HDF5, whole and self-describing; CSV, for exchange.
+"""IMU records in files: HDF5, self-describing; CSV, for exchange.
 
-HDF5 holds everything to the last bit: increments, every vector series, the truth, the specification of the gyro, the scenario,
-seed, units, conventions and version. CSV holds the gyro in one file, and each vector series in a further one.
+HDF5 stores everything exactly: increments, every vector series, the truth, the specification of the gyro, the scenario,
+seed, units, conventions and version. CSV stores the gyro in one file, and each vector series in another one.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ KIND = "strapdown record"
 """The attribute ``kind`` of a record's file."""
 
 FORMAT = 1
-"""Version of the layout; a reader refuses a newer one."""
+"""Version of the layout; a newer one is rejected by the reader."""
 _SERIES = {
     "time": "s",
     "vector_b": "1 (kind vector: the unit of sigma)",
@@ -47,14 +47,14 @@ _RESERVED = ("kind", "format", "version", "conventions", "gyro", "scenario", "se
 def write_record(
     path: str | os.PathLike[str], record: ImuRecord, *, attributes: Mapping[str, Any] | None = None
 ) -> None:
-    """Write a record to HDF5, with its origin; the file appears whole or not at all.
+    """Write a record to HDF5, with its origin; the file is created only when complete.
 
-    A scenario of which a part is a Python function or class of your own has no form in a file and is left out. ``attributes`` are further
-    ones of the file.
+    A scenario with a Python function or a user-defined class cannot be written to a file and is left out. ``attributes`` are additional
+    attributes of the file.
     """
     for name in attributes or {}:
         if name in _RESERVED:
-            raise InputError(f"attributes holds {name!r}, which the file has already; choose another name")
+            raise InputError(f"attributes has {name!r}, which is reserved by the file; choose another name")
     with result_file(path, "record", {"format": FORMAT}) as file:
         made = {
             name: json.dumps(value) if name == "gyro" else value
@@ -102,8 +102,8 @@ def _begins(path: str | os.PathLike[str], mark: bytes) -> bool:
 def read_record(path: str | os.PathLike[str]) -> ImuRecord:
     """Read the record of a file written by :func:`write_record` or :func:`export_csv`, with its origin.
 
-    Measurements of NaN are missing. An increment must not be NaN: the rotation over an interval without one is unknown. If a row of a CSV
-    is left out, the next one must hold the rotation over both intervals.
+    Measurements of NaN are missing. An increment must not be NaN, because the rotation over its interval would be unknown. If a row of a
+    CSV is left out, the next one must contain the rotation over both intervals.
     """
     if _begins(path, _MARK.encode()):
         with reading.from_file(path):
@@ -113,7 +113,7 @@ def read_record(path: str | os.PathLike[str]) -> ImuRecord:
         kind = attributes.get("kind")
         if kind != KIND:
             raise InputError(
-                f"{path} is {f'a {kind}' if kind else 'HDF5 of another program'}, not a {KIND}; pass one written by write_record"
+                f"{path} is {f'a {kind}' if kind else 'HDF5 of another program'}, not a {KIND}; give a file written by write_record"
             )
         if count("format", attributes["format"]) > FORMAT:
             raise InputError(
@@ -139,12 +139,12 @@ def read_record(path: str | os.PathLike[str]) -> ImuRecord:
 
 
 def origin_attributes(origin: Origin | None) -> dict[str, Any]:
-    """Return the origin of a record as values for a file, as far as it is known."""
+    """Return the known fields of a record's origin as values for a file."""
     if origin is None:
         return {}
     scenario = None
     if origin.scenario is not None:
-        from strapdown.scenarios import scenario_to_toml  # and every motion
+        from strapdown.scenarios import scenario_to_toml  # imported late, because it imports every motion
 
         with contextlib.suppress(InputError):
             scenario = scenario_to_toml(origin.scenario)
@@ -154,10 +154,10 @@ def origin_attributes(origin: Origin | None) -> dict[str, Any]:
 
 
 class _FiledOrigin(Origin):
-    """The origin that a file states; its scenario is read when it is asked for: that of a gyro preset takes half a second."""
+    """The origin from a file; its scenario is read on first access, because one with a gyro preset takes half a second."""
 
     def __init__(self, text: str, path: str | os.PathLike[str], made: Mapping[str, Any]) -> None:
-        """Keep the TOML; without a specification of the gyro it is the scenario's."""
+        """Store the TOML; if there is no specification of the gyro, that of the scenario is used."""
         super().__init__(**made)
         vars(self).pop("scenario")
         vars(self).update(_text=text, _path=path)
@@ -167,7 +167,7 @@ class _FiledOrigin(Origin):
     @functools.cached_property
     def scenario(self) -> Any:  # type: ignore[override]
         """The scenario."""
-        from strapdown.scenarios import scenario_from_toml  # and every motion
+        from strapdown.scenarios import scenario_from_toml  # imported late, because it imports every motion
 
         with reading.from_file(self._path):
             return scenario_from_toml(self._text, f"{self._path}: scenario")
@@ -177,7 +177,7 @@ class _FiledOrigin(Origin):
 
 
 def _origin(attributes: Mapping[str, Any], path: str | os.PathLike[str]) -> Origin | None:
-    """Return how a record was made, as its file states."""
+    """Return the origin of a record from the attributes of its file."""
     made: dict[str, Any] = {
         name: count(name, attributes[name], minimum=0) for name in ("seed", "run") if name in attributes
     }
@@ -198,7 +198,7 @@ def _values(group: Any, name: str, unit: str) -> Array:
     own = reading.attributes(group[name]).get("unit", unit)
     if own != unit:
         raise InputError(
-            f"{group.file.filename}: {f'{group.name}/{name}'.lstrip('/')} is in {own!r}, and read in {unit!r}; convert it"
+            f"{group.file.filename}: {f'{group.name}/{name}'.lstrip('/')} is in {own!r}, but must be in {unit!r}; convert it"
         )
     return value
 
@@ -208,7 +208,7 @@ def _series(group: Any) -> VectorMeasurements:
     attributes = reading.attributes(group)
     if attributes["kind"] != "attitude" and not fields.keys() & {"sigma", "sigma_axes", "covariance"}:
         raise InputError(
-            f"{group.file.filename}: {group.name.lstrip('/')} ({attributes['sensor']}) lacks sigma; give each measurement its standard "
+            f"{group.file.filename}: {group.name.lstrip('/')} ({attributes['sensor']}) has no sigma; give each measurement its standard "
             "deviation"
         )
     return VectorMeasurements(sensor=attributes["sensor"], kind=attributes["kind"], **fields)
@@ -229,11 +229,11 @@ _COUNTED, _MADE = " vector series", "; made by "
 def export_csv(path: str | os.PathLike[str], record: ImuRecord) -> tuple[Path, ...]:
     """Write a record as CSV, 17 digits per number; return the files written, the record first.
 
-    ``path`` holds one row per edge: its time, the increment of the interval that ends there (NaN in the first row), and the truth if there
-    is one. Each vector series goes to ``STEM-vectors-N.csv`` in the same folder. The first line of each is a comment with the kind of file,
-    the time of its last row, and for the record the number of its series; the second names the columns, with their units. The record is
-    written last. Superfluous series of an earlier record of the same name are removed. Noise that differs by body axis is refused, for CSV
-    has no columns for it.
+    ``path`` has one row per edge: its time, the increment of the interval that ends there (NaN in the first row), and the truth if there
+    is one. Each vector series is written to ``STEM-vectors-N.csv`` in the same folder. The first line of each file is a comment with the
+    kind of file, the time of its last row, and for the record the number of its series; the second line has the names of the columns with
+    their units. The record is written last. Extra series files of an earlier record of the same name are removed. Noise that differs
+    between body axes is rejected, because CSV has no columns for it.
     """
     for series in record.vectors:
         if series.anisotropic:
@@ -305,7 +305,7 @@ def _read_csv_record(target: Path) -> ImuRecord:
     warm = names[-1:] == (_TEMPERATURE,)
     if names[: len(names) - warm] not in (_GYRO_COLUMNS, _GYRO_COLUMNS + _TRUTH_COLUMNS):
         raise InputError(
-            f"{target} has the columns {', '.join(names)}; wanted {', '.join(_GYRO_COLUMNS)} and perhaps "
+            f"{target} has the columns {', '.join(names)}; wanted {', '.join(_GYRO_COLUMNS)} and optionally "
             f"{', '.join((*_TRUTH_COLUMNS, _TEMPERATURE))}"
         )
     comment, _, made = comment.partition(_MADE)
@@ -313,7 +313,7 @@ def _read_csv_record(target: Path) -> ImuRecord:
     if len(lost):
         row, column = lost[0]
         raise InputError(
-            f"{target}, line {row + 4}: {names[column + 1]} is nan; leave the row out; the next one needs the rotation over both"
+            f"{target}, line {row + 4}: {names[column + 1]} is nan; leave the row out; the next one needs the rotation over both intervals"
         )
     truth = Truth(attitude=rows[:, 4:8], bias=rows[:, 8:11]) if len(names) > 5 else None
     series = tuple(_import_series(beside) for beside in _series_beside(target, comment))
@@ -329,22 +329,22 @@ def _read_csv_record(target: Path) -> ImuRecord:
         return replace(record, origin=_origin(own, target))
     except (InputError, TypeError) as error:
         raise InputError(
-            f"{target}, line 1: how it was made cannot be read ({error}); take '{_MADE.strip()} …' away"
+            f"{target}, line 1: the origin of the record cannot be read ({error}); remove '{_MADE.strip()} …'"
         ) from None
 
 
 def _need_end(path: Path, rows: Array, stated: float | None) -> None:
-    """Refuse a file that ends at another time than its first line states (None: no rows): a cut between two lines leaves no other trace."""
+    """Reject a file whose last time differs from that in its first line (None: no rows), the only sign of truncation between two lines."""
     ends = rows[-1, 0] if len(rows) else None
     if ends != stated:
         raise InputError(
-            f"{path} ends at {ends} s, its first line states {stated} s; it was truncated or extended: restore it, or "
-            "change the time there if the rows are intended"
+            f"{path} ends at {ends} s, but its first line states {stated} s; it was truncated or extended: restore it, or "
+            "change the time in that line if the rows are intended"
         )
 
 
 def _series_beside(target: Path, comment: str) -> list[Path]:
-    """Return the files of the vector series of a record: the stated number, or without one all that are numbered in sequence."""
+    """Return the files of the vector series of a record: the stated number, or if none is stated, all numbered in sequence."""
     stated = re.search(rf", (\d+){_COUNTED};", comment)
     if stated is None:
         return list(itertools.takewhile(Path.is_file, (_series_file(target, number) for number in itertools.count())))
@@ -365,7 +365,7 @@ def _import_series(path: Path) -> VectorMeasurements:
     try:
         head = reading.from_json(
             comment.removeprefix(mark), str(path)
-        )  # of another kind, the mark stays and is no JSON
+        )  # for another kind of file the mark remains, and the text is not JSON
         attitude = head["kind"] == "attitude"
         wanted = _ATTITUDE_COLUMNS if attitude else _VECTOR_COLUMNS
         if names[:8] != wanted or names[8:] not in ((), (_ARRIVAL,)):
@@ -388,7 +388,7 @@ def _import_series(path: Path) -> VectorMeasurements:
 
 
 def _read_csv(path: Path, *, link: bool = True) -> tuple[str, tuple[str, ...], Array]:
-    """Return the comment, the names of the columns and the rows; ``link`` as of :func:`strapdown.files.reading.opened`."""
+    """Return the comment, the names of the columns and the rows; ``link`` as for :func:`strapdown.files.reading.opened`."""
     lines = reading.text(path, link=link).splitlines()
     if len(lines) < 2 or not lines[0].startswith(_MARK):
         raise InputError(f"{path} does not begin with '{_MARK}'; it is not a file written by export_csv")
@@ -401,9 +401,9 @@ def _read_csv(path: Path, *, link: bool = True) -> tuple[str, tuple[str, ...], A
                 [float(cell) for cell in cells] if len(cells) == len(names) else _ragged(len(cells), len(names))
             )
         except ValueError as error:
-            raise InputError(f"{path}, line {number + 3}: {error}; the file is cut short or edited") from None
+            raise InputError(f"{path}, line {number + 3}: {error}; the file is truncated or was edited") from None
     return lines[0], names, rows
 
 
 def _ragged(have: int, wanted: int) -> Array:
-    raise ValueError(f"{have} cells in place of {wanted}")
+    raise ValueError(f"{have} cells instead of {wanted}")

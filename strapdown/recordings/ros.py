@@ -1,16 +1,16 @@
 """ROS bags: ROS 1 (``.bag``), ROS 2 in SQLite (``.db3``) and MCAP (``.mcap``), or the folder of a ROS 2 bag. Library: ``rosbags``.
 
-``sensor_msgs/Imu``: angular velocity rad/s, linear acceleration m/s² (gravity is in it: at rest 9.81 upwards), in the axes of the message's
-frame, which by REP 103 and 145 are x forward, y left, z up; its orientation is another filter's estimate and left alone. Beside it go
-``sensor_msgs/MagneticField`` (T), ``sensor_msgs/Temperature`` (°C), and on a topic ``…reference`` a ``geometry_msgs/QuaternionStamped``
-(q_fb, East-North-Up), each at the nearest stamp of the inertial unit. The clock is that of the headers' stamps, ns; where these are all
-zero, that of the recorder. Stamps that go back are sorted and counted.
+``sensor_msgs/Imu``: angular velocity rad/s, linear acceleration m/s² (including gravity: at rest 9.81 upwards), in the axes of the
+message's frame, which by REP 103 and 145 are x forward, y left, z up; its orientation is another filter's estimate and is ignored. In
+addition ``sensor_msgs/MagneticField`` (T), ``sensor_msgs/Temperature`` (°C), and on a topic ``…reference`` a
+``geometry_msgs/QuaternionStamped`` (q_fb, East-North-Up) are read, each at the nearest stamp of the inertial unit. The clock is that of the
+headers' stamps, ns; if these are all zero, that of the recorder. Stamps out of order are sorted and counted.
 
-Orientation's covariance is written about the axes of the fixed frame, as REP 103 has it for poses: ``R P Rᵀ`` of the filter's body-side
-covariance. Where the filter has no estimate for a stamp, the first element is −1.
+The covariance of the orientation is written about the axes of the fixed frame, as REP 103 defines it for poses: ``R P Rᵀ`` of the filter's
+body-side covariance. At stamps without an estimate the first element is −1.
 
-The messages have a fixed layout behind the name of their frame, so they are decoded as arrays. A truncated bag, which the library
-refuses, is scanned record by record, and what is whole is read.
+The messages have a fixed layout after the name of their frame, so they are decoded as arrays. A truncated bag, which the library rejects,
+is scanned record by record, and its complete messages are read.
 """
 
 from __future__ import annotations
@@ -45,15 +45,15 @@ IMU, FIELD, TEMPERATURE, REFERENCE = (
     "geometry_msgs/msg/QuaternionStamped",
 )
 DOUBLES = {IMU: 37, FIELD: 12, TEMPERATURE: 2, REFERENCE: 4}
-"""Numbers behind the header of each message."""
+"""Number of doubles after the header of each message."""
 READ = {IMU: (13, 29), FIELD: (0, 3), TEMPERATURE: (0, 1), REFERENCE: (0, 4)}
-"""First and last of them that are read: of an inertial unit rate (3), its covariance (9), specific force (3), one of its covariance."""
+"""Range of them that is read; for an inertial unit rate (3), its covariance (9), specific force (3), first element of its covariance."""
 TOPICS = {IMU: "/imu/data_raw", FIELD: "/imu/mag", TEMPERATURE: "/imu/temperature", REFERENCE: "/imu/reference"}
-"""Topics that are written, by the names of REP 145."""
+"""Topics that are written, with the names of REP 145."""
 WITH_ORIENTATION = "/imu/data"
 FRAME = "imu_link"
 BATCH = 1024
-"""Messages that are taken from the library at once: a loop about each one would take as long as the library does."""
+"""Number of messages processed at once: processing each one separately would double the time."""
 
 ROS1_MAGIC, MCAP_MAGIC, SQLITE_MAGIC = b"#ROSBAG V2.0\n", b"\x89MCAP0\r\n", b"SQLite format 3\0"
 MAGICS = (ROS1_MAGIC, MCAP_MAGIC, SQLITE_MAGIC)
@@ -62,7 +62,7 @@ _SUFFIX = {ROS1_MAGIC: ".bag", MCAP_MAGIC: ".mcap", SQLITE_MAGIC: ".db3"}
 
 @dataclass(eq=False)
 class _Topic:
-    """The messages of one topic in the order of the bag: decoded as they come, or, to be copied, as they are."""
+    """The messages of one topic in the order of the bag: decoded, or raw if they are to be copied."""
 
     name: str
     kind: str
@@ -71,13 +71,13 @@ class _Topic:
     logged: list[int] = field(default_factory=list)
     """Times of the recorder, ns."""
     parts: list[tuple[NDArray[np.int64], Array]] = field(default_factory=list)
-    """Stamps, ns, and numbers of some messages."""
+    """Stamps, ns, and numbers of the messages, by batch."""
     fault: str = ""
-    """What is wrong with the first message that cannot be decoded."""
+    """Fault of the first message that cannot be decoded."""
     raw: list[bytes] = field(default_factory=list)
 
     def add(self, rows: Sequence[tuple[Any, int, bytes]]) -> None:
-        """Append messages: what they come from, time of the recorder, content."""
+        """Append messages (connection, time of the recorder, content)."""
         raws = [raw for _, _, raw in rows]
         if not self.decodes:
             self.raw += raws
@@ -100,12 +100,12 @@ class _Bag(NamedTuple):
 
 
 def is_folder(path: Path) -> bool:
-    """Return whether a folder is a ROS 2 bag: metadata.yaml, or storage files alone, of a recorder that was killed."""
+    """Return whether a folder is a ROS 2 bag: metadata.yaml, or only storage files, if the recorder was killed."""
     return path.is_dir() and ((path / "metadata.yaml").is_file() or bool(_storages(path)))
 
 
 def _storages(path: Path) -> list[Path]:
-    """Return the storage files of a folder in their order: with metadata all, else those named as the folder, or that and a number."""
+    """Return the storage files of a folder in order: with metadata all, else those named as the folder, or with a number appended."""
     found = [one for suffix in (".mcap", ".db3") for one in path.glob(f"*{suffix}")]
     name = ".*?" if (path / "metadata.yaml").is_file() else re.escape(path.absolute().name)
     numbers = {one: re.fullmatch(rf"{name}(?:_(\d+))?", one.stem) for one in found}
@@ -118,7 +118,7 @@ def _storages(path: Path) -> list[Path]:
 
 
 def read_bag(path: str | os.PathLike[str], *, topic: str = "") -> Recording:
-    """Read the inertial unit of a bag, a file or a folder; of several topics of ``sensor_msgs/Imu`` name one."""
+    """Read the inertial unit of a bag, a file or a folder; ``topic`` selects one of several topics of ``sensor_msgs/Imu``."""
     file = Path(path)
     bag = _messages(file, wanted=tuple(DOUBLES))
     chosen = _chosen(file.name, bag.topics, topic)
@@ -137,10 +137,12 @@ def read_bag(path: str | os.PathLike[str], *, topic: str = "") -> Recording:
         if not isinstance(other, _Topic) or (kind == REFERENCE and not other.name.endswith("reference")):
             continue
         other_stamps, other_values, words = _joined(file.name, other)
-        places = {FIELD: [0, 1, 2], TEMPERATURE: [0], REFERENCE: [3, 0, 1, 2]}[kind]  # a quaternion of ROS ends in w
+        places = {FIELD: [0, 1, 2], TEMPERATURE: [0], REFERENCE: [3, 0, 1, 2]}[
+            kind
+        ]  # in ROS, w is last in a quaternion
         own[name], lost = at_nearest(time, (other_stamps - epoch) / 1e9, other_values[:, places])
         said += [
-            f"Topic {other.name} beside it: {len(other_stamps)} messages{f', {lost} of them beyond its stamps' if lost else ''}."
+            f"Topic {other.name}: {len(other_stamps)} messages{f', {lost} of them beyond its stamps' if lost else ''}."
         ]
         said += words
     if "magnetic_field" in own:
@@ -151,7 +153,7 @@ def read_bag(path: str | os.PathLike[str], *, topic: str = "") -> Recording:
 
 
 def _chosen(name: str, topics: Mapping[str, _Topic], topic: str) -> str:
-    """Return the topic of the inertial unit: the one asked for, or the only one."""
+    """Return the topic of the inertial unit: the one given, or the only one."""
     units = {t.name: t for t in topics.values() if t.kind == IMU}
     listed = ", ".join(f"{t.name} ({len(t)} messages)" for t in units.values())
     if topic:
@@ -161,7 +163,7 @@ def _chosen(name: str, topics: Mapping[str, _Topic], topic: str) -> str:
     filled = [t.name for t in units.values() if len(t)]
     if not filled:
         what = f"no message of {IMU}" + (f" on {listed}" if units else "")
-        raise InputError(f"{name} holds {what}; give a bag of an inertial unit")
+        raise InputError(f"{name} has {what}; give a bag of an inertial unit")
     if len(filled) > 1:
         raise InputError(
             f"{name} has several inertial units: {listed}; choose one, --topic {filled[0]} (topic= in Python)"
@@ -170,7 +172,7 @@ def _chosen(name: str, topics: Mapping[str, _Topic], topic: str) -> str:
 
 
 def _beside(unit: str, found: list[_Topic]) -> _Topic | str | None:
-    """Return the topic of a kind that goes with an inertial unit: the only one, or the only one of its namespace; else a remark."""
+    """Return the topic of a kind that belongs to an inertial unit: the only one, or the only one of its namespace; else a remark."""
     if len(found) <= 1:
         return found[0] if found else None
     space = unit.rpartition("/")[0] + "/"
@@ -178,7 +180,7 @@ def _beside(unit: str, found: list[_Topic]) -> _Topic | str | None:
     if len(near) == 1:
         return near[0]
     names = ", ".join(t.name for t in found)
-    return f"None of {names} was taken, for none alone stands beside {unit}."
+    return f"None of {names} was read, because it is ambiguous which of them belongs to {unit}."
 
 
 class _UnreadableError(ValueError):
@@ -186,7 +188,7 @@ class _UnreadableError(ValueError):
 
 
 def _decoded(raws: list[bytes], kind: str, ros2: bool, before: int) -> tuple[NDArray[np.int64], Array]:
-    """Return stamps (n,), ns, and numbers (n, d) of messages of a type, of which so many came before."""
+    """Return stamps (n,), ns, and numbers (n, d) of messages of a type; ``before`` is the number of earlier messages."""
     wanted, (first, last) = DOUBLES[kind], READ[kind]
     lengths = np.fromiter(map(len, raws), np.int64, len(raws))
     stamps, values = np.empty(len(raws), np.int64), np.empty((len(raws), last - first))
@@ -215,7 +217,7 @@ def _decoded(raws: list[bytes], kind: str, ros2: bool, before: int) -> tuple[NDA
 
 
 def _joined(name: str, topic: _Topic) -> tuple[NDArray[np.int64], Array, list[str]]:
-    """Return stamps (n,), ns, numbers (n, d) of a topic's messages, in order of time, and remarks."""
+    """Return stamps (n,), ns, and numbers (n, d) of a topic's messages, in order of time, and remarks."""
     if topic.fault:
         raise InputError(f"{name}, topic {topic.name}: {topic.fault}; the bag is damaged or of another type")
     stamps, values = (np.concatenate(column) for column in zip(*topic.parts, strict=True))
@@ -229,13 +231,13 @@ def _joined(name: str, topic: _Topic) -> tuple[NDArray[np.int64], Array, list[st
         order = np.argsort(stamps, kind="stable")
         stamps, values = stamps[order], values[order]
         said.append(
-            f"{back} messages of {topic.name}, the first of them number {number}, came after later ones and were sorted."
+            f"{back} messages of {topic.name}, the first of them number {number}, were out of order and were sorted."
         )
     return stamps, values, said
 
 
 def _messages(path: Path, wanted: tuple[str, ...] = ()) -> _Bag:
-    """Return the messages of a bag by topic, of the wanted types (empty: of all), from the library or, of a damaged bag, what is whole."""
+    """Return the messages of a bag by topic, of the wanted types (empty: all); for a damaged bag only the complete messages."""
     highlevel = library("rosbags.highlevel", f"{path.name} is a ROS bag, which")
     typesys = library("rosbags.typesys", f"{path.name} is a ROS bag, which")
     files = [path]
@@ -258,18 +260,16 @@ def _messages(path: Path, wanted: tuple[str, ...] = ()) -> _Bag:
                             topics[name].add([row for row in batch if row[0].topic == name])
     except InputError:
         raise
-    except Exception as error:  # the library raises what its parsers do: of a cut file, anything
+    except Exception as error:  # for a truncated file the library raises any exception of its parsers
         return _salvaged(path, files, wanted, error)
     words: tuple[str, ...] = ()
     if files != [path]:
-        words = (
-            f"{path.name} has no metadata.yaml, as where the recorder was killed: read from its {len(files)} files.",
-        )
+        words = (f"{path.name} has no metadata.yaml, as if the recorder was killed: read from its {len(files)} files.",)
     return _Bag(topics, ros2, words)
 
 
 def named_as(path: Path, folder: Path) -> Path:
-    """Return a path whose ending is that of its content, by which the library distinguishes bags."""
+    """Return a path whose extension matches its content, because the library distinguishes bags by extension."""
     if path.is_dir():
         return path
     with reading.opened(path) as stream:
@@ -278,11 +278,11 @@ def named_as(path: Path, folder: Path) -> Path:
     return with_ending(path, suffix, folder)
 
 
-# ----------------------------------------------------------------------------------------------------------- what is whole
+# ----------------------------------------------------------------------------------------------------------- damaged bags
 
 
 def _salvaged(path: Path, files: list[Path], wanted: tuple[str, ...], error: Exception) -> _Bag:
-    """Return the whole messages of a bag that the library cannot open."""
+    """Return the complete messages of a bag that the library cannot open."""
     topics: dict[str, _Topic] = {}
     ros2 = True
     for file in _storages(path) if path.is_dir() else files:
@@ -302,12 +302,12 @@ def _salvaged(path: Path, files: list[Path], wanted: tuple[str, ...], error: Exc
     reason = " ".join(str(error).split()) or type(error).__name__
     if not number:
         raise InputError(
-            f"{path.name} cannot be read as a ROS bag ({reason}), and holds no whole message; record it again"
+            f"{path.name} cannot be read as a ROS bag ({reason}), and has no complete message; record it again"
         ) from None
     return _Bag(
         topics,
         ros2,
-        (f"{path.name} is truncated or damaged ({reason}): read are the {number} messages that are whole.",),
+        (f"{path.name} is truncated or damaged ({reason}): only its {number} complete messages are read.",),
     )
 
 
@@ -315,7 +315,7 @@ _Message = tuple[str, str, int, bytes]
 
 
 def _scan_ros1(path: Path) -> Iterator[_Message]:
-    """Yield the whole messages of a ROS 1 bag, record by record, without its index."""
+    """Yield the complete messages of a ROS 1 bag, record by record, without its index."""
     connections: dict[int, tuple[str, str]] = {}
 
     def records(data: memoryview) -> Iterator[tuple[dict[bytes, bytes], memoryview, bool]]:
@@ -368,7 +368,7 @@ def _ros2_name(kind: str) -> str:
 
 
 def _scan_mcap(path: Path) -> Iterator[_Message]:
-    """Yield the whole messages of an MCAP file, record by record, without its summary."""
+    """Yield the complete messages of an MCAP file, record by record, without its summary."""
     schemas: dict[int, str] = {}
     channels: dict[int, tuple[str, str]] = {}
 
@@ -408,7 +408,7 @@ def _scan_mcap(path: Path) -> Iterator[_Message]:
 def _scan_sqlite(path: Path) -> Iterator[_Message]:
     """Yield the rows of a ROS 2 database up to where it is damaged.
 
-    A database shorter than its header says is refused as a whole, so a copy is filled up with zeros: reading it ends at the first of them.
+    SQLite rejects a database shorter than its header states, so a copy is padded with zeros; reading ends at the first of them.
     """
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder) / "filled.db3"
@@ -419,7 +419,7 @@ def _scan_sqlite(path: Path) -> Iterator[_Message]:
                 return
             (size,) = struct.unpack_from(">H", header, 16)
             size = 65536 if size == 1 else size
-            stream.truncate(copy.stat().st_size // size * size)  # a page that is cut would be read as rows of zeros
+            stream.truncate(copy.stat().st_size // size * size)  # an incomplete page would be read as rows of zeros
             stream.truncate(struct.unpack_from(">I", header, 28)[0] * size)
         database = sqlite3.connect(f"{copy.as_uri()}?immutable=1", uri=True)
         try:
@@ -458,9 +458,9 @@ _SCANS: dict[bytes, Callable[[Path], Iterator[_Message]]] = {
 
 
 def write_bag(recording: Recording, path: str | os.PathLike[str]) -> None:
-    """Write a recording as a bag: ``.bag`` ROS 1, ``.mcap`` and ``.db3`` ROS 2, one file each.
+    """Write a recording as a bag in one file: ``.bag`` ROS 1, ``.mcap`` and ``.db3`` ROS 2.
 
-    Missing samples are not written; of a magnetometer the unit must be known.
+    Missing samples are not written; the unit of the magnetometer must be known.
     """
     _write(Path(path), _series(recording, None))
 
@@ -468,9 +468,9 @@ def write_bag(recording: Recording, path: str | os.PathLike[str]) -> None:
 def write_estimate(
     estimate: Estimate, path: str | os.PathLike[str], *, recording: Recording | None = None, source: Path | None = None
 ) -> None:
-    """Write the samples that an estimate was made from as a bag, with orientation and its covariance filled in.
+    """Write the samples that an estimate was made from as a bag, with the estimated orientation and its covariance.
 
-    Of ``source``, the bag that the recording was read from, all other topics go along as they are, if it is of the same ROS.
+    All other topics of ``source``, the bag that the recording was read from, are copied unchanged if it is of the same ROS version.
     """
     assert recording is not None
     target = Path(path)
@@ -488,11 +488,11 @@ _Series = tuple[str, NDArray[np.int64], Array]
 
 
 def _series(recording: Recording, estimate: Estimate | None) -> list[_Series]:
-    """Return the messages of a recording by type: stamps, ns, and the numbers behind the header."""
+    """Return the messages of a recording by type: stamps, ns, and the numbers after the header."""
     stamps = recording.clock_ns
     if stamps[0] < 0:
         raise InputError(
-            f"{recording.source}: time begins at {recording.time[0]:g} s, and a bag's clock has no negative times; move it"
+            f"{recording.source}: time begins at {recording.time[0]:g} s, and a bag's clock has no negative times; shift it"
         )
     imu = np.zeros((len(stamps), DOUBLES[IMU]))
     imu[:, 3] = 1.0
@@ -508,7 +508,7 @@ def _series(recording: Recording, estimate: Estimate | None) -> list[_Series]:
     if recording.magnetic_field is not None:
         if not recording.magnetic_unit:
             raise InputError(
-                f"{recording.source} does not say the unit of its magnetometer, and a bag holds tesla; declare it in the header or by "
+                f"{recording.source} does not declare the unit of its magnetometer, and a bag uses tesla; declare it in the header or by "
                 f"option ({' or '.join(MAGNETIC_UNITS)})"
             )
         known = ~np.isnan(recording.magnetic_field).any(axis=1)
@@ -527,12 +527,12 @@ def _series(recording: Recording, estimate: Estimate | None) -> list[_Series]:
 
 
 def _fill_orientation(imu: Array, recording: Recording, estimate: Estimate) -> None:
-    """Write an estimate's attitude and covariance into the messages of its stamps."""
+    """Write an estimate's attitude and covariance into the messages at its stamps."""
     places = np.clip(np.searchsorted(recording.time, estimate.time - 1e-7), 0, len(recording.time) - 1)
     same = np.abs(recording.time[places] - estimate.time) < 1e-6
     if not same.any():
         raise InputError(
-            f"{recording.source}: no stamp of it is one of the estimate's; give the recording that the estimate was made from"
+            f"{recording.source} and the estimate have no stamp in common; give the recording that the estimate was made from"
         )
     rows, q = places[same], estimate.attitude[same]
     imu[rows, 0:4] = q[:, [1, 2, 3, 0]]
@@ -554,7 +554,7 @@ def _encoded(stamps: NDArray[np.int64], numbers: Array, ros2: bool) -> NDArray[n
     words = np.zeros((len(stamps), 4), "<u4")
     words[:, 0] = (
         256 if ros2 else np.arange(len(stamps))
-    )  # 00 01 00 00: little-endian CDR; of ROS 1 the header's number
+    )  # 00 01 00 00: little-endian CDR; in ROS 1 the sequence number of the header
     words[:, 1], words[:, 2], words[:, 3] = stamps // 10**9, stamps % 10**9, len(frame)
     table[:, :16] = words.view(np.uint8)
     table[:, 16 : 16 + len(frame)] = np.frombuffer(frame, np.uint8)
@@ -563,7 +563,7 @@ def _encoded(stamps: NDArray[np.int64], numbers: Array, ros2: bool) -> NDArray[n
 
 
 def _write(target: Path, series: list[_Series], others: list[_Topic] | None = None, source: Path | None = None) -> None:
-    """Write messages in the order of their times; the bag appears whole or not at all."""
+    """Write messages in the order of their times; the bag is created only when complete."""
     what = f"writing {target.name}"
     ros2 = target.suffix.lower() != ".bag"
     typesys = library("rosbags.typesys", what)
@@ -598,7 +598,7 @@ def _writer(place: Path, suffix: str, what: str) -> Any:
 
 
 def _copied(writer: Any, topics: list[_Topic], source: Path) -> list[tuple[int, Any, bytes]]:
-    """Return the messages of topics that go along as they are, their types from the source."""
+    """Return the messages of topics that are copied unchanged, with their types from the source."""
     highlevel, typesys = library("rosbags.highlevel", source.name), library("rosbags.typesys", source.name)
     queue = []
     with tempfile.TemporaryDirectory() as folder:

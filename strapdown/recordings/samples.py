@@ -1,4 +1,4 @@
-"""Samples of one sensor at even intervals, for the identification of its noise."""
+"""Samples of one sensor at equal intervals, for the identification of its noise."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from strapdown.records.recording import GAP, Recording
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class GyroSamples:
-    """Samples of a gyro, or of another sensor, at even intervals, for noise identification.
+    """Samples of a gyro or another sensor at equal intervals, for noise identification.
 
     Parameters
     ----------
     values : ndarray (n, axes)
-        Samples, SI (rad/s, m/s², T), or increments of a gyro, rad. NaN where a sample is missing, if gaps were allowed.
+        Samples, SI (rad/s, m/s², T), or increments of a gyro, rad. Missing samples are NaN, if gaps were allowed.
     sample_interval : float
         Sample interval, s.
     kind : {"rate", "increments"}
         Kind of the values.
     temperature : ndarray (n,), optional
-        Temperature, °C, where it was recorded.
+        Temperature, °C, if it was recorded.
     remarks : tuple of str, default empty
         Choices and omissions of the reader.
     """
@@ -63,26 +63,26 @@ def read_samples(
     sensor : {"gyro", "accelerometer", "magnetometer"}, default "gyro"
         Sensor.
     rate : float, optional
-        Sample rate of a bare array, Hz.
+        Sample rate, Hz; only for an NPY array.
     units : mapping of str to str, optional
-        Units as in :func:`strapdown.recordings.read`; of a bare array by the name of the sensor.
+        Units as in :func:`strapdown.recordings.read`; for an NPY array by the name of the sensor.
     columns : mapping of str to str, optional
-        For tables: names of columns by role, perhaps with a unit, ``{"time": "timestamp [us]", "gx": "gyro_x[dps]"}``; the others
+        For tables: names of columns by role, optionally with a unit, ``{"time": "timestamp [us]", "gx": "gyro_x[dps]"}``; the others
         are found by their names.
     topic : str, default ""
-        For bags and flight logs: topic of the inertial unit, where there are several.
+        For bags and flight logs: topic of the inertial unit, if there are several.
     gaps : bool, default False
-        Whether gaps are allowed: samples then lie on a grid of the usual interval, and missing ones are NaN.
+        Whether gaps are allowed: samples are then placed on a grid, and missing ones are NaN.
 
     Returns
     -------
     GyroSamples
-        Samples at even intervals.
+        Samples at equal intervals.
 
     Raises
     ------
     InputError
-        If the sensor is missing, its unit is unknown, or its samples lie at uneven intervals.
+        If the sensor is missing, its unit is unknown, or its sample intervals are unequal.
     """
     file = Path(path)
     one_of("sensor", sensor, SENSORS)
@@ -106,7 +106,7 @@ def read_samples(
 def samples_of(
     content: Recording | ImuRecord, sensor: str = "gyro", *, gaps: bool = False, source: str = "record"
 ) -> GyroSamples:
-    """Return the samples of one sensor of a recording or a simulated record, as :func:`read_samples` for its file."""
+    """Return the samples of one sensor of a recording or a simulated record, as :func:`read_samples` does for a file."""
     one_of("sensor", sensor, SENSORS)
     if isinstance(content, Recording):
         return _of_recording(content, sensor, gaps)
@@ -122,7 +122,7 @@ def samples_of(
 def _read_array(file: Path, sensor: str, rate: float | None, given: Mapping[str, str]) -> GyroSamples:
     names = " or ".join(list(UNITS[sensor])[:2]) if sensor == "gyro" else " or ".join(UNITS[sensor])
     if rate is None or sensor not in given:
-        raise InputError(f"{file.name} is a bare array; give its rate in Hz and its unit ({names})")
+        raise InputError(f"{file.name} is an array without rate and unit; give its rate in Hz and its unit ({names})")
     values = reading.npy(file)
     factor = UNITS[sensor][one_of(f"{file.name}: unit of the {sensor}", given[sensor], UNITS[sensor])]
     axes = array(file.name, np.reshape(values, (-1, 1)) if np.ndim(values) == 1 else values, ("n", "axes"))
@@ -130,7 +130,7 @@ def _read_array(file: Path, sensor: str, rate: float | None, given: Mapping[str,
 
 
 def _of_recording(recording: Recording, sensor: str, gaps: bool) -> GyroSamples:
-    """Return one sensor's samples, SI; a slower sensor's at its own stamps."""
+    """Return one sensor's samples, SI; for a sensor of lower rate, only the stamps where it has samples."""
     values = {
         "gyro": recording.rate,
         "accelerometer": recording.specific_force,
@@ -142,7 +142,7 @@ def _of_recording(recording: Recording, sensor: str, gaps: bool) -> GyroSamples:
     if sensor == "magnetometer":
         if not recording.magnetic_unit:
             raise InputError(
-                f"{recording.source} does not say the unit of its magnetometer; declare it in the header or by option "
+                f"{recording.source} does not declare the unit of its magnetometer; declare it in the header or by option "
                 f"({' or '.join(UNITS['magnetometer'])})"
             )
         factor = UNITS["magnetometer"][recording.magnetic_unit]
@@ -167,14 +167,14 @@ def _of_recording(recording: Recording, sensor: str, gaps: bool) -> GyroSamples:
 
 
 JITTER = 0.25
-"""Largest distance of a stamp from the grid, in intervals, at which a sample is still that of its place."""
+"""Maximum deviation of stamps from the grid, in intervals, for each sample to be placed at its nearest grid point."""
 
 
 def _grid(source: str, time: Array) -> tuple[float, np.ndarray, tuple[str, ...]]:
-    """Return the interval of the grid that the stamps lie on, s, the place of each, and remarks.
+    """Return the interval of the grid of the stamps, s, the grid index of each, and remarks.
 
-    Stamps near the grid reveal every lost sample. Stamps with larger delays, as from a busy computer, reveal only gaps: between gaps the
-    samples are assumed to be even.
+    If all stamps are near the grid, every lost sample is found. If stamps are irregular, as from a busy computer, only gaps are found, and
+    the samples between gaps are assumed to be equally spaced.
     """
     steps = np.diff(time)
     usual = float(np.median(steps))
@@ -187,8 +187,8 @@ def _grid(source: str, time: Array) -> tuple[float, np.ndarray, tuple[str, ...]]
         interval = float(np.mean(steps[~gap]))
         whole = np.where(gap, np.rint(steps / interval), 1.0)
         words = (
-            f"Intervals of {source} stray by up to {1e3 * float(np.abs(steps[~gap] - interval).max()):.3g} ms from the mean: between gaps "
-            f"the samples are assumed to be even, {1.0 / interval:.6g} Hz.",
+            f"Intervals of {source} deviate by up to {1e3 * float(np.abs(steps[~gap] - interval).max()):.3g} ms from the mean: between "
+            f"gaps the samples are assumed to be equally spaced, {1.0 / interval:.6g} Hz.",
         )
     place = np.concatenate([[0], np.cumsum(whole)]).astype(np.int64)
     missing = int(place[-1] + 1 - len(place))

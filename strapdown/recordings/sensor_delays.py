@@ -1,7 +1,7 @@
-"""Delays of a unit's sensors, from the recording itself.
+"""Delays of a unit's sensors, estimated from its recording.
 
-A sensor's low-pass delays its samples by the group delay, and the sensors of one unit differ in it: a magnetometer 11 ms behind the gyro is
-6° off at 500 °/s.
+A sensor's low-pass filter delays its samples by the group delay, which differs between the sensors of one unit: a magnetometer 11 ms behind
+the gyro is in error by 6° at 500 °/s.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from strapdown.kernels.machine import compiled, read_only
 from strapdown.records.recording import Recording, increments, sampled
 
 FIELD_SPAN = 0.2
-"""Span over which the change of the field, turned back by the gyro, shows the magnetometer's delay, s."""
+"""Time difference over which the change of the field, in the frame fixed by the integrated gyro, is fitted for the delay, s."""
 PAIRS_IN_SPAN = 12
-"""Pairs of field samples used for each such span; more are not independent."""
+"""Number of pairs of field samples per span; more are not independent."""
 MAX_DELAY_SIGMA = 2e-3
-"""A delay of the magnetometer with a larger σ is not used, s."""
+"""Maximum σ of a delay of the magnetometer that is used, s."""
 MAX_DELAY = 0.05
-"""Nor is one beyond this, which is another error than a delay, s."""
+"""Maximum delay of the magnetometer that is used, s; a larger value has another cause than a delay."""
 ASSUMED_SIGMA = 2e-3
-"""σ of a gyro delay that is assumed, s."""
+"""σ of an assumed gyro delay, s."""
 GIVEN_SIGMA = 3e-4
-"""σ of a gyro delay that is given, s."""
+"""σ of a given gyro delay, s."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -35,13 +35,13 @@ class Delays:
     """Delays of a recording's sensors."""
 
     gyro: Array | float
-    """Delay of the stamps of gyro and accelerometer after the motion, s: one number, or one per sample (n,)."""
+    """Delay of the stamps of gyro and accelerometer relative to the motion, s: one number, or one per sample (n,)."""
     sigma: float
-    """Its standard deviation, s."""
+    """Standard deviation of that delay, s."""
     field: Array | float
-    """Delay of the magnetometer's stamps behind the gyro's, s, negative for earlier: one number, or one per sample."""
+    """Delay of the magnetometer's stamps relative to the gyro's, s, negative for earlier: one number, or one per sample."""
     field_sigma: float
-    """σ of the last of them, s; infinite where the recording does not show it."""
+    """σ of the last value of ``field``, s; infinite if it is not observable."""
     given: bool
     """Whether the gyro's delay was given."""
 
@@ -53,23 +53,23 @@ class Delays:
             f"Samples are assumed to be stamped {late:.3g} ms late."
             if self.given
             else f"Samples are assumed to be stamped {late:.3g} ms late, half a sample interval, σ {1e3 * self.sigma:.2g} ms; "
-            "give --latency (latency= in Python) if it is known (0: point samples)."
+            "if the delay is known, give --latency (latency= in Python; 0: point samples)."
         ]
         if field:
             side = "after" if field > 0.0 else "before"
             found.append(
-                f"The magnetometer's samples come {abs(field):.1f} ms {side} the gyro's, σ {1e3 * self.field_sigma:.1g} ms: compensated."
+                f"The magnetometer's samples come {abs(field):.1f} ms {side} the gyro's, σ {1e3 * self.field_sigma:.1g} ms, compensated."
             )
         return tuple(found)
 
     @property
     def last_gyro(self) -> float:
-        """The gyro's delay at the end, s."""
+        """Delay of the gyro at the end, s."""
         return float(np.ravel(self.gyro)[-1])
 
     @property
     def last_field(self) -> float:
-        """The magnetometer's delay behind the gyro at the end, s."""
+        """Delay of the magnetometer relative to the gyro at the end, s."""
         return float(np.ravel(self.field)[-1])
 
 
@@ -83,10 +83,10 @@ def find(
 ) -> Delays:
     """Return the delays of a recording's sensors.
 
-    ``latency`` is the delay of gyro and accelerometer where it is known, s; by default half a sample interval, as of samples that are means
-    over the interval before their stamp, or as much as the magnetometer is ahead of the gyro, for no sensor shows what is to come.
-    ``field`` is the delay of the magnetometer behind the gyro where it is known, s. ``causal``: each sample's delay from the samples before
-    it, found anew whenever the recording has become twice as long. ``turned`` (n, 4): attitude by the gyro alone, if it is at hand.
+    ``latency`` is the delay of gyro and accelerometer, s, if known. The default is half a sample interval, as for means over the interval
+    before the stamp, or if longer, the time by which the magnetometer is ahead of the gyro, because no sensor can precede the motion.
+    ``field`` is the delay of the magnetometer relative to the gyro, s, if known. ``causal``: each sample's delay is computed from the
+    samples before it, and updated whenever the duration has doubled. ``turned`` (n, 4): attitude from the gyro only, if already computed.
     """
     length = recording.time[-1] - recording.time[0]
     if latency is not None and non_negative("latency", latency, unit="s") >= length:
@@ -116,11 +116,11 @@ def find(
 
 
 def magnetometer_delay(recording: Recording) -> tuple[float, float]:
-    """Return the delay of the magnetometer's stamps behind the gyro's, s, and its σ; (0, ∞) where it is not observable.
+    """Return the delay of the magnetometer's stamps relative to the gyro's, s, and its σ; (0, ∞) if it is not observable.
 
-    Rotated back by the gyro alone, the field m is constant over a fraction of a second. Samples that are late by τ are in error by
-    ``−τ ṁ``, ``ṁ = −w × m``, and how that changes over :data:`FIELD_SPAN` is fitted by least squares without the outliers. A field that
-    turns with the body (hard iron) is in quadrature to it in a swing: it does not pass for a delay, but a strong one hides some.
+    In the frame fixed by the integrated gyro the field m is constant over a fraction of a second. Samples that are late by τ have the error
+    ``−τ ṁ``, ``ṁ = −w × m``; the change of this error over :data:`FIELD_SPAN` is fitted by least squares without outliers. A field that
+    rotates with the body (hard iron) is in quadrature with it in a swing: it does not appear as a delay, but large iron masks part of one.
     """
     return (
         (0.0, np.inf)
@@ -130,12 +130,12 @@ def magnetometer_delay(recording: Recording) -> tuple[float, float]:
 
 
 def gyro_attitude(recording: Recording) -> Array:
-    """Return the attitude (n, 4) by the gyro alone at every sample, from the identity at the first one."""
+    """Return the attitude (n, 4) from the gyro only at every sample, identity at the first one."""
     return coning.integrate(increments(recording), coning.ALGORITHMS["one-sample"])
 
 
 def _evidence(recording: Recording, turned: Array) -> tuple[Array, Array, Array, Array]:
-    """Return times (m,), s, of pairs of field samples, and what :func:`_fitted` needs of their changes and of those by a unit delay."""
+    """Return times (m,), s, of pairs of field samples, and the products c·w, w·w, c·c of their change c and that by a unit delay, w."""
     time, none = recording.time, (np.empty(0),) * 4
     assert recording.magnetic_field is not None
     lag = int(np.searchsorted(time, time[0] + FIELD_SPAN))
@@ -156,7 +156,7 @@ def _evidence(recording: Recording, turned: Array) -> tuple[Array, Array, Array,
 
 
 def _fitted(across: Array, along: Array, total: Array) -> tuple[float, float]:
-    """Return the delay, s, and its σ, by which w makes up c, without the farthest; c·w, w·w and c·c of each pair (m,) are given."""
+    """Return the delay τ, s, of the fit c = τ w without outliers, and its σ, from c·w, w·w and c·c of each pair (m,)."""
     kept, low, high = np.full(len(total), True), (len(total) - 1) // 2, len(total) // 2
     for _ in range(4):
         information = float(np.sum(along[kept]))
@@ -167,15 +167,15 @@ def _fitted(across: Array, along: Array, total: Array) -> tuple[float, float]:
         ordered = np.partition(left, (low, high))
         middle = 0.5 * float(ordered[low] + ordered[high])
         kept = left <= 2.5**2 * middle
-    # Of a normal residual with three components the median length is 1.54 σ; the pairs of one span overlap and are not independent.
+    # The median norm of a normal residual with three components is 1.54 σ; the pairs of one span overlap and are not independent.
     return delay, float(np.sqrt(max(middle, 0.0) * PAIRS_IN_SPAN / information)) / 1.54
 
 
 def turn_over(recording: Recording, delay: Array | float) -> Array:
-    """Return the rotation vector (n, 3), rad, by which the unit turned over a delay, s, before each stamp, by its gyro alone.
+    """Return the rotation vector (n, 3), rad, of the unit over a delay, s, before each stamp, from its gyro only.
 
-    Over a negative delay it is the turn to come, negative; before the first and after the last sample the unit turns on at their rates. The
-    delay is so short that turns of its parts add up.
+    For a negative delay it is minus the rotation after the stamp. Before the first and after the last sample their rates are held. The
+    delay must be so short that rotation vectors can be added.
     """
     late = np.broadcast_to(np.asarray(delay, np.float64), recording.time.shape)
     sums, turn = np.empty((2, len(late), 3))

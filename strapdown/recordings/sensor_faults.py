@@ -1,11 +1,11 @@
-"""Faulty samples of a recording: truncated or clipped ones, and a gyro that was silent.
+"""Faulty samples of a recording: truncated samples, clipped samples, and gaps of the gyro.
 
-A gyro whose samples are whole numbers of a step, truncated toward zero, measures every rate half a step too small, and so another bias at
-rest than in motion: half a step is added (:func:`truncation_step`).
+If the samples of a gyro are multiples of a step, truncated toward zero, every rate is measured half a step too small, so that the bias at
+rest differs from that in motion: half a step is added (:func:`truncation_step`).
 
-A clipped gyro sample is a lower bound of the rate. Between the samples before and after such a run the rate is restored by a cubic
-(:func:`restored`), and its error becomes a variance of the turn, which the filter adds to that of the gyro's noise. So does the turn over a
-gap. A clipped sample of the accelerometer has a false direction and is left out.
+A clipped gyro sample is a lower bound of the rate. The rate of a run of clipped samples is restored by a cubic between the samples before
+and after (:func:`restored`). Its error is represented by a variance of the rotation, which the filter adds to that of the gyro's noise, as
+it does for the rotation over a gap. A clipped sample of the accelerometer has a wrong direction and is left out.
 """
 
 from __future__ import annotations
@@ -20,29 +20,29 @@ from strapdown.records.recording import Recording
 from strapdown.units import DEGREE
 
 SLOW_RATE = 0.03
-"""Rates below this show by which step a gyro's samples are quantised, rad/s."""
+"""Maximum rate, rad/s, of the samples from which the quantisation step of a gyro is determined."""
 MIN_CLIPPED_RATE = 1.0
-"""Smallest limit of a clipped gyro axis, rad/s; quantised samples at rest repeat their extreme too."""
+"""Minimum limit of a clipped gyro axis, rad/s; quantised samples at rest repeat their extreme too."""
 MIN_CLIPPED_FORCE = 15.0
-"""Smallest limit of a clipped accelerometer axis, m/s²."""
+"""Minimum limit of a clipped accelerometer axis, m/s²."""
 MIN_CLIPPED = 3
-"""Smallest number of samples at the extreme, at least two of them in a row, of a clipped axis."""
+"""Minimum number of samples at the extreme, at least two of them consecutive, of a clipped axis."""
 MAX_REPEATS = 0.1
-"""Share of the other samples equal to the one before above which the sensor repeats samples anyway, and clipping is not reported."""
+"""Maximum share of the other samples equal to the one before; above it the sensor repeats samples, and clipping is not reported."""
 RESTORED_ERROR = 0.5
-"""σ of the turn beyond the limit over a clipped run, as a share of what the cubic makes of it."""
+"""σ of the rotation beyond the limit over a clipped run, relative to that of the cubic."""
 RESTORED_SPAN = 0.3
 """Assumed duration of the angular acceleration at the ends of a clipped run, s."""
 SLOWEST_CROSSING = 64
-"""Samples on either side of zero, at most, between which a rate that crosses it shows the bins of its quantisation about zero."""
+"""Maximum number of samples before and after a zero crossing of the rate that is used for the histogram about zero."""
 CROSSING_STEPS = 6
-"""Steps beyond zero on either side that make a crossing: noise at rest does not."""
+"""Minimum rate on either side of a zero crossing, in steps, so that noise at rest is excluded."""
 BINS = 4
-"""Bins on either side of that about zero that it is compared with."""
+"""Number of bins on either side of the zero bin with which it is compared."""
 TRUNCATED_ODDS = 100.0
-"""Likelihood ratio of truncation to rounding above which samples are taken for truncated."""
+"""Minimum likelihood ratio of truncation to rounding for samples to be treated as truncated."""
 LONG_INTERVAL = 1.5
-"""Ratio of an interval between stamps to the usual one above which its rotation is uncertain."""
+"""Ratio of an interval between stamps to the median interval above which its rotation is uncertain."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -50,22 +50,22 @@ class Faults:
     """Faults of a recording."""
 
     recording: Recording
-    """The recording with clipped gyro samples restored and clipped samples of the accelerometer missing."""
+    """Recording with clipped gyro samples restored and clipped accelerometer samples replaced by NaN."""
     turn_variance: Array
-    """Variance (n − 1,) of the rotation over each interval beyond the gyro's noise, rad² per axis; mostly 0."""
+    """Variance (n − 1,) of the rotation over each interval in addition to the gyro's noise, rad² per axis; mostly 0."""
     words: tuple[str, ...]
     """Description of the faults."""
 
 
 def find(recording: Recording) -> Faults:
-    """Return the faults of a recording's samples, and the recording without them."""
+    """Return the faults of a recording's samples, with the corrected recording."""
     words = []
     changes: dict[str, Any] = {}
     step = truncation_step(recording.rate)
     if step is not None:
         recording = replace(recording, rate=untruncated(recording.rate, step))
         words.append(
-            f"The gyro's samples are multiples of {step / DEGREE:.3g} °/s truncated toward zero: half of it is given back to each"
+            f"The gyro's samples are multiples of {step / DEGREE:.3g} °/s truncated toward zero: half a step is added to each"
         )
     rate, variance, clipped = restored(recording.time, recording.rate)
     if clipped.any():
@@ -76,7 +76,7 @@ def find(recording: Recording) -> Faults:
             if clipped[:, k].any()
         )
         words.append(
-            f"The gyro was clipped: {limits} of the samples. The rate is restored from the samples around, and σ grows over each run"
+            f"The gyro was clipped: {limits} of the samples. The rate is restored from adjacent samples, and σ grows over each run"
         )
     force = recording.specific_force
     if force is not None and (saturated := clipped_samples(force, MIN_CLIPPED_FORCE)).any():
@@ -90,8 +90,8 @@ def find(recording: Recording) -> Faults:
         variance[k] += turn_variance_over(recording.time, rate, float(steps[k]), usual)
     if len(long):
         words.append(
-            f"{len(long)} intervals between stamps are longer than {LONG_INTERVAL:g} usual ones, up to {steps.max():.3g} s: σ grows over "
-            "each by what the rate changes in as long a time"
+            f"Intervals between stamps longer than {LONG_INTERVAL:g} median ones: {len(long)}, up to {steps.max():.3g} s; σ grows over "
+            "each according to the change of the rate in that time"
         )
     if changes:
         recording = replace(recording, **changes)
@@ -101,8 +101,8 @@ def find(recording: Recording) -> Faults:
 def truncation_step(rate: Array) -> float | None:
     """Return the step, rad/s, of a gyro whose samples (n, 3) are multiples of it truncated toward zero; None for any other gyro.
 
-    The bin about zero is then twice as wide as the others. Counted are samples in the middle of a crossing of zero, where the rate is in
-    one bin as likely as in another; at rest it is not.
+    The bin about zero is then twice as wide as the others. Only samples in the middle of zero crossings are counted, where all rates are
+    equally probable; at rest they are not.
     """
     step = _quantisation(rate)
     if step is None:
@@ -117,14 +117,14 @@ def truncation_step(rate: Array) -> float | None:
     bins = np.abs(rate[crossing]) / step
     number = np.bincount(np.rint(bins[bins < BINS + 0.5]).astype(int), minlength=1)
     zero, others = int(number[0]), int(np.sum(number[1:]))
-    # Of 2 B + 1 bins the middle one holds a share of 1 / (2 B + 1), or if it is twice as wide, of 2 / (2 B + 2).
+    # Of 2 B + 1 bins the middle one has a share of 1 / (2 B + 1), or if it is twice as wide, of 2 / (2 B + 2).
     truncated, rounded = 1.0 / (BINS + 1), 1.0 / (2 * BINS + 1)
     odds = zero * np.log(truncated / rounded) + others * np.log((1.0 - truncated) / (1.0 - rounded))
     return step if odds > np.log(TRUNCATED_ODDS) else None
 
 
 def _quantisation(rate: Array) -> float | None:
-    """Return the step that nearly all the slow ones among the rates (n, 3) are multiples of, zero included; None where there is none."""
+    """Return the step of which nearly all small rates among (n, 3) are multiples, including zero; None if there is none."""
     sizes = np.abs(rate)
     counted = np.bincount(np.rint(1e7 * sizes[sizes < SLOW_RATE]).astype(np.intp))
     values = np.flatnonzero(counted)
@@ -140,12 +140,12 @@ def _quantisation(rate: Array) -> float | None:
 
 
 def untruncated(rate: Array, step: float) -> Array:
-    """Return rates with half a step given back to each, away from zero; to those that lie within a step of zero, as interpolated, less."""
+    """Return rates with half a step added away from zero; less to those within a step of zero, which are interpolated."""
     return np.asarray(rate + 0.5 * np.clip(rate, -step, step))
 
 
 def clipped_samples(samples: Array, least: float) -> np.ndarray:
-    """Return which of the samples (n, 3) are at their sensor's limit: those that repeat the extreme of their axis, beyond ``least``."""
+    """Return a mask of the samples (n, 3) at the limit of their sensor: those that repeat the extreme of their axis, beyond ``least``."""
     found = np.zeros(samples.shape, bool)
     for k, axis in enumerate(samples.T.copy()):
         extremes = [axis == end for end in (np.nanmax(axis, initial=-np.inf), np.nanmin(axis, initial=np.inf))]
@@ -163,10 +163,10 @@ def clipped_samples(samples: Array, least: float) -> np.ndarray:
 
 
 def restored(time: Array, rate: Array) -> tuple[Array, Array, np.ndarray]:
-    """Return rates (n, 3) with clipped runs restored, the variance of the turn (n − 1,) over each interval, and which samples were clipped.
+    """Return rates (n, 3) with clipped runs restored, the variance of the rotation over each interval (n − 1,), and the mask of clipping.
 
-    A run is bridged by the cubic of the values and slopes beside it, but stays beyond the limit. The turn beyond the limit over a whole
-    run is uncertain by :data:`RESTORED_ERROR` of itself; its variance is spread evenly over the intervals of the run.
+    A run is replaced by the cubic with the values and slopes at its ends, but not below the limit. The rotation beyond the limit over a
+    run has a relative σ of :data:`RESTORED_ERROR`; its variance is distributed equally over the intervals of the run.
     """
     clipped = clipped_samples(rate, MIN_CLIPPED_RATE)
     variance = np.zeros(len(time) - 1)
@@ -197,10 +197,10 @@ def restored(time: Array, rate: Array) -> tuple[Array, Array, np.ndarray]:
 
 
 def turn_variance_over(time: Array, rate: Array, length: float, usual: float) -> float:
-    """Return the variance, rad² per axis, of a rotation computed from the rates at the ends of an interval of this length, s.
+    """Return the variance, rad² per axis, of a rotation computed from the rates at the ends of an interval of duration T, s.
 
-    With D the mean square change of the rate over as long a time elsewhere in the recording, a rate that wanders between both ends as a
-    Brownian bridge turns by ``T² D/12`` about the mean of both.
+    With D the mean square change of the rate over T in the rest of the recording, and the rate between both ends modelled as a Brownian
+    bridge, the variance is ``T² D/12``.
     """
     lag = min(max(1, round(length / usual)), len(time) - 1)
     return length**2 / 12.0 * float(np.mean((rate[lag:] - rate[:-lag]) ** 2))

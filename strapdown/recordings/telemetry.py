@@ -1,9 +1,9 @@
 """Logs of cameras, flight controllers and phones. Library: ``telemetry-parser``.
 
 Gyroflow ``.gcsv``, Betaflight Blackbox (``.bbl``, ``.bfl``), ArduPilot (``.bin``), videos of GoPro, DJI, Sony, Insta360 (``.mp4``,
-``.mov``, ``.insv``, ``.braw``, ``.r3d``) and what else the library knows. It turns the axes of each device to one orientation of its own
-and gives gyro in °/s, accelerometer in m/s² and magnetometer in µT; which of the body's axes these are depends on the device, and so does
-the sign of the accelerometer: ask ``strapdown doctor``. The clock counts ms from the beginning of the log or video.
+``.mov``, ``.insv``, ``.braw``, ``.r3d``) and other formats of the library. The library converts the axes of each device to its own
+convention and gives gyro in °/s, accelerometer in m/s² and magnetometer in µT. Which body axes these are, and the sign of the
+accelerometer, depend on the device: check them with ``strapdown doctor``. The clock counts ms from the beginning of the log or video.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ _BEGINNINGS = {
     b"H Product:Blackbox": ".bbl",
     b"\xa3\x95\x80": ".bin",
 }
-"""How logs begin, and the ending that the library knows them by."""
+"""Beginnings of logs, with the file extension that the library requires."""
 
 
 def is_log(head: bytes) -> bool:
-    """Return whether a file begins as such a log, or as a video."""
+    """Return whether a file begins like such a log or a video."""
     return head.startswith(tuple(_BEGINNINGS)) or head[4:8] == b"ftyp"
 
 
@@ -46,14 +46,14 @@ def read_telemetry(path: str | os.PathLike[str]) -> Recording:
             rows: list[dict[str, Any]] = found.normalized_imu()
     except (KeyboardInterrupt, SystemExit, MemoryError):
         raise
-    except BaseException as error:  # a fault inside the library is no Exception
+    except BaseException as error:  # a fault inside the library is not a subclass of Exception
         reason = " ".join(str(error).split())
         raise InputError(
             f"{file.name} cannot be read by telemetry-parser ({reason}); the log is damaged or of another device"
         ) from None
     if len(rows) < 2 or all(row.get("gyro") is None for row in rows):
         raise InputError(
-            f"{file.name} ({found.camera or 'unknown device'}) holds no gyro samples; give a log with raw inertial data"
+            f"{file.name} ({found.camera or 'unknown device'}) has no gyro samples; give a log with raw inertial data"
         )
     time = np.array([row["timestamp_ms"] for row in rows], np.float64) / 1e3
     device = " ".join(part for part in (found.camera, found.model) if part)
@@ -70,7 +70,7 @@ def read_telemetry(path: str | os.PathLike[str]) -> Recording:
 
 
 def _ending(file: Path) -> str:
-    """Return the ending that the library knows a file by; its own where that is known."""
+    """Return the file extension that the library requires: that of the file if it is a known one, else from the content."""
     if file.suffix.lower() in ENDINGS:
         return file.suffix.lower()
     with reading.opened(file) as stream:
@@ -83,6 +83,6 @@ def _triples(rows: list[dict[str, Any]], name: str) -> Array:
 
 
 def _columns(rows: list[dict[str, Any]], name: str) -> Array | None:
-    """Return a sensor's samples, None where there are none at all."""
+    """Return a sensor's samples; None if there are none."""
     found = _triples(rows, name)
     return None if np.isnan(found).all() else found

@@ -1,16 +1,15 @@
 """Folders of EuRoC and TUM-VI, with their ground truth, and TUM trajectories.
 
-EuRoC (Burri et al. 2016; TUM-VI has the same layout): ``imu0/data.csv`` below ``mav0`` or the folder named; time ns since 1970, gyro rad/s,
-accelerometer m/s², in the axes of the inertial unit. Ground truth beside it, the first that is there of
-``state_groundtruth_estimate0/data.csv`` and ``mocap0/data.csv``: time ns, position m, quaternion scalar first, body to a frame whose z axis
-is up, with any heading (EuRoC's body frame is that of the inertial unit; TUM-VI's motion-capture body is turned into it by the data set's
-authors).
+EuRoC (Burri et al. 2016; TUM-VI has the same layout): ``imu0/data.csv`` below ``mav0`` or the given folder; time ns since 1970, gyro rad/s,
+accelerometer m/s², in the axes of the inertial unit. The ground truth is the first file found of ``state_groundtruth_estimate0/data.csv``
+and ``mocap0/data.csv``: time ns, position m, quaternion scalar first, body to a frame whose z axis is up, with any heading (EuRoC's body
+frame is that of the inertial unit; TUM-VI's motion-capture body was transformed to it by the data set's authors).
 
-A TUM trajectory is text, a row each of ``time tx ty tz qx qy qz qw``: s, m, quaternion **scalar last**, body to a fixed frame, which is
-taken to be z up. It holds no inertial samples: it is the reference of a recording, or an estimate that is written.
+A TUM trajectory is text with rows ``time tx ty tz qx qy qz qw``: s, m, quaternion **scalar last**, body to a fixed frame, assumed to be z
+up. It has no inertial samples: it is read as the reference of a recording, or written from an estimate.
 
-References have stamps of their own. At a recording's stamps they are interpolated along the shortest turn where the reference's stamps on
-both sides are at most :data:`BRIDGED` apart, and missing elsewhere.
+References have their own stamps. They are interpolated along the shortest rotation to the stamps of the recording if the reference's
+stamps on both sides are at most :data:`BRIDGED` apart; otherwise they are missing.
 """
 
 from __future__ import annotations
@@ -30,25 +29,25 @@ from strapdown.records.recording import Recording
 
 TRUTHS = ("state_groundtruth_estimate0", "mocap0")
 BRIDGED = 0.1
-"""Largest interval between two stamps of a reference, s, that is interpolated over."""
+"""Maximum interval between two stamps of a reference for interpolation, s."""
 
 
 def _root(path: Path) -> Path | None:
-    """Return the folder that holds imu0, of a data set's folder."""
+    """Return the folder that contains imu0, from a data set's folder; None if there is none."""
     return next((one for one in (path, path / "mav0") if (one / "imu0" / "data.csv").is_file()), None)
 
 
 def is_folder(path: Path) -> bool:
-    """Return whether a folder is of the layout of EuRoC."""
+    """Return whether a folder has the layout of EuRoC."""
     return path.is_dir() and _root(path) is not None
 
 
 def read_euroc(path: str | os.PathLike[str]) -> Recording:
-    """Read a folder of EuRoC or TUM-VI: the inertial unit, and ground truth where there is some."""
+    """Read a folder of EuRoC or TUM-VI: the inertial unit, and the ground truth if there is one."""
     folder = Path(path)
     root = _root(folder)
     if root is None:
-        raise InputError(f"{path} holds no imu0/data.csv; give the folder of a EuRoC or TUM-VI sequence")
+        raise InputError(f"{path} has no imu0/data.csv; give the folder of a EuRoC or TUM-VI sequence")
     recording = replace(read_csv(root / "imu0" / "data.csv"), source=folder.name, remarks=("EuRoC layout, imu0.",))
     truth = next((root / name / "data.csv" for name in TRUTHS if (root / name / "data.csv").is_file()), None)
     if truth is None:
@@ -58,7 +57,7 @@ def read_euroc(path: str | os.PathLike[str]) -> Recording:
 
 
 def _read_truth(path: Path) -> tuple[NDArray[np.int64], Array]:
-    """Return stamps, ns, and quaternions, scalar first, of a ground truth of EuRoC."""
+    """Return stamps, ns, and quaternions, scalar first, of an EuRoC ground truth."""
     rows = _rows(path, ",")
     if rows and len(rows[0]) < 8:
         raise InputError(f"{path} has {len(rows[0])} columns; wanted time, position and quaternion, 8 or more")
@@ -77,13 +76,13 @@ def read_tum(path: str | os.PathLike[str]) -> tuple[NDArray[np.int64], Array]:
     q = np.array([[float(x) for x in row[4:]] for row in rows])[:, [3, 0, 1, 2]]
     if np.any(np.linalg.norm(q, axis=1) < 0.5):
         raise InputError(
-            f"{file.name}: data row {int(np.argmin(np.linalg.norm(q, axis=1))) + 1} has a quaternion that is none; its norm is 1"
+            f"{file.name}: data row {int(np.argmin(np.linalg.norm(q, axis=1))) + 1} has a quaternion of norm below 0.5; it must be 1"
         )
     return _whole(file, [row[0] for row in rows], 10**9), quaternion.normalize(q)
 
 
 def is_tum(head: bytes) -> bool:
-    """Return whether a text begins as a TUM trajectory does: eight numbers a row, parted by blanks."""
+    """Return whether a text begins like a TUM trajectory: rows of eight numbers separated by blanks."""
     lines = [
         line.split()
         for line in head.decode("utf-8", "ignore").splitlines()[:-1]
@@ -109,7 +108,7 @@ def _rows(path: Path, separator: str | None) -> list[list[str]]:
         try:
             [float(x) for x in row]
         except ValueError:
-            raise InputError(f"{path.name}: data row {k + 1} holds what is no number: {' '.join(row)[:60]!r}") from None
+            raise InputError(f"{path.name}: data row {k + 1} is not numeric: {' '.join(row)[:60]!r}") from None
         if len(row) != len(rows[0]):
             raise InputError(
                 f"{path.name}: data row {k + 1} has {len(row)} fields, the first {len(rows[0])}; the file is truncated there"
@@ -120,7 +119,7 @@ def _rows(path: Path, separator: str | None) -> list[list[str]]:
 
 
 def _whole(path: Path, cells: list[str], factor: int) -> NDArray[np.int64]:
-    """Return stamps as whole ns, without the rounding of floats: seconds of a clock from 1970 have more digits than these."""
+    """Return stamps in integer ns without rounding: seconds since 1970 have more digits than a float."""
     stamps = np.empty(len(cells), np.int64)
     for k, cell in enumerate(cells):
         whole, _, part = cell.partition(".")
@@ -136,7 +135,7 @@ def _whole(path: Path, cells: list[str], factor: int) -> NDArray[np.int64]:
 
 
 def with_reference(recording: Recording, path: str | os.PathLike[str]) -> Recording:
-    """Return a recording with the attitudes of a TUM trajectory, of the same clock and body axes, as its reference."""
+    """Return a recording with the attitudes of a TUM trajectory, with the same clock and body axes, as its reference."""
     stamps, attitude = read_tum(path)
     return _with_reference(recording, stamps, attitude, Path(path).name)
 
@@ -148,14 +147,14 @@ def _with_reference(recording: Recording, stamps: NDArray[np.int64], attitude: A
     if not known:
         raise InputError(
             f"{name} goes from {time[0]:.3f} to {time[-1]:.3f} s of the recording's time and {recording.source} from "
-            f"{recording.time[0]:.3f} to {recording.time[-1]:.3f} s; give both of one clock"
+            f"{recording.time[0]:.3f} to {recording.time[-1]:.3f} s; both must have the same clock"
         )
     words = f"Reference of {name}: at {known} of {len(found)} stamps."
     return replace(recording, true_attitude=found, remarks=(*recording.remarks, words))
 
 
 def interpolated(time: Array, stamps: Array, attitude: Array) -> Array:
-    """Return attitudes (n, 4) at ``time`` (n,) between those at ``stamps``, along the shortest turn; NaN outside and in gaps."""
+    """Return attitudes (n, 4) at ``time`` (n,) interpolated between ``stamps`` along the shortest rotation; NaN outside and in gaps."""
     result = np.full((len(time), 4), np.nan)
     if len(stamps) < 2:
         return result

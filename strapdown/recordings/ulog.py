@@ -1,12 +1,12 @@
 """Flight logs of PX4 (ULog, ``.ulg``). Library: ``pyulog``.
 
 ``sensor_combined``: gyro rad/s and specific force m/s², in the body axes of the vehicle, forward, right, down (so at rest and level the
-specific force is (0, 0, −9.81)). Beside it ``vehicle_magnetometer`` (Gauss; of old logs the field in ``sensor_combined``) at the nearest
-stamps, and as reference ``vehicle_attitude``, the vehicle's own estimate, which PX4 gives from body to North-East-Down and which is turned
-to East-North-Up here; its North is true North where the vehicle knew its place. Body axes stay as they are. Numbers are single precision.
-The clock counts µs from the start of the machine.
+specific force is (0, 0, −9.81)). In addition ``vehicle_magnetometer`` (Gauss; for old logs the field in ``sensor_combined``) is read at the
+nearest stamps, and as reference ``vehicle_attitude``, the vehicle's estimate, which PX4 gives from body to North-East-Down and which is
+transformed to East-North-Up here; its North is true North if the vehicle had a position. Body axes are unchanged. Numbers are single
+precision. The clock counts µs from the start of the machine.
 
-Of a damaged or truncated log what is whole is read.
+For a damaged or truncated log, the complete messages are read.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ from strapdown.records.recording import MAGNETIC_UNITS, Recording, at_nearest, r
 
 UNIT, FIELD, ATTITUDE = "sensor_combined", "vehicle_magnetometer", "vehicle_attitude"
 NO_SAMPLE = 0x7FFFFFFF
-"""``accelerometer_timestamp_relative`` where there is no new sample."""
+"""``accelerometer_timestamp_relative`` if there is no new sample."""
 HEADER, TAIL = 16, 1 << 17
-"""Bytes before the first message, and of the end that is looked at: twice the longest message."""
+"""Number of bytes before the first message, and at the end that are checked for truncation: twice the longest message."""
 KINDS = b"ABCDFILMOPQRST"
 """Letters of the messages."""
 LATE = 0.5
-"""Share of the sample interval beyond which the accelerometer's own offset in time is reported."""
+"""Minimum time offset of the accelerometer, in sample intervals, that is reported."""
 
 
 def read_ulog(path: str | os.PathLike[str], *, topic: str = "") -> Recording:
@@ -47,21 +47,21 @@ def read_ulog(path: str | os.PathLike[str], *, topic: str = "") -> Recording:
     try:
         with contextlib.redirect_stdout(io.StringIO()):  # the library prints its findings
             log = pyulog.ULog(str(file), [UNIT, FIELD, ATTITUDE])
-    except Exception as error:  # of a damaged log the library raises what its parsers do
+    except Exception as error:  # for a damaged log the library raises any exception of its parsers
         raise InputError(
             f"{file.name} cannot be read as ULog ({' '.join(str(error).split())}); the log is damaged"
         ) from None
     data = {one.name if one.multi_id == 0 else f"{one.name}:{one.multi_id}": one.data for one in log.data_list}
     units = [name for name in data if name.startswith(UNIT) and len(data[name]["timestamp"])]
     if not units:
-        raise InputError(f"{file.name} holds no message of {UNIT} (it has: {', '.join(data) or 'none that is read'})")
+        raise InputError(f"{file.name} has no message of {UNIT} (it has: {', '.join(data) or 'none that is read'})")
     chosen = one_of(f"{file.name}: topic", topic or units[0], units)
     stamps, order, remarks = _stamps(chosen, data[chosen])
     remarks = [f"Topic {chosen}: {len(stamps)} messages.", *remarks]
     if _is_cut(file):
-        remarks.append(f"{file.name} is truncated: read is what is whole.")
+        remarks.append(f"{file.name} is truncated: only complete messages are read.")
     if log.file_corruption:
-        remarks.append(f"{file.name} is damaged: read is what is whole.")
+        remarks.append(f"{file.name} is damaged: only complete messages are read.")
     if log.dropouts:
         lost = sum(one.duration for one in log.dropouts)
         remarks.append(f"The logger lost {lost} ms in {len(log.dropouts)} dropouts.")
@@ -75,7 +75,7 @@ def read_ulog(path: str | os.PathLike[str], *, topic: str = "") -> Recording:
     late = float(np.median(relative[relative != NO_SAMPLE])) if np.any(relative != NO_SAMPLE) else 0.0
     if abs(late) > LATE * usual:
         remarks.append(
-            f"The accelerometer's samples are {1e-3 * late:.3g} ms off the gyro's stamps, which is left as it is."
+            f"The accelerometer's samples are offset by {1e-3 * late:.3g} ms from the gyro's stamps, which is not corrected."
         )
     own: dict[str, Any] = {}
     if FIELD in data:
@@ -92,14 +92,14 @@ def read_ulog(path: str | os.PathLike[str], *, topic: str = "") -> Recording:
         at, kept, words = _stamps(ATTITUDE, data[ATTITUDE])
         ned = quaternion.normalize(_columns(data[ATTITUDE], "q", 4)[kept])
         own["true_attitude"] = interpolated(time, (at * 1000 - epoch) / 1e9, outputs.to_ned(ned))
-        remarks += [f"Reference: {ATTITUDE}, the vehicle's own estimate.", *words]
+        remarks += [f"Reference: {ATTITUDE}, the vehicle's estimate.", *words]
     return with_gyro(
         source=file.name, time=time, rate=rate, specific_force=force, epoch_ns=epoch, remarks=tuple(remarks), **own
     )
 
 
 def _is_cut(file: Path) -> bool:
-    """Return whether a log ends within a message, as the chain of messages shows that leads there, or near the end any eight of one."""
+    """Return whether a log ends within a message: followed from the first message, or in a long log from any eight consecutive ones."""
     with reading.opened(file) as stream:
         begin = max(HEADER, stream.seek(0, io.SEEK_END) - TAIL)
         stream.seek(begin)
@@ -119,14 +119,14 @@ def _columns(rows: dict[str, Any], name: str, size: int) -> Array:
 
 
 def _stamps(topic: str, rows: dict[str, Any]) -> tuple[NDArray[np.int64], NDArray[np.int64], list[str]]:
-    """Return stamps, µs, in order, the rows that they are of, and remarks; of repeated stamps the first counts."""
+    """Return stamps, µs, in order, their rows, and remarks; of repeated stamps only the first is kept."""
     stamps = np.asarray(rows["timestamp"]).astype(np.int64)
     order = np.argsort(stamps, kind="stable")
     fresh = np.concatenate([[True], np.diff(stamps[order]) > 0])
     words = []
     back, twice = int(np.sum(np.diff(stamps) < 0)), int(np.sum(~fresh))
     if back:
-        words.append(f"{back} messages of {topic} came after later ones and were sorted.")
+        words.append(f"{back} messages of {topic} were out of order and were sorted.")
     if twice:
         words.append(f"{twice} messages of {topic} have the stamp of the one before and were left out.")
     kept = order[fresh]
@@ -134,13 +134,11 @@ def _stamps(topic: str, rows: dict[str, Any]) -> tuple[NDArray[np.int64], NDArra
 
 
 def _beside(topic: str, rows: dict[str, Any], name: str, time: Array, epoch: int, remarks: list[str]) -> Array:
-    """Return a sensor's samples at the nearest stamps of the inertial unit; its own ``timestamp_sample`` counts where it has one."""
+    """Return a sensor's samples at the nearest stamps of the inertial unit, by ``timestamp_sample`` if the topic has it."""
     stamped = {**rows, "timestamp": rows.get("timestamp_sample", rows["timestamp"])}
     stamps, kept, words = _stamps(topic, stamped)
     values, lost = at_nearest(time, (stamps * 1000 - epoch) / 1e9, _columns(rows, name, 3)[kept])
-    remarks.append(
-        f"Topic {topic} beside it: {len(stamps)} messages{f', {lost} of them beyond its stamps' if lost else ''}."
-    )
+    remarks.append(f"Topic {topic}: {len(stamps)} messages{f', {lost} of them beyond its stamps' if lost else ''}.")
     remarks += words
     return values
 
@@ -158,19 +156,19 @@ _TYPES = {"float": "<f4", "int32_t": "<i4", "uint64_t": "<u8"}
 
 
 def write_ulog(recording: Recording, path: str | os.PathLike[str]) -> None:
-    """Write a recording as a flight log: numbers in single precision, stamps in whole µs; body axes stay as they are."""
+    """Write a recording as a flight log: numbers in single precision, stamps in integer µs; body axes are unchanged."""
     stamps = np.rint(recording.clock_ns / 1000).astype(np.int64)
     if recording.specific_force is None:
         raise InputError(
-            f"{recording.source} has no accelerometer, which {UNIT} of a flight log has; choose another ending"
+            f"{recording.source} has no accelerometer, which {UNIT} of a flight log needs; choose another extension"
         )
     if stamps[0] < 0:
         raise InputError(
-            f"{recording.source}: time begins at {recording.time[0]:g} s, and a log's clock has no negative times; move it"
+            f"{recording.source}: time begins at {recording.time[0]:g} s, and a log's clock has no negative times; shift it"
         )
     if np.any(np.diff(stamps) <= 0):
         raise InputError(
-            f"{recording.source}: stamps are less than 1 µs apart, which a log's clock does not part; choose another ending"
+            f"{recording.source}: stamps are less than 1 µs apart, the resolution of a log's clock; choose another extension"
         )
     known = np.asarray(~np.isnan(recording.specific_force).any(axis=1))
     columns: list[tuple[str, NDArray[np.int64], list[NDArray[Any]]]] = [
@@ -183,7 +181,7 @@ def write_ulog(recording: Recording, path: str | os.PathLike[str]) -> None:
     if recording.magnetic_field is not None:
         if not recording.magnetic_unit:
             raise InputError(
-                f"{recording.source} does not say the unit of its magnetometer, and a log holds Gauss; declare it in the header or by "
+                f"{recording.source} does not declare the unit of its magnetometer, and a log uses Gauss; declare it in the header or by "
                 f"option ({' or '.join(MAGNETIC_UNITS)})"
             )
         seen = ~np.isnan(recording.magnetic_field).any(axis=1)

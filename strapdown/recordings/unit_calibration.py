@@ -1,6 +1,6 @@
-"""Calibration of one unit, found from one recording and used for the next of the same unit: gyro scale and misalignment, and delays.
+"""Calibration of one unit, found from one recording and used for the next of the same unit: gyro scale, misalignment, and delays.
 
-As a file it is the table ``[calibration]`` of a TOML document, units in the names of its keys.
+In a file it is the table ``[calibration]`` of a TOML document, with the units in the names of its keys.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ class UnitCalibration:
     Parameters
     ----------
     matrix : ndarray (3, 3)
-        M of a gyro that measures ``(I + M) w``: scale-factor errors on the diagonal, misalignments, rad, off it.
+        M of a gyro that measures ``(I + M) w``: diagonal scale-factor errors, off-diagonal misalignments, rad.
     sigma : float
         Root mean square of the standard deviations of the entries.
     magnetometer_delay : float, default 0.0
-        Delay of the magnetometer's stamps behind the gyro's, s; 0: unknown.
+        Delay of the magnetometer's stamps relative to the gyro's, s; 0: unknown.
     source : str, default ""
-        Recording that it was found from.
+        Recording from which it was found.
     """
 
     matrix: Array
@@ -74,14 +74,14 @@ class UnitCalibration:
         return replace(recording, rate=recording.rate @ np.linalg.inv(np.eye(3) + self.matrix).T)
 
     def and_then(self, block: ErrorStateEstimate, magnetometer_delay: float, source: str) -> UnitCalibration:
-        """Return the calibration combined with what a filter found with it applied.
+        """Return the calibration combined with the residual errors that a filter estimated with it applied.
 
         Parameters
         ----------
         block : ErrorStateEstimate
-            States of gyro scale and misalignment; their last values count.
+            States of gyro scale and misalignment; their last values are used.
         magnetometer_delay : float
-            Delay of the magnetometer behind the gyro, s.
+            Delay of the magnetometer relative to the gyro, s.
         source : str
             Name of the recording.
 
@@ -100,7 +100,7 @@ class UnitCalibration:
 
 
 NONE = UnitCalibration(matrix=np.zeros((3, 3)), sigma=0.0)
-"""That of a unit of which nothing is known."""
+"""Calibration of an unknown unit: no correction."""
 
 
 def matrix_of(block: ErrorStateEstimate) -> Array:
@@ -133,7 +133,7 @@ def to_toml(calibration: UnitCalibration) -> str:
         "magnetometer_delay_ms": 1e3 * calibration.magnetometer_delay,
         "source": calibration.source,
     }
-    return "# the gyro measures (I + M) w, M by rows; sigma is that of its entries\n" + tomli_w.dumps(
+    return "# the gyro measures (I + M) w, M by rows; sigma: standard deviation of its entries\n" + tomli_w.dumps(
         {"calibration": content}
     )
 
@@ -160,11 +160,11 @@ def read(path: str | os.PathLike[str]) -> UnitCalibration:
 
 
 def _from_table(table: Mapping[str, Any], place: str) -> UnitCalibration:
-    """Return the calibration that a table holds."""
+    """Return the calibration from a table."""
     known_keys(place, table, KEYS)
     missing = [key for key in KEYS[:2] if key not in table]
     if missing:
-        raise InputError(f"{place} lacks {', '.join(missing)}")
+        raise InputError(f"{place} lacks {', '.join(missing)}; add the missing keys")
     try:
         return UnitCalibration(
             matrix=np.asarray(table["gyro_scale_and_misalignment"], np.float64),

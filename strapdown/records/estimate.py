@@ -30,12 +30,12 @@ class Innovations:
     time : ndarray (m,)
         Times of the measurements used, s.
     innovation : ndarray (m, dof)
-        Independent innovations, each less its prediction from those before it in the row; rad, or the sensor's unit over the length
-        of its reference.
+        Decorrelated innovations: each is reduced by its prediction from those before it in the row. Unit: rad, or the sensor's unit over
+        the length of its reference.
     variance : ndarray (m, dof)
-        Variances of the innovations that the filter predicts, the square of their unit.
+        Variances of the innovations predicted by the filter, the square of their unit.
     weight : ndarray (m,), optional
-        Weight of each measurement in the update: 1 whole, 0 rejected by a gate, between them a robust update; None: all 1.
+        Weight of each measurement in the update: 1 full, 0 rejected by a gate, in between for a robust update; None: all 1.
     """
 
     time: Array
@@ -55,12 +55,12 @@ class Innovations:
 
     @property
     def whitened(self) -> Array:
-        """Innovations over their own standard deviations (m, dof): independent standard normals if the filter is right."""
+        """Innovations divided by their standard deviations (m, dof): independent standard normal if the filter is consistent."""
         return np.asarray(self.innovation / np.sqrt(self.variance))
 
     @property
     def nis(self) -> Array:
-        """Normalised innovation squared (m,), χ² with as many degrees of freedom as columns if the filter is right."""
+        """Normalised innovation squared (m,), χ² with dof degrees of freedom if the filter is consistent."""
         return np.asarray(np.sum(self.innovation**2 / self.variance, axis=1))
 
 
@@ -75,17 +75,18 @@ class Event:
     Parameters
     ----------
     kind : {"recovery", "hypotheses", "lock-out", "gap"}
-        What happened: a filter that rejected good measurements was restarted; a bank of hypotheses replaced it while a turn was
-        ambiguous; a gate rejected a sensor more often than it accepted it; the gyro was silent for much longer than its sample interval.
+        Kind of event, in this order: a filter that rejected good measurements was restarted; a bank of hypotheses replaced the filter
+        while a rotation was ambiguous; a gate rejected a sensor more often than it accepted it; gyro samples were missing for much longer
+        than the sample interval.
     start : float
         Time of its beginning, s.
     end : float
         Time of its end, s: the recovery, the decision between the hypotheses, the last rejection, the next gyro sample.
     sensor : str, default ""
-        Sensor concerned, if there is one.
+        Sensor concerned, if any.
     value : float, default 0.0
-        Of a recovery the rejections in a row; of hypotheses the number left (0: decided); of a lock-out the rejections; of a gap its
-        length over the usual interval.
+        Recovery: number of consecutive rejections. Hypotheses: number remaining (0: decided). Lock-out: number of rejections. Gap: its
+        duration over the median sample interval.
     """
 
     kind: str
@@ -119,7 +120,7 @@ class Event:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ErrorStateEstimate:
-    """Estimate of one declaration of error states (:mod:`strapdown.estimation.error_states`) at the kept edges.
+    """Estimate of one group of error states (:mod:`strapdown.estimation.error_states`) at the stored edges.
 
     Parameters
     ----------
@@ -146,7 +147,7 @@ class ErrorStateEstimate:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Estimate(Listed):
-    """Attitude and gyro bias with their covariance, at the stored epochs of a filter's run.
+    """Attitude and gyro bias with their covariance, at the stored epochs of a filter run.
 
     Parameters
     ----------
@@ -159,17 +160,17 @@ class Estimate(Listed):
     variance : ndarray (m, 6)
         Diagonal of P: attitude error, rad², body axes; bias error, (rad/s)².
     covariance : ndarray (m, 6, 6), optional
-        Whole P of (δθ, δb), if asked for.
+        Full P of (δθ, δb), if requested.
     innovations : mapping of str to Innovations, default empty
         Innovations by sensor.
     skipped : mapping of str to int, default empty
-        Measurements not used, by sensor: missing (NaN) ones and those outside the record's time.
+        Number of measurements not used, by sensor: missing (NaN) ones and those outside the record's time.
     events : tuple of Event, default empty
         Events of the run that a user of the estimate must know, in order of time.
     error_states : mapping of str to ErrorStateEstimate, default empty
         Error states c by name, in the order given.
     whole_covariance : ndarray (m, n, n), optional
-        P of (δθ, δb, δc) of a filter with error states, if asked for; ``covariance`` is its part (m, 6, 6).
+        P of (δθ, δb, δc) of a filter with error states, if requested; ``covariance`` is its part (m, 6, 6).
     """
 
     _drawn_by = "estimate_overview"
@@ -224,19 +225,19 @@ class Estimate(Listed):
         bias: ArrayLike | None = None,
         innovations: Mapping[str, Innovations] | None = None,
     ) -> Estimate:
-        """Return an estimate made of the arrays of any filter.
+        """Return an estimate from the arrays of any filter.
 
         Parameters
         ----------
         time : array_like (m,)
             Times, s, strictly increasing.
         attitude : array_like (m, 4)
-            Unit quaternions q_fb, scalar first. NaN where the filter has none.
+            Unit quaternions q_fb, scalar first. NaN at times without an estimate.
         covariance : array_like (m, 3, 3) or (m, 6, 6)
-            Covariance of δθ, rad², with ``q_true = q_est ⊗ exp(δθ)`` (body axes), or of (δθ, δb), δb = b_true − b_est, rad/s. NaN where
-            the filter has none.
+            Covariance of δθ, rad², with ``q_true = q_est ⊗ exp(δθ)`` (body axes), or of (δθ, δb), δb = b_true − b_est, rad/s. NaN at
+            times without an estimate.
         bias : array_like (m, 3), optional
-            Gyro bias, rad/s, body axes. Without one it is NaN, as is its covariance: only the attitude is judged.
+            Gyro bias, rad/s, body axes. If not given, bias and its covariance are NaN, and only the attitude is judged.
         innovations : mapping of str to Innovations, optional
             Innovations by sensor; without them there is no NIS.
 
@@ -262,7 +263,7 @@ class Estimate(Listed):
                 f"covariance has shape {P.shape}, wanted ({m}, 3, 3) or ({m}, 6, 6), a matrix for each time"
             )
         if bias is not None and P.shape[1] == 3:
-            raise InputError("bias is given, but covariance is of the attitude alone; give that of (δθ, δb), (m, 6, 6)")
+            raise InputError("bias is given, but covariance is of the attitude only; give that of (δθ, δb), (m, 6, 6)")
         whole = np.full((m, 6, 6), np.nan)
         size = 3 if bias is None else 6
         whole[:, :size, :size] = P[:, :size, :size]
@@ -277,7 +278,7 @@ class Estimate(Listed):
 
     @property
     def has_bias(self) -> bool:
-        """Whether a gyro bias is estimated at all."""
+        """Whether a gyro bias is estimated."""
         return bool(np.isfinite(self.bias).any())
 
     def errors(
@@ -292,8 +293,8 @@ class Estimate(Listed):
         true_bias : array_like (m, 3)
             True gyro bias, rad/s, body axes.
         true_values : mapping of str to array_like (size,) or (m, size), optional
-            True error states by name, in the axes of the estimated attitude where they are carried so
-            (:attr:`strapdown.estimation.error_states.Effect.carried`). Required for a filter with error states.
+            True error states by name, in the axes of the estimated attitude for those with
+            :attr:`strapdown.estimation.error_states.Effect.carried`. Required for a filter with error states.
 
         Returns
         -------
@@ -322,7 +323,7 @@ class Estimate(Listed):
 
     @property
     def attitude_covariance(self) -> Array:
-        """Covariance (m, 3, 3) of the attitude error, rad², body axes; diagonal where only variances were kept."""
+        """Covariance (m, 3, 3) of the attitude error, rad², body axes; diagonal if only variances were stored."""
         if self.covariance is not None:
             return np.asarray(self.covariance[:, :3, :3])
         return np.asarray(self.variance[:, :3, None] * np.eye(3))
@@ -334,7 +335,7 @@ class Estimate(Listed):
 
     @property
     def rotation(self) -> Rotation:
-        """Attitudes as a ``scipy.spatial.transform.Rotation`` that takes body vectors to the fixed frame."""
+        """Attitudes as a ``scipy.spatial.transform.Rotation`` that transforms body vectors to the fixed frame."""
         return quaternion.to_rotation(self.attitude)
 
     def euler(self, sequence: str = "ZYX") -> outputs.Angles:
@@ -370,24 +371,24 @@ class Estimate(Listed):
     def table(
         self, *, recording: Recording | None = None, sequence: str = "ZYX", frame: str = "ENU"
     ) -> dict[str, NDArray[np.generic]]:
-        """Return the estimate as columns, the unit in each name.
+        """Return the estimate as columns, with the unit in each name.
 
         Parameters
         ----------
         recording : Recording, optional
             Recording that the estimate was made from: adds its clock, its rate without the bias, and its acceleration without gravity.
         sequence : str, default "ZYX"
-            Sequence of the Euler angles, as of :meth:`euler`.
+            Sequence of the Euler angles, as in :meth:`euler`.
         frame : {"ENU", "NED"}, default "ENU"
-            Fixed frame of quaternion, angles and acceleration; body axes stay as they are.
+            Fixed frame of quaternion, angles and acceleration; body axes are unchanged.
 
         Returns
         -------
         dict of str to ndarray (m,)
-            ``time_s`` (or ``time_ns`` of a clock that counts from 1970), ``qw qx qy qz``, the angles and their σ in degrees,
+            ``time_s`` (or ``time_ns`` for a clock that counts from 1970), ``qw qx qy qz``, the angles and their σ in degrees,
             ``heading_deg`` of the body x axis from North towards East, bias and σ in °/h, ``rate_*_rad_per_s``,
-            ``free_acceleration_*_m_per_s2``. Where whole covariances were kept, ``cov_body_xx_rad2`` … of the body-side error,
-            ``b`` before an axis for the bias.
+            ``free_acceleration_*_m_per_s2``. If full covariances were stored, ``cov_body_xx_rad2`` … of the body-side error,
+            with ``b`` before an axis for the bias.
 
         Raises
         ------
@@ -427,7 +428,7 @@ class Estimate(Listed):
         return found
 
     def to_dataframe(self, **options: Any) -> Any:
-        """Return the estimate as a pandas ``DataFrame``, the columns of :meth:`table`.
+        """Return the estimate as a pandas ``DataFrame`` with the columns of :meth:`table`.
 
         Parameters
         ----------

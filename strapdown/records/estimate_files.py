@@ -1,4 +1,4 @@
-"""Estimates in HDF5, whole and self-describing, and what all result files of this package have in common."""
+"""Estimates in self-describing HDF5 files, and the functions common to all result files of this package."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ CONVENTIONS = (
 )
 
 LARGEST_BIAS = 1e6
-"""Largest credible gyro bias, rad/s; an estimate beyond it comes from a filter that diverged or a damaged file."""
+"""Maximum gyro bias accepted, rad/s; an estimate beyond it comes from a filter that diverged or a damaged file."""
 _ESTIMATE_UNITS = {
     "time": "s",
     "attitude": "1",
@@ -33,12 +33,12 @@ _ESTIMATE_UNITS = {
 
 
 CHUNK_ROWS = 4096
-"""Rows of a compressed chunk."""
+"""Maximum number of rows of a compressed chunk."""
 
 
 @contextlib.contextmanager
 def result_file(path: str | os.PathLike[str], kind: str, attributes: Mapping[str, Any] | None) -> Iterator[Any]:
-    """Yield an HDF5 file with its kind, version and conventions as attributes; it appears whole or not at all."""
+    """Yield an HDF5 file with its kind, version and conventions as attributes; it is created only when complete."""
     with written_beside(path) as temporary, whole_hdf5(temporary) as file:
         own = {"kind": f"strapdown {kind}", "version": strapdown.__version__, "conventions": CONVENTIONS}
         set_attributes(file, {**own, **(attributes or {})})
@@ -46,10 +46,11 @@ def result_file(path: str | os.PathLike[str], kind: str, attributes: Mapping[str
 
 
 def put(group: Any, name: str, value: Array, unit: str, meaning: str = "") -> None:
-    """Write an array with its unit, and its meaning where the name does not state it, as attributes; compressed unless it is small.
+    """Write an array with its unit, and its meaning if the name does not state it, as attributes; compressed unless it is small.
 
-    Nor are attitudes and covariances: they are most of a file, and compressing them would take a fifth of a warm `strapdown estimate`,
-    attitudes to save a quarter, covariances a third. Chunks are whole rows: rows that repeat shrink to half of what columns do.
+    Attitudes and covariances are not compressed either: they are most of a file, and compression would take a fifth of the time of a warm
+    `strapdown estimate` to save a quarter of the attitudes and a third of the covariances. Chunks are whole rows: repeated rows then take
+    half of the space that they take in chunks by column.
     """
     options: dict[str, Any] = {}
     if value.size > 256 and value.ndim < 3 and not name.endswith("attitude"):
@@ -67,15 +68,14 @@ def write_estimate(
     truth: Truth | None = None,
     reference: Array | None = None,
 ) -> None:
-    """Write an estimate, and the truth at its times if given, to HDF5; the file appears whole or not at all.
+    """Write an estimate, and the truth at its times if given, to HDF5; the file is created only when complete.
 
-    ``reference`` are attitudes (m, 4) of a reference system instead, NaN where it has none.
-
-    Values and variances of error states are written (:func:`read_states`); a whole covariance is not.
+    ``reference`` are attitudes (m, 4) of a reference system instead, NaN if missing. Values and variances of error states are written
+    (:func:`read_states`); their covariance matrix is not.
     """
     if truth is not None and len(truth.attitude) != len(estimate.time):
         raise InputError(
-            f"truth has {len(truth.attitude)} rows and the estimate {len(estimate.time)}; take the truth at the estimate's times"
+            f"truth has {len(truth.attitude)} rows and the estimate {len(estimate.time)}; give the truth at the estimate's times"
         )
     with result_file(path, "estimate", attributes) as file:
         size = 6 if estimate.has_bias else 3
@@ -95,7 +95,7 @@ def write_estimate(
             put(file, "reference/attitude", quaternion.normalize(reference[known]), "1")
         for number, (sensor, innovations) in enumerate(estimate.innovations.items()):
             group = file.create_group(f"innovations/{number}")
-            # The sensor is not the group's name: a slash in it would part groups.
+            # The sensor is not the group's name, because a slash in it would create a subgroup.
             set_attributes(group, {"sensor": sensor, "skipped": estimate.skipped.get(sensor, 0)})
             put(group, "time", innovations.time, "s")
             put(
@@ -119,7 +119,7 @@ def write_estimate(
 def write_attitude(
     path: str | os.PathLike[str], time: Array, attitude: Array, attributes: Mapping[str, Any] | None = None
 ) -> None:
-    """Write times (n,), s, and attitudes q_fb (n, 4) to HDF5; the file appears whole or not at all."""
+    """Write times (n,), s, and attitudes q_fb (n, 4) to HDF5; the file is created only when complete."""
     with result_file(path, "attitude", attributes) as file:
         put(file, "time", time, "s")
         put(file, "attitude", attitude, "1")
@@ -127,7 +127,7 @@ def write_attitude(
 
 @contextlib.contextmanager
 def _estimate_file(path: str | os.PathLike[str]) -> Iterator[Any]:
-    """Yield an estimate's HDF5 file, read only; errors are InputErrors that name it."""
+    """Yield the HDF5 file of an estimate, read-only; errors are InputErrors that name it."""
     with reading.hdf5(path) as file:
         if reading.attributes(file).get("kind") != "strapdown estimate":
             raise InputError(
@@ -137,7 +137,7 @@ def _estimate_file(path: str | os.PathLike[str]) -> Iterator[Any]:
 
 
 def _numbers(group: Any, name: str, shape: tuple[int | str, ...]) -> Array:
-    """Return an array of a file checked by :func:`strapdown.checks.array`."""
+    """Return an array of a file, checked by :func:`strapdown.checks.array`."""
     return array(_place(group, name), reading.numbers(group, name), shape)
 
 
@@ -146,30 +146,30 @@ def _place(group: Any, name: str) -> str:
 
 
 def _above_zero(place: str, variance: Array) -> Array:
-    """Return variances, none of them zero or less."""
+    """Return variances, checked to be positive."""
     if np.any(variance <= 0.0):
         index = tuple(int(i) for i in np.argwhere(variance <= 0.0)[0])
         raise InputError(
             f"{place}{list(index)} is {variance[index]:g}, and a variance must be greater than zero; the file is damaged, or a sensor had "
-            "no noise: give each a sigma above zero and make the estimate again"
+            "no noise: give each a sigma above zero and repeat the estimate"
         )
     return variance
 
 
 def _biases(group: Any, name: str, rows: int) -> Array:
-    """Return gyro biases (rows, 3), none beyond :data:`LARGEST_BIAS`."""
+    """Return gyro biases (rows, 3), checked not to exceed :data:`LARGEST_BIAS`."""
     value = _numbers(group, name, (rows, 3))
     if np.any(np.abs(value) > LARGEST_BIAS):
         index = tuple(int(i) for i in np.argwhere(np.abs(value) > LARGEST_BIAS)[0])
         raise InputError(
             f"{_place(group, name)}{list(index)} is {value[index]:g} rad/s, more than any gyro has; the file is damaged or its filter "
-            "diverged: make the estimate again, and check its start and the gyro's unit"
+            "diverged: repeat the estimate, and check its initial state and the gyro's unit"
         )
     return value
 
 
 def _attitudes(group: Any, name: str, rows: int) -> Array:
-    """Return attitudes (rows, 4) as they stand, of norm one."""
+    """Return attitudes (rows, 4) unchanged, checked to be of unit norm."""
     value = _numbers(group, name, (rows, 4))
     unit_quaternions(_place(group, name), value)
     return value
@@ -186,7 +186,7 @@ def read_truth(path: str | os.PathLike[str]) -> Truth | None:
 
 
 def read_reference(path: str | os.PathLike[str]) -> Truth | None:
-    """Read the reference of a file written by :func:`write_estimate` as a truth, NaN where it has none; None if the file has none."""
+    """Read the reference of a file written by :func:`write_estimate` as a truth, NaN where missing; None if the file has none."""
     with _estimate_file(path) as file:
         if "reference" not in file:
             return None
@@ -204,14 +204,14 @@ def read_reference(path: str | os.PathLike[str]) -> Truth | None:
 def read_estimate(path: str | os.PathLike[str]) -> Estimate:
     """Read an estimate written by :func:`write_estimate`, without its error states (:func:`read_states`).
 
-    What no filter estimates is refused: shapes that do not fit each other, decreasing times, quaternions that are not of unit norm,
-    variances of zero or less, biases above 1e6 rad/s.
+    Rejected are shapes that do not fit each other, decreasing times, quaternions that are not of unit norm, variances of zero or less, and
+    biases above 1e6 rad/s.
     """
     with _estimate_file(path) as file:
         time = increasing(_place(file, "time"), _numbers(file, "time", ("n",)))
         rows = len(time)
         attitude = _attitudes(file, "attitude", rows)
-        size = 6 if "bias" in file else 3  # an estimate from elsewhere may have none
+        size = 6 if "bias" in file else 3  # an estimate of another program may have none
         covariance = _numbers(file, "covariance", (rows, size, size)) if "covariance" in file else None
         if covariance is not None:
             _above_zero(f"{_place(file, 'covariance')}, diagonal", np.diagonal(covariance, axis1=1, axis2=2))
@@ -249,7 +249,7 @@ def read_states(path: str | os.PathLike[str]) -> dict[str, ErrorStateEstimate]:
             values = _numbers(part, "values", (rows, len(attributes["components"])))
             if len(attributes["units"]) != len(attributes["components"]):
                 raise InputError(
-                    f"{_place(part, 'units')} are not as many as the components; the file is damaged, make it again"
+                    f"{_place(part, 'units')} and components differ in number; the file is damaged, make it again"
                 )
             found[str(attributes["name"])] = ErrorStateEstimate(
                 components=tuple(str(one) for one in attributes["components"]),
@@ -261,7 +261,7 @@ def read_states(path: str | os.PathLike[str]) -> dict[str, ErrorStateEstimate]:
 
 
 def _parts(file: Any, name: str) -> list[tuple[dict[str, Any], Any]]:
-    """Return the groups below a group, each with its attributes; none where it is not there."""
+    """Return the subgroups of a group, each with its attributes; empty if there is no such group."""
     return [(reading.attributes(part), part) for part in file[name].values()] if name in file else []
 
 

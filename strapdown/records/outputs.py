@@ -1,11 +1,11 @@
-"""Attitudes in usual forms: Euler angles with σ, heading from North, North-East-Down, and free acceleration.
+"""Attitudes in other quantities: Euler angles with σ, heading from North, North-East-Down, and free acceleration.
 
-The fixed frame of an estimate is East-North-Up (z up with an arbitrary heading without a magnetometer), and ``q_fb`` takes body
-vectors to it. Rotation matrices and SciPy rotations are :func:`strapdown.quaternion.to_matrix` and
+The fixed frame of an estimate is East-North-Up (without a magnetometer z up with an arbitrary heading), and ``q_fb`` transforms body
+vectors to it. For rotation matrices and SciPy rotations see :func:`strapdown.quaternion.to_matrix` and
 :func:`strapdown.quaternion.to_rotation`.
 
-Covariances are those of the body-side error, ``q_true = q_est ⊗ exp(δθ)``. An estimate that kept variances alone has no
-correlations between axes; σ of angles is then that of a diagonal covariance (``full_covariance=True`` keeps the whole).
+Covariances are those of the body-side error, ``q_true = q_est ⊗ exp(δθ)``. If only variances were stored, correlations between axes are
+unknown, and σ of angles is that of a diagonal covariance; ``full_covariance=True`` stores the full covariance.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ __all__ = [
 
 FRAMES = ("ENU", "NED")
 NED_OF_ENU = np.array([0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0])
-"""Turns East-North-Up to North-East-Down and back: half a turn about the horizontal line to the north-east."""
+"""Quaternion from East-North-Up to North-East-Down and back: 180° about the horizontal axis to the north-east."""
 
 
 class Angles(NamedTuple):
@@ -59,16 +59,16 @@ def euler(attitude: ArrayLike, sequence: str = "ZYX", covariance: ArrayLike | No
     attitude : array_like (n, 4)
         Unit quaternions q_fb.
     sequence : str, default "ZYX"
-        Axes of the three rotations in SciPy's notation: capitals about the rotating body axes (``"ZYX"``: yaw, pitch, roll), small
-        letters about the fixed ones. Neighbours must differ.
+        Axes of the three rotations in SciPy's notation: upper case about the rotating body axes (``"ZYX"``: yaw, pitch, roll), lower
+        case about the fixed axes. Adjacent axes must differ.
     covariance : array_like (n, 3, 3), optional
         Covariance of the body-side attitude error, rad².
 
     Returns
     -------
     Angles
-        ``angles`` (n, 3) in the order of the sequence, rad. To first order ``δθ = E δφ``, the columns of E being the axes of the
-        three rotations in the body frame, so that ``σ²`` is the diagonal of ``E⁻¹ P E⁻ᵀ``.
+        ``angles`` (n, 3) in the order of the sequence, rad. To first order ``δθ = E δφ``, where the columns of E are the axes of the
+        three rotations in the body frame; ``σ²`` is the diagonal of ``E⁻¹ P E⁻ᵀ``.
 
     Examples
     --------
@@ -80,10 +80,10 @@ def euler(attitude: ArrayLike, sequence: str = "ZYX", covariance: ArrayLike | No
     repeated = any(a == b for a, b in itertools.pairwise(axes))
     if len(axes) != 3 or set(axes) - set("XYZ") or sequence not in (sequence.upper(), sequence.lower()) or repeated:
         raise InputError(
-            f"sequence is {sequence!r}; give three axes such as ZYX (body) or xyz (fixed), neighbours different"
+            f"sequence is {sequence!r}; give three axes such as ZYX (body) or xyz (fixed), adjacent ones different"
         )
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # gimbal lock: σ says it
+        warnings.simplefilter("ignore")  # gimbal lock is reported by an infinite σ
         angles = np.asarray(quaternion.to_rotation(q).as_euler(sequence), np.float64)
     if covariance is None:
         return Angles(angles, None)
@@ -99,7 +99,7 @@ def euler(attitude: ArrayLike, sequence: str = "ZYX", covariance: ArrayLike | No
 
 
 def euler_axes(attitude: ArrayLike, sequence: str = "ZYX") -> Array:
-    """Return E (n, 3, 3) of ``δθ = E δφ``: its columns are the axes of the three turns of an intrinsic sequence, in the body frame."""
+    """Return E (n, 3, 3) of ``δθ = E δφ``: its columns are the axes of the three rotations of an intrinsic sequence, body frame."""
     return _turn_axes(euler(attitude, sequence).angles, sequence)
 
 
@@ -107,7 +107,7 @@ def _turn_axes(angles: Array, sequence: str) -> Array:
     axes = [*sequence.upper()]
     order = (
         [0, 1, 2] if sequence == sequence.upper() else [2, 1, 0]
-    )  # turns about fixed axes are those about body axes, the last first
+    )  # rotations about fixed axes are those about body axes in reverse order
     directions = np.eye(3)[["XYZ".index(axes[k]) for k in order]]
     half = 0.5 * angles[:, order]
     turns = [
@@ -127,8 +127,7 @@ def heading(attitude: ArrayLike, covariance: ArrayLike | None = None, *, axis: s
     Parameters
     ----------
     attitude : array_like (n, 4)
-        Unit quaternions q_fb, fixed frame East-North-Up. North is that of the estimate: magnetic with a magnetometer, arbitrary
-        without.
+        Unit quaternions q_fb, fixed frame East-North-Up. North is that of the estimate: magnetic, or arbitrary without a magnetometer.
     covariance : array_like (n, 3, 3), optional
         Covariance of the body-side attitude error, rad².
     axis : {"x", "y", "z", "-x", "-y", "-z"}, default "x"
@@ -137,7 +136,7 @@ def heading(attitude: ArrayLike, covariance: ArrayLike | None = None, *, axis: s
     Returns
     -------
     Angles
-        Heading (n,), rad in [0, 2π); σ is infinite where the axis points up or down.
+        Heading (n,), rad in [0, 2π); σ is infinite if the axis points up or down.
 
     Examples
     --------
@@ -162,7 +161,7 @@ def heading(attitude: ArrayLike, covariance: ArrayLike | None = None, *, axis: s
 
 
 def to_ned(attitude: ArrayLike) -> Array:
-    """Return attitudes q_fb (n, 4) relative to East-North-Up as relative to North-East-Down, or back: half a turn either way."""
+    """Return attitudes q_fb (n, 4) with the fixed frame changed from East-North-Up to North-East-Down, or back."""
     return quaternion.multiply(NED_OF_ENU, array("attitude", attitude, (..., 4)))
 
 

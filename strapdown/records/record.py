@@ -1,7 +1,7 @@
-"""The IMU record: gyro increments and vector measurements, with their truth where it is known.
+"""The IMU record: gyro increments and vector measurements, with their truth if it is known.
 
 All times are *edges*: the n + 1 times that bound the n sample intervals. A gyro sample is the rotation increment over its interval;
-attitude, bias and covariance are values at the edges. So it is never ambiguous which end of an interval a stamp means.
+attitude, bias and covariance are values at the edges. This avoids any ambiguity between the start and the end of an interval.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from strapdown.gyro import GyroSpec
 
 LARGEST_TURN = 1e6
-"""Largest rotation in one sample interval, rad; a filter could not divide a larger one into steps."""
+"""Maximum rotation in one sample interval, rad; a filter could not divide a larger one into steps."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -43,7 +43,7 @@ class Truth:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Origin:
-    """How a record was simulated, as far as it is known.
+    """Origin of a simulated record; fields that are not known are None.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ class Origin:
     seed : int, optional
         Seed of the random streams.
     run : int, optional
-        Run of the random streams.
+        Run number of the random streams.
     """
 
     gyro: GyroSpec | None = None
@@ -67,8 +67,7 @@ class Origin:
 class ImuRecord(Listed):
     """Gyro increments and vector measurements over one run.
 
-    Arrays of floats are kept without a copy, for a long record fills much of the memory: pass a copy of a buffer that is written to
-    afterwards.
+    Arrays of floats are kept without a copy, to save memory: pass a copy if the buffer is written to afterwards.
 
     Parameters
     ----------
@@ -79,11 +78,11 @@ class ImuRecord(Listed):
     vectors : tuple of VectorMeasurements, default empty
         Vector measurements, one series per sensor, each with its own times.
     truth : Truth, optional
-        True attitude and bias, where known.
+        True attitude and bias, if known.
     origin : Origin, optional
-        How it was simulated, so that a filter can be matched to the scenario; None for measured data.
+        Scenario and random streams of a simulated record, so that a filter can be matched to them; None for measured data.
     temperature : ndarray (n + 1,), optional
-        Temperature of the gyro at the edges, °C, where known.
+        Temperature of the gyro at the edges, °C, if known.
     """
 
     time: Array
@@ -109,14 +108,14 @@ class ImuRecord(Listed):
         object.__setattr__(self, "time", time)
         object.__setattr__(self, "increments", increments)
         if isinstance(self.vectors, VectorMeasurements):
-            raise InputError(f"vectors is the series {self.vectors.sensor} by itself; give a tuple of them, (series,)")
+            raise InputError(f"vectors is the single series {self.vectors.sensor}; give a tuple of series, (series,)")
         instance("vectors", self.vectors, Iterable, "give a tuple of series, empty for none")
         object.__setattr__(self, "vectors", tuple(self.vectors))
         for k, series in enumerate(self.vectors):
-            instance(f"vectors[{k}]", series, VectorMeasurements, "give vectors.VectorMeasurements, a series each")
+            instance(f"vectors[{k}]", series, VectorMeasurements, "give a vectors.VectorMeasurements for each")
         names = [series.sensor for series in self.vectors]
         if len(set(names)) < len(names):
-            raise InputError(f"vectors holds two series of one name among {names}; give each sensor its own")
+            raise InputError(f"vectors has two series of the same name among {names}; give each sensor its own name")
         if self.truth is not None:
             truth = Truth(
                 attitude=unit_quaternions(
@@ -127,7 +126,7 @@ class ImuRecord(Listed):
             object.__setattr__(self, "truth", truth)
 
     def listing(self) -> Listing:
-        """Return gyro and sensors with their samples, and where the record comes from, as a table."""
+        """Return gyro and sensors with their numbers of samples, and the origin of the record, as a table."""
         span, count_ = self.time[-1] - self.time[0], len(self.increments)
         rows = [("gyro", "increments", str(count_), f"{count_ / span:.4g}")]
         rows += [(one.sensor, one.kind, str(len(one.time)), f"{len(one.time) / span:.4g}") for one in self.vectors]
@@ -139,24 +138,24 @@ class ImuRecord(Listed):
 
     @property
     def rates(self) -> Array:
-        """Averaged body rate over each interval (n, 3), rad/s."""
+        """Mean body rate over each interval (n, 3), rad/s."""
         return np.asarray(self.increments / np.diff(self.time)[:, None])
 
 
 def compress(record: ImuRecord, algorithm: str | coning.Algorithm) -> ImuRecord:
-    """Return the record at the rate of an N-sample coning algorithm: each N increments become one rotation vector.
+    """Return the record at the rate of an N-sample coning algorithm, which combines N increments into one rotation vector.
 
     Parameters
     ----------
     record : ImuRecord
         Record.
     algorithm : str or Algorithm
-        Coning algorithm, a name in :data:`strapdown.coning.ALGORITHMS` or an algorithm.
+        Coning algorithm: a name in :data:`strapdown.coning.ALGORITHMS` or an algorithm.
 
     Returns
     -------
     ImuRecord
-        Record of n // N intervals; intervals left over at the end are dropped.
+        Record of n // N intervals; remaining intervals at the end are dropped.
 
     Raises
     ------
@@ -165,8 +164,8 @@ def compress(record: ImuRecord, algorithm: str | coning.Algorithm) -> ImuRecord:
 
     Notes
     -----
-    The rotation vector is the increment of the longer interval: with commutation corrected, a filter may treat it as a rotation at
-    constant rate. Where sample intervals differ in length the correction is that of their lengths, and across a gap there is none
+    The rotation vector is the increment of the longer interval: with the coning correction, a filter may treat it as a rotation at
+    constant rate. For unequal sample intervals the correction is computed for their durations; across a gap there is no correction
     (:func:`strapdown.coning.rotation_vectors`).
     """
     table = coning.named(algorithm)
@@ -191,7 +190,7 @@ def cut(record: ImuRecord, first: int, last: int) -> ImuRecord:
     Returns
     -------
     ImuRecord
-        The part. Measurements at the very first edge of the whole record belong to its first part.
+        The part. A part from edge 0 includes the measurements at that edge.
     """
     if not 0 <= first < last < len(record.time):
         raise InputError(

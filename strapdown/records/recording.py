@@ -22,19 +22,19 @@ TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 """Units of a time column, and their factor to s."""
 
 CLOCK_OFFSET = 1e8
-"""Stamps beyond this many seconds count from 1970 or from the start of a machine: a recording's time then begins at the first of them."""
+"""Stamps above this, s, count from 1970 or from the start of a machine; the time of a recording then begins at its first stamp."""
 
 GAP = 5.0
-"""An interval between stamps of more than this many usual ones is a gap."""
+"""Minimum interval between stamps that counts as a gap, in median intervals."""
 
 _ROWS = ("time", "rate", "specific_force", "magnetic_field", "temperature", "true_attitude", "movement")
 
 
 FEW_REPEATED = 0.01
-"""Share of the rows with the stamp of the row before, below which they are left out though their samples differ."""
+"""Share of rows with the stamp of the row before, below which they are left out even if their samples differ."""
 LARGEST_RATE = 2000.0
-"""rad/s: five times the range of the fastest gyros. More are raw counts, or a damaged row; and a filter would cut each interval into
-thousands of steps."""
+"""Maximum rate, rad/s, five times the range of the fastest gyros. Larger values are raw counts or a damaged row, and a filter would divide
+each interval into thousands of steps."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -44,7 +44,7 @@ class Recording(Listed):
     Parameters
     ----------
     source : str
-        Name of the file or object that it comes from.
+        Name of the file or object that the recording was read from.
     time : ndarray (n,)
         Time stamps, s, increasing.
     rate : ndarray (n, 3)
@@ -52,7 +52,7 @@ class Recording(Listed):
     specific_force : ndarray (n, 3), optional
         Specific force, m/s², body axes: +9.81 along the upward axis at rest. Rows of NaN are missing.
     magnetic_field : ndarray (n, 3), optional
-        Magnetic field in any one unit, body axes. Rows of NaN are missing.
+        Magnetic field in any unit, body axes. Rows of NaN are missing.
     magnetic_unit : str, default ""
         Unit of the magnetic field, a key of :data:`MAGNETIC_UNITS`; empty if unknown.
     temperature : ndarray (n,), optional
@@ -64,13 +64,13 @@ class Recording(Listed):
     epoch_ns : int, default 0
         Reading of the source's clock at time 0, ns; nanoseconds since 1970 for a clock that counts from then.
     missing_gyro : ndarray (k,), default empty
-        Stamps of rows without a gyro sample, s. These rows are left out whole: the intervals on both sides are joined, the turn
-        comes from the samples at the ends, and the covariance of a filter grows over the whole interval.
+        Stamps of rows without a gyro sample, s. These rows are left out: the intervals on both sides are joined, the rotation is
+        computed from the samples at the ends, and the covariance of a filter grows over the whole interval.
     repeated : ndarray (k,), default empty
-        Stamps of rows that repeat the stamp of the row before, s; they are left out. Where they are more than :data:`FEW_REPEATED`
-        of all and their samples differ, the file is refused.
+        Stamps of rows that repeat the stamp of the row before, s; they are left out. If their share is above :data:`FEW_REPEATED` and
+        their samples differ, the file is rejected.
     remarks : tuple of str, default empty
-        Choices and omissions of the reader, a sentence each: columns guessed, topics used, the part of a truncated file.
+        Choices and omissions of the reader, one sentence each: columns guessed, topics used, the part of a truncated file.
     """
 
     source: str
@@ -99,13 +99,21 @@ class Recording(Listed):
                 f"{self.source}: rate[{row}, {axis}] is {self.rate[row, axis]:g} rad/s, which no gyro measures; convert raw counts to "
                 "rad/s or deg/s by the scale factor of the datasheet, or remove the row"
             )
-        for name, width in (("specific_force", 3), ("magnetic_field", 3), ("true_attitude", 4)):
+        for name, sensor in (
+            ("specific_force", "accelerometer"),
+            ("magnetic_field", "magnetometer"),
+            ("true_attitude", "reference"),
+        ):
             value = getattr(self, name)
             if value is not None:
-                value = array(f"{self.source}: {name}", value, (n, width), allow_nan=True)
-                if name != "true_attitude" and not np.any(np.abs(value) > 0.0) and not np.isnan(value).all():
+                value = array(f"{self.source}: {name}", value, (n, 4 if sensor == "reference" else 3), allow_nan=True)
+                if np.isnan(value).all():
+                    words = f"The {sensor} has no sample from {time[0]:.3g} s on."
+                    object.__setattr__(self, "remarks", (*self.remarks, words))
+                    value = None
+                elif sensor != "reference" and not np.any(np.abs(value) > 0.0):
                     raise InputError(
-                        f"{self.source}: {name} is 0 in every row, as where there is no such sensor; leave its columns out"
+                        f"{self.source}: {name} is 0 in every row, as if there were no such sensor; leave its columns out"
                     )
                 object.__setattr__(self, name, value)
         if self.temperature is not None:
@@ -119,7 +127,7 @@ class Recording(Listed):
             raise InputError(f"{self.source}: movement has shape {np.shape(self.movement)}, wanted ({n},)")
 
     def listing(self) -> Listing:
-        """Return each sensor with the sizes of its samples, which show a wrong unit, and what the reader remarked, as a table."""
+        """Return each sensor with the magnitudes of its samples, which show a wrong unit, and the reader's remarks, as a table."""
         span = self.time[-1] - self.time[0]
         rows = []
         for name, unit, values in (
@@ -135,7 +143,7 @@ class Recording(Listed):
         return Listing(title, ("sensor", "unit", "samples", "median size", "largest"), rows, self.remarks, left=2)
 
     def since(self, first: int) -> Recording:
-        """Return the recording from one sample on.
+        """Return the recording from a given sample on.
 
         Parameters
         ----------
@@ -202,12 +210,12 @@ class Recording(Listed):
 
 
 def with_gyro(*, source: str, time: Array, rate: Array, **columns: Any) -> Recording:
-    """Return a recording of the rows with a gyro sample that do not repeat the row before, and the stamps of the others."""
+    """Return a recording of the rows that have a gyro sample and do not repeat the row before, with the stamps of the other rows."""
     same = np.diff(time) == 0.0
     if same.any() and np.mean(same) >= FEW_REPEATED:
         for column in (rate, *columns.values()):
             if np.shape(column)[:1] != time.shape:
-                continue  # not there, or not of this length, which is refused below
+                continue  # absent, or of another length, which is rejected below
             rows = np.asarray(column).reshape(len(time), -1).astype(np.float64)
             same &= np.all((rows[1:] == rows[:-1]) | (np.isnan(rows[1:]) & np.isnan(rows[:-1])), axis=1)
     if same.any():
@@ -228,24 +236,24 @@ def with_gyro(*, source: str, time: Array, rate: Array, **columns: Any) -> Recor
 
 
 def _rows(columns: dict[str, Any], kept: NDArray[np.bool_]) -> dict[str, Any]:
-    """Return the columns with those rows; what has no rows (units, remarks, stamps of repeated rows) stays as it is."""
+    """Return the columns with those rows; entries without rows (units, remarks, stamps of repeated rows) are unchanged."""
     return {n: c[kept] if n in _ROWS and np.shape(c)[:1] == kept.shape else c for n, c in columns.items()}
 
 
 def relative_time(clock_ns: NDArray[np.int64]) -> tuple[Array, int]:
     """Return stamps of a clock that counts ns as time in s, and the clock's reading at time 0 (``epoch_ns``).
 
-    Time begins at the first stamp where the clock is beyond :data:`CLOCK_OFFSET`, for float64 would otherwise lose its digits.
+    Time begins at the first stamp if the clock is beyond :data:`CLOCK_OFFSET`, because float64 would otherwise lose digits.
     """
     epoch = int(clock_ns[0]) if len(clock_ns) and abs(int(clock_ns[0])) > CLOCK_OFFSET * 1e9 else 0
     return np.asarray((clock_ns - epoch) / 1e9), epoch
 
 
 def at_nearest(time: Array, other: Array, values: Array) -> tuple[Array, int]:
-    """Return the samples of a sensor with its own stamps at the nearest of ``time``, NaN elsewhere, and the number left over.
+    """Return the samples of a sensor with its own stamps at the nearest of ``time``, NaN elsewhere, and the number not used.
 
-    No sample is interpolated, for that would correlate its noise: each moves by at most half an interval of ``time``. A stamp keeps
-    the nearest of the samples that fall to it; further ones, and those more than an interval outside, are left over.
+    Samples are not interpolated, because that would correlate their noise: each moves by at most half an interval of ``time``. If several
+    samples have the same nearest stamp, only the closest is used; samples more than an interval outside ``time`` are not used.
     """
     placed = np.full((len(time), *values.shape[1:]), np.nan)
     right = np.clip(np.searchsorted(time, other), 1, len(time) - 1)
@@ -260,20 +268,20 @@ def at_nearest(time: Array, other: Array, values: Array) -> tuple[Array, int]:
 def increments(recording: Recording) -> Array:
     """Return body increments (n − 1, 3), rad, over the intervals between the stamps, by the trapezoid rule.
 
-    At uneven stamps point samples of rate support no higher order; at even ones :func:`strapdown.coning.increments_from_rates` fits
-    higher polynomials.
+    Point samples at unequal intervals support no higher order; at equal intervals :func:`strapdown.coning.increments_from_rates` fits
+    polynomials of higher order.
     """
     return np.asarray(0.5 * (recording.rate[1:] + recording.rate[:-1]) * np.diff(recording.time)[:, None])
 
 
 def sampled(samples: Array) -> np.ndarray:
-    """Return which rows (n, 3) of a sensor are samples (n,): neither NaN nor 0 throughout."""
+    """Return a mask (n,) of the rows (n, 3) of a sensor that are samples: neither NaN nor all 0."""
     x, y, z = samples.T
     return np.asarray(~np.isnan(x + y + z) & ((x != 0.0) | (y != 0.0) | (z != 0.0)))
 
 
 def gaps(time: ArrayLike) -> list[tuple[float, float]]:
-    """Return begin and length, s, of each gap between stamps: intervals of more than five usual ones.
+    """Return start and duration, s, of each gap between stamps: intervals of more than five median intervals.
 
     Examples
     --------

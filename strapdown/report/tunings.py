@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import math
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -44,6 +45,7 @@ class _Objective(_Table):
     name: str
     before: float
     after: float
+    attitude_rms_rad: tuple[float, float] | None = None
 
 
 class _Searches(_Table):
@@ -192,8 +194,8 @@ def _parameters(content: dict[str, Any]) -> list[str]:
     objective = content["objective"]
     gain = objective["before"] - objective["after"]
     gained = f"The {objective['name']} increased by {gain:.4g} nats."
-    if objective["name"] not in ("likelihood", "likelihood of the errors"):
-        gained = f"Tuned by {objective['name']}; the objective decreased by {gain:.4g}."
+    if rms := objective.get("attitude_rms_rad"):
+        gained = f"RMS attitude error: {math.degrees(rms[0]):.4g}° before, {math.degrees(rms[1]):.4g}° after."
     return [
         page.table(("parameter", "identified", "before", "after", "from", "to (95 %)"), rows, numbers=4, marked=marked),
         page.paragraph(gained, faint=True),

@@ -1,6 +1,6 @@
-"""Scenarios: a motion, a gyro and sensors over a time; simulating one gives a record with its truth.
+"""Scenarios: a motion, a gyro and sensors; simulating one gives a record with its truth.
 
-A scenario is a TOML file, units in the names of its keys; the built-in ones (``SCENARIOS``) are such files beside this module.
+A scenario can be a TOML file with the units in the names of its keys; the built-in ones (``SCENARIOS``) are such files in this package.
 """
 
 from __future__ import annotations
@@ -42,21 +42,21 @@ SCENARIOS: tuple[str, ...] = tuple(sorted(path.stem for path in _BUILTIN.glob("*
 """Names of the built-in scenarios."""
 
 MAX_SAMPLES = 1e9
-"""Gyro samples that a simulated record may have: beyond it none fits into memory."""
+"""Maximum number of gyro samples of a simulated record; more do not fit into memory."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Temperature:
-    """Temperature of the unit: exponentially from one to another, or without a time constant at a constant rate over the record.
+    """Temperature of the unit: an exponential change, or without a time constant a linear change over the record.
 
     Parameters
     ----------
     start : float
-        At the start, °C.
+        Temperature at the start, °C.
     end : float
-        That it tends to, or without a time constant that at the end of the record, °C.
+        Final temperature of the exponential, or without a time constant the temperature at the end of the record, °C.
     time_constant : float, default inf
-        Thermal time constant, s.
+        Thermal time constant, s; infinite: linear change.
     """
 
     start: float
@@ -90,32 +90,32 @@ class Temperature:
 
 @dataclass(frozen=True, kw_only=True)
 class Scenario:
-    """A motion, a gyro and sensors, at a sample rate, over a time.
+    """A motion, a gyro and sensors, with sample rate and duration.
 
     Parameters
     ----------
     motion : Motion
         True attitude and body rate over time (:mod:`strapdown.motion`).
     gyro : GyroSpec
-        The gyro's errors.
+        Specification of the gyro's errors.
     sensors : tuple of Sensor
-        Vector, attitude and heading sensors (:mod:`strapdown.vectors`), each with a name of its own.
+        Vector, attitude and heading sensors (:mod:`strapdown.vectors`), each with a different name.
     rate : float
-        Gyro samples a second, Hz.
+        Sample rate of the gyro, Hz.
     duration : float
-        Length of the record, s; rounded to whole gyro samples.
+        Duration of the record, s; rounded to whole gyro samples.
     name : str, default ""
-        For files and tables.
+        Name in files and tables.
     description : str, default ""
-        A sentence for people.
+        Description in one sentence.
     seed : int, default 0
         Default seed of :func:`simulate`.
     gravity_f : tuple of 3 floats, default (0, 0, -9.80665)
-        Gravity where the body is held up, m/s², fixed frame: what a g-sensitive gyro feels the reaction to; zeros in free fall.
+        Gravity, m/s², fixed frame; a g-sensitive gyro responds to its reaction. Zeros in free fall.
     gyro_preset : str, default ""
-        Name of the preset that ``gyro`` is, for files.
+        Name of the preset equal to ``gyro``, for files.
     temperature : Temperature, optional
-        Temperature of the unit, °C, over which a gyro may have a bias; it is recorded. Default: none.
+        Temperature of the unit, °C, on which the gyro's bias may depend; it is recorded. Default: none.
 
     Examples
     --------
@@ -155,17 +155,17 @@ class Scenario:
         count("seed", self.seed, minimum=0)
         if any(mark in self.name for mark in "/\\\0\n") or self.name.startswith("."):
             raise InputError(
-                f"name is {self.name!r}; files are called after it: leave out slashes, line breaks and leading dots"
+                f"name is {self.name!r}, which is used in file names: leave out slashes, line breaks and leading dots"
             )
         object.__setattr__(self, "sensors", tuple(self.sensors))
         object.__setattr__(self, "gravity_f", tuple(array("gravity_f", self.gravity_f, (3,)).tolist()))
         names = [sensor.name for sensor in self.sensors]
         for name in names:
             if not str(name).strip():
-                raise InputError("a sensor has no name; give each sensor a name of its own")
+                raise InputError("a sensor has no name; give each sensor a different name")
             if names.count(name) > 1 or name.startswith("gyro"):
                 raise InputError(
-                    f"two sensors are named {name!r}, or it begins with 'gyro'; give each sensor a name of its own"
+                    f"two sensors are named {name!r}, or it begins with 'gyro'; give each sensor a different name"
                 )
 
     @property
@@ -175,7 +175,7 @@ class Scenario:
 
 
 def chosen(given: Scenario | str | os.PathLike[str]) -> Scenario:
-    """Return a scenario, given itself, by a built-in name, or by the path of its TOML file."""
+    """Return a scenario from a Scenario, a built-in name, or the path of its TOML file."""
     instance(
         "scenario", given, (Scenario, str, os.PathLike), "give a Scenario, a built-in name, or the path of a TOML file"
     )
@@ -185,8 +185,8 @@ def chosen(given: Scenario | str | os.PathLike[str]) -> Scenario:
 def simulate(scenario: Scenario | str | os.PathLike[str], seed: int | None = None, run: int = 0) -> ImuRecord:
     """Simulate one run of a scenario: gyro increments, vector measurements and the truth.
 
-    Each sensor draws from a random stream of its own (seed, run, name), so adding one changes nothing of the others. With sampling jitter
-    the truth is that at the actual sampling instants, and the stamps are those that the gyro reports; lost samples are bridged
+    Each sensor has its own random stream (seed, run, name), so adding one does not change the others. With sampling jitter, the truth is
+    given at the actual sampling instants and the stamps are those that the gyro reports. Lost samples are bridged
     (:func:`strapdown.gyro.bridge_dropped`).
 
     Parameters
@@ -194,14 +194,14 @@ def simulate(scenario: Scenario | str | os.PathLike[str], seed: int | None = Non
     scenario : Scenario, str or path
         A scenario, the name of a built-in one (:data:`SCENARIOS`), or the path of its TOML file.
     seed : int, optional
-        Of the random numbers; default the scenario's own.
+        Seed of the random numbers. Default: that of the scenario.
     run : int, default 0
-        Number of the run; runs of one seed are independent.
+        Number of the run; runs with the same seed are independent.
 
     Returns
     -------
     ImuRecord
-        Its ``truth`` is known, and its ``origin`` is the scenario, which :func:`strapdown.estimate` matches its filter to.
+        Record with ``truth``, and with the scenario as ``origin``, to which :func:`strapdown.estimate` matches its filter.
 
     Examples
     --------
@@ -245,26 +245,26 @@ def simulate(scenario: Scenario | str | os.PathLike[str], seed: int | None = Non
 
 
 def drawn(scenario: Scenario, seed: int, run: int = 0) -> Scenario:
-    """Return the scenario with other individuals of its gyro and sensors: each fixed error times a standard normal number.
+    """Return the scenario with randomly drawn units of its gyro and sensors: each fixed error is multiplied by a standard normal number.
 
-    The fixed errors (scale factor, misalignment, sensitivity to acceleration, hard iron, a sensor's bias, lever arm) are taken as standard
-    deviations, entry by entry, as in a datasheet; to the coefficients of a bias over temperature errors of their own σ are added. A filter
-    with a state for each (``FilterSetup.for_scenario(scenario, states=True)``) is consistent on average over such individuals, and only
-    nearly so on one whose errors all have one size and sign.
+    The fixed errors (scale factor, misalignment, sensitivity to acceleration, hard iron, a sensor's bias, lever arm) are interpreted as
+    standard deviations, entry by entry, as in a datasheet. The coefficients of a bias over temperature get additive errors with their σ. A
+    filter with a state for each error (``FilterSetup.for_scenario(scenario, states=True)``) is consistent on average over such units, and
+    only approximately for a unit whose errors are all equal to one σ.
 
     Parameters
     ----------
     scenario : Scenario
-        Its fixed errors are standard deviations.
+        Scenario whose fixed errors are standard deviations.
     seed : int
         Seed of the random numbers.
     run : int, default 0
-        Number of the individual; individuals of one seed are independent.
+        Number of the unit; units with the same seed are independent.
 
     Returns
     -------
     Scenario
-        With the drawn errors, and without ``gyro_preset``.
+        Scenario with the drawn errors, without ``gyro_preset``.
     """
     draw = generator(seed, run, "individual")
 
@@ -290,11 +290,11 @@ _FIXED_OF_SENSORS = ("hard_iron", "bias", "lever_arm_b")
 # ------------------------------------------------------------------------------------------------------------------------ files
 
 _OWN = ("harmonics", "faults", "orbit", "acceleration_f")
-"""Fields that are no keys: tables, or functions that no file holds."""
+"""Fields that are not keys: tables, and functions, which cannot be written to a file."""
 
 
 def _form(kind: Any, units: Form) -> Form:
-    """Return the keys of a class; what ``units`` leaves out is a plain number or word."""
+    """Return the keys of a class; a field that is not in ``units`` is a plain number or word."""
     return {one.name: units.get(one.name, tables.PLAIN) for one in dataclasses.fields(kind) if one.name not in _OWN}
 
 
@@ -329,7 +329,7 @@ _MOTIONS: dict[str, tuple[type, Form]] = {
         "harmonic-rates": motion.HarmonicRates,
     }.items()
 }
-"""Motions by their word in a file. Besides: "rest", "composed" (tables ``base`` and ``vibration``)."""
+"""Motions by their ``type`` in a file, in addition to "rest" and "composed" (tables ``base`` and ``vibration``)."""
 
 _HARMONIC: Form = {"amplitude": tables.DEGREES_PER_SECOND, "frequency": tables.HERTZ, "phase": tables.DEGREES}
 _ORBIT: Form = {
@@ -369,8 +369,8 @@ _SENSORS: dict[str, tuple[type, Form, Form]] = {
         "heading-pair": (vectors.HeadingPair, tables.METRES),
     }.items()
 }
-"""Sensors by their word in a file: class, keys, keys of its faults. A magnetometer takes a table ``orbit`` for a field, and a
-horizon sensor has one."""
+"""Sensors by their ``type`` in a file: class, keys, keys of its faults. A horizon sensor has a table ``orbit``, and a magnetometer may have
+one instead of its field."""
 
 _TOP_FORM: Form = {
     "seed": tables.PLAIN,
@@ -384,7 +384,7 @@ _TEMPERATURE: Form = {"start": tables.DEGREES_CELSIUS, "end": tables.DEGREES_CEL
 
 
 def load_scenario(name_or_path: str | os.PathLike[str]) -> Scenario:
-    """Return a built-in scenario by its name, or the one in a TOML file.
+    """Return a built-in scenario by its name, or the scenario of a TOML file.
 
     Parameters
     ----------
@@ -394,7 +394,7 @@ def load_scenario(name_or_path: str | os.PathLike[str]) -> Scenario:
     Returns
     -------
     Scenario
-        In SI units and radians, whatever the units of the keys.
+        Scenario in SI units and radians, whatever the units of the keys.
 
     Examples
     --------
@@ -424,7 +424,7 @@ def _from_table(table: dict[str, Any], place: str) -> Scenario:
             raise InputError(f"{place}: {key} is missing; add it")
     for key in ("name", "description"):
         if not isinstance(table.get(key, ""), str):
-            raise InputError(f"{place}: {key} is {table[key]!r}; it must be a text")
+            raise InputError(f"{place}: {key} is {table[key]!r}; it must be a string")
     preset, spec = _read_gyro(_table(table.get("gyro", {}), f"{place}: gyro"), f"{place}: gyro")
     sensors = table.get("sensors", [])
     if not isinstance(sensors, list):
@@ -493,7 +493,7 @@ def _write_motion(body: Motion) -> dict[str, Any]:
             if isinstance(body, motion.HarmonicRates):
                 table["harmonics"] = [tables.encode(h, _HARMONIC) for h in body.harmonics]
             return table
-    raise InputError(f"a motion of class {type(body).__name__} has no form in a file; keep it in Python")
+    raise InputError(f"a motion of class {type(body).__name__} cannot be written to a file; keep it in Python")
 
 
 def _read_gyro(table: dict[str, Any], place: str) -> tuple[str, GyroSpec]:
@@ -526,10 +526,12 @@ def _read_sensor(entry: Any, place: str) -> Sensor:
 def _write_sensor(sensor: Any) -> dict[str, Any]:
     word = next((word for word, (kind, _, _) in _SENSORS.items() if type(sensor) is kind), None)
     if word is None:
-        raise InputError(f"a sensor of class {type(sensor).__name__} has no form in a file; keep it in Python")
+        raise InputError(f"a sensor of class {type(sensor).__name__} cannot be written to a file; keep it in Python")
     _, form, faults = _SENSORS[word]
     if getattr(sensor, "acceleration_f", None) is not None:
-        raise InputError(f"{sensor.name}: acceleration_f is a function, which has no form in a file; keep it in Python")
+        raise InputError(
+            f"{sensor.name}: acceleration_f is a function, which cannot be written to a file; keep it in Python"
+        )
     if isinstance(sensor, vectors.HorizonSensor):
         own = {**tables.encode(sensor, form), **tables.encode(sensor.faults, faults)}
         return {"type": word, **own, "orbit": tables.encode(sensor.orbit, _ORBIT)}
@@ -538,16 +540,14 @@ def _write_sensor(sensor: Any) -> dict[str, Any]:
         return {"type": word, **tables.encode(sensor, form), **tables.encode(sensor.faults, faults)}
     orbit = getattr(field, "__self__", None)
     if not isinstance(orbit, CircularOrbit):
-        raise InputError(
-            f"{sensor.name}: field_f is a function of its own, which has no form in a file; keep it in Python"
-        )
+        raise InputError(f"{sensor.name}: field_f is a function, which cannot be written to a file; keep it in Python")
     rest = {name: choice for name, choice in form.items() if name != "field_f"}
     table = {"type": word, **tables.encode(sensor, rest), **tables.encode(sensor.faults, faults)}
     return {**table, "orbit": tables.encode(orbit, _ORBIT)}
 
 
 def scenario_to_table(scenario: Scenario) -> dict[str, Any]:
-    """Return a scenario as the table that its TOML file holds."""
+    """Return a scenario as the table of its TOML file."""
     table: dict[str, Any] = {}
     for key in ("name", "description"):
         if getattr(scenario, key):
@@ -564,7 +564,7 @@ def scenario_to_table(scenario: Scenario) -> dict[str, Any]:
 
 
 def scenario_to_toml(scenario: Scenario) -> str:
-    """Return a scenario as TOML text, with the unit in each key; reading it gives the same scenario to the last bit."""
+    """Return a scenario as TOML text, with the unit in each key; reading it gives a bitwise equal scenario."""
     import tomli_w
 
     text = tomli_w.dumps(scenario_to_table(scenario))
@@ -576,7 +576,7 @@ def scenario_to_toml(scenario: Scenario) -> str:
 
 @functools.cache
 def builtin_rows() -> tuple[dict[str, object], ...]:
-    """Return one row a built-in scenario for printing: name, description, duration s, rate Hz, gyro."""
+    """Return one row per built-in scenario for printing: name, description, duration s, rate Hz, gyro."""
     rows = []
     for name in SCENARIOS:
         table = reading.toml(_BUILTIN / f"{name}.toml")

@@ -1,27 +1,27 @@
 """Tuning a filter from data: maximum likelihood, an interval for each parameter, and validation on held-out data.
 
-- ``procedure``: :func:`tune`: objective, search and what follows it in one call.
-- ``objective``: What every objective is: a problem checked, setups of points, sums over records and threads.
-- ``innovations``: Of the filter's innovations, with score and information, eight sets of parameters a pass where the filter allows it.
-- ``errors``: Of the errors against a truth.
-- ``outliers``: Of innovations some of which are outliers, and the gate that suits them.
-- ``fitting``: The search from several starts, intervals, what is identified and what is not.
-- ``parameters``: One table of names, places in a filter setup and units; priors.
-- ``initialization``: Where the filter starts on a record.
-- ``planning``: The Cramér–Rao bound before there is a record.
-- ``residual_checks``: What the tuned filter leaves unexplained, such as a scale factor that the gyro's noise stands for.
-- ``diagnosis``: Why a filter is inconsistent: the hypothesis under which the record is the likeliest.
-- ``own``: Parameters of a filter of one's own, by the same objectives.
-- ``validation``: What is held out, and the filter before and after on it.
+- ``procedure``: :func:`tune`: objective, search, residual checks and validation in one call.
+- ``objective``: Base of the objectives: checks of the problem, setups at a point, sums over records and threads.
+- ``innovations``: Likelihood of the innovations, with score and information; eight parameter sets per pass if the filter allows.
+- ``errors``: Likelihood of the errors against a truth.
+- ``outliers``: Likelihood of innovations with outliers, and the matching gate.
+- ``fitting``: The search from several starts, intervals, identifiability.
+- ``parameters``: Names, fields in a filter setup and units of the parameters; priors.
+- ``initialization``: Initial state of the filter on a record.
+- ``planning``: The Cramér–Rao bound for records to be made.
+- ``residual_checks``: Errors that the tuned filter does not model, such as a scale factor absorbed by the gyro's noise.
+- ``diagnosis``: Causes of an inconsistent filter: hypotheses ranked by likelihood.
+- ``own``: Tuning of a user-defined filter by the same objectives.
+- ``validation``: Held-out data, and the filter before and after tuning on them.
 
 >>> objective = tuning.likelihood([tuning.record_case(record, chosen)], chosen, ["gyro.arw", "star.sigma"])  # doctest: +SKIP
 >>> result = tuning.fit(objective)  # doctest: +SKIP
 >>> result["gyro.arw"].value, result.setup  # doctest: +SKIP
 
-The likelihood is right for a filter that is right but for its parameters: it gives white innovations. Disturbances that last over many
-samples break it, and the most likely filter may then follow them (:attr:`strapdown.tuning.Tuning.misfit` says so). On such records tune
-``filter.scale`` alone, which leaves the estimates as they are and sets their σ, or against a truth. Outliers need a model of their own
-(:func:`contaminated_likelihood`), and an error without a state looks like noise of the gyro (:func:`unmodelled` looks for it).
+The likelihood is valid for a filter that is correct except for its parameters, so that its innovations are white. Disturbances that last
+over many samples violate this, and the maximum-likelihood filter may then follow them (:attr:`strapdown.tuning.Tuning.misfit`). For these
+tune only ``filter.scale``, which scales the σ and leaves the estimates unchanged, or tune against a truth. Outliers need a model
+(:func:`contaminated_likelihood`), and an error without a state appears as noise of the gyro (:func:`unmodelled` tests for it).
 """
 
 from strapdown.tuning.errors import error_objective as error_objective

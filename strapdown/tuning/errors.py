@@ -1,10 +1,11 @@
 """Tuning against a truth: the likelihood of the state errors under the filter's covariance, or the size of the attitude error.
 
-The likelihood is that of the filter as it runs, with its error states, its gate and its robust weights; where it has none of them, and no
-more than seven parameters are free, eight points are computed at once.
+The likelihood is that of the filter with its error states, gate and robust weights. If it has none of them, and at most seven parameters
+are free, eight points are computed at once.
 
-Errors at neighbouring times are alike, so epochs are taken as far apart as the attitude error remembers, and the likelihood of all of them
-is a composite one (Lindsay 1988): its maximum is right, its curvature is not an information, and standard errors come from the sandwich.
+Errors at neighbouring times are correlated, so epochs are spaced by the correlation time of the attitude error. The likelihood of all of
+them is a composite one (Lindsay 1988): its maximum is consistent, its curvature is not the information, and standard errors come from the
+sandwich.
 """
 
 from __future__ import annotations
@@ -18,23 +19,23 @@ import numpy as np
 from strapdown import consistency
 from strapdown.checks import Array, InputError, one_of
 from strapdown.estimation.setup import FilterSetup
-from strapdown.tuning.innovations import MOST, LaneLikelihood, RunLikelihood, made, with_engine
+from strapdown.tuning.innovations import MOST, Likelihood, made, with_engine
 from strapdown.tuning.objective import STEP, Case, Derivatives, Objective, by_part, posed
 
 Measure = Literal["likelihood", "rmse"]
 MAX_EPOCHS = 1000
-"""Epochs taken of one record."""
+"""Maximum number of epochs per record."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ErrorObjective(Objective):
-    """Objective of the parameters, from the errors of the state; built by :func:`error_objective`."""
+    """Objective of the parameters from the state errors; created by :func:`error_objective`."""
 
-    base: LaneLikelihood | RunLikelihood
-    """The filter that makes the errors."""
+    base: Likelihood
+    """The filter whose errors are judged."""
     measure: Measure
     references: tuple[Reference, ...] = field(repr=False)
-    """Truth at the edges judged, of each record."""
+    """Truth of each record at the judged edges."""
     composite: ClassVar[bool] = True
 
     def derivatives(self, point: Array) -> Derivatives:
@@ -45,8 +46,13 @@ class ErrorObjective(Objective):
         P = np.concatenate([covariance for _, covariance in found])
         return self._squares(error) if self.measure == "rmse" else self._likelihood(error, P)
 
+    def rms(self, points: Array) -> Array:
+        """Return the RMS attitude error, all axes together, at points (k, p), rad (k,), where that is the measure."""
+        number = 3 * sum(len(one.epochs) for one in self.references)
+        return np.asarray(np.sqrt(3.0) * np.exp(self.minus_log(points) / number))
+
     def errors_of(self, number: int, rows: Array) -> tuple[Array, Array]:
-        """Return errors (m, lanes, n) and covariances (m, lanes, n, n) of one record; n is 3 where the true bias is not known."""
+        """Return errors (m, lanes, n) and covariances (m, lanes, n, n) of one record; n is 3 if the true bias is unknown."""
         truth = self.references[number]
         attitude, bias, P = self.base.estimates(number, rows, truth.epochs)
         true_bias = bias if truth.bias is None else truth.bias[:, None]
@@ -55,7 +61,7 @@ class ErrorObjective(Objective):
         return error[..., :n], P[..., :n, :n]
 
     def _likelihood(self, error: Array, P: Array) -> Derivatives:
-        scale = np.sqrt(np.einsum("mii->mi", P[:, 0]))  # rad beside rad/s
+        scale = np.sqrt(np.einsum("mii->mi", P[:, 0]))  # attitude in rad, bias in rad/s
         error, P = error / scale[:, None], P / (scale[:, None, :, None] * scale[:, None, None, :])
         inverse = np.linalg.inv(P[:, 0])
         whitened = np.einsum("mlj,mlj->ml", error, np.linalg.solve(P, error[..., None])[..., 0])
@@ -70,7 +76,7 @@ class ErrorObjective(Objective):
         return self._by_part(whole, score, information)
 
     def _squares(self, error: Array) -> Derivatives:
-        # ½ N log Σ e²: as if the size of the errors were a free σ of their own, so that the value is a log likelihood in size.
+        # ½ N log Σ e²: the log likelihood of errors with a free σ, so that the value has its scale.
         total, number = float(np.sum(error[:, 0] ** 2)), error[:, 0].size
         change = (error[:, 1:] - error[:, :1]) / STEP
         score = number / total * np.einsum("ma,mja->mj", error[:, 0], change)
@@ -91,11 +97,10 @@ def error_objective(
     measure: Measure = "likelihood",
     threads: int = 1,
 ) -> ErrorObjective:
-    """Return the objective that judges the filter by its errors on records with a truth, or a reference attitude: then only the attitude.
+    """Return the objective that judges the filter by its errors on records with a truth, or with a reference attitude (attitude only).
 
-    The likelihood of the errors under the filter's covariance asks that they be small and that the filter know how small. The root mean
-    square of the attitude error asks for the first alone, and does not determine a common scale of all σ; it is that of the filter without
-    gate and robust weights.
+    The likelihood of the errors under the filter's covariance requires small errors and a matching covariance. The RMS attitude error
+    requires only small errors, and does not determine a common scale of all σ; it is that of the filter without gate and robust weights.
     """
     one_of("measure", measure, ("likelihood", "rmse"))
     applied = replace(chosen, gate=None, robust=None) if measure == "rmse" else chosen
@@ -108,22 +113,22 @@ def error_objective(
 
 
 class Reference(NamedTuple):
-    """Truth of one record at some of the edges of the filter's steps."""
+    """Truth of one record at selected edges of the filter's steps."""
 
     epochs: np.ndarray
-    """Edges (m,)."""
+    """Indices of the edges (m,)."""
     attitude: Array
     """q_fb (m, 4)."""
     bias: Array | None
-    """(m, 3), where it is known."""
+    """Gyro bias (m, 3) if known, rad/s."""
 
     def at(self, rows: Any) -> Reference:
-        """Return some rows of it."""
+        """Return the selected rows."""
         return Reference(self.epochs[rows], self.attitude[rows], None if self.bias is None else self.bias[rows])
 
 
 def reference(case: Case, edges: np.ndarray) -> Reference:
-    """Return the truth of a record where it is known and counts for tuning, at some of these edges of its gyro samples."""
+    """Return the truth of a record at those of the given edges where it is known and used for tuning."""
     time, truth = case.record.time[edges], case.record.truth
     attitude = case.true_attitude if truth is None else truth.attitude
     judged = (time >= case.first) & (time <= case.last)
@@ -133,15 +138,15 @@ def reference(case: Case, edges: np.ndarray) -> Reference:
         judged &= np.isfinite(attitude[edges]).all(axis=1)
     if attitude is None or not judged.any():
         raise InputError(
-            f"{case.name or 'record'} has no truth where it is to be judged; tune by the innovations instead (leave truth out), or give a "
+            f"{case.name or 'record'} has no truth at the times to be judged; tune by the innovations instead (leave truth out), or give a "
             "reference"
         )
     rows = edges[judged]
     return Reference(np.flatnonzero(judged), attitude[rows], None if truth is None else truth.bias[rows])
 
 
-def _spread(base: LaneLikelihood | RunLikelihood, number: int, measure: Measure) -> Reference:
-    """Return the truth of a record at edges far enough apart that the attitude error of the starting filter has forgotten."""
+def _spread(base: Likelihood, number: int, measure: Measure) -> Reference:
+    """Return the truth of a record at edges spaced by the correlation time of the attitude error at the starting point."""
     case = base.cases[number]
     known = reference(case, np.arange(0, len(case.record.time), base.chosen.integration.samples))
     picked = known.at(slice(None, None, max(1, len(known.epochs) // MAX_EPOCHS)))

@@ -1,14 +1,14 @@
-"""The most likely parameters, from several starts, and how sure one may be of each.
+"""Maximum-likelihood parameters, from several starts, with an interval for each.
 
-The search is Fisher's scoring, damped (Levenberg–Marquardt) and confined to steps of a factor e² in each parameter. Where the data pin
-a parameter well, its interval is that of the information; where they do not, it comes from the profile likelihood, which knows what a
-parabola does not: that zero may be as likely as the best value. Then only a bound is reported.
+The search is Fisher's scoring, damped (Levenberg–Marquardt) and limited to steps of a factor e² in each parameter. If the data determine a
+parameter well, its interval follows from the information; otherwise from the profile likelihood, which a parabola does not describe when
+zero is as likely as the best value. Then only an upper bound is reported.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import NamedTuple, TypeVar
@@ -22,28 +22,28 @@ from strapdown.tuning.objective import REACH, Derivatives, Objective
 from strapdown.tuning.parameters import RRW, SCALE, Prior, Unit, with_values
 
 LONGEST_STEP = 2.0
-"""Largest change of a log parameter in one step of the search."""
+"""Maximum change of a log parameter in one step of the search."""
 WELL_KNOWN = 0.1
-"""Standard error of a log parameter below which the likelihood is a parabola to much better than the error itself."""
+"""Standard error of a log parameter below which the log likelihood is a parabola within the interval."""
 TWO_SIDED = 3.841458820694124
-"""95 % quantile of χ² with one degree of freedom: a profile 2 Δℓ below it is inside the interval."""
+"""95 % quantile of χ² with one degree of freedom: values with a profile 2 Δℓ below it are inside the interval."""
 ONE_SIDED = 2.705543454095404
-"""90 % quantile: the bound that is passed on one side with 5 %, and the test against zero, where half the probability is a point
-(Self & Liang 1987)."""
+"""90 % quantile of χ² with one degree of freedom: one-sided 95 % bound, and the test against zero, where the distribution is half a point
+mass (Self & Liang 1987)."""
 MIN_INFORMATION = 1e-10
-"""Least information on a log parameter; below it there is none."""
+"""Minimum information on a log parameter; less is treated as none."""
 NEGLIGIBLE = 1e-3
-"""A gain of the log likelihood that is not distinguishable from none."""
+"""Gain of the log likelihood that is negligible."""
 NOT_IDENTIFIED = "not identified"
 MISFIT = 1.6
-"""Sandwich error over that of the information beyond which the innovations are not what the filter takes them for."""
+"""Ratio of the sandwich error to that of the information above which the innovations contradict the filter's model."""
 
 T = TypeVar("T")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Local:
-    """Value, gradient and information of an objective, prior and all, at one point."""
+    """Value, gradient and information of an objective at a point, including the priors."""
 
     value: float
     score: Array
@@ -52,13 +52,13 @@ class Local:
 
     @property
     def settled(self) -> np.ndarray:
-        """Parameters that fall towards zero (p,): they gain no more than half the gradient, and below some size are as good as there."""
+        """Whether each parameter (p,) tends to zero with a negligible further gain: half its gradient at most."""
         return np.asarray((self.score > 0.0) & (self.score < NEGLIGIBLE) & (np.diag(self.information) < 0.1))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Optimum:
-    """Where one search ended."""
+    """End point of one search."""
 
     point: Array
     local: Local
@@ -69,6 +69,7 @@ class Optimum:
 def local_at(objective: Objective, point: Array, priors: Mapping[str, Prior]) -> Local:
     """Return the objective with its priors at a point."""
     found = objective.derivatives(point)
+    objective.evaluated()
     value, score, information = float(found.value.sum()), found.score.sum(axis=0), found.information.copy()
     for j, name in enumerate(objective.names):
         if name in priors:
@@ -88,7 +89,7 @@ def search(
     fixed: Sequence[int] = (),
     steps: int = 200,
 ) -> Optimum:
-    """Return the minimum that is reached from ``start``; parameters of the indices ``fixed`` stay where they are."""
+    """Return the minimum reached from ``start``; the parameters with indices ``fixed`` are held fixed."""
     known = dict(priors or {})
     x = np.array(start, float)
     moving = np.array([j not in fixed for j in range(len(x))], bool)
@@ -123,7 +124,7 @@ def search(
             if damping > 1e12:
                 return ended(number, converged=False)
         if shortened == 1.0 and not objective.composite:
-            # Where the information is more than the curvature, as of innovations that no such filter has, steps are too short.
+            # If the information exceeds the curvature, as for innovations that contradict the model, steps are too short.
             bend = 2.0 * (gain - (here.value - there.value))
             stretch = float(
                 np.clip(stretch * (np.clip(gain / bend, 0.5, 4.0) if bend > 0.25 * gain else 4.0), 1.0, 64.0)
@@ -139,34 +140,34 @@ class Estimated:
     name: str
     start: float
     value: float
-    """The value put into the filter: the most likely one; where the data leave zero open, the mean over the profile likelihood."""
+    """Value used in the filter: the most likely one, or the mean over the profile likelihood if zero is not excluded."""
     most_likely: float
     lower: float
-    """Lower end of the 95 % interval; zero where only a bound is known."""
+    """Lower end of the 95 % interval; zero if there is only an upper bound."""
     upper: float
-    """Upper end of the 95 % interval; infinite where nothing bounds it."""
+    """Upper end of the 95 % interval; infinite if there is no bound."""
     standard_error: float
-    """Standard error of the logarithm, by the information, or by the sandwich where :attr:`Tuning.misfit` or against a truth."""
+    """Standard error of the logarithm, by the information, or by the sandwich if :attr:`Tuning.misfit` or against a truth."""
     identified: bool
-    """Whether zero is refuted at 95 %, and an upper end found."""
+    """Whether zero is rejected at 95 % and an upper end exists."""
     note: str
     """Interpretation; :attr:`words` adds the bound."""
     unit: Unit
-    """Unit that it is printed in."""
+    """Unit in which it is printed."""
 
     @property
     def words(self) -> str:
-        """How well it is known, in its unit."""
+        """Interpretation with the upper bound, in its unit."""
         if self.note != NOT_IDENTIFIED:
             return self.note
         if not math.isfinite(self.upper):
-            return f"{NOT_IDENTIFIED}: these records say nothing of it"
+            return f"{NOT_IDENTIFIED}: these records have no information about it"
         return f"{NOT_IDENTIFIED}: at most {figure(self.upper / self.unit.factor, 3)} {self.unit.name} (95 %)"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Tuning(Listed):
-    """The outcome of a tuning.
+    """Result of a tuning.
 
     Parameters
     ----------
@@ -177,26 +178,26 @@ class Tuning(Listed):
     point : ndarray (p,)
         Natural logarithms of the most likely values, SI.
     before : float
-        Minus the log likelihood (with priors, without its constant) at the start.
+        Negative log likelihood (with priors, without its constant) at the start.
     after : float
-        The same at the most likely point.
+        Negative log likelihood at the most likely point.
     covariance : ndarray (p, p)
         Covariance of the logarithms, from the information.
     starts : ndarray (k, p)
         Points at which the searches started.
     optima : ndarray (k, p)
-        Points at which they ended.
+        Points at which the searches ended.
     optima_values : ndarray (k,)
-        Minus the log likelihood at these points.
+        Negative log likelihood at these points.
     misfit : bool
-        Whether the gradient scatters over the record by more than the information allows: the innovations are not white, or not of the
-        variance that any such filter gives them, and the most likely filter need not be the best one.
+        Whether the gradient varies over the record by more than the information allows: the innovations are not white, or their variance
+        is not that of any such filter, and the maximum-likelihood filter need not be the best one.
     agreeing : int
-        Searches that ended within a thousandth of a log likelihood of the best.
+        Number of searches that ended within 0.001 of the best log likelihood.
     composite : bool, default False
-        Whether what was minimised is no likelihood, so that intervals come from the scatter of its gradient (sandwich).
+        Whether the objective is no full likelihood, so that intervals come from the scatter of its gradient (sandwich).
     scale : ndarray (p,) or float, default 1.0
-        Factor on the parameters since the minimum (:func:`rescaled`).
+        Factor applied to the parameters after the minimisation (:func:`rescaled`).
     """
 
     parameters: tuple[Estimated, ...]
@@ -225,25 +226,25 @@ class Tuning(Listed):
         ]
         if not all(one.identified for one in self.parameters):
             notes.append(
-                "Of a parameter that is not identified these records give an upper bound alone; the filter uses the value in the column "
-                "“after”, the mean below that bound. --prior (priors= in Python) gives it a prior instead."
+                "For a parameter that is not identified these records give only an upper bound; the filter uses the value in the column "
+                "“after”, the mean below that bound. A prior can be given by --prior (priors= in Python)."
             )
         if self.misfit:
             remedy = (
-                "A common scale leaves the estimates as they are; it makes σ right on the whole, not at each time."
+                "A common scale leaves the estimates unchanged; it makes σ correct on average, not at each time."
                 if self.parameters[0].name == SCALE
-                else "The most likely filter may follow them and estimate worse. Tune filter.scale alone, or against a truth (--truth, "
-                "--rmse), or try --spacing."
+                else "The maximum-likelihood filter may follow them and estimate worse. Tune only filter.scale, or against a truth "
+                "(--truth, --rmse), or try --spacing."
             )
             notes.append(
-                "The innovations are not those of any such filter: disturbances last over many samples, or change. "
+                "The innovations contradict any filter of this model: disturbances last over many samples, or vary. "
                 + remedy
             )
         columns = ("parameter", "unit", "before", "after", "from", "to", "")
         return Listing("Tuned parameters with 95 % intervals", columns, rows, notes, left=2)
 
     def __getitem__(self, name: str) -> Estimated:
-        """Return the parameter of that name."""
+        """Return the parameter with this name."""
         known_keys("tuning", [name], [one.name for one in self.parameters])
         return next(one for one in self.parameters if one.name == name)
 
@@ -257,7 +258,7 @@ class _Known:
 
 
 def random_starts(point: Array, number: int, factor: float, generator: np.random.Generator) -> Array:
-    """Return the point and ``number − 1`` more (number, p), each parameter off by a log-uniform factor from 1/factor to factor."""
+    """Return the point and ``number − 1`` others (number, p), each parameter times a log-uniform factor from 1/factor to factor."""
     spread = np.log(factor)
     off = generator.uniform(-spread, spread, (count("starts", number) - 1, len(point)))
     return np.concatenate([point[None], point + off])
@@ -272,28 +273,28 @@ def fit(
     seed: int = 0,
     threads: int = 1,
     intervals: bool = True,
-    progress: Callable[[int], None] | None = None,
+    progress: Callable[[str], None] | None = None,
 ) -> Tuning:
-    """Return the most likely parameters with their intervals.
+    """Return the maximum-likelihood parameters with their intervals.
 
     Parameters
     ----------
     objective : Objective
-        Likelihood of the innovations (:func:`likelihood`), of the errors, or another of this package.
+        Likelihood of the innovations (:func:`likelihood`), of the errors (:func:`error_objective`), or another of this package.
     priors : mapping of str to Prior, optional
         Prior knowledge by parameter; the result is then the maximum of the posterior density.
     starts : int, default 4
-        Searches: the first from the setup's own values, the others from random starts.
+        Number of searches: the first from the setup's values, the others from random starts.
     factor : float, default 30
-        Random starts differ from the setup's values by factors of up to this, either way.
+        Maximum factor, up or down, between random starts and the setup's values.
     seed : int, default 0
-        Of the random starts.
+        Seed of the random starts.
     threads : int, default 1
-        Searches at once.
+        Number of searches in parallel.
     intervals : bool, default True
-        Follow the profile likelihood where a parameter is not well determined.
+        Whether to evaluate the profile likelihood of parameters that are not well determined.
     progress : callable, optional
-        Called with the number of searches just finished, and again for each parameter's interval.
+        Called after each evaluation of the objective with the progress, such as ``"searches: 1 of 4, 23 evaluations"``.
 
     Returns
     -------
@@ -308,21 +309,22 @@ def fit(
     References
     ----------
     F. C. Schweppe, Evaluation of likelihood functions for Gaussian signals, IEEE Trans. Information Theory 11(1), 1965.
-    H. White, Maximum likelihood estimation of misspecified models, Econometrica 50(1), 1982 (intervals where the model does not hold).
+    H. White, Maximum likelihood estimation of misspecified models, Econometrica 50(1), 1982 (intervals if the model does not hold).
     """
     known = dict(priors or {})
     known_keys("priors", known, objective.names)
     if not factor > 1.0:
-        raise InputError(f"factor is {factor}; random starts need one greater than 1")
-    report = progress or (lambda done: None)
+        raise InputError(f"factor is {factor}; it must be greater than 1")
     points = np.clip(random_starts(objective.start, starts, factor, np.random.default_rng(seed)), *objective.limits)
+    stage = _Stage(progress)
+    objective = replace(objective, evaluated=stage.evaluated)
 
     with ThreadPoolExecutor(threads) as pool:
-        optima = list(_reported(report, pool.map(lambda point: search(objective, point, known), points)))
+        optima = stage.each("searches", pool.map(lambda point: search(objective, point, known), points), len(points))
     best = min(optima, key=lambda optimum: optimum.local.value)
     if not best.converged:
         raise InputError(
-            "the search did not settle in 200 steps; free fewer parameters, or give priors for those that the record does not determine"
+            "the search did not converge in 200 steps; free fewer parameters, or give priors for those that the record does not determine"
         )
     errors = _errors(objective, best)
 
@@ -332,7 +334,8 @@ def fit(
         return _wald(best, j, float(errors.standard[j]))
 
     with ThreadPoolExecutor(threads) as pool:
-        ranges = list(_reported(report, pool.map(interval, range(len(points[0])))))
+        ranges = stage.each("intervals", pool.map(interval, range(len(points[0]))), len(points[0]))
+    stage.what = "parameters not identified"
     point = _with_means(objective, best.point, ranges, known)
     misfit = errors.misfit and not objective.composite
 
@@ -368,7 +371,7 @@ def fit(
 
 
 def _with_means(objective: Objective, point: Array, ranges: Sequence[_Known], priors: Mapping[str, Prior]) -> Array:
-    """Return a point with the parameters that are not identified at their means, and the others the most likely beside them."""
+    """Return a point with the parameters that are not identified at their means, and the others most likely given these."""
     loose = [j for j, one in enumerate(ranges) if not one.identified]
     if not loose:
         return point.copy()
@@ -377,35 +380,48 @@ def _with_means(objective: Objective, point: Array, ranges: Sequence[_Known], pr
     return search(objective, moved, priors, fixed=loose).point
 
 
-def _reported(report: Callable[[int], None], results: Iterable[T]) -> Iterator[T]:
-    """Yield the results, each reported when it is there."""
-    for result in results:
-        report(1)
-        yield result
+class _Stage:
+    """Progress of a fit, reported after each evaluation: the number of evaluations of a search is not known beforehand."""
+
+    def __init__(self, progress: Callable[[str], None] | None) -> None:
+        self.progress, self.what, self.evaluations = progress, "", 0
+
+    def evaluated(self) -> None:
+        self.evaluations += 1
+        if self.progress is not None:
+            self.progress(f"{self.what}, {self.evaluations} evaluations")
+
+    def each(self, what: str, results: Iterable[T], number: int) -> list[T]:
+        found: list[T] = []
+        self.what = f"{what}: 0 of {number}"
+        for result in results:
+            found.append(result)
+            self.what = f"{what}: {len(found)} of {number}"
+        return found
 
 
 class _Errors(NamedTuple):
-    """How well the best point is known."""
+    """Uncertainty of the best point."""
 
     covariance: Array
     """Covariance of the logarithms by the information (p, p)."""
     standard: Array
     """Standard errors of the logarithms (p,)."""
     swollen: Array
-    """Standard errors over those by the information (p,)."""
+    """Ratio of the standard errors to those by the information (p,)."""
     misfit: bool
 
 
 def _errors(objective: Objective, best: Optimum) -> _Errors:
-    """Return the errors of the best point: by the information, or by the sandwich where the objective is not the innovations' own."""
+    """Return the errors of the best point: by the information, or by the sandwich for a misfit or a composite objective."""
     local, information = best.local, best.local.information
-    if objective.curvature is not None:  # its own, and the priors', where the point is a minimum by it
+    if objective.curvature is not None:  # the curvature with that of the priors, if positive definite
         own = objective.curvature(best.point) + information - local.derivatives.information
         information = own if np.linalg.eigvalsh(own)[0] > 0.0 else information
     covariance, robust = covariances(information, local.derivatives.score)
     curvature, sandwich = np.sqrt(np.diag(covariance)), np.sqrt(np.diag(robust))
     misfit = bool(np.any(sandwich > MISFIT * curvature))
-    # A likelihood whose curvature promises too much falls too fast by the square of that.
+    # A likelihood whose standard errors are too small by a factor falls too fast by its square.
     swollen = np.ones(len(best.point))
     if misfit or objective.composite:
         swollen = np.maximum(sandwich / curvature, 0.0 if objective.composite else 1.0)
@@ -413,7 +429,7 @@ def _errors(objective: Objective, best: Optimum) -> _Errors:
 
 
 def rescaled(tuning: Tuning, factor: float) -> Tuning:
-    """Return a tuning with every σ of its filter scaled alike, which the size of the attitude error does not determine."""
+    """Return a tuning with all σ of its filter scaled, because the RMS attitude error does not determine a common scale."""
     positive("factor", factor)
     names = ("value", "most_likely", "lower", "upper")
     own = [1.0 if one.name.endswith("_time") else factor for one in tuning.parameters]
@@ -431,17 +447,22 @@ def rescaled(tuning: Tuning, factor: float) -> Tuning:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Slices:
-    """The likelihood along each parameter, the others at their most likely values."""
+    """The likelihood along each parameter, with the others at their most likely values."""
 
     names: tuple[str, ...]
     values: Array
     """Values of the parameter (p, k), SI."""
     fallen: Array
-    """2 Δℓ: by how much twice the log likelihood lies below its best (p, k)."""
+    """2 Δℓ: decrease of twice the log likelihood from its maximum (p, k)."""
 
 
-def slices(objective: Objective, tuning: Tuning, *, number: int = 24) -> Slices:
-    """Return slices of the objective through the tuned point, over somewhat more than each interval; priors are left out."""
+def slices(objective: Objective, tuning: Tuning, *, number: int = 25) -> Slices:
+    """Return slices of the objective through the tuned point, somewhat wider than each interval, without priors.
+
+    The points, an odd number, are densest about the tuned point, which is the middle one: a slice may be much narrower than the interval,
+    for which the other parameters vary too.
+    """
+    grid = np.linspace(-1.0, 1.0, number) ** 3
     values, fallen = [], []
     for j, one in enumerate(tuning.parameters):
         width = 2.5 * min(max(one.standard_error, 1e-3), 1.0)
@@ -449,20 +470,20 @@ def slices(objective: Objective, tuning: Tuning, *, number: int = 24) -> Slices:
         ends = np.log([max(min(one.lower, one.value), one.value * np.exp(-2.0 * width), 1e-300), max(top, one.value)])
         ends += np.array([-0.3, 0.3]) * max(float(np.ptp(ends)), 1e-3)
         points = np.tile(tuning.point, (number, 1))
-        points[:, j] = np.linspace(ends[0], ends[1], number)
-        found = objective.minus_log(np.concatenate([tuning.point[None], points]) - np.log(tuning.scale))
+        points[:, j] += np.where(grid < 0.0, tuning.point[j] - ends[0], ends[1] - tuning.point[j]) * grid
+        found = objective.minus_log(points - np.log(tuning.scale))
         values.append(np.exp(points[:, j]))
-        fallen.append(2.0 * (found[1:] - min(found[0], found[1:].min())))
+        fallen.append(2.0 * (found - found.min()))
     return Slices(names=objective.names, values=np.array(values), fallen=np.array(fallen))
 
 
 def covariances(information: Array, parts: Array) -> tuple[Array, Array]:
     """Return the covariance of the log parameters by the information (p, p), and by the sandwich F⁻¹ J F⁻¹.
 
-    J is the scatter of the gradient over parts (m, p) of the records (White 1982; parts long against the innovations' correlation make it
-    hold for innovations that are not white). Where there is no information the variance is infinite, to a large number.
+    J is the scatter of the gradient over parts (m, p) of the records (White 1982); with parts longer than the correlation of the
+    innovations it holds for innovations that are not white. Without information the variance is a large number instead of infinite.
     """
-    # A parameter that nothing depends on has no row to invert; a pseudo-inverse would make its variance zero.
+    # For a parameter without effect the pseudo-inverse would give a variance of zero.
     F = information + np.diag(np.maximum(MIN_INFORMATION - np.diag(information), 0.0))
     scale = np.sqrt(np.diag(F))
     inverse = np.linalg.pinv(F / np.outer(scale, scale), rcond=1e-10, hermitian=True) / np.outer(scale, scale)
@@ -484,7 +505,7 @@ def _wald(best: Optimum, j: int, error: float) -> _Known:
 def _profiled(
     objective: Objective, best: Optimum, j: int, priors: Mapping[str, Prior], error: float, swollen: float
 ) -> _Known:
-    """Follow the profile likelihood of parameter j to where it has fallen enough on either side."""
+    """Return the interval of parameter j by its profile likelihood."""
     from scipy.integrate import simpson
     from scipy.optimize import brentq
 
@@ -524,7 +545,7 @@ def _profiled(
     value = float(np.exp(centre))
     identified = refuted and top is not None
     if not identified and top is not None:
-        # Mean of σ under the profile likelihood, every σ of zero or more alike: between nothing and the bound, never either.
+        # Mean of σ under the profile likelihood with a uniform prior on σ ≥ 0: strictly between zero and the bound.
         warm[:] = best.point
         grid = np.linspace(0.0, 2.0 * upper, 17)
         with np.errstate(divide="ignore"):
@@ -540,11 +561,11 @@ def _note(
     if name in priors:
         share = 1.0 - priors[name].spread ** -2 / local.information[j, j]
         if share < 0.5:
-            return "the prior says so, this record adds little"
+            return "from the prior; this record adds little"
     if not found.identified:
         return NOT_IDENTIFIED
     if doubtful and name != SCALE:
-        return "in doubt: the innovations are not those of such a filter"
+        return "in doubt: the innovations contradict the filter's model"
     if found.lower == 0.0 or found.upper > 4.0 * found.lower:
         return "identified, but poorly"
     return "identified" if error < WELL_KNOWN else "identified roughly"

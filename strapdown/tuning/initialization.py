@@ -1,4 +1,4 @@
-"""Where the filter starts on a record that is tuned on."""
+"""Initial state of the filter on a record for tuning."""
 
 from __future__ import annotations
 
@@ -21,26 +21,26 @@ from strapdown.tuning.parameters import SCALE
 
 
 def recording_setup(parameters: AhrsParameters | None = None) -> FilterSetup:
-    """Return the setup of the filter that :func:`strapdown.ahrs.estimate` runs, of ``ahrs.MOTIONS["any"]`` by default."""
+    """Return the setup of the filter that :func:`strapdown.ahrs.estimate` runs. Default: that of ``ahrs.MOTIONS["any"]``."""
     return (parameters or ahrs.MOTIONS["any"]).setup
 
 
 def recording_case(recording: Recording, parameters: AhrsParameters | None = None) -> Case:
-    """Return a recording as :func:`strapdown.ahrs.estimate` filters it: from its first quiet second on, with its reference.
+    """Return a recording as filtered by :func:`strapdown.ahrs.estimate`: from its first quiet second, with its reference.
 
     Delays between sensors are not compensated.
 
     Parameters
     ----------
     recording : Recording
-        With an accelerometer.
+        Recording with an accelerometer.
     parameters : AhrsParameters, optional
-        Default ``ahrs.MOTIONS["any"]``.
+        Default: ``ahrs.MOTIONS["any"]``.
 
     Returns
     -------
     Case
-        Fixed frame East-North-Up, as of :func:`strapdown.ahrs.estimate`.
+        The record with its initial state; fixed frame East-North-Up, as in :func:`strapdown.ahrs.estimate`.
 
     Raises
     ------
@@ -61,40 +61,40 @@ def recording_case(recording: Recording, parameters: AhrsParameters | None = Non
 
 
 INDEPENDENT = 1.0
-"""Spacing, s, of measurements of a recording whose disturbances are nearly independent."""
+"""Spacing of measurements of a recording for nearly independent disturbances, s."""
 
 
 def by_innovations(names: Sequence[str] | None, spacing: float = 0.0, **more: Any) -> tuple[Sequence[str], float]:
-    """Return the parameters of a recording's filter that innovations can tune, and the spacing, s, of those: the scale of all σ alone.
+    """Return the parameters of a recording's filter that innovations can tune, only the scale of all σ, and the measurement spacing, s.
 
-    On the eleven trials of BROAD that leaves the error as it is, and the NEES per state is 0.01 to 0.91 (0.13 to 10 before). With all σ
-    free the error grows on nine of them, from 3.0° to 7.7° on the average; scaled by all innovations, the NEES is up to 28. ``more`` are
-    other options that need a likelihood that is right.
+    On the eleven trials of BROAD this leaves the error unchanged, and the NEES per state is 0.01 to 0.91 (0.13 to 10 before). With all σ
+    free the error grows on nine of them, from 3.0° to 7.7° on average; scaled by all innovations, the NEES is up to 28. ``more`` holds
+    other options, which need a valid likelihood.
     """
     wanted = [name for name in names or [] if name != SCALE] + [name for name, given in more.items() if given]
     if wanted:
         raise InputError(
-            f"{wanted[0]} is more than the innovations of a recording show: its disturbances last, so that a likelier filter is as a rule "
-            f"worse. Tune {SCALE} alone, as by default, or by the errors (truth, rmse) where there is a reference"
+            f"{wanted[0]} cannot be tuned by the innovations of a recording: its disturbances last, so a filter of larger likelihood is "
+            f"usually worse. Tune only {SCALE}, the default, or by the errors (truth, rmse) if there is a reference"
         )
     return (SCALE,) if names is None else names, spacing or INDEPENDENT
 
 
 def record_case(record: ImuRecord, chosen: FilterSetup, *, name: str = "", seed: int | None = None) -> Case:
-    """Return a record with the filter's initial state on it.
+    """Return a record with the filter's initial state.
 
     Parameters
     ----------
     record : ImuRecord
         Gyro increments and measurements.
     chosen : FilterSetup
-        Its σ of the initial errors.
+        Filter; defines the σ of the initial errors.
     name : str, optional
-        What errors and reports call the record.
+        Name of the record in messages and reports.
     seed : int, optional
-        Start at the truth with errors drawn from the setup's σ. Default: the attitude of the first measurements
-        (:func:`strapdown.estimation.first_state`) and zero bias; where the initial σ are large against the measurements both are soon
-        forgotten.
+        If given, start at the truth with errors drawn from the setup's σ. Default: the attitude of the first measurements
+        (:func:`strapdown.estimation.first_state`) and zero bias; their errors decay soon if the initial σ are large compared with those
+        of the measurements.
 
     Returns
     -------
@@ -104,7 +104,7 @@ def record_case(record: ImuRecord, chosen: FilterSetup, *, name: str = "", seed:
     Raises
     ------
     InputError
-        If the first measurements do not give the attitude.
+        If the first measurements do not determine the attitude.
     """
     if seed is not None and record.truth is not None:
         return Case(record=record, initial=setup.drawn_state(chosen, record, seed), name=name)
@@ -124,11 +124,11 @@ NOISES = (
     "quantization",
     "rate_resolution",
 )
-"""Parameters of a gyro that its two tuned noises represent."""
+"""Parameters of a gyro that the two tuned noise parameters represent."""
 
 
 def one_gyro(specs: Mapping[str, GyroSpec]) -> None:
-    """Refuse records, by name, whose gyros are of different noise: one set of parameters would fit none of them."""
+    """Raise if the records, by name, have gyros of different noise, which one set of parameters would not fit."""
     names = list(specs)
     for name in names[1:]:
         for field in NOISES:
@@ -137,5 +137,5 @@ def one_gyro(specs: Mapping[str, GyroSpec]) -> None:
                 k = int(np.argmax(first != other))
                 raise InputError(
                     f"{name} was recorded with another gyro than {names[0]}: {field} is {other[k]:.4g} and {first[k]:.4g} (SI); one filter "
-                    "fits records of one kind of gyro, so tune each kind by itself"
+                    "fits records of one type of gyro, so tune each type separately"
                 )

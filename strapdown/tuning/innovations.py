@@ -20,7 +20,7 @@ import numpy as np
 from strapdown import coning
 from strapdown.checks import Array
 from strapdown.estimation import setup
-from strapdown.estimation.schedule import Schedule, schedule
+from strapdown.estimation.schedule import Schedule, schedule, selected
 from strapdown.estimation.setup import FilterSetup
 from strapdown.estimation.setup.states import States
 from strapdown.estimation.states import covariance_matrices, pack
@@ -29,16 +29,22 @@ from strapdown.kernels import likelihood_outliers
 from strapdown.kernels.lane_values import WIDTH
 from strapdown.kernels.machine import compiled, read_only
 from strapdown.kernels.walk import walk
-from strapdown.records import Estimate, ImuRecord
-from strapdown.tuning.objective import OUTLIERS, STEP, Case, Derivatives, Objective, by_part, joined, of_sensors, posed
+from strapdown.records import Estimate, ImuRecord, Innovations
+from strapdown.tuning.objective import (
+    STEP,
+    Case,
+    Derivatives,
+    Objective,
+    by_part,
+    joined,
+    of_sensors,
+    outliers_at,
+    posed,
+)
 from strapdown.tuning.parameters import ARW, INITIAL_ATTITUDE, INITIAL_BIAS, RRW, SCALE, SIGMA, axis_of
 
 MOST = WIDTH - 1
 """Derivatives that one pass over a record gives."""
-SHARES = (1e-4, 0.4)
-"""Shares of outliers that are searched: what is more frequent is no outlier."""
-SCALES = (2.0, 100.0)
-"""Scales of outliers that are searched: what is hardly wider is none either."""
 CURVATURE_STEP = 0.02
 """Step of a log parameter for the differences of the score that are the curvature."""
 
@@ -61,24 +67,6 @@ class LaneLikelihood(Objective):
     """Minus the log likelihood of the innovations, eight points at once; with outliers where their parameters are among the names."""
 
     prepared: tuple[Prepared, ...] = field(repr=False)
-
-    @property
-    def base(self) -> LaneLikelihood:
-        """The same without outliers."""
-        return replace(self, names=self.names[:-2], start=self.start[:-2]) if self.mixed else self
-
-    @property
-    def mixed(self) -> bool:
-        """Whether some measurements are outliers (:mod:`strapdown.tuning.outliers`)."""
-        return self.names[-2:] == OUTLIERS
-
-    @property
-    def limits(self) -> tuple[Array, Array]:
-        """Least and largest logarithm of each parameter (p,), (p,)."""
-        low, high = super().limits
-        if self.mixed:
-            low[-2:], high[-2:] = np.log([SHARES, SCALES]).T
-        return low, high
 
     def minus_log(self, points: Array) -> Array:
         """Return minus the log likelihood, without its constant, at several points (k, p): (k,)."""
@@ -110,7 +98,7 @@ class LaneLikelihood(Objective):
     def _differences(self, case: Prepared, point: Array, block: tuple[int, ...]) -> Derivatives:
         rows = np.concatenate([point[None], point + STEP * np.eye(len(point))[list(block)]])
         found = self._pass(case, rows, free=len(block))
-        lower = found["outer" if self.mixed else "information"]  # of the mixture there are no sensitivities
+        lower = found["information"]
         return Derivatives(
             value=found["minus_log"][case.used, 0],
             score=found["score"][case.used],
@@ -123,14 +111,14 @@ class LaneLikelihood(Objective):
         states = np.moveaxis(found, 1, 2)
         return states[..., :4], states[..., 4:7], covariance_matrices(states[..., 7:])
 
-    def innovations(self, number: int, points: Array) -> tuple[Array, Array]:
-        """Return innovations and variances (events, 3, k) of record ``number`` at up to eight points (k, p), rows a measurement lacks 0."""
-        found = self._pass(self.prepared[number], points, innovations=True)["innovations"]
-        return found[:, :, 0, : len(points)], found[:, :, 1, : len(points)]
-
-    def probabilities(self, point: Array) -> tuple[Array, ...]:
-        """Return for each record, in order of its measurements, the probability that each is an outlier (events,)."""
-        return tuple(self._pass(case, point[None])["probability"][:, 0] for case in self.prepared)
+    def judged(self, point: Array) -> list[tuple[str, Array]]:
+        """Return of each record and sensor the probability that a measurement is an outlier, and the share of its own noise (m, 2)."""
+        found = []
+        for case in self.prepared:
+            rows = self._pass(case, point[None], judged=True)["probability"]
+            used = case.used[np.searchsorted(case.cuts, case.events.time, side="left")]
+            found += [(name, rows[used & (case.events.sensor == k)]) for k, name in enumerate(case.events.sensors)]
+        return found
 
     def lanes(self, case: Prepared, points: Array) -> dict[str, Array]:
         """Return what up to eight points (k, p) give a kernel, flat: gyro noise, factors of sensors' variances, state, outliers."""
@@ -151,14 +139,11 @@ class LaneLikelihood(Objective):
         state[7:13] *= angle**2
         state[13:22] *= angle * bias
         state[22:] *= bias**2
-        outliers = np.empty(0)
-        if self.mixed:  # shares beyond the search for its differences and profiles
-            outliers = np.concatenate([np.minimum(np.exp(rows[:, -2]), 0.9), np.exp(2.0 * rows[:, -1])])
         return {
             "noise": np.concatenate([white, walk]),
             "factors": factors.ravel(),
             "state": state.ravel(),
-            "outliers": outliers,
+            "outliers": np.concatenate(outliers_at(rows)) if self.mixed else np.empty(0),
         }
 
     def _pass(
@@ -168,20 +153,17 @@ class LaneLikelihood(Objective):
         *,
         free: int = 0,
         epochs: np.ndarray | None = None,
-        innovations: bool = False,
+        judged: bool = False,
     ) -> dict[str, Array]:
         """Run up to eight points over one record; return what it writes, by names of :class:`strapdown.kernels.likelihood.Outputs`."""
         kept = np.empty(0, np.int64) if epochs is None else np.ascontiguousarray(epochs, np.int64)
-        parts, events = len(case.cuts) + 1, len(case.events.time)
+        parts = len(case.cuts) + 1
         room = {
             "minus_log": np.zeros((parts, WIDTH)),
-            "squares": np.zeros((parts, WIDTH)),
             "score": np.zeros((parts, free)),
             "information": np.zeros((parts, free, free)),
-            "outer": np.zeros((parts, free, free)),
             "states": np.empty((len(kept), 28, WIDTH)),
-            "innovations": np.zeros((events if innovations else 0, 3, 2, WIDTH)),
-            "probability": np.empty((events if self.mixed else 0, 2)),
+            "probability": np.empty((len(case.events.time) if judged else 0, 2)),
         }
         body = kernel.Body(
             **self.lanes(case, points),
@@ -191,7 +173,7 @@ class LaneLikelihood(Objective):
             step=STEP,
             room=np.empty(kernel.ROOM),
         )
-        flat = ("minus_log", "squares", "states", "innovations")
+        flat = ("minus_log", "states")
         out = kernel.Outputs(**{name: value.reshape(-1) if name in flat else value for name, value in room.items()})
         bodies = (likelihood_outliers, kernel) if self.mixed else (kernel,)
         run = compiled(walk, *bodies)
@@ -212,20 +194,21 @@ class RunLikelihood(Objective):
     def minus_log(self, points: Array) -> Array:
         """Return minus the log likelihood, without its constant, at several points (k, p): (k,)."""
         runs = self._runs(np.atleast_2d(points))
-        each = [[0.5 * float(np.sum(np.log(s) + e * e / s)) for e, s, _ in found] for found in runs]
-        return np.asarray(np.sum(np.array(each), axis=1))
+        return np.array([sum(float(np.sum(value)) for value, *_ in found) for found in runs])
 
     def derivatives(self, point: Array) -> Derivatives:
         """Return the likelihood and its derivatives at a point: p + 1 runs over each record."""
         runs = self._runs(np.concatenate([point[None], point + STEP * np.eye(len(point))]))
         return joined([self._differences(*one) for one in zip(*runs, strict=True)])
 
-    def _differences(self, *runs: tuple[Array, Array, np.ndarray]) -> Derivatives:
-        e, s, part = runs[0]
-        de, ds = (np.stack([(one[k] - runs[0][k]) / STEP for one in runs[1:]], axis=1) for k in (0, 1))
+    def _differences(self, *runs: tuple[Array, ...]) -> Derivatives:
+        value, part, e, s = runs[0]
+        if self.mixed:
+            score = np.stack([(one[0] - value) / STEP for one in runs[1:]], axis=1)
+            return by_part(value, score, score.T @ score, part, self.parts)
+        de, ds = (np.stack([(one[k] - runs[0][k]) / STEP for one in runs[1:]], axis=1) for k in (2, 3))
         score = e[:, None] * de / s[:, None] + 0.5 * ds * ((1.0 - e * e / s) / s)[:, None]
         information = (de / s[:, None]).T @ de + 0.5 * (ds / s[:, None] ** 2).T @ ds
-        value = 0.5 * (np.log(s) + e * e / s)
         return by_part(value, score, information, part, self.parts)
 
     def curvature(self, point: Array) -> Array:  # type: ignore[override]
@@ -235,27 +218,39 @@ class RunLikelihood(Objective):
         rows = np.array([(ahead - back) / (2.0 * CURVATURE_STEP) for ahead, back in ends])
         return np.asarray(0.5 * (rows + rows.T))
 
-    def _runs(self, points: Array) -> list[list[tuple[Array, Array, np.ndarray]]]:
-        """Return innovations, their variances, and the parts that they belong to, of every point and record."""
-        setups = [self.setup(point) for point in points]
-        found = self.each(self._run, [(chosen, case) for chosen in setups for case in self.cases])
+    def judged(self, point: Array) -> list[tuple[str, Array]]:
+        """Return of each record and sensor the probability that a measurement is an outlier, and the share of its own noise (m, 2)."""
+        found = [self._innovations(point, case) for case in self.cases]
+        return [(name, np.asarray(one.weight)[:, 1:]) for by_sensor in found for name, one in by_sensor.items()]
+
+    def _runs(self, points: Array) -> list[list[tuple[Array, ...]]]:
+        """Return of every point and record what each term adds, the part that it belongs to, and innovations with variances."""
+        found = self.each(self._run, [(point, case) for point in points for case in self.cases])
         return [found[k : k + len(self.cases)] for k in range(0, len(found), len(self.cases))]
 
-    def _run(self, chosen: FilterSetup, case: Case) -> tuple[Array, Array, np.ndarray]:
+    def _run(self, point: Array, case: Case) -> tuple[Array, ...]:
+        first, last = case.span
+        found = []
+        for one in self._innovations(point, case).values():
+            place = ((one.time - first) / (last - first) * self.parts).astype(np.int64)
+            e, s = one.innovation.ravel(), one.variance.ravel()
+            value = 0.5 * (np.log(s) + e * e / s) if one.weight is None else one.weight[:, 0]
+            places = np.repeat(np.minimum(place, self.parts - 1), len(value) // max(len(place), 1))
+            found.append((value, places, e, s))
+        return tuple(np.concatenate(column) for column in zip(*found, strict=True))
+
+    def _innovations(self, point: Array, case: Case) -> dict[str, Innovations]:
+        """Return the innovations that count of a record, by sensor."""
+        chosen = self.setup(point)
         # The filter of optional states has the innovations of measurements whose noise differs by axis, with none too.
         used = replace(chosen, states=States() if chosen.states is None else chosen.states)
         # Of the states only the first and the last are kept.
         every = max(1, len(case.record.increments) // used.integration.samples)
-        estimate = self._estimate(used, case, every=every, gate=None, robust=None)
+        mixture: Any = tuple(map(float, outliers_at(point))) if self.mixed else None
+        estimate = self._estimate(used, case, every=every, gate=None, robust=None, outliers=mixture)
         first, last = case.span
-        found = []
-        for one in estimate.innovations.values():
-            inside = (one.time >= first) & (one.time <= last)
-            place = ((one.time[inside] - first) / (last - first) * self.parts).astype(np.int64)
-            places = np.repeat(np.minimum(place, self.parts - 1), one.innovation.shape[1])
-            found.append((one.innovation[inside].ravel(), one.variance[inside].ravel(), places))
-        e, s, part = (np.concatenate(column) for column in zip(*found, strict=True))
-        return e, s, part
+        found = estimate.innovations.items()
+        return {name: selected(one, (one.time >= first) & (one.time <= last)) for name, one in found}
 
     def estimates(self, number: int, points: Array, epochs: np.ndarray) -> tuple[Array, Array, Array]:
         """Return q_fb (m, k, 4), bias (m, k, 3) and P (m, k, 6, 6) on record ``number`` at edges (m,), at points (k, p)."""
@@ -272,6 +267,7 @@ class RunLikelihood(Objective):
         return setup.run(self.modelled(case, chosen), applied, initial, **options)
 
 
+Likelihood = LaneLikelihood | RunLikelihood
 Made = TypeVar("Made", bound=Objective)
 
 
@@ -288,7 +284,7 @@ def likelihood(
     spacing: float = 0.0,
     parts: int = 20,
     threads: int = 1,
-) -> LaneLikelihood | RunLikelihood:
+) -> Likelihood:
     """Return the likelihood of the free parameters, by the innovations of the filter on some records.
 
     Parameters
@@ -317,7 +313,7 @@ def likelihood(
     return with_engine(posed(cases, chosen, free, spacing=spacing, parts=parts, threads=threads))
 
 
-def with_engine(problem: Objective, *, lanes: bool = True) -> LaneLikelihood | RunLikelihood:
+def with_engine(problem: Objective, *, lanes: bool = True) -> Likelihood:
     """Return the likelihood of a problem, eight points at once where the filter can be run so and ``lanes`` allows it."""
     records = [problem.modelled(case, problem.chosen) for case in problem.cases]
     by_axis = any(axis_of(name) for name in problem.names) or any(

@@ -39,6 +39,10 @@ REACH = 16.0
 """How far a log parameter may go from where it starts."""
 OUTLIERS = (OUTLIER_SHARE, OUTLIER_SCALE)
 """Parameters of the outliers, the last two of a likelihood that has them."""
+SHARES = (1e-4, 0.4)
+"""Shares of outliers that are searched: what is more frequent is no outlier."""
+SCALES = (2.0, 100.0)
+"""Scales of outliers that are searched: what is hardly wider is none either."""
 LARGEST_SCALE = 0.1
 """σ of scale factors and misalignments from which on a filter that is linear in them makes no sense: noise would pass for a turn."""
 QUICKEST, SLOWEST = 0.05, 100.0
@@ -99,6 +103,11 @@ class Derivatives:
     """Fisher's information from the sensitivities of the innovations (p, p), or Σ g gᵀ over the measurements, g the gradient of each."""
 
 
+def outliers_at(points: Array) -> tuple[Array, Array]:
+    """Return share and variance, over that of the others, of outliers at points (…, p); differences and profiles go beyond the search."""
+    return np.minimum(np.exp(points[..., -2]), 0.9), np.exp(2.0 * points[..., -1])
+
+
 def joined(found: Sequence[Derivatives]) -> Derivatives:
     """Return the derivatives of several records together."""
     return Derivatives(
@@ -134,15 +143,25 @@ class Objective:
     """Spans of time of each record whose gradients are kept apart."""
     threads: int = 1
     spacing: float = 0.0
+    evaluated: Callable[[], object] = field(default=lambda: None, repr=False)
+    """Called after each evaluation of a search."""
     composite: ClassVar[bool] = False
     """Whether its curvature is no information, so that errors come from the scatter of its gradient."""
     curvature: ClassVar[Callable[[Any, Array], Array] | None] = None
     """Second derivatives at a point (p, p), where the information of the search is not good enough for errors."""
 
     @property
+    def mixed(self) -> bool:
+        """Whether some measurements are outliers (:mod:`strapdown.tuning.outliers`)."""
+        return self.names[-2:] == OUTLIERS
+
+    @property
     def limits(self) -> tuple[Array, Array]:
         """Least and largest logarithm of each parameter that a search looks at (p,), (p,)."""
-        return self.start - REACH, self.start + REACH
+        low, high = self.start - REACH, self.start + REACH
+        if self.mixed:
+            low[-2:], high[-2:] = np.log([SHARES, SCALES]).T
+        return low, high
 
     def unit(self, name: str) -> Unit:
         """Return the unit that a parameter is printed in."""

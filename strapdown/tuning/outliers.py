@@ -4,7 +4,8 @@ A gate's threshold cannot be tuned by the likelihood of what passes it: the narr
 modelled: with probability ε (``outliers.share``) the noise of a measurement is κ times as large (``outliers.scale``; Tukey's contaminated
 normal, 1960). Each innovation is then a mixture of two normals, and share and scale are estimated with the filter's other parameters, which
 so no longer answer for the outliers. The filter of this likelihood makes each update both ways and goes on with mean and covariance of the
-mixture (:func:`strapdown.kernels.likelihood_outliers`). Share and scale are those of all sensors together.
+mixture (:mod:`strapdown.kernels.likelihood_outliers`). Share and scale are those of all sensors together. The noise of an
+angular acceleration, at a lever arm, is taken to be larger with that of the accelerometer.
 
 The gate refuses where an outlier has become the likelier explanation (Bayes): with d rows and κ′ the ratio of σ of the innovations,
 
@@ -24,10 +25,9 @@ import numpy as np
 from strapdown.checks import Array, InputError, positive
 from strapdown.estimation.gating import Gate
 from strapdown.estimation.setup import FilterSetup
-from strapdown.kernels.lane_values import WIDTH
 from strapdown.tuning.fitting import Estimated, Tuning
-from strapdown.tuning.innovations import MOST, SCALES, SHARES, LaneLikelihood, likelihood
-from strapdown.tuning.objective import OUTLIERS, Case
+from strapdown.tuning.innovations import Likelihood, likelihood
+from strapdown.tuning.objective import OUTLIERS, SCALES, SHARES, Case
 from strapdown.tuning.parameters import OUTLIER_SCALE, OUTLIER_SHARE
 from strapdown.vectors import KINDS
 
@@ -47,22 +47,12 @@ def contaminated_likelihood(
     share: float = SHARE,
     scale: float = SCALE,
     threads: int = 1,
-) -> LaneLikelihood:
-    """Return the likelihood of the free parameters, at most five, and of the outliers' share and scale, which are always free.
-
-    Its ``base`` is the likelihood without outliers, and its ``probabilities`` those that each measurement is one.
-    """
+) -> Likelihood:
+    """Return the likelihood of the free parameters, and of the outliers' share and scale, which are always free."""
     for name, value, (least, most) in (("share", share, SHARES), ("scale", scale, SCALES)):
         if not least <= positive(name, value) <= most:
             raise InputError(f"{name} of the outliers is {value:g}; it must lie between {least:g} and {most:g}")
     base = likelihood(cases, chosen, free, threads=threads)
-    if not isinstance(base, LaneLikelihood):
-        raise InputError(
-            "outliers are modelled for filters without optional states, and for sensors with one sigma for all axes; leave out the gate, "
-            "or the states and the single axes"
-        )
-    if len(base.names) + len(OUTLIERS) > MOST:
-        raise InputError(f"{len(base.names)} parameters are free; beside outliers at most {MOST - 2} can be")
     return replace(base, names=(*base.names, *OUTLIERS), start=np.concatenate([base.start, np.log([share, scale])]))
 
 
@@ -84,7 +74,7 @@ class TunedGate:
     scale: Estimated
 
 
-def tuned_gate(objective: LaneLikelihood, tuning: Tuning, *, draws: int = 2000) -> TunedGate:
+def tuned_gate(objective: Likelihood, tuning: Tuning, *, draws: int = 2000) -> TunedGate:
     """Return the gate at the Bayes threshold, its interval from that of share and scale."""
     share, scale = tuning[OUTLIER_SHARE], tuning[OUTLIER_SCALE]
     seen = _seen(objective, tuning.point[:-2])
@@ -112,21 +102,17 @@ def tuned_gate(objective: LaneLikelihood, tuning: Tuning, *, draws: int = 2000) 
     )
 
 
-def log_likelihood(cases: Sequence[Case], tuned: LaneLikelihood, result: Tuning) -> float:
+def log_likelihood(cases: Sequence[Case], tuned: Likelihood, result: Tuning) -> float:
     """Return the log likelihood of cases under the tuned filter and its outliers, in nats an innovation, as on data held out."""
     share, scale = result[OUTLIER_SHARE].value, result[OUTLIER_SCALE].value
     other = contaminated_likelihood(
         cases,
         result.setup,
-        tuned.base.names,
+        tuned.names[:-2],
         share=float(np.clip(share, *SHARES)),
         scale=float(np.clip(scale, *SCALES)),
     )
-    number = 0
-    for case in other.prepared:
-        counted = case.used[np.searchsorted(case.cuts, case.events.time, side="left")]
-        degrees = np.array([KINDS[kind] for kind in case.events.kinds])[case.events.sensor]
-        number += int(degrees[counted].sum())
+    number = sum(one.degrees * one.number for one in _seen(other, other.start[:-2]).values())
     return float(-other.minus_log(other.start)[0] / number - 0.5 * np.log(2.0 * np.pi))
 
 
@@ -140,23 +126,17 @@ class _Seen:
     """Mean share of the measurement's own noise in the variance of its innovation."""
 
 
-def _seen(objective: LaneLikelihood, point: Array) -> dict[str, _Seen]:
-    base = objective.base
-    sums: dict[str, tuple[int, int, float]] = {}
-    for number, case in enumerate(base.prepared):
-        _, variance = base.innovations(number, point[None])
-        factors = base.lanes(case, point[None])["factors"].reshape(-1, WIDTH)[:, 0]
-        part = np.searchsorted(case.cuts, case.events.time, side="left")
-        for sensor, (name, kind) in enumerate(zip(case.events.sensors, case.events.kinds, strict=True)):
-            mine = (case.events.sensor == sensor) & case.used[part]
-            if not mine.any():
-                continue
-            rows = min(KINDS[kind], 2) if kind != "attitude" else 3
-            own = case.events.vector_b[mine] if kind == "attitude" else np.tile(case.events.variance[mine], (3, 1)).T
-            share = factors[sensor] * own[:, :rows] / variance[mine, :rows, 0]
-            degrees, count, total = sums.get(name, (KINDS[kind], 0, 0.0))
-            sums[name] = degrees, count + int(mine.sum()), total + float(share.mean(axis=1).sum())
-    return {name: _Seen(degrees=d, number=count, noise=total / count) for name, (d, count, total) in sums.items()}
+def _seen(objective: Likelihood, point: Array) -> dict[str, _Seen]:
+    none = np.concatenate([point, [-np.inf, 0.0]])
+    shares: dict[str, list[float]] = {}
+    for name, rows in objective.judged(none):
+        shares.setdefault(name, []).extend(rows[:, 1])
+    kinds = {series.sensor: KINDS[series.kind] for case in objective.cases for series in case.record.vectors}
+    return {
+        name: _Seen(degrees=kinds[name], number=len(own), noise=float(np.mean(own)))
+        for name, own in shares.items()
+        if own
+    }
 
 
 def _probability(seen: dict[str, _Seen], tried: Array) -> tuple[Array, dict[str, Array]]:

@@ -1,7 +1,7 @@
-"""Parameters of a filter of one's own (:mod:`strapdown.estimation.filters.own`), by the objectives of the package's filter.
+"""Tuning of a user-defined filter (:mod:`strapdown.estimation.filters.own`) by the objectives of the package's filter.
 
-The objective is evaluated run by run of the filter, whatever it computes in, so the search needs no derivatives: Nelder & Mead's simplex
-in the logarithms of the parameters, for a handful of them.
+Each evaluation runs the filter, which need not provide derivatives: the search is the simplex of Nelder & Mead in the logarithms of the
+parameters, suitable for a few of them.
 
 >>> def make(values):  # doctest: +SKIP
 ...     return MyFilter(white=values["white"], walk=values["walk"])
@@ -34,7 +34,7 @@ TOLERANCE = 1e-4
 CURVATURE_STEP = 0.05
 """Step of a log parameter for second derivatives."""
 MAX_RUNS = 400
-"""Evaluations for each parameter after which the search is given up."""
+"""Maximum number of evaluations of the search, per parameter."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -46,9 +46,9 @@ class OwnTuning:
     values : mapping of str to float
         Best value of each parameter, in the unit of its starting value.
     relative_sigma : mapping of str to float
-        Standard deviation of each over its value, from the curvature of the likelihood of white innovations; NaN for other measures.
+        Relative standard deviation of each value, by the curvature of the likelihood of white innovations; NaN for other measures.
     value : float
-        Minus the log likelihood without its constant, or the RMS attitude error of one axis, rad.
+        Negative log likelihood without its constant, or the RMS attitude error per axis, rad.
     evaluations : int
         Number of evaluations of the objective; each runs the filter over all records.
     estimator : object
@@ -69,18 +69,18 @@ def fit_own(
     *,
     measure: OwnMeasure = "innovations",
 ) -> OwnTuning:
-    """Return the parameters of a filter of one's own that suit records best.
+    """Return the parameters of a user-defined filter that fit records best.
 
     Parameters
     ----------
     make : callable
-        Takes the values by name and returns the filter.
+        Function of the values by name that returns the filter.
     cases : sequence of Case
-        Records and where the filter starts (:func:`strapdown.tuning.record_case`).
+        Records with the filter's initial states (:func:`strapdown.tuning.record_case`).
     start : mapping
-        Parameters, all greater than zero, by name: where the search starts.
+        Starting values of the parameters by name, all greater than zero.
     measure : {"innovations", "errors", "rmse"}
-        Likelihood of the innovations, likelihood of the errors against the truth by the filter's own covariance, or the RMS attitude error.
+        Likelihood of the innovations, likelihood of the errors against the truth by the filter's covariance, or the RMS attitude error.
 
     Returns
     -------
@@ -90,7 +90,7 @@ def fit_own(
     Raises
     ------
     InputError
-        If there is no record or parameter, the filter gives no innovations (or the records no truth), or the search does not settle.
+        If there is no record or parameter, the filter gives no innovations (or the records no truth), or the search does not converge.
     """
     from scipy.optimize import minimize
 
@@ -99,7 +99,7 @@ def fit_own(
         raise InputError("there is no record to tune on; give one")
     names = list(start)
     if not names:
-        raise InputError("start names no parameter; give each with its first value")
+        raise InputError("start names no parameter; give each with its starting value")
     first = np.log([positive(f"start: {name}", start[name]) for name in names])
 
     def objective(point: Array) -> float:
@@ -111,13 +111,13 @@ def fit_own(
         return float(total[0]) if np.isfinite(total[0]) else np.inf
 
     if not np.isfinite(objective(first)):
-        raise InputError("the filter fails with the first values: its likelihood is not finite; start from others")
+        raise InputError("the filter fails with the starting values: its likelihood is not finite; give other values")
     simplex = np.concatenate([first[None], first + FIRST_STEP * np.eye(len(first))])
     options = {"initial_simplex": simplex, "xatol": TOLERANCE, "fatol": 1e-9, "maxfev": MAX_RUNS * len(first)}
     found = minimize(objective, first, method="Nelder-Mead", options=options)
     if not found.success:
         raise InputError(
-            f"the search did not settle in {MAX_RUNS * len(first)} runs of the filter; tune fewer parameters, or start nearer"
+            f"the search did not converge in {MAX_RUNS * len(first)} runs of the filter; tune fewer parameters, or start closer"
         )
     values = dict(zip(names, np.exp(found.x).tolist(), strict=True))
     sigma = _sigma(objective, found.x) if measure == "innovations" else np.full(len(names), np.nan)
@@ -131,7 +131,7 @@ def fit_own(
 
 
 def _measured(estimate: Estimate, case: Case, measure: OwnMeasure) -> Array:
-    """Return what a record adds to the objective, and how many numbers it rests on."""
+    """Return the contribution of a record to the objective, and its number of samples."""
     if measure == "innovations":
         total, number = 0.0, 0
         for innovations in estimate.innovations.values():
@@ -150,7 +150,7 @@ def _measured(estimate: Estimate, case: Case, measure: OwnMeasure) -> Array:
 
 
 def _errors(estimate: Estimate, case: Case) -> tuple[Array, Array]:
-    """Return errors and covariances at up to so many epochs with a truth, the start left out."""
+    """Return errors and covariances at the epochs with a truth, thinned to a maximum number, without the start."""
     known = reference(case, np.searchsorted(case.record.time, estimate.time))
     known = known.at(known.epochs > 0)
     known = known.at(slice(None, None, -(-len(known.epochs) // MAX_EPOCHS) or 1))
@@ -163,7 +163,7 @@ def _errors(estimate: Estimate, case: Case) -> tuple[Array, Array]:
 
 
 def _sigma(objective: Callable[[Array], float], point: Array) -> Array:
-    """Return the standard deviations of log parameters by the curvature there; NaN where it is not that of a minimum."""
+    """Return the standard deviations of log parameters by the curvature at the point; NaN if it is not that of a minimum."""
     n = len(point)
     steps = CURVATURE_STEP * np.eye(n)
     middle = objective(point)

@@ -1,12 +1,12 @@
-"""Tunable parameters: one table of their places in a filter setup and their units, their values, and setups with other values.
+"""Tunable parameters: their fields in a filter setup, units and values, and setups with other values.
 
-The gyro's two noises are shared by its axes, as the filter has one σ_v and one σ_u: only isotropic noise is the same seen from a body
-that turns within a step, and has the closed form of :func:`strapdown.kernels.filter_step.process_noise`.
+The gyro's axes share two noise parameters, because the filter has one σ_v and one σ_u: only isotropic noise is invariant to rotations of
+the body within a step, and has the closed form of :func:`strapdown.kernels.filter_step.process_noise`.
 
-``SENSOR.sigma`` is one factor on the σ of all axes, as their root mean square; their ratios are the setup's or the record's.
-``SENSOR.sigma.x``, ``.y`` and ``.z`` are the σ about (of whole vectors along) each body axis on its own, of any sensor but a heading. There
-are no such names of the gyro, for the reason above. The σ and times of a filter's optional states (:data:`GYRO_STATES`,
-:data:`SENSOR_STATES`) scale all axes or drifts of a state alike; their value is the root mean square.
+``SENSOR.sigma`` is the root mean square of the σ of all axes; their ratios are those of the setup or the record.
+``SENSOR.sigma.x``, ``.y`` and ``.z`` are the σ about each body axis (along it, for full vectors), for any sensor except a heading. The gyro
+has no such names, for the reason above. The σ and times of a filter's optional states (:data:`GYRO_STATES`, :data:`SENSOR_STATES`) scale
+all axes or drifts of a state together; their value is the root mean square.
 """
 
 from __future__ import annotations
@@ -27,30 +27,30 @@ from strapdown.gyro import GyroSpec
 from strapdown.records import ImuRecord
 
 ARW = "gyro.arw"
-"""σ_v, rad/√s."""
+"""Angle random walk σ_v, rad/√s."""
 RRW = "gyro.rrw"
-"""σ_u, rad/s/√s; the one parameter that may be zero."""
+"""Rate random walk σ_u, rad/s/√s; the only parameter that may be zero."""
 INITIAL_ATTITUDE = "initial.attitude"
 """Standard deviation of the initial attitude error, rad."""
 INITIAL_BIAS = "initial.bias"
 """Standard deviation of the initial bias error, rad/s."""
 SCALE = "filter.scale"
-"""A factor on every σ of the filter, gyro, sensors, states and initial state alike; to be tuned alone. It leaves the estimates as they
-are and sets their covariance."""
+"""A common factor on every σ of the filter: gyro, sensors, states and initial state. It scales the covariance and leaves the estimates
+unchanged; it can only be tuned alone."""
 OUTLIER_SHARE = "outliers.share"
-"""Share of the measurements that are outliers (:mod:`strapdown.tuning.outliers`)."""
+"""Fraction of the measurements that are outliers (:mod:`strapdown.tuning.outliers`)."""
 OUTLIER_SCALE = "outliers.scale"
-"""Their noise over that of the others."""
+"""Ratio of the σ of outliers to that of the other measurements."""
 SIGMA = ".sigma"
 """Suffix of a sensor's σ."""
 
 AXES = tuple(f"{SIGMA}.{axis}" for axis in "xyz")
-"""Suffixes of a sensor's σ of one body axis."""
+"""Suffixes of a sensor's σ for one body axis."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Unit:
-    """Unit of a parameter in print: multiply by ``factor`` for SI."""
+    """Unit in which a parameter is printed; ``factor`` converts to SI."""
 
     name: str
     factor: float
@@ -67,7 +67,7 @@ PLAIN = {
     INITIAL_ATTITUDE: (("attitude_sigma",), Unit(name="°", factor=units.DEGREE)),
     INITIAL_BIAS: (("bias_sigma",), _PER_HOUR),
 }
-"""Parameters of attitude and bias: place in a setup, and unit."""
+"""Parameters of attitude and bias: field in a setup, and unit."""
 GYRO_STATES = {
     "gyro.scale_sigma": (("states", "gyro_scale_sigma"), Unit(name="ppm", factor=1e-6)),
     "gyro.misalignment_sigma": (("states", "gyro_misalignment_sigma"), Unit(name="mrad", factor=1e-3)),
@@ -76,7 +76,7 @@ GYRO_STATES = {
     "gyro.drift_sigma": (("states", "gyro_drift_sigma"), _PER_HOUR),
     "gyro.drift_time": (("states", "gyro_drift_time"), _SECOND),
 }
-"""Those of the gyro's optional states."""
+"""Parameters of the gyro's optional states."""
 SENSOR_STATES = {
     "bias_sigma": ("bias_sigma", _OF_SENSOR),
     "correlated_sigma": ("correlated_sigma", _OF_SENSOR),
@@ -84,7 +84,7 @@ SENSOR_STATES = {
     "lever_sigma": ("lever_arm_sigma", Unit(name="m", factor=1.0)),
     **{name: (name, Unit(name=unit, factor=1.0)) for name, unit in VELOCITY.items()},
 }
-"""Those of a sensor's optional states by what follows its name and a dot: field of :class:`.SensorStates`, unit."""
+"""Parameters of a sensor's optional states, named ``SENSOR.KEY``: field of :class:`.SensorStates`, unit."""
 CONSTANTS = (
     "scale_sigma",
     "misalignment_sigma",
@@ -94,13 +94,13 @@ CONSTANTS = (
     INITIAL_ATTITUDE,
     INITIAL_BIAS,
 )
-"""Ends of the names of σ of constants, of which a record has one draw an axis however long it is."""
+"""Suffixes of the names of the σ of constants, of which a record of any duration has one draw per axis."""
 _WHOLE = {SCALE: _ONE, OUTLIER_SHARE: Unit(name="%", factor=0.01), OUTLIER_SCALE: _ONE}
-"""Units of what is no field of a setup."""
+"""Units of the parameters that are no fields of a setup."""
 
 
 def _place(name: str) -> tuple[tuple[str, ...], Unit] | None:
-    """Return where a setup has a parameter, and its unit; None of a sensor's σ."""
+    """Return the field of a parameter in a setup, and its unit; None for a sensor's σ."""
     sensor, _, last = name.rpartition(".")
     if last in SENSOR_STATES and name not in PLAIN:
         field, unit = SENSOR_STATES[last]
@@ -115,26 +115,26 @@ def _at(owner: Any, path: Sequence[str]) -> Any:
 
 
 def _put(owner: Any, path: Sequence[str], value: Any) -> Any:
-    """Return a dataclass, or mapping, with another value at the end of a path through its fields."""
+    """Return a dataclass or mapping with another value of the field at a path."""
     head, *rest = path
     inner = _put(_at(owner, [head]), rest, value) if rest else value
     return {**owner, head: inner} if isinstance(owner, Mapping) else replace(owner, **{head: inner})
 
 
 def known_names(records: Sequence[ImuRecord]) -> tuple[str, ...]:
-    """Return the names of all parameters that a filter on these records has, but those of single axes and of optional states."""
+    """Return the names of all parameters of a filter on these records, except those of single axes and of optional states."""
     sensors = dict.fromkeys(series.sensor for record in records for series in record.vectors if len(series.time))
     return (*PLAIN, SCALE, *(f"{sensor}{SIGMA}" for sensor in sensors))
 
 
 def axis_of(name: str) -> tuple[str, int] | None:
-    """Return the sensor and the axis that a name such as ``star.sigma.x`` is of; None of another name."""
+    """Return the sensor and axis of a name such as ``star.sigma.x``; None for another name."""
     sensor, _, axis = name.rpartition(f"{SIGMA}.")
     return (sensor, "xyz".index(axis)) if sensor and axis in ("x", "y", "z") else None
 
 
 def axis_names(records: Sequence[ImuRecord]) -> tuple[str, ...]:
-    """Return the names of the σ of single body axes: of every sensor but headings, which have one degree of freedom."""
+    """Return the names of the σ of single body axes, of every sensor except headings, which have one degree of freedom."""
     series = [one for record in records for one in record.vectors if len(one.time)]
     sensors = dict.fromkeys(one.sensor for one in series if one.sensor not in _headings(records))
     return tuple(f"{sensor}{axis}" for sensor in sensors for axis in AXES)
@@ -145,7 +145,7 @@ def _headings(records: Sequence[ImuRecord]) -> set[str]:
 
 
 def state_names(states: States | None) -> tuple[str, ...]:
-    """Return the names of the parameters that these states have; none where there are no states."""
+    """Return the names of the parameters of these states; none if there are no states."""
     if states is None:
         return ()
     names = [*GYRO_STATES, *(f"{sensor}.{last}" for sensor in states.sensors for last in SENSOR_STATES)]
@@ -154,12 +154,12 @@ def state_names(states: States | None) -> tuple[str, ...]:
 
 
 def default_names(records: Sequence[ImuRecord]) -> tuple[str, ...]:
-    """Return what is tuned by default: the gyro's two noises and the σ of every sensor."""
+    """Return the default parameters: the gyro's two noises and the σ of every sensor."""
     return tuple(name for name in known_names(records) if not name.startswith("initial.") and name != SCALE)
 
 
 def checked_names(free: Sequence[str], chosen: FilterSetup, records: Sequence[ImuRecord]) -> tuple[str, ...]:
-    """Return the names given if this filter has each on these records, none comes twice and none is a part of another."""
+    """Return the given names, checked: each is a parameter of this filter on these records, none repeats or includes another."""
     known = [*known_names(records), *axis_names(records), *state_names(chosen.states)]
     if not free:
         raise InputError(f"free names no parameter; give some of {', '.join(known)}")
@@ -169,7 +169,7 @@ def checked_names(free: Sequence[str], chosen: FilterSetup, records: Sequence[Im
             raise InputError(f"free: {name}: a heading has one degree of freedom; give {part[0]}{SIGMA}")
         one_of("free: parameter", name, known)
         if list(free).count(name) > 1:
-            raise InputError(f"free names {name} twice; once is enough")
+            raise InputError(f"free names {name} twice; give it once")
         if part is not None and f"{part[0]}{SIGMA}" in free:
             raise InputError(f"free: {name} is part of {part[0]}{SIGMA}; give that, or the axes")
     if SCALE in free and len(free) > 1:
@@ -178,7 +178,7 @@ def checked_names(free: Sequence[str], chosen: FilterSetup, records: Sequence[Im
 
 
 def unit_of(name: str, records: Sequence[ImuRecord] = ()) -> Unit:
-    """Return the unit that a parameter is printed in: of a sensor's σ the one that suits its size in the records."""
+    """Return the unit in which a parameter is printed; for a sensor's σ one that suits its size in the records."""
     place = _place(name)
     if place is not None:
         return place[1]
@@ -194,7 +194,7 @@ def unit_of(name: str, records: Sequence[ImuRecord] = ()) -> Unit:
 
 
 def _sensor(name: str) -> str:
-    """Return the sensor of ``SENSOR.sigma`` or of ``SENSOR.sigma.x``."""
+    """Return the sensor of ``SENSOR.sigma`` or ``SENSOR.sigma.x``."""
     part = axis_of(name)
     return name.removesuffix(SIGMA) if part is None else part[0]
 
@@ -213,7 +213,7 @@ def own_axes(sensor: str, records: Sequence[ImuRecord]) -> Array:
 
 
 def by_axis(chosen: FilterSetup, names: Sequence[str], records: Sequence[ImuRecord]) -> FilterSetup:
-    """Return the setup with three σ for each sensor that ``names`` has one axis of: those that it, or the records, say at present."""
+    """Return the setup with three σ for each sensor of which ``names`` has an axis: those of the setup, or of the records."""
     sigma = dict(chosen.sigma)
     for sensor in dict.fromkeys(part[0] for part in map(axis_of, names) if part is not None):
         given = sigma.get(sensor)
@@ -229,11 +229,11 @@ def by_axis(chosen: FilterSetup, names: Sequence[str], records: Sequence[ImuReco
 
 
 def _silent(sensor: str) -> InputError:
-    return InputError(f"{sensor}: the records say that its sigma is 0; give one to start from in [filter.sigma]")
+    return InputError(f"{sensor}: its sigma is 0 in the records; give a starting value in [filter.sigma]")
 
 
 def _size(value: Any) -> float:
-    """Return a number itself, of several their root mean square, those that are zero left out."""
+    """Return a number unchanged; for several their root mean square, without those that are zero."""
     entries = np.asarray(value, np.float64)
     if entries.ndim == 0:
         return float(value)
@@ -246,7 +246,7 @@ def _times(value: Any, factor: float) -> Any:
 
 
 def values_of(chosen: FilterSetup, names: Sequence[str], records: Sequence[ImuRecord]) -> dict[str, float]:
-    """Return the values that a setup gives the parameters."""
+    """Return the values of the parameters in a setup."""
     return {name: _value_of(chosen, name, records) for name in names}
 
 
@@ -268,9 +268,9 @@ def _value_of(chosen: FilterSetup, name: str, records: Sequence[ImuRecord]) -> f
 
 
 def with_values(chosen: FilterSetup, values: Mapping[str, float]) -> FilterSetup:
-    """Return the setup with other values of these parameters; a σ is set with the setup's factor taken off.
+    """Return the setup with other values of these parameters; a σ is divided by the setup's factor.
 
-    ``SENSOR.sigma`` and the σ of states keep the ratios of several; ``SENSOR.sigma.x`` and the like need three in the setup
+    ``SENSOR.sigma`` and the σ of states keep the ratios of their axes; ``SENSOR.sigma.x`` and the like need three in the setup
     (:func:`by_axis`).
     """
     if SCALE in values:
@@ -282,7 +282,7 @@ def with_values(chosen: FilterSetup, values: Mapping[str, float]) -> FilterSetup
             _set(sigma, name, value / chosen.measurement_sigma_factor)
             continue
         given = _at(chosen, place[0])
-        if name == "gyro.drift_sigma":  # the part too fast for a state goes with the others
+        if name == "gyro.drift_sigma":  # the part with a bandwidth above that of the states is scaled with them
             fast = ("states", "gyro_fast_bias_sigma")
             chosen = _put(chosen, fast, value / _size(given) * _at(chosen, fast))
         several = place[0][0] == "states"
@@ -291,14 +291,14 @@ def with_values(chosen: FilterSetup, values: Mapping[str, float]) -> FilterSetup
 
 
 def _set(sigma: dict[str, Sigma], name: str, value: float) -> None:
-    """Set one σ, all three in their ratios, or that of one axis."""
+    """Set the σ of a sensor, keeping the ratios of its axes, or that of one axis."""
     part, sensor = axis_of(name), _sensor(name)
     given = sigma.get(sensor)
     if part is None:
         sigma[sensor] = tuple(value * one / _size(given) for one in given) if isinstance(given, tuple) else value  # type: ignore[assignment]
         return
     if not isinstance(given, tuple):
-        raise InputError(f"{name}: the setup has no three sigmas of {sensor}; make them with tuning.parameters.by_axis")
+        raise InputError(f"{name}: the setup has no three sigmas for {sensor}; see tuning.parameters.by_axis")
     x, y, z = (value if k == part[1] else one for k, one in enumerate(given))
     sigma[sensor] = x, y, z
 
@@ -307,7 +307,7 @@ Owner = TypeVar("Owner", FilterSetup, States, SensorStates)
 
 
 def _sigmas_times(owner: Owner, factor: float) -> Owner:
-    """Return a setup, or states, with every field that is a standard deviation times a factor."""
+    """Return a setup, or states, with every standard deviation multiplied by a factor."""
     names = [field.name for field in fields(owner) if field.name.endswith("_sigma")]
     return replace(owner, **{name: _times(getattr(owner, name), factor) for name in names})
 
@@ -353,23 +353,23 @@ class Prior:
 
 
 def priors_from_gyro(spec: GyroSpec, record: ImuRecord, *, factor: float = 3.0) -> dict[str, Prior]:
-    """Return priors of the gyro's two noise parameters from a specification: of a datasheet, or of an Allan deviation.
+    """Return priors of the gyro's two noise parameters from a specification, of a datasheet or an Allan deviation.
 
-    Flicker noise is matched as by :meth:`strapdown.estimation.setup.FilterSetup.for_record`; a noise that is not specified gets no prior.
+    Flicker noise is matched as in :meth:`strapdown.estimation.setup.FilterSetup.for_record`; a noise not specified has no prior.
 
     Parameters
     ----------
     spec : GyroSpec
-        Its noise coefficients are the medians of the priors.
+        Specification whose noise coefficients are the medians of the priors.
     record : ImuRecord
-        For the rate and quality of its measurements.
+        Record that gives the rate and noise of the measurements.
     factor : float, default 3
-        One standard deviation of a prior is a factor of this.
+        Factor that is one standard deviation of a prior.
 
     Returns
     -------
     dict of str to Prior
-        For ``"gyro.arw"`` (rad/√s) and ``"gyro.rrw"`` (rad/s/√s).
+        Priors of ``"gyro.arw"`` (rad/√s) and ``"gyro.rrw"`` (rad/s/√s).
     """
     noise = setup.FilterSetup.for_record(record, spec).process_noise if _flickers(spec) else None
     found = gyro.process_noise(spec) if noise is None else vars(noise)

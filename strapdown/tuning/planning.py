@@ -1,4 +1,4 @@
-"""How well a record of some length will determine each parameter, before it is made: the Cramér–Rao bound from simulated records."""
+"""Cramér–Rao bound of each parameter for records of given durations, from simulated records."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ from strapdown.tuning.parameters import CONSTANTS, Unit, unit_of, values_of
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Plan(Listed):
-    """Standard errors that records of several lengths will give at best."""
+    """Minimum standard errors of the parameters for records of several durations."""
 
     names: tuple[str, ...]
     values: Array
-    """The parameters assumed (p,), SI."""
+    """Assumed values of the parameters (p,), SI."""
     units: tuple[Unit, ...]
-    """Units that they are printed in."""
+    """Units in which they are printed."""
     lengths: Array
-    """Lengths of a record (k,), s."""
+    """Durations of a record (k,), s."""
     errors: Array
-    """Least standard error of the logarithm of each parameter (k, p): 0.1 is 10 %."""
+    """Minimum standard error of the logarithm of each parameter (k, p): 0.1 is 10 %."""
     scatter: float
-    """Largest relative scatter of these over the simulated records, standard deviation of their mean."""
+    """Largest relative standard deviation of the mean of these over the simulated records."""
 
     def listing(self) -> Listing:
-        """Return the least standard errors as factors, as a table."""
+        """Return the minimum standard errors as factors, in a table."""
         rows = [
             (
                 name,
@@ -51,13 +51,13 @@ class Plan(Listed):
             )
         ]
         columns = ("parameter", "unit", "value", *(f"{length:g} s" for length in self.lengths), "10 % needs")
-        note = "Above about × 1.5 a record gives a bound rather than a value. The last column lets information grow as at the end."
-        return Listing("Least standard error, as a factor (Cramér–Rao)", columns, rows, [note], left=2)
+        note = "Above about × 1.5 a record gives a bound and not a value. The last column extrapolates the information at its final rate."
+        return Listing("Minimum standard error, as a factor (Cramér–Rao)", columns, rows, [note], left=2)
 
     def needed(self, error: float = 0.1) -> Array:
-        """Return the length (p,), s, at which each parameter is known to this relative error, if information grows as at the end.
+        """Return the duration (p,), s, at which each parameter has this relative error, extrapolating the information at its last rate.
 
-        Infinite for the σ of a constant error: more records tell more of it, a longer one does not.
+        Infinite for the σ of a constant error, whose information grows with the number of records and not with their duration.
         """
         drawn_once = np.array([name.endswith(CONSTANTS) for name in self.names])
         longer = drawn_once & (self.errors[-1] > error)
@@ -75,39 +75,39 @@ def plan(
     threads: int = 1,
     progress: Callable[[int], None] | None = None,
 ) -> Plan:
-    """Return the Cramér–Rao bound of the logarithms of parameters, for records of given lengths.
+    """Return the Cramér–Rao bound of the logarithms of parameters for records of given durations.
 
-    Fisher's information is the mean of that of the sensitivities over ``records`` simulated records for which the setup is exact. For a
-    filter with optional states each record has other individuals of the gyro and the sensors (:func:`strapdown.scenarios.drawn`).
+    Fisher's information is averaged over ``records`` simulated records, evaluated from sensitivities, with the setup exact. For a
+    filter with optional states gyro and sensors are drawn anew for each record (:func:`strapdown.scenarios.drawn`).
 
     Parameters
     ----------
     scenario : Scenario
-        Simulated with its own gyro and sensors.
+        Scenario to simulate, with its gyro and sensors.
     chosen : FilterSetup
-        Taken as true.
+        Filter whose parameters are the true ones.
     free : sequence of str
-        Names of parameters, as of :func:`likelihood`.
+        Names of parameters, as in :func:`likelihood`.
     lengths : sequence of float
-        Lengths of a record, s.
+        Durations of a record, s.
     records : int, default 4
         Number of simulated records over which the information is averaged.
     seed : int, default 0
         Seed of the simulated records.
     threads : int, default 1
-        Records simulated at once.
+        Number of records simulated in parallel.
     progress : callable, optional
         Called with the number of records just finished.
 
     Returns
     -------
     Plan
-        Least standard error of the logarithm of each parameter, by record length: 0.1 is 10 %.
+        Minimum standard error of the logarithm of each parameter, by duration: 0.1 is 10 %.
     """
     instance("scenario", scenario, Scenario, "give a Scenario")
     wanted = np.sort(np.asarray(lengths, float))
     if len(wanted) == 0 or not wanted[0] > 0.0:
-        raise InputError("lengths must be greater than zero; give the seconds that a record may last")
+        raise InputError("lengths must be greater than zero; give durations of a record in seconds")
     count("records", records)
 
     def one(number: int) -> Array:
@@ -140,7 +140,7 @@ def plan(
 
 
 def bound(information: Array) -> Array:
-    """Return the root of the diagonal of the inverse of information matrices (..., p, p): (..., p)."""
+    """Return the roots (..., p) of the diagonals of the inverses of information matrices (..., p, p)."""
     scale = np.sqrt(np.maximum(np.einsum("...jj->...j", information), 1e-12))
     unit = information / (scale[..., :, None] * scale[..., None, :])
     inverse = np.linalg.pinv(unit, rcond=1e-12, hermitian=True)

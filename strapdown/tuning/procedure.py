@@ -10,7 +10,7 @@ from strapdown.checks import InputError
 from strapdown.estimation.setup import FilterSetup
 from strapdown.tuning.errors import error_objective
 from strapdown.tuning.fitting import Tuning, fit, rescaled
-from strapdown.tuning.innovations import LaneLikelihood, likelihood
+from strapdown.tuning.innovations import LaneLikelihood, Likelihood, likelihood
 from strapdown.tuning.objective import OUTLIERS, Case, Objective
 from strapdown.tuning.outliers import TunedGate, contaminated_likelihood, tuned_gate
 from strapdown.tuning.parameters import Prior, default_names
@@ -63,11 +63,13 @@ def objective_for(
         )
     if gate and (other or spacing > 0.0):
         raise InputError("gate needs the likelihood of all innovations: leave truth, rmse and spacing out")
-    if gate:
-        return contaminated_likelihood(cases, setup, names)
     if other:
         return error_objective(cases, setup, names, measure="rmse" if rmse else "likelihood", threads=threads)
-    made = likelihood(cases, setup, names, spacing=spacing, threads=threads)
+    made = (
+        contaminated_likelihood(cases, setup, names, threads=threads)
+        if gate
+        else likelihood(cases, setup, names, spacing=spacing, threads=threads)
+    )
     # Where eight points run at once, searches run in the threads; else records and points do.
     return dataclasses.replace(made, threads=1) if isinstance(made, LaneLikelihood) else made
 
@@ -82,7 +84,7 @@ def tune(
     factor: float = 30.0,
     seed: int = 0,
     threads: int = 1,
-    progress: Callable[[int], None] | None = None,
+    progress: Callable[[str], None] | None = None,
     gate: bool = False,
     **objective: Any,
 ) -> Tuned:
@@ -132,14 +134,17 @@ def tune(
         starts=starts,
         factor=factor,
         seed=seed,
-        threads=threads if isinstance(made, LaneLikelihood) else 1,
+        threads=threads if isinstance(made, LaneLikelihood) or (made.composite and len(cases) == 1) else 1,
         progress=progress,
     )
     if objective.get("rmse"):
         # The size of the error leaves a common scale open; the innovations determine it.
-        scaled = fit(likelihood(cases, result.setup, ["filter.scale"]), starts=2, threads=threads)
+        scale = likelihood(cases, result.setup, ["filter.scale"])
+        scaled = fit(
+            scale, starts=2, threads=threads, progress=progress and (lambda now: progress(f"scale of all σ, {now}"))
+        )
         result = rescaled(result, scaled["filter.scale"].value)
-    found = tuned_gate(made, result) if gate and isinstance(made, LaneLikelihood) else None
+    found = tuned_gate(made, result) if isinstance(made, Likelihood) and made.mixed else None
     if found is not None and found.gate is not None:
         result = dataclasses.replace(result, setup=dataclasses.replace(result.setup, gate=found.gate))
     return Tuned(result, made, found)

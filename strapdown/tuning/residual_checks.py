@@ -1,13 +1,14 @@
-"""Residual checks of a tuned filter: whether the data it was tuned on contradict it still, and an error that moves with the rate.
+"""Residual checks of a tuned filter: whether its tuning data still contradict it, and whether an error proportional to the rate does.
 
-Tuning gives every parameter its most likely value, right model or wrong. A gyro's scale-factor error moves its bias with the rate, so the
-walk of the bias is made as large as that takes; it looks identified, and the innovations look white. Then the question is not whether
-they are, but what explains them better. The scale factor θ of each axis is tried by one step of Gauss–Newton on the whitened innovations,
-which is Rao's score test (1948): at the tuned walk, and at smaller ones beside it, as a filter would have that knows the scale factor.
-Its gain is twice the log-likelihood over the tuned filter's, χ² of three degrees of freedom where θ is zero.
+Tuning gives every parameter its most likely value even if the model is wrong. A gyro's scale-factor error changes its apparent bias with
+the rate, so the random walk of the bias is tuned large enough to cover that; it appears identified, and the innovations appear white. The
+test is then whether a scale factor explains the innovations better. The scale factor θ of each axis is estimated by one step of
+Gauss–Newton on the whitened innovations, which is Rao's score test (1948), with the tuned random walk and with smaller ones, which a filter
+that models the scale factor would have. Its gain is twice the log-likelihood ratio to the tuned filter, χ² with three degrees of freedom if
+θ is zero.
 
-The rate that θ multiplies is the gyro's own less its bias and its noise (:func:`strapdown.tuning.diagnosis.turning.turns`), which must not
-explain itself. A prior of ``PLAUSIBLE`` bounds it where the rates are too small to show it.
+The rate that θ multiplies is the gyro's, without its bias and noise (:func:`strapdown.tuning.diagnosis.turning.turns`), because noise must
+not explain itself. A prior of ``PLAUSIBLE`` bounds θ if the rates are too small to determine it.
 """
 
 from __future__ import annotations
@@ -38,67 +39,67 @@ from strapdown.tuning.parameters import RRW
 from strapdown.tuning.validation import performance
 
 LEVELS = (1.0, 0.2, 0.04)
-"""Multiples of the tuned walk of the bias beside which a scale factor is tried."""
+"""Multiples of the tuned random walk of the bias with which a scale factor is tested."""
 STEP = 1e-4
-"""Step of a scale factor for differences."""
+"""Step of a scale factor for finite differences."""
 MAX_REPORTED = 2
-"""Largest number of failed tests that are reported one by one."""
+"""Maximum number of failed tests that are reported individually."""
 SHAPES = ("whiteness", "normality", "mean innovation", "cross-correlation")
-"""Tests of innovations that no tuning of σ makes pass."""
+"""Tests of innovations that tuning σ cannot make pass."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ScaleFactor:
-    """A gyro's scale factor as an explanation of what the tuned filter puts down to noise."""
+    """A gyro's scale factor as an explanation of what the tuned filter models as noise."""
 
     value: Array
     """θ of each axis (3,): the gyro measures 1 + θ of the rate."""
     standard_error: Array
-    """(3,)"""
+    """Standard error of θ (3,)."""
     gain: float
-    """Twice the log-likelihood gained over the tuned filter."""
+    """Twice the gain in log-likelihood over the tuned filter."""
     p_value: float
-    """Probability that a filter that is right gains as much, over all levels tried."""
+    """Probability of as large a gain for a correct filter, over all levels tested."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Unmodelled:
-    """Evidence against a filter in the data that it was tuned on."""
+    """Evidence against a filter in its tuning data."""
 
     record: str
     """Name of the record."""
     judgement: Judgement
-    """Judgement of the tuned filter on its own data; with a truth of its errors too."""
+    """Judgement of the tuned filter on its tuning data; of its errors too if there is a truth."""
     scale_factor: ScaleFactor
     causes: tuple[Cause, ...] = ()
-    """Likely causes, where the innovations are not of the right shape."""
+    """Likely causes, if a test in :data:`SHAPES` fails."""
     probability: float
 
     @property
     def moves_with_the_rate(self) -> bool:
-        """Whether a scale factor explains the innovations better than the noise of the gyro does, and than any other cause."""
+        """Whether a scale factor explains the innovations better than the noise of the gyro and than any other cause."""
         other = max((cause.gain for cause in self.causes), default=0.0)
         return self.scale_factor.p_value < 1.0 - self.probability and self.scale_factor.gain > other
 
     @property
     def failed(self) -> tuple[str, ...]:
-        """Remaining faults in words, one a test; a pessimistic filter has none that it does not model."""
+        """Failed tests in words; σ that are too large do not count, because they are no sign of an unmodelled error."""
         return tuple(
             one.means for one in self.judgement.findings if one.rejected and not (one.is_ratio and one.value < 1.0)
         )
 
     @property
     def suspected(self) -> bool:
-        """Whether an error that the filter has no state for is likely."""
+        """Whether an error without a state in the filter is likely."""
         return self.moves_with_the_rate or bool(self.failed)
 
     @property
     def words(self) -> tuple[str, ...]:
-        """Sentences for people; none if nothing is suspected."""
+        """Sentences that describe the evidence; none if nothing is suspected."""
         if not self.suspected:
             return ()
         sentences = [
-            f"After tuning, {self.record or 'the record'} still holds what no σ explains: an error that the filter has no state for."
+            f"After tuning, {self.record or 'the record'} contradicts the filter in a way that no σ explains: an error without a state."
         ]
         if self.moves_with_the_rate:
             one = self.scale_factor
@@ -107,7 +108,7 @@ class Unmodelled:
             )
             sentences.append(
                 f"A scale factor of the gyro of [{sizes}] ppm explains the innovations better than its noise does (gain {one.gain:.3g}, "
-                f"p = {one.p_value:.1g}): the tuned noise of the gyro stands for it. Calibrate it, or estimate with a state for it."
+                f"p = {one.p_value:.1g}): the tuned noise of the gyro covers it. Calibrate it, or add a state for it."
             )
         sentences += [f"{what[0].upper()}{what[1:]}." for what in self.failed[:MAX_REPORTED]]
         if len(self.failed) > MAX_REPORTED:
@@ -115,7 +116,7 @@ class Unmodelled:
                 f"And {len(self.failed) - MAX_REPORTED} more of {len(self.judgement.findings)} tests contradict the tuned filter."
             )
         if self.causes:
-            sentences.append(f"Likeliest cause: {self.causes[0].words}.")
+            sentences.append(f"Most likely cause: {self.causes[0].words}.")
         return tuple(sentences)
 
     def summary(self) -> dict[str, Any]:
@@ -132,14 +133,14 @@ class Unmodelled:
 
 
 def unmodelled(case: Case, chosen: FilterSetup, *, probability: float = 0.99) -> Unmodelled:
-    """Return what the part of a record that a filter was tuned on says against the tuned filter."""
+    """Return the evidence against a tuned filter in the part of a record that it was tuned on."""
     tail(probability)
     judgement = performance([case], chosen).judgements[0]
     record = seen(case)
     used = of_sensors(chosen, record)
     initial = setup.initial_state(used, case.initial.attitude, case.initial.bias)
     if used.gate is not None:
-        # What passes a gate has lost its tails, and keeps the outliers that are like the rest: neither is news.
+        # A gate removes the tails of the innovations and passes small outliers: NIS and normality are not evidence then.
         kept = tuple(one for one in judgement.findings if one.name not in ("NIS", "normality"))
         judgement = concluded(kept, judgement.limits, probability)
         record = accepted(record, setup.run(record, used, initial, every=len(record.increments)))
@@ -156,7 +157,7 @@ def unmodelled(case: Case, chosen: FilterSetup, *, probability: float = 0.99) ->
 
 
 def seen(case: Case) -> ImuRecord:
-    """Return the part of a case's record up to where it counts for tuning."""
+    """Return a case's record up to the end of its tuning data."""
     time = case.record.time
     last = int(np.searchsorted(time, case.last, side="right")) - 1
     return case.record if last >= len(time) - 1 else cut(case.record, 0, max(last, 1))
@@ -172,7 +173,7 @@ def accepted(record: ImuRecord, estimate: Estimate) -> ImuRecord:
 
 
 def scale_factor(record: ImuRecord, noise: ProcessNoise, initial: estimation.State) -> ScaleFactor:
-    """Return the scale factor of the gyro that explains most beside a filter of this noise, or of less walk of the bias."""
+    """Return the gyro's scale factor of largest gain, with this noise or a smaller random walk of the bias."""
     rate_angle = turns(record, noise, initial)
     levels = LEVELS if noise.rate_random_walk > 0.0 else LEVELS[:1]
     tuned = run(Model(record=record, noise=noise, initial=initial))
@@ -190,7 +191,7 @@ def scale_factor(record: ImuRecord, noise: ProcessNoise, initial: estimation.Sta
         information = J[known].T @ J[known] + np.eye(3) / PLAUSIBLE**2
         theta = np.asarray(-np.linalg.solve(information, J[known].T @ base.white[known]), np.float64)
         spread = np.asarray(np.sqrt(np.diag(np.linalg.inv(information))), np.float64)
-        # What less walk alone gains, where the walk was not tuned, is not the scale factor's.
+        # The gain of a smaller random walk alone, if it was not tuned, is not due to the scale factor.
         better = max(base.gain_over(tuned), 0.0)
         gain = run(moved(theta)).gain_over(tuned) - better - float(np.sum((theta / PLAUSIBLE) ** 2))
         found.append((gain, theta, spread))
@@ -204,10 +205,10 @@ def scale_factor(record: ImuRecord, noise: ProcessNoise, initial: estimation.Sta
 
 
 def doubted(tuning: Tuning, found: Unmodelled) -> Tuning:
-    """Return the tuning with a note of doubt on the walk of the bias where a scale factor explains the innovations better."""
+    """Return the tuning with a note on the random walk of the bias if a scale factor explains the innovations better."""
     if not found.moves_with_the_rate:
         return tuning
-    doubt = "in doubt: may stand for a scale factor of the gyro"
+    doubt = "in doubt: may cover a scale factor of the gyro"
     return replace(
         tuning,
         parameters=tuple(

@@ -1,4 +1,4 @@
-"""Data that the tuning has not seen, and the filter before and after on it."""
+"""Validation on held-out data: performance of the filter before and after tuning."""
 
 from __future__ import annotations
 
@@ -21,27 +21,27 @@ from strapdown.units import DEGREE
 
 By = Literal["time", "record"]
 MAX_ROWS = 20_000
-"""States that are kept of one record to judge."""
+"""Maximum number of states of a record that are judged."""
 MIN_ERRORS = 100
-"""Fewest errors against a truth of which the course is reported."""
+"""Minimum number of errors against a truth for their NEES over time to be reported."""
 
 
 def split(cases: Sequence[Case], share: float, by: By = "time") -> tuple[tuple[Case, ...], tuple[Case, ...]]:
-    """Divide cases into what is tuned on and what is held out.
+    """Divide cases into tuning data and held-out data.
 
     Parameters
     ----------
     cases : sequence of Case
         Records to divide.
     share : float
-        Share of the data held out, between 0 and 1.
+        Fraction of the data held out, between 0 and 1.
     by : {"time", "record"}
-        Hold out the end of every record, which the filter reaches through its beginning; or whole records, the last ones.
+        Hold out the end of every record, which the filter reaches from its beginning; or the last records.
 
     Returns
     -------
     tuned, held : tuple of Case
-        Cases to tune on, and cases held out. By time both have the same records, with other ``first`` and ``last``.
+        Cases to tune on, and cases held out. By time both have the same records, with different ``first`` and ``last``.
     """
     if not 0.0 < share < 1.0:
         raise InputError(f"holdout is {share:g}; it must lie between 0 and 1")
@@ -64,54 +64,54 @@ def split(cases: Sequence[Case], share: float, by: By = "time") -> tuple[tuple[C
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class NeesCourse:
-    """NEES of one set of states over the time of a record."""
+    """NEES of a subset of the states over the time of a record."""
 
     of: str
     """"attitude" or "bias"."""
     time: Array
-    """Middle of spans of time (k,), s."""
+    """Midpoints of the time bins (k,), s."""
     mean: Array
-    """Mean NEES per state in each (k,); NaN where no truth is known."""
+    """Mean NEES per state in each bin (k,); NaN without a truth."""
     effective: float
-    """Independent errors that a span's mean rests on, in effect: errors of one run are alike for a while."""
+    """Effective number of independent errors per bin; errors of one run are correlated."""
 
     @property
     def bounds(self) -> tuple[float, float]:
-        """Two-sided 99 % bounds of a consistent filter in each span."""
+        """Two-sided 99 % bounds of the mean in each bin for a consistent filter."""
         return mean_bounds(3, max(self.effective, 1.0), 0.99)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Performance:
-    """One filter on held-out data."""
+    """Performance of a filter on held-out data."""
 
     log_likelihood: float
-    """Log likelihood per innovation, nats, without those that a gate refused."""
+    """Log likelihood per innovation, nats, without those refused by a gate."""
     nis: float
     """Mean NIS per degree of freedom; 1 for a consistent filter."""
     nis_bounds: tuple[float, float]
-    """Two-sided 99 % bounds of it."""
+    """Two-sided 99 % bounds of the mean NIS."""
     anees: float
-    """NEES of attitude and bias, per state, averaged over time and records; NaN without a truth."""
+    """NEES per state of attitude and bias, averaged over time and records; NaN without a truth."""
     attitude_rms: float
-    """Root mean square of the attitude error (all axes together), rad; NaN without a truth."""
+    """RMS of the attitude error (all axes together), rad; NaN without a truth."""
     judgements: tuple[Judgement, ...]
     """The verdict on each record."""
     nis_time: Array
-    """Middle of spans of time of the first record (k,), s."""
+    """Midpoints of the time bins of the first record (k,), s."""
     nis_course: Array
-    """Mean NIS per degree of freedom in each (k,)."""
+    """Mean NIS per degree of freedom in each bin (k,)."""
     nis_degrees: Array
-    """Degrees of freedom in each (k,)."""
+    """Degrees of freedom in each bin (k,)."""
     nees: tuple[NeesCourse, ...] = ()
-    """NEES over the time of the first record, of the attitude and of the bias as far as their truth is known."""
+    """NEES over the time of the first record, of attitude and bias if their truth is known."""
 
     @property
     def row(self) -> tuple[str, ...]:
-        """What :meth:`Comparison.listing` shows of it."""
+        """Row of the table :meth:`Comparison.listing`."""
         verdicts = [judgement.verdict for judgement in self.judgements]
         anees = figure(self.anees, 3) if np.isfinite(self.anees) else "-"
-        if self.nees and not np.isfinite(self.anees):  # of the attitude alone the reference is known
+        if self.nees and not np.isfinite(self.anees):  # the reference has no bias
             anees = f"{figure(float(np.nanmean(self.nees[0].mean)), 3)} (attitude)"
         return (
             f"{self.log_likelihood:.4f}",
@@ -137,7 +137,7 @@ class Comparison(Listed):
 
     @property
     def better(self) -> bool:
-        """Whether the likelihood of the held-out innovations has grown."""
+        """Whether the likelihood of the held-out innovations has increased."""
         return self.after.log_likelihood > self.before.log_likelihood
 
 
@@ -149,20 +149,20 @@ def compare(
     Parameters
     ----------
     cases : sequence of Case
-        With the initial attitudes and biases; their σ are those of each setup.
+        Held-out cases, with initial attitudes and biases; the initial σ are those of each setup.
     before : FilterSetup
         The filter before tuning.
     after : FilterSetup
         The tuned filter.
     threads : int, default 1
-        Cases filtered at once.
+        Number of cases filtered in parallel.
     bins : int, default 40
-        Spans of time of the averaged NIS and NEES.
+        Number of time bins of the averaged NIS and NEES.
 
     Returns
     -------
     Comparison
-        Log likelihood, NIS, NEES and RMS attitude error (rad) of each filter; NaN where they need a truth that is unknown.
+        Log likelihood, NIS, NEES and RMS attitude error (rad) of each filter; NaN where the truth needed is unknown.
     """
     with ThreadPoolExecutor(threads) as pool:
         results = list(pool.map(lambda chosen: performance(cases, chosen, bins=bins), (before, after)))
@@ -170,7 +170,7 @@ def compare(
 
 
 def performance(cases: Sequence[Case], chosen: FilterSetup, *, bins: int = 40) -> Performance:
-    """Return how one filter does on what is to be judged of these cases."""
+    """Return the performance of a filter on the judged part of these cases."""
     judged = [_judged(case, chosen) for case in cases]
     total, number, squares = 0.0, 0, 0.0
     for one in (one for estimate, _ in judged for one in estimate.innovations.values()):
@@ -210,7 +210,7 @@ def _knows_bias(truth: Truth) -> bool:
 
 
 def _judged(case: Case, chosen: FilterSetup) -> tuple[Estimate, Truth | None]:
-    """Return the part of the filter's estimate that is to be judged, with the truth at its times; of a reference without the bias."""
+    """Return the judged part of the filter's estimate, with the truth at its times; a reference has no bias."""
     used = of_sensors(chosen, case.record)
     record = setup.modelled_record(case.record, used)
     truth, reference = record.truth, case.true_attitude
@@ -241,7 +241,7 @@ def _judged(case: Case, chosen: FilterSetup) -> tuple[Estimate, Truth | None]:
 
 
 def _spans(time: Array, first: float, last: float, bins: int) -> tuple[Array, np.ndarray]:
-    """Return the middles of equal spans of time (bins,), and the span that each time lies in."""
+    """Return the midpoints of equal time bins (bins,), and the bin of each time."""
     edges = np.linspace(first, last + 1e-9, bins + 1)
     place = np.clip(np.searchsorted(edges, time, side="right") - 1, 0, bins - 1)
     return 0.5 * (edges[1:] + edges[:-1]), place
@@ -273,7 +273,7 @@ def _nees_courses(estimate: Estimate, truth: Truth | None, bins: int) -> tuple[N
     found = []
     for name in ("attitude", "bias") if whole else ("attitude",):
         states = consistency.SUBSETS[name]
-        # The memory of all states is learnt together where the bias is known too.
+        # If the bias is known too, the correlation is estimated from all states.
         average = (
             consistency.time_average(error, P, states)
             if whole

@@ -1,6 +1,6 @@
 """Vector and attitude sensors, and attitude from their measurements at one time.
 
-- ``sensors``: Star trackers, sun and horizon sensors, magnetometers, accelerometers: what they measure, with noise and faults.
+- ``sensors``: Star trackers, sun and horizon sensors, magnetometers, accelerometers: their measurements, with noise and faults.
 - ``wahba``: Attitude from two or more vectors by least squares (Wahba's problem), with its covariance.
 """
 

@@ -1,16 +1,16 @@
-"""Vector sensors: measurements in the body frame of what is known in the fixed frame, ``q⁻¹ r q + v``, or of the attitude itself.
+"""Vector sensors: body-frame measurements of vectors known in the fixed frame, ``q⁻¹ r q + v``, or of the attitude itself.
 
 Every sensor has its own rate, phase and :class:`Faults` (latency, outages, outliers, correlated noise), and returns a series of
-:class:`VectorMeasurements`. The series states the *nominal* noise: outliers, correlation, hard iron and acceleration are hidden
-from the filter.
+:class:`VectorMeasurements`. The series has the *nominal* noise only: outliers, correlation, hard iron and acceleration are not
+disclosed to the filter.
 
 Noise of a normalised vector
 ----------------------------
-A direction is a noisy vector over its length: its noise of σ per component, relative to the length, leaves σ²(1 − σ² − σ⁴ − …) of
-variance across the direction, exactly ``σ² [1 − √2 σ D(1/(√2 σ))]`` with Dawson's function D; and the mean of the measured
-component along it is shorter than 1, by about σ². Filters assume σ² and 1. So the NIS of a right filter is too small by a fraction
-of about σ²: 0.25 % at σ = 0.05 rad, 1 % at 0.1 rad, 4.2 % at 0.2 rad, 10 % at 0.3 rad. Where that matters (``σ`` above 0.1 rad),
-give the whole vector (kind ``"vector"``), whose noise is the same in all components.
+A direction is a noisy vector divided by its length. With noise σ per component, relative to the length, the variance across the
+direction is σ²(1 − σ² − σ⁴ − …), exactly ``σ² [1 − √2 σ D(1/(√2 σ))]`` with Dawson's function D, and the mean of the measured
+component along the direction is about 1 − σ². Filters assume σ² and 1. The NIS of a correct filter is therefore too small by a fraction
+of about σ²: 0.25 % at σ = 0.05 rad, 1 % at 0.1 rad, 4.2 % at 0.2 rad, 10 % at 0.3 rad. If that matters (``σ`` above 0.1 rad), give the
+whole vector (kind ``"vector"``), whose noise is the same in all components.
 """
 
 from __future__ import annotations
@@ -50,15 +50,15 @@ if TYPE_CHECKING:
 
 Kind = Literal["direction", "heading", "vector", "attitude"]
 KINDS: dict[str, int] = {"direction": 2, "heading": 1, "vector": 3, "attitude": 3}
-"""Kinds of measurement and their degrees of freedom: of a direction both components across it; of a heading only the turn about the
-fixed z axis of the vector's horizontal part; of a vector all three components; of an attitude the whole rotation."""
+"""Kinds of measurement and their degrees of freedom: direction, both components across it; heading, only the rotation of the vector's
+horizontal part about the fixed z axis; vector, all three components; attitude, the whole rotation."""
 
 GRAVITY_F = (0.0, 0.0, -STANDARD_GRAVITY)
-"""Acceleration of gravity where the fixed z axis points up, m/s²."""
+"""Acceleration of gravity if the fixed z axis points up, m/s²."""
 
 Attitude = Callable[[Array], Array]
 VectorField = Callable[[Array], Array]
-"""A vector of the fixed frame at given times: (m,) s to (m, 3)."""
+"""A fixed-frame vector as a function of time: (m,), s, to (m, 3)."""
 
 
 class Sensor(Protocol):
@@ -99,16 +99,16 @@ class VectorMeasurements:
 
     A sample with a NaN in ``vector_b``, or in ``attitude``, is missing: filters skip and count it. Its other entries may be NaN too; they
     are then replaced (σ and covariance by the mean square of the others, the reference by another one, the arrival by the time), so that
-    nothing computed over the series is affected.
+    results computed over the series are not affected.
 
-    Arrays of floats are kept without a copy: pass a copy of a buffer that is written to afterwards.
+    Arrays of floats are kept without a copy: pass a copy if the buffer is written to afterwards.
 
     Parameters
     ----------
     sensor : str
         Name of the sensor.
     kind : {"direction", "heading", "vector", "attitude"}
-        What is measured; see :data:`KINDS`.
+        Kind of measurement; see :data:`KINDS`.
     time : ndarray (m,)
         Times of measurement, s, increasing.
     reference_f : ndarray (3,) or (m, 3), default (0, 0, 1)
@@ -116,18 +116,18 @@ class VectorMeasurements:
     vector_b : ndarray (m, 3), default empty
         Measured vectors, body frame, of unit length except for kind ``"vector"``. NaN for kind ``"attitude"``, which has none.
     sigma : float or ndarray (m,), default 0
-        Noise of each component: rad across a direction, the unit of a vector, rad about each body axis of an attitude. Where
-        ``sigma_axes`` or ``covariance`` are given, their root mean square.
+        Standard deviation of the noise of each component: rad across a direction, the unit of a vector, rad about each body axis of an
+        attitude. If ``sigma_axes`` or ``covariance`` is given, their root mean square.
     attitude : ndarray (m, 4), optional
         Measured q_fb for kind ``"attitude"``, with the error on the body side.
     sigma_axes : ndarray (3,) or (m, 3), optional
-        Noise along each body axis, in the unit of sigma. For a direction the part across it counts. A series of kind ``"attitude"``
-        always has it.
+        Standard deviation along each body axis, in the unit of sigma. For a direction only the part across it is used. A series of
+        kind ``"attitude"`` always has it.
     covariance : ndarray (3, 3) or (m, 3, 3), optional
-        Covariance of the noise in body axes, the unit of sigma squared. For a direction the part across it counts; a heading has
-        none.
+        Covariance of the noise in body axes, the unit of sigma squared. For a direction only the part across it is used; not for a
+        heading.
     arrival : ndarray (m,), optional
-        Time of arrival of each sample, s, not before its time; None: at once.
+        Time of arrival of each sample, s, not before its time; None: without delay.
     """
 
     sensor: str
@@ -181,7 +181,7 @@ class VectorMeasurements:
             object.__setattr__(self, name, value)
 
     def _noise(self, m: int, missing: np.ndarray) -> dict[str, Array]:
-        """Return sigma (m,), and with them sigma_axes (m, 3) and covariance (m, 3, 3) as far as they are given."""
+        """Return sigma (m,), and sigma_axes (m, 3) and covariance (m, 3, 3) if they are given."""
         found: dict[str, Array] = {}
         axes: Array | None = None
         if self.kind == "heading" and not (self.sigma_axes is None and self.covariance is None):
@@ -201,7 +201,7 @@ class VectorMeasurements:
             if self.kind == "attitude":
                 found["sigma_axes"] = axes
         given = self._given_sigma(m)
-        given_sigma = np.any(numbers("sigma", self.sigma, allow_nan=True) != 0.0)  # of an empty series too
+        given_sigma = np.any(numbers("sigma", self.sigma, allow_nan=True) != 0.0)  # for an empty series too
         if axes is None and self.kind == "attitude" and not given_sigma:
             raise InputError(
                 f"{self.sensor}: a series of kind 'attitude' needs its noise: sigma (m,), sigma_axes (m, 3) or covariance (m, 3, 3)"
@@ -231,7 +231,7 @@ class VectorMeasurements:
         return found
 
     def _given_sigma(self, m: int) -> Array:
-        """Return σ of each sample (m,) as it was given, a single one spread over all."""
+        """Return the given σ of each sample (m,); a single one is repeated."""
         given = numbers(f"{self.sensor}: sigma", self.sigma, allow_nan=True)
         if given.shape not in ((), (1,), (m,)):
             by_axis = "" if self.kind == "heading" else ", and one per body axis as sigma_axes"
@@ -241,7 +241,7 @@ class VectorMeasurements:
         return array(f"{self.sensor}: sigma", np.broadcast_to(given, (m,)), (m,), allow_nan=True)
 
     def _given_axes(self, m: int) -> Array:
-        """Return σ of each body axis (m, 3) as it was given, one of all samples spread over them."""
+        """Return the given σ of each body axis (m, 3); a single set is repeated."""
         given = numbers(f"{self.sensor}: sigma_axes", self.sigma_axes, allow_nan=True)  # type: ignore[arg-type]
         if given.shape not in ((), (3,), (1, 3), (m, 3)):
             raise InputError(
@@ -271,7 +271,7 @@ class VectorMeasurements:
         return np.broadcast_to(self.reference_f, (len(self.time), 3))
 
     def taken(self, which: Any) -> VectorMeasurements:
-        """Return the samples that an index selects, with all that belongs to them.
+        """Return the samples that an index selects, with their noise, references and arrival times.
 
         Parameters
         ----------
@@ -314,12 +314,12 @@ class VectorMeasurements:
 
     @property
     def anisotropic(self) -> bool:
-        """Whether the noise needs more than one sigma per sample; for an attitude, more than one per axis."""
+        """Whether the noise is not described by one sigma per sample; for an attitude, by one per axis."""
         return self.covariance is not None or (self.kind != "attitude" and self.sigma_axes is not None)
 
     @property
     def covariances(self) -> Array:
-        """Covariance of the noise of every sample (m, 3, 3), body axes; for a heading its variance on the diagonal."""
+        """Covariance of the noise of every sample (m, 3, 3), body axes; for a heading a diagonal of its variance."""
         if self.covariance is not None:
             return self.covariance
         if self.sigma_axes is not None:
@@ -328,7 +328,7 @@ class VectorMeasurements:
 
 
 def _missing(value: Array) -> np.ndarray:
-    """Return which rows (m,) hold a NaN. The sum is NaN if any is, which is the quickest check that there is none."""
+    """Return a mask (m,) of the rows with a NaN. The sum, which is NaN if any entry is, is the fastest check for none."""
     if np.isnan(np.sum(value)):
         return np.asarray(np.isnan(value).any(axis=1))
     return np.zeros(len(value), bool)
@@ -362,7 +362,7 @@ def _first_or_level(known: Array) -> Array:
 
 
 def _covariances(name: str, value: ArrayLike, m: int, missing: np.ndarray) -> Array:
-    """Return covariances (m, 3, 3), symmetric and with no negative eigenvalue; (3, 3) is spread over all."""
+    """Return covariances (m, 3, 3), checked to be symmetric without negative eigenvalues; a single one is repeated."""
     given = numbers(name, value)
     if given.shape == (3, 3):
         one = array(name, given, (3, 3))[None]
@@ -376,18 +376,20 @@ def _covariances(name: str, value: ArrayLike, m: int, missing: np.ndarray) -> Ar
     least = np.linalg.eigvalsh(one)[:, 0] if len(one) else np.zeros(0)
     if np.any(least < -1e-12 * size.ravel()):
         k = int(np.argmin(least))
-        raise InputError(f"{name}[{k}] has the eigenvalue {least[k]:.3g}; a covariance has none below zero")
+        raise InputError(
+            f"{name}[{k}] has the eigenvalue {least[k]:.3g}; a covariance must have no negative eigenvalue"
+        )
     return whole
 
 
 UNIT_TOLERANCE = 1e-6
-"""Departure of the length of a measured direction from 1 above which it is an error, not rounding."""
+"""Maximum deviation of the length of a measured direction from 1, by rounding."""
 MIN_LEVEL = 1e-3
-"""Horizontal part of a unit reference below which it shows no heading."""
+"""Minimum horizontal part of a unit reference of a heading."""
 
 
 def need_unit(name: str, vector: Array) -> None:
-    """Refuse measured vectors (..., 3) that are not of unit length; those with NaN pass, they are missing."""
+    """Reject measured vectors (..., 3) that are not of unit length, except missing ones (NaN)."""
     norm = np.linalg.norm(vector, axis=-1)
     bad = np.abs(norm - 1.0) > UNIT_TOLERANCE
     if np.any(bad):
@@ -399,7 +401,7 @@ def need_unit(name: str, vector: Array) -> None:
 
 
 def need_level(name: str, reference: Array) -> None:
-    """Refuse unit references (..., 3) of a heading that are vertical."""
+    """Reject vertical unit references (..., 3) of a heading."""
     level = np.hypot(reference[..., 0], reference[..., 1])
     if np.any(level < MIN_LEVEL):
         place = f"{name}[{int(np.argmax(level < MIN_LEVEL))}]" if level.ndim else name
@@ -411,7 +413,7 @@ def _direction(name: str, value: ArrayLike) -> Array:
     length = float(np.linalg.norm(vector))
     if length == 0.0:
         raise InputError(f"{name} is the zero vector, which has no direction")
-    # A unit vector but for rounding stays as it is, so that one written to a file and read is the same to the bit.
+    # A vector of unit length to within rounding is unchanged, so that one read from a file is bitwise equal to the one written.
     return vector if abs(length - 1.0) <= ROUNDING else np.asarray(vector / length)
 
 
@@ -437,7 +439,7 @@ def triad(reference_f: ArrayLike) -> Array:
 
 
 def _one_triad(x: float, y: float, z: float) -> Array:
-    """Return :func:`triad` of one vector in a twentieth of the time that NumPy takes for it, the same to the bit."""
+    """Return :func:`triad` of one vector, bitwise the same, 20 times faster than NumPy."""
     length = math.sqrt(x * x + y * y + z * z)
     if length == 0.0:
         raise InputError(_NO_DIRECTION)
@@ -468,7 +470,7 @@ class Faults:
     outlier_probability : float, default 0.0
         Probability that a sample is an outlier, independently of the others.
     outlier_scale : float, default 10.0
-        Noise of an outlier over that of other samples (contaminated normal, Tukey 1960).
+        Ratio of the noise of an outlier to that of other samples (contaminated normal, Tukey 1960).
     correlated_sigma : float, default 0.0
         Standard deviation of an additional first-order Gauss–Markov noise of each component, in the unit of sigma.
     correlation_time : float, default 100.0
@@ -478,7 +480,7 @@ class Faults:
     duty_period : float, default 0.0
         Period of a duty cycle, s, counted from time 0; 0: the sensor is always on.
     duty_share : float, default 1.0
-        Part of each period, from its beginning, in which the sensor is on.
+        Fraction of each period, from its beginning, in which the sensor is on.
     """
 
     latency: float = 0.0
@@ -513,7 +515,7 @@ class Faults:
         non_negative("duty_period", self.duty_period, unit="s")
 
     def noise(self, time: Array, generator: np.random.Generator) -> tuple[Array, Array]:
-        """Return white noise of unit σ with its outliers, and the correlated noise.
+        """Return white noise of unit σ including outliers, and the correlated noise.
 
         Parameters
         ----------
@@ -525,7 +527,7 @@ class Faults:
         Returns
         -------
         white : ndarray (m, 3)
-            White noise of unit σ; the same one with faults and without, as it is drawn first.
+            White noise of unit σ. It is drawn first, so that it is the same with and without correlated noise or outliers.
         correlated : ndarray (m, 3)
             Gauss–Markov noise, in the unit of ``correlated_sigma``.
         """
@@ -547,19 +549,19 @@ class Faults:
     def heard(self, series: VectorMeasurements, generator: np.random.Generator) -> VectorMeasurements:
         """Return the series without the samples in outages, off duty or lost, with arrival times if there is a latency.
 
-        Lost samples are drawn from a child of the generator, so they are the same whatever the noise.
+        Lost samples are drawn from a child of the generator, so they do not depend on the noise.
 
         Parameters
         ----------
         series : VectorMeasurements
-            Measurements without faults of timing.
+            Measurements without timing faults.
         generator : numpy.random.Generator
             Random stream of the sensor; a child of it draws the lost samples.
 
         Returns
         -------
         VectorMeasurements
-            The series as it arrives.
+            The series as received.
         """
         arrival = series.time + self.latency if self.latency > 0.0 else None
         series = dataclasses.replace(series, arrival=arrival)
@@ -567,7 +569,7 @@ class Faults:
         for a, b in self.outages:
             lost |= (series.time >= a) & (series.time <= b)
         if self.duty_period > 0.0:
-            # The tolerance keeps a sample that falls on a switch but for rounding.
+            # The tolerance keeps a sample that differs from a switching time by rounding.
             lost |= np.mod(series.time / self.duty_period + 1e-9, 1.0) > self.duty_share + 2e-9
         if self.drop_probability > 0.0:
             lost |= generator.spawn(1)[0].random(len(lost)) < self.drop_probability
@@ -577,10 +579,10 @@ class Faults:
 def sample_times(rate: float, phase: float, start: float, end: float) -> Array:
     """Return the measurement times in (start, end], s: the first after ``phase``, or after one interval if that is 0."""
     first, skipped = (start + phase, 0) if phase > 0.0 else (start, 1)
-    # The tolerance of a millionth of an interval keeps the last one when end falls on it but for rounding.
+    # The tolerance of a millionth of an interval keeps the last sample if end differs from it by rounding.
     number = int(np.floor((finite("end", end) - first) * rate + 1e-6)) + 1 - skipped
-    # Whole numbers over the rate, as the gyro's edges are: where rates are multiples the times are equal to the last bit, and a filter
-    # has no step of a rounding error to take.
+    # Computed as integers divided by the rate, as the gyro's edges are: if the rates are multiples, the times are bitwise equal, and a
+    # filter needs no step of the size of a rounding error.
     return np.minimum(first + np.arange(skipped, max(number, 0) + skipped) / rate, end)
 
 
@@ -597,7 +599,7 @@ def _body(motion: Any, time: Array, vector_f: Array) -> Array:
 
 
 class _Sampled:
-    """A sensor with a rate and faults of its own; :meth:`_measured` of the class is what it measures."""
+    """A sensor with its own rate and faults; :meth:`_measured` of the class returns its measurements."""
 
     name: str
     rate: float
@@ -625,7 +627,7 @@ class VectorSensor(_Sampled, ByValue):
     name : str
         Name of the sensor and of its stream of random numbers.
     reference_f : ndarray (3,)
-        Direction measured, fixed frame; its length does not matter.
+        Direction measured, fixed frame; it is normalised.
     sigma : float
         Noise of each component of the unit direction before it is normalised, rad; above 0.1 rad see the module's notes.
     rate : float
@@ -633,7 +635,7 @@ class VectorSensor(_Sampled, ByValue):
     phase : float, default 0.0
         Time of the first measurement after the start, s; 0: one interval after it.
     kind : {"direction", "heading"}, default "direction"
-        ``"direction"``, or ``"heading"``: only the rotation about the fixed z axis.
+        ``"direction"``, or ``"heading"`` (only the rotation about the fixed z axis).
     faults : Faults, default no faults
         Errors beyond the white noise.
     """
@@ -654,7 +656,7 @@ class VectorSensor(_Sampled, ByValue):
 
     def _measured(self, motion: Any, time: Array, white: Array, correlated: Array) -> dict[str, Any]:
         noisy = _body(motion, time, self.reference_f) + self.sigma * white + correlated
-        # The noise of a heading is that across the direction over its horizontal part.
+        # The noise of a heading is that across the direction divided by its horizontal part.
         level = float(np.hypot(self.reference_f[0], self.reference_f[1])) if self.kind == "heading" else 1.0
         return {
             "kind": self.kind,
@@ -673,7 +675,7 @@ class HorizonSensor(_Sampled, ByValue):
     name : str
         Name of the sensor and of its stream of random numbers.
     orbit : CircularOrbit
-        Orbit that it flies on, in the fixed frame.
+        Orbit of the body, in the fixed frame.
     sigma : float
         Noise of each component of the unit direction, rad.
     rate : float
@@ -693,7 +695,7 @@ class HorizonSensor(_Sampled, ByValue):
 
     def __post_init__(self) -> None:
         """Check every field."""
-        from strapdown.motion.orbit import CircularOrbit  # all motions come with it, and recordings need none
+        from strapdown.motion.orbit import CircularOrbit  # imports all motions, which recordings do not need
 
         _check_sampling(self.name, self.sigma, "rad", self.rate, self.phase)
         instance(f"{self.name}: orbit", self.orbit, CircularOrbit, "give an orbit.CircularOrbit")
@@ -712,7 +714,7 @@ Boresight = str | tuple[float, ...] | tuple[tuple[float, ...], ...]
 
 
 def _boresight(name: str, value: Any) -> str | tuple[float, ...]:
-    """Return a boresight as "x", "y" or "z" where it is along that axis, either way, or as a unit vector."""
+    """Return a boresight as "x", "y" or "z" if it is along that axis, in either direction, otherwise as a unit vector."""
     if isinstance(value, str):
         return one_of(name, value.removeprefix("-"), ("x", "y", "z"))
     given = np.asarray(numbers(name, value))
@@ -731,7 +733,7 @@ def _boresight(name: str, value: Any) -> str | tuple[float, ...]:
         )
     length = float(np.linalg.norm(b))
     if not np.isfinite(length) or length == 0.0:
-        raise InputError(f"{name} is {value!r}, no direction; give x, y or z, or three numbers not all zero")
+        raise InputError(f"{name} is {value!r}, not a direction; give x, y or z, or three numbers not all zero")
     b = b / length
     k = int(np.argmax(np.abs(b)))
     return "xyz"[k] if abs(b[k]) > 1.0 - 1e-12 else tuple(b.tolist())
@@ -739,7 +741,7 @@ def _boresight(name: str, value: Any) -> str | tuple[float, ...]:
 
 @dataclass(frozen=True, kw_only=True)
 class AttitudeSensor(_Sampled):
-    """A star tracker that gives the attitude as a quaternion; coarse about its boresight, fine across it.
+    """A star tracker that measures the attitude as a quaternion; less precise about its boresight than across it.
 
     Parameters
     ----------
@@ -752,8 +754,8 @@ class AttitudeSensor(_Sampled):
     rate : float
         Measurements per second, Hz.
     boresight : {"x", "y", "z"} or array_like (3,), (4,) or (3, 3), default "z"
-        Where it looks: a body axis, a direction in body axes (3,), or its mounting, sensor to body, as a quaternion (4,), scalar first,
-        or a rotation matrix (3, 3), whose z axis is the boresight. Kept as an axis or a unit vector.
+        Boresight: a body axis, a direction in body axes (3,), or the mounting, sensor to body, as a quaternion (4,), scalar first,
+        or a rotation matrix (3, 3), whose z axis is the boresight. Stored as an axis or a unit vector.
     phase : float, default 0.0
         Time of the first measurement after the start, s; 0: one interval after it.
     faults : Faults, default no faults
@@ -776,7 +778,7 @@ class AttitudeSensor(_Sampled):
 
     @property
     def covariance(self) -> Array | None:
-        """Covariance of the noise in body axes (3, 3), rad²; None where the boresight is a body axis."""
+        """Covariance of the noise in body axes (3, 3), rad²; None if the boresight is a body axis."""
         if isinstance(self.boresight, str):
             return None
         b = np.asarray(self.boresight)
@@ -825,7 +827,7 @@ class Magnetometer(_Sampled, ByValue):
     hard_iron : ndarray (3,), default zeros
         Hard iron h: field of magnetised parts that move with the body, T, body axes.
     soft_iron : ndarray (3, 3), default zeros
-        Soft iron S: of parts that the outer field magnetises, dimensionless.
+        Soft iron S: effect of parts magnetised by the external field, dimensionless.
     kind : {"direction", "heading", "vector"}, default "direction"
         ``"direction"``, ``"heading"`` (about the fixed z axis) or ``"vector"`` (the whole field, T).
     phase : float, default 0.0
@@ -852,9 +854,9 @@ class Magnetometer(_Sampled, ByValue):
             object.__setattr__(self, "field_f", array(f"{self.name}: field_f", self.field_f, (3,)))
             seen = self.field_f[:2] if self.kind == "heading" else self.field_f
             if not np.any(seen):
-                part = "level part of field_f" if self.kind == "heading" else "field_f"
+                part = "horizontal part of field_f" if self.kind == "heading" else "field_f"
                 raise InputError(
-                    f"{self.name}: {part} is zero, which has no direction; give the field where the body is"
+                    f"{self.name}: {part} is zero, which has no direction; give the field at the location of the body"
                 )
         object.__setattr__(self, "hard_iron", array(f"{self.name}: hard_iron", self.hard_iron, (3,)))
         object.__setattr__(self, "soft_iron", array(f"{self.name}: soft_iron", self.soft_iron, (3, 3)))
@@ -898,7 +900,7 @@ def specific_force(
     lever_arm_b : array_like (3,), default zeros
         Position r of the point, m, body axes, from the point that moves with ``acceleration_f``.
     acceleration_f : callable, optional
-        Acceleration a_f, m/s², fixed frame, as a function of time (m,), s, that returns (m, 3). Default: zero.
+        Acceleration a_f, m/s², fixed frame: a function of time (m,), s, that returns (m, 3). Default: zero.
     gravity_f : array_like (3,), default (0, 0, −9.80665)
         Acceleration of gravity g_f, m/s², fixed frame.
 
@@ -925,7 +927,7 @@ def specific_force(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Accelerometer(_Sampled, ByValue):
-    """An accelerometer used as a sensor of the vertical: right at rest, in error by the acceleration of the body.
+    """An accelerometer used as a sensor of the vertical: correct at rest, otherwise in error by the acceleration of the body.
 
     Parameters
     ----------
@@ -940,11 +942,11 @@ class Accelerometer(_Sampled, ByValue):
     bias : ndarray (3,), default zeros
         Bias, m/s², body axes.
     acceleration_f : callable, optional
-        Acceleration of that point, m/s², fixed frame, as a function of time (m,), s, that returns (m, 3); None: none.
+        Acceleration of that point, m/s², fixed frame: a function of time (m,), s, that returns (m, 3); None: zero.
     gravity_f : ndarray (3,), default (0, 0, −9.80665)
         Acceleration of gravity, m/s², fixed frame.
     kind : {"direction", "vector"}, default "direction"
-        ``"direction"`` of the vertical, or ``"vector"`` (the specific force, m/s²).
+        ``"direction"`` (of the vertical) or ``"vector"`` (the specific force, m/s²).
     phase : float, default 0.0
         Time of the first measurement after the start, s; 0: one interval after it.
     faults : Faults, default no faults
@@ -995,9 +997,9 @@ class HeadingPair(_Sampled, ByValue):
     name : str
         Name of the sensor and of its stream of random numbers.
     baseline_b : ndarray (3,)
-        From the first antenna to the second, m, body axes.
+        Vector from the first antenna to the second, m, body axes.
     sigma : float
-        Noise of each component of the relative position, m; that of the heading is this over the baseline's horizontal length.
+        Noise of each component of the relative position, m; that of the heading is this divided by the baseline's horizontal length.
     rate : float
         Measurements per second, Hz.
     phase : float, default 0.0

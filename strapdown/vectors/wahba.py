@@ -1,11 +1,10 @@
 """Attitude from vector observations at one instant: from vertical and North, and the optimal solution of Wahba's problem.
 
-Directions ``b_i`` measured in the body frame are known as ``r_i`` in the fixed frame; wanted is the attitude ``q_fb``, matrix R,
-that minimises Wahba's loss ``½ Σ |b_i − Rᵀ r_i|² / σ_i²`` (Wahba 1965, SIAM Review 7). ``σ_i`` is the noise of each of the *two*
-components across the direction, rad: ``E[n nᵀ] = σ² (I − b bᵀ)``, the QUEST measurement model (Shuster & Oh 1981, J. Guidance and
-Control 4).
+Directions ``b_i`` are measured in the body frame and known as ``r_i`` in the fixed frame. The attitude ``q_fb``, matrix R, minimises
+Wahba's loss ``½ Σ |b_i − Rᵀ r_i|² / σ_i²`` (Wahba 1965, SIAM Review 7). ``σ_i`` is the noise of each of the *two* components across the
+direction, rad: ``E[n nᵀ] = σ² (I − b bᵀ)``, the QUEST measurement model (Shuster & Oh 1981, J. Guidance and Control 4).
 
-Only directions count: every vector is divided by its length.
+Every vector is divided by its length: only its direction is used.
 """
 
 from __future__ import annotations
@@ -28,16 +27,16 @@ __all__ = [
 ]
 
 INCONSISTENT = 6.0
-"""Two measured directions whose angle is off by more than this many σ are inconsistent: chance exceeds it twice in 1e9 pairs."""
+"""Maximum error of the angle between two measured directions, σ; correct data exceed it in two of 1e9 pairs."""
 
 LARGEST_UNCERTAINTY = 1.0
-"""A 1σ of the attitude, rad, beyond which a direction of it counts as undetermined (a uniform angle has 1.8)."""
+"""Maximum 1σ of a component of the attitude, rad, for it to count as determined (a uniform angle has 1.8)."""
 
 MIN_HORIZONTAL_ANGLE = 1e-3
-"""Angle between magnetic field and vertical, rad, below which there is no heading."""
+"""Minimum angle between magnetic field and vertical for a heading, rad."""
 
 MIN_WEIGHT = 1e-12
-"""Weights 1/σ² below this part of the largest are lifted to it in the matrix that the SVD starts from: doubles hold no more."""
+"""Minimum weight 1/σ² in the matrix of the SVD, relative to the largest weight; double precision cannot represent a larger ratio."""
 
 ROUNDING = 1e-15
 """Rounding error of the direction of a unit vector, rad."""
@@ -56,7 +55,7 @@ def from_vertical_and_heading(up_b: ArrayLike, magnetic_b: ArrayLike) -> Array:
     Returns
     -------
     ndarray (..., 4)
-        Unit quaternions q_fb (TRIAD; Black 1964). The vertical is met exactly; of the field only the horizontal part counts, which
+        Unit quaternions q_fb (TRIAD; Black 1964). The vertical is matched exactly; only the horizontal part of the field is used, which
         points North whatever the dip.
     """
     up, field = _directions("up_b", up_b), _directions("magnetic_b", magnetic_b)
@@ -66,7 +65,7 @@ def from_vertical_and_heading(up_b: ArrayLike, magnetic_b: ArrayLike) -> Array:
         index = np.argwhere(bad)[0]
         raise InputError(
             f"{_place('up_b', *index)} and {_place('magnetic_b', *index)} are {angle[tuple(index)] / DEGREE:.6g}° apart, less than "
-            f"{MIN_HORIZONTAL_ANGLE / DEGREE:.2g}° from one line: such a field shows no heading; check both"
+            f"{MIN_HORIZONTAL_ANGLE / DEGREE:.2g}° from one line: such a field gives no heading; check both"
         )
     north_up = _frame(np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0]))
     return quaternion.from_matrix(north_up @ np.swapaxes(_frame(up, field), -1, -2))
@@ -84,7 +83,7 @@ def _frame(first: Array, second: Array) -> Array:
 
 
 class InconsistentError(InputError):
-    """Directions whose angles differ between the frames by more than their noise explains."""
+    """The angle of two directions differs between the frames by more than their noise allows."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -110,12 +109,12 @@ class Solution:
 
     @property
     def chi_square(self) -> Array:
-        """Twice the loss: χ² with ``dof`` degrees of freedom if directions and σ are right."""
+        """Twice the loss: χ² with ``dof`` degrees of freedom if directions and σ are correct."""
         return np.asarray(2.0 * self.loss)
 
     @property
     def probability(self) -> Array:
-        """Probability that right data leave a residual at least as large (...,). Near 0: an outlier, a wrong reference or a σ too small."""
+        """Probability of a residual at least as large with correct data (...,). Near 0: outlier, wrong reference or σ too small."""
         from scipy.special import chdtrc
 
         return np.asarray(chdtrc(self.dof, self.chi_square))
@@ -124,8 +123,9 @@ class Solution:
 def solve(vectors_b: ArrayLike, references_f: ArrayLike, sigmas: ArrayLike) -> Solution:
     """Return the attitude that minimises Wahba's loss, with its covariance and residual.
 
-    Markley's SVD method, then Gauss–Newton steps on the residuals: the matrix that the SVD starts from holds 1/σ², so that its rounding
-    rotates the attitude by up to 1e-16 (σ_max/σ_min)² rad about the worst known axis; the residuals hold 1/σ and do not.
+    Markley's SVD method, followed by Gauss–Newton steps on the residuals. The matrix of the SVD is weighted by 1/σ², so its rounding
+    rotates the attitude by up to 1e-16 (σ_max/σ_min)² rad about the least determined axis; the residuals, weighted by 1/σ, do not have
+    this error.
 
     Parameters
     ----------
@@ -145,7 +145,7 @@ def solve(vectors_b: ArrayLike, references_f: ArrayLike, sigmas: ArrayLike) -> S
     ------
     InputError
         If there are fewer than two directions, one is zero or not finite, all lie on one line within the noise, or the angle of a
-        pair differs between the frames by more than the noise explains (:class:`InconsistentError`).
+        pair differs between the frames by more than the noise allows (:class:`InconsistentError`).
 
     Examples
     --------
@@ -176,7 +176,7 @@ def solve(vectors_b: ArrayLike, references_f: ArrayLike, sigmas: ArrayLike) -> S
     _refuse_undetermined("references_f", r, sigma)
     _refuse_undetermined("vectors_b", b, sigma)
 
-    # The best known direction has weight 1: only ratios matter. What the floor moves the Gauss–Newton steps move back.
+    # Only ratios of weights matter: the most precise direction has weight 1. The Gauss–Newton steps correct the effect of the minimum.
     weight = np.maximum(np.square(np.min(sigma, axis=-1, keepdims=True) / sigma), MIN_WEIGHT)
     attitude = _refined(_svd(b, r, weight), b, r, sigma)
     attitude = np.where(attitude[..., :1] < 0.0, -attitude, attitude)
@@ -210,7 +210,7 @@ def _svd(b: Array, r: Array, weight: Array) -> Array:
 def _factorised(predicted: Array, residual: Array, sigma: Array) -> tuple[Array, Array]:
     """Return (T, y): δθ = T⁻¹ y minimises Σ |residual − [predicted] δθ|²/σ², and its covariance is T⁻¹ T⁻ᵀ.
 
-    By orthogonal factorisation, which keeps the digits of the least weight beside the largest; the normal equations lose them.
+    By orthogonal factorisation: the normal equations would lose the digits of the smallest weights.
     """
     scale = sigma[..., None, None]
     rows = (skew(predicted) / scale).reshape(*predicted.shape[:-2], -1, 3)
@@ -220,7 +220,7 @@ def _factorised(predicted: Array, residual: Array, sigma: Array) -> tuple[Array,
 
 
 def _refined(attitude: Array, b: Array, r: Array, sigma: Array) -> Array:
-    """Return the attitude after Gauss–Newton steps on Wahba's loss, until they are lost in rounding."""
+    """Return the attitude after Gauss–Newton steps on Wahba's loss, down to the size of rounding errors."""
     for _ in range(_GAUSS_NEWTON_STEPS):
         predicted = _to_body(attitude, r)
         triangle, right = _factorised(predicted, b - predicted, sigma)
@@ -249,7 +249,7 @@ def _directions(name: str, value: ArrayLike) -> Array:
     if np.any(largest == 0.0):
         index = np.argwhere(largest[..., 0] == 0.0)[0]
         raise InputError(f"{_place(name, *index)} is the zero vector, which has no direction; leave it out")
-    # Scaled by the largest component first, so that no square leaves the range of a float.
+    # Scaled by the largest component first, so that no square overflows or underflows.
     scaled = vector / largest
     return np.asarray(scaled / np.linalg.norm(scaled, axis=-1, keepdims=True))
 
@@ -265,7 +265,7 @@ def _sigmas(value: ArrayLike, shape: tuple[int, ...]) -> Array:
     if np.any(sigma <= 0.0):
         index = np.argwhere(sigma <= 0.0)[0]
         raise InputError(
-            f"{_place('sigmas', *index)} is {sigma[tuple(index)]:g} rad; every direction needs a noise greater than zero"
+            f"{_place('sigmas', *index)} is {sigma[tuple(index)]:g} rad; every direction needs a σ greater than zero"
         )
     return sigma
 
@@ -275,7 +275,7 @@ def _angle(u: Array, v: Array) -> Array:
 
 
 def _refuse_inconsistent(b: Array, r: Array, sigma: Array) -> None:
-    """Refuse pairs whose angle differs between the frames by more than the noise explains."""
+    """Reject pairs whose angle differs between the frames by more than the noise allows."""
     i, j = np.triu_indices(b.shape[-2], 1)
     angle_b, angle_f = _angle(b[..., i, :], b[..., j, :]), _angle(r[..., i, :], r[..., j, :])
     allowed = INCONSISTENT * np.hypot(sigma[..., i], sigma[..., j]) + 4.0 * ROUNDING
@@ -288,13 +288,13 @@ def _refuse_inconsistent(b: Array, r: Array, sigma: Array) -> None:
             f"directions {i[k]} and {j[k]}{' of set ' + str([int(n) for n in index]) if index else ''} are "
             f"{np.broadcast_to(angle_b, excess.shape)[here] / DEGREE:.6g}° apart in the body frame but "
             f"{np.broadcast_to(angle_f, excess.shape)[here] / DEGREE:.6g}° in the fixed frame, where the noise allows a difference of "
-            f"{allowed_here / DEGREE:.3g}° ({INCONSISTENT:g} σ); look for a mixed-up pair, a reference in another frame, an outlier "
+            f"{allowed_here / DEGREE:.3g}° ({INCONSISTENT:g} σ); check for a mixed-up pair, a reference in another frame, an outlier "
             "or a σ too small"
         )
 
 
 def _refuse_undetermined(name: str, vectors: Array, sigma: Array) -> None:
-    """Refuse sets of directions that leave a turn undetermined: all on one line, as seen by the noise."""
+    """Reject sets of directions that lie on one line within the noise, so that a rotation is undetermined."""
     rows = skew(vectors) / np.maximum(sigma, ROUNDING)[..., None, None]
     least = np.linalg.svd(rows.reshape(*rows.shape[:-3], -1, 3), compute_uv=False)[..., -1]
     bad = least < 1.0 / LARGEST_UNCERTAINTY
@@ -306,7 +306,7 @@ def _refuse_undetermined(name: str, vectors: Array, sigma: Array) -> None:
         widest = int(np.argmax(np.minimum(angle, np.pi - angle)))
         uncertainty = "without bound" if least[index] == 0.0 else f"{1.0 / least[index]:.3g} rad"
         raise InputError(
-            f"{_place(name, *index)}: the attitude is not determined, the 1σ of its worst known turn is "
+            f"{_place(name, *index)}: the attitude is not determined, the 1σ of its least determined rotation is "
             f"{uncertainty}; of all pairs, directions {i[widest]} and {j[widest]} are furthest from one line, "
             f"{angle[widest] / DEGREE:.6g}° "
             "apart; add a direction away from that line, or give smaller sigmas (rad) if the noise is smaller"

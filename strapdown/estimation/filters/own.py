@@ -33,7 +33,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from strapdown.checks import Array, InputError, array, increasing, instance
+from strapdown.checks import OF_YOUR_OWN, Array, InputError, array, increasing, instance
 from strapdown.estimation.states import State
 from strapdown.files import reading
 from strapdown.records import Estimate, ImuRecord
@@ -140,7 +140,12 @@ class Own:
                 f"{self.name} is a filter of your own, whose code no result file holds; give it again: {again}, or in Python "
                 "replace(plan, setup=replace(plan.setup, estimator=…))"
             )
-        estimate = _function(_copied(self.given, self.name))(replace(record, truth=None), initial)
+        function = _function(_copied(self.given, self.name))
+        try:
+            estimate = function(replace(record, truth=None), initial)
+        except Exception as error:
+            error.add_note(f"{self.name}, {OF_YOUR_OWN}, failed")
+            raise
         return _checked(self.name, estimate, record, times)
 
 

@@ -1,1 +1,1 @@
-"""Filters beside the MEKF: each module defines what :mod:`strapdown.kernels.filters.extended` leaves open, and is all of its filter."""
+"""Other filters than the MEKF: each module is one filter and defines the open functions of :mod:`strapdown.kernels.filters.extended`."""

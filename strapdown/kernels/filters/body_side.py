@@ -1,4 +1,4 @@
-"""The error of the MEKF, body side: ``q_true = q ⊗ exp(δθ)``, ``δb = b_true − b``; others start from it."""
+"""The error of the MEKF, body side: ``q_true = q ⊗ exp(δθ)``, ``δb = b_true − b``: the default of the other filters."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from strapdown.kernels.rotation import moved, unit
 
 
 def from_body_side(q, A, B, C):
-    """Return the blocks as they are."""
+    """Return the blocks unchanged."""
     return A, B, C
 
 
 def to_body_side(q, A, B, C):
-    """Return the blocks as they are."""
+    """Return the blocks unchanged."""
     return A, B, C
 
 
@@ -35,6 +35,6 @@ def row_update(a, c, A, B, C, h, y, variance):
 
 
 def closed(q, b, A, B, C, correction, bias_correction):
-    """Move the state, and carry the covariance to the new tangent space by J_r."""
+    """Correct the state, and transform the covariance to the new tangent space by J_r."""
     q, G = moved(q, correction)
     return unit(q), add(b, bias_correction), congruent(G, A), multiply(G, B), C

@@ -1,7 +1,7 @@
-"""The complementary filter of Mahony, Hamel & Pflimlin (2008), with the covariance that its own gains give.
+"""The complementary filter of Mahony, Hamel & Pflimlin (2008), with the covariance for its gains.
 
-``ω_mes = z × R̂ᵀ r`` of each measurement turns the attitude by the sensor's gain times ω_mes and moves the bias by its bias gain times
-ω_mes: equations (32) of the paper over the interval of one sample, k_P dt and −k_I dt.
+Each measurement rotates the attitude by the sensor's gain times ``ω_mes = z × R̂ᵀ r`` and changes the bias by its bias gain times ω_mes:
+equations (32) of the paper over one sample interval, k_P dt and −k_I dt.
 """
 
 from __future__ import annotations
@@ -47,25 +47,24 @@ __all__ = ["from_body_side", "propagated", "to_body_side", "update"]
 NOTHING = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 MAX_VARIANCE = 100.0
-"""Of the attitude, all axes, rad²."""
+"""Maximum trace of the attitude covariance, rad²."""
 
 
 def held(A):
     """Return the diagonal of A, each number at most a third of ``MAX_VARIANCE``.
 
-    Gains that do not fit what is seen make the linear theory of the errors unstable. An attitude's error is bounded: beyond some radians
-    it only says that nothing is known, and what it says of correlations is rounding.
+    With unsuitable gains the linear error model is unstable, but an attitude error is bounded: a variance of several rad² only means that
+    the attitude is unknown, and correlations are then rounding.
     """
     most = MAX_VARIANCE / 3.0
     return (min(A[0], most), 0.0, 0.0, min(A[3], most), 0.0, min(A[5], most))
 
 
 def corrected_covariance(A, B, C, M, V, gain, bias_gain):
-    """Return the blocks of the covariance after a correction with gains of any size, not only Kalman's.
+    """Return the blocks of the covariance after a correction with any gains.
 
-    The filter turns by g ω and moves its bias by κ ω, where to first order ``ω = M δθ + n``, Cov n = V: ``δθ⁺ = (I − g M) δθ − g n``,
-    ``δb⁺ = δb − κ (M δθ + n)``. That is Joseph's form ``(I − K H) P (I − K H)ᵀ + K R Kᵀ``, which holds for any gain (Gelb 1974, section
-    4.2).
+    The filter rotates by g ω and changes its bias by κ ω, where to first order ``ω = M δθ + n``, Cov n = V: ``δθ⁺ = (I − g M) δθ − g n``,
+    ``δb⁺ = δb − κ (M δθ + n)``. This is Joseph's form ``(I − K H) P (I − K H)ᵀ + K R Kᵀ``, valid for any gain (Gelb 1974, section 4.2).
     """
     noise = full(V)
     left = combine_matrices(1.0, IDENTITY, -gain, M)
@@ -83,8 +82,8 @@ def corrected_covariance(A, B, C, M, V, gain, bias_gain):
 def measured_turn(kind, q, R, z, frame, noise, h, y):
     """Return ω_mes, M (9-tuple) and V (6-tuple) of a measurement, ``ω_mes = M δθ + n`` to first order, Cov n = V; body axes.
 
-    Of a direction or vector ``z × r_b``; of an attitude the vex of the antisymmetric part of ``R̂ᵀ R``, sin θ about the axis of the turn
-    (the passive filter of the paper); of a heading, with its row h and error y, the turn y about the fixed z axis.
+    For a direction or vector, ``z × r_b``; for an attitude, the vex of the antisymmetric part of ``R̂ᵀ R``, sin θ about the rotation axis
+    (the passive filter of the paper); for a heading, with its row h and error y, the rotation y about the fixed z axis.
     """
     if kind == ATTITUDE:
         d = quaternion_multiply((q[0], -q[1], -q[2], -q[3]), (frame[0], frame[1], frame[2], frame[3]))
@@ -99,7 +98,7 @@ def measured_turn(kind, q, R, z, frame, noise, h, y):
 
 
 def update(state, e, now, measured, body, out):
-    """Turn the attitude and move the bias by fixed gains."""
+    """Correct attitude and bias with fixed gains."""
     q, b, A, B, C = state
     place = measured.place[e]
     sensor = measured.sensor[e]
@@ -113,7 +112,7 @@ def update(state, e, now, measured, body, out):
         h1, h2, h3, y1, y2, y3, covariance = measurement_rows(kind, q, R, z, frame, noise)
         turn, M, V = measured_turn(kind, q, R, z, frame, noise, h1, y1)
         h1, h2, h3, e1, y2, y3, variance = independent_rows(h1, h2, h3, y1, y2, y3, covariance)
-        # Innovations of this filter, made independent: each less its regression on the ones before it.
+        # Innovations decorrelated: each minus its regression on those before it.
         F = innovation_factors(A, h1, h2, h3, variance)
         e2 = y2 - F[0] * e1
         e3 = y3 - F[1] * e1 - F[2] * e2

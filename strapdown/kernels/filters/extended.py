@@ -1,8 +1,8 @@
-"""An extended Kalman filter with an error of its own definition: a body of :mod:`strapdown.kernels.walk` that leaves the definition open.
+"""An extended Kalman filter with any definition of the error: a body of :mod:`strapdown.kernels.walk` that leaves the definition open.
 
-A module of this folder defines the error: how its covariance is carried over a step (``propagated``), the axes of a measurement's rows
-(``error_rows``), what a correction does (``closed``), and its blocks in terms of the body side (δθ, δb) (``from_body_side``,
-``to_body_side``). What it does not define is that of the MEKF. R = R_fb of the estimate.
+A module of this folder defines the error: propagation of its covariance over a step (``propagated``), rows of a measurement
+(``error_rows``), correction of the state (``closed``), and conversion of the covariance from and to the body-side error (δθ, δb)
+(``from_body_side``, ``to_body_side``). The default of each is that of the MEKF. R = R_fb of the estimate.
 """
 
 from __future__ import annotations
@@ -45,45 +45,45 @@ OPEN = ("from_body_side", "to_body_side", "propagated", "error_rows", "row_updat
 
 
 class Body(NamedTuple):
-    """What the filter is made of."""
+    """State, noise and gains of the filter."""
 
     state: np.ndarray
-    """(28,), body side; left at the end state."""
+    """Packed state (28,), body side; at return, the end state."""
     angle_variance: float
     """σ_v², rad²/s."""
     rate_variance: float
     """σ_u², rad²/s³."""
     gains: np.ndarray
-    """Of a filter with fixed gains, of attitude and bias (1/s) by sensor (2, sensors); of others empty."""
+    """Gains of attitude and bias (1/s) by sensor (2, sensors) for a filter with fixed gains; otherwise empty."""
 
 
 class Outputs(NamedTuple):
-    """Arrays that a run writes."""
+    """Output arrays."""
 
     states: np.ndarray
-    """(rows, 28), body side."""
+    """Packed states (rows, 28), body side."""
     innovation: np.ndarray
     """(events, 6) by place."""
 
 
 def from_body_side(q, A, B, C):
-    """Return the blocks of the filter's own error of those of the body side."""
+    """Return the covariance blocks of the filter's error from those of the body-side error."""
 
 
 def to_body_side(q, A, B, C):
-    """Return the blocks of the body side of those of the filter's own error."""
+    """Return the covariance blocks of the body-side error from those of the filter's error."""
 
 
 def propagated(q, b, A, B, C, delta_theta, dt, angle_variance, rate_variance):
-    """Return q, A, B, C after an increment of a small turn."""
+    """Return q, A, B, C after a small increment."""
 
 
 def error_rows(kind, q, R, z, frame, noise):
-    """Return (h1, h2, h3, y1, y2, y3, covariance of the rows) in the axes of the attitude error."""
+    """Return (h1, h2, h3, y1, y2, y3, covariance of the noise) in the axes of the attitude error."""
 
 
 def row_update(a, c, A, B, C, h, y, variance):
-    """Return (a, c, A, B, C, innovation, its variance) after a scalar row, where rows before it have corrected by (a, c)."""
+    """Return (a, c, A, B, C, innovation, its variance) after a scalar row; (a, c) is the correction by the rows before it."""
 
 
 def closed(q, b, A, B, C, correction, bias_correction):
@@ -147,7 +147,7 @@ def keep(state, row, e, body, out):
 
 
 def finish(state, row, e, body):
-    """Leave the end state, body side."""
+    """Store the end state, body side."""
     q, b, A, B, C = state
     A, B, C = to_body_side(q, A, B, C)
     store_state(body.state, q, b, A, B, C)
@@ -163,15 +163,15 @@ def negated(v):
 
 
 def turned_in_fixed_axes(q, phi):
-    """Return exp(φ) ⊗ q, of norm one: a turn by φ of any size given in fixed axes."""
+    """Return exp(φ) ⊗ q, normalised: a rotation by φ of any size in fixed axes."""
     turn, _ = moved((1.0, 0.0, 0.0, 0.0), phi)
     return unit(quaternion_multiply(turn, q))
 
 
 def joseph_row(a, c, A, B, C, h, y, variance):
-    """Update with one scalar row ``y = h · (attitude error) + v``, Var v = ``variance``, where rows before it have corrected by (a, c).
+    """Update with one scalar row ``y = h · (attitude error) + v``, Var v = ``variance``; (a, c) is the correction by the rows before it.
 
-    Joseph's form ``(I − k hᵀ) P (I − k hᵀ)ᵀ + r k kᵀ``, written as the short form plus its rounding error on the attitude side,
+    Joseph's form ``(I − k hᵀ) P (I − k hᵀ)ᵀ + r k kᵀ``, written as the short form with a correction by its rounding error in the attitude,
     ``d = (P − k p) h − r k``.
     """
     pa = symmetric_times_vector(A, h)
@@ -194,7 +194,7 @@ def joseph_row(a, c, A, B, C, h, y, variance):
 
 
 def rows_in_fixed_axes(kind, q, R, z, frame, noise):
-    """Return a measurement's rows for an attitude error in fixed axes: R h, of a constant direction its triad, whatever the estimate."""
+    """Return a measurement's rows for an attitude error in fixed axes, R h; for a constant direction they do not depend on the estimate."""
     h1, h2, h3, y1, y2, y3, noise = measurement_rows(kind, q, R, z, frame, noise)
     return matrix_times_vector(R, h1), matrix_times_vector(R, h2), matrix_times_vector(R, h3), y1, y2, y3, noise
 

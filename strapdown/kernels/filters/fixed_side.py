@@ -1,4 +1,4 @@
-"""The MEKF with its attitude error in fixed axes, ``q_true = exp(δφ) ⊗ q``, reset by the left Jacobian: the MEKF's equal."""
+"""The MEKF with its attitude error in fixed axes, ``q_true = exp(δφ) ⊗ q``, reset by the left Jacobian: equivalent to the MEKF."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def propagated(q, b, A, B, C, delta_theta, dt, angle_variance, rate_variance):
     """Propagate (δφ, δb): ``δφ̇ = −R δb − R n_v``, ``δḃ = n_u``.
 
     The MEKF of Markley & Crassidis (2014, chapter 6) with its error in the reference frame: Φ11 = I, Φ12 = −∫R dt = −dt R₁ J_r(φ) with
-    R₁ at the end; the noise is that of the body side seen from fixed axes, ``Q11(R₁φ)`` and ``R₁ Q12(φ)``.
+    R₁ at the end; the noise is that of the body side, rotated to fixed axes, ``Q11(R₁φ)`` and ``R₁ Q12(φ)``.
     """
     phi = combine(1.0, delta_theta, -dt, b)
     q = turned(q, phi)
@@ -66,9 +66,9 @@ def error_rows(kind, q, R, z, frame, noise):
 
 
 def closed(q, b, A, B, C, correction, bias_correction):
-    """Move the state by a correction of (δφ, δb) and carry the covariance to the new tangent space.
+    """Correct the state by (δφ, δb) and transform the covariance to the new tangent space.
 
-    ``exp(δφ) = exp(δφ⁺) ⊗ exp(a)`` gives ``δφ⁺ = J_l(a) (δφ − a)`` to first order: G = J_l(a), the mirror image of the body side's J_r.
+    ``exp(δφ) = exp(δφ⁺) ⊗ exp(a)`` gives ``δφ⁺ = J_l(a) (δφ − a)`` to first order: G = J_l(a), in place of J_r for the body side.
     """
     _, G = moved((1.0, 0.0, 0.0, 0.0), negated(correction))
     return turned_in_fixed_axes(q, correction), add(b, bias_correction), congruent(G, A), multiply(G, B), C

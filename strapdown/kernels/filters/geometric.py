@@ -1,6 +1,6 @@
 """The geometric filter of Andrle & Crassidis (2015): the bias error in one common frame, ``η = b_true − exp(−[δθ]) b``, body side.
 
-Carried as (δθ, δb) and sheared where η's b changes.
+The covariance is that of (δθ, δb), with a shear for each change of b in η.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from strapdown.kernels.rotation import moved, sine_and_versine, unit
 __all__ = ["closed", "error_rows", "from_body_side", "propagated", "row_update", "to_body_side"]
 
 LARGEST_CORRECTION = 1.8954942670339809
-"""rad; the root of θ = 2 sin θ. The geometric filter takes the bias b to ``exp(−[a]) b − b × a``; across a correction a that is
-multiplication by ``e^{−iθ} + iθ``, of magnitude ``√(1 + θ² − 2 θ sin θ)``: above one for any larger turn. There each correction would
-enlarge the bias and, by the shear, its variance, which makes room for the next: without end."""
+"""Maximum correction, rad: the root of θ = 2 sin θ. A correction a changes the bias b to ``exp(−[a]) b − b × a``; for components across a
+this is a multiplication by ``e^{−iθ} + iθ``, of magnitude ``√(1 + θ² − 2 θ sin θ)``, above one for larger angles. Each correction would
+then increase the bias and, by the shear, its variance and the next correction, without limit."""
 
 
 def closed(q, b, A, B, C, correction, bias_correction):
-    """Move the state by a correction of (δθ, δb) and carry the covariance, as a filter of (δθ, η), η = δb − [b] δθ, does.
+    """Correct the state by (δθ, δb) and transform the covariance, as in a filter of (δθ, η), η = δb − [b] δθ.
 
-    Its own correction is (a, c − [b] a) and moves the bias to ``b⁺ = exp(−[a]) b + c − b × a``; the covariance of (δθ, η) stays (Andrle &
-    Crassidis 2015). Seen in (δθ, δb) that is one shear by [b⁺ − b]: going to η and back would cost the digits of a bias variance that is
-    small beside b² times that of the attitude. A correction of more than ``LARGEST_CORRECTION`` is shortened to it, its bias in proportion.
+    The correction of (δθ, η) is (a, c − [b] a); it changes the bias to ``b⁺ = exp(−[a]) b + c − b × a`` and leaves the covariance unchanged
+    (Andrle & Crassidis 2015). In (δθ, δb) this is one shear by [b⁺ − b]: a transformation to η and back would lose the digits of a bias
+    variance much smaller than b² times that of the attitude. A correction above ``LARGEST_CORRECTION`` is scaled down to it.
     """
     squared = dot(correction, correction)
     if squared > LARGEST_CORRECTION * LARGEST_CORRECTION:
@@ -50,7 +50,7 @@ def closed(q, b, A, B, C, correction, bias_correction):
 
 
 def sheared(A, B, C, X):
-    """Return the blocks of the covariance of (x, y + X x) of those of (x, y)."""
+    """Return the covariance blocks of (x, y + X x) from those of (x, y)."""
     AX = multiply(full(A), transpose(X))
     S = times_transpose_upper_add(X, transpose(AX), C)
     XB = multiply(X, B)

@@ -73,9 +73,9 @@ def error_rows(kind, q, R, z, frame, noise):
 
 
 def closed(q, b, A, B, C, correction, bias_correction):
-    """Move the state by the group exponential of a correction (a, c) of (δφ, β), ``χ⁺ = exp(a, c) • χ``; the covariance stays.
+    """Correct the state by the group exponential of (a, c), ``χ⁺ = exp(a, c) • χ``; the covariance is unchanged.
 
-    Of the group law (R₁, b₁) • (R₂, b₂) = (R₁R₂, b₂ + R₂ᵀ b₁) the exponential is (exp a, J_r(a) c): ``b⁺ = b + Rᵀ J_r(a) c``.
+    For the group law (R₁, b₁) • (R₂, b₂) = (R₁R₂, b₂ + R₂ᵀ b₁) the exponential is (exp a, J_r(a) c): ``b⁺ = b + Rᵀ J_r(a) c``.
     """
     _, J = moved((1.0, 0.0, 0.0, 0.0), correction)
     step = transpose_times_vector(rotation_matrix(q), matrix_times_vector(J, bias_correction))

@@ -12,35 +12,35 @@ from strapdown.files import plain
 from strapdown.results import Listed, Listing, figure
 
 LIKELIER = math.log(20.0)
-"""Difference in ln p from which on the likelier of two causes is preferred: odds of 20 to 1, "strong" evidence (Kass & Raftery 1995)."""
+"""Minimum difference in ln p to prefer one of two causes: odds of 20 to 1, "strong" evidence (Kass & Raftery 1995)."""
 APPROXIMATION = 0.01
-"""Relative error of ln p itself: a hypothesis keeps the filter's start and is linearised, which shows where a fault is gross."""
+"""Relative error of ln p: hypotheses keep the filter's initial state and are linearised, which matters for gross faults."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Cause:
-    """One hypothesis with the θ that fits best.
+    """One hypothesis with its best-fitting θ.
 
     Parameters
     ----------
     name : str
-        What is wrong: "R too small", "R too large", "Q too small", "Q too large", "outliers", "time offset", "hard
+        Fault: "R too small", "R too large", "Q too small", "Q too large", "outliers", "time offset", "hard
         iron", "body-fixed bias", "mounting", "misalignment", "scale factor", "reference length", "reference direction",
         "initial attitude", "initial bias", "commutation", "wrong convention".
     of : str
-        Of what: a sensor, "gyro", …
+        Object with the fault: a sensor, "gyro", …
     estimate : ndarray (k,)
-        The θ that fits best, in ``unit``.
+        Best-fitting θ, in ``unit``.
     standard_error : ndarray (k,)
-        Standard error of θ, in ``unit``; NaN where there is none.
+        Standard error of θ, in ``unit``; NaN if there is none.
     unit : str
         SI unit of θ.
     gain : float
-        Twice the log-likelihood gained.
+        Twice the gain in log-likelihood.
     log_p : float
-        Natural logarithm of the probability that a consistent filter gains as much.
+        Natural logarithm of the probability of as large a gain for a consistent filter.
     words : str
-        What it says, with its size.
+        Description with the size of the fault.
     """
 
     name: str
@@ -54,26 +54,25 @@ class Cause:
 
     @property
     def finding(self) -> Finding:
-        """The cause as evidence against the filter, to be taken together with the statistics."""
+        """The cause as evidence against the filter, for a joint test with the statistics."""
         return Finding(name=self.name, of=self.of, value=self.gain, p_value=math.exp(self.log_p), samples=1)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Diagnosis(Listed):
-    """Likely causes, the likeliest first, and the evidence.
+    """Likely causes, the most likely first, with the evidence.
 
     Parameters
     ----------
     causes : tuple of Cause
-        Those that are significant, all evidence taken together. After the first, others may only mirror it: correct it
-        and look again.
+        Significant causes, all evidence taken together. Those after the first may be side effects of it: correct it and
+        repeat the diagnosis.
     considered : tuple of Cause
-        All hypotheses, by rank.
+        All hypotheses in order of rank.
     judgement : Judgement
-        The verdict on the filter as it is: statistics and causes taken together (Holm), so that neither contradicts the
-        other.
+        The verdict on the filter from statistics and causes together (Holm), so that neither contradicts the other.
     probability : float
-        Probability, at least, that a consistent filter passes and is given no cause.
+        Minimum probability that a consistent filter passes and has no cause reported.
     """
 
     causes: tuple[Cause, ...]
@@ -82,7 +81,7 @@ class Diagnosis(Listed):
     probability: float
 
     def listing(self) -> Listing:
-        """Return the causes considered, the likeliest first, as a table."""
+        """Return the causes considered, the most likely first, as a table."""
         rows = [
             (one.name, one.of, figure(one.gain), figure(one.log_p), "likely" if one in self.causes else "no")
             for one in self.considered[:8]
@@ -92,29 +91,29 @@ class Diagnosis(Listed):
 
     @property
     def alternatives(self) -> tuple[Cause, ...]:
-        """The likeliest cause and those less likely by a factor of 20 or 1 % of ln p at most: the data do not distinguish them."""
+        """The most likely cause, and those that the data do not distinguish from it: within a factor of 20 or 1 % of ln p."""
         best = self.causes[0].log_p if self.causes else 0.0
         return tuple(cause for cause in self.causes if cause.log_p <= best + max(LIKELIER, APPROXIMATION * -best))
 
     @property
     def words(self) -> str:
-        """The verdict and the causes, for people."""
+        """The verdict and the causes as text."""
         return f"{self.judgement.words}\n{self.cause_words}"
 
     @property
     def cause_words(self) -> str:
-        """The causes, for people."""
+        """The causes as text."""
         if not self.causes:
             return "No cause among those considered is significant."
         first = self.alternatives
         if len(first) == 1:
-            lines = [f"Likeliest cause: {first[0].words}"]
+            lines = [f"Most likely cause: {first[0].words}"]
         else:
             lines = [
-                "One of these causes, which the data do not tell apart:",
+                "One of these causes, which the data do not distinguish:",
                 *(f"  - {cause.words}" for cause in first),
             ]
-        lines += [f"  then, unless it mirrors the first: {cause.words}" for cause in self.causes[len(first) : 4]]
+        lines += [f"  then, unless a side effect of the first:  {cause.words}" for cause in self.causes[len(first) : 4]]
         return "\n".join(lines)
 
     def summary(self) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Commutation error of the gyro's integration: to a filter it is a gyro bias."""
+"""Commutation error of the gyro's integration, which a filter cannot distinguish from a gyro bias."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from strapdown.tuning.diagnosis.likelihood import log_p
 from strapdown.units import DEGREE_PER_HOUR
 
 ACCURATE_ALGORITHM = "matched-1-8-8"
-"""Integration algorithm that others are held against."""
+"""Integration algorithm with which others are compared."""
 
 
 def commutation_drift(record: ImuRecord, algorithm: coning.Algorithm) -> tuple[Array, Array]:
     """Return the mean drift of an algorithm's attitude on a record, estimated minus true (3,), rad/s, body axes, and its standard error.
 
-    The increments are integrated by the algorithm and by a better one, and the turns of each step compared. To a filter this drift is a
-    gyro bias: its bias estimate is too large by it.
+    The increments are integrated by the algorithm and by a more accurate one, and the rotations of each step compared. A filter estimates
+    this drift as gyro bias, in addition to the true one.
     """
     n = algorithm.samples
     blocks = len(record.increments) // n
@@ -39,7 +39,7 @@ def commutation_drift(record: ImuRecord, algorithm: coning.Algorithm) -> tuple[A
         turn = quaternion.multiply(turn, best[:, k])
     step = np.diff(record.time[: blocks * n + 1 : n])
     drift = quaternion.log(quaternion.multiply(quaternion.conjugate(turn), own))
-    # Steps of one vibration are correlated: the scatter is taken between blocks that are long against it.
+    # Steps of one vibration are correlated, so the scatter is that between blocks much longer than its period.
     parts = min(20, blocks)
     bounds = np.linspace(0, blocks, parts + 1).astype(int)
     means = np.array([drift[a:b].sum(axis=0) / step[a:b].sum() for a, b in itertools.pairwise(bounds)])
@@ -47,14 +47,14 @@ def commutation_drift(record: ImuRecord, algorithm: coning.Algorithm) -> tuple[A
 
 
 def commutation(record: ImuRecord, setup: FilterSetup, estimate: Estimate, truth: Truth | None) -> Cause:
-    """Return commutation as a cause: the gain is what it explains of the bias error at the end, or would if there is no truth."""
+    """Return commutation as a cause; its gain is by the bias error that it explains at the end, or would without a truth."""
     drift, error = commutation_drift(record, setup.integration)
     assert estimate.covariance is not None
     P = estimate.covariance[-1, 3:, 3:] + np.diag(error**2)
     if truth is None:
         gain = float(drift @ np.linalg.solve(P, drift))
     else:
-        # b_true − b_est is −drift if the drift is taken for bias: does that explain the error at the end?
+        # If the drift is estimated as bias, b_true − b_est is −drift: the gain is by how well this explains the final error.
         e = truth.bias[-1] - estimate.bias[-1]
         gain = float(e @ np.linalg.solve(P, e) - (e + drift) @ np.linalg.solve(P, e + drift))
     size = float(np.linalg.norm(drift))
@@ -68,7 +68,7 @@ def commutation(record: ImuRecord, setup: FilterSetup, estimate: Estimate, truth
         gain=gain,
         log_p=log_p(gain, 1),
         words=(
-            f"integration by {setup.integration.name} drifts by {shown(drift / DEGREE_PER_HOUR)} °/h, taken for gyro bias by the filter; "
-            f"its σ there is {sigma / DEGREE_PER_HOUR:.3g} °/h"
+            f"integration by {setup.integration.name} drifts by {shown(drift / DEGREE_PER_HOUR)} °/h, estimated as gyro bias; "
+            f"the filter's σ in this direction is {sigma / DEGREE_PER_HOUR:.3g} °/h"
         ),
     )

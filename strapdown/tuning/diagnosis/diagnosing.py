@@ -18,7 +18,7 @@ from strapdown.tuning.diagnosis.hypotheses import conventions, mean_hypotheses, 
 from strapdown.tuning.diagnosis.likelihood import Model, by_mean, by_variance, run
 
 GROSS = 3.0
-"""Discrete conventions are tried where the NIS per degree of freedom of some sensor exceeds this: a wrong one is not subtle."""
+"""Conventions are tested if the NIS per degree of freedom of a sensor exceeds this, because a wrong one has a large effect."""
 
 
 def diagnose(
@@ -29,30 +29,30 @@ def diagnose(
     probability: float = 0.99,
     judgement: Judgement | None = None,
 ) -> Diagnosis:
-    """Return the verdict on a filter by all evidence in a record, and the likely causes of what is wrong with it.
+    """Return the verdict on a filter by all evidence in a record, and the likely causes of its faults.
 
     Parameters
     ----------
     record : ImuRecord
-        As the sensors gave it, gyro samples not yet compressed; its truth, if any, is used too.
+        Record as measured, with all gyro samples; its truth is used if there is one.
     setup : FilterSetup
-        The filter's model. Gates and robust updates are left out here: they hide what is to be seen.
+        The filter's model. Gates and robust updates are disabled here, because they hide faults.
     initial : State
-        Where the filter starts.
+        Initial state of the filter.
     probability : float
-        A consistent filter passes and is given no cause with at least this probability.
+        Minimum probability that a consistent filter passes and has no cause reported.
     judgement : Judgement, optional
-        Of the filter's own estimate, by :func:`strapdown.consistency.judge`; default: the filter is run here and judged.
+        Judgement of the filter's estimate by :func:`strapdown.consistency.judge`. Default: the filter is run and judged here.
 
     Returns
     -------
     Diagnosis
-        Its ``judgement`` takes the statistics and the likelihood ratios of all hypotheses together, at one probability of a false alarm.
+        The causes, and a ``judgement`` by statistics and all likelihood ratios at one joint probability of a false alarm.
 
     Notes
     -----
-    The filter is run some ten times a sensor, and a hundred times more where something is grossly wrong. Statistics may pass where a
-    likelihood ratio does not: a rate random walk ten times too small leaves hardly a trace in the NIS.
+    The filter is run about ten times per sensor, and a hundred times more for gross faults. Statistics may pass where a likelihood ratio
+    does not: a rate random walk ten times too small has hardly any effect on the NIS.
     """
     tail(probability)
     if not any(len(series.time) for series in record.vectors):
@@ -60,7 +60,7 @@ def diagnose(
     need_mekf(setup, "the search for causes")
     modelled = modelled_record(record, setup)
     truth = modelled.truth
-    # No hypothesis looks at the truth, which each of their many records would check anew.
+    # The hypotheses do not use the truth, whose checks would be repeated for each of their records.
     model = Model(record=replace(modelled, truth=None), noise=setup.process_noise, initial=initial)
     every = max(1, len(model.record.increments) // 1000)
     estimate = estimation.run(model.record, model.noise, model.initial, every=every, full_covariance=True)

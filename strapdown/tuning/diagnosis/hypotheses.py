@@ -19,12 +19,12 @@ from strapdown.vectors import VectorMeasurements
 
 
 def shown(theta: Array, factor: float = 1.0) -> str:
-    """Return numbers in brackets, three digits each."""
+    """Return numbers in brackets with three digits each."""
     return "[" + ", ".join(f"{x * factor:.3g}" for x in theta) + "]"
 
 
 def mean_hypotheses(model: Model) -> Iterator[Hypothesis]:
-    """Yield what shifts innovations."""
+    """Yield the hypotheses that shift innovations."""
     record = model.record
     interval = float(np.median(np.diff(record.time)))
     seen = [series for series in record.vectors if len(series.time)]
@@ -35,7 +35,7 @@ def mean_hypotheses(model: Model) -> Iterator[Hypothesis]:
             yield _body_fixed(series)
         if series.kind == "vector":
             yield _reference_length(series)
-        if len(seen) > 1:  # of one sensor alone a turned reference is another fixed frame
+        if len(seen) > 1:  # with one sensor, a rotated reference is only another fixed frame
             yield _reference_direction(series)
     if len(seen) > 1:
         yield _time_offset("gyro", tuple(series.sensor for series in seen), interval)
@@ -51,7 +51,7 @@ def mean_hypotheses(model: Model) -> Iterator[Hypothesis]:
             limit=np.pi,
             apply=lambda m, theta, part=part: replace(m, initial=_moved(m.initial, part, theta)),  # type: ignore[misc]
             words=lambda theta, _, part=part, unit=unit, sigma=sigma: (  # type: ignore[misc]
-                f"the {part} at the start was off by {shown(theta)} {unit}, {np.max(np.abs(theta / sigma)):.3g} times its σ: "
+                f"the initial {part} was in error by {shown(theta)} {unit},  {np.max(np.abs(theta / sigma)):.3g} times its σ: "
                 "the initial covariance is too small"
             ),
         )
@@ -64,7 +64,7 @@ def _moved(state: estimation.State, part: str, theta: Array) -> estimation.State
 
 
 def _time_offset(of: str, sensors: tuple[str, ...], interval: float) -> Hypothesis:
-    sign = -1.0 if of == "gyro" else 1.0  # a gyro whose stamps are late is the other sensors' being early
+    sign = -1.0 if of == "gyro" else 1.0  # late stamps of the gyro are equivalent to early ones of the other sensors
 
     def apply(model: Model, theta: Array) -> Model:
         for sensor in sensors:
@@ -91,7 +91,7 @@ def _body_fixed(series: VectorMeasurements) -> Hypothesis:
         if old.kind == "vector":
             length = np.linalg.norm(old.references_f, axis=1, keepdims=True)
             return replace(old, vector_b=old.vector_b - theta * length)
-        # The noise is scaled as the vectors are, or taking off the direction itself would look like less noise.
+        # The noise is scaled with the vectors; otherwise subtracting part of the direction would appear as less noise.
         length = np.linalg.norm(old.vector_b - theta, axis=1, keepdims=True)
         moved = replace(old, vector_b=(old.vector_b - theta) / length)
         return moved.noise_scaled(float(np.nanmean(1.0 / length)))
@@ -118,7 +118,7 @@ def _mounting(series: VectorMeasurements) -> Hypothesis:
                 old,
                 attitude=quaternion.normalize(quaternion.multiply(old.attitude, quaternion.conjugate(turn))),
             )
-        return replace(old, vector_b=old.vector_b @ quaternion.to_matrix(turn).T)  # rows of NaN pass
+        return replace(old, vector_b=old.vector_b @ quaternion.to_matrix(turn).T)  # keeps rows of NaN
 
     return Hypothesis(
         name="mounting",
@@ -127,7 +127,7 @@ def _mounting(series: VectorMeasurements) -> Hypothesis:
         steps=np.full(3, 1e-5),
         limit=0.35,
         apply=lambda model, theta: model.with_series(series.sensor, lambda s: change(s, theta)),
-        words=lambda theta, _: f"{series.sensor} is mounted off by a rotation of {shown(theta, 1e3)} mrad in the body",
+        words=lambda theta, _: f"{series.sensor} has a mounting error of {shown(theta, 1e3)} mrad in the body",
     )
 
 
@@ -154,7 +154,7 @@ def _reference_direction(series: VectorMeasurements) -> Hypothesis:
         back = quaternion.exp(-theta)
         if old.attitude is not None:
             return replace(old, attitude=quaternion.normalize(quaternion.multiply(back, old.attitude)))
-        if old.kind == "heading":  # about the fixed z axis, or the reference would leave the horizontal
+        if old.kind == "heading":  # only about the fixed z axis, so that the reference stays horizontal
             back = quaternion.exp(-theta * np.array([0.0, 0.0, 1.0]))
         return replace(old, reference_f=quaternion.rotate(back, old.reference_f))
 
@@ -166,7 +166,7 @@ def _reference_direction(series: VectorMeasurements) -> Hypothesis:
         limit=0.35,
         apply=lambda model, theta: model.with_series(series.sensor, lambda s: change(s, theta)),
         words=lambda theta, _: (
-            f"the reference of {series.sensor} is turned by {shown(theta, 1e3)} mrad in the fixed frame"
+            f"the reference of {series.sensor} is rotated by {shown(theta, 1e3)} mrad in the fixed frame"
         ),
     )
 
@@ -178,14 +178,14 @@ def _off_diagonal(theta: Array) -> Array:
 
 
 GYRO_ERRORS: tuple[tuple[str, str, int, Callable[[Array], Array], Callable[[Array], str]], ...] = (
-    ("scale factor", "1", 3, np.diag, lambda theta: f"the gyro's scale factor is off by {shown(theta, 1e6)} ppm"),
+    ("scale factor", "1", 3, np.diag, lambda theta: f"the gyro's scale factor is in error by {shown(theta, 1e6)} ppm"),
     (
         "mounting",
         "rad",
         3,
-        # What is measured in axes turned by θ is the rate turned back.
+        # In axes rotated by θ the measured rate is rotated by −θ.
         lambda theta: quaternion.to_matrix(quaternion.exp(-theta)) - np.eye(3),
-        lambda theta: f"the gyro is mounted off by a rotation of {shown(theta, 1e3)} mrad in the body",
+        lambda theta: f"the gyro has a mounting error of {shown(theta, 1e3)} mrad in the body",
     ),
     (
         "misalignment",
@@ -195,14 +195,14 @@ GYRO_ERRORS: tuple[tuple[str, str, int, Callable[[Array], Array], Callable[[Arra
         lambda theta: f"the gyro's axes are misaligned, xy, xz, yx, yz, zx, zy by {shown(theta, 1e3)} mrad",
     ),
 )
-"""Errors M of a gyro that measures (I + M) w: name, unit, how many numbers θ, M of θ, and its words."""
+"""Errors M of a gyro that measures (I + M) w: name, unit, dimension of θ, M(θ), and description."""
 
 
 def _gyro_errors(
     turned: Array, name: str, unit: str, size: int, matrix: Callable[[Array], Array], words: Callable[[Array], str]
 ) -> Hypothesis:
     def apply(model: Model, theta: Array) -> Model:
-        # Not the increments times (I + M)⁻¹: that would change their noise and their bias too.
+        # Increments times (I + M)⁻¹ would also change their noise and bias.
         excess = turned @ (np.eye(3) - np.linalg.inv(np.eye(3) + matrix(theta))).T
         return replace(model, record=replace(model.record, increments=model.record.increments - excess))
 
@@ -219,7 +219,7 @@ def _gyro_errors(
 
 
 def noise_hypotheses(model: Model) -> Iterator[Hypothesis]:
-    """Yield what scales them."""
+    """Yield the hypotheses that scale innovations."""
 
     def factor(theta: Array) -> float:
         return float(np.exp(theta[0]))
@@ -261,15 +261,15 @@ MAX_OUTLIERS = 0.25
 
 
 def outliers(sensor: str, white: Array) -> Cause:
-    """Return how much better a mixture of two normals explains the innovations: the contaminated normal of Tukey (1960), by EM.
+    """Return the gain of a mixture of two normals for the innovations: the contaminated normal of Tukey (1960), by EM.
 
-    At least three times the noise and at most a quarter of the samples, or it would be a larger noise.
+    Outliers have at least three times the σ and are at most a quarter of the samples; otherwise they are a larger noise.
     """
     square, degrees = np.sum(white**2, axis=1), white.shape[1]
     share, spread = 0.02, 25.0
     gain = 0.0
     for _ in range(60):
-        # Log of the outliers' density over that of the others.
+        # Logarithm of the ratio of the outliers' density to that of the others.
         ratio = 0.5 * square * (1.0 - 1.0 / spread) - 0.5 * degrees * math.log(spread)
         log_odds = ratio + math.log(share) - math.log1p(-share)
         belongs = np.where(log_odds > 0.0, 1.0, np.exp(np.minimum(log_odds, 0.0))) / (1.0 + np.exp(-np.abs(log_odds)))
@@ -290,14 +290,14 @@ def outliers(sensor: str, white: Array) -> Cause:
 
 
 def conventions(model: Model, base: Run) -> list[Cause]:
-    """Return what each discrete change of axes, units or quaternion convention gains."""
+    """Return the gain of each discrete change of axes, units or quaternion convention."""
     trials: list[tuple[str, str, Model]] = []
     for matrix in AXES[1:]:
         turned = replace(model, record=replace(model.record, increments=model.record.increments @ matrix.T))
         trials.append(("gyro", f"axes should be read as ({axes_words(matrix)})", turned))
     for factor, unit in ((180.0 / np.pi, "57.3 times more"), (np.pi / 180.0, "57.3 times less")):
         scaled = replace(model, record=replace(model.record, increments=model.record.increments * factor))
-        trials.append(("gyro", f"turns {unit} than it says (rad for deg?)", scaled))
+        trials.append(("gyro", f"rotation {unit} than recorded (rad for deg?)", scaled))
     for series in model.record.vectors:
         name = series.sensor
         if series.attitude is not None:

@@ -1,4 +1,4 @@
-"""The likelihood of a record under a hypothesis, and the parameters at which it is largest."""
+"""The likelihood of a record under a hypothesis, and its maximum-likelihood parameters."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from strapdown.vectors import VectorMeasurements
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Model:
-    """A record with the filter's model: what a run needs."""
+    """A record with the filter's model, the input of a run."""
 
     record: ImuRecord
     noise: ProcessNoise
@@ -32,18 +32,18 @@ class Model:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Run:
-    """Innovations of one run, in the order of the record's measurements whether or not they were used; NaN where not."""
+    """Innovations of one run in the order of the record's measurements; NaN for those not used."""
 
     white: Array
     log_variance: Array
 
     def gain_over(self, other: Run) -> float:
-        """Twice the log-likelihood gained over another run, on the measurements that both used."""
+        """Twice the gain in log-likelihood over another run, on the measurements that both used."""
         own, theirs = self.white**2 + self.log_variance, other.white**2 + other.log_variance
         return float(np.nansum(theirs - own))
 
     def closer_than(self, other: Run) -> float:
-        """The same, of what shifts innovations and leaves their variances: a change of the data is no gain in their density."""
+        """The same without the variances, for changes that shift innovations: rescaling the data must not count as a gain."""
         return float(np.nansum(other.white**2 - self.white**2))
 
 
@@ -66,19 +66,19 @@ def run(model: Model) -> Run:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Hypothesis:
-    """A family of models with parameters θ, θ = 0 being the filter as it is."""
+    """A family of models with parameters θ, where θ = 0 is the filter unchanged."""
 
     name: str
     of: str
     unit: str
     steps: Array
-    """Differences by which derivatives are taken (k,)."""
+    """Steps of θ for finite differences (k,)."""
     limit: float
-    """Largest |θ| that is sensible."""
+    """Maximum |θ|."""
     apply: Callable[[Model, Array], Model] = field(repr=False)
     words: Callable[[Array, Array], str] = field(repr=False)
     plausible: float | None = None
-    """Standard deviation of θ before the data are seen; None: a third of the limit."""
+    """Prior standard deviation of θ; None: a third of the limit."""
 
 
 def log_p(gain: float, degrees: int) -> float:
@@ -87,16 +87,16 @@ def log_p(gain: float, degrees: int) -> float:
 
     if gain <= 0.0 or not math.isfinite(gain):
         return 0.0
-    if gain > 1e3:  # the tail's leading terms, where the function underflows
+    if gain > 1e3:  # leading terms of the tail, because the function underflows
         half = 0.5 * gain
         return -half + (0.5 * degrees - 1.0) * math.log(half) - math.lgamma(0.5 * degrees)
     return float(chi2.logsf(gain, degrees))
 
 
 def by_mean(model: Model, base: Run, hypothesis: Hypothesis) -> Cause:
-    """Return the best θ by Gauss–Newton on the whitened innovations."""
+    """Return the maximum-likelihood θ by Gauss–Newton on the whitened innovations."""
     k = len(hypothesis.steps)
-    prior = (hypothesis.plausible or hypothesis.limit / 3.0) ** -2  # keeps where it is what hardly shows
+    prior = (hypothesis.plausible or hypothesis.limit / 3.0) ** -2  # holds weakly observable components near zero
     theta, current, gain = np.zeros(k), base, 0.0
     spread = np.full(k, np.nan)
     for iteration in range(4):
@@ -138,7 +138,7 @@ def by_mean(model: Model, base: Run, hypothesis: Hypothesis) -> Cause:
 
 
 def by_variance(model: Model, base: Run, hypothesis: Hypothesis) -> Cause:
-    """Return the best factor by parabolas through three points."""
+    """Return the maximum-likelihood factor by parabolas through three points."""
     step = float(hypothesis.steps[0])
     known: dict[float, float] = {0.0: 0.0}
 
