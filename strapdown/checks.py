@@ -28,7 +28,7 @@ class InputError(ValueError):
 
 
 OF_YOUR_OWN = "a filter of your own"
-"""In the note of an exception that such a filter raised."""
+"""Part of the note added to exceptions raised by a user's filter."""
 
 
 def _place(name: str, index: tuple[np.intp, ...]) -> str:

@@ -98,7 +98,7 @@ def main() -> None:
         for note in getattr(error, "__notes__", ()):
             if OF_YOUR_OWN in note:
                 errors.print(
-                    f"error: {note} ({type(error).__name__}); its lines end the traceback above", soft_wrap=True
+                    f"error: {note} ({type(error).__name__}); see the end of the traceback above", soft_wrap=True
                 )
                 sys.exit(2)
         errors.print(

@@ -56,7 +56,7 @@ class _Rate(ProgressColumn):
 
 
 Advance = Callable[[int | str], None]
-"""Advances a progress by a number of units, or says what is done now."""
+"""Advances the progress by a number of units, or sets the description of the current task."""
 
 
 @contextmanager

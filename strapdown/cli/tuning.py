@@ -186,7 +186,7 @@ class _Found(NamedTuple):
     """Tests of each record for errors that the tuned filter does not model."""
     worst: Unmodelled | None
     attitude_rms: tuple[float, float] | None
-    """Before and after, rad, where it was minimised."""
+    """RMS attitude error before and after, rad, if it was the objective."""
 
 
 @command
