@@ -8,15 +8,15 @@
 Tasks
     ``simulate``, ``read``, ``write``, ``estimate``, ``smooth``, ``integrate``, ``check``, ``tune``, ``monte_carlo``,
     ``covariance_analysis``, ``allan_deviation``, ``fit_noise``, ``initial_state``
-What they take
+Classes
     ``Scenario``, ``GyroSpec``, ``VectorSensor``, ``FilterSetup``, ``ProcessNoise``, ``Gate``, ``Robust``; ``LiveFilter`` and
-    ``StepFilter`` filter sample by sample, compiled and on filterpy. Every function raises ``InputError`` on bad input, which names the
-    value, its place and the remedy; a section *Raises* says what else a function refuses.
-More
-    The submodules, each with its own ``__all__``, and below them ``estimation.error_states``, ``estimation.filters``,
+    ``StepFilter`` filter sample by sample, compiled and on filterpy. Every function raises ``InputError`` on bad input; the message names
+    the value, its place and the remedy. A section *Raises* lists further conditions.
+Submodules
+    Each has its own ``__all__``; public below them are ``estimation.error_states``, ``estimation.filters``,
     ``estimation.multiple_model``, ``estimation.setup``, ``montecarlo.campaign``, ``montecarlo.cluster``, ``montecarlo.coning_study`` and
-    ``tuning.diagnosis``. Names and submodules load when they are first used.
-    Every other module and name (``kernels``, ``cli``, ``checks``, ``files``, ``reading``, ``tables``, …) is private and may change.
+    ``tuning.diagnosis``. Names and submodules are loaded on first use.
+    All other modules and names (``kernels``, ``cli``, ``checks``, ``files``, ``reading``, ``tables``, …) are private and may change.
 
 Conventions, the same in code, files and plots
 ----------------------------------------------
@@ -30,8 +30,7 @@ Attitude error
 Error state of the filter
     ``(δθ, δb)`` with ``δb = b_true − b_estimate`` in rad/s; ``P = E[δx δxᵀ]`` in the tangent space after the reset.
 Units
-    SI and radians inside. Degrees, °/h, °/√h and arcseconds appear in files, figures and on the command line only, with the unit in the
-    name.
+    SI and radians. Degrees, °/h, °/√h and arcseconds are used only in files, figures and on the command line, with the unit in the name.
 """
 
 __version__ = "0.1.0"
@@ -150,13 +149,13 @@ _HOMES = {
     "tune": "workflows",
     "write": "workflows",
 }
-"""The submodule of each name that is none itself."""
+"""Submodule of each name that is not a submodule."""
 
 
-if not TYPE_CHECKING:  # type checkers know the names above, and shall find fault with any other
+if not TYPE_CHECKING:  # type checkers use the imports above and must report any other name
 
     def __getattr__(name: str):
-        """Load a name or a submodule when it is first used (PEP 562)."""
+        """Load a name or a submodule on first use (PEP 562)."""
         if name not in __all__:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         from importlib import import_module

@@ -1,7 +1,7 @@
-"""Checks at the rim: every public function asks here whether its input makes sense, before it computes anything.
+"""Validation of the arguments of public functions, before any computation.
 
-Each check returns the value as the code below wants it (a float64 array, a float) or raises :class:`InputError`, whose message names
-the value, the place (name and index) and the remedy. Kernels check nothing.
+Each check returns the value in the form that the code needs (a float64 array, a float) or raises :class:`InputError`, whose message names
+the value, the place (name and index) and the remedy. Kernels do not check their arguments.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 
 UNIT_NORM_TOLERANCE = 1e-6
-"""A quaternion whose norm is off by more than this is taken for a mistake, not for rounding (float32 files stay below it)."""
+"""Maximum norm error of a unit quaternion; larger than the rounding errors of float32 files."""
 
 ROUNDING = 1e-14
-"""Norm errors below this are left as they are."""
+"""Norm errors below this are not corrected."""
 
 
 class InputError(ValueError):
@@ -28,7 +28,7 @@ class InputError(ValueError):
 
 
 OF_YOUR_OWN = "a filter of your own"
-"""In the note of an exception that such a filter raised."""
+"""Part of the note added to exceptions raised by a user's filter."""
 
 
 def _place(name: str, index: tuple[np.intp, ...]) -> str:
@@ -40,18 +40,18 @@ def _first(mask: NDArray[np.bool_]) -> tuple[np.intp, ...]:
 
 
 _NO_NUMBERS = {"b": "True or False", "S": "text", "U": "text", "c": "complex numbers", "M": "dates", "m": "time spans"}
-"""Kinds of dtype that NumPy would turn into floats though they hold no numbers."""
+"""Kinds of dtype that NumPy converts to float although they are not numbers."""
 
 
 def _truth_value(value: object) -> bool:
-    """Return whether a value is True or False, or a sequence that holds one."""
+    """Return whether a value is True or False, or a sequence that contains one."""
     if isinstance(value, (list, tuple)):
         return any(_truth_value(one) for one in value)
     return isinstance(value, (bool, np.bool_))
 
 
 def _unmasked(name: str, value: ArrayLike, allow_nan: bool) -> ArrayLike:
-    """Return a masked array without its mask, what is masked NaN or refused: NumPy would take what lies under the mask for data."""
+    """Return a masked array with NaN in place of masked values, or an error; NumPy would use the values under the mask as data."""
     if isinstance(value, (list, tuple)) and any(isinstance(one, np.ma.MaskedArray) for one in value):
         value = np.ma.array(value)
     if not isinstance(value, np.ma.MaskedArray):
@@ -65,7 +65,7 @@ def _unmasked(name: str, value: ArrayLike, allow_nan: bool) -> ArrayLike:
 
 
 def numbers(name: str, value: ArrayLike, *, allow_nan: bool = False) -> Array:
-    """Return ``value`` as a float64 array of any shape; what is no number, though NumPy would make it one, is refused."""
+    """Return ``value`` as a float64 array of any shape; raise an error for text, dates and booleans, which NumPy would convert."""
     if type(value) is np.ndarray and value.dtype == np.float64:
         return value
     try:
@@ -87,12 +87,12 @@ def array(name: str, value: ArrayLike, shape: Sequence[int | str | EllipsisType]
     Parameters
     ----------
     name : str
-        What the caller calls it; named in the error.
+        Name in the caller, for the error message.
     value : array_like
     shape : sequence
-        One entry an axis: an ``int`` is exact, a ``str`` names a free length, a leading ``...`` any leading axes.
+        One entry per axis: an ``int`` is exact, a ``str`` names a free length, a leading ``...`` any leading axes.
     allow_nan : bool
-        Let NaN through (it marks missing samples, and so does a mask); infinities never pass.
+        Whether NaN or a mask (missing samples) is allowed; infinities never are.
     """
     result = numbers(name, value, allow_nan=allow_nan)
     free = bool(shape) and shape[0] is ...
@@ -132,7 +132,7 @@ def finite(name: str, value: float, *, unit: str = "") -> float:
     """Return ``value`` as a finite float."""
     try:
         given = np.asarray(value)
-        if given.ndim or given.dtype.kind in _NO_NUMBERS:  # "60" in a file is a slip, not a number; so is True
+        if given.ndim or given.dtype.kind in _NO_NUMBERS:  # "60" in a file is an error, not a number; so is True
             raise ValueError
         number = float(value)
     except (TypeError, ValueError, OverflowError):
@@ -143,7 +143,7 @@ def finite(name: str, value: float, *, unit: str = "") -> float:
 
 
 MAX_COUNTED = 2.0**63
-"""Whole numbers stay below it, so that they fit into any array."""
+"""Upper bound of whole numbers, so that they fit into an int64 array."""
 
 
 def count(name: str, value: int, *, minimum: int = 1) -> int:
@@ -165,7 +165,7 @@ def _unit(unit: str, glue: str = " ") -> str:
 
 
 def unit_quaternions(name: str, value: ArrayLike) -> Array:
-    """Return ``value`` as an array (..., 4) of unit quaternions; the norm errors of single precision are normalised away."""
+    """Return ``value`` as an array (..., 4) of unit quaternions; norm errors of the size of float32 rounding are removed."""
     q = array(name, value, (..., 4))
     norm = lengths(q)
     off = np.abs(norm - 1.0)
@@ -182,7 +182,7 @@ def unit_quaternions(name: str, value: ArrayLike) -> Array:
 
 
 def lengths(vectors: Array) -> Array:
-    """Return the lengths (...,) of vectors (..., k), a component at a time: a sum over a short last axis takes five times as long."""
+    """Return the norms (...,) of vectors (..., k), component by component: a sum over a short last axis takes five times as long."""
     total = vectors[..., 0] ** 2
     for k in range(1, vectors.shape[-1]):
         total = total + vectors[..., k] ** 2
@@ -215,7 +215,7 @@ def covariance(name: str, value: ArrayLike, size: int) -> Array:
         raise InputError(
             f"{name} is not symmetric: [{i}, {j}] is {matrix[i, j]:g} but [{j}, {i}] is {matrix[j, i]:g}; use ½(P + Pᵀ)"
         )
-    # Scaled to unit diagonal first, so that rad² beside (rad/s)² does not look indefinite.
+    # Scaled to unit diagonal first: with rad² and (rad/s)² in one matrix, rounding could make it appear indefinite.
     scale = np.sqrt(np.diag(matrix)) if np.all(np.diag(matrix) > 0.0) else np.full(size, np.nan)
     least = (
         float(np.linalg.eigvalsh(matrix / np.outer(scale, scale))[0])
@@ -224,7 +224,7 @@ def covariance(name: str, value: ArrayLike, size: int) -> Array:
     )
     if not least > 0.0:
         raise InputError(
-            f"{name} is not positive definite: its least (scaled) eigenvalue is {least:.3g}; "
+            f"{name} is not positive definite: its smallest (scaled) eigenvalue is {least:.3g}; "
             "give every state a variance above zero"
         )
     return matrix
@@ -237,22 +237,22 @@ def one_of(name: str, value: str, choices: Iterable[str]) -> str:
         return value
     begun = [
         name for name in known if value and name.startswith(str(value))
-    ]  # an ending left out, such as that of a unit
+    ]  # a missing ending, such as that of a unit
     near = difflib.get_close_matches(str(value), known, n=5) or [name for name in known if value and str(value) in name]
     near = [*begun, *near]
-    near.sort(key=lambda one: ("_deg" in str(value)) != ("_deg" in one))  # another unit is no slip of the pen
+    near.sort(key=lambda one: ("_deg" in str(value)) != ("_deg" in one))  # names with the same unit first
     hint = f"; did you mean {near[0]!r}?" if near else ""
     raise InputError(f"{name} {value!r} is not known{hint} (known: {', '.join(known)})")
 
 
 def instance(name: str, value: object, wanted: type | tuple[type, ...], remedy: str) -> None:
-    """Refuse a value that is not of a class, or of one of several; ``remedy`` says how to come by one."""
+    """Raise an error if a value is not of a class, or of one of several; ``remedy`` ends the message."""
     if not isinstance(value, wanted):
         classes = " or ".join(one.__name__ for one in (wanted if isinstance(wanted, tuple) else (wanted,)))
         raise InputError(f"{name} is {reprlib.repr(value)}, not of class {classes}; {remedy}")
 
 
 def known_keys(place: str, given: Iterable[str], known: Iterable[str]) -> None:
-    """Refuse keys that nothing reads, naming the nearest known one."""
+    """Raise an error for unknown keys that names the nearest known one."""
     for key in given:
         one_of(f"{place}: key", key, known)

@@ -1,7 +1,7 @@
 """Kinematics of attitude: rates and quaternion derivatives, equations (3), (4), (15)–(17), and the Jacobians of the rotation vector.
 
-Equation numbers are those of *Quaternion differentiation*, which writes one letter W for both rates. Here ``w_b`` is the angular
-velocity in body axes and ``w_f`` the same vector in fixed axes, rad/s, shapes (..., 3).
+Equation numbers are those of *Quaternion differentiation*. ``w_b`` is the angular velocity in body axes (W̄ there), ``w_f`` the same vector
+in fixed axes (W there), rad/s, shapes (..., 3).
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def _pure(v: Array) -> Array:
 
 
 def fixed_quaternion_derivative(q: ArrayLike, w_f: ArrayLike) -> Array:
-    """Return q̇ = ½ W ⊗ q for a rate in fixed axes, equation (3); by components equation (4).
+    """Return q̇ = ½ W ⊗ q for a rate in fixed axes, equation (3); in components equation (4).
 
     Parameters
     ----------
@@ -172,7 +172,7 @@ def skew(v: ArrayLike) -> Array:
     return result
 
 
-# Series and closed form meet at θ² = 4, where the closed form has lost no more than two bits and the series has converged.
+# Below θ² = 4 the series is used, which has converged there; above it the closed form, whose cancellation costs at most two bits.
 _JOIN = 4.0
 _THIRD = np.array([(-1.0) ** k / math.factorial(2 * k + 3) for k in range(15)])
 
@@ -186,7 +186,7 @@ def right_jacobian(rotation_vector: ArrayLike) -> Array:
     phi = array("rotation_vector", rotation_vector, (..., 3))
     theta = np.linalg.norm(phi, axis=-1)
     x, safe = theta * theta, np.maximum(theta, math.sqrt(_JOIN))
-    sinc_half = np.sinc(theta / (2.0 * math.pi))  # (1 − cos θ)/θ² = ½ sinc²(θ/2) loses no digits at any θ
+    sinc_half = np.sinc(theta / (2.0 * math.pi))  # (1 − cos θ)/θ² = ½ sinc²(θ/2) has no cancellation at any θ
     series = np.polynomial.polynomial.polyval(np.minimum(x, _JOIN), _THIRD)
     third = np.where(x < _JOIN, series, (safe - np.sin(safe)) / safe**3)
     cross = skew(phi)

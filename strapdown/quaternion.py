@@ -41,11 +41,11 @@ IDENTITY: Array = np.array([1.0, 0.0, 0.0, 0.0])
 IDENTITY.flags.writeable = False
 
 LONGEST = 1e150
-"""Largest component of a rotation vector, rad; the square of a larger one overflows."""
+"""Maximum component of a rotation vector, rad; the square of a larger one overflows."""
 ROTATION_MATRIX_TOLERANCE = 1e-6
-"""Largest entry of ``R Rᵀ − I`` that counts as rounding."""
+"""Maximum entry of ``R Rᵀ − I`` of a rotation matrix."""
 UNDETERMINED = 1e-9
-"""Relative gap between the two smallest losses of a mean below which the mean is not unique."""
+"""Relative difference of the two smallest losses of a mean below which the mean is not unique."""
 
 
 def multiply(p: ArrayLike, q: ArrayLike) -> Array:
@@ -83,7 +83,7 @@ def multiply(p: ArrayLike, q: ArrayLike) -> Array:
 
 @contextlib.contextmanager
 def _together(**given: Array) -> Iterator[None]:
-    """Raise an InputError where leading axes do not broadcast."""
+    """Raise an InputError if leading axes do not broadcast."""
     try:
         yield
     except ValueError:
@@ -150,7 +150,7 @@ def normalize(q: ArrayLike) -> Array:
 
 
 def _scale(value: Array) -> Array:
-    """Return powers of two (..., 1) near the largest entry, over which squares neither overflow nor vanish and no bit is lost."""
+    """Return powers of two (..., 1) near the largest entry; scaled by them, squares neither overflow nor underflow, without rounding."""
     largest = functools.reduce(np.maximum, np.moveaxis(np.abs(value), -1, 0))[..., None]
     zero = largest[..., 0] == 0.0
     if np.any(zero):
@@ -225,7 +225,7 @@ def exp(rotation_vector: ArrayLike) -> Array:
 
 
 def log(q: ArrayLike) -> Array:
-    """Return the rotation vector of unit quaternions, that of the shorter rotation.
+    """Return the rotation vectors of unit quaternions, with an angle of at most π.
 
     Parameters
     ----------
@@ -235,8 +235,8 @@ def log(q: ArrayLike) -> Array:
     Returns
     -------
     ndarray (..., 3)
-        φ, rad, no longer than π. ``q`` and ``−q`` are the same attitude and give the same vector; at half a turn exactly (w = 0)
-        both ±φ are right.
+        φ, rad, of length at most π. ``q`` and ``−q`` are the same attitude and give the same vector; at exactly π (w = 0) both ±φ are
+        valid.
 
     Examples
     --------
@@ -366,7 +366,7 @@ def angle_between(p: ArrayLike, q: ArrayLike) -> Array:
     Returns
     -------
     ndarray (...,)
-        Angle, rad, in [0, π]; accurate for tiny angles too.
+        Angle, rad, in [0, π]; also accurate for small angles.
 
     Examples
     --------
@@ -385,8 +385,8 @@ def _with_positive_w(q: Array) -> Array:
 def mean(q: ArrayLike, covariance: ArrayLike | None = None) -> tuple[Array, Array]:
     """Return the mean of attitudes and the covariance of its error.
 
-    The mean is the most likely attitude for small errors: the unit quaternion that minimises ``Σ v_iᵀ R_i⁻¹ v_i``, v_i the vector
-    part of ``q_i⁻¹ ⊗ q``, found as an eigenvector of a 4 × 4 matrix (Markley, Cheng, Crassidis & Oshman 2007, J. Guid. Control Dyn.
+    The mean is the maximum-likelihood attitude for small errors: the unit quaternion that minimises ``Σ v_iᵀ R_i⁻¹ v_i``, v_i the vector
+    part of ``q_i⁻¹ ⊗ q``, computed as an eigenvector of a 4 × 4 matrix (Markley, Cheng, Crassidis & Oshman 2007, J. Guid. Control Dyn.
     30). The signs of the quaternions do not matter.
 
     Parameters
@@ -394,8 +394,8 @@ def mean(q: ArrayLike, covariance: ArrayLike | None = None) -> tuple[Array, Arra
     q : array_like (n, 4)
         Unit quaternions q_fb.
     covariance : array_like (3, 3) or (n, 3, 3), optional
-        Covariance R_i of each error δθ, ``q_i = q ⊗ exp(δθ)``, rad², body axes. Default: equal weights, and the covariance of the
-        mean comes from the scatter of two attitudes or more.
+        Covariance R_i of each error δθ, ``q_i = q ⊗ exp(δθ)``, rad², body axes. Default: equal weights; the covariance of the mean is
+        then computed from the scatter of at least two attitudes.
 
     Returns
     -------
@@ -407,7 +407,7 @@ def mean(q: ArrayLike, covariance: ArrayLike | None = None) -> tuple[Array, Arra
     Raises
     ------
     InputError
-        If the mean is not unique, as of attitudes half a turn apart, or a covariance is not symmetric and positive definite.
+        If the mean is not unique, as for attitudes 180° apart, or a covariance is not symmetric and positive definite.
 
     Examples
     --------
@@ -419,11 +419,11 @@ def mean(q: ArrayLike, covariance: ArrayLike | None = None) -> tuple[Array, Arra
     n = len(value)
     if covariance is None:
         if n < 2:
-            raise InputError(f"q holds {n} attitudes; the scatter needs two or more, or give the covariance of each")
+            raise InputError(f"q has {n} attitudes; the scatter needs two or more, or give the covariance of each")
         information = np.broadcast_to(np.eye(3), (n, 3, 3))
     else:
         if n < 1:
-            raise InputError("q holds no attitude; give one or more")
+            raise InputError("q has no attitude; give one or more")
         given = np.asarray(covariance)
         whole = array("covariance", given if given.ndim != 2 else np.broadcast_to(given, (n, *given.shape)), (n, 3, 3))
         information = np.linalg.inv(np.array([checked(f"covariance[{k}]", R, 3) for k, R in enumerate(whole)]))
@@ -432,7 +432,7 @@ def mean(q: ArrayLike, covariance: ArrayLike | None = None) -> tuple[Array, Arra
     rows = np.concatenate([-v[:, :, None], w * np.eye(3) - np.cross(np.eye(3), v[:, None, :])], axis=2)
     loss, vectors = np.linalg.eigh(np.einsum("nia,nij,njb->ab", rows, information, rows))
     if loss[1] - loss[0] < UNDETERMINED * loss[-1]:
-        raise InputError("the mean of the attitudes is not unique; are two of them half a turn apart?")
+        raise InputError("the mean of the attitudes is not unique; check whether two of them are 180° apart")
     best = _with_positive_w(vectors[:, 0])
     if covariance is not None:
         return best, np.asarray(np.linalg.inv(np.sum(information, axis=0)))

@@ -1,8 +1,7 @@
 """Base classes of frozen dataclasses of arrays: equality by value, and printing as a short table. Private.
 
-Specifications (of a gyro, a sensor, a filter) derive from :class:`ByValue`: they are written to files and read back, and two with the same
-numbers are the same. Data and results are compared by identity; for them ``@dataclass(eq=False)`` is enough. Results derive from
-:class:`Listed`.
+Specifications (of a gyro, a sensor, a filter) derive from :class:`ByValue`: they are written to files and read back, and are equal if their
+values are. Data and results are compared by identity; for them ``@dataclass(eq=False)`` is enough. Results derive from :class:`Listed`.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ import numpy as np
 __all__ = ["ByValue", "Listed", "Listing", "figure"]
 
 WIDTH = 88
-"""Characters of a line of a title or a note."""
+"""Maximum number of characters in a line of a title or a note."""
 
 
 class Listing(NamedTuple):
@@ -32,7 +31,7 @@ class Listing(NamedTuple):
     rows: Sequence[Sequence[str]]
     notes: Sequence[str] = ()
     left: int = 1
-    """Number of first columns that hold words, the others hold numbers."""
+    """Number of leading columns with text; the others contain numbers."""
 
     @property
     def text(self) -> str:
@@ -98,7 +97,7 @@ class Listed:
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
-        cls.__repr__ = Listed.__str__  # type: ignore[method-assign, assignment]  # a dataclass would show all its arrays
+        cls.__repr__ = Listed.__str__  # type: ignore[method-assign, assignment]  # that of a dataclass would print all arrays
 
     def __str__(self) -> str:
         return self.listing().text
@@ -107,7 +106,7 @@ class Listed:
         html = self.listing().html
         if not self._drawn_by:
             return html
-        import strapdown  # the front door loads plots, which stand above
+        import strapdown  # loads plots on first use; a layer above this one
 
         buffer = io.BytesIO()
         getattr(strapdown.plots, self._drawn_by)(self).savefig(buffer, format="png", dpi=90)
@@ -116,7 +115,7 @@ class Listed:
 
 
 def figure(value: float | None, digits: int = 4) -> str:
-    """Return a number with so many significant digits; a dash where there is none.
+    """Return a number with the given number of significant digits; a dash for None and NaN.
 
     Examples
     --------
@@ -160,7 +159,7 @@ def _contents(instance: Any) -> tuple[Any, ...]:
 
 
 def _plain(value: Any) -> Any:
-    """Return a value with its arrays and containers as tuples, and mappings as sets of items, which compare and hash by value."""
+    """Return a value with arrays and sequences as tuples and mappings as sets of items, which compare and hash by value."""
     if isinstance(value, np.ndarray):
         return _plain(value.tolist())
     if isinstance(value, Mapping):

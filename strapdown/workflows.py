@@ -1,8 +1,8 @@
-"""The commonest tasks, one call each: what ``import strapdown as sd`` offers by name, shared with the command line.
+"""High-level functions for the most common tasks, available as ``sd.NAME`` after ``import strapdown as sd``; also used by the command line.
 
-Each function chooses what the data specify (noise of the gyro, filter, initial state) and then calls the module that does the work, which
-is the place for more options: :mod:`strapdown.estimation` and :mod:`strapdown.estimation.setup`, :mod:`strapdown.ahrs`,
-:mod:`strapdown.consistency`, :mod:`strapdown.montecarlo`, :mod:`strapdown.tuning`, :mod:`strapdown.covariance`, :mod:`strapdown.allan`.
+Each function chooses gyro noise, filter and initial state from the data and then calls a module that has more options:
+:mod:`strapdown.estimation` and :mod:`strapdown.estimation.setup`, :mod:`strapdown.ahrs`, :mod:`strapdown.consistency`,
+:mod:`strapdown.montecarlo`, :mod:`strapdown.tuning`, :mod:`strapdown.covariance`, :mod:`strapdown.allan`.
 """
 
 from __future__ import annotations
@@ -71,34 +71,33 @@ __all__ = [
 
 SOURCE = "give an ImuRecord or a Recording, as simulate and read return them"
 SAME_STAMP = 1e-9
-"""Largest difference of two stamps of one epoch, s."""
+"""Maximum difference between two time stamps of the same epoch, s."""
 
 
 # ------------------------------------------------------------------------------------------------------------------ read, write
 
 
 def read(path: Any, **options: Any) -> ImuRecord | Recording | Estimate | Campaign:
-    """Read a file of any known kind, recognised by its content, or a table in memory.
+    """Read a file of any known format, identified by its content, or a table in memory.
 
     Parameters
     ----------
     path : path, DataFrame, Dataset or mapping
-        A simulated record, an estimate or a Monte Carlo of this package, or a recording of any format of
-        :data:`strapdown.recordings.FORMATS` (CSV, ROS bag, ULog, EuRoC folder, …); or a recording's columns as
-        :func:`strapdown.recordings.from_table` takes them (pandas, xarray, arrays by name).
+        A simulated record, an estimate or a Monte Carlo of this package, or a recording in a format of
+        :data:`strapdown.recordings.FORMATS` (CSV, ROS bag, ULog, EuRoC folder, …); or the columns of a recording, as for
+        :func:`strapdown.recordings.from_table` (pandas, xarray, arrays by name).
     **options
         For recordings: ``units``, ``columns`` and ``topic`` of :func:`strapdown.recordings.read`.
 
     Returns
     -------
     ImuRecord, Estimate, Campaign or Recording
-        A record has its ``origin``, a recording in ``remarks`` what the reader chose.
+        A record has its ``origin``; the ``remarks`` of a recording list the choices of the reader.
 
     Raises
     ------
     InputError
-        If the file is missing, damaged, of no known format, or does not declare a unit that is needed; or if options are given that do
-        not go with it.
+        If the file is missing, damaged, of unknown format, or does not declare a required unit; or if an option does not apply to it.
 
     Examples
     --------
@@ -128,7 +127,7 @@ def read(path: Any, **options: Any) -> ImuRecord | Recording | Estimate | Campai
 
 
 def _kind(file: Path) -> str:
-    """Return which of this package's other files it is; empty: none of them."""
+    """Return the kind of a file of this package that is no record; empty for other files."""
     from strapdown.files import reading
 
     if not reading.is_hdf5(file):
@@ -141,17 +140,17 @@ def _kind(file: Path) -> str:
 def write(
     content: ImuRecord | Recording | Estimate | Scenario | FilterSetup, path: str | os.PathLike[str], **options: Any
 ) -> None:
-    """Write a record, recording, estimate, scenario or filter setup to a file; it appears whole or not at all.
+    """Write a record, recording, estimate, scenario or filter setup to a file, atomically.
 
     Parameters
     ----------
     content : ImuRecord, Recording, Estimate, Scenario or FilterSetup
-        A record's file holds its origin too, without a scenario of which a part is a Python function or class of your own.
+        The file of a record contains its origin; a scenario that includes your own Python functions or classes is omitted.
     path : path
-        The ending names the format: ``.h5`` or ``.csv`` of a record, ``.toml`` of a scenario or a filter setup,
-        and :func:`strapdown.recordings.writers` lists those of recordings and estimates.
+        The suffix selects the format: ``.h5`` or ``.csv`` for a record, ``.toml`` for a scenario or a filter setup;
+        :func:`strapdown.recordings.writers` lists those for recordings and estimates.
     **options
-        Of the format (:func:`strapdown.recordings.write`): ``sequence`` and ``frame`` of an estimate as a table.
+        Options of the format (:func:`strapdown.recordings.write`): ``sequence`` and ``frame`` for an estimate as a table.
 
     Examples
     --------
@@ -180,16 +179,16 @@ def write(
 
 
 class RecordRun(NamedTuple):
-    """A filter's run over a record."""
+    """Result of running a filter over a record."""
 
     estimate: Estimate
     record: ImuRecord
-    """The part of the record from the filter's start on, at the gyro's rate."""
+    """The record from the start of the filter on, at the sample rate of the gyro."""
     truth: Truth | None
-    """At the epochs of the estimate."""
+    """Truth at the epochs of the estimate."""
     initial: State
     start: str
-    """How the initial state was found, in words."""
+    """Description of how the initial state was determined."""
 
 
 def estimate_record(
@@ -201,11 +200,11 @@ def estimate_record(
     full_covariance: bool = True,
     smooth: bool = False,
 ) -> RecordRun:
-    """Run the filter, or with ``smooth`` the smoother, of a setup over a record, by default from its first measurements on."""
+    """Run the filter of a setup, or with ``smooth`` its smoother, over a record, by default from the first measurements on."""
     modelled = setups.modelled_record(record, chosen)
     if count("every", every) > len(modelled.increments):
         raise InputError(
-            f"every is {every}, more than the {len(modelled.increments)} filter steps of the record; only the start would be kept"
+            f"every is {every}, more than the {len(modelled.increments)} filter steps of the record; only the first epoch would be kept"
         )
     found = for_record.start(modelled, chosen) if start is None else start
     used = record
@@ -214,7 +213,7 @@ def estimate_record(
         modelled = records.cut(modelled, found.edge, len(modelled.increments))
         if every > len(modelled.increments):
             raise InputError(
-                f"every is {every}, and {len(modelled.increments)} filter steps are left from the start on"
+                f"every is {every}, more than the {len(modelled.increments)} filter steps after the start of the filter"
             )
     if smooth:
         result = setups.smooth(used, chosen, found.state, full_covariance=full_covariance)
@@ -241,52 +240,52 @@ def estimate(
     full_covariance: bool | None = None,
     smooth: bool = False,
 ) -> Estimate:
-    """Estimate attitude and gyro bias by a multiplicative extended Kalman filter, as the command ``strapdown estimate`` does.
+    """Estimate attitude and gyro bias with a multiplicative extended Kalman filter, as the command ``strapdown estimate`` does.
 
-    Of a simulated record the filter is matched to the scenario and starts from the first measurements. Of a recording the accelerometer
-    gives the vertical and the magnetometer the heading (:mod:`strapdown.ahrs`), from the first quiet second on.
+    For a simulated record, the filter matches the scenario and is initialised from the first measurements. For a recording, the
+    accelerometer gives the vertical and the magnetometer the heading (:mod:`strapdown.ahrs`), from the first interval at rest on.
 
     Parameters
     ----------
     source : ImuRecord or Recording
-        What :func:`simulate` or :func:`read` returned, or a record of your own data.
+        Result of :func:`simulate` or :func:`read`, or a record made from your own data.
     noise : GyroSpec, NoiseFit or ProcessNoise, optional
-        Noise of the gyro: a specification, an Allan fit (:func:`fit_noise`), or the filter's own two coefficients. Default: that of the
+        Noise of the gyro: a specification, an Allan fit (:func:`fit_noise`), or the two coefficients of the filter. Default: that of the
         record's origin; for a recording that of :data:`strapdown.ahrs.MOTIONS`.
     setup : FilterSetup, optional
-        Record: the whole filter, such as :func:`tune` returns it, instead of ``noise`` and ``states``.
+        For a record: the complete filter, for example from :func:`tune`, in place of ``noise`` and ``states``.
     initial : State, optional
-        Record: initial state (:func:`initial_state`) at the first edge. Default: from the first measurements.
+        For a record: initial state (:func:`initial_state`) at the first edge. Default: from the first measurements.
     states : bool or sequence of str, optional
-        Record: with an error state for each error that the scenario specifies (scale factor, misalignment, hard iron, …), or for those
-        named alone; False: without any. Default: with them where there are such errors.
+        For a record: whether to add an error state for each error that the scenario specifies (scale factor, misalignment, hard iron, …),
+        or the names of those to add. Default: True if the scenario specifies such errors.
     gate : Gate or float, optional
-        Refuse measurements beyond this quantile of χ² (0.999), and recover from a lost attitude.
+        Reject measurements beyond this quantile of χ² (such as 0.999), and recover from a lost attitude.
     robust : Robust or {"huber", "student"}, optional
-        Weigh measurements by the size of their innovations.
+        Weight measurements by the size of their innovations.
     motion : {"auto", "hand", "vehicle", "any"}, optional
-        Recording: model of the motion, with states for the gyro's scale factors. ``"hand"``: of bounded velocity; ``"vehicle"``: of
-        acceleration that lasts for seconds; default ``"auto"``: the likelier of them. ``"any"``: white noise, without such states.
+        For a recording: model of the motion, with states for the gyro's scale factors. ``"hand"``: bounded velocity; ``"vehicle"``:
+        acceleration that lasts for seconds; ``"auto"``, the default: that of higher likelihood; ``"any"``: white noise, without states.
     latency : float, optional
-        Recording: delay of the gyro's samples, s; default half a sample interval.
+        For a recording: delay of the gyro's samples, s. Default: half a sample interval.
     calibration : UnitCalibration, optional
-        Recording: what an earlier recording of the same unit showed.
+        For a recording: calibration from an earlier recording of the same unit.
     full_covariance : bool, optional
-        Store whole covariance matrices, not their diagonals alone; default: of a record yes, of a recording no.
+        Whether to store covariance matrices rather than their diagonals. Default: True for a record, False for a recording.
     smooth : bool, default False
-        Estimate each epoch from all measurements: see :func:`smooth`.
+        Whether to estimate each epoch from all measurements: see :func:`smooth`.
 
     Returns
     -------
     Estimate
         At the edges of the filter's steps (record) or at the stamps of the recording: ``time`` (m,) s, ``attitude`` (m, 4) q_fb,
-        ``bias`` (m, 3) rad/s, ``variance`` (m, 6) rad² and (rad/s)². A recording's fixed frame is East-North-Up with magnetic North.
+        ``bias`` (m, 3) rad/s, ``variance`` (m, 6) rad² and (rad/s)². The fixed frame of a recording is East-North-Up with magnetic North.
 
     Raises
     ------
     InputError
-        If the gyro's noise is unknown, the measurements do not give the initial attitude, a recording has no accelerometer, or an option
-        does not go with the source.
+        If the gyro's noise is unknown, the initial attitude is not observable from the measurements, a recording has no accelerometer, or
+        an option does not apply to the source.
 
     Examples
     --------
@@ -325,24 +324,24 @@ def estimate(
 
 
 def smooth(source: ImuRecord | Recording, **options: Any) -> Estimate:
-    """Estimate attitude and gyro bias at each epoch from all measurements, those after it too (fixed-interval smoother).
+    """Estimate attitude and gyro bias at each epoch from all measurements, before and after it (fixed-interval smoother).
 
     Parameters
     ----------
     source : ImuRecord or Recording
-        What :func:`simulate` or :func:`read` returned, or a record of your own data.
+        Result of :func:`simulate` or :func:`read`, or a record made from your own data.
     **options
-        Those of :func:`estimate`, except ``smooth``.
+        Options of :func:`estimate`, except ``smooth``.
 
     Returns
     -------
     Estimate
-        At the same epochs and with the same fields as that of :func:`estimate`.
+        Smoothed estimate at the same epochs and with the same fields as that of :func:`estimate`.
 
     Raises
     ------
     InputError
-        As :func:`estimate`, or if the record is too long for the memory.
+        As for :func:`estimate`, or if the record is too long for the memory.
 
     References
     ----------
@@ -379,7 +378,7 @@ def _recording_parameters(
 
 
 def with_gyro_noise(parameters: ahrs.AhrsParameters, spec: GyroSpec) -> ahrs.AhrsParameters:
-    """Return the model of a recorded unit with the noise of its gyro; flicker is matched for the filter of the tilt."""
+    """Return the parameters of a recorded unit with the noise of its gyro; flicker is approximated for the accuracy of the tilt."""
     density = (parameters.specific_force_noise / units.STANDARD_GRAVITY) ** 2  # rad² s
     noise: dict[str, Any] = gyro.matched_process_noise(spec, density)
     return dataclasses.replace(parameters, **noise)
@@ -396,14 +395,14 @@ def _record_setup(
         instance(
             "setup", setup, FilterSetup, "give a FilterSetup, as setup.FilterSetup.for_scenario or tune returns it"
         )
-        _refuse("the scenario's own filter, and setup is a whole one", noise=noise, states=states or None)
+        _refuse("the filter of the scenario, and setup defines another", noise=noise, states=states or None)
         return setup
     if not isinstance(noise, ProcessNoise):
         spec = None if noise is None else _specification(noise)
         return setups.FilterSetup.for_record(record, spec, states=states)
     if initial is None:
         raise InputError(
-            "noise is a ProcessNoise, which says nothing of the initial gyro bias; give initial= too, or a GyroSpec as noise"
+            "noise is a ProcessNoise, which has no σ of the initial gyro bias; give initial= too, or a GyroSpec as noise"
         )
     _refuse("a specified gyro; declare the states of your own filter in setup=", states=states or None)
     sigma = np.sqrt(np.diag(initial.covariance))
@@ -413,7 +412,7 @@ def _record_setup(
 
 
 class AttitudeHistory(NamedTuple):
-    """Attitude from the gyro alone."""
+    """Attitude integrated from the gyro only."""
 
     time: Array
     """Edges of the algorithm's steps (k + 1,), s."""
@@ -427,21 +426,21 @@ def integrate(
     *,
     initial_attitude: ArrayLike | None = None,
 ) -> AttitudeHistory:
-    """Integrate a gyro to attitude, without any other sensor.
+    """Integrate gyro samples to attitude, without other sensors.
 
     Parameters
     ----------
     source : ImuRecord or Recording
-        Its gyro samples alone are used; gyro errors are not corrected.
+        Only its gyro samples are used; gyro errors are not corrected.
     algorithm : str or Algorithm, default "four-sample"
         Coning algorithm (``strapdown.coning.ALGORITHMS``).
     initial_attitude : array_like (4,), optional
-        q_fb at the first edge. Default: the true attitude where the source has it, else the identity.
+        q_fb at the first edge. Default: the true attitude if the source has it, otherwise the identity.
 
     Returns
     -------
     AttitudeHistory
-        ``time`` (k + 1,), s, and ``attitude`` (k + 1, 4), q_fb, at the edges of the algorithm's steps; samples left over are dropped.
+        ``time`` (k + 1,), s, and ``attitude`` (k + 1, 4), q_fb, at the edges of the algorithm's steps; remaining samples are dropped.
 
     Examples
     --------
@@ -476,22 +475,22 @@ def integrate(
 def check(
     result: Estimate | Statistics | Campaign, truth: Truth | ImuRecord | None = None, *, probability: float = 0.99
 ) -> Judgement:
-    """Test whether a filter is consistent: whether its errors and innovations agree with its own covariance.
+    """Test whether a filter is consistent, that is, whether its errors and innovations agree with its covariance.
 
     Parameters
     ----------
     result : Estimate, Statistics or Campaign
-        What :func:`estimate` or :func:`monte_carlo` returned, or :func:`read` read.
+        Result of :func:`estimate`, :func:`monte_carlo` or :func:`read`.
     truth : Truth or ImuRecord, optional
-        Truth at the epochs of the estimate, or the record with its truth, whose stamps are matched. Without it the innovations alone are
-        tested.
+        Truth at the epochs of the estimate, or the record with its truth, which is matched by time. If not given, only the innovations
+        are tested.
     probability : float, default 0.99
-        A consistent filter passes with at least this probability, all tests together.
+        Minimum probability with which a consistent filter passes all tests together.
 
     Returns
     -------
     Judgement
-        ``verdict`` is "consistent", "not consistent" or "cannot tell"; ``findings`` are the statistics.
+        ``verdict`` is "consistent", "not consistent" or "cannot tell"; ``findings`` has the statistics.
 
     Examples
     --------
@@ -508,7 +507,7 @@ def check(
     if not hasattr(statistics, "log_nees_sum"):
         raise InputError(f"result is {type(result).__name__}; give an Estimate, or what monte_carlo returned")
     if truth is not None:
-        raise InputError("truth goes with an estimate; a Monte Carlo knows its own; leave it out")
+        raise InputError("truth goes with an estimate; a Monte Carlo contains its own truth; leave it out")
     judgement: Judgement = statistics.judge(probability=probability)
     return judgement
 
@@ -517,16 +516,16 @@ def _truth_at(result: Estimate, truth: Truth | ImuRecord | None) -> Truth | None
     """Return the truth at the epochs of an estimate."""
     if isinstance(truth, ImuRecord):
         if truth.truth is None:
-            raise InputError("the record has no truth; leave it out, and the innovations are tested alone")
+            raise InputError("the record has no truth; leave it out to test the innovations only")
         rows = np.minimum(np.searchsorted(truth.time, result.time - SAME_STAMP), len(truth.time) - 1)
         if np.max(np.abs(truth.time[rows] - result.time)) > SAME_STAMP:
-            raise InputError("the record has other stamps than the estimate, which was made from another record")
+            raise InputError("the time stamps of record and estimate differ; give the record of the estimate")
         return Truth(attitude=truth.truth.attitude[rows], bias=truth.truth.bias[rows])
     if truth is not None:
         instance("truth", truth, Truth, "give the record, or a Truth at the epochs of the estimate")
     if truth is not None and len(truth.attitude) != len(result.time):
         raise InputError(
-            f"truth has {len(truth.attitude)} epochs and the estimate {len(result.time)}; give the record, whose stamps are matched"
+            f"truth has {len(truth.attitude)} epochs and the estimate {len(result.time)}; give the record, which is matched by time"
         )
     return truth
 
@@ -541,11 +540,11 @@ def plan(
     dispersions: Dispersions | None = None,
     precision: str = "float64",
 ) -> Plan:
-    """Return the plan of a Monte Carlo: a scenario through the filter that matches it, or another ``setup``.
+    """Return the plan of a Monte Carlo: a scenario with the filter that matches it, or with another ``setup``.
 
-    ``gyro``: what the matched filter assumes of its gyro, such as a data sheet; by default the scenario's.
-    ``states``: whether the matched filter has an error state for each error that the scenario specifies, by default where there are such.
-    Where fixed errors have states, each run draws its own gyro and sensors: the filter is right on average over such individuals.
+    ``gyro``: gyro specification assumed by the matched filter, such as that of a data sheet; default: that of the scenario.
+    ``states``: whether the matched filter has an error state for each error that the scenario specifies; default: if there are such errors.
+    If constant errors have states, each run draws its own gyro and sensors, since the filter is consistent on average over such units only.
     """
     from strapdown import montecarlo
 
@@ -576,33 +575,33 @@ def monte_carlo(
     threads: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Statistics:
-    """Run a scenario many times through a filter and return the statistics over the runs.
+    """Simulate many runs of a scenario with a filter and return the statistics over the runs.
 
-    :func:`strapdown.montecarlo.campaign.run` does the same with a file that survives interruptions, and on clusters.
+    :func:`strapdown.montecarlo.campaign.run` does the same with a file from which it can be resumed, also on clusters.
 
     Parameters
     ----------
     scenario : Scenario, str or path
-        As of :func:`simulate`.
+        As for :func:`simulate`.
     runs : int, default 1000
         Number of independent runs.
     seed : int, optional
-        Default: the scenario's own.
+        Seed of the random numbers. Default: that of the scenario.
     setup : FilterSetup, optional
-        The filter; default: matched to the scenario.
+        The filter. Default: matched to the scenario.
     states : bool, optional
-        Whether the matched filter has an error state for each error that the scenario specifies. Default: where there are such errors.
+        Whether the matched filter has an error state for each error that the scenario specifies. Default: True if there are such errors.
     dispersions : Dispersions, optional
         Initial errors and gyro parameters that differ from run to run.
     threads : int, optional
-        Default: one a core.
+        Number of threads. Default: one per core.
     progress : callable, optional
-        Called with the number of runs just finished.
+        Called with the number of runs completed since its last call.
 
     Returns
     -------
     Statistics
-        For :func:`check`; the same to the bit for any number of threads.
+        Argument of :func:`check`; bit-identical for any number of threads.
 
     Examples
     --------
@@ -629,25 +628,25 @@ def tune(
     threads: int | None = None,
     **objective: Any,
 ) -> Tuning:
-    """Tune noise parameters of a filter by maximum likelihood of its innovations, with intervals.
+    """Tune noise parameters of a filter by maximum likelihood of its innovations, with confidence intervals.
 
     Parameters
     ----------
     sources : ImuRecord, Recording, or sequence of them
-        All of one unit.
+        Records of one unit.
     setup : FilterSetup, optional
-        The filter to start from. Default: matched to the first record, or that of recordings.
+        Initial filter. Default: matched to the first record, or that of recordings.
     free : sequence of str, optional
-        Parameters to tune: ``"gyro.arw"``, ``"gyro.rrw"``, ``"SENSOR.sigma"``, …; default the gyro's two and every sensor's σ. Of
-        recordings, but for ``truth`` or ``rmse``: ``"filter.scale"`` alone.
+        Parameters to tune: ``"gyro.arw"``, ``"gyro.rrw"``, ``"SENSOR.sigma"``, …. Default: the two of the gyro and the σ of every sensor;
+        for recordings without ``truth`` or ``rmse`` only ``"filter.scale"``.
     priors : mapping of str to Prior, optional
-        What is known of a parameter before, by its name.
+        Prior distributions of parameters, by name.
     starts : int, default 4
-        Searches: one from the filter, the others from random starts.
+        Number of searches: one from the initial filter, the others from random initial values.
     seed : int, default 0
-        Of the random starts.
+        Seed of the random initial values.
     threads : int, optional
-        Default: one a core.
+        Number of threads. Default: one per core.
     **objective
         Other objectives than the likelihood of the innovations: options of :func:`strapdown.tuning.tune`.
 
@@ -666,7 +665,7 @@ def tune(
 
     given = [sources] if isinstance(sources, (ImuRecord, Recording, str, os.PathLike)) else list(sources)
     if not given:
-        raise InputError("sources is empty; give a record or recording at least")
+        raise InputError("sources is empty; give at least one record or recording")
     for one in given:
         instance("sources", one, (ImuRecord, Recording), SOURCE)
     tuning.one_gyro(
@@ -699,7 +698,7 @@ def tune(
 def _samples(
     source: Recording | ImuRecord | GyroSamples | ArrayLike, sample_interval: float | None, sensor: str, kind: str
 ) -> tuple[ArrayLike, float, str]:
-    """Return samples, NaN where missing, their interval and their kind."""
+    """Return samples (missing ones as NaN), sample interval and kind."""
     if isinstance(source, (Recording, ImuRecord)):
         source = recordings.samples_of(source, sensor, gaps=True)
     if isinstance(source, recordings.GyroSamples):
@@ -707,9 +706,7 @@ def _samples(
             raise InputError("sample_interval goes with an array; a recording has its own: leave it out")
         return source.values, source.sample_interval, source.kind
     if sample_interval is None:
-        raise InputError(
-            "sample_interval is missing; an array does not know the time between its samples: give it in s"
-        )
+        raise InputError("sample_interval is missing; for an array, give the time between its samples in s")
     return source, sample_interval, kind
 
 
@@ -728,11 +725,11 @@ def allan_deviation(
     source : Recording, ImuRecord, GyroSamples or array_like (n,) or (n, axes)
         Missing samples are NaN (:mod:`strapdown.allan.gaps`).
     sample_interval : float, optional
-        Of an array: time between its samples, s.
+        For an array: time between its samples, s.
     sensor : {"gyro", "accelerometer", "magnetometer"}
-        Of a recording.
+        For a recording: the sensor.
     kind : {"rate", "increments"}
-        Of an array: averaged samples, or their integrals over each interval.
+        For an array: averages over each sample interval, or integrals.
     **options
         ``taus``, ``level``, ``estimator`` of :func:`strapdown.allan.allan_deviation`.
 
@@ -762,23 +759,23 @@ def fit_noise(
     kind: str = "rate",
     **options: Any,
 ) -> NoiseFit:
-    """Return the noise coefficients of a sensor at rest (angle random walk, bias instability, …), with intervals.
+    """Return the noise coefficients of a sensor at rest (angle random walk, bias instability, …), with confidence intervals.
 
     Parameters
     ----------
     source : Recording, ImuRecord, GyroSamples or array_like (n,) or (n, axes)
         Samples at rest; a recording may have gaps.
     sample_interval : float, optional
-        Of an array, s.
+        For an array: time between its samples, s.
     sensor, kind : str
-        As of :func:`allan_deviation`.
+        As for :func:`allan_deviation`.
     **options
         ``highest_frequency``, ``terms``, ``level`` of :func:`strapdown.allan.fit_noise`.
 
     Returns
     -------
     NoiseFit
-        For ``noise`` of :func:`estimate`.
+        Coefficients and intervals; can be passed to :func:`estimate` as ``noise``.
 
     Examples
     --------

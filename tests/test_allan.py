@@ -635,9 +635,9 @@ def test_misfit_is_reported():
     [
         (
             lambda rate: rate + 20.0 * ((np.arange(8192) > 3000) & (np.arange(8192) < 5000)),
-            "noise is not steady|stands out",
+            "noise is not stationary|is an outlier",
         ),
-        (lambda rate: rate + 9.0 * (np.arange(8192) == 1234), "a sample at 1234 s stands out by 8.7 σ"),
+        (lambda rate: rate + 9.0 * (np.arange(8192) == 1234), "a sample at 1234 s is an outlier of 8.7 σ"),
         (lambda rate: rate * np.where(np.arange(8192) // 128 == 7, 1.7, 1.0), "largest from 896 to 1024 s"),
         (lambda rate: np.convolve(rate, [0.6, 0.4], "same"), "another shape"),
     ],

@@ -69,7 +69,7 @@ def test_terms_not_seen_are_left_out_and_bounded_in_comments(run, tmp_path):
     assert np.all(np.array(list(bounds.values())) > 0.0)
     fit = allan.fit_noise(walking, 0.01)
     assert bounds["quantization_arcsec"] == pytest.approx(fit.upper[:, 0] / units.ARCSECOND, rel=1e-3)
-    partly = next(line for line in text.splitlines() if "0 where not seen" in line)
+    partly = next(line for line in text.splitlines() if "0 where not detected" in line)
     bound = fit.upper[:2, 3] / units.DEGREE_PER_HOUR_PER_ROOT_HOUR
     assert f"x below {bound[0]:.4g}, y below {bound[1]:.4g}." in partly
     # Six digits, in the unit of the key.
@@ -87,7 +87,9 @@ def test_one_column_gives_one_number_for_all_axes(run, tmp_path):
 def test_a_record_of_something_else_is_said_in_the_file_and_last(run, tmp_path):
     rates = white()
     rates[8000:12_000, 1] += 0.3  # two steps: a spectrum as f⁻², like that of a rate random walk
-    words = "axis y holds more than such noises: its noise is not steady, and largest from 78.12 to 81.25 s"
+    words = (
+        "axis y has other errors than these noise terms: its noise is not stationary, and largest from 78.12 to 81.25 s"
+    )
     np.save(tmp_path / "gyro.npy", rates)
     status, said, _ = run("allan", "gyro.npy", *AT_100_HZ)
     assert status == 0
@@ -141,7 +143,7 @@ def test_a_name_with_a_line_break_still_gives_toml(run, tmp_path):
         (white(100, axes=2), AT_100_HZ, "gyro.npy has 2 columns"),
         (white(3), AT_100_HZ, "gyro.npy: values has 3 samples; at least 64"),
         (white(0), AT_100_HZ, "gyro.npy: values has 0 samples"),
-        (np.zeros((500, 3)), AT_100_HZ, "gyro.npy: values, axis 0, holds no noise"),
+        (np.zeros((500, 3)), AT_100_HZ, "gyro.npy: values, axis 0, has no noise"),
         (np.zeros((10, 20, 3)), AT_100_HZ, "gyro.npy has shape (10, 20, 3)"),
         (np.where(np.arange(300)[:, None] == 7, np.nan, white(300)), AT_100_HZ, "gyro.npy[7, 0] is nan"),
         (white(300), (), "give its rate in Hz and its unit"),

@@ -124,9 +124,9 @@ def test_a_stretch_that_moves_is_seen():
 @pytest.mark.parametrize(
     ("values", "words"),
     [
-        (np.full(100, np.nan), "at least 64 are needed"),
-        (np.where(np.arange(500) % 50, 1.0, np.nan), "at least 64 are needed"),
-        (np.where(np.arange(500) == 250, np.nan, 1.0), "axis 0, holds no noise"),
+        (np.full(100, np.nan), "at least 64 without a gap are needed"),
+        (np.where(np.arange(500) % 50, 1.0, np.nan), "at least 64 without a gap are needed"),
+        (np.where(np.arange(500) == 250, np.nan, 1.0), "axis 0, has no noise"),
     ],
 )
 def test_what_shows_nothing_is_refused(values, words):

@@ -18,7 +18,7 @@ import strapdown
 PACKAGE = Path(strapdown.__file__).parent
 
 TABLE = (
-    (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8").partition("| floor |")[2].partition("\n\n")[0]
+    (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8").partition("| layer |")[2].partition("\n\n")[0]
 )
 FLOORS = tuple(tuple(re.findall(r"`(\w+)`", row)) for row in reversed(TABLE.splitlines()[2:]))
 """Modules and sub-packages of ``strapdown`` by floor, from the ground up, as in the README: imports go down or stay on their floor."""
@@ -36,7 +36,7 @@ def floor(unit: str) -> int:
     for k, units in enumerate(FLOORS):
         if unit in units:
             return k
-    pytest.fail(f"strapdown/{unit} stands on no floor; add it to the README's table")
+    pytest.fail(f"strapdown/{unit} is in no layer; add it to the README's table")
 
 
 @cache

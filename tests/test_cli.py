@@ -106,7 +106,7 @@ def test_a_fault_of_the_program_is_no_verdict(run, monkeypatch):
     assert (status, said) == (70, "")
     assert "ZeroDivisionError: a fault" in error.splitlines()
     assert error.splitlines()[0].startswith("Traceback")
-    assert error.splitlines()[-1].startswith(f"error: a fault of strapdown {strapdown.__version__} itself")
+    assert error.splitlines()[-1].startswith(f"error: internal error of strapdown {strapdown.__version__}")
 
 
 def test_a_fault_of_a_filter_of_ones_own_is_not_the_programs(run, tmp_path):
@@ -181,7 +181,7 @@ def test_coning_studies_algorithms_of_ones_own(coning):
     out, study, said = coning
     said = " ".join(said.split())
     assert "0.003571 = 1/280" in said
-    assert "rounded drifts from (ωh)^2 on" in said
+    assert "the drift of rounded is of order (ωh)^2" in said
     rows = {row["algorithm"]: row for row in study["integration"]}
     predicted = rows["miller-3"]["predicted_deg_per_hour"]
     assert rows["miller-3"]["drift_deg_per_hour"] == pytest.approx(predicted, rel=0.02)
@@ -251,7 +251,7 @@ def test_coning_is_the_same_for_the_same_seed(run, coning, tmp_path):
         (("--runs", -3), "runs is -3"),
         (("--seed", -1), "seed is -1; it must be a whole number of 0 or more"),
         (("--angle", 0), "--angle is 0 degrees; it must be greater than zero"),
-        (("--angle", 200), "--angle is 200 degrees; a cone's half-angle is below"),
+        (("--angle", 200), "--angle is 200 degrees; the half-angle of a cone must be below"),
         (("--angle", "nan"), "angle is nan; it must be a finite number"),
         (("--frequency", -1), "frequency is -1"),
         (("--rate", 0), "rate is 0"),
@@ -318,7 +318,7 @@ def test_simulate_warns_of_sensors_that_no_filter_can_use(run, tmp_path, star, t
     assert status == 0, error
     assert [line.split(":")[1].strip() for line in said.splitlines() if line.startswith("warning")] == warned
     if warned:
-        assert "its sigma is zero, which no filter can use" in said
+        assert "its sigma is zero, which a filter cannot use" in said
 
 
 # ---------------------------------------------------------------------------------------------------- estimate
@@ -395,7 +395,7 @@ def test_estimate_reports_missing_samples(run, tmp_path):
     columns = walk()
     columns[500:507, 4:7] = np.nan
     _, said, _ = run("estimate", write_csv(tmp_path / "walk.csv", columns, UNITS), "--out", tmp_path / "out")
-    assert "7 of the gyro's samples have none of the accelerometer beside them" in said
+    assert "7 of the gyro's samples have no sample of the accelerometer at the same time" in said
 
 
 def test_estimate_on_broad(run, broad, tmp_path):

@@ -112,7 +112,7 @@ def test_a_lost_filter_says_that_it_recovered(run, record, tmp_path):
     status, said, _ = run("estimate", record, "--out", tmp_path / "out", "--attitude", "0,0,1,0.1", "--gate", 0.999)
     assert status == 0
     assert "Recovered at" in said
-    assert "were refused by the gate" in said
+    assert "were rejected by the gate" in said
 
 
 def test_what_a_record_does_not_hold_is_asked_for(run, record, tmp_path):
@@ -126,8 +126,8 @@ def test_what_a_record_does_not_hold_is_asked_for(run, record, tmp_path):
         ((record, "--attitude", "1,0,0,0", "--from-truth"), "give one of them"),
         ((record, "--robust", "hubert"), "did you mean 'huber'"),
         ((record, "--gate", 1.5), "between 0 and 1"),
-        ((record, "--time-unit", "ms"), "goes with a table"),
-        ((record, "--columns", "time=t"), "goes with a table"),
+        ((record, "--time-unit", "ms"), "applies to a table"),
+        ((record, "--columns", "time=t"), "applies to a table"),
         ((tmp_path / "own.csv", "--every", 2), "goes with a record"),
         ((tmp_path / "none.csv", "--every", 2), "none.csv does not exist"),
     )
@@ -250,11 +250,11 @@ def test_what_the_filter_has_no_state_for_is_reported(spinning, record, tmp_path
     held = read_record(spinning)
     for file, states in ((None, False), (tmp_path / "filter.toml", None)):
         (message,) = filter_for(spinning, held, None, file, states)[1]
-        assert "no state for: the gyro's scale factor of 100 ppm; --states of `strapdown estimate`" in message
+        assert "has no state: the gyro's scale factor of 100 ppm; --states of `strapdown estimate`" in message
     assert filter_for(record, read_record(record), None, None, None)[1] == []
     chosen, (message,) = filter_for(spinning, held, None, None, None)
     assert chosen.states.names == ("gyro.scale",)
-    assert message.startswith("The filter estimates errors that are specified, gyro.scale: without states")
+    assert message.startswith("The filter has states for the specified errors, gyro.scale: without them")
 
 
 def test_the_verdict_names_what_the_filter_has_no_state_for(run, spinning, tmp_path):
@@ -315,7 +315,7 @@ def test_the_default_filter_of_a_satellite_passes_and_says_why_it_has_states(run
     plain = json.loads((tmp_path / "plain.json").read_text())
     assert plain["nees"]["bias"]["anees"] > 1.5**2 * 0.8
     status, said, _ = run("montecarlo", satellite, "--runs", 120, "--out", tmp_path / "states.h5")
-    assert "The filter estimates errors that are specified, gyro.scale, gyro.drift" in said
+    assert "The filter has states for the specified errors, gyro.scale, gyro.drift" in said
     assert "consistent: none of" in said
     assert "of the bias" in said
     assert status == 0
@@ -326,7 +326,7 @@ def test_the_default_filter_of_a_satellite_passes_and_says_why_it_has_states(run
 def test_states_of_a_record_without_a_scenario_and_a_gate(run, record, tmp_path):
     status, said, error = run("estimate", record, "--out", tmp_path / "out", "--states", "--gate", 0.999)
     assert (status, error) == (0, "")
-    assert "does not hold its scenario" in said
+    assert "does not contain its scenario" in said
     assert "the filter has none" in said
     assert not (tmp_path / "out" / "states.json").exists()
 
@@ -376,7 +376,7 @@ def test_an_estimate_replaces_all_of_an_earlier_one_and_nothing_else(run, record
     (out / "estimate.h5").write_text("mine too")
     status, _, error = run("estimate", record, "--out", out)
     assert status == 2
-    assert "is not what `strapdown estimate` writes" in error
+    assert "was not written by `strapdown estimate`" in error
     assert (out / "estimate.h5").read_text() == "mine too"
 
 
@@ -490,8 +490,8 @@ def test_a_recording_is_taken_for_that_of_a_hand(run, recording, tmp_path):
     status, said, error = run("estimate", recording, "--out", tmp_path / "out")
     assert (status, error) == (0, "")
     moved = re.search(
-        r"of a hand \(log-likelihood [0-9]+ above that of a vehicle\), ([0-9.]+) m/s, as the recording shows, with a correlation time "
-        r"of 0.3 s\.",
+        r"of a hand \(log-likelihood larger by [0-9.]+ than for a vehicle\), velocity σ ([0-9.]+) m/s "
+        r"\(from the recording\), correlation time 0.3 s\.",
         said,
     )
     assert moved is not None
@@ -536,7 +536,7 @@ def test_a_recording_that_is_not_what_it_says_is_doubted(run, recording, tmp_pat
     status, said, error = run("estimate", recording, "--out", tmp_path / "out")
     assert (status, error) == (0, "")
     words = (
-        "warning: as it seems, gyro rates are 57.3 times too small (rad/s read as deg/s: --gyro-unit rad/s; units={'gyro': 'rad/s'} in "
+        "warning: probably gyro rates are 57.3 times too small (rad/s read as deg/s: --gyro-unit rad/s; units={'gyro': 'rad/s'} in "
         "Python); specific force is 9.81"
     )
     assert words in said
@@ -589,7 +589,7 @@ def test_a_hand_that_never_rests_is_reported(run, recording, tmp_path):
     moving.write_text("\n".join([lines[0], *lines[800:]]) + "\n")
     status, said, error = run("estimate", moving, "--out", tmp_path / "out")
     assert (status, error) == (0, "")
-    assert "no second is quiet enough to show it, so the heading may drift at first." in said
+    assert "no second is quiet enough to estimate it, so the heading may drift at first." in said
 
 
 @pytest.mark.parametrize(

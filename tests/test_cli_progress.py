@@ -101,10 +101,10 @@ def test_compiling_is_said_once_with_how_many_of_how_many(said, monkeypatch):
             assert numba.njit(source["outer"])(1.0) == 5.0
     finally:
         del progress._compiling.started, progress._compiling.finished
-    assert [one.partition("once: ")[2].split(" of ")[0] for one in seen if one] == ["0", "0", "1"]
+    assert [one.partition("compiling: ")[2].split(" of ")[0] for one in seen if one] == ["0", "0", "1"]
     assert all(one.endswith(" functions") for one in seen if one)
     assert seen[-1] == ""
-    assert lines_of(said)[:1] == ["compiling for this machine, once: later runs start at once"]
+    assert lines_of(said)[:1] == ["compiling for this machine; the compiled code is cached for later runs"]
 
 
 def test_quiet_may_stand_anywhere(run, monkeypatch):
@@ -139,10 +139,10 @@ def test_a_fault_ends_the_compiling():
     kernel = Function((called,))
     compiling = progress._Compiling()
     compiling.started(kernel)
-    assert compiling.current == "compiling, once: 0 of 2 functions"
+    assert compiling.current == "compiling: 0 of 2 functions"
     compiling.started(called)
     compiling.finished(called)
-    assert compiling.current == "compiling, once: 1 of 2 functions"
+    assert compiling.current == "compiling: 1 of 2 functions"
     compiling.finished(kernel)
     assert compiling.current == ""
     later = Function((Function(()),))

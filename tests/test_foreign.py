@@ -151,7 +151,7 @@ def test_exported_and_read_back_it_has_the_same_verdict(run, files, name, monkey
         [one["value"] for one in saved["findings"]], [one.value for one in own.findings], rtol=1e-9
     )
     assert saved["alignment"]["removed"] == []
-    assert "the file says that its covariance is of the body error" in said
+    assert "the file declares that its covariance is of the body error" in said
 
 
 def test_the_reference_of_a_broad_trial_is_a_truth(tmp_path):
@@ -559,7 +559,7 @@ def test_tables_of_sigma_and_of_other_units_are_read(tmp_path):
 
 def test_the_command_refuses(files, monkeypatch, capsys):
     for arguments, message in (
-        (["check", files / "estimate.tum"], "holds no innovations, so nothing can be judged without a truth"),
+        (["check", files / "estimate.tum"], "has no innovations, so it cannot be judged without a truth"),
         (["check", files / "estimate.h5", "--align", "none"], "--align goes with --truth"),
         (["check", files / "estimate.csv", "--truth", files / "record.h5", "--align", "clock"], "align"),
         (["check", files / "estimate.csv", "--truth", files / "record.h5", "--error-frame", "ned"], "error_frame"),

@@ -485,7 +485,7 @@ def test_units_convert(name, unit, factor):
         ({"arw": 0.15}, "as text with its unit"),
         ({"bandwidth": "50 rad/s"}, "bandwidth.*Hz"),
         ({"awr": "1 deg/h"}, "did you mean 'arw'"),
-        ({"quantization": "1 arcsec", "angle_resolution": "1 arcsec"}, "one quantity"),
+        ({"quantization": "1 arcsec", "angle_resolution": "1 arcsec"}, "the same quantity"),
     ],
 )
 def test_wrong_units_are_refused_by_name(given_as, message):

@@ -342,7 +342,7 @@ SCALAR = ("--machine", "scalar")
 def test_the_command_computes_prints_and_writes(command):
     status, said, error = command("short.toml", "--runs", 30, "--seed", 4, *SCALAR)
     assert (status, error) == (2, "")  # 30 runs cannot tell
-    assert "More runs (--runs, with --resume) would show it." in said
+    assert "More runs (--runs, with --resume) are needed for a decision." in said
     assert "short: 30 runs, seed 4, machine: scalar." in said
     for words in (
         "NEES of the attitude",
@@ -377,7 +377,7 @@ def test_the_command_matches_the_filter_to_a_data_sheet(command):
     assert plan.setup.process_noise.rate_random_walk == pytest.approx(6.0 * np.pi / 180.0 / 3600.0 / 60.0)
     status, _, error = command("short.toml", "--gyro", "gyro.toml", "--filter", "filter.toml")
     assert status == 2
-    assert "--gyro and --filter both give" in error
+    assert "--gyro and --filter both define" in error
 
 
 def test_the_command_resumes_extends_and_shows(command):
@@ -509,7 +509,7 @@ def test_interrupted_it_keeps_what_is_finished_and_says_so(command, heeded, monk
     monkeypatch.setattr(scalar, "run_chunks", interrupted)
     status, said, _ = command("short.toml", "--runs", 60, "--threads", 1, *SCALAR)
     assert status == 130
-    assert "go on with --resume" in said
+    assert "continue with --resume" in said
     assert signal.getsignal(signal.SIGTERM) == before
     assert campaign.read("short-montecarlo.h5").statistics.runs == 2 * scalar.CHUNK
 
@@ -538,7 +538,7 @@ def test_a_signal_whose_exception_python_drops_is_heeded_after_the_chunk(command
     monkeypatch.setattr(campaign, "_write", interrupted)
     status, said, _ = command("short.toml", "--runs", 60, "--threads", 1, *SCALAR)
     assert status == 130
-    assert "go on with --resume" in said
+    assert "continue with --resume" in said
     assert campaign.read("short-montecarlo.h5").statistics.runs == scalar.CHUNK
 
 

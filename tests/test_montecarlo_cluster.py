@@ -141,7 +141,7 @@ def test_the_help_says_what_trust_a_scheduler_takes(monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["strapdown", "montecarlo", "--help"])
     with pytest.raises(SystemExit):
         cli.main()
-    assert "can run any code here" in " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert "can run any code in your account" in " ".join(capsys.readouterr().out.replace("│", " ").split())
 
 
 def test_without_the_extra_the_remedy_is_reported(monkeypatch, capsys, tmp_path):

@@ -117,11 +117,11 @@ def test_what_is_not_seen_is_bounded_and_said():
     assert not fit.supported[:, i].any()
     assert noise_parameters.largest(fit, "rate_random_walk") == (fit.upper[:, i].max(), False)
     text = noise_parameters.to_kalibr({"gyro": fit, "accelerometer": fit})
-    assert text.count("not seen, the upper end of its interval") == 2
+    assert text.count("not detected, the upper end of its interval") == 2
     assert f"gyroscope_random_walk: {fit.upper[:, i].max():.6e}" in text
-    assert "# EKF2_GYR_B_NOISE: not seen" in noise_parameters.to_px4({"gyro": fit, "accelerometer": fit})
+    assert "# EKF2_GYR_B_NOISE: not detected" in noise_parameters.to_px4({"gyro": fit, "accelerometer": fit})
     with pytest.raises(
-        InputError, match="Kalibr takes the noise of gyro and accelerometer; identify the accelerometer too"
+        InputError, match="Kalibr needs the noise of gyro and accelerometer; identify the accelerometer too"
     ):
         noise_parameters.to_kalibr({"gyro": fit})
 
@@ -158,11 +158,11 @@ def test_gaps_are_said_and_the_noise_is_right(run, tmp_path):
     status, said, error = run("allan", "gappy.csv")
     assert status == 0, error
     assert "801 samples are missing in 3 gaps." in said
-    assert "With gaps: the fit uses 19199 samples" in said
+    assert "Because of gaps the fit uses 19199 samples" in said
     table = tomllib.loads((tmp_path / "allan-results" / "gyro.toml").read_text())["gyro"]
     np.testing.assert_allclose(table["angle_random_walk_deg_per_sqrt_hour"], GYRO[0] / DEGREE_PER_ROOT_HOUR, rtol=0.03)
     status, _, error = run("allan", "gappy.csv", "--robust")
-    assert (status, "has gaps, with which --robust does not go" in error) == (2, True)
+    assert (status, "has gaps, which --robust does not support" in error) == (2, True)
 
 
 def test_stamps_that_stray_are_taken_for_even_and_said():

@@ -144,7 +144,7 @@ def test_every_command_takes_a_file_for_a_name():
         ('name = "x"\ncoefficients = ["two"]', "fraction in quotes"),
         ('name = "x"\ncoefficients = [true]', "is True"),
         ('name = "x"\ncoefficients = "2/3"', "is no list"),
-        ('name = "x"\nsamples = 3\ncoefficients = ["2/3"]', "are of 2 samples"),
+        ('name = "x"\nsamples = 3\ncoefficients = ["2/3"]', "need 2"),
         ('name = "x"\nprevious = 2\ncoefficients = ["2/3"]', "leave no increment"),
         ('name = "x"\nsamples = 2\nproducts = [[1, 1, 0.5]]', "two different increments"),
         ('name = "x"\nsamples = 2\nproducts = [[1, 3, 0.5]]', "increments of 1 … 2"),

@@ -190,7 +190,7 @@ def test_what_are_no_axes_is_refused(bad):
     ("options", "words"),
     [
         (("--axes", "x,y"), "--axes is 'x,y'; give each of x, y and z once"),
-        (("--axes", "x,-y,-z", "--axes", "gyro=y,x,z"), "is of the whole unit; give it alone"),
+        (("--axes", "x,-y,-z", "--axes", "gyro=y,x,z"), "applies to the whole unit; give only it"),
         (("--axes", "gyros=x,y,z"), "did you mean 'gyro'"),
         (("--invert", "gyros"), "did you mean 'gyro'"),
         (("--frame", "nwu", "--to", "x.csv"), "--frame 'NWU' is not known"),

@@ -417,7 +417,7 @@ def test_what_the_target_has_no_room_for_is_said(tmp_path):
     recordings.write(whole, tmp_path / "a.csv")
     status, said = convert(tmp_path / "a.csv", tmp_path / "b.h5")
     assert status == 0, said
-    assert "b.h5 has no room for temperature, clock: left out." in said
+    assert "b.h5 cannot store temperature, clock: omitted." in said
     back = read(tmp_path / "b.h5")
     np.testing.assert_array_equal(back.rate, whole.rate)
     np.testing.assert_array_equal(back.movement, whole.movement)
@@ -428,7 +428,7 @@ def test_what_is_there_is_not_replaced_by_default(tmp_path):
     recordings.write(walk(), tmp_path / "a.csv")
     (tmp_path / "b.csv").write_text("precious")
     for target, words in (
-        ("b.csv", "exists; move it, choose another name, or say --force"),
+        ("b.csv", "exists; move it, choose another name, or give --force"),
         ("a.csv", "the same file that is read"),
     ):
         status, said = convert(tmp_path / "a.csv", tmp_path / target)
@@ -447,7 +447,7 @@ def test_a_simulated_record_and_an_estimate_are_converted(tmp_path):
     write_record(tmp_path / "r.h5", record)
     status, said = convert(tmp_path / "r.h5", tmp_path / "r.csv")
     assert status == 0, said
-    assert "mean over the sample interval that ends there" in said
+    assert "mean over the sample interval before it" in said
     back = read(tmp_path / "r.csv")
     np.testing.assert_allclose(back.rate * np.diff(record.time)[:, None], record.increments, rtol=1e-14)
     np.testing.assert_array_equal(back.time, record.time[1:])

@@ -93,11 +93,11 @@ def test_a_tuning_does_not_replace_what_no_tuning_wrote(folder, tmp_path):
     """The filter that is written where no name is given may be one by hand."""
     (tmp_path / "filter.toml").write_text("# by hand\n[filter]\n")
     command = ["tune", folder / "record.h5", "--out", tmp_path / "filter.toml"]
-    assert "filter.toml exists and is not what `strapdown tune` writes" in refused(command)
+    assert "filter.toml exists and was not written by `strapdown tune`" in refused(command)
     (tmp_path / "filter.json").write_text('{"mine": 1}')
-    assert "filter.toml exists and is not what `strapdown tune` writes" in refused(command)
+    assert "filter.toml exists and was not written by `strapdown tune`" in refused(command)
     (tmp_path / "filter.toml").unlink()
-    assert "filter.json exists and is not what `strapdown tune` writes" in refused(command)
+    assert "filter.json exists and was not written by `strapdown tune`" in refused(command)
     assert (tmp_path / "filter.json").read_text() == '{"mine": 1}'
 
 
@@ -108,7 +108,7 @@ def test_a_command_does_not_replace_what_others_wrote(there, tmp_path, command, 
     if command[0] == "integrate" and name == "data.csv":
         return  # refused by its suffix
     said = refused_at_once([*command, "--out", tmp_path / name])
-    assert f"{name} exists and is not what `strapdown {command[0]}` writes; move it, or choose another --out" in said
+    assert f"{name} exists and was not written by `strapdown {command[0]}`; move it, or choose another --out" in said
     assert (tmp_path / name).read_bytes() == content
 
 
@@ -161,7 +161,7 @@ def test_the_filter_in_the_estimate_is_enough_to_seek_causes(folder):
     command = ["check", str(folder / "run" / "estimate.h5"), "--record", str(folder / "record.h5")]
     result = CliRunner().invoke(cli.app, command)
     assert result.exit_code in (0, 2), result.output
-    assert "Causes by what they would explain" in result.output
+    assert "Causes by their effect on the likelihood" in result.output
 
 
 def test_no_cause_is_named_of_a_filter_that_the_search_does_not_know(folder, short, tmp_path):
@@ -180,9 +180,9 @@ def test_no_cause_is_named_of_a_filter_that_the_search_does_not_know(folder, sho
     options = ["--record", str(tmp_path / "record.h5"), "--json", str(tmp_path / "check.json")]
     result = CliRunner().invoke(cli.app, ["check", str(tmp_path / "estimate.h5"), *options])
     assert result.exit_code in (0, 2), result.output
-    assert "Causes by what they would explain" not in result.output
+    assert "Causes by their effect on the likelihood" not in result.output
     assert (
-        "Causes were not looked for: the search knows a filter of attitude and bias alone, and this one has the "
+        "Causes were not searched for: the search supports filters of attitude and bias only, and this one has the "
         in (result.output)
     )
     assert "states gyro.scale." in result.output
@@ -200,8 +200,8 @@ def test_what_the_record_specifies_and_the_filter_has_no_state_for_is_reported_b
     recordfiles.write_record(tmp_path / "record.h5", dataclasses.replace(held, origin=origin))
     command = ["check", str(folder / "run" / "estimate.h5"), "--record", str(tmp_path / "record.h5")]
     result = CliRunner().invoke(cli.app, command)
-    assert "errors that this filter has no state for: the gyro's scale factor of 1e+03 ppm" in result.output
-    assert "Causes by what they would explain" in result.output
+    assert "errors for which this filter has no state: the gyro's scale factor of 1e+03 ppm" in result.output
+    assert "Causes by their effect on the likelihood" in result.output
 
 
 def test_an_estimate_keeps_more_than_its_start(folder, tmp_path):
@@ -419,8 +419,8 @@ def test_sigma_of_an_angle_in_another_unit_is_reported(folder, short, tmp_path, 
 @pytest.mark.parametrize(
     ("rate", "factor", "words"),
     [
-        (1e300, 1.0, "1e+300 Hz is no rate of a gyro"),
-        (1e-300, 1.0, "1e-300 Hz is no rate of a gyro"),
+        (1e300, 1.0, "1e+300 Hz is no sample rate of a gyro"),
+        (1e-300, 1.0, "1e-300 Hz is no sample rate of a gyro"),
         (100.0, 1e300, "which no gyro measures; check its unit"),
     ],
 )
@@ -433,7 +433,7 @@ def test_allan_refuses_what_no_gyro_measures(tmp_path, rate, factor, words):
 @pytest.mark.parametrize("options", [("--frequency", "1e300"), ("--rate", "1e-5"), ("--rate", "0.9")])
 def test_coning_refuses_what_no_algorithm_follows(tmp_path, options):
     said = refused_at_once(["coning", "--runs", 2, *options, "--out", tmp_path / "out"])
-    assert "no algorithm follows it" in said
+    assert "too few for any algorithm" in said
 
 
 def test_a_budget_of_no_vibration_is_refused(folder, tmp_path):
@@ -452,8 +452,8 @@ def test_integration_reports_samples_that_fill_no_step(there, tmp_path):
     assert not (tmp_path / "attitude.h5").exists()
     result = CliRunner().invoke(cli.app, ["integrate", str(tmp_path / "short.csv"), *out])
     assert result.exit_code == 0, result.output
-    assert "The last 3 of them do not fill a step of 4 and are left out." in result.output
-    assert "holds its units" in refused(["integrate", "record.h5", "--gyro-unit", "rad/s", *out])
+    assert "The last 3 of them do not complete a step of 4 samples and are not used." in result.output
+    assert "contains its units" in refused(["integrate", "record.h5", "--gyro-unit", "rad/s", *out])
 
 
 def test_want_of_memory_ends_with_one_line(run, monkeypatch):

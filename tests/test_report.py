@@ -188,11 +188,11 @@ def test_a_tuning_is_reported_from_its_json(folder, scenario, tmp_path):
     assert "<td>star 1.sigma, arcsec</td>" in content
     for value in (parameter["value"], parameter["lower"], parameter["upper"]):
         assert f"{value / parameter['si_per_unit']:.4g}" in content
-    assert "the verdict takes all tests of a record together" in content
+    assert "the verdict is for all tests of a record together" in content
     assert tuned["held_out"]["after"]["judgements"][0]["verdict"].capitalize() in content.split("<h2>")[0]
     assert content.count("data:image/png") == 2
     assert "[filter]" in content
-    with pytest.raises(InputError, match="not what `strapdown tune` writes"):
+    with pytest.raises(InputError, match="give the JSON that `strapdown tune` writes"):
         report.write(folder / "right.report.json", tmp_path / "page.html")
     # A tuning without data held out, of the same name, leaves nothing of what was said of held-out data before.
     figure = (tmp_path / "filter-heldout.png").read_bytes()
@@ -202,7 +202,7 @@ def test_a_tuning_is_reported_from_its_json(folder, scenario, tmp_path):
     (tmp_path / "filter-heldout.png").write_bytes(figure)
     content = body(report.write(tmp_path / "filter.json").page)
     assert content.count("data:image/png") == 1
-    assert "<strong>Consistent.</strong> The tuned filter explains the data that it was tuned on" in content
+    assert "<strong>Consistent.</strong> The tuned filter agrees with the data used for tuning" in content
 
 
 def test_gaps_become_null_not_nan():
@@ -283,7 +283,7 @@ def test_passing_findings_are_called_pass_and_failing_ones_fail(folder):
     for name, failing in (("right", False), ("wrong", True)):
         content = body(folder / f"{name}.html")
         judgement = json.loads((folder / f"{name}.report.json").read_text())["judgement"]
-        evidence = content.split("<h2>The evidence</h2>")[1].split("</section>")[0]
+        evidence = content.split("<h2>Evidence</h2>")[1].split("</section>")[0]
         marks = [mark for kind, mark in re.findall(r'<tr><td class="(pass|fail)">(\w+)</td>', evidence) if kind == mark]
         assert marks == ["fail" if one["rejected"] else "pass" for one in judgement["findings"]]
         assert ("fail" in marks) == failing

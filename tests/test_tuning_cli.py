@@ -125,13 +125,13 @@ def test_plan_takes_a_built_in_scenario_by_name(run):
     ("arguments", "complaint"),
     [
         (("--free", "gyro.awr"), "did you mean 'gyro.arw'"),
-        (("--length", "100"), "--length is for --plan"),
+        (("--length", "100"), "--length goes with --plan"),
         (("--holdout", "1.5"), "between 0 and 1"),
         (("--holdout", "0.3", "--holdout-by", "week"), "holdout-by 'week'"),
         (("--out", "filter.json"), ".toml"),
         (("--truth", "--spacing", "1"), "leave it out"),
         (("--prior", "no-such-gyro"), "no-such-gyro"),
-        (("--plan", "--length", "100;300"), "seconds with commas"),
+        (("--plan", "--length", "100;300"), "seconds separated by commas"),
         (("--free", " , "), "names no parameter"),
         (("--truth", "--rmse"), "give one of them"),
     ],
@@ -187,8 +187,8 @@ def test_a_filter_with_states_and_a_gate_is_tuned_against_the_truth(run, tmp_pat
     found = setup.read_setup(out)
     assert found.states == gated.states
     assert found.gate == gated.gate
-    assert "as it runs" not in said
-    assert run(*given)[1].count("--truth tunes the filter as it runs") == 1
+    assert "with its gate and weights" not in said
+    assert run(*given)[1].count("--truth tunes the filter with its gate and weights") == 1
 
 
 def test_outliers_beside_optional_states(run, tmp_path):

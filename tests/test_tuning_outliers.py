@@ -443,7 +443,7 @@ def test_tune_with_a_gate_writes_it_into_the_filter(run, tmp_path):
     status, said, complaint = run("tune", path, *options, "-o", out)
     assert status == 0, complaint
     assert "outliers.share" in said
-    assert "An outlier is the likelier explanation" in said
+    assert "is more likely an outlier than noise" in said
     content = json.loads(out.with_suffix(".json").read_text())
     found = setup.read_setup(out)
     assert found.gate is not None
@@ -451,7 +451,7 @@ def test_tune_with_a_gate_writes_it_into_the_filter(run, tmp_path):
     assert content["gate"]["lower"] < content["gate"]["probability"] < content["gate"]["upper"]
     assert set(content["gate"]["thresholds"]) == {"star 1", "star 2"}
     page, _ = tunings.report(out.with_suffix(".json"), 0.99)
-    assert "an outlier is the likelier explanation of a NIS above" in page
+    assert "a measurement with a NIS above" in page
     one = case(1, 300.0)
     estimate = setup.run(one.record, found, one.initial)
     assert all(innovation.refused > 5 for innovation in estimate.innovations.values())

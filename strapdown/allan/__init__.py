@@ -1,10 +1,10 @@
-"""Noise of a sensor at rest: Allan deviation, the fit of its coefficients, and the parameters that other programs want.
+"""Noise of a sensor at rest: Allan deviation, fit of noise coefficients, and noise parameters for other programs.
 
 - ``deviation``: :func:`allan_deviation` with confidence intervals.
 - ``noise_fit``: :func:`fit_noise` by maximum likelihood, on the ``spectrum`` of the cosine transform.
 - ``gaps``: Allan deviation of a record with gaps.
 - ``temperature``: Bias as a polynomial in temperature.
-- ``parameters``: Noise parameters of a six-axis unit, as Kalibr, PX4 and MATLAB write them.
+- ``parameters``: Noise parameters of a six-axis unit in the formats of Kalibr, PX4 and MATLAB.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """Load a submodule when it is first used (PEP 562)."""
+    """Load a submodule on first use (PEP 562)."""
     if name in ("gaps", "parameters", "temperature"):
         return import_module(f"{__name__}.{name}")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,7 +1,7 @@
 """Allan deviation of a gyro record at rest: overlapping, robust, modified, or Hadamard, with χ² confidence bands.
 
-The noises, with the Allan variance σ²(τ) of samples that average the rate over the sample interval (exact at every τ; bias: the
-floor):
+Noise terms and the Allan variance σ²(τ) of samples that average the rate over the sample interval (exact at every τ; bias: the
+minimum):
 
 ============  ======================  =============  ==========================================================================
 term          two-sided PSD of rate   σ²(τ)          unit
@@ -44,25 +44,25 @@ NOISE_TYPES = {
     -1: "bias instability",
     -2: "rate random walk",
 }
-"""Name of each power law: the PSD of the rate goes as f to the key."""
+"""Name of each power law; the key is the exponent of f in the PSD of the rate."""
 
 ESTIMATORS = {
     "overlapping": "overlapping Allan deviation, OADEV",
     "robust": "Allan deviation by the median of second differences",
-    "modified": "modified Allan deviation, MDEV: of the angle averaged over τ, which parts quantisation from flicker of the angle",
-    "hadamard": "overlapping Hadamard deviation, HDEV: by third differences of the angle, which do not see a rate ramp",
+    "modified": "modified Allan deviation, MDEV: of the angle averaged over τ; separates quantisation from flicker of the angle",
+    "hadamard": "overlapping Hadamard deviation, HDEV: from third differences of the angle, which are insensitive to a rate ramp",
 }
 """Estimators of :func:`allan_deviation`."""
 
 _MEDIAN_OF_NORMAL = 0.6744897501960817  # Φ⁻¹(3/4): median of |z|, z standard normal
 
 _MEDIAN_EFFICIENCY = (
-    0.3675  # of the median of |z| against the mean square, independent normal data: 8 (z φ(z))², z = Φ⁻¹(3/4)
+    0.3675  # of the median of |z| relative to the mean square, independent normal data: 8 (z φ(z))², z = Φ⁻¹(3/4)
 )
 
-_FEWEST_BLOCKS = 30  # below this the lag-1 autocorrelation says little (SP 1065, §5.5.6)
+_FEWEST_BLOCKS = 30  # with fewer the lag-1 autocorrelation is too uncertain (SP 1065, §5.5.6)
 
-_MANY_BLOCKS = 128  # its scatter is then well below what moves the power law by one half
+_MANY_BLOCKS = 128  # the scatter of the power law is then well below one half
 
 _MAX_BLOCKS = 1 << 17
 
@@ -92,7 +92,7 @@ class AllanDeviation(Listed):
     estimator : str
         Key of :data:`ESTIMATORS`.
     samples : int
-        Samples of the record.
+        Number of samples of the record.
     sample_interval : float
         Sample interval, s.
     """
@@ -145,8 +145,8 @@ def allan_deviation(
     kind : {"rate", "increments"}, default "rate"
         Kind of the values.
     taus : array_like, optional
-        Averaging times, s, each rounded to a multiple of the sample interval; repeated ones are dropped. Default: 12 a decade, up
-        to a third of the record.
+        Averaging times, s, each rounded to a multiple of the sample interval; duplicates are dropped. Default: 12 per decade, up to a third
+        of the record.
     estimator : {"overlapping", "robust", "modified", "hadamard"}, default "overlapping"
         Estimator, see the notes.
     level : float, default 0.95
@@ -160,23 +160,23 @@ def allan_deviation(
     Notes
     -----
     The overlapping estimator equals ``allantools.oadev``, the modified one ``allantools.mdev`` and the Hadamard one
-    ``allantools.ohdev``. The model of the module's table is that of the Allan variance only (of angle random walk, N²/τ, the
-    modified variance is (1 + 1/m²)/2 of it at m samples, and the Hadamard one all of it).
+    ``allantools.ohdev``. The table in the module docstring is for the Allan variance only (for angle random walk, N²/τ, the modified
+    variance is smaller by the factor (1 + 1/m²)/2 at m samples, and the Hadamard variance is equal).
 
-    The robust estimator is the median size of the second differences over its value for a Gaussian. It withstands single outliers,
-    bursts and bias steps as long as well under half of all spans of 2τ are affected, so only few of them at long τ. It does not
-    suit records of a few coarse counts, whose median sits on the counts.
+    The robust estimator is the median magnitude of the second differences divided by its value for a Gaussian. It is robust to outliers,
+    bursts and bias steps if they affect well under half of all intervals of 2τ, that is, to few of them at long τ. It is not suitable for
+    coarsely quantised records, whose median is one of a few values.
 
-    The phase is kept as float64: the sum of the rate less its mean, carried with its rounding error, so that each value is rounded
-    once (½ unit in the last place of the largest phase) also after 1e8 samples. Memory: one float64 per sample beyond the record,
-    an axis at a time. Time: proportional to the samples for each τ.
+    The phase is the sum of the rate less its mean, in float64 with compensated summation, so that each value is rounded once (½ unit in the
+    last place of the largest phase), also after 1e8 samples. Memory: one float64 per sample in addition to the record, one axis at a time.
+    Time: proportional to the number of samples for each τ.
     """
     record, dt, scale = averaged(values, sample_interval, kind)
     checks.one_of("estimator", estimator, ESTIMATORS)
     level = confidence(level)
     if np.isnan(record).any():
         if estimator != "overlapping":
-            raise InputError(f"values has gaps (NaN), with which estimator {estimator!r} does not go; leave it out")
+            raise InputError(f"values has gaps (NaN), which estimator {estimator!r} does not support; leave it out")
         found = gaps.allan_deviation(scale * record, dt, taus=taus, level=level)._asdict()
         noise_type = np.vectorize(NOISE_TYPES.__getitem__)(found.pop("alphas"))
         return AllanDeviation(**found, noise_type=noise_type, level=level, estimator="gaps", sample_interval=dt)
@@ -189,7 +189,7 @@ def allan_deviation(
     for axis in range(record.shape[1]):
         rate = read_only(record[:, axis])
         compiled(accumulate)(rate, float(np.mean(rate)), phase)
-        # Where the first τ has few averages, what comes before it is the longest one that has many.
+        # If the first τ has few averages, the power law before it is that of the longest τ with many.
         alpha = _power_law(phase, max(1, min(int(multiples[0]), samples // _MANY_BLOCKS)), 0)
         for i, m in enumerate(int(m) for m in multiples):
             alpha = _power_law(phase, m, alpha)
@@ -226,12 +226,12 @@ def allan_deviation(
 
 
 def _order(estimator: str) -> int:
-    """Return the order of the differences that an estimator squares: of the angle, or of its sum for the modified Allan deviation."""
+    """Return the order of the differences that an estimator squares: of the angle, or for the modified Allan deviation of its sum."""
     return 3 if estimator in ("modified", "hadamard") else 2
 
 
 def _third_differences(series: Array, m: int) -> float:
-    """Return the mean of (y[k + 3m] − 3 y[k + 2m] + 3 y[k + m] − y[k])² over all k, a block at a time."""
+    """Return the mean of (y[k + 3m] − 3 y[k + 2m] + 3 y[k + m] − y[k])² over all k, block by block."""
     count = len(series) - 3 * m
     total = 0.0
     for start in range(0, count, _STRETCH):
@@ -243,12 +243,12 @@ def _third_differences(series: Array, m: int) -> float:
 
 
 def equivalent_degrees_of_freedom(alpha: int, samples: int, m: int, estimator: str = "overlapping") -> float:
-    """Return the equivalent degrees of freedom of the variance averaged over m samples, out of ``samples`` of the rate.
+    """Return the equivalent degrees of freedom of the variance at m samples, from ``samples`` samples of the rate.
 
-    ``2 E²/Var`` of the mean of squared differences, by summing their squared autocorrelation (Greenhall & Riley 2003). Sampled
-    phase of a noise that is white, flicker or random walk in continuous time has the generalised covariances −|t|, t² ln|t| and |t|³,
-    which need no further approximation; quantisation is white phase. The sum of the phase, whose third differences the modified Allan
-    deviation squares, has the second integrals of these.
+    ``2 E²/Var`` of the mean of squared differences, by summing their squared autocorrelation (Greenhall & Riley 2003). The phase of white,
+    flicker and random-walk noise in continuous time has the generalised covariances −|t|, t² ln|t| and |t|³, used without further
+    approximation; quantisation is white phase. The covariances of the summed phase, whose third differences the modified Allan deviation
+    squares, are their second integrals.
     """
     if alpha not in NOISE_TYPES:
         raise InputError(f"alpha is {alpha!r}; it must be one of {', '.join(map(str, NOISE_TYPES))}")
@@ -256,14 +256,14 @@ def equivalent_degrees_of_freedom(alpha: int, samples: int, m: int, estimator: s
     checks.count("samples", samples, minimum=2)
     order = _order(estimator)
     if not 1 <= m <= samples // order:
-        raise InputError(f"m is {m!r}; with {samples} samples it must lie between 1 and {samples // order}")
+        raise InputError(f"m is {m!r}; with {samples} samples it must be between 1 and {samples // order}")
     summed = estimator == "modified"
     count = samples + 1 + summed - order * m
     if alpha == 2 and not summed:  # overlaps of the differences by lags of 0, m, 2m, …
         weights = [math.comb(2 * order, order + j) for j in range(order + 1)]
         overlaps = sum((1 + (j > 0)) * w**2 * max(count - j * m, 0) for j, w in enumerate(weights))
         return float((weights[0] * count) ** 2 / overlaps)
-    # Cells of one lag near the peaks at 0, m, 2m, … (sharp for flicker phase), wider ones elsewhere, each by its middle.
+    # Midpoint rule with cells of one lag near the peaks at 0, m, 2m, … (narrow for flicker phase) and larger ones elsewhere.
     end = min(count, 6 * m)
     if m <= 1000:
         edges = np.arange(end + 1)
@@ -283,7 +283,7 @@ def equivalent_degrees_of_freedom(alpha: int, samples: int, m: int, estimator: s
 def _difference_covariance(
     covariance: Callable[[int, Array, int], Array], alpha: int, lag: Array, m: int, order: int
 ) -> Array:
-    """Return the autocovariance of the differences over m of an order, up to a factor, from a generalised covariance."""
+    """Return the autocovariance, up to a factor, of differences of the given order over m samples, from a generalised covariance."""
     total = np.zeros_like(lag)
     for j in range(-order, order + 1):
         total += (-1) ** j * math.comb(2 * order, order + j) * covariance(alpha, lag + j * m, m)
@@ -300,7 +300,7 @@ def _phase_covariance(alpha: int, k: Array, m: int) -> Array:
     if alpha == -2:
         return np.asarray(t**3)
 
-    # Flicker of the phase has infinite variance unless its band ends: Greenhall's second difference over one sample interval.
+    # Flicker of the phase needs a band limit for a finite variance: Greenhall's second difference over one sample interval.
     def smooth(j: Array) -> Array:
         return np.asarray(j * j * _logarithm(np.abs(j)))
 
@@ -310,9 +310,9 @@ def _phase_covariance(alpha: int, k: Array, m: int) -> Array:
 
 
 def _summed_phase_covariance(alpha: int, k: Array, m: int) -> Array:
-    """Return the same of the running sum of the phase: minus its second difference over one sample is that of the phase.
+    """Return the same for the running sum of the phase: minus its second difference over one sample is the covariance of the phase.
 
-    Exactly so, but for flicker of the rate, where the difference approximates the derivative.
+    This is exact except for flicker of the rate, where the difference approximates the derivative.
     """
     t, step = np.abs(k) / m, 1.0 / m
     if alpha == 2:
@@ -327,13 +327,13 @@ def _summed_phase_covariance(alpha: int, k: Array, m: int) -> Array:
 
 
 def _logarithm(t: Array) -> Array:
-    """Return ln t, and 0 at 0, where a power of t stands before it."""
+    """Return ln t, and 0 at t = 0, where it is multiplied by a power of t."""
     return np.asarray(np.log(np.where(t > 0.0, t, 1.0)))
 
 
 def _median_deviation(phase: Array, m: int, alpha: int) -> float:
-    """Return the median size of the second differences, scaled to the standard deviation of a Gaussian, as an Allan deviation."""
-    # Spans that overlap by 15/16 hold nearly all there is, unless the noise is in the phase itself.
+    """Return the Allan deviation from the median magnitude of the second differences, scaled for Gaussian noise."""
+    # An overlap of 15/16 uses nearly all the information, unless the noise is white or flicker phase.
     stride = 1 if alpha > 0 else max(1, m // 16)
     sizes = np.empty((len(phase) - 1 - 2 * m) // stride + 1)
     compiled(second_difference_sizes)(phase, m, stride, sizes)
@@ -343,9 +343,9 @@ def _median_deviation(phase: Array, m: int, alpha: int) -> float:
 def _power_law(phase: Array, m: int, otherwise: int) -> int:
     """Return the power law of the rate averaged over m samples, by the lag-1 autocorrelation (Riley & Greenhall 2004).
 
-    A series with correlation r at lag 1 has fractional-difference parameter δ = r/(1 + r); it is differenced while δ ≥ ¼. A middle
-    stretch of the record is enough where there are very many averages. Noises of a gyro redden with τ, so what few averages show may
-    only be redder than ``otherwise``, the power law of the τ before: by chance they show anything.
+    A series with correlation r at lag 1 has fractional-difference parameter δ = r/(1 + r); it is differenced while δ ≥ ¼. If there are very
+    many averages, only the middle of the record is used. The exponent of gyro noise decreases with τ. With few averages, whose estimate is
+    uncertain, the result is therefore at most ``otherwise``, the exponent at the previous τ.
     """
     edges = phase[::m]
     spare = max(0, len(edges) - _MAX_BLOCKS) // 2
@@ -368,10 +368,10 @@ def _power_law(phase: Array, m: int, otherwise: int) -> int:
 
 
 def flicker_variance(multiples: ArrayLike) -> Array:
-    """Return the exact Allan variance, over B², of samples with the two-sided PSD B²/(2π f) up to the Nyquist frequency.
+    """Return the exact Allan variance, divided by B², of samples with the two-sided PSD B²/(2π f) up to the Nyquist frequency.
 
-    ``∫ (4/(2π f)) sin⁴(π f m)/(m sin π f)² df`` over f in (0, ½), as a sum over the autocovariance −Cin(π k)/π of the samples. It tends
-    to 2 ln 2/π as 1/m² (to 1e-7 at m = 4096, beyond which the limit is returned), from above: one sample shows 19 % more.
+    ``∫ (4/(2π f)) sin⁴(π f m)/(m sin π f)² df`` over f in (0, ½), as a sum over the autocovariance −Cin(π k)/π of the samples. It converges
+    to 2 ln 2/π as 1/m² from above (to 1e-7 at m = 4096, beyond which the limit is returned); at one sample it is 19 % larger.
     """
     m_all = np.atleast_1d(checks.array("multiples", multiples, (...,)))
     limit = int(min(m_all.max(initial=1.0), _FLICKER_SUM_LIMIT))
@@ -411,12 +411,12 @@ def confidence(level: float) -> float:
     """Return a confidence level, checked."""
     number = checks.positive("level", level)
     if not 0.5 < number < 1.0:
-        raise InputError(f"level is {number:g}; a confidence lies between 0.5 and 1, for example 0.95")
+        raise InputError(f"level is {number:g}; a confidence must be between 0.5 and 1, for example 0.95")
     return number
 
 
 def averaged(values: ArrayLike, sample_interval: float, kind: str) -> tuple[Array, float, float]:
-    """Return the record (n, axes), NaN where a sample is missing, its sample interval, and the factor that makes rates of its values."""
+    """Return the record (n, axes), NaN for missing samples, its sample interval, and the factor that converts its values to rates."""
     dt = checks.positive("sample_interval", sample_interval, unit="s")
     checks.one_of("kind", kind, ("rate", "increments"))
     record = checks.array("values", values, ("n",) if np.ndim(values) == 1 else ("n", "axes"), allow_nan=True)
@@ -440,7 +440,7 @@ def _multiples(taus: ArrayLike | None, samples: int, dt: float, order: int) -> N
     for tau, m in zip(wanted, multiples, strict=True):
         if not 1 <= m <= samples // order:
             raise InputError(
-                f"taus holds {tau:g} s; with {samples} samples of {dt:g} s it must lie between {dt:g} s and {samples // order * dt:g} s"
+                f"taus holds {tau:g} s; with {samples} samples of {dt:g} s it must be between {dt:g} s and {samples // order * dt:g} s"
             )
     if len(multiples) == 0:
         raise InputError("taus is empty; leave it out for the default")

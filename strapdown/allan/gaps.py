@@ -1,13 +1,13 @@
-"""Allan deviation of a record with gaps: samples on an even grid, missing ones NaN.
+"""Allan deviation of a record with gaps: evenly spaced samples, missing ones NaN.
 
-Gaps must not depend on the values lost: those of a lost packet do not, those of a sensor that saturates do.
+Gaps must not depend on the lost values: those of a lost packet do not, those of a saturated sensor do.
 
 This is the wavelet-variance estimator for gappy series of Mondal & Percival ("Wavelet variance analysis for gappy time series", Ann. Inst.
-Stat. Math. 62, 2010) for the Haar wavelet, whose variance the Allan variance is. With the semivariogram of all pairs of samples that are
-there, ``V_k = ½⟨(x_{t+k} − x_t)²⟩``, it is ``σ²(m) = −Σ_{k=1}^{2m−1} r_k V_k / m²``, r being the autocorrelation of m times −1 and m times
-+1. It is unbiased for every noise of the table in :mod:`strapdown.allan`, whatever the gaps, and no sum of squares: where few pairs are
-left it may come out below zero (6 % of records of white noise at a tenth of the record, a fifth of it lost); the deviation is NaN there and
-its band unbounded. The band comes from simulated records of the same gaps and the power law at hand.
+Stat. Math. 62, 2010) for the Haar wavelet, whose wavelet variance is the Allan variance. With the semivariogram of all pairs of available
+samples, ``V_k = ½⟨(x_{t+k} − x_t)²⟩``, it is ``σ²(m) = −Σ_{k=1}^{2m−1} r_k V_k / m²``, r being the autocorrelation of m times −1 and m
+times +1. It is unbiased for every noise of the table in :mod:`strapdown.allan.deviation` and for any gaps, but not a sum of squares: with
+few pairs it may be negative (6 % of records of white noise at a tenth of the record, a fifth of it lost); the deviation is then NaN and its
+band unbounded. The band is computed from simulated records with the same gaps and power law.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from strapdown import checks
 from strapdown.checks import Array, InputError
 
 SIMULATED = 1 << 12
-"""Largest number of samples of a simulated record; several samples of a longer record are one there."""
+"""Maximum number of samples of a simulated record, which for longer records combines several samples into one."""
 RUNS = 400
-"""Simulated records for each power law."""
+"""Number of simulated records for each power law."""
 WHOLE_RUNS = 50
-"""The same of records longer than :data:`SIMULATED`, with all their samples."""
+"""Number of simulated records with all samples, for records longer than :data:`SIMULATED`."""
 
 
 class Deviation(NamedTuple):
-    """Allan deviation (axes, k) at taus (k,), its confidence band, degrees of freedom and power laws; samples that are present."""
+    """Allan deviation (axes, k) at taus (k,), its confidence band, degrees of freedom and power laws; number of available samples."""
 
     taus: Array
     deviation: Array
@@ -45,12 +45,12 @@ def allan_deviation(
 ) -> Deviation:
     """Return the Allan deviation of averaged samples with gaps (NaN), and its confidence band.
 
-    By default at 12 averaging times a decade, up to a tenth of the record; NaN where too few pairs of samples are that far apart. The band
-    comes from simulated records (``seed``).
+    By default at 12 averaging times per decade, up to a tenth of the record; NaN if too few pairs of samples have this spacing. The band is
+    computed from simulated records (``seed``).
     """
     known = np.asarray(~np.isnan(record).any(axis=1))
     if known.sum() < 3:
-        raise InputError(f"values has {int(known.sum())} samples that are present; an Allan deviation needs at least 3")
+        raise InputError(f"values has {int(known.sum())} samples that are not NaN; an Allan deviation needs at least 3")
     samples, record = len(record), np.where(known[:, None], record, 0.0)
     wanted = dt * _multiples(samples // 10) if taus is None else taus
     multiples = np.unique(np.rint(np.atleast_1d(checks.array("taus", wanted, (...,))) / dt).astype(np.int64))
@@ -78,7 +78,7 @@ def allan_deviation(
 
 
 class _Pairs(NamedTuple):
-    """Pairs of samples that are there, by lag."""
+    """Pairs of available samples, by lag."""
 
     known: NDArray[np.bool_]
     size: int
@@ -94,7 +94,7 @@ class _Pairs(NamedTuple):
         return cls(known, size, transform, np.rint(irfft(np.abs(transform) ** 2, size)[: 2 * largest]))
 
     def variance(self, x: Array, multiples: NDArray[np.int64]) -> Array:
-        """Return the Allan variance at each multiple of the sample interval; NaN where a lag has no pair."""
+        """Return the Allan variance at each multiple of the sample interval; NaN if a lag has no pair."""
         from scipy.fft import irfft, rfft
 
         centred = np.where(self.known, x - x[self.known].mean(), 0.0)
@@ -123,13 +123,13 @@ def _power_laws(multiples: NDArray[np.int64], variance: Array) -> NDArray[np.int
         near = np.abs(x - x[i]) <= np.log(3.0)
         slopes[i] = np.polyfit(x[near], y[near], 1)[0] if near.sum() > 2 else -1.0
     law = np.where(slopes < -1.5, 2, np.where(slopes < -0.5, 0, np.where(slopes < 0.5, -1, -2)))
-    for i in range(1, len(law)):  # few averages show anything, and noises redden with τ
+    for i in range(1, len(law)):  # the exponent of sensor noise decreases with τ, and few averages are uncertain
         law[i] = min(law[i], law[i - 1])
     return np.asarray(law[np.clip(np.searchsorted(usable, np.arange(len(multiples))), 0, len(usable) - 1)])
 
 
 def _multiples(largest: int) -> NDArray[np.int64]:
-    """Return averaging times in samples, 12 a decade up to the largest."""
+    """Return averaging times in samples, 12 per decade up to the largest."""
     top = max(1, largest)
     return np.unique(np.rint(np.geomspace(1, top, 2 + int(12 * np.log10(top)))).astype(np.int64))
 
@@ -137,11 +137,11 @@ def _multiples(largest: int) -> NDArray[np.int64]:
 def _spread(
     known: NDArray[np.bool_], multiples: NDArray[np.int64], alphas: NDArray[np.int64], level: float, seed: int
 ) -> tuple[Array, Array, Array]:
-    """Return how the estimator spreads over simulated records with the same gaps: degrees of freedom, low and high quantile over its mean.
+    """Return degrees of freedom, and low and high quantile over the mean, of the estimator for simulated records with the same gaps.
 
-    Of records longer than :data:`SIMULATED` the simulation with fewer samples gives the shape of the distribution (χ² below one of its
-    samples), and a few records of all samples its variance: of white noise the estimator spreads more, at one share of the record, the
-    more samples there are.
+    For records longer than :data:`SIMULATED`, the simulation with fewer samples gives the shape of the distribution (χ² below one of its
+    samples), and a few records with all samples its variance: for white noise and τ at a given fraction of the record, the relative
+    variance of the estimator increases with the number of samples.
     """
     from scipy.stats import chi2
 
@@ -150,7 +150,7 @@ def _spread(
     there = known[: rows * coarse].reshape(rows, coarse).mean(axis=1) > 0.5
     if there.sum() < 3:
         raise InputError(
-            "values has too few samples between its gaps for a confidence band; cut it to where it has more"
+            "values has too few samples between its gaps for a confidence band; cut it to a part with fewer gaps"
         )
     random = np.random.default_rng(seed)
     at = multiples / coarse
@@ -179,13 +179,13 @@ def _spread(
 
 
 def _freedom(found: Array) -> Array:
-    """Return the degrees of freedom of the χ² with the mean and variance of each column."""
+    """Return the degrees of freedom of the χ² distribution with the mean and variance of each column."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(2.0 * found.mean(axis=0) ** 2 / found.var(axis=0, ddof=1))
 
 
 def _noise(alpha: int, samples: int, random: np.random.Generator) -> Array:
-    """Return a record of a power law."""
+    """Return a simulated record of a power law."""
     white = random.standard_normal(samples + 1)
     if alpha == 2:
         return np.asarray(np.diff(white))

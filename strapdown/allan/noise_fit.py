@@ -2,14 +2,14 @@
 
 Quantisation Q, angle random walk N, bias instability B, rate random walk K and rate ramp R, as in :mod:`strapdown.allan.deviation`.
 
-Why not least squares on the Allan deviation: its values at neighbouring τ share nearly all their data, so their errors are strongly
-correlated, and at long τ, which alone contains K and R, they are far from Gaussian. The cosine (DCT-II) coefficients of
-averaged-rate samples are independent and Gaussian instead, exactly for angle and rate random walk, which a DCT diagonalises, and
-nearly for flicker and quantisation, whose exact variances are used; the Allan variance is a smoothing of their squares and holds no
-more. So no covariance between taus has to be modelled, and the intervals are those of a likelihood.
+Least squares on the Allan deviation is not used: values at neighbouring τ are computed from nearly the same data, so that their errors are
+strongly correlated, and at long τ, where K and R are observable, they are far from Gaussian. The cosine (DCT-II) coefficients of
+averaged-rate samples, in contrast, are independent and Gaussian, exactly for angle and rate random walk, which a DCT diagonalises, and
+nearly for flicker and quantisation, whose exact variances are used. The Allan variance is a smoothed function of their squares and has no
+further information. No covariance between averaging times has to be modelled, and the intervals follow from the likelihood.
 
-Quantisation is white only while successive angles differ by noise or motion of about half a step or more; below that its error
-follows the motion, no coefficient describes it, and ``NoiseFit.misfit_probability`` approaches zero.
+Quantisation is white only if successive angles differ by noise or motion of about half a step or more; otherwise its error is correlated
+with the motion, no coefficient describes it, and ``NoiseFit.misfit_probability`` approaches zero.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ UNITS: Mapping[str, Mapping[str, tuple[str, float]]] = {
         "rate_ramp": ("nT/h", 1e-9 / 3600.0),
     },
 }
-"""Unit at the rim and its factor to SI, for each term of each sensor."""
+"""Unit for input and output and its factor to SI, for each term of each sensor."""
 NAMES: Mapping[str, Mapping[str, str]] = {
     "gyro": {},
     "accelerometer": {
@@ -79,24 +79,24 @@ NAMES: Mapping[str, Mapping[str, str]] = {
     },
     "magnetometer": {"angle_random_walk": "white_noise", "rate_random_walk": "random_walk", "rate_ramp": "ramp"},
 }
-"""Name of a term by sensor, where it differs from that of a gyro."""
+"""Name of a term by sensor, if it differs from that of a gyro."""
 
 TERM_COST = 1.5
-"""Log-likelihood by which a coefficient must raise that of a combination of terms to raise its weight (Akaike's: 1).
+"""Penalty on the log-likelihood of a combination of terms per coefficient (Akaike's: 1).
 
-Measured in 30 s of white noise and random walk alike on three axes: at a cost of 1 the interval of the largest axis covers 97.9 % (too
-wide), at 1.5 96.6 %. Beside flicker that the record hardly shows, one axis's interval of the random walk covers 94 % at 1, 88 % at 1.5 and
-86 % at 2.
+Measured in 30 s of white noise and random walk, equal on three axes: at a penalty of 1 the interval of the largest axis covers 97.9 % (too
+large), at 1.5 96.6 %. With flicker that is hardly observable in the record, the interval of the random walk of one axis covers 94 % at 1,
+88 % at 1.5 and 86 % at 2.
 """
 
 SUPPORT_PROBABILITY = 1e-3
-"""A term is supported if a record without it would show as much of it by chance with less than this probability."""
+"""Significance level of a term: the probability that a record without it shows as much of it by chance."""
 
 MISFIT_PROBABILITY = 1e-3
-"""Value of ``NoiseFit.misfit_probability`` below which the record contains more than the noises."""
+"""Threshold of ``NoiseFit.misfit_probability``, below which the record contains other errors than the noise terms."""
 
 SHORTEST = 64
-"""Samples of the shortest segment without a gap that a fit uses."""
+"""Minimum number of samples of a segment without gaps that the fit uses."""
 
 _STRETCHES = 64
 
@@ -110,25 +110,25 @@ class NoiseFit(Listed):
     terms : tuple of str
         Terms fitted, a subset of :data:`TERMS`; they index the last axis below.
     estimate : ndarray (axes, terms)
-        Coefficients, averaged over the combinations of terms; NaN where the record does not support the term.
+        Coefficients, averaged over the combinations of terms; NaN if the record does not support the term.
     lower, upper : ndarray (axes, terms)
-        Two-sided interval of confidence ``level``. Where the term is not supported ``lower`` is 0 and ``upper`` the upper end of
-        that interval (for the ramp: a bound on its size), so that the pair covers the truth at least as often as ``level`` whether
-        or not the term is supported; a looser bound there would fail where the threshold of support selects the low estimates.
+        Two-sided interval of confidence ``level``. If the term is not supported, ``lower`` is 0 and ``upper`` the upper end of that
+        interval (for the ramp: a bound on its magnitude), so that the coverage is at least ``level`` whether or not the term is supported;
+        a one-sided bound would have a lower coverage, since the threshold of support selects the low estimates.
     supported : ndarray of bool (axes, terms)
         Whether the record supports the term.
     covariance : ndarray (axes, terms, terms)
-        Covariance of the estimates, from the Fisher information of all terms at their most likely values; NaN for unsupported terms.
+        Covariance of the estimates, from the Fisher information of all terms at the maximum of the likelihood; NaN for unsupported terms.
     misfit_probability : ndarray (axes,)
-        Probability that a record of the fitted noises departs as far from them, by the most significant of three tests: its
-        spectrum, its largest sample and its noise by segments, the last two after whitening. Near zero the record contains
-        something else (motion, a vibration line, a low-pass filter, outliers, a Gauss–Markov bias), and the intervals do not hold.
+        p-value of the record under the fitted noise terms, by the most significant of three tests: its spectrum, its largest sample and its
+        noise by segments, the last two after whitening. Near zero the record contains other errors (motion, a vibration line, a low-pass
+        filter, outliers, a Gauss–Markov bias), and the intervals are not valid.
     misfit : tuple of str
-        What that test found and when, for each axis.
+        Description of the deviation found by that test, for each axis.
     level : float
         Confidence of the intervals.
     samples : int
-        Samples of the record.
+        Number of samples of the record.
     sample_interval : float
         Sample interval, s.
     sensor : {"gyro", "accelerometer", "magnetometer"}, default "gyro"
@@ -150,9 +150,9 @@ class NoiseFit(Listed):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What of an axis is no such noise, a sentence each."""
+        """Warnings about axes with other errors than the noise terms, one sentence each."""
         return tuple(
-            f"axis {'xyz'[axis]} holds more than such noises: {what} (probability {max(probability, 1e-99):.0e})"
+            f"axis {'xyz'[axis]} has other errors than these noise terms: {what} (probability {max(probability, 1e-99):.0e})"
             for axis, (probability, what) in enumerate(zip(self.misfit_probability, self.misfit, strict=True))
             if probability < MISFIT_PROBABILITY
         )
@@ -161,7 +161,7 @@ class NoiseFit(Listed):
         """Return the coefficients with their intervals, as a table."""
         rows = []
         for row in table(self):
-            seen = (figure(row["estimate"]), figure(row["lower"])) if row["supported"] else ("not seen", "")
+            seen = (figure(row["estimate"]), figure(row["lower"])) if row["supported"] else ("not detected", "")
             what = f"{row['term']} ({row['symbol']})"
             rows.append(("xyz"[row["axis"]], what, row["unit"], *seen, figure(row["upper"])))
         title = f"Noise of the {self.sensor}, {self.samples} samples of {self.sample_interval:.6g} s, {100.0 * self.level:g} % intervals"
@@ -178,24 +178,24 @@ def fit_noise(
     highest_frequency: float | None = None,
     level: float = 0.95,
 ) -> NoiseFit:
-    """Return the noise coefficients of a record at rest, each with its interval, or a bound where it is not supported.
+    """Return the noise coefficients of a record at rest, each with its interval, or with an upper bound if it is not supported.
 
     Parameters
     ----------
     values : array_like (n,) or (n, axes)
-        Averaged-rate samples, rad/s, or angle increments, rad, at most three axes. Missing ones, NaN, must not depend on the values
-        lost; the segments between them of at least 64 samples are used, which ``samples`` of the result counts.
+        Averaged-rate samples, rad/s, or angle increments, rad, at most three axes. Gaps are NaN and must not depend on the lost values;
+        segments of at least 64 samples between them are used, whose number of samples is ``samples`` of the result.
     sample_interval : float
         Sample interval, s.
     kind : {"rate", "increments"}, default "rate"
         Kind of the values.
     sensor : {"gyro", "accelerometer", "magnetometer"}, default "gyro"
-        Sensor of the values, in m/s² or T where it is no gyro.
+        Sensor of the values, which are in m/s² or T if it is not a gyro.
     terms : sequence of str, default TERMS
         Terms to fit, of :data:`TERMS`.
     highest_frequency : float, optional
-        Frequency, Hz, above which the spectrum is left out, where a low-pass filter or a vibration shapes it. The samples are then
-        regarded as averages below it.
+        Maximum frequency of the spectrum that is used, Hz, to exclude a low-pass filter or a vibration. Below it the samples are treated as
+        averages.
     level : float, default 0.95
         Confidence of the intervals, 0.5 to 1.
 
@@ -207,18 +207,20 @@ def fit_noise(
     Notes
     -----
     The squared DCT-II coefficients of the record, j = 1 … n − 1 at frequency j/(2 n dt), are modelled as independent χ² of one
-    degree of freedom around ``Σ θ_i V_i(j)``, θ = (Q², N², B², K²) ≥ 0, V the exact expectation for each noise on a finite record;
+    degree of freedom with mean ``Σ θ_i V_i(j)``, θ = (Q², N², B², K²) ≥ 0, V the exact expectation for each noise on a finite record;
     a rate ramp is a mean. Coefficients are pooled in bins of 5 % in frequency. θ maximises the likelihood restricted for the ramp
     (REML). In a record with gaps the likelihood is that within each segment: the differences between the means of segments are not used,
-    so that many short ones contain little information on a random walk. ``misfit_probability`` is that of the worst, times their number.
+    so that many short segments contain little information on a random walk. ``misfit_probability`` is the minimum over the segments, times
+    their number.
 
-    Which terms the sensor has is not known, and where one is absent, at the bound θ = 0 of the model, twice the fall of the
-    likelihood of the *other* terms is no χ²: with all terms in the model their upper ends would be too low and their lower ends
-    fail too seldom (Self & Liang 1987). Nor may a term be left out because the record does not show it, for what it adds would be
-    attributed to the others. So the intervals are averaged over all combinations of terms, ``Σ_m w_m Φ(r_m(θ)) = (1 ± level)/2``, r_m
-    being the signed root of twice the fall of the likelihood in combination m, maximised over its other terms (Fletcher & Turek
-    2012), with the weights ``w_m ∝ exp(log L_m − TERM_COST · coefficients)``. The axes are units of one kind: L is the likelihood of
-    all axes, each with its own coefficients. For a term count the combinations with it.
+    The terms present in the sensor are unknown. If one is absent, that is, at the boundary θ = 0 of the model, twice the decrease of the
+    log-likelihood of the *other* terms is not χ² distributed: with all terms in the model their upper ends would be too low and their lower
+    ends would exceed the truth too seldom (Self & Liang 1987). Nor may a term be omitted because it is not significant, since its
+    contribution would be attributed to the others. The intervals are therefore averaged over all combinations of terms,
+    ``Σ_m w_m Φ(r_m(θ)) = (1 ± level)/2``, r_m being the signed root of twice the decrease of the log-likelihood in combination m, maximised
+    over its other terms (Fletcher & Turek 2012), with the weights ``w_m ∝ exp(log L_m − TERM_COST · coefficients)``. All axes are assumed
+    to have the same terms: L is the likelihood of all axes, each with its own coefficients. The average for a term is over the combinations
+    that contain it.
 
     References: Self & Liang, "Asymptotic properties of maximum likelihood estimators and likelihood ratio tests under
     nonstandard conditions", J. Am. Stat. Assoc. 82, 1987; Fletcher & Turek, "Model-averaged profile likelihood intervals", J.
@@ -235,12 +237,12 @@ def fit_noise(
     places = without_gaps(np.asarray(~np.isnan(record).any(axis=1)))
     if not places:
         raise InputError(
-            f"values has {len(record)} samples; at least {SHORTEST} are needed to separate the noises, in a row without a gap"
+            f"values has {len(record)} samples; at least {SHORTEST} without a gap are needed to separate the noise terms"
         )
     lasts = [last_coefficient(place.stop - place.start, dt, highest_frequency) for place in places]
     if highest_frequency is not None and (sum(lasts) < 32 or min(lasts) < 1):
         raise InputError(
-            f"highest_frequency is {highest_frequency:g} Hz: only {sum(lasts)} coefficients lie below; raise it"
+            f"highest_frequency is {highest_frequency:g} Hz: only {sum(lasts)} coefficients are below it; raise it"
         )
     segments = [segment(place, dt, random_terms, highest_frequency) for place in places]
     fits, misfits = [], []
@@ -251,7 +253,7 @@ def fit_noise(
         largest = scale * float(max(np.nanmax(rate), -np.nanmin(rate)))
         if not np.any(whole.square > (1e-13 * largest) ** 2 * whole.number):
             raise InputError(
-                f"values, axis {axis}, holds no noise (it is constant or a straight line); pass a recorded sensor"
+                f"values, axis {axis}, has no noise (it is constant or a straight line); pass a recorded sensor"
             )
         fits.append(fit_axis(whole, "rate_ramp" in chosen))
         misfits.append(_worst_misfit(coefficients, each, fits[-1].best, random_terms, segments, dt))
@@ -261,16 +263,16 @@ def fit_noise(
 
 
 def without_gaps(known: NDArray[np.bool_]) -> list[slice]:
-    """Return the segments of samples between gaps, without those of fewer than :data:`SHORTEST`."""
+    """Return the segments of at least :data:`SHORTEST` samples between gaps."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], known, [False]]).astype(np.int8)))
     return [slice(int(a), int(b)) for a, b in edges.reshape(-1, 2) if b - a >= SHORTEST]
 
 
 def expected_errors(parameters: Mapping[str, float], samples: int, sample_interval: float) -> dict[str, float]:
-    """Return the standard errors, SI, that a fit of all terms would have: how long a record must be.
+    """Return the expected standard errors, SI, of a fit of all terms, for choosing the duration of a record.
 
-    ``parameters`` are coefficients, SI, by name in :data:`TERMS`. The Cramér–Rao bound of the cosine coefficients, which the fit attains
-    where an error is well below the coefficient itself; elsewhere the record does not support the term.
+    ``parameters`` are coefficients, SI, by name in :data:`TERMS`. The errors are the Cramér–Rao bound of the cosine coefficients, which the
+    fit attains if an error is well below the coefficient; otherwise the record does not support the term.
     """
     checks.known_keys("parameters", parameters, TERMS)
     dt = checks.positive("sample_interval", sample_interval, unit="s")
@@ -307,7 +309,7 @@ def curves_by_axis(fit: NoiseFit, deviation: AllanDeviation) -> list[dict[str, A
 
 
 def to_gyro_parameters(fit: NoiseFit) -> dict[str, float | tuple[float, ...]]:
-    """Return the coefficients by the names of the gyro specification.
+    """Return the coefficients by their names in the gyro specification.
 
     Parameters
     ----------
@@ -317,14 +319,14 @@ def to_gyro_parameters(fit: NoiseFit) -> dict[str, float | tuple[float, ...]]:
     Returns
     -------
     dict of str to float or tuple of float
-        Coefficients, SI, one number or one per axis. A term that no axis supports is left out; one that some axes support is 0 on
-        the others.
+        Coefficients, SI, one number or one per axis. A term that no axis supports is omitted; one that some axes support is 0 on the
+        others.
     """
     return _by_name(fit, np.where(fit.supported, fit.estimate, 0.0), np.asarray(fit.supported.any(axis=0)))
 
 
 def upper_bounds(fit: NoiseFit) -> dict[str, float | tuple[float, ...]]:
-    """Return the upper ends, SI, by term, one or one an axis, of the intervals of the terms that some axis does not support."""
+    """Return the upper ends, SI, by term, one number or one per axis, of the intervals of the terms that some axis does not support."""
     return _by_name(fit, fit.upper, np.asarray(~fit.supported.all(axis=0)))
 
 
@@ -342,7 +344,7 @@ def name(sensor: str, term: str) -> str:
 
 
 def table(fit: NoiseFit) -> list[dict[str, Any]]:
-    """Return one row per axis and term for printing, in the units of :data:`UNITS`: estimate, lower and upper (NaN: no such value)."""
+    """Return one row per axis and term for printing, in the units of :data:`UNITS`: estimate, lower and upper (NaN: none)."""
     rows = []
     for axis, i in np.ndindex(*fit.estimate.shape):
         term = fit.terms[i]
@@ -357,7 +359,7 @@ def table(fit: NoiseFit) -> list[dict[str, Any]]:
 
 
 class Optimum(NamedTuple):
-    """Most likely coefficients of one axis."""
+    """Maximum-likelihood coefficients of one axis."""
 
     loss: float
     theta: Array
@@ -366,7 +368,7 @@ class Optimum(NamedTuple):
 
 
 class AxisFit(NamedTuple):
-    """Likelihood of one axis: the most likely coefficients of each combination of terms, and of all; a slope that is fixed, or None."""
+    """Likelihood of one axis: maximum-likelihood coefficients for each combination of terms, and the best; a fixed slope, or None."""
 
     bins: Bins
     slope: float | None
@@ -391,7 +393,7 @@ def _loss(bins: Bins, theta: Array, slope: float | None, restricted: bool) -> Op
 def _maximise(
     bins: Bins, start: Array, free: NDArray[np.bool_], *, slope: float | None = None, restricted: bool = True
 ) -> Optimum:
-    """Return the most likely theta ≥ 0 by Fisher scoring, each step a non-negative least-squares problem, with step halving."""
+    """Return the maximum-likelihood theta ≥ 0 by Fisher scoring, each step a non-negative least-squares problem, with step halving."""
     from scipy.optimize import nnls
 
     held = np.where(free, 0.0, start)
@@ -422,7 +424,7 @@ def _maximise(
 
 
 def _first_guess(bins: Bins) -> Array:
-    """Return a positive theta: every term at the level where it alone would explain the quietest octave it is strongest in."""
+    """Return a positive initial theta: each term at most as large as the power of every octave allows, divided by the number of terms."""
     edges = np.searchsorted(np.cumsum(bins.number), 2.0 ** np.arange(3, 60))
     edges = np.unique(np.concatenate([[0], edges[edges < len(bins.number)]]))
     power = np.add.reduceat(bins.square, edges) / np.add.reduceat(bins.number, edges)
@@ -443,7 +445,7 @@ def _standard_errors(information: Array) -> Array:
 
 
 def fit_axis(bins: Bins, with_ramp: bool) -> AxisFit:
-    """Return the most likely coefficients of each combination of terms on one axis."""
+    """Return the maximum-likelihood coefficients of each combination of terms on one axis."""
     slope, guess = None if with_ramp else -bins.first_slope, _first_guess(bins)
     combinations = {
         chosen: _maximise(bins, np.where(chosen, guess, 0.0), np.array(chosen), slope=slope)
@@ -454,7 +456,7 @@ def fit_axis(bins: Bins, with_ramp: bool) -> AxisFit:
 
 
 def _weights(fits: Sequence[AxisFit], i: int) -> dict[tuple[bool, ...], float]:
-    """Return the weights of the combinations with term i, of sum 1."""
+    """Return the weights of the combinations with term i; their sum is 1."""
     cost = {
         chosen: sum(fit.combinations[chosen].loss + TERM_COST * sum(chosen) for fit in fits)
         for chosen in fits[0].combinations
@@ -468,7 +470,7 @@ def _weights(fits: Sequence[AxisFit], i: int) -> dict[tuple[bool, ...], float]:
 def _interval(
     fit: AxisFit, i: int, weights: Mapping[tuple[bool, ...], float], level: float
 ) -> tuple[float, float, float]:
-    """Return estimate, lower and upper of a term's coefficient on one axis; not supported: NaN, 0 and the upper end."""
+    """Return estimate, lower and upper end of a coefficient on one axis; if not supported NaN, 0 and the upper end."""
     from scipy.optimize import brentq
     from scipy.special import ndtr, ndtri
 
@@ -478,11 +480,11 @@ def _interval(
 
     @functools.cache
     def below(size: float) -> float:
-        """Return the averaged probability that the coefficient is less."""
+        """Return the averaged probability that the coefficient is below ``size``."""
         return float(sum(w / total * ndtr(_signed_root(fit, np.array(c), i, size**2)) for c, w in heavy.items()))
 
     def crossing(probability: float, low: float, high: float) -> float:
-        # The normal score is nearly a straight line, which the solver likes.
+        # The normal score is nearly linear, so the solver converges fast.
         score = lambda size: ndtri(min(max(below(size), 1e-15), 1.0 - 1e-15)) - ndtri(probability)  # noqa: E731
         return float(brentq(score, low, high, xtol=1e-5 * high))
 
@@ -499,7 +501,7 @@ def _interval(
 
 
 def _signed_root(fit: AxisFit, chosen: NDArray[np.bool_], i: int, value: float) -> float:
-    """Return the root of twice the fall of log likelihood from the most likely coefficients of some terms to ``value`` of θ_i, signed."""
+    """Return the signed root of twice the decrease of the log-likelihood of a combination of terms from its maximum to θ_i = ``value``."""
     best = fit.combinations[tuple(chosen.tolist())]
     start, free = best.theta.copy(), chosen.copy()
     start[i], free[i] = value, False
@@ -510,7 +512,7 @@ def _signed_root(fit: AxisFit, chosen: NDArray[np.bool_], i: int, value: float) 
 
 
 def _covariance(fit: AxisFit, estimate: Array) -> Array:
-    """Return the covariance of the coefficients of one axis from the Fisher information; NaN where there is no estimate."""
+    """Return the covariance of the coefficients of one axis from the Fisher information; NaN without an estimate."""
     supported = ~np.isnan(estimate)
     size = np.where(supported, estimate, np.sqrt(fit.best.theta))
     used = np.flatnonzero(size > 0.0)
@@ -533,7 +535,7 @@ def _of_axes(
     samples: int,
     sample_interval: float,
 ) -> NoiseFit:
-    """Return the fits of single axes as one, with intervals; a misfit is its probability and what was seen."""
+    """Combine the fits of single axes, with intervals; a misfit is its probability and its description."""
     count = len(fits[0].best.theta)
     estimate, lower, upper = np.empty((3, len(fits), len(terms)))
     covariance = np.full((len(fits), len(terms), len(terms)), np.nan)
@@ -566,7 +568,7 @@ def _of_axes(
 
 
 def _fit_ramp(fit: AxisFit, level: float) -> tuple[float, float, float]:
-    """Return estimate, lower and upper of the ramp; unsupported: NaN, 0 and a bound on its size."""
+    """Return estimate, lower and upper end of the ramp; if not supported NaN, 0 and a bound on its magnitude."""
     from scipy.optimize import brentq
     from scipy.stats import chi2
 
@@ -601,7 +603,7 @@ def _worst_misfit(
     segments: Sequence[Segment],
     dt: float,
 ) -> tuple[float, str]:
-    """Return the least probability of :func:`_misfit_of` over the segments, times their number, and its description."""
+    """Return the minimum probability of :func:`_misfit_of` over the segments, times their number, and its description."""
     found = []
     for coefficient, bins, one in zip(coefficients, each, segments, strict=True):
         own = best._replace(variance=best.theta @ bins.basis)
@@ -615,10 +617,11 @@ def _worst_misfit(
 def _misfit_of(
     coefficient: Array, bins: Bins, best: Optimum, random_terms: tuple[str, ...], one: Segment, dt: float
 ) -> tuple[float, str]:
-    """Return the probability of a departure from the fit this large, and its description; overwrites ``coefficient``.
+    """Return the p-value of the deviation from the fit, and its description; overwrites ``coefficient``.
 
-    Divided by their fitted sizes and transformed back, the coefficients are a white series of unit variance. A turn or a step of the
-    bias, whose spectrum may pass for a random walk's, stands out in it. Of three tests the smallest probability is multiplied by three.
+    The coefficients divided by their fitted standard deviations and transformed back are a white series of unit variance. A rotation or a
+    step of the bias, whose spectrum may resemble that of a random walk, is an outlier in this series. The smallest p-value of three tests
+    is multiplied by three.
     """
     samples, last = len(coefficient), one.last
     for s in bin_slices(one.starts, last):
@@ -644,19 +647,19 @@ def _misfit_of(
     freedom = number * (last / samples)
     loudest = int(np.argmax(energy / number))
     found = (
-        (samples * math.erfc(size / math.sqrt(2.0)), f"a sample at {dt * largest:.6g} s stands out by {size:.3g} σ"),
+        (samples * math.erfc(size / math.sqrt(2.0)), f"a sample at {dt * largest:.6g} s is an outlier of {size:.3g} σ"),
         (
             _probability(freedom, energy / number, stretches - 1),
-            f"its noise is not steady, and largest from {dt * edges[loudest]:.6g} to {dt * edges[loudest + 1]:.6g} s",
+            f"its noise is not stationary, and largest from {dt * edges[loudest]:.6g} to {dt * edges[loudest + 1]:.6g} s",
         ),
         (_spectrum_probability(bins, best), "its spectrum has another shape"),
     )
-    probability, what = min(found, key=lambda test: test[0])  # of several at 0 the one with a time
+    probability, what = min(found, key=lambda test: test[0])  # if several are 0, the first, which has a time
     return min(1.0, len(found) * probability), what
 
 
 def _spectrum_probability(bins: Bins, best: Optimum) -> float:
-    """Return the probability of a spectrum as far from the fit, over the bins of enough coefficients."""
+    """Return the p-value of the spectrum, over the bins with enough coefficients."""
     many = bins.number >= min(30.0, bins.number.max())
     power = bins.square - 2.0 * best.slope * bins.product + best.slope**2 * bins.ramp
     ratio = power[many] / (bins.number[many] * best.variance[many])
@@ -664,9 +667,9 @@ def _spectrum_probability(bins: Bins, best: Optimum) -> float:
 
 
 def _probability(freedom: Array, ratio: Array, count: int) -> float:
-    """Return the probability of as large a sum of squares of the normal scores of χ²/freedom ratios, the sum of ``count`` degrees.
+    """Return the p-value of the sum of squared normal scores of χ²/freedom ratios, with ``count`` degrees of freedom.
 
-    The cube root of a χ² is nearly normal (Wilson & Hilferty 1931); the Pearson statistic has too long a tail for 1e-3.
+    The cube root of a χ² variable is nearly normal (Wilson & Hilferty 1931); the tail of the Pearson statistic is too heavy at 1e-3.
     """
     from scipy.stats import chi2
 

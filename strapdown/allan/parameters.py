@@ -1,21 +1,20 @@
-"""Noise coefficients of gyros, accelerometers and magnetometers in the terms and units of the field, and in the files of other programs.
+"""Noise coefficients of gyros, accelerometers and magnetometers in the usual terms and units, and in the file formats of other programs.
 
 The coefficients of :class:`strapdown.allan.NoiseFit` are SI of the sampled quantity: N in rad/s, m/s² or T per √Hz (the same as per
 √Hz of a two-sided density, rad/√s), B in the unit itself, K in the unit per √s. Other programs use one number for all axes: the
-largest. Where no axis shows a term, the upper end of its interval is written, which the record cannot exclude, and a comment says
-so.
+largest. If no axis supports a term, the upper end of its interval is written, with a comment.
 
 Kalibr
-    ``imu.yaml``: noise densities N and random walks K of gyro and accelerometer, each with the interval of the largest axis's
-    (:func:`largest_interval`) as a comment, since Kalibr has no key for it. They are commonly multiplied by 5 to 10 or more,
-    for Kalibr has no terms for vibration, scale and temperature; here by the requested factor, which a comment states.
+    ``imu.yaml``: noise densities N and random walks K of gyro and accelerometer, each with the interval of the maximum over the axes
+    (:func:`largest_interval`) as a comment, since Kalibr has no key for it. They are commonly multiplied by 5 to 10 or more, because Kalibr
+    has no terms for vibration, scale and temperature; here by the given factor, which is stated in a comment.
 PX4
     Parameters of EKF2, which uses them as the standard deviation of white noise over one step of the filter, ``EKF2_PREDICT_US``:
     N/√dt for ``EKF2_GYR_NOISE`` (rad/s) and ``EKF2_ACC_NOISE`` (m/s²), K/√dt for ``EKF2_GYR_B_NOISE`` (rad/s²) and
     ``EKF2_ACC_B_NOISE`` (m/s³).
 MATLAB
-    ``gyroparams``, ``accelparams`` and ``magparams`` of ``imuSensor``, for each axis. ``NoiseType`` must be single-sided for N to
-    be the Allan deviation at 1 s; the default makes it smaller by √2. The magnetometer is in µT there.
+    ``gyroparams``, ``accelparams`` and ``magparams`` of ``imuSensor``, for each axis. ``NoiseType`` must be single-sided for N to be the
+    Allan deviation at 1 s; with the default it is smaller by √2. The unit of the magnetometer is µT.
 """
 
 from __future__ import annotations
@@ -41,11 +40,11 @@ __all__ = [
 _KEYS = {"mm/s": "mm_per_s", "µg/√Hz": "ug_per_sqrt_hz", "µg": "ug", "µg/√h": "ug_per_sqrt_hour", "µg/h": "ug_per_hour"}
 _KEYS |= {"nT s": "nt_s", "nT/√Hz": "nt_per_sqrt_hz", "nT": "nt", "nT/√h": "nt_per_sqrt_hour", "nT/h": "nt_per_hour"}
 PX4_STEP = 0.01
-"""s: EKF2_PREDICT_US as PX4 comes."""
+"""Default of EKF2_PREDICT_US in PX4, s."""
 
 
 def key(sensor: str, term: str) -> tuple[str, float]:
-    """Return the key of a term in TOML, its unit in the name, and the unit's factor to SI."""
+    """Return the TOML key of a term, with its unit in the name, and the factor of the unit to SI."""
     if sensor == "gyro":
         suffix, factor = gyro.FORM[term][0]
         return f"{term}_{suffix}", factor
@@ -54,7 +53,7 @@ def key(sensor: str, term: str) -> tuple[str, float]:
 
 
 def to_toml(fit: NoiseFit) -> dict[str, dict[str, Any]]:
-    """Return a sensor's table for TOML: the terms that are supported, 0 on an axis that does not show one.
+    """Return the TOML table of a sensor: the terms that any axis supports, 0 on the other axes.
 
     Parameters
     ----------
@@ -78,9 +77,9 @@ def to_toml(fit: NoiseFit) -> dict[str, dict[str, Any]]:
 
 
 def largest(fit: NoiseFit, term: str) -> tuple[float, bool]:
-    """Return the largest coefficient of a term over the axes, SI, and whether any axis shows it; else the largest upper end."""
+    """Return the maximum coefficient of a term over the axes, SI, and True, or if no axis supports it the maximum upper end and False."""
     if term not in fit.terms:
-        raise InputError(f"the fit has no {term}; fit it too")
+        raise InputError(f"the fit has no {term}; add it to the terms of the fit")
     i = fit.terms.index(term)
     seen = fit.supported[:, i]
     if seen.any():
@@ -89,12 +88,12 @@ def largest(fit: NoiseFit, term: str) -> tuple[float, bool]:
 
 
 def largest_interval(fit: NoiseFit, term: str) -> tuple[float, float]:
-    """Return the interval of the largest of the axes' coefficients, SI, at the confidence of the fit.
+    """Return the confidence interval of the maximum coefficient over the axes, SI, at the level of the fit.
 
-    Below it are the lower ends of all axes, above it only the upper end of the largest: of axes that are alike any lower end may be too
-    high and all upper ends would have to be too low; of one that is by far the largest its own alone count. A lower end fails with the
-    probability by which it is too high for axes alike, and the upper end with what is left, so that both cases have the same confidence.
-    The ends are moved there from the fit's own tails in the logarithm.
+    Its lower end is the maximum of the axes' lower ends, its upper end the maximum of their upper ends. If the axes are equal, the interval
+    fails if any lower end is too high, or if all upper ends are too low; if one axis is by far the largest, only its ends count. The tail
+    probability of the lower ends is that for equal axes, the rest is that of the upper ends, so that the level holds in both cases. The
+    ends are moved from the tails of the fit to these in the logarithm.
     """
     from scipy.special import ndtri
 
@@ -149,7 +148,7 @@ def to_kalibr(fits: Mapping[str, NoiseFit], *, factor: float = 1.0, topic: str =
             value, seen = largest(fits[sensor], term)
             low, high = (factor * end for end in largest_interval(fits[sensor], term))
             interval = f"{100.0 * fits[sensor].level:g} % interval {low:.6e} to {high:.6e}"
-            note = "" if seen else "; not seen, the upper end of its interval"
+            note = "" if seen else "; not detected, the upper end of its interval"
             lines.append(f"{own}_{word}: {factor * value:.6e}  # {unit} {per}, {interval}{note}")
     lines += [f"update_rate: {1.0 / fits['gyro'].sample_interval:.6g}  # Hz", f"rostopic: {topic}"]
     return "\n".join(line for line in lines if line) + "\n"
@@ -182,7 +181,7 @@ def to_px4(fits: Mapping[str, NoiseFit], *, step: float = PX4_STEP, source: str 
     lines = [
         *([f"# {_plain(source)}"] if source else []),
         f"# Noise by `strapdown allan`, the largest of the axes, over steps of {1e6 * step:.0f} us (EKF2_PREDICT_US).",
-        "# PX4's own values are larger: they include vibration.",
+        "# The defaults of PX4 are larger: they include vibration.",
         "# Vehicle-Id Component-Id Name Value Type",
     ]
     for parameter, sensor, term in (
@@ -192,13 +191,13 @@ def to_px4(fits: Mapping[str, NoiseFit], *, step: float = PX4_STEP, source: str 
         ("EKF2_ACC_B_NOISE", "accelerometer", "rate_random_walk"),
     ):
         value, seen = largest(fits[sensor], term)
-        lines += [] if seen else [f"# {parameter}: not seen, the upper end of its interval"]
+        lines += [] if seen else [f"# {parameter}: not detected, the upper end of its interval"]
         lines.append(f"1\t1\t{parameter}\t{value / root:.6e}\t9")
     return "\n".join(lines) + "\n"
 
 
 def to_matlab(fits: Mapping[str, NoiseFit], *, source: str = "") -> str:
-    """Return MATLAB code for an ``imuSensor``, each axis with its own noise; a term that an axis does not show is 0.
+    """Return MATLAB code for an ``imuSensor``, with noise per axis; a term that an axis does not support is 0.
 
     Parameters
     ----------
@@ -223,7 +222,7 @@ def to_matlab(fits: Mapping[str, NoiseFit], *, source: str = "") -> str:
     known = {"accel-gyro", "accel-mag", "accel-gyro-mag"}
     lines = [
         *([f"% {_plain(source)}"] if source else []),
-        "% Noise by `strapdown allan`, SI; terms that an axis does not show are 0.",
+        "% Noise by `strapdown allan`, SI; terms not detected on an axis are 0.",
     ]
     lines.append(f"imu = imuSensor('{kinds if kinds in known else 'accel-gyro-mag'}', 'SampleRate', {rate:.6g});")
     for sensor, fit in fits.items():
@@ -245,7 +244,7 @@ def to_matlab(fits: Mapping[str, NoiseFit], *, source: str = "") -> str:
 def _both(fits: Mapping[str, NoiseFit], what: str) -> None:
     for sensor in ("gyro", "accelerometer"):
         if sensor not in fits:
-            raise InputError(f"{what} takes the noise of gyro and accelerometer; identify the {sensor} too")
+            raise InputError(f"{what} needs the noise of gyro and accelerometer; identify the {sensor} too")
 
 
 def _plain(text: str) -> str:

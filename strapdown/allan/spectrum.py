@@ -18,7 +18,7 @@ LARGEST_EXACT = 1 << 16
 
 
 def last_coefficient(samples: int, dt: float, highest_frequency: float | None) -> int:
-    """Return the index of the last DCT coefficient below a frequency, Hz; None: of the last of all."""
+    """Return the index of the last DCT coefficient below a frequency, Hz; None: of the last one."""
     if highest_frequency is None:
         return samples - 1
     return min(samples - 1, int(2.0 * samples * dt * positive("highest_frequency", highest_frequency, unit="Hz")))
@@ -50,9 +50,9 @@ def mean_power(term: str, samples: int, dt: float, starts: NDArray[np.int64], la
 def expected_power(term: str, samples: int, dt: float, j: NDArray[np.int64]) -> Array:
     """Return the expected square of the orthonormal DCT-II coefficients j of averaged-rate samples, unit coefficient of ``term``.
 
-    With θ = πj/n: white rate is white. The difference of averaged random-walk samples has covariance dt (2/3, 1/6 at lag 1), which the
-    sine transform diagonalises as the cosine transform does for the samples. Quantised phase, differenced, is the same Laplacian plus
-    its two corners.
+    With θ = πj/n, the spectrum of white rate noise is constant. The difference of averaged random-walk samples has covariance dt (2/3, 1/6
+    at lag 1), which the sine transform diagonalises as the cosine transform does that of the samples. The covariance of differenced
+    quantisation noise is the same Laplacian with two different corner entries.
     """
     theta = np.pi * j / samples
     laplacian = 4.0 * np.sin(0.5 * theta) ** 2
@@ -66,14 +66,14 @@ def expected_power(term: str, samples: int, dt: float, j: NDArray[np.int64]) -> 
     ratio = flicker_leakage(min(samples, LARGEST_EXACT))
     known = (
         len(ratio) if samples <= LARGEST_EXACT else len(ratio) // 8
-    )  # far from both ends the ratio depends on j alone, and tends to 1
+    )  # far from both ends the ratio depends only on j, and converges to 1
     return np.asarray(spectrum * np.where(j < known, ratio[np.minimum(j, known - 1)], 1.0))
 
 
 def flicker_covariance(count: int) -> Array:
     """Return the generalised autocovariance −Cin(πk)/π of unit flicker samples band-limited at Nyquist, k = 0 … count − 1.
 
-    Flicker has infinite variance; the constant that is left out cancels in every combination of samples whose weights sum to zero.
+    Flicker has infinite variance; the omitted constant cancels in every combination of samples whose weights sum to zero.
     """
     from scipy.special import sici
 
@@ -83,9 +83,9 @@ def flicker_covariance(count: int) -> Array:
 
 @functools.lru_cache(maxsize=8)
 def flicker_leakage(samples: int) -> Array:
-    """Return the expected squared DCT-II coefficients of flicker over its spectrum, by index j (entry 0 unused).
+    """Return the expected squared DCT-II coefficients of flicker divided by its spectrum, by index j (entry 0 unused).
 
-    ``E c_j² = γ_0 + (2/n) Σ_h γ_h ((n − h) cos hθ − sin hθ / sin θ)``, θ = πj/n: the autocorrelation of a cosine row, summed.
+    ``E c_j² = γ_0 + (2/n) Σ_h γ_h ((n − h) cos hθ − sin hθ / sin θ)``, θ = πj/n: the sum over the autocorrelation of a row of the DCT.
     """
     from scipy.fft import rfft
 
@@ -105,7 +105,7 @@ def ramp_coefficients(samples: int, j: NDArray[np.int64]) -> Array:
 
 
 class Bins(NamedTuple):
-    """Sums over each bin: of squared coefficients less a first slope, their product with the ramp's, the ramp's squares."""
+    """Sums over each bin: squared coefficients less a first slope, their products with those of the ramp, squares of those of the ramp."""
 
     number: Array
     square: Array
@@ -125,7 +125,7 @@ def cosine_transform(values: Array, scale: float) -> Array:
 
 
 class Segment(NamedTuple):
-    """A segment of a record without a gap: the bins of its cosine coefficients, and the expected square in each of every noise."""
+    """Segment of a record without gaps: the bins of its cosine coefficients, and their expected squares for each noise term."""
 
     place: slice
     starts: NDArray[np.int64]
@@ -142,7 +142,7 @@ def segment(place: slice, dt: float, terms: Sequence[str], highest_frequency: fl
 
 
 def binned(coefficients: Sequence[Array], segments: Sequence[Segment], dt: float) -> tuple[list[Bins], Bins]:
-    """Return the sums over bins of each segment and of all, the lowest frequencies first; one ramp goes through all segments."""
+    """Return the sums over the bins of each segment and of all, by increasing frequency; all segments have the same ramp."""
     low = [c[1 : min(one.last, 1 << 20) + 1] for c, one in zip(coefficients, segments, strict=True)]
     ramps = [
         dt * ramp_coefficients(len(c), np.arange(1, len(part) + 1)) for c, part in zip(coefficients, low, strict=True)

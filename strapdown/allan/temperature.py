@@ -1,12 +1,12 @@
-"""A sensor's bias over temperature, from a record at rest with its temperature: a polynomial with intervals, and the remainder.
+"""Bias of a sensor over temperature, from a record at rest with its temperature: a polynomial with intervals, and the residuals.
 
-``x = c_0 + c_1 (T − T_0) + c_2 (T − T_0)² + … + noise``. The noise is far from white (a wandering bias looks like one that follows
-the temperature), so plain least squares would be overconfident. The cosine transform of the record has independent coefficients,
-whose variances the noise terms give (:mod:`strapdown.allan`): the regression is weighted by these, generalised least squares, and
-iterated with the noise of the remainder until it converges. A rate ramp is not fitted beside it, for a sensor that warms up has
-one.
+``x = c_0 + c_1 (T − T_0) + c_2 (T − T_0)² + … + noise``. The noise is far from white (a drifting bias resembles one that depends on the
+temperature), so the intervals of ordinary least squares would be too small. The coefficients of the cosine transform of the record are
+independent, and their variances follow from the noise terms (:mod:`strapdown.allan`). The regression is therefore by generalised least
+squares with these weights, iterated with the noise of the residuals until it converges. No rate ramp is fitted, because the bias of a
+sensor that warms up resembles one.
 
-``c_0``, the bias at ``T_0``, is the mean of the remainder; a wandering bias gives it no interval. The record must have no gaps.
+``c_0``, the bias at ``T_0``, is the mean of the residuals; it has no interval, since the bias drifts. The record must have no gaps.
 
 Source: IEEE Std 952-1997, 12.11 (temperature sensitivity); the weights: as in :mod:`strapdown.allan`.
 """
@@ -30,24 +30,24 @@ __all__ = [
 ]
 
 MAX_PASSES = 50
-"""Most iterations of the regression, each with the noise of the last residuals."""
+"""Maximum number of iterations of the regression, each with the noise of the last residuals."""
 SETTLED = 1e-3
-"""Convergence: largest change of a coefficient, in σ, and relative change of the noise's spectrum."""
+"""Tolerance of convergence: change of a coefficient, in σ, and relative change of the noise spectrum."""
 SMALLEST_SPAN = 0.5
-"""Range of temperature, K, below which no regression is made."""
+"""Minimum temperature range of a regression, K."""
 
 
 class TemperatureFit(NamedTuple):
-    """A sensor's bias over temperature.
+    """Bias of a sensor over temperature.
 
     Parameters
     ----------
     polynomial : BiasOverTemperature
         ``bias = Σ c_k (T − T_0)^k`` of each axis with its σ; T_0 is the mean temperature of the record.
     reach : ndarray (order + 1, axes)
-        Half-width of the intervals of the coefficients; 0 of c_0, which has none.
+        Half-width of the intervals of the coefficients; 0 for c_0, which has none.
     left : ndarray (n, axes)
-        The record without its dependence on temperature, the mean kept.
+        The record less its dependence on temperature, with its mean.
     """
 
     polynomial: BiasOverTemperature
@@ -58,7 +58,7 @@ class TemperatureFit(NamedTuple):
 def fit_temperature(
     values: ArrayLike, temperature: ArrayLike, sample_interval: float, *, order: int = 1, level: float = 0.95
 ) -> TemperatureFit:
-    """Return the dependence of a sensor's bias on temperature.
+    """Return the dependence of the bias of a sensor on temperature.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ def fit_temperature(
     Returns
     -------
     TemperatureFit
-        Coefficients with intervals, and the record without the dependence.
+        Coefficients with intervals, and the record less the dependence.
 
     Raises
     ------
@@ -92,7 +92,7 @@ def fit_temperature(
     span = (float(T.min()), float(T.max()))
     if span[1] - span[0] < SMALLEST_SPAN:
         raise InputError(
-            f"temperature spans {span[1] - span[0]:.2g} K, less than {SMALLEST_SPAN} K; warm the sensor up while it records"
+            f"temperature spans {span[1] - span[0]:.2g} K, less than {SMALLEST_SPAN} K; record while the sensor warms up"
         )
     reference = float(T.mean())
     powers = (T[:, None] - reference) ** np.arange(1, order + 1)
@@ -109,10 +109,10 @@ def fit_temperature(
 
 
 def _regression(x: Array, powers: Array, dt: float) -> tuple[Array, Array]:
-    """Return the coefficients of the powers and their σ, weighted by the noise, whose terms are those of greatest restricted likelihood.
+    """Return the coefficients of the powers and their σ, weighted by the noise, whose terms maximise the restricted likelihood.
 
-    Fisher scoring as in :func:`strapdown.allan.fit_noise`: the noise's terms are fitted to the squares of what is left, each with the part
-    put back that the regression took from it.
+    Fisher scoring as in :func:`strapdown.allan.fit_noise`: the noise terms are fitted to the squared residuals, each with the expected
+    reduction by the regression added back.
     """
     from scipy.fft import dct
     from scipy.optimize import nnls

@@ -1,10 +1,10 @@
-"""The command line. Only this package prints; units are degrees, hours and arcseconds here and radians and seconds below.
+"""The command line. Only this package prints. Units are degrees, hours and arcseconds here, radians and seconds in the other packages.
 
-A result replaces all of an earlier result of the same name. ``estimate``, ``simulate``, ``integrate`` and ``tune`` refuse to replace a file
+A result replaces an earlier result of the same name completely. ``estimate``, ``simulate``, ``integrate`` and ``tune`` never replace a file
 that they did not write; ``montecarlo``, whose result may have taken hours, needs ``--resume`` or ``--overwrite``.
 
-- ``terminal``: What every command shares.
-- ``progress``: Progress of what takes long.
+- ``terminal``: Functions shared by all commands.
+- ``progress``: Progress of long computations.
 - ``layout``: Groups, order, modules and examples of the commands.
 - ``studies``: ``coning``
 - ``integration``: ``algorithms``, ``integrate``, ``coning-budget``
@@ -43,7 +43,7 @@ from strapdown.files.reading import NoDigestWarning
 def _about(
     version: bool = typer.Option(False, "--version", help="Print the version and stop.", is_eager=True),
     quiet: bool = typer.Option(
-        False, "--quiet", help="Show no progress on standard error; may stand after the command too."
+        False, "--quiet", help="Show no progress on standard error; also allowed after the command."
     ),
 ) -> None:
     if quiet:
@@ -56,7 +56,7 @@ def _about(
 
 
 def _say(usual: Callable[..., None], message: Warning | str, category: type[Warning], *place: Any) -> None:
-    """Say a warning about a file in one line, without where in the code it came up."""
+    """Print a warning about a file in one line, without its place in the code."""
     if issubclass(category, NoDigestWarning):
         errors.print(f"warning: {message}", soft_wrap=True)
     else:
@@ -64,16 +64,16 @@ def _say(usual: Callable[..., None], message: Warning | str, category: type[Warn
 
 
 FAULT = 70
-"""Exit status of a fault of the program itself (EX_SOFTWARE of BSD): no verdict, and not bad input."""
+"""Exit status of an internal error of the program (EX_SOFTWARE of BSD)."""
 
 
 def main() -> None:
-    """Run the command line; bad input ends with one clear line and status 2, Ctrl-C with 130, a fault of the program with 70."""
+    """Run the command line; bad input ends with one line and status 2, Ctrl-C with 130, an internal error with 70."""
     warnings.showwarning = functools.partial(_say, warnings.showwarning)
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):  # what ASCII or cp1252 has no sign for is a question mark, not the end
+        if isinstance(stream, io.TextIOWrapper):  # characters missing in ASCII or cp1252 become question marks
             stream.reconfigure(errors="replace")
-    console.stderr = False  # --json - of an earlier command in this process
+    console.stderr = False  # an earlier command in this process may have set it (--json -)
     if "--quiet" in sys.argv[1:]:
         sys.argv = [sys.argv[0], "--quiet", *(argument for argument in sys.argv[1:] if argument != "--quiet")]
     try:
@@ -98,11 +98,11 @@ def main() -> None:
         for note in getattr(error, "__notes__", ()):
             if OF_YOUR_OWN in note:
                 errors.print(
-                    f"error: {note} ({type(error).__name__}); its lines end the traceback above", soft_wrap=True
+                    f"error: {note} ({type(error).__name__}); see the end of the traceback above", soft_wrap=True
                 )
                 sys.exit(2)
         errors.print(
-            f"error: a fault of strapdown {strapdown.__version__} itself ({type(error).__name__}), not a verdict and not your input; "
+            f"error: internal error of strapdown {strapdown.__version__} ({type(error).__name__}), not a verdict and not bad input; "
             "please report the traceback above with the command",
             soft_wrap=True,
         )

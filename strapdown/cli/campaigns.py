@@ -47,48 +47,48 @@ _CAMPAIGN_SUFFIXES = (".h5", ".hdf5")
 
 @dataclass(frozen=True)
 class _Model:
-    """Filter and errors; a file of a campaign has its own."""
+    """Filter and errors; a campaign file contains its own."""
 
     filter_file: Path | None = typer.Option(
         None,
         "--filter",
-        help="TOML with a table named filter, as `strapdown tune` writes it; or FILE.py:NAME, a filter of your own in a Python file, "
+        help="TOML with a table named filter, as written by `strapdown tune`; or FILE.py:NAME, your own filter in a Python file, "
         "which is executed. Default: the filter that matches the scenario.",
     )
     gyro: Path | None = typer.Option(
         None,
-        help="TOML with a table named gyro, a data sheet's: the filter is matched to it, not to the scenario's gyro.",
+        help="TOML with a table named gyro, such as that of a data sheet: the filter matches it, not the gyro of the scenario.",
     )
     dispersions: Path | None = typer.Option(
         None,
         help="TOML with a table named dispersions: initial errors and gyro parameters that differ from run to run.",
     )
-    seed: int | None = typer.Option(None, help="Seed; the scenario's own if not given.")
-    float32: bool = typer.Option(False, "--float32", help="Compute in single precision; with lanes only.")
+    seed: int | None = typer.Option(None, help="Seed. Default: that of the scenario.")
+    float32: bool = typer.Option(False, "--float32", help="Compute in single precision; only with lanes.")
     states: bool | None = typer.Option(
         None,
         "--states/--no-states",
-        help="With or without a state for each error that the scenario specifies. Default: with them, where there are such errors and "
-        "no filter, --float32 or lanes are asked for.",
+        help="With or without a state for each error that the scenario specifies. Default: with, if there are such errors and "
+        "neither a filter nor --float32 nor lanes are given.",
     )
 
 
 @dataclass(frozen=True)
 class _Computing:
-    """Runs and what computes them."""
+    """Runs and computation."""
 
-    runs: int | None = typer.Option(None, help="Number of runs; 1000, or that of the file resumed.")
-    threads: int | None = typer.Option(None, help="Threads; one a core if not given.")
+    runs: int | None = typer.Option(None, help="Number of runs. Default: 1000, or that of the resumed file.")
+    threads: int | None = typer.Option(None, help="Number of threads. Default: one per core.")
     machine: str = typer.Option(
         "auto",
-        help="lanes: eight runs at once in vector registers; scalar: any scenario and filter; auto: lanes where they can.",
+        help="lanes: eight runs at once in SIMD lanes; scalar: any scenario and filter; auto: lanes if they support both.",
     )
-    chunk: int | None = typer.Option(None, help="Runs between merges and writes; the machine's if not given.")
+    chunk: int | None = typer.Option(None, help="Runs between merges and writes. Default: chosen by the machine.")
     workers: int | None = typer.Option(None, help="Number of processes to use instead of threads (needs Dask).")
     cluster: str | None = typer.Option(
         None,
         help="Compute on the Dask scheduler at this address, tcp://HOST:8786, or tls:// with Dask's certificates configured. Scheduler "
-        "and workers can run any code here (they send pickles): name only one that you trust as you trust your own account.",
+        "and workers can run any code in your account (they send pickles): connect only to one that you trust.",
     )
 
 
@@ -97,13 +97,11 @@ class _Output:
     """Output."""
 
     out: Path | None = typer.Option(
-        None, help="HDF5 file; NAME-montecarlo.h5 after the name, or the TOML file, of the scenario if not given."
+        None, help="HDF5 file. Default: NAME-montecarlo.h5 with the name, or the TOML file, of the scenario."
     )
-    resume: bool = typer.Option(False, "--resume", help="Go on with the file, if it exists.")
-    overwrite: bool = typer.Option(False, "--overwrite", help="Begin anew although the file exists.")
-    replay: int | None = typer.Option(
-        None, help="Compute this one run again and write it in full detail: record and estimate."
-    )
+    resume: bool = typer.Option(False, "--resume", help="Continue with the file if it exists.")
+    overwrite: bool = typer.Option(False, "--overwrite", help="Start from the beginning even if the file exists.")
+    replay: int | None = typer.Option(None, help="Repeat this run and write its record and estimate.")
     tables: Path | None = TABLES
 
 
@@ -111,20 +109,20 @@ class _Output:
 def montecarlo(
     scenario: Annotated[
         str,
-        typer.Argument(help="Name of a built-in scenario, a TOML file, or the HDF5 file of a campaign: its own plan."),
+        typer.Argument(help="Name of a built-in scenario, a TOML file, or the HDF5 file of a campaign, with its plan."),
     ],
     model: _Model,
     computing: _Computing,
     output: _Output,
 ) -> None:
-    """Run a scenario many times through a filter and judge the filter: exit status 0 consistent, 1 not, 2 cannot tell (or bad input)."""
+    """Run many simulations of a scenario and judge the filter: exit status 0 consistent, 1 not, 2 cannot tell (or bad input)."""
     source = Path(scenario)
     held, plan = _planned(source, scenario, model, computing.machine)
     machine = held.machine if held is not None and computing.machine == "auto" else computing.machine
     target = output.out or (source if held is not None else Path(f"{source.stem}-montecarlo.h5"))
     tables_folder(output.tables)
     if output.resume and output.overwrite:
-        raise InputError("--resume and --overwrite exclude each other: go on with the file, or start it anew")
+        raise InputError("--resume and --overwrite exclude each other; give one of them")
     _check_files(target, replaced=output.overwrite or output.replay is not None)
     if output.replay is not None:
         writable("out", *_replayed(target, output.replay))
@@ -143,7 +141,7 @@ def montecarlo(
 
 
 def _planned(source: Path, scenario: str, model: _Model, machine: str) -> tuple[Campaign | None, Plan]:
-    """Return the campaign that a file holds, if it is one's, and the plan."""
+    """Return the campaign of a file, None if the source is no campaign file, and the plan."""
     from strapdown.montecarlo import campaign as campaigns
 
     if source.suffix.lower() not in _CAMPAIGN_SUFFIXES:
@@ -154,12 +152,12 @@ def _planned(source: Path, scenario: str, model: _Model, machine: str) -> tuple[
     if model.filter_file is not None and (own := own_filter(model.filter_file)) is not None:
         held, model = _with_filter(held, own, source), replace(model, filter_file=None)
     for name in given(model):
-        raise InputError(f"{name} is given, but {source} holds its own; leave it out, or name a scenario")
+        raise InputError(f"{name} is given, but {source} contains its own; leave it out, or name a scenario")
     return held, held.plan
 
 
 def _check_files(target: Path, *, replaced: bool) -> None:
-    """Refuse a file that cannot be written, or a report beside it that is another's; ``replaced``: what is there may be."""
+    """Raise an error if the file or its JSON report cannot be written, or if the report exists without the file and not ``replaced``."""
     writable("out", target, suffixes=_CAMPAIGN_SUFFIXES)
     beside = target.with_suffix(".json")
     if beside.exists() and not target.exists() and not replaced:
@@ -168,7 +166,7 @@ def _check_files(target: Path, *, replaced: bool) -> None:
 
 
 def _computed(plan: Plan, target: Path, name: str, computing: _Computing, output: _Output) -> Campaign:
-    """Compute the runs, in threads or on Dask, and write them to the file as they are finished."""
+    """Compute the runs, in threads or on Dask, and write each chunk to the file."""
     from strapdown import montecarlo as engine
     from strapdown.montecarlo import campaign as campaigns
 
@@ -176,10 +174,10 @@ def _computed(plan: Plan, target: Path, name: str, computing: _Computing, output
     if runs is None:
         runs = campaigns.read(target).runs if output.resume and target.exists() else _RUNS
     if computing.workers is not None and computing.cluster is not None:
-        raise InputError("--workers and --cluster exclude each other: a cluster has workers of its own")
+        raise InputError("--workers and --cluster exclude each other: a cluster has its own workers")
     choice = engine.choose(plan, computing.machine)
     count("runs", runs)
-    engine.in_threads(computing.threads)  # so that a wrong number is found now
+    engine.in_threads(computing.threads)  # checks the number
     console.print(f"{plan.scenario.name or name}: {counted(runs, 'run')}, seed {plan.seed}, machine: {choice}.")
     with contextlib.ExitStack() as stack:
         hands = None
@@ -210,15 +208,15 @@ def _computed(plan: Plan, target: Path, name: str, computing: _Computing, output
                 progress=advanced,
             )
         except KeyboardInterrupt:
-            console.print(f"What is finished is in {target}; go on with --resume.")
+            console.print(f"The completed runs are in {target}; continue with --resume.")
             raise
 
 
 @contextlib.contextmanager
 def asked_to_stop() -> Iterator[Callable[[], None]]:
-    """Take SIGTERM, which batch systems send before they kill, for Ctrl-C, so that what is finished is written.
+    """Treat SIGTERM, which batch systems send before they kill a process, as Ctrl-C, so that completed runs are written.
 
-    Yields what raises once more if one came: Python drops an exception that is raised while a weak reference is cleared.
+    Yields a function that raises again after a signal: Python drops an exception that is raised while a weak reference is cleared.
     """
     asked = False
 
@@ -247,9 +245,9 @@ def _plan(scenario: str, model: _Model) -> Plan:
     from strapdown.gyro import read_spec
 
     if model.states is not None and model.filter_file is not None:
-        raise InputError("--filter names the whole filter, its states too; leave --states and --no-states out")
+        raise InputError("--filter defines the complete filter with its states; leave --states and --no-states out")
     if model.gyro is not None and model.filter_file is not None:
-        raise InputError("--gyro and --filter both give the filter's gyro noise; give one of them")
+        raise InputError("--gyro and --filter both define the gyro noise of the filter; give one of them")
     loaded = scenario_named(scenario)
     chosen = None
     if model.filter_file is not None:
@@ -271,37 +269,37 @@ def _plan(scenario: str, model: _Model) -> Plan:
     if model.states is None and model.filter_file is None and plan.setup.states is not None:
         console.print(default_words(plan.setup.states.names))
     if plan.individuals:
-        console.print("Each run draws its own gyro and sensors: the fixed errors specified are standard deviations.")
+        console.print("Each run draws its own gyro and sensors: specified constant errors are standard deviations.")
     return plan
 
 
 def _with_filter(held: Campaign, own: Own, source: Path) -> Campaign:
-    """Return a campaign with its filter's code, which its file does not hold."""
+    """Return a campaign with the code of its filter, which its file does not contain."""
     if held.plan.setup.estimator != own:
         raise InputError(
-            f"{own.name} as its file stands is not the filter of {source}, {held.plan.setup.estimator_name}; take the file as it was, or "
-            "start anew with the scenario and another --out"
+            f"{own.name} in its present file is not the filter of {source}, {held.plan.setup.estimator_name}; restore the file, or "
+            "start again with the scenario and another --out"
         )
     return replace(held, plan=replace(held.plan, setup=replace(held.plan.setup, estimator=own)))
 
 
 def _print_result(campaign: Campaign) -> tuple[int, dict[str, Any]]:
-    """Show the statistics and the verdict, that of `strapdown check`; return the exit status, and all as it is written to JSON."""
+    """Print the statistics and the verdict of `strapdown check`; return the exit status and the content of the JSON file."""
     from strapdown.cli.judgement import status_of
     from strapdown.estimation.setup import MEKF
     from strapdown.montecarlo import summary
     from strapdown.montecarlo.verdicts import bound_of
 
     if campaign.statistics is None:
-        raise InputError("no chunk of the campaign is finished; go on with it (--resume)")
+        raise InputError("no chunk of the campaign is completed; continue it with --resume")
     if not campaign.finished:
-        console.print(f"{campaign.statistics.runs} of {campaign.runs} runs are finished.")
+        console.print(f"{campaign.statistics.runs} of {campaign.runs} runs are completed.")
     report = summary(campaign.statistics, bound=bound_of(campaign.plan))
     figure = lambda value: "-" if value is None else f"{value:.4g}" if value >= 1e3 else f"{value:.4f}"  # noqa: E731
     judgement = campaign.statistics.judge(unmodelled=campaign.plan.unmodelled)
     rows = table(
         f"Per degree of freedom; 1 for a consistent filter. NEES over {report['epochs_judged']} epochs",
-        *("", "mean", "least", "greatest", "from", "to", ""),
+        *("", "mean", "minimum", "maximum", "from", "to", ""),
     )
     for subset, part in report["nees"].items():
         values = (part["anees"], part["least"], part["greatest"], *part["bounds"])
@@ -312,27 +310,27 @@ def _print_result(campaign: Campaign) -> tuple[int, dict[str, Any]]:
     show(rows)
     refused = ", ".join(f"{part['refused']} of {part['sensor']}" for part in report["nis"] if part["refused"])
     if refused:
-        console.print(f"The gate refused {refused}.")
+        console.print(f"The gate rejected {refused}.")
     _print_errors(report)
     worst = ", ".join(
         f"{part['run']} ({'failed' if part['largest_nees'] is None else format(part['largest_nees'], '.1f')})"
         for part in report["worst_runs"][:5]
     )
-    console.print(f"Worst runs, by their largest NEES of the state: {worst}. See one with --replay.")
+    console.print(f"Worst runs, by maximum NEES of the state: {worst}. Use --replay to examine one.")
     if report["failed_runs"]:
         console.print(f"In {counted(report['failed_runs'], 'run')} the filter failed: no finite error or covariance.")
     rate = ""
     if campaign.seconds > 0.0:
-        rate = f" ({rate_text(campaign.statistics.runs / campaign.seconds)} runs/s, compiling included)"
+        rate = f" ({rate_text(campaign.statistics.runs / campaign.seconds)} runs/s, including compilation)"
     console.print(
-        f"{counted(report['runs'], 'run')}, {campaign.seconds:.3g} s{rate}. The verdict takes all {len(judgement.findings)} "
-        f"statistics of `strapdown check` together: a right filter passes with {100.0 * report['probability']:g} %."
+        f"{counted(report['runs'], 'run')}, {campaign.seconds:.3g} s{rate}. The verdict combines all {len(judgement.findings)} "
+        f"statistics of `strapdown check`: a consistent filter passes with {100.0 * report['probability']:g} %."
     )
     console.print(judgement.words)
     if judgement.verdict == "cannot tell":
-        console.print("More runs (--runs, with --resume) would show it.")
+        console.print("More runs (--runs, with --resume) are needed for a decision.")
     if judgement.unmodelled and campaign.plan.setup.states is None and campaign.plan.setup.estimator == MEKF:
-        console.print("--states gives the filter states for most of these errors.")
+        console.print("--states adds states for most of these errors to the filter.")
     return status_of(judgement), {
         "plan": campaign.plan.to_table(),
         "digest": campaign.plan.digest,
@@ -347,12 +345,12 @@ def _print_result(campaign: Campaign) -> tuple[int, dict[str, Any]]:
 
 
 def _print_errors(report: dict[str, Any]) -> None:
-    """Show the errors at the end, worst axis, and the coverage."""
+    """Print the errors of the worst axis at the end, and the coverage."""
     from strapdown.montecarlo.verdicts import QUANTILES
 
     last = report["last_epoch"]
     errors = table(
-        f"Errors at {last['time_s']:g} s, worst axis; share of the judged ones inside kσ",
+        f"Errors at {last['time_s']:g} s, worst axis; fraction of the tested errors within kσ",
         "",
         "unit",
         "RMS",
@@ -364,7 +362,7 @@ def _print_errors(report: dict[str, Any]) -> None:
         left=2,
     )
     for name, unit, text in (("attitude", "arcsec", "arcsec"), ("bias", "deg_per_hour", "°/h")):
-        if name not in report["nees"]:  # a filter of one's own without a bias
+        if name not in report["nees"]:  # a user's filter without a bias
             continue
         axis = _worst_axis(last[f"{name}_rms_error_{unit}"])
         keys = ("rms_error", "sigma", *(f"error_quantile_{q:g}" for q in QUANTILES))
@@ -378,7 +376,7 @@ def _print_errors(report: dict[str, Any]) -> None:
         )
     show(errors)
     expected = ", ".join(f"{100.0 * share:.2f}" for share in report["coverage"]["expected"])
-    console.print(f"Of a right filter's errors {expected} % lie inside 1, 2, 3 σ.")
+    console.print(f"For a consistent filter, {expected} % of the errors are within 1, 2, 3 σ.")
     if (efficiency := report.get("rms_over_root_cramer_rao_bound")) is not None:
         low, high = efficiency["bounds_of_an_efficient_filter"]
         ratios = "; ".join(
@@ -387,8 +385,8 @@ def _print_errors(report: dict[str, Any]) -> None:
             if name in efficiency
         )
         console.print(
-            f"RMS error over the root of the Cramér–Rao bound, which no filter can beat, by axis: {ratios} "
-            f"(at one epoch {low:.3f} to {high:.3f} for a filter that attains it)."
+            f"RMS error divided by the root of the Cramér–Rao bound, by axis: {ratios} "
+            f"(at one epoch {low:.3f} to {high:.3f} for an efficient filter)."
         )
 
 
@@ -398,7 +396,7 @@ def _worst_axis(values: list[float | None]) -> int:
 
 
 def _replayed(target: Path, run: int) -> list[Path]:
-    """Return the files that a run computed again goes to: its record and its estimate."""
+    """Return the files of a replayed run: record and estimate."""
     return [target.with_name(f"{target.stem}-run-{run}-{what}.h5") for what in ("record", "estimate")]
 
 
@@ -415,7 +413,7 @@ def _replay(plan: Plan, run: int, machine: str, target: Path) -> None:
     again = engine.replay(plan, run, machine=machine)
     truth = again.record.truth
     assert truth is not None
-    # Of a filter that joins samples to steps some machines give the record at the samples, some at the steps.
+    # If a filter step combines several samples, the record is at the samples or at the steps, depending on the machine.
     edges = np.searchsorted(again.record.time, again.estimate.time - 1e-9)
     true = Truth(attitude=truth.attitude[edges], bias=truth.bias[edges])
     attributes: dict[str, Any] = {
@@ -441,7 +439,7 @@ def _replay(plan: Plan, run: int, machine: str, target: Path) -> None:
     nees = consistency.nees(error, estimate.covariance[:, :size, :size])
     step = int(np.argmax(nees))
     console.print(
-        f"Run {run} of seed {plan.seed}, machine: {choice}. Its largest NEES is {nees[step]:.4g}, of {states} states, "
+        f"Run {run} of seed {plan.seed}, machine: {choice}. Its maximum NEES is {nees[step]:.4g} ({states} states), "
         f"at {estimate.time[step]:g} s."
     )
     written(*paths)

@@ -1,4 +1,4 @@
-"""Recordings and estimates from one format to another."""
+"""Conversion of recordings and estimates to other formats."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def convert(
         Path,
         typer.Argument(
             metavar="OUT",
-            help="File whose ending names the format: .csv, .tsv, .parquet, .bag (ROS 1), .mcap or .db3 (ROS 2), .h5 (BROAD); of an "
+            help="File whose suffix selects the format: .csv, .tsv, .parquet, .bag (ROS 1), .mcap or .db3 (ROS 2), .h5 (BROAD); for an "
             "estimate .csv, .tsv, .parquet, .tum, .rrd.",
         ),
     ],
@@ -36,9 +36,9 @@ def convert(
     reference: Path | None = typer.Option(
         None, help="TUM trajectory whose attitudes become the recording's reference."
     ),
-    force: bool = typer.Option(False, "--force", help="Replace OUT if it is there."),
+    force: bool = typer.Option(False, "--force", help="Replace OUT if it exists."),
 ) -> None:
-    """Convert a recording, a simulated record or an estimate: IN is recognised by its content, OUT written by its ending."""
+    """Convert a recording, a simulated record or an estimate; the format of IN is detected, that of OUT is given by its suffix."""
     from strapdown import recordings
     from strapdown.records import read_estimate
 
@@ -51,13 +51,13 @@ def convert(
         sources=(source, reference),
     )
     if target.exists() and not force:
-        raise InputError(f"{target} exists; move it, choose another name, or say --force")
+        raise InputError(f"{target} exists; move it, choose another name, or give --force")
     if estimate:
         recordings.estimate_format(target, recording=False)
         if layout.axes or layout.invert:
-            raise InputError("--axes and --invert go with a recording; estimate again with them")
+            raise InputError("--axes and --invert apply to a recording; estimate again with them")
         if reference is not None:
-            raise InputError("--reference goes with a recording; an estimate has attitudes of its own")
+            raise InputError("--reference applies to a recording; an estimate contains attitudes")
         held = read_estimate(source)
         recordings.write(held, target)
         console.print(
@@ -69,7 +69,7 @@ def convert(
 
             content = recordings.from_record(read_record(source), source.name)
             console.print(
-                "A simulated record: the rate at each stamp is the mean over the sample interval that ends there."
+                "Simulated record: the rate at each time stamp is the mean over the sample interval before it."
             )
         else:
             content = recordings.read(source, **options)
@@ -81,7 +81,7 @@ def convert(
 
 
 def _say(recording: Recording, target: Path) -> None:
-    """Say what was read, and what of it the target has no room for."""
+    """Print what was read, and which quantities the format of the target cannot store."""
     from strapdown import recordings
 
     held = {
@@ -100,4 +100,4 @@ def _say(recording: Recording, target: Path) -> None:
         console.print(recording.left_out_words)
     lost = [name for name in recordings.not_held(target) if name in parts or (name == "clock" and recording.epoch_ns)]
     if lost:
-        console.print(f"{target.name} has no room for {', '.join(lost)}: left out.")
+        console.print(f"{target.name} cannot store {', '.join(lost)}: omitted.")

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from strapdown.workflows import RecordRun
 
     Exports = Sequence[tuple[Path, dict[str, Any]]]
-    """Further files of an estimate, with the options of their writers."""
+    """Additional files of an estimate, with the options of their writers."""
 
 FILES = (
     "estimate.h5",
@@ -49,9 +49,9 @@ FILES = (
     "observability.json",
     "calibration.toml",
 )
-"""Files that the command may write to its folder, beside figures."""
+"""Files that the command may write to its folder, in addition to figures."""
 FIGURES = ("estimate", "errors", "states")
-"""Figures that it may draw there, without the suffix of their format."""
+"""Figures that it may write there, without the suffix of their format."""
 ABOUT_IT = ("estimate.html", "estimate.report.json")
 """Files that other commands write there about an estimate."""
 
@@ -61,30 +61,29 @@ class _Shared:
     """Filter."""
 
     gyro: Path | None = typer.Option(
-        None, help="TOML with a table named gyro, as `strapdown allan` writes it: the gyro noise of the filter."
+        None, help="TOML with a table named gyro, as written by `strapdown allan`: the gyro noise of the filter."
     )
     gate: float | None = typer.Option(
-        None, help="Refuse measurements beyond this quantile (0.999) of chi-squared, and recover."
+        None, help="Reject measurements beyond this quantile of chi-squared, such as 0.999, and recover."
     )
     robust: str | None = typer.Option(
-        None, help="Weigh measurements by the size of their innovations: huber or student."
+        None, help="Weight measurements by the size of their innovations: huber or student."
     )
     full_covariance: bool | None = typer.Option(
         None,
         "--full-covariance/--variances",
-        help="Write whole 6 x 6 covariances, or only their diagonals; whole ones by default where there is a specification or a "
-        "reference attitude.",
+        help="Write full 6 x 6 covariances, or only their diagonals. Default: full if there is a specification or a reference attitude.",
     )
     observability: bool = typer.Option(
-        False, "--observability", help="Report how observable each state is, optional ones included."
+        False, "--observability", help="Report the observability of each state, including optional ones."
     )
     smooth: bool = typer.Option(
-        False, "--smooth", help="Use the samples after each time too, by the fixed-interval smoother."
+        False, "--smooth", help="Also use the samples after each time, by the fixed-interval smoother."
     )
 
     @property
     def robustness(self) -> dict[str, Any]:
-        """The gate and the weights, as far as they are given."""
+        """The gate and the weights, if given."""
         from strapdown.estimation.gating import Gate, Robust
 
         gate = None if self.gate is None else Gate(probability=self.gate)
@@ -99,28 +98,28 @@ class _Specified:
     filter_file: Path | None = typer.Option(
         None,
         "--filter",
-        help="TOML with a table named filter, as `strapdown tune` writes it; by default one that matches.",
+        help="TOML with a table named filter, as written by `strapdown tune`. Default: one that matches the specification.",
     )
     states: bool | None = typer.Option(
         None,
         "--states/--no-states",
-        help="With or without a state for each error in it (scale, misalignment, drift, hard iron, …). By default with them, where "
-        "there are such errors.",
+        help="With or without a state for each specified error (scale, misalignment, drift, hard iron, …). Default: with, if there "
+        "are such errors.",
     )
     state: list[str] | None = typer.Option(
         None, help="Only this one of those states, such as gyro.scale or SENSOR.bias; may be repeated."
     )
     attitude: str | None = typer.Option(
-        None, help="Initial attitude body to fixed, w,x,y,z; by default from the first measurements."
+        None, help="Initial attitude body to fixed, w,x,y,z. Default: from the first measurements."
     )
     from_truth: bool = typer.Option(
-        False, "--from-truth", help="With a truth: start there, off by errors drawn from the filter's σ."
+        False, "--from-truth", help="Initial state: the truth with errors drawn from the filter's σ."
     )
     every: int = typer.Option(1, help="Store every n-th filter step.")
 
     @property
     def chosen_states(self) -> ChosenStates:
-        """Optional states that are asked for."""
+        """Optional states requested."""
         return tuple(self.state or ()) if self.states or self.state else False if self.states is False else None
 
 
@@ -130,20 +129,20 @@ class _Recorded:
 
     motion: str | None = typer.Option(
         None,
-        help="What moves the unit: hand, of bounded velocity; vehicle, whose acceleration lasts for seconds; auto (default), the "
-        "likelier of both; or any, whose acceleration is white noise, without states for the gyro's scale.",
+        help="Motion model: hand, with bounded velocity; vehicle, with acceleration that lasts for seconds; auto (default), that of "
+        "higher likelihood; or any, with white-noise acceleration and without states for the gyro's scale factors.",
     )
     latency: float | None = typer.Option(
         None,
-        help="Delay of the gyro's samples, ms, that of its low-pass; 0: point samples. By default half a sample interval.",
+        help="Delay of the gyro's samples by its low-pass filter, ms; 0: point samples. Default: half a sample interval.",
     )
     calibration: Path | None = typer.Option(
         None, help="calibration.toml of an earlier recording of the same unit; a new one is written."
     )
     temperature: Path | None = typer.Option(
         None,
-        help="gyro-temperature.toml of `strapdown allan --temperature`, the gyro's bias over temperature, subtracted first; the "
-        "error of its slope is estimated (with --smooth and --observability it becomes a random walk).",
+        help="gyro-temperature.toml of `strapdown allan --temperature`: the gyro's bias over temperature, which is subtracted first; the "
+        "error of its slope is estimated (with --smooth and --observability it is modelled as a random walk).",
     )
 
 
@@ -154,12 +153,12 @@ class _Output:
     out: Path = typer.Option(Path("estimate-results"), help="Folder for estimate.h5, errors.json and the figures.")
     to: list[Path] | None = typer.Option(
         None,
-        help="Write the estimate to this file too, in the format of its ending: .csv, .tsv, .parquet, .tum, .h5, .rrd (Rerun), and of "
+        help="Also write the estimate to this file, in the format of its suffix: .csv, .tsv, .parquet, .tum, .h5, .rrd (Rerun), and for "
         "a recording .bag, .mcap or .db3 with orientation and covariance filled in; may be repeated.",
     )
-    euler: str | None = typer.Option(None, help="With --to a table: Euler angles of this sequence, ZYX if not given.")
+    euler: str | None = typer.Option(None, help="With --to a table: sequence of the Euler angles. Default: ZYX.")
     frame: str | None = typer.Option(
-        None, help="With --to: fixed frame of the output, enu (if not given) or ned; body axes stay as they are."
+        None, help="With --to: fixed frame of the output, enu (default) or ned; the body axes are not changed."
     )
     figures: bool = typer.Option(
         False, "--figures", help="Draw the estimate, its states and errors; --format does too."
@@ -168,7 +167,7 @@ class _Output:
 
     @property
     def drawn_as(self) -> FigureFormat | None:
-        """Format of the figures; None: draw none."""
+        """Format of the figures; None: no figures."""
         return None if self.form is None and not self.figures else self.form or FigureFormat.png
 
 
@@ -177,7 +176,7 @@ def estimate(
     recording: Annotated[
         Path,
         typer.Argument(
-            help=f"{RECORDING_HELP}; or the HDF5 file of `strapdown simulate`, which holds its specification and its truth too."
+            help=f"{RECORDING_HELP}; or the HDF5 file of `strapdown simulate`, which contains its specification and its truth."
         ),
     ],
     shared: _Shared,
@@ -188,8 +187,8 @@ def estimate(
 ) -> None:
     """Estimate attitude and gyro bias from a recording.
 
-    The accelerometer gives the vertical and the magnetometer the heading; where the recording holds its specification, as one of `strapdown
-    simulate` does, the filter is matched to that.
+    The accelerometer gives the vertical and the magnetometer the heading. If the recording contains its specification, like those of
+    `strapdown simulate`, the filter matches it.
     """
     from strapdown.recordings import is_record
     from strapdown.records import read_attributes
@@ -211,19 +210,19 @@ def estimate(
 
 
 def _check_kind(recording: Path, options: list[str], specified: bool) -> None:
-    """Refuse options that need a specification where there is none, and the other way round."""
+    """Raise an error for options that do not apply to a recording with, or without, a specification."""
     if options and specified:
         raise InputError(
-            f"{options[0]} goes with a recording without a specification; {recording} holds one, of `strapdown simulate`"
+            f"{options[0]} goes with a recording without a specification; {recording} contains one, of `strapdown simulate`"
         )
     if options:
         raise InputError(
-            f"{options[0]} goes with a recording that holds its specification, as those of `strapdown simulate`; {recording} does not"
+            f"{options[0]} goes with a recording that contains its specification, as those of `strapdown simulate`; {recording} does not"
         )
 
 
 def _exports(output: _Output, recording: Path, *, changed: bool) -> Exports:
-    """Return the further files of an estimate; what cannot be written is refused."""
+    """Return the additional files of an estimate; raise an error for those that cannot be written."""
     from strapdown import recordings
     from strapdown.records import outputs
 
@@ -238,7 +237,7 @@ def _exports(output: _Output, recording: Path, *, changed: bool) -> Exports:
         writable("to", target, suffixes=recordings.writers("write_estimate"), sources=(recording,))
         options: dict[str, Any] = dict(wanted)
         chosen = recordings.estimate_format(target, wanted, recording=not recordings.is_record(recording))
-        # A copy of the file with the orientation filled in would put it beside samples in other axes.
+        # If the axes were changed, the samples in a copy of the file would not be in those of the orientation.
         if "source" in chosen.estimate_options and recordings.format_of(recording) is chosen and not changed:
             options["source"] = recording
         found.append((target, options))
@@ -246,7 +245,7 @@ def _exports(output: _Output, recording: Path, *, changed: bool) -> Exports:
 
 
 def _export(exports: Exports, estimate: Estimate, recording: Recording | None) -> list[Path]:
-    """Write an estimate to its further files and return them."""
+    """Write an estimate to its additional files and return them."""
     from strapdown import recordings
 
     for target, options in exports:
@@ -255,15 +254,15 @@ def _export(exports: Exports, estimate: Estimate, recording: Recording | None) -
 
 
 def _estimate_specified(path: Path, shared: _Shared, options: _Specified, output: _Output, exports: Exports) -> None:
-    """Run the filter over a recording that holds its specification, report and write its estimate."""
+    """Run the filter over a recording with a specification; print and write its estimate."""
     from strapdown import workflows
     from strapdown.recordings.recordfiles import read_record
 
     every = count("every", options.every)
     if shared.smooth and every > 1:
-        raise InputError("--every stores some filter steps, and the smoother gives all; leave one of them out")
+        raise InputError("--every stores some filter steps, but the smoother needs all; leave one of them out")
     if shared.gyro is not None and options.filter_file is not None:
-        raise InputError("--gyro and --filter both give the filter's gyro noise; give one of them")
+        raise InputError("--gyro and --filter both define the gyro noise of the filter; give one of them")
     record = read_record(path)
     chosen, remarks = filter_for(path, record, shared.gyro, options.filter_file, options.chosen_states)
     chosen = replace(chosen, **shared.robustness)
@@ -296,7 +295,7 @@ def _estimate_specified(path: Path, shared: _Shared, options: _Specified, output
 def _write_specified(
     path: Path, origin: Origin | None, chosen: FilterSetup, run: RecordRun, shared: _Shared, out: Path
 ) -> list[Path]:
-    """Write the estimate and what is known of it, and print its errors; return the files."""
+    """Write the estimate with its attributes, and print its errors; return the files."""
     from strapdown.estimation import setup
     from strapdown.recordings.recordfiles import origin_attributes
     from strapdown.records import write_estimate
@@ -325,11 +324,11 @@ def _say_nis(result: Estimate, path: Path) -> None:
     seen = {s: i for s, i in result.innovations.items() if np.sum(i.used)}
     if seen:
         each = ", ".join(f"{np.mean(i.nis[i.used]) / i.innovation.shape[1]:.3g} {s}" for s, i in seen.items())
-        console.print(f"Mean NIS per degree of freedom (right: 1): {each}. `strapdown check {path}` judges them.")
+        console.print(f"Mean NIS per degree of freedom (expected: 1): {each}. Test them with `strapdown check {path}`.")
 
 
 def _observability(out: Path, source: str, record: ImuRecord, chosen: FilterSetup, initial: State) -> Path:
-    """Print and write how observable each state is; return the file."""
+    """Print and write the observability of each state; return the file."""
     from strapdown.estimation import setup
 
     with progress_bar("observability"):
@@ -345,7 +344,7 @@ def _errors_words(found: dict[str, float]) -> str:
         f"{found['bias_rms_deg_per_h']:.4g} °/h (σ {found['bias_sigma_deg_per_h']:.4g} °/h)"
     )
     if "nees_per_state" in found:
-        line += f"; mean NEES per state {found['nees_per_state']:.3g} (right: about 1)"
+        line += f"; mean NEES per state {found['nees_per_state']:.3g} (expected: about 1)"
     return line + "."
 
 
@@ -359,7 +358,7 @@ def _drawn(
     errors: Any = None,
     fixed_frame: str = "",
 ) -> list[Path]:
-    """Draw the estimate, its optional states, and its errors beside a truth or a recording's reference; return the files."""
+    """Draw the estimate, its optional states, and its errors relative to a truth or a reference; return the files."""
     from strapdown import plots
     from strapdown.plots.style import save_as
 
@@ -374,7 +373,7 @@ def _drawn(
 
 
 def _states(result: Any) -> dict[str, Any]:
-    """Return the optional states at the end."""
+    """Return the final values and σ of the optional states."""
     return {
         name: {
             "components": list(block.components),
@@ -388,11 +387,11 @@ def _states(result: Any) -> dict[str, Any]:
 
 
 def _print_states(result: Any, record: ImuRecord) -> dict[str, Any]:
-    """Show the optional states at the end, and return them for JSON."""
+    """Print the final values and σ of the optional states, and return them for JSON."""
     from strapdown.plots.style import error_state_unit
 
     of_directions = tuple(f"{one.sensor} " for one in record.vectors if one.kind in ("direction", "heading"))
-    rows = table("Optional states at the end", "state", "", "unit", "value", "σ", "σ at the start", left=3)
+    rows = table("Optional states at the end", "state", "", "unit", "value", "σ", "initial σ", left=3)
     for name, block in result.error_states.items():
         for k, (component, unit) in enumerate(zip(block.components, block.units, strict=True)):
             word, size = error_state_unit(name, unit)
@@ -405,12 +404,12 @@ def _print_states(result: Any, record: ImuRecord) -> dict[str, Any]:
 
 
 def _start(record: ImuRecord, chosen: FilterSetup, attitude: str | None, from_truth: bool) -> Start | None:
-    """Return the start that the options give; None: from the first measurements."""
+    """Return the start given by the options; None: from the first measurements."""
     from strapdown.estimation import setup
     from strapdown.estimation.setup.for_record import Start, drawn_start
 
     if attitude is not None and from_truth:
-        raise InputError("--attitude and --from-truth both give the start; give one of them")
+        raise InputError("--attitude and --from-truth both define the initial attitude; give one of them")
     if from_truth:
         return drawn_start(record, chosen)
     if attitude is None:
@@ -425,27 +424,27 @@ def _start(record: ImuRecord, chosen: FilterSetup, attitude: str | None, from_tr
 
 
 def _clear(out: Path) -> None:
-    """Remove what an earlier estimate left in the folder, which the next one may not write anew."""
+    """Remove the files of an earlier estimate from the folder, some of which the next one may not write."""
     figures = (f"{name}.{form}" for name in FIGURES for form in FigureFormat)
     for name in (*FILES[1:], *figures, *ABOUT_IT):
         (out / name).unlink(missing_ok=True)
 
 
 def _print_result(result: Estimate) -> None:
-    """Say what was not used, and what happened."""
+    """Print the numbers of unused samples and the events."""
     for sensor, number in result.skipped.items():
         if number:
             console.print(f"{number} samples of the {sensor} are missing or outside the record and were skipped.")
     for sensor, number in result.refused.items():
         if number:
             share = number / len(result.innovations[sensor].time)
-            console.print(f"{number} samples of the {sensor} ({share:.2%}) were refused by the gate.")
+            console.print(f"{number} samples of the {sensor} ({share:.2%}) were rejected by the gate.")
     for event in result.events:
         console.print(str(event))
 
 
 def _errors(result: Estimate, truth: Any) -> dict[str, float]:
-    """Return errors and consistency over the second half, degrees and degrees an hour."""
+    """Return errors and consistency over the second half, degrees and degrees per hour."""
     from strapdown import consistency
 
     half = slice(len(result.time) // 2, None)
@@ -514,9 +513,9 @@ def _estimate_recording(
 def _read_recording(
     recording: Path, layout: dict[str, Any], motion: str, shared: _Shared, temperature: Path | None
 ) -> tuple[Begun, AhrsParameters, str, float]:
-    """Return the recording, its bias over temperature subtracted, the filter's parameters with the noise of the gyro given, and the motion.
+    """Return the recording less its bias over temperature, the parameters of the filter, the motion, and the margin of its log-likelihood.
 
-    With the motion comes its log-likelihood beyond that of the other, infinite where it was given.
+    The margin over the other motion is infinite if the motion was given.
     """
     from strapdown import ahrs, recordings
     from strapdown.gyro import read_spec
@@ -530,7 +529,7 @@ def _read_recording(
     motion, odds = ahrs.motions.chosen(begun, motion, name="--motion")
     parameters = ahrs.MOTIONS[motion]
     if shared.gyro is not None:
-        from strapdown import workflows  # which imports much more
+        from strapdown import workflows  # slow to import
 
         spec = read_spec(shared.gyro)
         parameters, warm = workflows.with_gyro_noise(parameters, spec), warm or spec.temperature
@@ -585,12 +584,12 @@ def _write_recording(
 
 
 def _say_recording(result: AhrsEstimate, parameters: AhrsParameters, motion: str, odds: float) -> None:
-    """Print what was read, how the filter started, and what of the samples is not as it should be."""
+    """Print what was read, the initial state, the motion model, and faults of the samples."""
     from strapdown import recordings
 
     used, found = result.recording, result.estimate
     console.print(
-        f"{used.source}: {len(used.time)} samples over {used.time[-1] - used.time[0]:.1f} s, started in "
+        f"{used.source}: {len(used.time)} samples over {used.time[-1] - used.time[0]:.1f} s, initialised in "
         f"{'the quiet second' if _rested(parameters, result) else 'its quietest second, which is not at rest,'} from {used.time[0]:.2f} s."
     )
     for remark in used.remarks:
@@ -610,12 +609,12 @@ def _say_recording(result: AhrsEstimate, parameters: AhrsParameters, motion: str
         console.print(used.left_out_words)
     for sensor, number in found.skipped.items():
         if number:
-            console.print(f"{number} of the gyro's samples have none of the {sensor} beside them.")
+            console.print(f"{number} of the gyro's samples have no sample of the {sensor} at the same time.")
     _print_result(replace(found, skipped={}))
 
 
 def _rms(out: Path, source: str, rms: dict[str, float], over: str) -> Path:
-    """Print and write the RMS errors against the reference, degrees; return the file."""
+    """Print and write the RMS errors relative to the reference, degrees; return the file."""
     write_json(out / "errors.json", {"source": source, **{f"{name}_rmse_deg": value for name, value in rms.items()}})
     rows = table(f"RMS error over {over}, degrees", *rms, left=0)
     rows.add_row(*(f"{value:.2f}" for value in rms.values()))
@@ -624,28 +623,28 @@ def _rms(out: Path, source: str, rms: dict[str, float], over: str) -> Path:
 
 
 def _rested(parameters: AhrsParameters, result: AhrsEstimate) -> bool:
-    """Return whether the start showed the gyro bias, where the filter takes it from there."""
+    """Return whether the gyro bias was estimated at the start, if the filter is initialised with it."""
     if parameters.rest_bias_sigma == 0.0:
         return True
     return bool(result.initial.covariance[3, 3] <= (0.5 * parameters.bias_sigma) ** 2)
 
 
 def _model(moved_by: str, odds: float, parameters: AhrsParameters, result: AhrsEstimate) -> str:
-    """Return in words the model of a recording's motion, and the bias that the filter started from."""
+    """Return a description of the motion model and of the initial gyro bias."""
     if moved_by == "any":
         return "Motion: any, its acceleration modelled as white noise."
     bias, sigma = result.initial.bias / DEGREE, np.sqrt(result.initial.covariance[3, 3]) / DEGREE
-    shown = ", as the recording shows," if parameters.velocity_from_record else ""
+    shown = " (from the recording)" if parameters.velocity_from_record else ""
     likelier = (
-        f" (log-likelihood {odds:.0f} above that of a {'hand' if moved_by == 'vehicle' else 'vehicle'})"
+        f" (log-likelihood larger by {odds:.0f} than for a {'hand' if moved_by == 'vehicle' else 'vehicle'})"
         if odds < np.inf
         else ""
     )
     words = (
-        f"Motion: of a {moved_by}{likelier}, {parameters.velocity_sigma:.2g} m/s{shown} with a correlation time of "
+        f"Motion: of a {moved_by}{likelier}, velocity σ {parameters.velocity_sigma:.2g} m/s{shown}, correlation time "
         f"{parameters.velocity_time:g} s. "
-        f"Gyro bias at the start: {', '.join(f'{value:.3g}' for value in bias)} °/s, σ {sigma:.2g} °/s"
+        f"Initial gyro bias: {', '.join(f'{value:.3g}' for value in bias)} °/s, σ {sigma:.2g} °/s"
     )
     if not _rested(parameters, result):
-        return f"{words}: no second is quiet enough to show it, so the heading may drift at first."
+        return f"{words}: no second is quiet enough to estimate it, so the heading may drift at first."
     return f"{words}, from that second."

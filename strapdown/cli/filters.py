@@ -1,4 +1,4 @@
-"""The filter that a command runs on a record: of a file, or matched to what the record specifies."""
+"""The filter that a command runs on a record: from a file, or matched to the specification of the record."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 ChosenStates = tuple[str, ...] | Literal[False] | None
-"""Error states by name: empty, all that the specified errors call for; False, none; None, all where there are such errors."""
+"""Names of error states: empty, one for each specified error; False, none; None, one for each if any error is specified."""
 
 
 def filter_for(
@@ -29,7 +29,7 @@ def filter_for(
     filter_file: Path | None,
     states: ChosenStates,
 ) -> tuple[FilterSetup, list[str]]:
-    """Return the filter, and what to say of it: of a file, or matched to the gyro's specification and the record's sensors."""
+    """Return the filter of a file, or one that matches the gyro's specification and the record's sensors; and remarks to print."""
     from strapdown.estimation import setup
     from strapdown.estimation.setup.for_record import unmodelled_errors
     from strapdown.gyro import read_spec
@@ -37,14 +37,14 @@ def filter_for(
     if filter_file is not None:
         if states is not None:
             raise InputError(
-                "--filter holds the filter's states itself, in [filter.states]; leave --states, --no-states and --state out"
+                "--filter contains the filter's states in [filter.states]; leave --states, --no-states and --state out"
             )
         chosen = setup.read_setup(filter_file)
         need_angles(filter_file, chosen, record)
         return chosen, no_state_words(unmodelled_errors(record, chosen), chosen)
     spec = None if gyro is None else read_spec(gyro)
     if spec is None and (record.origin is None or record.origin.gyro is None):
-        raise InputError(f"{path} does not hold the gyro's specification; give --gyro or --filter, a TOML file")
+        raise InputError(f"{path} does not contain the gyro's specification; give --gyro or --filter, a TOML file")
     chosen = setup.FilterSetup.for_record(record, spec, states=True if states == () else states)
     missing = unmodelled_errors(record, chosen)
     if states is False or (states is None and chosen.states is None):
@@ -52,10 +52,10 @@ def filter_for(
     remarks = []
     if record.origin is None or record.origin.scenario is None:
         remarks.append(
-            f"{path.name} does not hold its scenario, so the errors of its sensors are not known: no state for them."
+            f"{path.name} does not contain its scenario, so the errors of its sensors are unknown: no state for them."
         )
     if chosen.states is None:
-        remarks.append("No error is specified that would call for an optional state; the filter has none.")
+        remarks.append("No errors are specified that need optional states; the filter has none.")
     elif states is None:
         remarks.append(default_words(chosen.states.names))
     else:
@@ -64,15 +64,15 @@ def filter_for(
 
 
 def default_words(names: Sequence[str]) -> str:
-    """Return why a filter has error states that nobody asked for."""
+    """Return the reason why a filter has error states by default."""
     return (
-        f"The filter estimates errors that are specified, {', '.join(names)}: without states for them its σ would be too small "
-        "(--no-states leaves them out)."
+        f"The filter has states for the specified errors, {', '.join(names)}: without them its σ would be too small "
+        "(--no-states omits them)."
     )
 
 
 def need_angles(filter_file: Path, chosen: FilterSetup, record: ImuRecord) -> None:
-    """Refuse σ of the record's sensors that cannot be in rad, but where the record's own are as wide."""
+    """Raise an error for σ of the record's sensors that cannot be in rad, unless the record's own are as large."""
     from strapdown.estimation import setup
 
     fine = {one.sensor: one.kind for one in record.vectors if len(one.time) and np.max(one.sigma) <= np.pi}
@@ -90,21 +90,21 @@ def filter_of_scenario(filter_file: Path, scenario: Scenario) -> FilterSetup:
 
 
 def own_filter(place: Path) -> Own | None:
-    """Return the filter of a Python file, ``FILE.py:NAME``, which is executed; None of any other file."""
+    """Return the filter of a Python file, ``FILE.py:NAME``, which is executed; None for any other file."""
     from strapdown.cli.terminal import console
     from strapdown.estimation.filters.own import read_filter
 
     if not (place.suffix == ".py" or ".py:" in place.name):
         return None
-    console.print(f"Executing {place.name.partition(':')[0]}: it can do whatever you can.")
+    console.print(f"Executing {place.name.partition(':')[0]} with your permissions.")
     return read_filter(place)
 
 
 def no_state_words(missing: tuple[str, ...], chosen: FilterSetup) -> list[str]:
-    """Return what to say of errors that a filter has no state for, and what helps; nothing where there are none."""
+    """Return a message about errors for which a filter has no state, with a remedy; empty if there are none."""
     if not missing:
         return []
-    remedy = "; --states of `strapdown estimate` and `strapdown tune` gives it states for most"
+    remedy = "; --states of `strapdown estimate` and `strapdown tune` adds states for most of them"
     return [
-        f"The record specifies errors that this filter has no state for: {', '.join(missing)}{remedy if chosen.states is None else ''}."
+        f"The record specifies errors for which this filter has no state: {', '.join(missing)}{remedy if chosen.states is None else ''}."
     ]

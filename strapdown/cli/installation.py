@@ -1,4 +1,4 @@
-"""What is installed."""
+"""Versions and processor features."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from strapdown.cli.terminal import command, console
 
 @command
 def info() -> None:
-    """Show the versions and the processor features that compiled code uses here."""
+    """Print the versions and the processor features used by compiled code."""
     import strapdown
     from strapdown.kernels.machine import describe
 

@@ -1,4 +1,4 @@
-"""Integration algorithms: the catalogue, attitude from a gyro file, and the drift budget of a vibration spectrum."""
+"""Integration algorithms: list, attitude from a gyro file, and the drift budget of a vibration spectrum."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ if TYPE_CHECKING:
 
 @command
 def algorithms(
-    time: bool = typer.Option(True, help="Measure the time a sample takes on this machine (a few seconds)."),
+    time: bool = typer.Option(True, help="Measure the time per sample on this machine (a few seconds)."),
     tables: Path | None = TABLES,
 ) -> None:
-    """List the integration algorithms: samples, orders, drift constant, what they need, time a sample."""
+    """List the integration algorithms: samples, orders, drift constant, required input, time per sample."""
     from strapdown import coning
 
     tables_folder(tables)
@@ -66,9 +66,9 @@ def algorithms(
             advance(1)
     show(listing)
     console.print(
-        "Increments cost nothing where the gyro gives them; from rate samples (…-rate-K: K samples form one increment) an oscillation "
-        "shows too small by a part in (ωh)^K, and the drift order falls with it. matched-… are this package's own.\n"
-        "matched-1-8-8 is the most exact and looks 8 samples ahead; matched-4-11 works in real time; four-sample serves ordinary work."
+        "Use increments if the gyro provides them. From rate samples (…-rate-K: K samples form one increment) an oscillation "
+        "appears too small by a fraction of order (ωh)^K, which lowers the drift order. matched-… were derived for this package.\n"
+        "matched-1-8-8 is the most accurate and needs 8 later samples; matched-4-11 runs in real time; four-sample is enough in most cases."
     )
     if tables is not None:
         written(*tables_written(tables, "algorithms", rows))
@@ -81,7 +81,7 @@ def integrate(
     algorithm: str = typer.Option("four-sample", help="Name of the algorithm; see `strapdown algorithms`."),
     out: Path = typer.Option(Path("attitude.h5"), help="HDF5 file for the attitude."),
 ) -> None:
-    """Integrate a gyro recording to attitude, starting at the true attitude if the file holds it, else at the identity."""
+    """Integrate a gyro recording to attitude. Initial attitude: the true one if the file contains it, otherwise the identity."""
     from strapdown import coning, quaternion, recordings, records, workflows
     from strapdown.recordings import recordfiles
 
@@ -110,15 +110,15 @@ def integrate(
     console.print(f"{recording.name}: {samples} samples over {time[-1] - time[0]:.6g} s with {chosen.name}.")
     left = samples % chosen.samples
     if left:
-        console.print(f"The last {left} of them do not fill a step of {chosen.samples} and are left out.")
+        console.print(f"The last {left} of them do not complete a step of {chosen.samples} samples and are not used.")
     if truth is not None:
         reference = truth[:: chosen.samples][: len(attitude)]
         known = np.isfinite(reference).all(axis=1)
     if truth is not None and known.any():
         error = np.degrees(quaternion.angle_between(quaternion.normalize(reference[known]), attitude[known]))
-        console.print(f"Error against the file's attitude: at the end {error[-1]:.4g}°, at most {error.max():.4g}°.")
+        console.print(f"Error relative to the file's attitude: final {error[-1]:.4g}°, maximum {error.max():.4g}°.")
     for begin, length in gaps:
-        console.print(f"Gap of {length:.3g} s after {begin:.3f} s: the turn across it is a guess.")
+        console.print(f"Gap of {length:.3g} s after {begin:.3f} s: the rotation during it is interpolated.")
     if words:
         console.print(words)
     written(out)
@@ -132,12 +132,12 @@ def coning_budget(
     psd: Annotated[
         Path, typer.Option(help="CSV of vibration lines: frequency_hz, angle_deg[, angle_across_deg, phase_deg].")
     ],
-    rate: Annotated[list[float], typer.Option(help="Gyro samples a second, Hz; may be given several times.")],
+    rate: Annotated[list[float], typer.Option(help="Sample rate of the gyro, Hz; may be given several times.")],
     algorithm: list[str] | None = typer.Option(None, help="Algorithm; may be given several times."),
     json: Path | None = typer.Option(None, help="Write the table as JSON too, to this file; - for standard output."),
     tables: Path | None = TABLES,
 ) -> None:
-    """Predict the drift that an angular vibration spectrum leaves, for each algorithm and sample rate."""
+    """Predict the drift caused by an angular vibration spectrum, for each algorithm and sample rate."""
     from strapdown import coning
 
     json_target(json, psd)
@@ -146,7 +146,7 @@ def coning_budget(
     largest = max(max(line.angle, line.angle_across or 0.0) for line in lines)
     if largest >= _RIGHT_ANGLE:
         raise InputError(
-            f"{psd} holds an amplitude of {largest / DEGREE:.4g}°; that of a vibration is below 90°: check the unit"
+            f"{psd} has an amplitude of {largest / DEGREE:.4g}°, but that of a vibration is below 90°; check the unit"
         )
     rows: list[dict[str, Any]] = [
         {
@@ -158,7 +158,7 @@ def coning_budget(
         for r in rate
     ]
     listing = table(
-        f"Drift about the third axis left by {len(lines)} vibration lines, °/h",
+        f"Drift about the third axis caused by {len(lines)} vibration lines, °/h",
         "algorithm",
         *(f"{r:g} Hz" for r in rate),
     )

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from strapdown.tuning.diagnosis import Diagnosis
 
 CONSISTENT, NOT, CANNOT_TELL = 0, 1, 2
-"""Exit status of a verdict. Bad input ends with 2 too, and an error on standard error."""
+"""Exit status of a verdict. Bad input also ends with 2, and an error on standard error."""
 
 
 @dataclass(frozen=True)
@@ -47,21 +47,21 @@ class _Foreign:
 
     truth: Path | None = typer.Option(
         None,
-        help="Reference attitudes, of any clock and frames: a simulated record, TUM, EuRoC, BROAD, CSV, ROS bag. What differs is printed.",
+        help="Reference attitudes in any clock and frames: a simulated record, TUM, EuRoC, BROAD, CSV, ROS bag. Differences are printed.",
     )
     error_frame: str = typer.Option(
         "find",
-        help="How the covariance is meant, body, fixed or euler (roll, pitch, yaw); find takes what the errors fit.",
+        help="Frame of the covariance: body, fixed or euler (roll, pitch, yaw); find: determined from the errors.",
     )
     align: str = typer.Option(
         "auto",
-        help="What is estimated and removed: any of time,fixed,body (frames), or none; auto: a clock's offset, and rotations beyond 5°.",
+        help="Differences to estimate and remove: any of time,fixed,body (frames), or none; auto: clock offset, and rotations beyond 5°.",
     )
     aligned: Path | None = typer.Option(
-        None, help="HDF5 file for the estimate as it was judged, which `strapdown report` reads."
+        None, help="HDF5 file for the aligned estimate, which `strapdown report` reads."
     )
-    topic: str | None = typer.Option(None, help="Topic of the estimate, where a bag holds several.")
-    truth_topic: str | None = typer.Option(None, help="Topic of the truth, where a bag holds several.")
+    topic: str | None = typer.Option(None, help="Topic of the estimate, if a bag has several.")
+    truth_topic: str | None = typer.Option(None, help="Topic of the truth, if a bag has several.")
 
 
 @command
@@ -75,33 +75,33 @@ def check(
     ],
     foreign: _Foreign,
     probability: float = typer.Option(
-        0.99, help="Probability that a right filter passes all tests together, at least."
+        0.99, help="Minimum probability with which a consistent filter passes all tests together."
     ),
     record: Path | None = typer.Option(
-        None, help="Record that an estimate was made from: with it, likely causes are named."
+        None, help="Record from which the estimate was made; likely causes are then determined."
     ),
     filter_file: Path | None = typer.Option(
         None,
         "--filter",
-        help="TOML with the table named filter that the estimate was made with; by default that in the estimate.",
+        help="TOML with the table named filter of the filter that made the estimate. Default: that in the estimate.",
     ),
     json: Path | None = typer.Option(None, "--json", help="File for all statistics; - for standard output."),
 ) -> None:
     """Judge whether a filter is consistent: exit status 0 consistent, 1 not, 2 cannot tell (or bad input).
 
-    With --record the verdict takes the statistics and the causes that were looked for together. With --truth the estimate may be of any
-    filter; clocks and frames are compared first. An estimate from elsewhere without a truth is judged by its innovations, if it has any.
+    With --record, the verdict combines the statistics with a search for causes. With --truth, the estimate may be from any filter; clocks
+    and frames are compared first. Without a truth, an estimate of another program is judged by its innovations, if it has any.
     """
     from strapdown.consistency.bounds import tail
 
     json_target(json, result, record, filter_file, foreign.truth)
     if record is None and filter_file is not None:
-        raise InputError("--filter goes with --record: the record is needed to look for causes")
+        raise InputError("--filter goes with --record: the record is needed to search for causes")
     tail(probability)
     own = _is_own(result)
     if record is not None and (foreign.truth is not None or not own):
         raise InputError(
-            "--record goes with an estimate of `strapdown estimate`, judged by itself; leave out --truth or --record"
+            "--record goes with an estimate of `strapdown estimate` without --truth; leave out --truth or --record"
         )
     for name in given(foreign) if foreign.truth is None else ():
         if name not in ("--topic", "--truth-topic"):
@@ -127,7 +127,7 @@ def check(
 
 
 def _judged_own(result: Path, probability: float, *, with_record: bool) -> tuple[Judgement, dict[str, Any]]:
-    """Judge a result of this package; return the verdict and what the JSON says of it."""
+    """Judge a result of this package; return the verdict and the start of the JSON content."""
     from strapdown import records
     from strapdown.report import findings
 
@@ -137,10 +137,10 @@ def _judged_own(result: Path, probability: float, *, with_record: bool) -> tuple
         from strapdown.montecarlo import campaign
 
         if with_record:
-            raise InputError("--record and --filter go with an estimate; of a Monte Carlo replay a run first")
+            raise InputError("--record and --filter go with an estimate; for a Monte Carlo, replay a run first")
         held = campaign.read(result)
         if held.statistics is None:
-            raise InputError(f"{result} holds no finished run yet; resume it with `strapdown montecarlo --resume`")
+            raise InputError(f"{result} has no completed run yet; resume it with `strapdown montecarlo --resume`")
         console.print(f"{result.name}: {held.statistics.runs} of {counted(held.runs, 'run')}, machine {held.machine}.")
         judgement = held.statistics.judge(probability=probability, unmodelled=held.plan.unmodelled)
     elif kind == "strapdown estimate":
@@ -153,7 +153,7 @@ def _judged_own(result: Path, probability: float, *, with_record: bool) -> tuple
         )
         judgement = findings.judged(result, attributes, estimate, truth, probability=probability)
     else:
-        raise InputError(f"{result} is a {kind}; pass what `strapdown estimate` or `strapdown montecarlo` wrote")
+        raise InputError(f"{result} is a {kind}; give a result of `strapdown estimate` or `strapdown montecarlo`")
     return judgement, {"source": result.name, "kind": kind}
 
 
@@ -167,12 +167,12 @@ def status_of(judgement: Judgement) -> int:
 
 
 def _is_own(path: Path) -> bool:
-    """Return whether a file is, or should be by its name, a result of this package; one that is missing is reported as such."""
+    """Return whether a file is a result of this package, by content or name; a missing file is treated as one and reported later."""
     return not path.exists() or path.suffix.lower() in (".h5", ".hdf5") or (path.is_file() and reading.is_hdf5(path))
 
 
 def _judged_foreign(result: Path, options: _Foreign, probability: float) -> tuple[Judgement, dict[str, Any]]:
-    """Judge an estimate from elsewhere; return the verdict and what the JSON says of it."""
+    """Judge an estimate of another program; return the verdict and the start of the JSON content."""
     from strapdown import consistency
     from strapdown.consistency import foreign
     from strapdown.recordings.attitudes import read_attitudes
@@ -189,13 +189,13 @@ def _judged_foreign(result: Path, options: _Foreign, probability: float) -> tupl
     if options.truth is None:
         if not own.innovations:
             raise InputError(
-                f"{result} holds no innovations, so nothing can be judged without a truth; give --truth, attitudes over the same time"
+                f"{result} has no innovations, so it cannot be judged without a truth; give --truth, attitudes over the same time"
             )
         estimate = foreign.without_truth(own.seconds(int(own.stamps_ns[0])), own.attitude, own.innovations)
         return consistency.judge(estimate, None, probability=probability), content
     reference = read_attitudes(options.truth, topic=options.truth_topic or "")
     console.print(f"Truth: {reference.source}, {len(reference.stamps_ns)} attitudes.")
-    # Clocks from 1970 and from the start of a machine: each from the first stamp of both, in whole ns.
+    # One clock may count from 1970 and the other from the boot of a machine: both relative to the first stamp, in integer ns.
     origin = int(min(own.stamps_ns[0], reference.stamps_ns[0]))
     frame = own.error_frame if options.error_frame == "find" and own.error_frame else options.error_frame
     found = foreign.check_arrays(
@@ -215,7 +215,7 @@ def _judged_foreign(result: Path, options: _Foreign, probability: float) -> tupl
     for remark in found.remarks:
         console.print(f"Note: {remark}.")
     if frame != options.error_frame:
-        console.print(f"Note: the file says that its covariance is of the {frame} error.")
+        console.print(f"Note: the file declares that its covariance is of the {frame} error.")
     _show_explanations(found)
     if options.aligned is not None:
         attributes = {"source": own.source, "truth": reference.source}
@@ -226,7 +226,7 @@ def _judged_foreign(result: Path, options: _Foreign, probability: float) -> tupl
 def _show_explanations(found: Checked) -> None:
     if not found.explanations:
         return
-    rows = table("What would explain the attitude errors", "cause", "size", "NEES left", "p-value", "", left=2)
+    rows = table("Possible causes of the attitude errors", "cause", "size", "remaining NEES", "p-value", "", left=2)
     for one in found.explanations:
         mark = Text("likely", style="red") if one.likely else Text("no")
         rows.add_row(one.name, one.value, f"{one.nees:.4g}", f"{one.p_value:.2g}", mark)
@@ -235,17 +235,17 @@ def _show_explanations(found: Checked) -> None:
 
 def _show_statistics(judgement: Judgement) -> None:
     if judgement.findings:
-        show_listing(judgement.listing(), "Statistics of the filter against what they are of a right one")
+        show_listing(judgement.listing(), "Statistics of the filter and their bounds for a consistent filter")
         console.print(
-            "Each p-value is that of its statistic alone; bounds, pass and FAIL take all together "
-            f"(a right filter fails with at most {100.0 * (1.0 - judgement.probability):.2g} %). NIS and NEES are per degree of freedom."
+            "Each p-value is for one statistic; bounds, pass and FAIL are for all together "
+            f"(a consistent filter fails with at most {100.0 * (1.0 - judgement.probability):.2g} %). NIS, NEES: per degree of freedom."
         )
 
 
 def _diagnosed(
     result: Path, record: Path, filter_file: Path | None, judgement: Judgement
 ) -> tuple[dict[str, Any], Diagnosis | None]:
-    """Show the causes that a record gives evidence of; return them as plain values, and with the verdict by all evidence, if any."""
+    """Print the causes found from a record; return them for JSON, and the diagnosis with the combined verdict, or None."""
     from strapdown import estimation, records
     from strapdown.estimation.setup.for_record import unmodelled_errors
     from strapdown.recordings import recordfiles
@@ -260,28 +260,28 @@ def _diagnosed(
     for sentence in no_state_words(missing, chosen):
         console.print(sentence)
     if chosen.states is not None and chosen.states.names:
-        reason = f"the search knows a filter of attitude and bias alone, and this one has the states {', '.join(chosen.states.names)}"
-        console.print(f"Causes were not looked for: {reason}.")
+        reason = f"the search supports filters of attitude and bias only, and this one has the states {', '.join(chosen.states.names)}"
+        console.print(f"Causes were not searched for: {reason}.")
         return {"not_looked_for": reason, "without_a_state": list(missing)}, None
     P = np.diag(estimate.variance[0]) if estimate.covariance is None else estimate.covariance[0]
     initial = estimation.State(attitude=estimate.attitude[0], bias=estimate.bias[0], covariance=P)
-    # The verdict is on the filter with its gate, so what that refused is left out.
-    with progress_bar("looking for causes"):
+    # The verdict is on the filter with its gate, so measurements that it rejected are left out.
+    with progress_bar("searching for causes"):
         found = diagnosis.diagnose(
             accepted(held, estimate), chosen, initial, probability=judgement.probability, judgement=judgement
         )
-    show_listing(found.listing(), "Causes by what they would explain")
+    show_listing(found.listing(), "Causes by their effect on the likelihood")
     content = {**found.summary(), "without_a_state": list(missing)}
     own = _not_of_the_search(chosen, estimate)
     if own:
-        console.print(f"{own}; so the causes are no part of the verdict, which the statistics give alone.")
+        console.print(f"{own}; therefore the verdict is based on the statistics only.")
         console.print(found.cause_words)
         return content, None
     return content, found
 
 
 def _filter_of(result: Path, filter_file: Path | None) -> FilterSetup:
-    """Return the setup that an estimate was made with, as a file gives it or as the estimate itself does."""
+    """Return the setup of an estimate, from a file or from the estimate itself."""
     from strapdown import records
     from strapdown.estimation import setup
 
@@ -289,22 +289,22 @@ def _filter_of(result: Path, filter_file: Path | None) -> FilterSetup:
         return setup.read_setup(filter_file)
     text = records.read_attributes(result).get("filter")
     if text is None:
-        raise InputError(f"{result} does not hold its filter; give --filter, a TOML file with the table [filter]")
+        raise InputError(f"{result} does not contain its filter; give --filter, a TOML file with the table [filter]")
     return setup.from_toml(str(text), f"{result}: filter")
 
 
 def _need_same(result: Path, estimate: Estimate, path: Path, record: ImuRecord) -> None:
-    """Refuse a record that an estimate was not made from."""
+    """Raise an error if an estimate was not made from the record."""
     unknown = sorted(set(estimate.innovations) - {series.sensor for series in record.vectors})
     if unknown or not np.isin(estimate.time, record.time).all():
-        what = f"has no sensor {unknown[0]!r}" if unknown else "has other stamps"
+        what = f"has no sensor {unknown[0]!r}" if unknown else "has other time stamps"
         raise InputError(f"{path} {what}; {result} was made from another record")
 
 
 def _not_of_the_search(chosen: FilterSetup, estimate: Estimate) -> str:
-    """Say what a filter did that the search for causes does not; empty if there is nothing."""
+    """Return a feature of the filter that the search for causes does not support; empty if there is none."""
     if chosen.robust is not None:
-        return "The filter weighs measurements by their innovations, and the search for causes does not"
+        return "The filter weights measurements by their innovations, and the search for causes does not"
     if any(event.kind == "recovery" for event in estimate.events):
         return "The filter recovered from a lost attitude, and the search for causes does not"
     return ""
@@ -318,13 +318,13 @@ def doctor(
         None, "--json", help="File for the explanations and their scores; - for standard output."
     ),
 ) -> None:
-    """Find the conventions that a recording follows, by trying the others: exit status 0 as declared, 1 wrong, 2 cannot tell."""
+    """Test the axes, signs, frames and units of a recording against alternatives: exit status 0 as declared, 1 wrong, 2 cannot tell."""
     from strapdown import recordings
     from strapdown.ahrs import check_conventions
 
     json_target(json, recording)
     source = recordings.read(recording, **layout.options(recording))
-    with progress_bar("trying conventions"):
+    with progress_bar("testing conventions"):
         found = check_conventions.examine(source)
     console.print(f"{found.source}: {found.words}")
     for words in found.doubts:

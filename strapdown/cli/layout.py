@@ -1,4 +1,4 @@
-"""The layout of ``--help``: commands in groups, in the order of the work, each with examples."""
+"""The layout of ``--help``: commands in groups, in the order of use, each with examples."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ COMMANDS: dict[str, dict[str, tuple[str, ...]]] = {
         "doctor": ("judgement", "strapdown doctor walk.csv --gyro-unit deg/s --accelerometer-unit g"),
         "convert": ("conversion", "strapdown convert walk.bag walk.csv"),
     },
-    "Integration of the gyro alone": {
+    "Integration of the gyro": {
         "coning": ("studies", "strapdown coning", "strapdown coning --algorithm mine.toml --runs 20"),
         "integrate": ("integration", "strapdown integrate flight.h5 --algorithm three-sample"),
         "algorithms": ("integration",),
@@ -48,11 +48,11 @@ COMMANDS: dict[str, dict[str, tuple[str, ...]]] = {
     },
     "This installation": {"info": ("installation",)},
 }
-"""Commands by group: the module that registers each, then its examples."""
+"""Commands by group: the module that registers each, and examples."""
 
 
 def register(command: str | None = None) -> None:
-    """Register one command, whose module alone is imported; all of them if there is none of that name, for ``--help`` and for errors."""
+    """Register one command and import only its module; register all if there is none of that name, for ``--help`` and errors."""
     places = {name: (title, *place) for title, group in COMMANDS.items() for name, place in group.items()}
     for module in dict.fromkeys(place[1] for name, place in places.items() if name == command or command not in places):
         importlib.import_module(f"strapdown.cli.{module}")

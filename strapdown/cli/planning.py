@@ -1,4 +1,4 @@
-"""Planning: what a filter will achieve, before anything is simulated."""
+"""Planning: predicted accuracy of a filter, without simulation."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 
 def _named(option: str, values: list[str] | None) -> dict[str, float]:
-    """Return the numbers of options NAME=VALUE."""
+    """Return the numbers from options NAME=VALUE."""
     found = {}
     for text in values or []:
         name, equals, number = text.rpartition("=")
@@ -50,7 +50,7 @@ def _named(option: str, values: list[str] | None) -> dict[str, float]:
 
 
 def _in_own_units(biases: dict[str, float], sensors: Any) -> dict[str, float]:
-    """Return sensor biases in the unit of each sensor's σ, of numbers in nT, m/s² or arcsec."""
+    """Return sensor biases, given in nT, m/s² or arcsec, in the unit of each sensor's σ."""
     from strapdown.vectors import Accelerometer, Magnetometer
 
     sizes = {sensor.name: {Magnetometer: 1e-9, Accelerometer: 1.0}.get(type(sensor), ARCSECOND) for sensor in sensors}
@@ -59,35 +59,35 @@ def _in_own_units(biases: dict[str, float], sensors: Any) -> dict[str, float]:
 
 @dataclass(frozen=True, eq=False)
 class _Errors:
-    """Errors besides those that the filter models."""
+    """Errors that the filter does not model."""
 
-    scale_factor: float = typer.Option(0.0, help="Consider gyro scale factors of this 1σ, ppm.")
-    misalignment: float = typer.Option(0.0, help="Consider gyro misalignments of this 1σ, mrad.")
-    g_sensitivity: float = typer.Option(0.0, help="Consider gyro g-sensitivities of this 1σ, °/h/g.")
+    scale_factor: float = typer.Option(0.0, help="Consider gyro scale factor errors with this 1σ, ppm.")
+    misalignment: float = typer.Option(0.0, help="Consider gyro misalignments with this 1σ, mrad.")
+    g_sensitivity: float = typer.Option(0.0, help="Consider gyro g-sensitivities with this 1σ, °/h/g.")
     sensor_bias: list[str] | None = typer.Option(
-        None, help="Consider a sensor's bias of this 1σ on each axis, NAME=VALUE: nT, m/s², or arcsec. Repeatable."
+        None, help="Consider a sensor bias with this 1σ per axis, NAME=VALUE: nT, m/s², or arcsec. Repeatable."
     )
     mounting: list[str] | None = typer.Option(
-        None, help="Consider a sensor turned on the body by this 1σ about each axis, NAME=ARCSEC. Repeatable."
+        None, help="Consider a mounting error of a sensor with this 1σ per axis, NAME=ARCSEC. Repeatable."
     )
     time_offset: list[str] | None = typer.Option(
-        None, help="Consider a sensor that measures late by this 1σ, NAME=MS. Repeatable."
+        None, help="Consider a delay of a sensor with this 1σ, NAME=MS. Repeatable."
     )
     attitude_sigma: float | None = typer.Option(
-        None, help="Actual 1σ of the initial attitude, each axis, degrees; else the filter's."
+        None, help="True 1σ of the initial attitude, per axis, degrees. Default: that of the filter."
     )
     bias_sigma: float | None = typer.Option(
-        None, help="Actual 1σ of the initial bias, each axis, °/h; else the filter's."
+        None, help="True 1σ of the initial bias, per axis, °/h. Default: that of the filter."
     )
 
     def check(self) -> None:
-        """Refuse negative σ, in the unit that they were given in."""
+        """Raise an error for negative σ, in the unit of the option."""
         units = {"scale_factor": "ppm", "misalignment": "mrad", "g_sensitivity": "°/h/g"}
         for name, unit in (units | {"attitude_sigma": "degrees", "bias_sigma": "°/h"}).items():
             non_negative("--" + name.replace("_", "-"), getattr(self, name) or 0.0, unit=unit)
 
     def considered(self, sensors: Any) -> Consider:
-        """Return the errors in SI, for a scenario's sensors."""
+        """Return the errors in SI units, for the sensors of a scenario."""
         from strapdown.covariance import Consider
 
         return Consider(
@@ -107,14 +107,14 @@ def covariance(
     filter_file: Path | None = typer.Option(
         None,
         "--filter",
-        help="TOML with a table named filter, as `strapdown tune` writes it; without it the filter that matches the scenario.",
+        help="TOML with a table named filter, as written by `strapdown tune`. Default: the filter that matches the scenario.",
     ),
-    epochs: int = typer.Option(100, help="Epochs over the scenario's time."),
+    epochs: int = typer.Option(100, help="Number of epochs over the duration of the scenario."),
     out: Path = typer.Option(Path("covariance-results"), help="Folder for covariance.json and the figure."),
     form: FigureFormat = FORMAT,
     tables: Path | None = TABLES,
 ) -> None:
-    """Predict a filter's errors and their budget by source, in one pass without noise."""
+    """Predict the errors of a filter and their budget by source, by a covariance analysis without random noise."""
     from strapdown import covariance as analysis
     from strapdown import plots
     from strapdown.estimation import setup
@@ -144,16 +144,16 @@ def covariance(
     missing = setup.unmodelled_errors(chosen.gyro, chosen.sensors, modelled.states, gravity_f=chosen.gravity_f)
     if missing and filter_file is None:
         console.print(
-            f"This is the filter of attitude and bias alone. `estimate` and `montecarlo` by default add states for {', '.join(missing)}."
+            f"This filter estimates attitude and bias only. By default `estimate` and `montecarlo` add states for {', '.join(missing)}."
         )
     write_json(out / "covariance.json", _summary(name, found))
-    title = f"{name}: predicted errors, without a Monte Carlo"
+    title = f"{name}: predicted errors"
     figures = save_as({out / "budget": plots.error_budget(found, title=title)}, form)
     written(out / "covariance.json", *figures, *tables_written(tables, "covariance", found.budget()))
 
 
 def _summary(name: str, found: Any) -> dict[str, Any]:
-    """Return the analysis for JSON, units in the key names."""
+    """Return the content of the JSON file, with the units in the keys."""
     units = np.array([ARCSECOND] * 3 + [DEGREE_PER_HOUR] * 3)
 
     def parts(values: Any) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Progress of what takes long: a bar on a terminal, a line every ten seconds elsewhere, and what is compiled; on standard error."""
+"""Progress of long computations and of compilation on standard error: a bar on a terminal, otherwise a line every ten seconds."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from rich.text import Text
 errors = Console(stderr=True, markup=False, highlight=False)
 
 LINE_INTERVAL = 10.0
-"""Seconds between two lines off a terminal."""
+"""Time between two lines if the output is no terminal, s."""
 _POLL = 0.2
 
 _quiet = False
@@ -38,25 +38,25 @@ def be_quiet() -> None:
 
 
 def rate_text(speed: float) -> str:
-    """Return a rate in three digits or whole ones."""
+    """Return a rate with three digits, or as an integer if it has more."""
     return f"{speed:.0f}" if speed >= 100.0 else f"{speed:.3g}"
 
 
 class _Rate(ProgressColumn):
-    """Units a second."""
+    """Units per second."""
 
     def __init__(self, unit: str) -> None:
         super().__init__()
         self._unit = unit
 
     def render(self, task: Task) -> Text:
-        """Return the rate of the last while, or of the whole where it is finished."""
+        """Return the recent rate, or the mean rate of a finished task."""
         speed = task.finished_speed or task.speed
         return Text("" if speed is None else f"{rate_text(speed)} {self._unit}")
 
 
 Advance = Callable[[int | str], None]
-"""Advances a progress by a number of units, or says what is done now."""
+"""Advances the progress by a number of units, or sets the description of the current task."""
 
 
 @contextmanager
@@ -78,7 +78,7 @@ def progress_bar(what: str, total: int | None = None, *, rate: str = "") -> Iter
 
 
 Say = Callable[[str, float], None]
-"""Shows what is compiled, if anything, and the seconds gone."""
+"""Shows the state of the compilation, if any, and the elapsed time, s."""
 
 
 @contextmanager
@@ -117,7 +117,7 @@ def _lines(what: str, total: int | None) -> Iterator[tuple[Advance, Say]]:
         nonlocal next_line, announced
         if compiling and not announced:
             announced = True
-            errors.print("compiling for this machine, once: later runs start at once", soft_wrap=True)
+            errors.print("compiling for this machine; the compiled code is cached for later runs", soft_wrap=True)
         if seconds >= next_line:
             next_line += LINE_INTERVAL
             share = "" if total is None else f" {done} of {total},"
@@ -135,7 +135,7 @@ def _watch(ended: Event, say: Say) -> None:
 
 
 class _Compiling:
-    """Functions that numba is compiling, by its own events; nothing is imported for it."""
+    """Functions that numba is compiling, from numba's events; numba is not imported here."""
 
     def __init__(self) -> None:
         self.current = ""
@@ -143,10 +143,10 @@ class _Compiling:
         self._known: set[Any] = set()
         self._left: set[Any] = set()
         self._begun = 0
-        """Functions begun and not ended: one calls the next."""
+        """Number of compilations in progress; they are nested, since functions call each other."""
 
     def listen(self) -> None:
-        """Listen as soon as numba is there."""
+        """Register for the events once numba is imported."""
         numba = sys.modules.get("numba")
         if self._listening or numba is None or getattr(numba.__spec__, "_initializing", False):
             return
@@ -164,7 +164,7 @@ class _Compiling:
         self._listening = True
 
     def started(self, dispatcher: Any) -> None:
-        """Count a function that is being compiled, and all that it calls."""
+        """Count a function whose compilation starts, and all that it calls."""
         self._left |= _called(dispatcher) - self._known
         self._known |= self._left
         self._begun += 1
@@ -174,18 +174,18 @@ class _Compiling:
         """Count a function as compiled."""
         self._left.discard(dispatcher)
         self._begun -= 1
-        if self._begun == 0:  # what is left was not needed, or a fault ended the compiling
+        if self._begun == 0:  # the remaining functions were not needed, or an error ended the compilation
             self._left.clear()
         self._say()
 
     def _say(self) -> None:
         number = len(self._known)
         done = number - len(self._left)
-        self.current = f"compiling, once: {done} of {number} functions" if self._left else ""
+        self.current = f"compiling: {done} of {number} functions" if self._left else ""
 
 
 def _called(dispatcher: Any) -> set[Any]:
-    """Return a compiled function and those that it names, directly or not."""
+    """Return a compiled function and those that it references, directly or indirectly."""
     found: set[Any] = set()
     open_ones = [dispatcher]
     while open_ones:
@@ -197,7 +197,7 @@ def _called(dispatcher: Any) -> set[Any]:
 
 
 def _is_twin(dispatcher: Any) -> bool:
-    """Return whether the function has globals of its own, those that it names (:mod:`strapdown.kernels.machine`)."""
+    """Return whether the globals of the function are only the names that it uses (:mod:`strapdown.kernels.machine`)."""
     return str(dispatcher.py_func.__module__).startswith("strapdown.kernels")
 
 

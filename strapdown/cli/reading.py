@@ -1,4 +1,4 @@
-"""Options for a recording's units, columns, topic, axes and signs: the same in every command that reads one."""
+"""Options for units, columns, topic, axes and signs of a recording, the same for every command that reads one."""
 
 from __future__ import annotations
 
@@ -29,11 +29,9 @@ class Samples:
     columns: str | None = typer.Option(
         None,
         metavar="ROLE=NAME,…",
-        help="Table: its columns where they are not the usual ones, unit in parentheses: time=timestamp(us),gx=gyro_x(dps),gy=….",
+        help="Table: names of its columns if they are not the usual ones, unit in parentheses: time=timestamp(us),gx=gyro_x(dps),gy=….",
     )
-    topic: str | None = typer.Option(
-        None, help="Bag or flight log: topic of the inertial unit, where there are several."
-    )
+    topic: str | None = typer.Option(None, help="Bag or flight log: topic of the inertial unit, if there are several.")
 
     @property
     def units(self) -> dict[str, str]:
@@ -47,8 +45,8 @@ class Samples:
 
         if (options := given(self)) and recordings.is_record(path):
             what = {"--topic": "a bag or a flight log", "--axes": "a recording", "--invert": "a recording"}
-            own = "holds its units" if options[0].endswith("-unit") else "needs none"
-            raise InputError(f"{options[0]} goes with {what.get(options[0], 'a table')}; the record {path} {own}")
+            own = "contains its units" if options[0].endswith("-unit") else "needs none"
+            raise InputError(f"{options[0]} applies to {what.get(options[0], 'a table')}; the record {path} {own}")
         found: dict[str, Any] = {"units": self.units}
         if self.columns:
             found["columns"] = recordings.parse_mapping(self.columns)
@@ -64,13 +62,13 @@ class Layout(Samples):
     axes: list[str] | None = typer.Option(
         None,
         metavar="[SENSOR=]AXES",
-        help="Recorded axes that become the body's x, y, z: x,-y,-z of a unit whose z axis points down, magnetometer=y,x,-z of one "
+        help="Recorded axes that become the body's x, y, z: x,-y,-z for a unit whose z axis points down, magnetometer=y,x,-z for one "
         "sensor; may be repeated.",
     )
     invert: list[str] | None = typer.Option(
         None,
         metavar="SENSOR",
-        help="Sensor of inverted sign: accelerometer (of one that reads -g upward at rest), magnetometer or gyro; may be repeated.",
+        help="Sensor with inverted sign: accelerometer (if it reads -g upward at rest), magnetometer or gyro; may be repeated.",
     )
 
     def options(self, path: Path) -> dict[str, Any]:
@@ -94,7 +92,7 @@ def _axes(texts: Sequence[str]) -> str | dict[str, str]:
         sensor, equals, axes = text.partition("=")
         if not equals and len(texts) > 1:
             raise InputError(
-                f"--axes {text} is of the whole unit; give it alone, or each sensor its own, as gyro=y,x,-z"
+                f"--axes {text} applies to the whole unit; give only it, or the axes of each sensor, such as gyro=y,x,-z"
             )
         recordings.axes_matrix(axes if equals else text, "--axes")
         if not equals:

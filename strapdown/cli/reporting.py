@@ -17,13 +17,13 @@ def report(
         Path, typer.Argument(help="HDF5 file of `strapdown estimate` or `montecarlo`, or the JSON of `strapdown tune`.")
     ],
     out: Path | None = typer.Option(
-        None, "--out", "-o", help="The page, .html; beside the result, of its name, if not given."
+        None, "--out", "-o", help="The page, .html. Default: the file name of the result with this suffix."
     ),
     probability: float = typer.Option(
-        0.99, help="That a right filter is not called wrong by any test, between 0 and 1."
+        0.99, help="Probability that a consistent filter passes all tests, between 0 and 1."
     ),
 ) -> None:
-    """Write a self-contained HTML page about a result: verdict in words, numbers, figures, how to reproduce it; the statistics as JSON."""
+    """Write a self-contained HTML page about a result: verdict, numbers, figures, provenance; and the statistics as JSON."""
     from strapdown import report as reports
 
     existing_file(result)

@@ -1,4 +1,4 @@
-"""Sensors: simulating scenarios, and identifying a gyro's noise."""
+"""Sensors: simulation of scenarios, and identification of sensor noise."""
 
 from __future__ import annotations
 
@@ -53,11 +53,11 @@ def scenarios() -> None:
 def simulate(
     scenario: Annotated[str, typer.Argument(help="Name of a built-in scenario, or a TOML file.")],
     out: Path | None = typer.Option(
-        None, help="HDF5 file, or CSV by its suffix; by default .h5 after the name, or the TOML file, of the scenario."
+        None, help="HDF5 file, or CSV by its suffix. Default: .h5 with the name, or the TOML file, of the scenario."
     ),
-    seed: int | None = typer.Option(None, help="Seed; the scenario's own if not given."),
+    seed: int | None = typer.Option(None, help="Seed. Default: that of the scenario."),
     run: int = typer.Option(0, help="Number of the run of this seed."),
-    show: bool = typer.Option(False, help="Print the scenario as TOML, to start a file of one's own, and stop."),
+    show: bool = typer.Option(False, help="Print the scenario as TOML, as a template for your own, and stop."),
 ) -> None:
     """Simulate a scenario: a record with its truth."""
     from strapdown import scenarios as catalogue
@@ -93,8 +93,8 @@ def simulate(
         sigma = series.sigma if series.sigma_axes is None else series.sigma_axes
         if series.covariance is None and (sigma == 0.0).any():
             console.print(
-                f"warning: {series.sensor}: its sigma is zero, which no filter can use; give it noise in the scenario, or give the filter "
-                "another in [filter.sigma]"
+                f"warning: {series.sensor}: its sigma is zero, which a filter cannot use; add noise in the scenario, or give the filter "
+                "another sigma in [filter.sigma]"
             )
     written(*paths)
 
@@ -103,17 +103,17 @@ def simulate(
 class _Identification:
     """Identification."""
 
-    rate: float | None = typer.Option(None, help="Samples a second, Hz; for NPY.")
+    rate: float | None = typer.Option(None, help="Sample rate of an NPY file, Hz.")
     highest_frequency: float | None = typer.Option(
-        None, help="Hz; the fit leaves out what lies above: a low-pass filter's shape, vibration."
+        None, help="Maximum frequency of the fit, Hz, to exclude a low-pass filter or vibration."
     )
     robust: bool = typer.Option(
-        False, help="Deviation by medians, which outliers hardly change; the fit is not affected."
+        False, help="Compute the deviation from medians, which is robust to outliers; does not affect the fit."
     )
     temperature: int | None = typer.Option(
         None,
         metavar="ORDER",
-        help="Regress the bias on the recorded temperature, by a polynomial of this order, and identify the noise of what is left.",
+        help="Regress the bias on the recorded temperature, with a polynomial of this order, and identify the noise of the residuals.",
     )
 
 
@@ -121,25 +121,25 @@ class _Identification:
 class _Exports:
     """Files for other programs."""
 
-    kalibr: bool = typer.Option(False, "--kalibr", help="Write imu.yaml too; needs gyro and accelerometer.")
-    factor: float = typer.Option(1.0, help="Factor on the noise in imu.yaml; 5 to 10 are usual.")
-    px4: bool = typer.Option(False, "--px4", help="Write px4.params of EKF2 too; needs gyro and accelerometer.")
-    matlab: bool = typer.Option(False, "--matlab", help="Write imu_sensor.m, for imuSensor, too.")
+    kalibr: bool = typer.Option(False, "--kalibr", help="Also write imu.yaml; needs gyro and accelerometer.")
+    factor: float = typer.Option(1.0, help="Factor on the noise in imu.yaml, usually 5 to 10.")
+    px4: bool = typer.Option(False, "--px4", help="Also write px4.params of EKF2; needs gyro and accelerometer.")
+    matlab: bool = typer.Option(False, "--matlab", help="Also write imu_sensor.m for imuSensor.")
 
     @property
     def files(self) -> list[str]:
-        """Names of the files asked for."""
+        """Names of the requested files."""
         wanted = {"imu.yaml": self.kalibr, "px4.params": self.px4, "imu_sensor.m": self.matlab}
         return [name for name, asked in wanted.items() if asked]
 
     def check(self, sensors: list[str]) -> None:
-        """Refuse files that need another sensor, and a factor that is none."""
+        """Raise an error for files that need another sensor, and for an invalid factor."""
         if (self.kalibr or self.px4) and not {"gyro", "accelerometer"} <= set(sensors):
             raise InputError("--kalibr and --px4 need both: --sensor gyro --sensor accelerometer")
         positive("--factor", self.factor)
 
     def write(self, fits: dict[str, identification.NoiseFit], out: Path, source: str, topic: str | None) -> None:
-        """Write the files that are asked for."""
+        """Write the requested files."""
         from strapdown.allan import parameters
 
         made = {
@@ -153,7 +153,7 @@ class _Exports:
         if self.files:
             written(*(out / name for name in self.files))
         if self.kalibr:
-            console.print(f"imu.yaml holds the largest of the axes, times {self.factor:g} (--factor).")
+            console.print(f"imu.yaml has the maximum over the axes times {self.factor:g} (--factor).")
 
 
 @dataclass(frozen=True)
@@ -176,10 +176,10 @@ def allan(
     exports: _Exports,
     output: _Output,
     sensor: list[str] | None = typer.Option(
-        None, help="gyro (if not given), accelerometer or magnetometer; may be repeated."
+        None, help="gyro (default), accelerometer or magnetometer; may be repeated."
     ),
 ) -> None:
-    """Identify a sensor's noise from a recording at rest: Allan deviation, fitted coefficients, specification as TOML."""
+    """Identify the noise of a sensor from a recording at rest: Allan deviation, fitted coefficients, specification as TOML."""
     from strapdown.allan.noise_fit import SENSORS
 
     chosen = list(dict.fromkeys(sensor or ["gyro"]))
@@ -198,7 +198,7 @@ def allan(
 
 
 def _layout(recording: Path, samples: Samples) -> dict[str, Any]:
-    """Return how the file is read; of a simulated record and of an array the reader itself refuses what does not go with them."""
+    """Return the options for reading the file; for simulated records and arrays, the reader raises errors for those that do not apply."""
     if recording.suffix.lower() == ".npy" or (samples.columns is None and samples.topic is None):
         return {"units": samples.units}
     return samples.options(recording)
@@ -213,7 +213,7 @@ def _names(sensor: str, form: str = FigureFormat.png) -> tuple[str, ...]:
 def _identify(
     recording: Path, sensor: str, layout: dict[str, Any], options: _Identification, output: _Output
 ) -> identification.NoiseFit:
-    """Identify one sensor, print and write what was found."""
+    """Identify the noise of one sensor; print and write the results."""
     from strapdown import allan as identification
     from strapdown import plots, recordings
     from strapdown.plots.style import save_as
@@ -223,7 +223,7 @@ def _identify(
     _plausible(recording, sensor, source)
     gaps = bool(np.isnan(source.values).any())
     if gaps and options.robust:
-        raise InputError(f"{recording.name} has gaps, with which --robust does not go; leave it out")
+        raise InputError(f"{recording.name} has gaps, which --robust does not support; leave it out")
     values = source.values
     paths: list[Path] = []
     try:
@@ -254,11 +254,11 @@ def _identify(
     if gaps:
         shortest = identification.noise_fit.SHORTEST
         console.print(
-            f"With gaps: the fit uses {fit.samples} samples in segments of {shortest} or more, the deviation all there are."
+            f"Because of gaps the fit uses {fit.samples} samples in segments of {shortest} or more; the deviation uses all samples."
         )
     rows = identification.table(fit)
     show_listing(fit.listing(), f"Noise coefficients with {100.0 * fit.level:g} % intervals")
-    console.print("Of a term not seen in this record, the last column bounds what it could hide.")
+    console.print("For a term not detected in this record, the last column is an upper bound.")
     with written_beside(out / specification) as temporary:
         temporary.write_text(_specification(fit, f"{recording.name}, {length}"), encoding="utf-8")
     _write_numbers(out / numbers, recording.name, fit, deviation, rows)
@@ -268,14 +268,14 @@ def _identify(
         console.print(f"warning: {warning}", highlight=False)
     if fit.warnings:
         console.print(
-            f"Cut the recording to where the {sensor} rests, or leave a filter's band out by --highest-frequency."
+            f"Cut the recording to an interval where the {sensor} is at rest, or exclude the band of a filter by --highest-frequency."
         )
         console.print(f"warning: {_DISTRUST}, nor {specification}.", highlight=False)
     return fit
 
 
 def _plausible(recording: Path, sensor: str, source: GyroSamples) -> None:
-    """Refuse samples that no sensor gives, from which squares would leave the range of doubles."""
+    """Raise an error for impossible samples, whose squares would overflow."""
     if source.values.shape[1] not in (1, 3):
         raise InputError(
             f"{recording.name} has {source.values.shape[1]} columns; a {sensor} has three axes, or pass one column, (n,) or (n, 1)"
@@ -286,12 +286,12 @@ def _plausible(recording: Path, sensor: str, source: GyroSamples) -> None:
         raise InputError(f"{recording.name} holds {largest:g} {unit}, which no {sensor} measures; check its unit")
     if not 1.0 / _LARGEST_RATE <= source.sample_interval <= _LARGEST_RATE:
         raise InputError(
-            f"{recording.name}: {1.0 / source.sample_interval:g} Hz is no rate of a {sensor}; check it and its unit"
+            f"{recording.name}: {1.0 / source.sample_interval:g} Hz is no sample rate of a {sensor}; check it and its unit"
         )
 
 
 def _regressed(recording: Path, sensor: str, source: GyroSamples, order: int, out: Path, paths: list[Path]) -> Any:
-    """Return the samples without their dependence on temperature, which is printed and written."""
+    """Return the samples less their regression on temperature, which is printed and written."""
     import tomli_w
 
     from strapdown.allan import temperature as allan_temperature
@@ -300,7 +300,7 @@ def _regressed(recording: Path, sensor: str, source: GyroSamples, order: int, ou
     if source.temperature is None:
         raise InputError("no temperature is recorded; leave --temperature out")
     if np.isnan(source.values).any():
-        raise InputError("there are gaps, with which --temperature does not go; cut the recording between them")
+        raise InputError("there are gaps, which --temperature does not support; cut the recording between them")
     scale = source.sample_interval if source.kind == "increments" else 1.0
     fit = allan_temperature.fit_temperature(
         source.values / scale, source.temperature, source.sample_interval, order=order
@@ -357,12 +357,12 @@ def _write_numbers(
 
 
 _LARGEST_RATE = 1e12
-"""rad/s and Hz: far beyond any gyro, and far from where the fit's squares overflow."""
+"""Maximum rate, rad/s, and sample rate, Hz: far beyond any gyro, and far below overflow of squares in the fit."""
 _DISTRUST = "do not trust these intervals"
 
 
 def _specification(fit: identification.NoiseFit, source: str) -> str:
-    """Return the text of gyro.toml, or of another sensor's: the terms seen, and as comments bounds of the others, and warnings."""
+    """Return the text of gyro.toml, or of that of another sensor: the terms detected, and as comments bounds of the others and warnings."""
     import tomli_w
 
     from strapdown import allan as identification
@@ -381,14 +381,14 @@ def _specification(fit: identification.NoiseFit, source: str) -> str:
         seen = fit.supported[:, fit.terms.index(term)]
         if seen.any():
             below = ", ".join(f"{'xyz'[k]} below {values[k] / factor:.4g}" for k in range(len(values)) if not seen[k])
-            partly.append(f"{key}: 0 where not seen, {below}.")
+            partly.append(f"{key}: 0 where not detected, {below}.")
         else:
             shown = ", ".join(f"{value / factor:.4g}" for value in values)
             wholly.append(f"{key} = {shown if len(values) == 1 else f'[{shown}]'}")
     if partly or wholly:
         text += "\n" + _commented(
             [
-                f"Not seen in the record, so left out; the upper ends of their {100 * fit.level:g} % intervals:",
+                f"Not detected in the record, so left out; the upper ends of their {100 * fit.level:g} % intervals:",
                 *partly,
                 *wholly,
             ]
@@ -396,13 +396,13 @@ def _specification(fit: identification.NoiseFit, source: str) -> str:
     if sensor == "gyro":
         text += "\n" + _commented(
             [
-                "Add turn_on_bias_sigma_deg_per_hour from the data sheet: one recording does not show",
-                "how the bias differs between switch-ons, and filters then take it for near zero.",
+                "Add turn_on_bias_sigma_deg_per_hour from the data sheet: one recording has no information",
+                "about the variation of the bias between switch-ons, and filters then assume that it is near zero.",
             ]
         )
     return text
 
 
 def _commented(lines: list[str]) -> str:
-    """Return lines as comments of TOML, which may hold no control characters; a file's name may."""
+    """Return lines as TOML comments, without the control characters that a file name may contain."""
     return "".join(f"# {''.join(c if c.isprintable() else '?' for c in line)}\n" for line in lines)

@@ -1,4 +1,4 @@
-"""The main job: the coning study."""
+"""The coning study."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from strapdown.montecarlo.coning_study import ConingParameters
 
 MIN_SAMPLES_A_CYCLE = 0.1
-"""With fewer a step holds more than ten turns of the cone, and nothing of the study means anything."""
+"""Minimum number of gyro samples per cone cycle; with fewer, a step contains more than ten cycles and the results are meaningless."""
 
 
 def _drift(value: float | None) -> str:
@@ -43,7 +43,7 @@ def _drift(value: float | None) -> str:
 
 
 def _show_own(own: tuple[Algorithm, ...]) -> None:
-    """Show what follows from the coefficients of one's own algorithms."""
+    """Print the orders and drift constants of the user's algorithms."""
     from strapdown.montecarlo.coning_study import own_summary
 
     if not own:
@@ -55,7 +55,7 @@ def _show_own(own: tuple[Algorithm, ...]) -> None:
         "order",
         "n",
         "C",
-        "best n, C of as many increments",
+        "optimum n, C for the same increments",
     )
     for one in own:
         row = own_summary(one)
@@ -74,14 +74,14 @@ def _show_own(own: tuple[Algorithm, ...]) -> None:
         following = own_summary(one)
         if one.drift_order < following["best_drift_order"] and abs(one.drift_constant) < _ROUNDED:
             console.print(
-                f"Note: {one.name} drifts from (ωh)^{one.drift_order} on, by a small constant: rounded coefficients do so. Give them as "
-                "fractions, or with all digits, if they are."
+                f"Note: the drift of {one.name} is of order (ωh)^{one.drift_order} with a small constant, as with rounded coefficients. "
+                "If they are rounded, give them as fractions or with all digits."
             )
 
 
 _SHOWN_DENOMINATOR = 10**7
 _ROUNDED = 1e-3
-"""A drift constant below this in an order that the increments could do without is likely that of rounded coefficients."""
+"""A drift constant below this, in an order that the optimum coefficients cancel, is probably due to rounded coefficients."""
 
 
 @dataclass(frozen=True)
@@ -90,23 +90,23 @@ class _Scenario:
 
     angle: float = typer.Option(0.7, help="Half-angle of the cone, degrees.")
     frequency: float = typer.Option(10.0, help="Coning frequency, Hz.")
-    rate: float = typer.Option(100.0, help="Gyro samples a second, Hz.")
-    duration: float = typer.Option(240.0, help="Length of each run, s.")
-    runs: int = typer.Option(100, help="Monte Carlo runs.")
+    rate: float = typer.Option(100.0, help="Sample rate of the gyro, Hz.")
+    duration: float = typer.Option(240.0, help="Duration of each run, s.")
+    runs: int = typer.Option(100, help="Number of Monte Carlo runs.")
     seed: int = typer.Option(1, help="Seed; the same one gives the same runs.")
 
     def parameters(self, own: tuple[Algorithm, ...]) -> ConingParameters:
-        """Return the parameters of the study, ``own`` algorithms compared too; what no algorithm follows is refused."""
+        """Return the parameters of the study, with ``own`` algorithms; raise an error if no algorithm can follow the motion."""
         from strapdown.montecarlo import coning_study
 
         if positive("--angle", self.angle, unit="degrees") >= 90.0:  # in the unit that it was given in
-            raise InputError(f"--angle is {self.angle:g} degrees; a cone's half-angle is below a right angle")
+            raise InputError(f"--angle is {self.angle:g} degrees; the half-angle of a cone must be below 90 degrees")
         found = coning_study.ConingParameters(**{**vars(self), "angle": self.angle * DEGREE, "own": own})
         cycle = self.rate / self.frequency
         if cycle < MIN_SAMPLES_A_CYCLE:
             raise InputError(
-                f"rate is {self.rate:g} Hz, {cycle:.3g} samples of a cone's cycle at {self.frequency:g} Hz; no algorithm follows it: "
-                f"raise the rate, to {MIN_SAMPLES_A_CYCLE:g} samples a cycle at least"
+                f"rate is {self.rate:g} Hz, {cycle:.3g} samples per cone cycle at {self.frequency:g} Hz, too few for any algorithm; "
+                f"raise the rate to at least {MIN_SAMPLES_A_CYCLE:g} samples per cycle"
             )
         return found
 
@@ -117,13 +117,13 @@ def coning(
     out: Path = typer.Option(Path("coning-results"), help="Folder for coning.json and the figures."),
     algorithm: list[Path] | None = typer.Option(
         None,
-        help="TOML file of algorithms of your own, coefficients as textbooks write them; compared beside the package's. May be given "
+        help="TOML file of your own algorithms, coefficients in the order of textbooks; compared with those of the package. May be given "
         "several times.",
     ),
     form: FigureFormat = FORMAT,
     tables: Path | None = TABLES,
 ) -> None:
-    """Study coning: the drift of each integration algorithm, and what a filter makes of it."""
+    """Study coning: the drift of each integration algorithm, and its effect on a filter."""
     from strapdown import plots
     from strapdown.coning import read_algorithms
     from strapdown.montecarlo import coning_study
@@ -148,12 +148,12 @@ def _print_study(motion: _Scenario, summary: dict[str, Any]) -> None:
     scenario = summary["scenario"]
     console.print(
         f"Coning of {motion.angle:g}° at {motion.frequency:g} Hz, gyro sampled at {motion.rate:g} Hz "
-        f"({motion.rate / motion.frequency:.3g} samples a cycle); "
+        f"({motion.rate / motion.frequency:.3g} samples per cycle); "
         f"{counted(motion.runs, 'run')} of {scenario['duration_s']:g} s, seed {motion.seed}.\n"
     )
     if scenario["duration_s"] != motion.duration:
         console.print(
-            f"Runs are {scenario['duration_s']:g} s long, not {motion.duration:g}: whole epochs of whole steps.\n"
+            f"The duration of the runs is {scenario['duration_s']:g} s, not {motion.duration:g}, an integer number of epochs and steps.\n"
         )
     drift = table(
         "Drift of the integration, °/h about the cone's axis", "algorithm", "samples", "measured", "predicted"
@@ -166,7 +166,7 @@ def _print_study(motion: _Scenario, summary: dict[str, Any]) -> None:
         )
     show(drift)
     verdicts = table(
-        "The same noisy filter on each: RMS error / the filter's own σ",
+        "The same filter with each algorithm: RMS error / σ of the filter",
         "integration",
         "attitude\narcsec",
         "bias\n°/h",

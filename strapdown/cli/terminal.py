@@ -1,4 +1,4 @@
-"""Shared by every command: the application, the two consoles, tables."""
+"""Functions shared by all commands: the application, the two consoles, tables."""
 
 from __future__ import annotations
 
@@ -50,21 +50,21 @@ __all__ = [
 ]
 
 LARGEST_NUMBER = 1e30
-"""No number of a scenario is larger in any unit that its file may use; beyond it squares and products leave the range of doubles."""
+"""Maximum of a number in a scenario, in any unit; squares and products of larger ones overflow."""
 MAX_MEASUREMENTS = 1e8
-"""Most measurements of one sensor in a scenario; more do not fit into memory."""
+"""Maximum number of measurements of one sensor in a scenario; more do not fit into memory."""
 
 app = typer.Typer(
     help="Strapdown gyro attitude estimation: simulate, estimate, judge.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
-# Without markup, so that a file name in brackets is said as it is; a statement is one line, which the terminal wraps.
+# Without markup, so that brackets in file names are printed; a statement is one line, which the terminal wraps.
 console = Console(markup=False, highlight=False, soft_wrap=True)
 
 
 def command(function: Callable[..., None]) -> Callable[..., None]:
-    """Register a command. A parameter whose type is a dataclass stands for the options that are its fields, under one heading of --help."""
+    """Register a command; a parameter whose type is a dataclass becomes one option per field, under one heading of --help."""
     hints = get_type_hints(function, include_extras=True)
     groups: dict[str, Any] = {name: hint for name, hint in hints.items() if dataclasses.is_dataclass(hint)}
     parameters = []
@@ -88,7 +88,7 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
 
 
 def _options(group: Any) -> list[inspect.Parameter]:
-    """Return the fields of a group as parameters, their options the defaults; the first line of its docstring is the heading in --help."""
+    """Return the fields of a group as parameters; the first line of its docstring is the heading in --help."""
     hints = get_type_hints(group)
     found = []
     for field in dataclasses.fields(group):
@@ -119,15 +119,15 @@ class FigureFormat(enum.StrEnum):
 
 
 FORMAT: Any = typer.Option(FigureFormat.png, "--format", help="Format of the figures.")
-"""Option of every command that draws."""
+"""Option of all commands that draw figures."""
 TABLES: Any = typer.Option(
-    None, "--tables", help="Folder to write the tables to as well, as CSV with every digit and as LaTeX."
+    None, "--tables", help="Folder to which the tables are also written, as CSV with all digits and as LaTeX."
 )
-"""Option of every command that prints the tables of a study."""
+"""Option of all commands that print the tables of a study."""
 
 
 def counted(number: int, what: str) -> str:
-    """Return a number with what it counts, in the plural unless it is one."""
+    """Return a number with a noun, in the plural unless it is one."""
     return f"{number} {what}" if number == 1 else f"{number} {what}s"
 
 
@@ -141,7 +141,7 @@ def table(title: str, *columns: str, left: int = 1) -> Table:
 
 
 def show(rows: Table) -> None:
-    """Print a table whole: on a narrow terminal its lines run over rather than lose their ends."""
+    """Print a table; on a narrow terminal its lines wrap and are not cut off."""
     width, console.width = console.width, 1000
     try:
         console.print(rows, crop=False)
@@ -150,7 +150,7 @@ def show(rows: Table) -> None:
 
 
 def show_listing(listing: Listing, title: str | None = None, *, notes: bool = False) -> None:
-    """Show the table of a result, perhaps under another title, and its notes where they are asked for."""
+    """Print the table of a result, optionally under another title and with its notes."""
     rows = table(title or listing.title, *listing.columns, left=listing.left)
     styles = {"pass": "green", "FAIL": "red", "likely": "red"}
     for row in listing.rows:
@@ -170,40 +170,40 @@ def tables_written(folder: Path | None, study: str, *results: Any) -> list[Path]
 
 
 def tables_folder(folder: Path | None) -> None:
-    """Refuse a folder of ``--tables`` that cannot be written to, before anything is computed."""
+    """Raise an error if the folder of ``--tables`` cannot be written to, before anything is computed."""
     if folder is not None:
         usable_folder("--tables", folder)
 
 
 def verdict(good: bool) -> Text:
-    """Return "pass" or "FAIL", coloured where the terminal can."""
+    """Return "pass" or "FAIL", in colour on terminals that support it."""
     return Text("pass", style="green") if good else Text("FAIL", style="red")
 
 
 def scenario_named(name: str) -> Scenario:
-    """Return the scenario of a name or a TOML file whose numbers can be computed with, not only read."""
+    """Return the scenario of a name or a TOML file, after checking that its numbers are within the range of computation."""
     from strapdown.scenarios import load_scenario, scenario_to_table
 
     chosen = load_scenario(name)
     for key, number in _numbers("", scenario_to_table(chosen)):
-        if LARGEST_NUMBER < abs(number) < float("inf"):  # infinite is what never happens, such as a time without end
-            raise InputError(f"{name}: {key} is {number:g}, which no such thing can be; check it and its unit")
+        if LARGEST_NUMBER < abs(number) < float("inf"):  # infinity is valid, as for a time that never comes
+            raise InputError(f"{name}: {key} is {number:g}, which is impossible; check it and its unit")
     if chosen.duration * chosen.rate < 1.0:
         raise InputError(
-            f"{name}: {chosen.duration:g} s at {chosen.rate:g} Hz are less than one gyro sample; lengthen the run or raise the rate"
+            f"{name}: {chosen.duration:g} s at {chosen.rate:g} Hz are less than one gyro sample; increase the duration or the rate"
         )
     for sensor in chosen.sensors:
         measurements = chosen.duration * getattr(sensor, "rate", 0.0)
         if measurements > MAX_MEASUREMENTS:
             raise InputError(
                 f"{name}: {sensor.name} would measure {measurements:.3g} times, more than {MAX_MEASUREMENTS:.0e}; lower its rate or "
-                "shorten the run"
+                "the duration"
             )
     return chosen
 
 
 def _numbers(place: str, content: Any) -> Iterator[tuple[str, float]]:
-    """Yield the numbers in a table of TOML with their places."""
+    """Yield the numbers in a TOML table with their places."""
     if isinstance(content, dict):
         for key, value in content.items():
             yield from _numbers(f"{place}.{key}" if place else key, value)
@@ -217,37 +217,35 @@ def _numbers(place: str, content: Any) -> Iterator[tuple[str, float]]:
 def writable(
     option: str, *targets: Path, suffixes: tuple[str, ...] = (), sources: tuple[Path | str | None, ...] = ()
 ) -> None:
-    """Refuse files that a command is going to write but cannot, before it computes what goes into them."""
+    """Raise an error for output files that cannot be written, before anything is computed."""
     for target in targets:
         if target.is_dir():
-            raise InputError(
-                f"{option}: {target} is a folder, and a file of that name is to be written; choose another"
-            )
+            raise InputError(f"{option}: {target} is a folder, but a file of that name must be written; choose another")
         read = [source for source in sources if source is not None]
         output_file(option, target, suffixes or (target.suffix.lower(),), *read)
 
 
 def need_own(target: Path, command: str, own: Callable[[Path], bool]) -> None:
-    """Refuse to replace a file that the command did not write, of which there may be no other copy; its own it may make again."""
+    """Raise an error if the command would replace a file that it did not write, of which there may be no other copy."""
     try:
         replaceable = not target.exists() or own(target)
     except InputError:
         replaceable = False
     if not replaceable:
         raise InputError(
-            f"{target} exists and is not what `strapdown {command}` writes; move it, or choose another --out"
+            f"{target} exists and was not written by `strapdown {command}`; move it, or choose another --out"
         )
 
 
 def doubt(source: Recording, path: Path) -> None:
-    """Say where a recording seems not to be what it says: of all that is made of it, a wrong unit is the likeliest to be missed."""
+    """Warn if axes, signs or units of a recording seem wrong, which is easily overlooked in its estimate."""
     from strapdown.ahrs import check_conventions
 
-    with progress_bar("trying conventions"):
+    with progress_bar("testing conventions"):
         found = check_conventions.examine(source)
     doubts = found.doubts
     if found.verdict == "wrong convention":
-        doubts = (f"as it seems, {found.reason}",)
+        doubts = (f"probably {found.reason}",)
     for words in doubts:
         console.print(f"warning: {words}. See `strapdown doctor {path}`.")
 
@@ -256,7 +254,7 @@ STANDARD_OUTPUT = Path("-")
 
 
 def json_target(json: Path | None, *sources: Path | None) -> None:
-    """Refuse a file for JSON that cannot be written; "-" is standard output, and what else is printed goes to standard error."""
+    """Raise an error if a JSON file cannot be written; "-" is standard output, and all other output then goes to standard error."""
     if json == STANDARD_OUTPUT:
         console.stderr = True
     elif json is not None:
@@ -264,7 +262,7 @@ def json_target(json: Path | None, *sources: Path | None) -> None:
 
 
 def put_json(json: Path | None, content: Any) -> None:
-    """Write JSON where it was asked for."""
+    """Write JSON to the target, if one is given."""
     if json == STANDARD_OUTPUT:
         sys.stdout.write(json_text(content))
     elif json is not None:
@@ -273,5 +271,5 @@ def put_json(json: Path | None, content: Any) -> None:
 
 
 def written(*paths: Any) -> None:
-    """Say which files were written."""
+    """Print which files were written."""
     console.print("Written: " + ", ".join(str(path) for path in paths))

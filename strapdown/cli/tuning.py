@@ -40,39 +40,39 @@ if TYPE_CHECKING:
 
 
 FIGURES = ("likelihood", "heldout")
-"""Figures that are drawn beside the filter, by the ends of their names."""
+"""Figures written beside the filter, by the ends of their names."""
 MAX_EXAMINED = 4
-"""Records that are looked at for what the tuned filter leaves unexplained."""
+"""Maximum number of records examined for errors that the tuned filter does not model."""
 WORSE = 1.05
-"""An attitude error on the data held out that has grown by more than this is reported."""
+"""An increase of the attitude error on the held-out data by more than this factor is reported."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Filter:
-    """Filter to start from."""
+    """Initial filter."""
 
     free: str | None = typer.Option(
         None,
-        help="Parameters to tune, with commas: gyro.arw, gyro.rrw, SENSOR.sigma, initial.attitude, initial.bias, "
-        "gate.probability (as --gate); SENSOR.sigma.x, .y, .z (about one body axis); or filter.scale alone. If not given the "
-        "gyro's two and every sensor's; of a recording without --truth or --rmse filter.scale, and no other.",
+        help="Parameters to tune, separated by commas: gyro.arw, gyro.rrw, SENSOR.sigma, initial.attitude, initial.bias, "
+        "gate.probability (as --gate); SENSOR.sigma.x, .y, .z (about one body axis); or only filter.scale. Default: the two of the "
+        "gyro and the sigma of every sensor; for a recording without --truth or --rmse only filter.scale is allowed.",
     )
     filter_file: Path | None = typer.Option(
-        None, "--filter", help="TOML with a table named filter; by default one that matches the records."
+        None, "--filter", help="TOML with a table named filter. Default: one that matches the records."
     )
     states: bool = typer.Option(
         False,
         "--states",
-        help="Give the filter the optional states that the record's specified errors call for; --free may name their sizes too, such "
-        "as gyro.scale_sigma, SENSOR.correlated_sigma, SENSOR.correlation_time.",
+        help="Add an optional state for each error that the record specifies; --free may then also name their parameters, such as "
+        "gyro.scale_sigma, SENSOR.correlated_sigma, SENSOR.correlation_time.",
     )
     prior: str | None = typer.Option(
-        None, help="Weak prior of the gyro's noise: TOML of `strapdown allan`, or the name of a preset."
+        None, help="Weak prior of the gyro noise: TOML of `strapdown allan`, or the name of a preset."
     )
 
     @property
     def names(self) -> list[str] | None:
-        """Parameters named, if any are."""
+        """Names of the parameters, if given."""
         return None if self.free is None else [name.strip() for name in self.free.split(",") if name.strip()]
 
     def setup(self) -> FilterSetup | None:
@@ -81,11 +81,11 @@ class _Filter:
 
         chosen = None if self.filter_file is None else read_setup(self.filter_file)
         if self.states and chosen is not None:
-            raise InputError("--filter holds the filter's states itself, in [filter.states]; leave --states out")
+            raise InputError("--filter contains the filter's states in [filter.states]; leave --states out")
         return chosen
 
     def wanted(self, cases: Sequence[Case], gyros: dict[str, GyroSpec]) -> list[str]:
-        """Return the parameters to tune on these records; refused are those of a gyro that the records do not share."""
+        """Return the parameters to tune on these records; raise an error for those of a gyro that differs between the records."""
         from strapdown import tuning
 
         if self.names == []:
@@ -97,7 +97,7 @@ class _Filter:
         return wanted
 
     def priors(self, record: ImuRecord, names: Sequence[str]) -> dict[str, Any]:
-        """Return the priors of the parameters named."""
+        """Return the priors of the given parameters."""
         from strapdown import tuning
         from strapdown.gyro import datasheets, read_spec
 
@@ -112,22 +112,22 @@ class _Filter:
 class _Objective:
     """Objective, by default the likelihood of all innovations."""
 
-    truth: bool = typer.Option(False, "--truth", help="Tune by the errors against the truth and their σ.")
+    truth: bool = typer.Option(False, "--truth", help="Tune by the likelihood of the errors relative to the truth.")
     rmse: bool = typer.Option(
-        False, "--rmse", help="Tune by the RMS attitude error against the truth; then all σ alike by innovations."
+        False, "--rmse", help="Tune by the RMS attitude error against the truth; then scale all σ by innovations."
     )
     gate: bool = typer.Option(
         False,
         "--gate",
-        help="Model outliers too, their share and scale, and set the filter's gate where an outlier is the likelier explanation.",
+        help="Also model the fraction and scale of outliers, and set the filter's gate where an outlier is more likely than noise.",
     )
     spacing: float = typer.Option(
-        0.0, help="Use a sensor's samples this many seconds apart, with the weight of all: for disturbances that last."
+        0.0, help="Use samples of a sensor this far apart, s, with the weight of all: for correlated disturbances."
     )
     holdout: float | None = typer.Option(
-        None, help="Share of the data held out, to judge the filter before and after on."
+        None, help="Fraction of the data held out, for comparing the filter before and after tuning."
     )
-    holdout_by: str = typer.Option("time", help="Hold out the end of each record (time), or whole ones (record).")
+    holdout_by: str = typer.Option("time", help="Hold out the end of each record (time), or complete records (record).")
 
     @property
     def name(self) -> str:
@@ -136,7 +136,7 @@ class _Objective:
         return name + (" of the errors" if self.truth else "")
 
     def split(self, cases: Sequence[Case]) -> tuple[tuple[Case, ...], tuple[Case, ...]]:
-        """Return the data to tune on and those held out."""
+        """Return the data for tuning and the held-out data."""
         from strapdown import tuning
 
         if self.holdout is None:
@@ -148,19 +148,19 @@ class _Objective:
 class _Search:
     """Search."""
 
-    starts: int = typer.Option(4, help="Searches: one from the filter, the others from random starts.")
-    factor: float = typer.Option(30.0, help="Random starts are off by up to this factor, either way.")
-    seed: int = typer.Option(0, help="Of the random starts.")
-    threads: int | None = typer.Option(None, help="Threads; one a core if not given.")
+    starts: int = typer.Option(4, help="Number of searches: one from the filter, the others from random values.")
+    factor: float = typer.Option(30.0, help="Maximum factor between random and initial values, up or down.")
+    seed: int = typer.Option(0, help="Seed of the random values.")
+    threads: int | None = typer.Option(None, help="Number of threads. Default: one per core.")
 
 
 @dataclass(frozen=True)
 class _Planning:
     """Plan, before there are records."""
 
-    plan: bool = typer.Option(False, "--plan", help="Predict how well records will determine each parameter.")
+    plan: bool = typer.Option(False, "--plan", help="Predict the uncertainty of each parameter for future records.")
     length: str | None = typer.Option(
-        None, help="Lengths of a record, s, with commas; that of the scenario if not given."
+        None, help="Durations of a record, s, separated by commas. Default: that of the scenario."
     )
 
 
@@ -169,24 +169,24 @@ class _Output:
     """Output."""
 
     out: Path = typer.Option(
-        Path("filter.toml"), "--out", "-o", help="TOML for --filter of other commands; JSON and figures go beside it."
+        Path("filter.toml"), "--out", "-o", help="TOML for --filter of other commands, beside it JSON and figures."
     )
     form: FigureFormat = FORMAT
     tables: Path | None = TABLES
 
 
 class _Found(NamedTuple):
-    """What a tuning found."""
+    """Result of a tuning."""
 
     result: Tuning
     objective: Any
     gate: TunedGate | None
     comparison: Comparison | None
     examined: Sequence[Unmodelled]
-    """What the tuned filter leaves unexplained of each record."""
+    """Tests of each record for errors that the tuned filter does not model."""
     worst: Unmodelled | None
     attitude_rms: tuple[float, float] | None
-    """Before and after, rad, where it was minimised."""
+    """RMS attitude error before and after, rad, if it was the objective."""
 
 
 @command
@@ -205,7 +205,7 @@ def tune(
     layout: Layout,
     output: _Output,
 ) -> None:
-    """Tune the filter by maximum likelihood, with an interval for each parameter."""
+    """Tune the filter by maximum likelihood, with a confidence interval for each parameter."""
     from strapdown import recordings, tuning
 
     workers = count("threads", search.threads if search.threads is not None else os.cpu_count() or 1)
@@ -214,7 +214,7 @@ def tune(
         _plan(records, chosen, start, planning.length, workers)
         return
     if planning.length is not None:
-        raise InputError("--length is for --plan; the records' own length is taken")
+        raise InputError("--length goes with --plan; leave it out")
     count("seed", search.seed, minimum=0)
     _check_files(records, start.filter_file, output)
     cases, before, gyros = _cases(records, chosen, start, layout)
@@ -223,8 +223,8 @@ def tune(
         start, goal = replace(start, free=",".join(names)), replace(goal, spacing=spacing)
     if (before.gate or before.robust) and not (goal.truth or goal.gate):
         console.print(
-            "The filter's gate and weights are not applied: what passes a gate is the likelier the narrower it is. --gate models outliers, "
-            "and --truth tunes the filter as it runs."
+            "The filter's gate and weights are not applied: a narrower gate would always increase the likelihood. --gate models outliers, "
+            "and --truth tunes the filter with its gate and weights."
         )
     found = _tuned(cases, before, gyros, start, goal, search, workers)
     show_listing(found.result.listing(), notes=True)
@@ -249,7 +249,7 @@ def _tuned(
     search: _Search,
     workers: int,
 ) -> _Found:
-    """Tune, compare on the data held out, and look at what the tuned filter leaves unexplained."""
+    """Tune, compare on the held-out data, and test for errors that the tuned filter does not model."""
     from strapdown import tuning
 
     train, held = goal.split(cases)
@@ -284,12 +284,12 @@ def _tuned(
 
 
 def _check_files(records: Sequence[Path], filter_file: Path | None, output: _Output) -> None:
-    """Refuse a record that is given twice, and files that cannot be written or are not this command's."""
+    """Raise an error for a record given twice, and for files that cannot be written or were not written by this command."""
     from strapdown.report import tunings
 
     for k, path in enumerate(records):
         if path.exists() and any(path.samefile(other) for other in records[:k] if other.exists()):
-            raise InputError(f"{path} is given twice; a record counts once")
+            raise InputError(f"{path} is given twice; give each record once")
     sources, out = (*records, filter_file), output.out
     report = out.with_suffix(".json")
     writable("out", out, suffixes=(".toml",), sources=sources)
@@ -302,12 +302,12 @@ def _check_files(records: Sequence[Path], filter_file: Path | None, output: _Out
 def _compared(
     held: Sequence[Case], before: FilterSetup, objective: Any, result: Tuning, threads: int, *, gated: bool
 ) -> Comparison | None:
-    """Return the filter before and after on the data held out, if any; ``gated``: the likelihood after is that with the gate."""
+    """Compare the filter before and after tuning on the held-out data, if any; ``gated``: the likelihood after includes the gate."""
     from strapdown import tuning
 
     if not held:
         return None
-    with progress_bar("judging on the data held out"):
+    with progress_bar("judging on the held-out data"):
         comparison = tuning.compare(held, before, result.setup, threads=threads)
     if not gated:
         return comparison
@@ -316,14 +316,14 @@ def _compared(
 
 
 def _examined(train: Sequence[Case], before: FilterSetup, result: Tuning) -> tuple[list[Unmodelled], Unmodelled | None]:
-    """Return what the tuned filter leaves unexplained of each record, and the worst of it."""
+    """Return tests of each record for errors that the tuned filter does not model, and the worst of them."""
     from strapdown import tuning
 
-    # Optional states stand for just that; and the search knows one σ a sample.
+    # Optional states model such errors already; and the search supports one σ per sample only.
     looked = before.states is None and not _differs_by_axis(train, result.setup)
     suspects = train[:MAX_EXAMINED] if looked else ()
     examined = []
-    with progress_bar("what is left unexplained", len(suspects)) as advance:
+    with progress_bar("unmodelled errors", len(suspects)) as advance:
         for case in suspects:
             examined.append(tuning.unmodelled(case, result.setup))
             advance(1)
@@ -343,7 +343,7 @@ def _differs_by_axis(cases: Sequence[Case], chosen: FilterSetup) -> bool:
 def _cases(
     paths: Sequence[Path], chosen: FilterSetup | None, start: _Filter, layout: Layout
 ) -> tuple[list[Case], FilterSetup, dict[str, GyroSpec]]:
-    """Return the records to tune on, the filter to start from, and the gyros of the records that hold theirs."""
+    """Return the records, the initial filter, and the gyro specifications of the records that contain one."""
     from strapdown import recordings, tuning
     from strapdown.cli.filters import filter_for, need_angles
     from strapdown.recordings import recordfiles
@@ -357,7 +357,7 @@ def _cases(
             if chosen is None:
                 if gyro is None:
                     raise InputError(
-                        f"{path} does not hold its gyro's specification; give a filter to start from, --filter filter.toml"
+                        f"{path} does not contain its gyro's specification; give an initial filter, --filter filter.toml"
                     )
                 chosen, remarks = filter_for(path, record, None, None, () if start.states else False)
                 for remark in remarks:
@@ -383,12 +383,12 @@ def _cases(
 def _print_gate(found: TunedGate) -> None:
     if found.gate is None:
         why = "no outliers" if not found.share.identified else "noise of two sizes rather than outliers"
-        console.print(f"The records show {why}; the filter's gate is left as it was.")
+        console.print(f"The records show {why}; the filter's gate is unchanged.")
         return
     thresholds = ", ".join(f"{value:.1f} of {name}" for name, value in found.thresholds.items())
     console.print(
-        f"An outlier is the likelier explanation of a NIS above {thresholds}. The gate lets {100.0 * found.probability:.4g} % of right "
-        f"measurements pass (95 %: {100.0 * found.lower:.4g} to {100.0 * found.upper:.4g})."
+        f"A measurement with a NIS above {thresholds} is more likely an outlier than noise. The gate accepts "
+        f"{100.0 * found.probability:.4g} % of valid measurements (95 %: {100.0 * found.lower:.4g} to {100.0 * found.upper:.4g})."
     )
 
 
@@ -401,9 +401,9 @@ def _print_comparison(comparison: Comparison, *, truth: bool) -> None:
         for line in judgement.words.splitlines()[1:]:
             console.print("After:" + line[3:])
     if not comparison.better and not truth:
-        console.print("On the data held out the tuned filter is less likely than the one before: keep that one.")
+        console.print("On the held-out data the likelihood has decreased: keep the previous filter.")
     elif comparison.after.attitude_rms > WORSE * comparison.before.attitude_rms:
-        console.print("On the data held out the attitude error has grown: keep the filter before.")
+        console.print("On the held-out data the attitude error has increased: keep the previous filter.")
 
 
 def _write(found: _Found, paths: Sequence[Path], of: str, output: _Output) -> None:
@@ -429,7 +429,7 @@ def _write(found: _Found, paths: Sequence[Path], of: str, output: _Output) -> No
         figures = {places["likelihood"]: drawing.likelihood_slices(tuning.slices(found.objective, result), result)}
     if found.comparison is not None:
         figures[places["heldout"]] = drawing.before_and_after(
-            found.comparison, title="The first record, on what was held out"
+            found.comparison, title="Held-out part of the first record"
         )
     written(out, report, *save_as(figures, output.form), *tables_written(output.tables, "tuning", content))
 
@@ -442,7 +442,7 @@ def _report(found: _Found, paths: Sequence[Path], of: str) -> dict[str, Any]:
             {**vars(one), "note": one.words, "unit": one.unit.name, "si_per_unit": one.unit.factor}
             for one in result.parameters
         ],
-        "units": "SI: rad, s, and the units of whole vectors; pages and tables give each in its unit, si_per_unit of it",
+        "units": "SI: rad, s, and the units of whole vectors; divide by si_per_unit for the unit of a parameter",
         "objective": {
             "name": of,
             "before": result.before,
@@ -479,7 +479,7 @@ def _plan(
     from strapdown.recordings import recordfiles
 
     if len(sources) != 1:
-        raise InputError(f"--plan takes one scenario; {len(sources)} are given")
+        raise InputError(f"--plan needs one scenario, but {len(sources)} are given; give one")
     lengths = None if length is None else _numbers(length)
     (source,) = sources
     of_record = source.is_file() and recordfiles.is_record(source)
@@ -499,7 +499,7 @@ def _scenario_of(path: Path) -> Scenario:
 
     origin = recordfiles.read_record(path).origin
     if origin is None or origin.scenario is None:
-        raise InputError(f"{path} does not hold its scenario; give the scenario's name or TOML file to --plan")
+        raise InputError(f"{path} does not contain its scenario; give the scenario's name or TOML file to --plan")
     scenario: Scenario = origin.scenario
     return scenario
 
@@ -508,4 +508,4 @@ def _numbers(text: str) -> list[float]:
     try:
         return [float(part) for part in text.split(",")]
     except ValueError:
-        raise InputError(f"--length is {text!r}; it must be seconds with commas, as in 600,1800") from None
+        raise InputError(f"--length is {text!r}; give seconds separated by commas, such as 600,1800") from None

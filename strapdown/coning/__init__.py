@@ -1,17 +1,18 @@
-"""Strapdown integration of gyro samples: algorithms as frozen tables whose drift is derived exactly, one accumulator for all.
+"""Strapdown integration of gyro samples: algorithms as tables of coefficients whose drift is derived exactly.
 
-An increment Δθ is the integral of the body rate over one sample interval. A step combines N of them, and perhaps p before and f
-after, into its rotation δq; attitude advances by ``q ← q ⊗ δq``, the solution of equation (17) of *Quaternion differentiation*.
+An increment Δθ is the integral of the body rate over one sample interval. The rotation δq of a step is computed from its N increments, and
+for some algorithms also from p before and f after it; attitude is propagated by ``q ← q ⊗ δq``, the solution of equation (17) of
+*Quaternion differentiation*.
 
-- ``coefficients``: The mathematics of the tables, in exact rationals.
+- ``coefficients``: Derivation of the coefficients, in exact rationals.
 - ``algorithms``: :class:`Algorithm`, the catalogue :data:`ALGORITHMS`, and :func:`algorithm_rows`, its printed table.
 - ``stepping``: :func:`integrate`, :func:`rotation_vectors`: from records to attitude.
-- ``drift``: :func:`predicted_coning_drift`, :func:`vibration_drift`: the drift that vibration leaves.
+- ``drift``: :func:`predicted_coning_drift`, :func:`vibration_drift`: the drift due to coning and vibration.
 
-What to choose: ``"four-sample"`` for ordinary work; ``"matched-1-8-8"`` for recorded data or where a delay of eight samples is
-allowed; ``"matched-2-8"`` in real time; ``"matched-4-11"`` in real time with a quiet gyro. (Its long one-sided fit amplifies noise
-24 times beside a rotation of one radian per sample; ``"matched-2-8"`` 2.1 times, ``"matched-1-8-8"`` 0.12 times.) The matched
-family is this package's own; :func:`strapdown.coning.coefficients.matched_correction` derives it.
+Recommended: ``"four-sample"`` in most cases; ``"matched-1-8-8"`` for recorded data or if a delay of eight samples is allowed;
+``"matched-2-8"`` in real time; ``"matched-4-11"`` in real time with a low-noise gyro. (Its long one-sided fit amplifies noise 24 times at a
+rotation of one radian per sample; ``"matched-2-8"`` 2.1 times, ``"matched-1-8-8"`` 0.12 times.) The matched family was derived for this
+package: :func:`strapdown.coning.coefficients.matched_correction`.
 """
 
 from strapdown.coning.algorithms import ALGORITHMS, Algorithm, read_algorithms
@@ -25,7 +26,7 @@ from strapdown.coning.drift import vibration_drift as vibration_drift
 from strapdown.coning.stepping import increments_from_rates, integrate, rotation_vectors
 from strapdown.coning.stepping import time_per_sample as time_per_sample
 
-# Imported as itself above and not listed here: for the package alone.
+# Names imported as themselves above and not listed here are for use within the package.
 __all__ = [
     "ALGORITHMS",
     "Algorithm",

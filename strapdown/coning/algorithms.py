@@ -1,4 +1,4 @@
-"""The algorithms: frozen tables whose drift under small coning follows exactly, and the catalogue of all of them."""
+"""Integration algorithms as tables of coefficients, from which the drift under small coning is derived exactly, and their catalogue."""
 
 from __future__ import annotations
 
@@ -28,20 +28,20 @@ SOLVERS = {
     "runge-kutta-4": "classical Runge–Kutta on the quaternion",
     "euler": "first-order update of the quaternion, normalised",
 }
-"""How an algorithm turns the increments of a step into its rotation."""
+"""Methods by which the rotation of a step is computed from its increments."""
 
 Coefficient = int | float | str | Fraction
-"""Forms of a coefficient: 27/20 as "27/20", 1.35, "1.35" or Fraction(27, 20)."""
+"""Types of a coefficient: 27/20 as "27/20", 1.35, "1.35" or Fraction(27, 20)."""
 
 _TABLES = {"compressed": "coefficients", "pairs": "pairs", "polynomial": "correction"}
-"""The table that a solver reads. The other solvers read none, and no increments but those of the step."""
+"""The table that a solver uses. The other solvers use none, and only the increments of the step."""
 
 
 def pair_tables(samples: int, window: int, own: Mapping[int, Table]) -> Array:
     """Return pair tables as floats by the place of the step in the window (M − N + 1, M, M): ``own``, and time-Taylor ones elsewhere.
 
-    Near the ends of a record the window stays inside it and the step takes another place in the window, for which the algorithm's own
-    table is not made; a record shorter than the window has none of it.
+    Near the ends of a record the window is shifted to stay inside it, so that the step has another place in the window, for which the table
+    of the algorithm is not valid. For a record shorter than the window it is never valid.
     """
     places = range(max(0, window - samples + 1))
     tables = [own.get(place) or exact.taylor_pairs(samples, place, window - samples - place) for place in places]
@@ -50,7 +50,7 @@ def pair_tables(samples: int, window: int, own: Mapping[int, Table]) -> Array:
 
 @dataclass(frozen=True, kw_only=True)
 class Algorithm:
-    """An integration algorithm as a table; the drift under small coning follows from it in exact rationals.
+    """Integration algorithm as a table of coefficients, from which the drift under small coning is derived in exact rationals.
 
     Parameters
     ----------
@@ -59,23 +59,23 @@ class Algorithm:
     solver : str
         One of :data:`SOLVERS`.
     samples : int
-        N, increments in a step.
+        N, number of increments in a step.
     previous : int, default 0
-        p, increments used before the step.
+        p, number of increments used before the step.
     following : int, default 0
-        f, increments used after the step: the delay in samples.
+        f, number of increments used after the step: the delay in samples.
     rate_points : int, default 0
-        Rate samples in the quadrature that forms one increment; 0 where the algorithm takes true increments.
+        Number of rate samples in the quadrature of one increment; 0 if the algorithm uses true increments.
     order : int
-        Global order of convergence on any smooth motion, with all increments exact.
+        Global order of convergence for any smooth motion and exact increments.
     coefficients : tuple of Fraction, default empty
-        Of the compressed solver: k_1 … k_{N−1+p} in φ = Σ Δθ_i + (Σ_j k_j Δθ_{N−j}) × Δθ_N.
+        For the compressed solver: k_1 … k_{N−1+p} in φ = Σ Δθ_i + (Σ_j k_j Δθ_{N−j}) × Δθ_N.
     pairs : tuple of tuples of Fraction, default empty
-        Of the pairs solver: K over the window in φ = Σ Δθ_i + Σ_{i<j} K_ij Δθ_i × Δθ_j, a pair table (see ``coefficients``).
+        For the pairs solver: K over the window in φ = Σ Δθ_i + Σ_{i<j} K_ij Δθ_i × Δθ_j, a pair table (see ``coefficients``).
     correction : tuple of tuples of Fraction, default empty
-        Of the polynomial solver: the pair table C that is added to the solution of the quaternion equation; zeros for none.
+        For the polynomial solver: the pair table C that is added to the solution of the quaternion equation; zeros for none.
     source : str, default ""
-        Where it was published.
+        Publication.
     """
 
     name: str
@@ -105,12 +105,12 @@ class Algorithm:
     def _check_window(self) -> None:
         if self.solver == "compressed" and self.following:
             raise InputError(
-                f"{self.name}: following is {self.following}, but the compressed solver ends with the step's last increment; "
+                f"{self.name}: following is {self.following}, but the compressed solver uses no increments after the step; "
                 "use solver 'pairs'"
             )
         if self.solver not in _TABLES and self.window != self.samples:
             raise InputError(
-                f"{self.name}: solver {self.solver!r} uses the increments of the step alone; previous and following must be 0"
+                f"{self.name}: solver {self.solver!r} uses only the increments of the step; previous and following must be 0"
             )
 
     def _check_tables(self) -> None:
@@ -125,7 +125,7 @@ class Algorithm:
         entries = table if own == "coefficients" else [x for row in table for x in row]
         if not all(isinstance(x, Rational) for x in entries):
             raise InputError(
-                f"{self.name}: {own} holds a number that is not rational; give fractions.Fraction or int, for orders are checked exactly"
+                f"{self.name}: {own} has a number that is not rational; give fractions.Fraction or int, since orders are derived exactly"
             )
         if own == "coefficients":
             if len(table) != m - 1:
@@ -150,8 +150,8 @@ class Algorithm:
         name : str
             Name of the algorithm.
         coefficients : sequence of int, float, str or Fraction
-            c_1 … c_{M−1}, the oldest increment's first, as textbooks write them (the field ``coefficients`` counts them from the
-            last). M = N + p. A float is taken as the nearest simple fraction (:func:`strapdown.coning.coefficients.rational`).
+            c_1 … c_{M−1}, that of the oldest increment first, as in textbooks (the field ``coefficients`` has the opposite order).
+            M = N + p. A float is converted to a simple fraction (:func:`strapdown.coning.coefficients.rational`).
         previous : int, default 0
             p, increments before the step; the sum Σ Δθ_i is that of the N others.
         source : str, default ""
@@ -205,11 +205,11 @@ class Algorithm:
         name : str
             Name of the algorithm.
         samples : int
-            N, increments in a step.
+            N, number of increments in a step.
         products : iterable of (i, j, K_ij)
-            Increments are counted from 1, the oldest of the window; i and j differ. K_ij as in :meth:`from_coefficients`.
+            Increments are counted from 1, the oldest of the window; i ≠ j. Types of K_ij as in :meth:`from_coefficients`.
         previous, following : int, default 0
-            Increments of the window before and after the step.
+            Number of increments of the window before and after the step.
         source : str, default ""
             Publication.
 
@@ -252,14 +252,14 @@ class Algorithm:
 
     @classmethod
     def from_table(cls, table: Mapping[str, Any], place: str = "algorithm") -> Algorithm:
-        """Return the algorithm in a table of a file.
+        """Return the algorithm defined by a table of a file.
 
         Parameters
         ----------
         table : mapping of str
             Arguments of :meth:`from_coefficients` or :meth:`from_products` by name.
         place : str, default "algorithm"
-            Name of the table, for messages.
+            Name of the table, for error messages.
 
         Returns
         -------
@@ -270,7 +270,7 @@ class Algorithm:
             place, table, ("name", "samples", "previous", "following", "coefficients", "products", "source")
         )
         if not isinstance(table.get("name"), str):
-            raise InputError(f"{place}: name is missing; give the algorithm one, in quotes")
+            raise InputError(f"{place}: name is missing; give the algorithm a name, in quotes")
         if ("coefficients" in table) == ("products" in table):
             raise InputError(
                 f"{place}: give either coefficients, [c_1, …] of (Σ c_i Δθ_i) × Δθ_M, or products, [[i, j, K], …] of K Δθ_i × Δθ_j"
@@ -287,11 +287,11 @@ class Algorithm:
         made = cls.from_coefficients(coefficients=entries, **rest)
         if wanted is not None and wanted != made.samples:
             raise InputError(
-                f"{place}: samples is {wanted}, but {len(entries)} coefficients with previous {made.previous} are of {made.samples} samples"
+                f"{place}: samples is {wanted}, but {len(entries)} coefficients and previous {made.previous} need {made.samples}"
             )
         if late:
             raise InputError(
-                f"{place}: following is {late}; coefficients end with the step's last increment: give products"
+                f"{place}: following is {late}, but coefficients use no increments after the step; give products"
             )
         return made
 
@@ -302,7 +302,7 @@ class Algorithm:
         Parameters
         ----------
         path : path-like
-            File; for one with several tables see :func:`read_algorithms`.
+            File; for a file with several tables see :func:`read_algorithms`.
 
         Returns
         -------
@@ -322,7 +322,7 @@ class Algorithm:
         Returns
         -------
         dict
-            Table of a rotation-vector algorithm; no other has such a form.
+            Table; exists for rotation-vector algorithms only.
 
         Raises
         ------
@@ -342,28 +342,26 @@ class Algorithm:
                 [i + 1, j + 1, str(self.pairs[i][j])] for i in range(m) for j in range(i + 1, m) if self.pairs[i][j]
             ]
         else:
-            raise InputError(
-                f"{self.name}: an algorithm with solver {self.solver!r} is written to files by its name alone"
-            )
+            raise InputError(f"{self.name}: an algorithm with solver {self.solver!r} has no table; write its name")
         if self.source:
             table["source"] = self.source
         return table
 
     @property
     def window(self) -> int:
-        """M = N + p + f, increments used for one step."""
+        """M = N + p + f, number of increments used for one step."""
         return self.samples + self.previous + self.following
 
     @property
     def needs(self) -> str:
-        """Input of the algorithm in words: increments or rates, and the delay."""
+        """Description of the input: increments or rates, and the delay."""
         if self.rate_points:
             return f"rates ({self.rate_points}-point quadrature)"
         return "increments" + (f", {self.following} samples late" if self.following else "")
 
     @functools.cached_property
     def products(self) -> Table:
-        """All products of two increments in a step, to second order, as a pair table over the window; it follows from the solver."""
+        """Coefficients of all products of two increments in a step, as a pair table over the window."""
         n, m = self.samples, self.window
         if self.solver == "compressed":
             before = [*reversed(self.coefficients), Fraction(0)]
@@ -381,13 +379,13 @@ class Algorithm:
 
     @functools.cached_property
     def _leading_drift(self) -> tuple[int, Fraction]:
-        # M − 1 lag sums satisfy at most as many conditions, so the drift begins at λ^{2M} at the latest.
+        # M − 1 lag sums satisfy at most M − 1 conditions, so the drift is of order λ^{2M} at most.
         series = self._drift_series(self.window + 1)
         return next((2 * n, c) for n, c in enumerate(series) if c)
 
     @property
     def drift_order(self) -> int:
-        """Even power of λ with which the drift under small coning falls."""
+        """Order of the drift under small coning: the (even) power of λ."""
         return self._leading_drift[0]
 
     @property
@@ -395,7 +393,7 @@ class Algorithm:
         """C of the leading drift −C β² ω λ^``drift_order``; for N + p samples, compressed, (M!)²/(2(2M+1)!)."""
         return -self._leading_drift[1]
 
-    # The kernels' forms of the tables, kept with them: hashing hundreds of fractions for a cache costs more than a short record.
+    # Arrays for the kernels, cached here: hashing hundreds of fractions for a cache takes longer than a short record.
 
     @functools.cached_property
     def coefficient_array(self) -> Array:
@@ -413,12 +411,12 @@ class Algorithm:
         return exact.floats(self.correction)
 
     def _drift_series(self, terms: int) -> Rationals:
-        """Return the powers 0, 2, 4, … of λ of the drift over β²ω."""
+        """Return the coefficients of λ⁰, λ², λ⁴, … of the drift divided by β²ω."""
         return tuple(c / self.samples for c in exact.residuals(self.lags, self.samples, self.rate_points, terms))
 
     @functools.cached_property
     def drift_series(self) -> tuple[float, ...]:
-        """The powers 0, 2, 4, … of λ of the drift over β²ω, enough of them for λ ≤ 1 and a window of 17."""
+        """Coefficients of λ⁰, λ², λ⁴, … of the drift divided by β²ω, enough for λ ≤ 1 and a window of 17."""
         return tuple(float(c) for c in self._drift_series(48))
 
 
@@ -457,23 +455,23 @@ def read_algorithms(path: str | os.PathLike[str]) -> tuple[Algorithm, ...]:
             for k, table in enumerate(tables if isinstance(tables, list) else [tables])
         ]
         if not found or not all(isinstance(table, Mapping) for _, table in found):
-            raise InputError(f"{path} has no table [algorithm]; write name, and coefficients or products, into one")
+            raise InputError(f"{path} has no table [algorithm]; add one with name, and coefficients or products")
         made = tuple(Algorithm.from_table(table, place) for place, table in found)
     names = [one.name for one in made]
     for one in made:
         if names.count(one.name) > 1:
-            raise InputError(f"{path} holds two algorithms of the name {one.name}; give each its own")
+            raise InputError(f"{path} has two algorithms of the name {one.name}; give each a different name")
         if one.name in ALGORITHMS:
             raise InputError(f"{path}: {one.name} is the name of a built-in algorithm; choose another")
     return made
 
 
 def _scheme_products(solver: str, samples: int) -> Table:
-    """Return the products of two increments that a one-step scheme makes of its moments B_n, or of its rates w."""
+    """Return the pair table of a one-step scheme that uses moments B_n or rates w."""
     if solver == "euler":
         return ((Fraction(0),) * samples,) * samples
     if solver == "runge-kutta-4":
-        # In the vector part of the step quaternion, doubled: T²/12 (w₀ × w_½ + w_½ × w₁).
+        # Twice the vector part of the step quaternion has the products T²/12 (w₀ × w_½ + w_½ × w₁).
         w = exact.step_rates_at(samples, (Fraction(0), Fraction(samples, 2), Fraction(samples)))
         both = exact.sum_of_tables(exact.outer_pairs(w[0], w[1]), exact.outer_pairs(w[1], w[2]))
         return tuple(tuple(x / 12 for x in row) for row in both)
@@ -489,7 +487,7 @@ def _scheme_products(solver: str, samples: int) -> Table:
 
 
 def compressed(samples: int, previous: int = 0, rate_points: int = 0) -> Algorithm:
-    """Return the coning-optimal compressed algorithm with N samples and p of the step before."""
+    """Return the coning-optimal compressed algorithm with N samples and p samples of the previous step."""
     name = f"{_NUMBERS[samples - 1]}-sample" + (f"-previous-{previous}" if previous else "")
     m = samples + previous
     if rate_points:
@@ -503,8 +501,8 @@ def compressed(samples: int, previous: int = 0, rate_points: int = 0) -> Algorit
         samples=samples,
         previous=previous,
         rate_points=rate_points,
-        # One lag-symmetric cross product serves coning; for a general motion it is exact for linear rates only, and two samples alone
-        # are symmetric enough to gain an order.
+        # One lag-symmetric cross product is optimal for coning. For general motion it is exact for linear rates only; two samples gain an
+        # order by symmetry.
         order=2 if m == 1 or rate_points == 2 else 4 if (samples, previous) == (2, 0) else 3,
         coefficients=table,
         source="this package, from rate samples" if rate_points else "Miller 1983; Ignagni 1996; Savage 2010",
@@ -524,19 +522,19 @@ def uncompressed_taylor(samples: int) -> Algorithm:
 
 
 def uncompressed_optimal(samples: int) -> Algorithm:
-    """Return the uncompressed algorithm that is optimal under coning and keeps what it can of the time-Taylor one."""
+    """Return the uncompressed algorithm that is optimal under coning and otherwise closest to the time-Taylor algorithm."""
     return Algorithm(
         name=f"uncompressed-{samples}",
         solver="pairs",
         samples=samples,
         order=4,
         pairs=exact.sum_of_tables(exact.taylor_pairs(samples), exact.matched_correction(samples)),
-        source="Song 2013, with the freedom used as in matched_correction",
+        source="Song 2013, with the free coefficients of matched_correction",
     )
 
 
 def polynomial(samples: int) -> Algorithm:
-    """Return the quaternion equation solved to rounding on the rate polynomial through the N increments of a step."""
+    """Return the algorithm that solves the quaternion equation to rounding for the rate polynomial through the N increments of a step."""
     return Algorithm(
         name=f"polynomial-{samples}",
         solver="polynomial",
@@ -548,7 +546,7 @@ def polynomial(samples: int) -> Algorithm:
 
 
 def matched(samples: int, previous: int, following: int = 0) -> Algorithm:
-    """Return this package's own algorithm; :func:`strapdown.coning.coefficients.matched_correction` derives it."""
+    """Return an algorithm derived for this package, see :func:`strapdown.coning.coefficients.matched_correction`."""
     m = samples + previous + following
     return Algorithm(
         name=f"matched-{samples}-{previous}" + (f"-{following}" if following else ""),
@@ -568,14 +566,14 @@ def scheme(name: str, solver: str, samples: int, order: int, source: str) -> Alg
 
 
 _SCHEMES = {
-    # On moments of the polynomial.
+    # From moments of the polynomial.
     "magnus-4": ("magnus-4", 3, 4, "Blanes, Casas, Ros 2000"),
     "magnus-6": ("magnus-6", 4, 6, "Blanes, Casas, Ros 2000"),
     # exp(½B₀ − 2B₁) ⊗ exp(½B₀ + 2B₁).
     "commutator-free-4": ("commutator-free-4", 3, 4, "Blanes, Moan 2006"),
-    # On equation (17), with rates at 0, T/2, T.
+    # From equation (17), with rates at 0, T/2, T.
     "runge-kutta-4": ("runge-kutta-4", 3, 4, "Kutta 1901"),
-    # q + ½ q ⊗ Δθ, normalised: that of many small projects.
+    # q + ½ q ⊗ Δθ, normalised, as in many small projects.
     "quaternion-euler": ("euler", 1, 2, "Euler 1768"),
 }
 """Solver, samples, order and source of each."""
@@ -593,7 +591,7 @@ _NUMBERS = ("one", "two", "three", "four", "five", "six", "seven", "eight")
 
 
 class Catalogue(Mapping[str, Algorithm]):
-    """Algorithms by name, each made (and so checked) when first asked for: importing costs nothing."""
+    """Algorithms by name, each constructed and checked on first use, so that the import is fast."""
 
     def __init__(self, makers: dict[str, Callable[[], Algorithm]]) -> None:
         self._makers = makers
@@ -642,7 +640,7 @@ def _makers() -> dict[str, Callable[[], Algorithm]]:
 
 
 ALGORITHMS: Mapping[str, Algorithm] = Catalogue(_makers())
-"""Every algorithm by name."""
+"""All built-in algorithms by name."""
 
 
 def named(algorithm: str | Algorithm) -> Algorithm:
@@ -655,7 +653,7 @@ def named(algorithm: str | Algorithm) -> Algorithm:
 
 
 def algorithm_rows() -> list[dict[str, str | int | float]]:
-    """Return the printed table of the catalogue, one row an algorithm."""
+    """Return the printed table of the catalogue, one row per algorithm."""
     return [
         {
             "name": a.name,

@@ -1,9 +1,9 @@
 """Coefficients of the integration algorithms, in exact rationals.
 
-Time is counted in sample intervals. A window of M increments covers [0, M]; a step of N of them starts at sample p of the window and
-leaves f = M − N − p after it. A *pair table* K is antisymmetric and means Σ_{i<j} K_ij Δθ_i × Δθ_j. Its *lag sums*
-``k_l = Σ_i K_{i,i+l}`` determine the response to small coning: two increments l samples apart have the mean product 2(1 − cos λ) sin lλ, so
-that the drift of a step, for small β, is ``β² [Σ k_l 2(1 − cos λ) sin lλ − ½(Nλ − sin Nλ)]``.
+The unit of time is the sample interval. A window of M increments covers [0, M]; a step of N increments starts at sample p of the window,
+and f = M − N − p increments follow it. A *pair table* K is antisymmetric and represents Σ_{i<j} K_ij Δθ_i × Δθ_j. Its *lag sums* ``k_l =
+Σ_i K_{i,i+l}`` determine the response to small coning: two increments l samples apart have the mean product 2(1 − cos λ) sin lλ, so that
+the drift of a step, for small β, is ``β² [Σ k_l 2(1 − cos λ) sin lλ − ½(Nλ − sin Nλ)]``.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def compressed_coefficients(samples: int, previous: int = 0) -> Rationals:
     """Return k_1 … k_{M−1} of the compressed coning correction with ``samples`` N and ``previous`` p, M = N + p, in closed form.
 
     They solve ``Σ k_j 2(1 − cos λ) sin jλ = ½(Nλ − sin Nλ)`` up to the power λ^{2M−1}. In the second differences
-    ``e_l = k_{l−1} − 2k_l + k_{l+1}`` (k_0 = k_M = 0) the system is a Vandermonde one in l², with the solution
+    ``e_l = k_{l−1} − 2k_l + k_{l+1}`` (k_0 = k_M = 0) the system is a Vandermonde system in l², with the solution
 
         e_l = ½δ_{lN} + (−1)^l (N/l) (M!)² / ((M−l)! (M+l)!),    l = 1 … M.
     """
@@ -44,7 +44,7 @@ def compressed_coefficients(samples: int, previous: int = 0) -> Rationals:
 
 @functools.cache
 def rate_basis(window: int) -> tuple[tuple[int, ...], ...]:
-    """Return, for each increment of the window, M! times the powers 0 … M−1 of t of the rate polynomial it contributes.
+    """Return, for each increment of the window, M! times the coefficients of t⁰ … t^{M−1} of its contribution to the rate polynomial.
 
     The polynomial of degree M − 1 whose integrals over the M sample intervals are the increments is the derivative of the Lagrange
     interpolant of the summed angle at 0, 1, … M.
@@ -65,7 +65,7 @@ def rate_basis(window: int) -> tuple[tuple[int, ...], ...]:
 
 
 def _shifted(polynomial: Sequence[int], origin: int) -> list[int]:
-    """Return the powers of (t − origin) of an integer polynomial in t."""
+    """Return the coefficients in powers of (t − origin) of an integer polynomial in t."""
     c = list(polynomial)
     for low in range(len(c)):
         for power in range(len(c) - 2, low - 1, -1):
@@ -74,7 +74,7 @@ def _shifted(polynomial: Sequence[int], origin: int) -> list[int]:
 
 
 def interval_rates(window: int, interval: int) -> Table:
-    """Return, for each increment of the window, the powers of s ∈ [−½, ½] of the rate polynomial, s measured from the interval's middle."""
+    """Return, per increment of the window, the rate polynomial in powers of s ∈ [−½, ½], the time from the interval's middle."""
     rows = []
     for basis in rate_basis(window):
         doubled = [c * 2 ** (window - 1 - power) for power, c in enumerate(basis)]  # in x = 2t
@@ -86,7 +86,7 @@ def interval_rates(window: int, interval: int) -> Table:
 
 
 def _step_rates(samples: int, previous: int, following: int) -> Table:
-    """Return, for each increment of the window, the powers of t − p of the rate polynomial."""
+    """Return, for each increment of the window, the coefficients of the rate polynomial in powers of t − p."""
     window = samples + previous + following
     scale = math.factorial(window)
     return tuple(tuple(Fraction(c, scale) for c in _shifted(basis, previous)) for basis in rate_basis(window))
@@ -96,7 +96,7 @@ def _step_rates(samples: int, previous: int, following: int) -> Table:
 def taylor_pairs(samples: int, previous: int = 0, following: int = 0) -> Table:
     """Return the time-Taylor pair table: ``K_ij = ½ ∫ (L_i L_j' − L_j L_i') dt`` over the step, L_i' the rate basis, L_i = 0 at its start.
 
-    Exact, to second order in the rotation, for a body rate polynomial of degree M − 1.
+    It is exact, to second order in the rotation, if the body rate is a polynomial of degree M − 1.
     """
     rates = _step_rates(samples, previous, following)
     m = len(rates)
@@ -118,23 +118,24 @@ def lag_sums(pairs: Table) -> Rationals:
 def matched_correction(samples: int, previous: int = 0, following: int = 0) -> Table:
     """Return the pair table C that, added to an algorithm exact for rate polynomials, makes it optimal under coning as well.
 
-    This is the package's own family, ``matched-N-p-f``. Its step is ``δq = δq_polynomial ⊗ exp(Σ C_ij Δθ_i × Δθ_j)``: the quaternion
-    equation solved to rounding on the rate polynomial through all M = N + p + f increments of the window, and then C. Derivation:
+    This is the family ``matched-N-p-f``, derived for this package. Its step is ``δq = δq_polynomial ⊗ exp(Σ C_ij Δθ_i × Δθ_j)``: the
+    quaternion equation solved to rounding for the rate polynomial through all M = N + p + f increments of the window, then the correction
+    C. Derivation:
 
-    1. *The polynomial* carries every power of the rotation, so no floor of order β⁴ωλ⁴ remains: what is left is the error of the
-       interpolation, of relative order λ^M, in the products of two, three, … rates.
-    2. *Products of two* make the drift at small β. Only the lag sums matter there, and the best M − 1 of them are the closed form of
-       :func:`compressed_coefficients` (the step's position in the window does not enter): drift λ^{2M} instead of about λ^{M+1}. So the
-       lag sums of C must be the difference between those and the lag sums of :func:`taylor_pairs`.
-    3. *No other motion may lose accuracy.* Any pair table with those lag sums would serve two axes in quadrature, but would
-       turn, for example, a constant rate beside an oscillation into a periodic error of order β³. Both tables being exact for
-       polynomials, the difference of their generating functions is divisible by (2 − z − 1/z)^d, d = ⌊M/2⌋: C = Dᵀ S D with D the
-       d-th difference. C then gives exactly zero whenever either factor is a polynomial of degree below d, and is of the order of
-       the interpolation error itself otherwise.
-    4. S has its lag sums from the division, spread evenly along its diagonals.
+    1. *The polynomial* solution contains all powers of the rotation, so there is no error floor of order β⁴ωλ⁴. The remaining error is that
+       of the interpolation, of relative order λ^M, in the products of two, three, … rates.
+    2. *Products of two rates* cause the drift at small β, which depends only on the lag sums. The optimal M − 1 lag sums are those
+       of :func:`compressed_coefficients` (the position of the step in the window does not matter): drift λ^{2M} instead of about λ^{M+1}.
+       The lag sums of C must therefore be the difference between those and the lag sums of :func:`taylor_pairs`.
+    3. *Other motions must not lose accuracy.* Any pair table with those lag sums would be optimal for coning, but most would cause, for
+       example, a periodic error of order β³ for a constant rate combined with an oscillation. Since both tables are exact for polynomials,
+       the difference of their generating functions is divisible by (2 − z − 1/z)^d, d = ⌊M/2⌋: C = Dᵀ S D with D the d-th difference. The
+       correction is then exactly zero if either factor is a polynomial of degree below d, and otherwise of the order of the interpolation
+       error.
+    4. The lag sums of S follow from the division; they are distributed evenly along its diagonals.
 
-    With f = 0 the algorithm is causal; with f > 0 it needs f samples of delay (or a recorded file), the step lies inside the window
-    where interpolation is at its best, and errors fall by two to four powers of ten.
+    With f = 0 the algorithm is causal. With f > 0 it needs a delay of f samples (or a recorded file); the step is then inside the window,
+    where the interpolation is most accurate, and errors are smaller by two to four powers of ten.
     """
     m = samples + previous + following
     d = m // 2
@@ -194,11 +195,11 @@ def step_rates_at(samples: int, instants: Sequence[Fraction]) -> Table:
 
 
 def second_order(pairs: Table, samples: int, previous: int = 0) -> int:
-    """Return the global order of convergence that a pair table has on any smooth motion, triple products left out.
+    """Return the global order of convergence of a pair table for any smooth motion, without triple products.
 
-    For rates tᵃ and tᵇ along two axes the table must give ``½ ∫ (L_a L_b' − L_b L_a') dt``, L' the rates, L = 0 at the step's start. If
-    the first a + b for which it does not is d, a step is wrong by h^{d+2} and the whole by h^{d+1}. Products of three rates, which no
-    such table has, are wrong by h⁵ a step, and bound the order by 4.
+    For rates tᵃ and tᵇ along two axes the table must give ``½ ∫ (L_a L_b' − L_b L_a') dt``, L' the rates, L = 0 at the start of the step.
+    If the smallest a + b for which it does not is d, the error of a step is of order h^{d+2} and the global error of order h^{d+1}. The
+    products of three rates that such a table omits cause an error of order h⁵ per step, so the order is at most 4.
     """
     window, n = len(pairs), Fraction(samples)
     edges = [Fraction(i - previous) for i in range(window + 1)]
@@ -209,7 +210,7 @@ def second_order(pairs: Table, samples: int, previous: int = 0) -> int:
                 [(high ** (p + 1) - low ** (p + 1)) / (p + 1) for low, high in itertools.pairwise(edges)]
                 for p in (a, b)
             )
-            # A table holds K_ij and −K_ij, and Σ_{i<j} K_ij (u_i v_j − u_j v_i) = Σ_ij K_ij u_i v_j.
+            # Since K is antisymmetric, Σ_{i<j} K_ij (u_i v_j − u_j v_i) = Σ_ij K_ij u_i v_j.
             made = sum(
                 (k * x * y for row, x in zip(pairs, u, strict=True) for k, y in zip(row, v, strict=True)), Fraction(0)
             )
@@ -219,14 +220,14 @@ def second_order(pairs: Table, samples: int, previous: int = 0) -> int:
 
 
 MAX_DENOMINATOR = 10**6
-"""Largest denominator of a fraction that a float is taken for."""
+"""Maximum denominator of the fraction to which a float is converted."""
 
 
 def rational(value: float | str | Fraction) -> Fraction:
     """Return a coefficient as a fraction.
 
-    A text is read exactly ("27/20", "1.35"), a float is taken for the fraction of least denominator, up to a million, that is equal to it
-    as a float (2/3 for 0.6666666666666666), or for the decimal that it prints as.
+    Text is read exactly ("27/20", "1.35"). A float is converted to the fraction of smallest denominator, at most a million, that equals it
+    as a float (2/3 for 0.6666666666666666); if there is none, to the decimal number that it prints as.
     """
     if isinstance(value, bool):
         raise TypeError("a truth value is no coefficient")
@@ -244,7 +245,7 @@ def outer_pairs(a: Rationals, b: Rationals) -> Table:
 def rate_weights(points: int, interval: int | None = None) -> Rationals:
     """Return the weights that integrate the polynomial through ``points`` rate samples over one interval (the middle one by default).
 
-    Two points: the trapezoid, ½ and ½. Four: −1/24, 13/24, 13/24, −1/24.
+    Two points: the trapezoidal rule, ½ and ½. Four: −1/24, 13/24, 13/24, −1/24.
     """
     start = Fraction(points // 2 - 1 if interval is None else interval)
     weights = []
@@ -266,9 +267,9 @@ def rate_weights(points: int, interval: int | None = None) -> Rationals:
 
 
 def squared_gain(points: int, terms: int) -> Rationals:
-    """Return the powers 0, 2, 4, … of λ of g², g the factor by which increments formed from rate samples scale an oscillation.
+    """Return the coefficients of λ⁰, λ², λ⁴, … of g², g the gain for an oscillation of increments formed from rate samples.
 
-    ``g = Σ_j b_j cos((j − ½)λ) (λ/2)/sin(λ/2)``, b the two-sided weights; 1 − λ²/6 + … for the trapezoid. ``points`` = 0 means true
+    ``g = Σ_j b_j cos((j − ½)λ) (λ/2)/sin(λ/2)``, b the two-sided weights; 1 − λ²/6 + … for the trapezoidal rule. ``points`` = 0: true
     increments, g = 1.
     """
     if points == 0:
@@ -288,7 +289,7 @@ def squared_gain(points: int, terms: int) -> Rationals:
 
 
 def residuals(lags: Rationals, samples: int, points: int, terms: int) -> Rationals:
-    """Return the powers 1, 3, 5, … of λ of a step's drift over β²: ``g² Σ k_l 2(1 − cos λ) sin lλ − ½(Nλ − g² sin Nλ)``."""
+    """Return the coefficients of λ, λ³, λ⁵, … of the drift of a step over β²: ``g² Σ k_l 2(1 − cos λ) sin lλ − ½(Nλ − g² sin Nλ)``."""
     sines = []
     for n in range(terms):
         q = 2 * n + 1
@@ -301,11 +302,11 @@ def residuals(lags: Rationals, samples: int, points: int, terms: int) -> Rationa
 
 
 def rate_compressed_coefficients(samples: int, previous: int, points: int) -> Rationals:
-    """Return the compressed coefficients for increments formed from rate samples: they undo, in the drift, what the quadrature lost.
+    """Return the compressed coefficients for increments formed from rate samples; they compensate the drift due to the quadrature.
 
-    A quadrature over ``points`` rate samples scales an oscillation by g ≠ 1, which makes a drift of order λ^points whatever is done with
-    the increments as such. The coefficients here solve ``g² Σ k_j 2(1 − cos λ) sin jλ = ½(Nλ − g² sin Nλ)`` instead, up to λ^{2M−1}, so
-    the drift is of order λ^{2M} again; the periodic error stays that of the quadrature.
+    A quadrature over ``points`` rate samples scales an oscillation by g ≠ 1, which with coefficients for true increments causes a drift of
+    order λ^points. The coefficients here solve ``g² Σ k_j 2(1 − cos λ) sin jλ = ½(Nλ − g² sin Nλ)`` instead, up to λ^{2M−1}, so that the
+    drift is of order λ^{2M} again; the periodic error of the quadrature remains.
     """
     m = samples + previous
     if m == 1:

@@ -1,4 +1,4 @@
-"""The attitude drift that coning leaves behind, in closed form, and its sum over a vibration spectrum."""
+"""Attitude drift due to coning, in closed form, and its sum over a vibration spectrum."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def predicted_coning_drift(algorithm: str | Algorithm, angle: float, frequency: 
     -------
     float
         Drift about the cone's axis, rad/s: −C β² ω λ^(drift order), which for M = N + p compressed samples is −c_M β² ω λ^(2M),
-        c_M = (M!)²/(2(2M+1)!) (Miller 1983; Ignagni 1996). For one sample without correction the exact −½ sin²β ω (1 − sin λ/λ).
+        c_M = (M!)²/(2(2M+1)!) (Miller 1983; Ignagni 1996). For one sample without correction, exactly −½ sin²β ω (1 − sin λ/λ).
     """
     table = named(algorithm)
     beta, omega, lam = _motion(angle, frequency, sample_interval)
@@ -44,11 +44,11 @@ def predicted_coning_drift(algorithm: str | Algorithm, angle: float, frequency: 
 
 
 def small_angle_drift(algorithm: str | Algorithm, frequency_ratio: float) -> float:
-    """Return the drift over β²ω for small β, from the whole power series in λ = ω × sample interval, 0 to 1."""
+    """Return the drift divided by β²ω for small β, from the full power series in λ = ω × sample interval, 0 to 1."""
     table = named(algorithm)
     lam = checks.non_negative("frequency_ratio", frequency_ratio)
     if lam > 1.0:
-        raise InputError(f"frequency_ratio is {lam:g}; the series serves up to 1 (6 samples a period): sample faster")
+        raise InputError(f"frequency_ratio is {lam:g}; the series is valid up to 1 (6 samples a period): sample faster")
     total = 0.0
     for c in reversed(table.drift_series):
         total = total * lam * lam + c
@@ -66,13 +66,13 @@ class VibrationLine:
     """One line of an angular vibration spectrum: two orthogonal axes at one frequency."""
 
     frequency: float
-    """Hz."""
+    """Frequency, Hz."""
     angle: float
     """Amplitude about the first axis, rad."""
     angle_across: float | None = None
-    """Amplitude about the second axis, rad; ``angle`` if not given."""
+    """Amplitude about the second axis, rad. Default: ``angle``."""
     phase: float = 0.5 * math.pi
-    """Lag of the second axis behind the first, rad; π/2 is coning, 0 or π rocking without drift."""
+    """Phase lag of the second axis behind the first, rad; π/2 is coning, 0 or π rocking without drift."""
 
     def __post_init__(self) -> None:
         """Check the fields."""
@@ -84,27 +84,27 @@ class VibrationLine:
 
     @property
     def coning_square(self) -> float:
-        """β² of the circular coning that drifts as much: θ_x θ_y sin(phase), rad²."""
+        """β² of the circular coning with the same drift: θ_x θ_y sin(phase), rad²."""
         across = self.angle if self.angle_across is None else self.angle_across
         return self.angle * across * math.sin(self.phase)
 
 
 BUDGETED = ("one-sample", "two-sample", "four-sample", "matched-4-11", "matched-1-8-8")
-"""Algorithms of a drift budget where none are named."""
+"""Default algorithms of a drift budget."""
 
 
 def vibration_drift(lines: Sequence[VibrationLine], algorithm: str | Algorithm, sample_rate: float) -> float:
-    """Return the drift about the third axis, rad/s, that a vibration spectrum leaves with an algorithm at a sample rate, Hz.
+    """Return the drift about the third axis, rad/s, due to a vibration spectrum, for an algorithm and a sample rate, Hz.
 
-    Lines at different frequencies do not drift together (their products average out), so their drifts add. Angles are taken as small: of
-    each drift the part in β² is counted. The β⁴ floor of rotation-vector forms comes on top; it matters above a degree or so.
+    The products of lines at different frequencies average to zero, so the drifts of the lines add. Angles are assumed small: only the term
+    in β² of each drift is included. The β⁴ error floor of rotation-vector algorithms is additional; it matters above about one degree.
     """
     table, rate = named(algorithm), checks.positive("sample rate", sample_rate, unit="Hz")
     omegas = [2.0 * math.pi * line.frequency for line in lines]
     if max(omegas, default=0.0) > rate:
         raise InputError(
-            f"sample rate {rate:g} Hz is below 2π × the highest line, {max(omegas) / (2.0 * math.pi):g} Hz: the drift series does not "
-            f"serve there; sample at {max(omegas):.4g} Hz or more, or leave out the line"
+            f"sample rate {rate:g} Hz is below 2π × the highest line, {max(omegas) / (2.0 * math.pi):g} Hz, where the drift series is not "
+            f"valid; sample at {max(omegas):.4g} Hz or more, or leave out the line"
         )
     drifts = (
         line.coning_square * w * small_angle_drift(table, w / rate) for line, w in zip(lines, omegas, strict=True)
@@ -128,7 +128,7 @@ def _vibration(file: Path, text: list[str]) -> tuple[VibrationLine, ...]:
     checks.known_keys(f"{file.name}: columns", names, _COLUMNS)
     lacking = [name for name in _COLUMNS[:2] if name not in names]
     if lacking:
-        raise InputError(f"{file.name} lacks the column {' and '.join(lacking)}; wanted {', '.join(_COLUMNS)}")
+        raise InputError(f"{file.name} lacks the column {' and '.join(lacking)}; give {', '.join(_COLUMNS)}")
     lines = []
     for k, row in enumerate(rows):
         if len(row) != len(names):

@@ -1,4 +1,4 @@
-"""From records to attitude: increments or rates in, rotation vectors or attitude out, by any algorithm of the catalogue."""
+"""Integration of increments or rates to rotation vectors or attitude, by any algorithm of the catalogue."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ _UNTURNED = np.array(IDENTITY)
 _VECTOR_SOLVERS = ("compressed", "pairs")
 
 EVEN = 1e-3
-"""Largest relative departure of an interval from the mean of its window with which the intervals count as equal: the rounding of
-stamps in microseconds at a kilohertz."""
+"""Maximum relative deviation of an interval from the mean of its window for which the intervals are treated as equal: the rounding of
+stamps in microseconds at 1 kHz."""
 GAP = 4.0
-"""Largest ratio of an interval to its neighbour, or of the neighbour to it, across which a rate polynomial is fitted."""
+"""Maximum ratio of an interval to its neighbour, or of the neighbour to it, across which a rate polynomial is fitted."""
 LOPSIDED = 4
-"""Largest excess of increments on one side of an interval over the other side in the fit of its polynomial, uneven intervals."""
+"""Maximum difference between the numbers of increments on the two sides of an interval in the fit of its polynomial, uneven intervals."""
 
 
 def integrate(
@@ -52,20 +52,20 @@ def integrate(
     Parameters
     ----------
     increments : array_like (n, 3)
-        Integrals of the rate over each sample interval, rad, axes by ``frame``; a remainder of n mod N increments is not used.
+        Integrals of the rate over each sample interval, rad, axes by ``frame``; the last n mod N increments are not used.
     algorithm : str or Algorithm, default "one-sample"
         Name in :data:`ALGORITHMS`, or an algorithm.
     initial_attitude : array_like (4,), default identity
         Unit quaternion q_fb at the first edge.
     frame : {"body", "fixed"}, default "body"
-        Axes of the increments: of body rates, equation (17), or of fixed-frame rates, equation (3) of *Quaternion differentiation*.
+        Axes of the increments: body rates, equation (17), or fixed-frame rates, equation (3) of *Quaternion differentiation*.
     edges : array_like (n + 1,), optional
         Times of the edges of the sample intervals, s, as in :func:`rotation_vectors`. Default: equal intervals.
 
     Returns
     -------
     ndarray (n // N + 1, 4)
-        Unit quaternions q_fb, first the initial attitude.
+        Unit quaternions q_fb, starting with the initial attitude.
     """
     table = named(algorithm)
     checks.one_of("frame", frame, ("body", "fixed"))
@@ -94,7 +94,7 @@ def integrate(
             steps[uneven] = corrected
         compiled(accumulate_quaternions)(steps.reshape(-1), initial, work, attitude.reshape(-1))
     if not math.isfinite(attitude[-1, 0]):
-        # What is not finite makes all attitudes after it NaN, so that plain arrays need no search before.
+        # A value that is not finite makes all later attitudes NaN, so plain arrays need not be searched before.
         _increments(increments)
         raise InputError("increments holds a rotation vector of more than 1e150 rad; check its unit")
     return quaternion.conjugate(attitude) if frame == "fixed" else attitude
@@ -110,14 +110,15 @@ def increments_from_rates(rates: ArrayLike, sample_interval: float, points: int 
     sample_interval : float
         Interval between samples, s.
     points : int, default 2
-        Even number of nearest samples whose interpolating polynomial is integrated; 2 is the trapezoid rule. For an algorithm made for
-        rates its ``rate_points``; for another 8, as the trapezoid with a correction made for increments drifts as much as no correction.
+        Even number of nearest samples whose interpolating polynomial is integrated; 2 is the trapezoidal rule. Use ``rate_points`` of an
+        algorithm for rates; for others use 8, because the trapezoidal rule with a correction for increments drifts as much as no
+        correction.
 
     Returns
     -------
     ndarray (n, 3)
-        Increments, rad. For an oscillation they are too small by a relative error of order λ^points. Near the ends the samples used
-        lie to one side.
+        Increments, rad. For an oscillation they are too small by a relative error of order λ^points. Near the ends one-sided samples are
+        used.
 
     Examples
     --------
@@ -129,7 +130,7 @@ def increments_from_rates(rates: ArrayLike, sample_interval: float, points: int 
     checks.count("points", points, minimum=2)
     if points % 2:
         raise InputError(
-            f"points is {points}; it must be even, so that as many samples lie before an interval as after"
+            f"points is {points}; it must be even, with the same number of samples before and after an interval"
         )
     if len(samples) < 2:
         raise InputError(f"rates has {len(samples)} samples; at least 2 are needed, one at each edge of an interval")
@@ -153,23 +154,23 @@ def rotation_vectors(
     Parameters
     ----------
     increments : array_like (n, 3)
-        Integrals of the body rate over each sample interval, rad; a remainder of n mod N increments is not used.
+        Integrals of the body rate over each sample interval, rad; the last n mod N increments are not used.
     algorithm : str or Algorithm, default "one-sample"
         Name in :data:`ALGORITHMS`, or an algorithm.
     edges : array_like (n + 1,), optional
-        Times of the edges of the sample intervals, s. Give none where stamps are coarser than the sampling was (milliseconds at 300
-        Hz). Default: equal intervals.
+        Times of the edges of the sample intervals, s. Omit them if the resolution of the stamps is coarser than the sampling jitter
+        (milliseconds at 300 Hz). Default: equal intervals.
 
     Returns
     -------
     ndarray (n // N, 3)
-        Rotation vectors, rad. The solvers that work on quaternions return the logarithm of their step, of length at most π.
+        Rotation vectors, rad. For solvers that use quaternions it is the logarithm of the step, of length at most π.
 
     Notes
     -----
-    The coefficients of every algorithm hold for intervals of equal length. Where ``edges`` show unequal intervals in the window of
-    a step, the polynomial solver computes that step instead: the quaternion equation on the rate polynomial through the increments,
-    whatever the lengths of the intervals. An interval that is a gap among its neighbours is a rotation at constant rate.
+    The coefficients of every algorithm are for equal intervals. If the intervals in the window of a step are unequal according to
+    ``edges``, the polynomial solver computes that step: the quaternion equation for the rate polynomial through the increments over
+    intervals of any length. For an interval that is a gap relative to its neighbours, the rate is assumed constant.
     """
     table = named(algorithm)
     samples = _increments(increments)
@@ -185,7 +186,7 @@ def rotation_vectors(
 
 
 def time_per_sample(algorithm: str | Algorithm, samples: int = 20_160, repeats: int = 5) -> float:
-    """Return the least time per sample, s, that :func:`integrate` needs here, compilation excluded."""
+    """Return the minimum time per sample of :func:`integrate` on this machine, s, without compilation."""
     table = named(algorithm)
     checks.count("samples", samples, minimum=table.window)
     increments = 1e-3 * np.random.default_rng(0).standard_normal((samples, 3))
@@ -198,7 +199,7 @@ def time_per_sample(algorithm: str | Algorithm, samples: int = 20_160, repeats: 
 
 
 def _is_plain(increments: ArrayLike) -> bool:
-    """Return whether kernels can take the increments as they are, but for their values."""
+    """Return whether kernels can use the array of increments without conversion; its values are not checked."""
     return (
         isinstance(increments, np.ndarray)
         and increments.dtype == np.float64
@@ -209,7 +210,7 @@ def _is_plain(increments: ArrayLike) -> bool:
 
 
 def _empty_rows(count: int) -> Array:
-    """Return an empty array (count, 4) that begins at a cache line, so that no row crosses one."""
+    """Return an empty array (count, 4) aligned to cache lines, so that no row crosses one."""
     line = 8
     array = np.empty(4 * count + line)
     first = -(array.__array_interface__["data"][0] // array.itemsize) % line
@@ -225,7 +226,7 @@ def _vectors(increments: Array, table: Algorithm) -> Array:
         return increments
     vectors = np.empty((len(increments) // table.samples, 3))
     if table.solver == "compressed":
-        # The first steps look ahead for want of history; a record too short for that gets the member of the family that fits it.
+        # The first steps use later increments instead of previous ones; for a record too short for that, a smaller p is used.
         previous = min(table.previous, max(0, len(increments) - table.samples) // 2)
         coefficients = _compressed_array(table, previous)
         flat, rows = increments.reshape(-1), vectors.reshape(-1)
@@ -244,7 +245,7 @@ def _vectors(increments: Array, table: Algorithm) -> Array:
 def _steps(increments: Array, table: Algorithm) -> Array:
     steps = np.empty((len(increments) // table.samples, 4))
     if table.solver == "polynomial":
-        # A record shorter than the window is fitted whole, by a polynomial of lower degree, and without the correction.
+        # A record shorter than the window is fitted by one polynomial of lower degree, without the correction.
         window = min(table.window, len(increments))
         correction = table.correction_array if window == table.window else np.zeros((1, 1))
         previous = table.previous if window == table.window else len(increments)
@@ -260,7 +261,7 @@ def _steps(increments: Array, table: Algorithm) -> Array:
 
 
 def _uneven(increments: Array, edges: ArrayLike | None, table: Algorithm) -> tuple[NDArray[np.intp], Array]:
-    """Return the steps that have intervals of unequal length in their window, and their rotations as quaternions."""
+    """Return the steps with unequal intervals in their window, and their rotations as quaternions."""
     none = np.empty(0, np.intp), np.empty((0, 4))
     if edges is None:
         return none
@@ -313,7 +314,7 @@ def _compressed_array(table: Algorithm, previous: int) -> Array:
 
 @functools.cache
 def _fits(window: int) -> Array:
-    """Return (interval, increment, power): the increments' weights in the powers of the rate polynomial about the interval's middle."""
+    """Return (interval, increment, power): coefficients of the rate polynomial per increment, in time from the middle of the interval."""
     tables = [exact.interval_rates(window, i) for i in range(window)]
     return np.array([exact.floats(table) for table in tables]).reshape(window, window, window)
 

@@ -1,9 +1,9 @@
-"""The gyro: its errors as a specification, and increments that contain them.
+"""Gyro errors: specification, simulation of increments, and process noise of a matched filter.
 
 - ``model``: :class:`GyroSpec`, :func:`simulate`, and the process noise of a filter matched to a specification.
 - ``flicker``: Flicker noise (bias instability) as a sum of Gauss-Markov processes.
 - ``temperature``: Bias over temperature.
-- ``datasheets``: Specifications in the units of datasheets.
+- ``datasheets``: Specifications in the units of data sheets.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Gyro specifications in the units of data sheets, and presets from public ones.
+"""Gyro specifications in the units of data sheets, and presets from public data sheets.
 
-Units are text and are checked: ``from_datasheet(arw="0.15 deg/sqrt(h)", bias_instability="0.5 deg/h")``. A quantity of another dimension
-is refused by name. A noise density in °/s/√Hz is the same quantity as an angle random walk: 1 °/s/√Hz = 60 °/√h.
+Units are given as text and checked: ``from_datasheet(arw="0.15 deg/sqrt(h)", bias_instability="0.5 deg/h")``. A quantity of another
+dimension is an error. A noise density in °/s/√Hz is the same quantity as an angle random walk: 1 °/s/√Hz = 60 °/√h.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _QUANTITIES = {
     "bandwidth": ("bandwidth", "1 / second", "Hz"),
     "range": ("range", "rad / second", "deg/s"),
 }
-"""Name in the sheet: field of the specification, its unit, and an example."""
+"""Name in the data sheet: field of the specification, its unit, and an example."""
 
 
 @functools.cache
@@ -54,7 +54,7 @@ def _registry() -> Any:
 
 
 def parse(name: str, text: str, wanted: str, example: str = "") -> float:
-    """Return a quantity given as text, in the unit ``wanted``; another dimension is refused."""
+    """Return a quantity given as text, in the unit ``wanted``; raise an error for another dimension."""
     registry = _registry()
     if not isinstance(text, str):
         raise InputError(f"{name} is {text!r}; give it as text with its unit, such as {example!r}")
@@ -70,20 +70,20 @@ def parse(name: str, text: str, wanted: str, example: str = "") -> float:
     try:
         quantity = registry.Quantity(plain)
         units = quantity.to_root_units().units
-    except Exception as error:  # pint raises whatever Python raises on a text that is no expression
+    except Exception as error:  # pint raises any of Python's exceptions for a text that is no expression
         raise InputError(
             f"{name} is {text!r}, which is not a quantity with a unit ({error}); write for example {example or wanted!r}"
         ) from None
     needed = registry.Quantity(1.0, wanted).to_root_units().units
-    # The radian has no dimension, so a forgotten "deg" would pass for radians: compare the units, not the dimensions alone.
+    # The radian has no dimension, so without "deg" a number would be read as radians: compare units, not only dimensions.
     if units != needed:
         have = "no unit" if units == registry.dimensionless else f"in {units}"
-        raise InputError(f"{name} is {text!r} ({have}); it wants a quantity in {needed}, such as {example or wanted!r}")
+        raise InputError(f"{name} is {text!r} ({have}); give a quantity in {needed}, such as {example or wanted!r}")
     return float(quantity.to(wanted).magnitude)
 
 
 def from_datasheet(**quantities: str) -> GyroSpec:
-    """Return the specification of a gyro from the figures of its data sheet, as texts with their units.
+    """Return the specification of a gyro from the figures of its data sheet, given as text with units.
 
     Parameters
     ----------
@@ -100,8 +100,8 @@ def from_datasheet(**quantities: str) -> GyroSpec:
 
     Notes
     -----
-    IEEE Std 952 defines B by the PSD B²/(2π f), whose Allan deviation is flat at √(2 ln 2/π) B = 0.664 B. Most sheets print the
-    coefficient under the name "bias instability" or the minimum itself under "in-run bias stability", and few say which. The figure
+    IEEE Std 952 defines B by the PSD B²/(2π f), whose Allan deviation is flat at √(2 ln 2/π) B = 0.664 B. Most data sheets give this
+    coefficient as "bias instability" or the minimum of the Allan deviation as "in-run bias stability", and few specify which. The figure
     is used as B.
 
     Examples
@@ -111,7 +111,7 @@ def from_datasheet(**quantities: str) -> GyroSpec:
     """
     known_keys("from_datasheet", quantities, _QUANTITIES)
     if "quantization" in quantities and "angle_resolution" in quantities:
-        raise InputError("from_datasheet got quantization and angle_resolution, which are one quantity; keep one")
+        raise InputError("quantization and angle_resolution are the same quantity; give one of them")
     values: dict[str, Any] = {}
     for name, text in quantities.items():
         field, wanted, example = _QUANTITIES[name]
@@ -134,23 +134,23 @@ def _shaped(name: str, number: float) -> float | Array:
 
 @dataclass(frozen=True, eq=False)
 class Preset:
-    """A gyro on the market, by its public data sheet."""
+    """A commercial gyro, specified by its public data sheet."""
 
     name: str
     title: str
-    """Maker, type and range."""
+    """Manufacturer, type and range."""
     grade: str
     """Kind of gyro, such as "consumer MEMS"."""
     document: str
     """Data sheet of the stated figures."""
     checked: str
-    """How the stated figures were checked against that sheet."""
+    """How the stated figures were verified."""
     rate: float
-    """A sample rate at which it is commonly run, Hz."""
+    """Typical sample rate, Hz."""
     stated: Mapping[str, str]
-    """Figures of the sheet, in its own units."""
+    """Figures of the data sheet, in its units."""
     assumed: Mapping[str, str]
-    """Figures that the sheet does not give in this form, assumed of the size usual for the grade."""
+    """Figures that the data sheet does not give in this form; typical values for the grade."""
 
     @property
     def spec(self) -> GyroSpec:

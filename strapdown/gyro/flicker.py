@@ -1,14 +1,14 @@
-"""Flicker noise as the output of a small linear system: bias instability for simulators and filters.
+"""Flicker noise (bias instability) as the output of a shaping filter, for simulation and as states of a filter.
 
-Samples with the two-sided PSD ``1/(2π f)``, f in cycles per sample, from far below 1/T up to the Nyquist frequency. The rational function
-of ``s = 4 sin²(π f)`` nearest to 1/√s on [s_min, 4] is Zolotarev's, known in closed form; a fixed factor of three poles and zeros makes of
-1/√s = 1/(2 sin π f) the wanted 1/(2π f). Each factor of a rational function of s is a squared modulus, so the spectrum has a filter with
-real poles, and in partial fractions the filter is sixteen first-order states driven by *one* white noise:
+The samples have the two-sided PSD ``1/(2π f)``, f in cycles per sample, from far below 1/T up to the Nyquist frequency. The best rational
+approximation of 1/√s on [s_min, 4], ``s = 4 sin²(π f)``, is Zolotarev's, known in closed form; a fixed factor of three poles and zeros
+converts 1/√s = 1/(2 sin π f) to 1/(2π f). Each factor of a rational function of s is a squared modulus, so the spectrum has a shaping
+filter with real poles, which in partial fractions is sixteen first-order states driven by *one* white noise:
 
     x_i ← p_i x_i + w,    y = Σ g_i x_i
 
-Sixteen states hold the spectrum within 1 % over eight decades. As the states have a stationary covariance, in closed form, the noise is
-stationary from its first sample. The same system augments a filter: see :class:`Shaping`.
+With sixteen states the error of the spectrum is within 1 % over eight decades. The stationary covariance of the states is known in closed
+form, so the noise is stationary from its first sample. The same states can augment a filter: see :class:`Shaping`.
 """
 
 from __future__ import annotations
@@ -21,22 +21,22 @@ import numpy as np
 from strapdown.checks import Array, count
 
 STATES = 16
-"""States of the shaping filter."""
+"""Number of states of the shaping filter."""
 
 MARGIN = 8
-"""The spectrum is held down to 1/(MARGIN · samples); below, it is flat."""
+"""The spectrum is correct down to the frequency 1/(MARGIN · samples); below it is flat."""
 
 _ZEROS = (-0.92451637, -0.62241797, -0.17473594)
 _POLES = (-0.92314517, -0.60000265, -0.10898167)
-"""Least-squares fit of ``|Π(1 − ζ/z)/Π(1 − p/z)|²`` to sin(πf)/(πf), up to a factor, on 0 < f < ½: 0.22 % at worst, checked by a test."""
+"""Least-squares fit of ``|Π(1 − ζ/z)/Π(1 − p/z)|²`` to sin(πf)/(πf), up to a factor, on 0 < f < ½; maximum error 0.22 %, by a test."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Shaping:
-    """A shaping filter of unit flicker: ``x ← p x + w``, ``y = g · x``, with w one standard normal per sample."""
+    """Shaping filter of flicker with B = 1: ``x ← p x + w``, ``y = g · x``, with w one standard normal per sample."""
 
     decrements: Array
-    """1 − p of each state (n,), exact where p itself is rounded; the time constants are sample interval / decrement."""
+    """1 − p of each state (n,), which keeps the digits that p loses by rounding; the time constants are sample interval / decrement."""
     gains: Array
     """g (n,)."""
 
@@ -57,7 +57,7 @@ class Shaping:
         return float(self.gains @ self.covariance @ self.gains)
 
     def start(self, normals: Array) -> Array:
-        """Return stationary states (..., n) of standard normals (..., n)."""
+        """Return stationary states (..., n) from standard normals (..., n)."""
         scale = np.sqrt(np.diag(self.covariance))
         correlation = self.covariance / np.outer(scale, scale)
         return np.asarray(scale * (normals @ np.linalg.cholesky(correlation).T))
@@ -73,7 +73,7 @@ class Shaping:
 
 @functools.lru_cache(maxsize=64)
 def shaping(samples: int) -> Shaping:
-    """Return the shaping filter for records of that many samples.
+    """Return the shaping filter for records of the given number of samples.
 
     The poles and zeros of Zolotarev's function are ``−c_l``, ``c_l = 4 κ² tn²(l K'/(2n); k')`` for odd and even l, κ² = s_min/4
     (Petrushev & Popov 1987, section 4.3).
@@ -93,7 +93,7 @@ def shaping(samples: int) -> Shaping:
     decrements = _decrement(4.0 * squared)
     poles = np.concatenate([decrements[0::2], 1.0 - np.array(_POLES)])
     zeros = np.concatenate([decrements[1::2], 1.0 - np.array(_ZEROS)])
-    # Partial fractions by the differences of the decrements, which keep all digits where poles crowd at 1.
+    # Partial fractions from differences of the decrements, accurate for poles close to 1.
     p = 1.0 - poles
     above = np.prod((zeros[None, :] - poles[:, None]) / p[:, None], axis=1)
     apart = poles[None, :] - poles[:, None] + np.diag(p)

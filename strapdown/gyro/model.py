@@ -1,27 +1,26 @@
 """Gyro error model: from the true rotation to the output of a rate gyro.
 
-Rate form: ``w_meas = (I + M) w_b + b + n``, with ``n`` white of PSD σ_v² (angle random walk) and b a sum of drifts; increment form:
-the integral of that over each sample interval. An increment over its interval is the averaged-rate sample, so both outputs are the
-same numbers (:attr:`GyroOutput.rates`). All noise is exact in discrete time, for any interval.
+Rate: ``w_meas = (I + M) w_b + b + n``, with ``n`` white noise of PSD σ_v² (angle random walk) and b a sum of drifts. Increment: the
+integral of the rate over each sample interval. An increment divided by its interval is the averaged-rate sample (:attr:`GyroOutput.rates`).
+All noise is exact in discrete time, for any interval.
 
 Power spectral densities are two-sided, as in IEEE Std 952: ARW σ_v², flicker B²/(2π f), rate random walk σ_u²/(2π f)².
 
 Flicker in the filter
 ---------------------
-A filter with a random-walk bias has no flicker. :func:`process_noise` covers it by the smallest white and random-walk noise whose
-spectrum is nowhere below that of the gyro: ``σ_v'² = σ_v² + B²/(2ω*)`` and ``σ_u'² = σ_u² + ω* B²/2``; by the inequality of the
-means ``B²/(2ω*) + ω* B²/(2ω²) ≥ B²/ω`` for every ω, with equality at ω*. A spectrum that is nowhere below gives an attitude
-covariance that is nowhere too small. :func:`best_bandwidth` puts ω* where that costs least: at the natural frequency of the filter.
+A filter with a random-walk bias does not model flicker. :func:`process_noise` bounds the flicker by the smallest white and random-walk
+noise whose spectrum is nowhere below that of the gyro: ``σ_v'² = σ_v² + B²/(2ω*)`` and ``σ_u'² = σ_u² + ω* B²/2``; by the inequality of the
+means ``B²/(2ω*) + ω* B²/(2ω²) ≥ B²/ω`` for every ω, with equality at ω*. The attitude covariance is then never too small.
+:func:`best_bandwidth` gives the ω* of minimum attitude variance, the natural frequency of the filter.
 
-That bound is safe and rather conservative. :func:`matched_process_noise` scales it so that the filter's attitude variance is the
-actual one. The exact model adds the sixteen states of :class:`strapdown.gyro.flicker.Shaping` to the filter, driven by one white noise
-per axis.
+The bound is conservative. :func:`matched_process_noise` scales it so that the filter's attitude variance equals the actual one. The exact
+model adds the sixteen states of :class:`strapdown.gyro.flicker.Shaping` to the filter, driven by one white noise per axis.
 
 ``sims/flicker_in_filter.py`` compares them on the presets: mean NEES per degree of freedom of the attitude 1.00 to 1.05 matched, 0.92 to
-1.02 by the spectral bound, 1.00 to 1.61 where flicker is ignored.
-So match it, or bound it where too small a covariance must be excluded. The RMS error is within 1.2 % of the augmented filter's.
-The bias is another matter: a random-walk bias tracks the slow part of the flicker, and its covariance does not cover the fast part,
-which the simulator's bias holds too. Judge such a filter by its attitude.
+1.02 with the spectral bound, 1.00 to 1.61 if flicker is ignored. Use the matched noise, or the bound if too small a covariance must be
+excluded. The RMS error is within 1.2 % of that of the augmented filter. For the bias this does not hold: a random-walk bias tracks the
+low-frequency part of the flicker, and its covariance does not include the high-frequency part, which the simulated bias contains. Judge
+such a filter by its attitude.
 """
 
 from __future__ import annotations
@@ -71,7 +70,7 @@ _BY_AXIS = {
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class GyroSpec(ByValue):
-    """Parameters of a three-axis gyro, SI and radians. Every default is a perfect gyro.
+    """Parameters of a three-axis gyro, SI and radians. The defaults are those of a gyro without errors.
 
     Noise coefficients are one number for all axes, or one per axis.
 
@@ -85,41 +84,41 @@ class GyroSpec(ByValue):
         Bias instability B, rad/s: flicker of two-sided PSD B²/(2π f), stationary from the first sample; the floor of
         the Allan deviation is 0.664 B.
     quantization : float or ndarray (3,), default 0.0
-        Quantisation Q, rad: the increments are whole multiples of Q√12 and the remainder is carried to the next, which gives 3Q²/τ².
+        Quantisation Q, rad: the increments are integer multiples of Q√12 and the remainder is carried to the next; Allan variance 3Q²/τ².
     rate_ramp : float or ndarray (3,), default 0.0
         Rate ramp R, rad/s²: slope of the bias, which starts at 0 at the first edge.
     markov_noise : float or ndarray (3,), default 0.0
         Noise √q, rad/s/√s, that drives a Gauss–Markov bias ``ḃ = −b/τ + √q w``; its stationary standard deviation is √(qτ/2).
     markov_correlation_time : float, default inf
-        Correlation time τ of that bias, s; a finite one starts stationary, an infinite one is a random walk from 0.
+        Correlation time τ of that bias, s; stationary from the start if finite, a random walk from 0 if infinite.
     turn_on_bias : ndarray (3,), default zeros
-        Fixed bias, rad/s, body axes.
+        Constant bias, rad/s, body axes.
     turn_on_bias_sigma : float or ndarray (3,), default 0.0
-        Standard deviation of a bias drawn anew for every run, rad/s.
+        Standard deviation of a constant bias drawn in every run, rad/s.
     scale_factor : ndarray (3,), default zeros
         Scale-factor errors, dimensionless: the diagonal of M.
     asymmetry : ndarray (3,), default zeros
         Scale-factor asymmetry a, dimensionless: adds ``a |w|``, so that the scale factor is 1 + s ± a by the sign of the rate.
     misalignment : ndarray (3, 3), default zeros
-        Off-diagonal part of M, rad; entry (i, j) is the share of the rate about axis j that axis i senses.
+        Off-diagonal part of M, rad; entry (i, j) is the fraction of the rate about axis j that axis i senses.
     g_sensitivity : ndarray (3, 3), default zeros
         Bias per specific force, rad/s per m/s², body axes.
     temperature : BiasOverTemperature, optional
         Bias over temperature in °C (:class:`strapdown.gyro.temperature.BiasOverTemperature`). Default: none.
     bandwidth : float, default inf
-        Natural frequency of a second-order low-pass, Hz; needs uniform edges. Infinite: none.
+        Natural frequency of a second-order low-pass filter, Hz; needs uniform edges. Infinite: no filter.
     damping : float, default √½
-        Damping ratio of the low-pass.
+        Damping ratio of the low-pass filter.
     range : float, default inf
-        Largest rate that an axis measures, rad/s; beyond it the output saturates.
+        Maximum rate of an axis, rad/s; beyond it the output saturates.
     rate_resolution : float or ndarray (3,), default 0.0
-        Step of a rate output, rad/s: each averaged rate is rounded on its own, without carrying the remainder.
+        Resolution of a rate output, rad/s: each averaged rate is rounded separately, without carrying the remainder.
     sampling_jitter : float, default 0.0
         Standard deviation of the sampling instants about the nominal ones, s.
     timestamp_error : float, default 0.0
-        Standard deviation of the stamps about the nominal instants, s.
+        Standard deviation of the time stamps about the nominal instants, s.
     timestamp_offset : float, default 0.0
-        Delay of the stamps after the nominal instants, s.
+        Delay of the time stamps after the nominal instants, s.
     drop_probability : float, default 0.0
         Probability that a sample is lost, independently of the others; 0 to below 1.
     """
@@ -182,7 +181,7 @@ class GyroSpec(ByValue):
 
     @property
     def quantization_step(self) -> Axes:
-        """Step of the increments, Q√12, rad."""
+        """Quantisation step of the increments, Q√12, rad."""
         return self.quantization * float(np.sqrt(12.0))
 
 
@@ -204,8 +203,8 @@ class GyroOutput:
     increments : ndarray (n, 3)
         Measured rotation increments, rad, body axes.
     bias : ndarray (n + 1, 3)
-        True bias at the edges, rad/s, body axes: turn-on bias and all drifts, before any low-pass and without the effect of
-        acceleration. Flicker has no value at an instant; its mean over the two intervals at the edge is taken.
+        True bias at the edges, rad/s, body axes: turn-on bias and all drifts, before any low-pass filter and without the effect of
+        acceleration. Flicker has no value at an instant; its mean over the two intervals at the edge is used.
     edges : ndarray (n + 1,)
         Edges of the intervals, s.
     """
@@ -222,7 +221,7 @@ class GyroOutput:
 
 _INITIAL, _LOW_PASS = 4, 5  # stream numbers above those of gyro_errors
 _STREAMS = 8  # stream numbers reserved for an axis
-_UNEVEN = 0.1  # of the mean interval: largest departure of an interval with flicker or low-pass
+_UNEVEN = 0.1  # maximum relative deviation of an interval from the mean interval with flicker or low-pass filter
 
 
 def simulate(
@@ -243,9 +242,9 @@ def simulate(
     true_increments : array_like (n, 3)
         Exact integrals of the body rate over each interval, rad, body axes.
     edges : array_like (n + 1,)
-        Edges of the sample intervals, s. With flicker or a low-pass, which use the mean interval, uniform to a tenth.
+        Edges of the sample intervals, s. With flicker or a low-pass filter, which use the mean interval, uniform within 10 %.
     generator : numpy.random.Generator
-        Source of the streams: two words are drawn from it, and each noise term of each axis has its own stream under them.
+        Seeds the random streams: two words are drawn from it, and each noise term of each axis has a separate stream seeded by them.
     specific_force : array_like (n, 3), optional
         Mean specific force over each interval, m/s², body axes; required if the specification has a g-sensitivity.
     temperature : array_like (n + 1,), optional
@@ -259,9 +258,9 @@ def simulate(
     Notes
     -----
     Over an interval dt the bias walks by σ_u √dt n₁; its integral, given both ends, is ½ (b_k + b_{k+1}) dt plus a Gaussian of
-    variance σ_u² dt³/12 (the Brownian bridge), and the integral of the white noise has variance σ_v² dt. So an increment is
-    ``(I + M) Δθ + ½ (b_k + b_{k+1}) dt + √(σ_v² dt + σ_u² dt³/12) n₂``: exact for any dt. A Gauss–Markov bias has its own exact
-    step and bridge (:func:`strapdown.kernels.gyro_errors.markov_step`). Low-pass, saturation and rounding follow.
+    variance σ_u² dt³/12 (the Brownian bridge), and the integral of the white noise has variance σ_v² dt. An increment is therefore
+    ``(I + M) Δθ + ½ (b_k + b_{k+1}) dt + √(σ_v² dt + σ_u² dt³/12) n₂``, exact for any dt. A Gauss–Markov bias has an exact step and
+    bridge, too (:func:`strapdown.kernels.gyro_errors.markov_step`). Low-pass filter, saturation and rounding are applied last.
     """
     stamps = increasing("edges", edges, minimum=2)
     exact = np.ascontiguousarray(array("true_increments", true_increments, (len(stamps) - 1, 3)))
@@ -303,7 +302,7 @@ def simulate(
 def _errors(
     spec: GyroSpec, initial: Array, samples: int, low_passed: bool
 ) -> tuple[gyro_errors.Errors, gyro_errors.Drift]:
-    """Return the errors of a gyro and what its drift starts from, of normals (3, 64); a low-pass adds the white noise itself."""
+    """Return the errors of a gyro and the initial state of its drift from normals (3, 64); with a low-pass, that adds the white noise."""
     shaping = flicker.shaping(samples)
     tau = spec.markov_correlation_time
     q, instability = _axes(spec.markov_noise), _axes(spec.bias_instability)
@@ -337,7 +336,7 @@ def _add_environment(
     increments: Array,
     bias: Array,
 ) -> None:
-    """Add what specific force and temperature make of increments and bias, in place."""
+    """Add the effects of specific force and temperature to increments and bias, in place."""
     dt = np.diff(edges)[:, None]
     if np.any(spec.g_sensitivity != 0.0):
         if specific_force is None:
@@ -347,7 +346,7 @@ def _add_environment(
     if spec.temperature is not None:
         if temperature is None:
             raise InputError(
-                "the gyro has a bias over temperature, and there is no temperature; add the table [temperature] to the scenario "
+                "the gyro has a bias over temperature, but no temperature is given; add the table [temperature] to the scenario "
                 "(temperature (n + 1,), °C, in Python)"
             )
         drift = spec.temperature.bias(array("temperature", temperature, (len(edges),)))
@@ -375,7 +374,7 @@ def _need_uniform(edges: Array) -> None:
     if abs(dt[k] - mean) > _UNEVEN * mean:
         raise InputError(
             f"edges[{k}] to edges[{k + 1}] is {dt[k]:.9g} s, the mean interval {mean:.9g} s; bias_instability and bandwidth need "
-            "uniform edges: simulate at nominal ones, drop samples afterwards"
+            "uniform edges: simulate at nominal edges and drop samples afterwards"
         )
 
 
@@ -389,10 +388,10 @@ def _low_pass(
     words: np.ndarray,
     normals: Array,
 ) -> Array:
-    """Return the increments after ``H(s) = ω²/(s² + 2ζωs + ω²)``, with the white noise, exact over each interval."""
+    """Return the increments filtered by ``H(s) = ω²/(s² + 2ζωs + ω²)``, with the white noise, exact over each interval."""
     natural, damping = 2.0 * np.pi * spec.bandwidth, spec.damping
     transition, factor = low_pass_step(natural, damping, dt)
-    # Stationary: ȳ is the first mean rate; the white noise alone gives var y = σ_v² ω/(4ζ), var ẏ = σ_v² ω³/(4ζ), uncorrelated.
+    # Stationary: ȳ is the first mean rate; the white noise gives var y = σ_v² ω/(4ζ), var ẏ = σ_v² ω³/(4ζ), uncorrelated.
     sigma = white * np.sqrt(natural / (4.0 * damping))
     state = np.stack([increments[0] / dt + sigma * initial[:, -3], sigma * natural * initial[:, -4]], axis=1)
     out = np.empty_like(increments)
@@ -414,12 +413,12 @@ def _low_pass(
 def low_pass_step(natural: float, damping: float, dt: float) -> tuple[Array, Array]:
     """Return the exact step of ``ÿ + 2ζω ẏ + ω² y = ω² u`` over dt, and the Cholesky factor (3, 3) for unit white noise in u.
 
-    The step (3, 4) takes (y, ẏ, mean of u, slope of u) to (y, ẏ, ∫y) at the end, for u a straight line (matrix exponential; the noise by
-    Van Loan 1978).
+    The step (3, 4) maps (y, ẏ, mean of u, slope of u) to (y, ẏ, ∫y) at the end, for linear u (matrix exponential; the noise by Van Loan
+    1978).
     """
     from scipy.linalg import expm
 
-    # Scaled time and velocity (t ω, ẏ/ω) keep the exponential well balanced.
+    # Scaled time and velocity (t ω, ẏ/ω) keep the matrix exponential well conditioned.
     A = np.zeros((5, 5))
     A[0, 1] = 1.0
     A[1, :2] = -1.0, -2.0 * damping
@@ -433,7 +432,7 @@ def low_pass_step(natural: float, damping: float, dt: float) -> tuple[Array, Arr
     lines[:, 3] -= 0.5 * x * lines[:, 2]
     unscale = np.array([1.0, natural, 1.0 / natural])
     transition = unscale[:, None] * lines * np.array([1.0, 1.0 / natural, 1.0, 1.0 / natural])
-    # Van Loan's matrix holds e^(−Fx), so it is used where that is small, then doubled: Q(2x) = Q(x) + Φ Q(x) Φᵀ.
+    # Van Loan's matrix contains e^(−Fx), so it is used for small x, which is then doubled: Q(2x) = Q(x) + Φ Q(x) Φᵀ.
     F, noise_in = A[:3, :3], np.zeros((3, 3))
     noise_in[1, 1] = 1.0
     doublings = max(0, int(np.ceil(np.log2(x))))
@@ -443,7 +442,7 @@ def low_pass_step(natural: float, damping: float, dt: float) -> tuple[Array, Arr
     for _ in range(doublings):
         covariance = covariance + step @ covariance @ step.T
         step = step @ step
-    # ∫y has a variance that falls as x⁵: factor the correlation, not the covariance.
+    # The variance of ∫y decreases as x⁵: factor the correlation, not the covariance.
     scale = np.sqrt(np.diag(covariance))
     correlation = covariance / np.outer(scale, scale)
     factor = np.linalg.cholesky(0.5 * (correlation + correlation.T)) * scale[:, None]
@@ -451,7 +450,7 @@ def low_pass_step(natural: float, damping: float, dt: float) -> tuple[Array, Arr
 
 
 def sampling(spec: GyroSpec, edges: ArrayLike, generator: np.random.Generator) -> tuple[Array, Array]:
-    """Return the true sampling instants (n + 1,) and the reported stamps (n + 1,), s, for nominal edges."""
+    """Return the true sampling instants (n + 1,) and the reported time stamps (n + 1,), s, for nominal edges."""
     nominal = increasing("edges", edges, minimum=2)
     most = 0.4 * float(np.diff(nominal).min())
     draws = generator.standard_normal((2, len(nominal)))
@@ -461,14 +460,14 @@ def sampling(spec: GyroSpec, edges: ArrayLike, generator: np.random.Generator) -
 
 
 def dropped(spec: GyroSpec, samples: int, generator: np.random.Generator) -> np.ndarray:
-    """Return which samples are lost, a mask (samples,)."""
+    """Return a mask (samples,) of the lost samples."""
     return generator.random(samples) < spec.drop_probability
 
 
 def bridge_dropped(increments: ArrayLike, edges: ArrayLike, lost: np.ndarray) -> tuple[Array, np.ndarray]:
-    """Return increments without the lost samples, and the indices of the edges left, as a reader of the record bridges a gap.
+    """Return increments without the lost samples, and the indices of the remaining edges.
 
-    A gap is joined to the sample after it, whose rate is held throughout; lost samples at the end are cut off.
+    A gap is merged with the interval of the sample after it, with the rate of that sample; lost samples at the end are cut off.
     """
     stamps = increasing("edges", edges, minimum=2)
     turns = array("increments", increments, (len(stamps) - 1, 3))
@@ -481,20 +480,20 @@ def bridge_dropped(increments: ArrayLike, edges: ArrayLike, lost: np.ndarray) ->
 
 
 def process_noise(spec: GyroSpec, *, bandwidth: float | None = None) -> dict[str, float]:
-    """Return the noise of a filter with a random-walk bias: ``ProcessNoise(**process_noise(spec))``.
+    """Return the process noise of a filter with a random-walk bias: ``ProcessNoise(**process_noise(spec))``.
 
     Parameters
     ----------
     spec : GyroSpec
         Specification of the gyro.
     bandwidth : float, optional
-        ω*, rad/s, where the spectral bound of :mod:`strapdown.gyro` touches the flicker: :func:`best_bandwidth` of the
-        measurements. Required if the gyro has flicker.
+        ω*, rad/s, at which the spectral bound equals the flicker: :func:`best_bandwidth` for the measurements. Required if the gyro has
+        flicker.
 
     Returns
     -------
     dict
-        ``angle_random_walk``, rad/√s, and ``rate_random_walk``, rad/s/√s, of the worst axis.
+        ``angle_random_walk``, rad/√s, and ``rate_random_walk``, rad/s/√s, the maximum over the axes.
 
     Raises
     ------
@@ -503,8 +502,8 @@ def process_noise(spec: GyroSpec, *, bandwidth: float | None = None) -> dict[str
 
     Notes
     -----
-    Without flicker these are the gyro's own; a Gauss–Markov bias is represented by its driving noise, which holds over times short
-    against τ.
+    Without flicker these are the coefficients of the gyro; a Gauss–Markov bias is represented by its driving noise, which is valid for
+    times much shorter than τ.
 
     Examples
     --------
@@ -515,7 +514,7 @@ def process_noise(spec: GyroSpec, *, bandwidth: float | None = None) -> dict[str
     if instability > 0.0:
         if bandwidth is None:
             raise InputError(
-                "the specification has flicker (bias_instability); pass the bandwidth at which to bound it, in rad/s"
+                "the specification has flicker (bias_instability); pass the bandwidth of its spectral bound, in rad/s"
             )
         corner = positive("bandwidth", bandwidth, unit="rad/s")
         white += instability**2 / (2.0 * corner)
@@ -524,23 +523,23 @@ def process_noise(spec: GyroSpec, *, bandwidth: float | None = None) -> dict[str
 
 
 def best_bandwidth(spec: GyroSpec, measurement_density: float) -> float:
-    """Return the ω*, rad/s, at which the spectral bound of flicker gives the least attitude variance.
+    """Return the ω*, rad/s, for which the spectral bound of flicker gives the minimum attitude variance.
 
     A filter with white and random-walk noise and measurements of density r (variance about an axis times the interval, rad² s) has the
-    steady variance ``√r √(σ_v'² + 2 σ_u' √r)`` about an axis (Farrenkopf 1978, in the limit of frequent measurements). With the bound
-    inserted it is least where ``r ω*⁴ = σ_u² + ω* B²/2``; ω* is the natural frequency of the filter itself.
+    steady-state variance ``√r √(σ_v'² + 2 σ_u' √r)`` about an axis (Farrenkopf 1978, in the limit of frequent measurements). With the bound
+    inserted, its minimum is at ``r ω*⁴ = σ_u² + ω* B²/2``; ω* is the natural frequency of the filter.
     """
     _, walk, instability = _filter_terms(spec)
     density = positive("measurement_density", measurement_density, unit="rad² s")
     if walk == 0.0 and instability == 0.0:
         raise InputError(
-            "the specification has neither flicker nor a drifting bias; its filter has no bandwidth to bound at"
+            "the specification has neither flicker nor a drifting bias, so its filter has no bandwidth; add one of them"
         )
     return _natural_frequency(walk, instability**2, density)
 
 
 def matched_process_noise(spec: GyroSpec, measurement_density: float) -> dict[str, float]:
-    """Return the noise with which the filter's steady attitude variance is right, flicker included.
+    """Return the process noise for which the filter's steady-state attitude variance is correct in the presence of flicker.
 
     Parameters
     ----------
@@ -556,10 +555,10 @@ def matched_process_noise(spec: GyroSpec, measurement_density: float) -> dict[st
 
     Notes
     -----
-    The filter's error responds to the rate with ``s/(s² + 2ζω s + ω²)``, so flicker gives the attitude variance
+    The transfer function from rate to attitude error is ``s/(s² + 2ζω s + ω²)``, so flicker gives the attitude variance
     ``B²/(2πω²) arccos ζ/(ζ √(1 − ζ²))``, and the bound at ω* = ω gives ``B²/(4ζω²)``. Their ratio is ``κ(ζ) = (2/π) arccos ζ/√(1 −
-    ζ²)`` (arcosh and ζ² − 1 above ζ = 1): 1, 0.71 and 0.64 at ζ = 0, 0.71 and 1. The bound with κ B² for B² is solved for the ω and
-    ζ of the filter itself.
+    ζ²)`` (arcosh and ζ² − 1 above ζ = 1): 1, 0.71 and 0.64 at ζ = 0, 0.71 and 1. The bound with κ B² in place of B² is solved for the ω and
+    ζ of the resulting filter.
     """
     white, walk, instability = _filter_terms(spec)
     density = positive("measurement_density", measurement_density, unit="rad² s")
@@ -578,7 +577,7 @@ def matched_process_noise(spec: GyroSpec, measurement_density: float) -> dict[st
 
 
 def flicker_share(damping: float) -> float:
-    """Return κ(ζ) of :func:`matched_process_noise`: the attitude variance due to flicker over that of its spectral bound."""
+    """Return κ(ζ) of :func:`matched_process_noise`: the ratio of the attitude variance due to flicker to that of its spectral bound."""
     away = 1.0 - damping**2
     if abs(away) < 1e-6:
         return float(2.0 / np.pi * (1.0 + (1.0 - damping) / 3.0))
@@ -597,7 +596,7 @@ def _natural_frequency(walk: float, power: float, density: float) -> float:
 
 
 def _filter_terms(spec: GyroSpec) -> tuple[float, float, float]:
-    """Return σ_v², the PSD of all random walks, and B, of the worst axis each."""
+    """Return σ_v², the PSD of all random walks, and B, each the maximum over the axes."""
     white = float(np.max(spec.angle_random_walk)) ** 2
     walk = float(np.max(np.square(spec.rate_random_walk) + np.square(spec.markov_noise)))
     return white, walk, float(np.max(spec.bias_instability))
@@ -632,17 +631,17 @@ FORM: tables.Form = {
     "timestamp_offset": tables.SECONDS,
     "drop_probability": tables.RATIO,
 }
-"""Keys of the specification in files, but for the table ``temperature``."""
+"""Keys of the specification in files, except the table ``temperature``."""
 
 
 def to_table(spec: GyroSpec) -> dict[str, Any]:
-    """Return the departures from a perfect gyro as a table for TOML or JSON, units in the key names; exact both ways."""
+    """Return the fields that differ from the defaults as a table for TOML or JSON, with the units in the keys; read back exactly."""
     warm = {} if spec.temperature is None else {"temperature": thermal.to_table(spec.temperature)}
     return tables.encode(spec, FORM) | warm
 
 
 def from_table(table: Mapping[str, Any], place: str = "gyro", base: GyroSpec | None = None) -> GyroSpec:
-    """Return the specification in a table with units in the key names, changes of ``base`` if given."""
+    """Return the specification of a table with the units in the keys; with ``base``, the table has the changes to it."""
     known_keys(place, table, [*tables.keys(FORM), "temperature", *(["preset"] if base else [])])
     own = {key: value for key, value in table.items() if key != "temperature"}
     values = tables.decode(own, FORM, place)
@@ -652,7 +651,7 @@ def from_table(table: Mapping[str, Any], place: str = "gyro", base: GyroSpec | N
 
 
 def read_spec(path: str | os.PathLike[str]) -> GyroSpec:
-    """Read the table ``[gyro]`` of a TOML file, such as ``strapdown allan`` writes.
+    """Read the table ``[gyro]`` of a TOML file, as written by ``strapdown allan``.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Bias of a gyro over temperature: the polynomial that ``strapdown allan --temperature`` identifies, which simulator and filter read."""
+"""Bias of a gyro over temperature: the polynomial identified by ``strapdown allan --temperature``, used by simulator and filter."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ class BiasOverTemperature(ByValue):
     reference : float
         T_0, °C.
     span : (float, float)
-        Lowest and highest temperature that it holds for, °C; beyond them it is that of the end.
+        Lowest and highest temperature of the fit, °C; beyond them the bias is constant.
     coefficients : ndarray (order + 1, 3)
         c, rad/s/K^k.
     sigma : ndarray (order + 1, 3)
-        Standard deviations of them; 0 of c_0, which the filter estimates.
+        Standard deviations of the coefficients; 0 for c_0, which the filter estimates.
     """
 
     reference: float
@@ -49,15 +49,16 @@ class BiasOverTemperature(ByValue):
 
     @property
     def slope_sigma(self) -> Array:
-        """Largest σ of the slope dbias/dT within the span (3,), rad/s/K, the coefficients' errors taken for independent."""
+        """Maximum σ of the slope dbias/dT within the span (3,), rad/s/K, for independent errors of the coefficients."""
         reach = max(abs(end - self.reference) for end in self.span)
         k = np.arange(1, len(self.sigma))
         return np.asarray(np.sqrt((k * reach ** (k - 1)) ** 2 @ self.sigma[1:] ** 2))
 
     def walk(self, temperature: ArrayLike, time: ArrayLike) -> float:
-        """Return the rate random walk, rad/s/√s, that covers the error of the polynomial.
+        """Return a rate random walk, rad/s/√s, that bounds the error of the polynomial.
 
-        The error follows the temperature: the walk's variance is at every stamp at least that of its change since the first one.
+        The error depends on the temperature. At every stamp, the variance of the walk is at least that of the change of this error since
+        the first stamp.
         """
         powers = self.powers(temperature)
         changed = np.max((powers - powers[0]) ** 2 @ self.sigma**2, axis=1)
@@ -77,16 +78,16 @@ def to_table(warm: BiasOverTemperature, stem: str = STEM) -> dict[str, Any]:
 
 
 def from_table(table: Any, place: str = "temperature") -> BiasOverTemperature:
-    """Return the polynomial in a table such as :func:`to_table` gives."""
+    """Return the polynomial of a table made by :func:`to_table`."""
     if not isinstance(table, Mapping):
-        raise InputError(f"{place} is {table!r}; it must be a table, as `strapdown allan --temperature` writes it")
+        raise InputError(f"{place} is {table!r}; it must be a table, as written by `strapdown allan --temperature`")
     keys = [key for key in _keys(STEM, len(table)) if key == STEM or f"bias_{key}" in table]
     limits = ("reference_degc", "lowest_degc", "highest_degc")
     needed = [*limits, *(f"bias_{key}" for key in keys), *(f"sigma_{key}" for key in keys[1:])]
     known_keys(place, table, needed)
     missing = [key for key in needed if key not in table]
     if missing:
-        raise InputError(f"{place} lacks {', '.join(missing)}")
+        raise InputError(f"{place} lacks {', '.join(missing)}; `strapdown allan --temperature` writes a complete table")
     reference, lowest, highest = (finite(f"{place}: {key}", table[key]) for key in limits)
     if not lowest <= reference <= highest:
         raise InputError(f"{place}: reference_degc is {reference:g}, outside lowest_degc to highest_degc")

@@ -1,16 +1,16 @@
-"""Figures. Each function takes results and an optional ``ax``, draws, and returns the axes; nothing here computes statistics.
+"""Figures. Each function has results and an optional ``ax`` as arguments, and returns the axes; statistics are computed elsewhere.
 
-Colours are those of Okabe and Ito, which every kind of colour vision can tell apart. :func:`new_figure` needs no display.
+Colours are those of Okabe and Ito, distinguishable with colour vision deficiency. :func:`new_figure` needs no display.
 
 - ``style``: Colours, themes (light, dark), sizes, saving.
-- ``decimation``: Long series reduced to the extremes of each pixel column.
+- ``decimation``: Reduction of long series to the extremes of each pixel column.
 - ``estimates``: One estimate over time: attitude, bias, σ, errors.
 - ``innovations``: Innovations of one record: NIS, distribution, autocorrelation.
 - ``statistics``: Error statistics over many runs.
 - ``coning``: The coning study.
-- ``allan``: Allan deviations with their fit.
+- ``allan``: Allan deviations with fits.
 - ``budget``: Predicted errors by source.
-- ``tuning``: Likelihood slices, and the statistics before and after.
+- ``tuning``: Likelihood slices, and statistics before and after tuning.
 """
 
 from strapdown.plots.allan import allan_overview

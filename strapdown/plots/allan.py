@@ -1,4 +1,4 @@
-"""Allan deviations with their fit."""
+"""Allan deviations with fits."""
 
 from __future__ import annotations
 
@@ -64,9 +64,9 @@ def allan_overview(deviation: AllanDeviation, fit: NoiseFit) -> Figure:
     Parameters
     ----------
     deviation : AllanDeviation
-        SI.
+        Deviation, SI.
     fit : NoiseFit
-        Of the same samples.
+        Fit to the same samples.
 
     Returns
     -------
@@ -81,6 +81,6 @@ def allan_overview(deviation: AllanDeviation, fit: NoiseFit) -> Figure:
         ax.set_title(f"{AXES[axis]} axis", loc="left")
         ax.set_ylabel(f"Allan deviation, {unit}" if axis == 0 else "")
     drawn = deviation.deviation[deviation.deviation > 0.0] / scale
-    axes[0, 0].set_ylim(0.3 * drawn.min(), 3.0 * drawn.max())  # shared: the last axis alone would cut the others off
+    axes[0, 0].set_ylim(0.3 * drawn.min(), 3.0 * drawn.max())  # shared: those of the last axis could cut off others
     legend_below(figure, list(axes[0]), ncols=8)
     return figure

@@ -1,4 +1,4 @@
-"""Error budgets of a covariance analysis: predicted errors, and the share of each source."""
+"""Error budgets of a covariance analysis: predicted errors, and the fraction of each source."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from strapdown.plots.style import BLUE, CYCLE, VERMILION, YELLOW, legend_above, 
 from strapdown.units import angle_unit, rate_unit
 
 _SHADES = (*CYCLE, YELLOW, "#666666", "#8C564B", "#17BECF", "#AEC7E8", "#C5B0D5")
-_MIN_SHARE = 0.01  # sources below this part of the mean square at all times are drawn together
+_MIN_SHARE = 0.01  # sources below this fraction of the mean square at all times are combined
 
 
 def error_budget(analysis: Analysis, *, title: str = "") -> Figure:
-    """Draw RMS error and the filter's σ of attitude and bias over time, and below the share of each source in the mean square error.
+    """Draw RMS error and the filter's σ of attitude and bias over time, and below the fraction of each source in the mean square error.
 
     Parameters
     ----------
     analysis : Analysis
-        Of :func:`strapdown.covariance.analyse`.
+        Result of :func:`strapdown.covariance.analyse`.
     title : str
-        Of the figure.
+        Title of the figure.
 
     Returns
     -------
     Figure
-        Sources below 1 % of both mean squares at all times are drawn as one, and so are errors that are the same in every run.
+        Sources below 1 % of both mean squares at all times are combined, and so are errors that are the same in every run.
     """
     figure, axes = new_figure(2, 2, size=(11.0, 7.0), sharex=True, height_ratios=(1.0, 1.25))
     parts = (slice(0, 3), slice(3, 6))
@@ -42,7 +42,7 @@ def error_budget(analysis: Analysis, *, title: str = "") -> Figure:
         what = ("attitude", "bias")[column]
         rms = np.sqrt(np.mean(analysis.rms[:, part] ** 2, axis=1))
         sigma = np.sqrt(np.mean(analysis.filter_sigma[:, part] ** 2, axis=1))
-        # The unit is that of the settled filter: its start is the prior, orders above.
+        # The unit is chosen for the converged filter; the initial σ is orders of magnitude larger.
         unit, size = (angle_unit if column == 0 else rate_unit)(rms[len(rms) // 2 :])
         top.semilogy(
             analysis.time, np.where(rms > 0.0, rms / size, np.nan), color=VERMILION, linewidth=2.4, label="RMS error"
@@ -61,7 +61,7 @@ def error_budget(analysis: Analysis, *, title: str = "") -> Figure:
         )
         handles.update(zip(shown, stack, strict=True))
         bottom.set(ylim=(0.0, 100.0), xlim=(analysis.time[0], analysis.time[-1]), xlabel="time, s")
-        bottom.set_ylabel(f"share of mean square {what} error, %")
+        bottom.set_ylabel(f"fraction of mean square {what} error, %")
     legend_above(axes[0, 0])
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=4, frameon=False)
     if title:
@@ -74,7 +74,7 @@ def _largest(share: Array) -> float:
 
 
 def _shares(analysis: Analysis, part: slice) -> dict[str, Array]:
-    """Return the share (m,) of each source in the mean square error; errors of every run are one share, for they add as errors."""
+    """Return the fraction (m,) of each source in the mean square error; errors equal in every run add linearly and are one fraction."""
     total = np.sum(analysis.rms[:, part] ** 2, axis=1)
     total = np.where(total > 0.0, total, np.nan)
     share = {

@@ -1,4 +1,4 @@
-"""The coning study: drift by algorithm, and what it does to the filter."""
+"""The coning study: drift by algorithm, and its effect on the filter."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ from strapdown.plots.style import (
 )
 from strapdown.units import ARCSECOND, DEGREE, DEGREE_PER_HOUR
 
-_ROUNDING = 1e-6  # °/h: below it a drift is rounding of the run that measures it
+_ROUNDING = 1e-6  # °/h: smaller drifts are rounding errors of the simulation
 
 
 def drift_by_algorithm(drifts: Sequence[Drift], ax: Axes | None = None) -> Axes:
-    """Draw the size of each algorithm's drift, measured and predicted, °/h on a log axis."""
+    """Draw the magnitude of each algorithm's drift, measured and predicted, °/h on a log axis."""
     ax = axes_or_new(ax)
     places = np.arange(len(drifts))
     measured = np.array([abs(drift.measured) / DEGREE_PER_HOUR for drift in drifts])
@@ -53,7 +53,7 @@ def drift_by_algorithm(drifts: Sequence[Drift], ax: Axes | None = None) -> Axes:
         np.where(measured > _ROUNDING, measured, np.nan),
         width=0.55,
         color=SKY,
-        label="measured against the closed form",
+        label="measured relative to the closed form",
     )
     lines = np.where(predicted > _ROUNDING, predicted, np.nan)
     ax.hlines(lines, places - 0.36, places + 0.36, color=ink(), linewidth=2, label="predicted by the formula")
@@ -63,13 +63,13 @@ def drift_by_algorithm(drifts: Sequence[Drift], ax: Axes | None = None) -> Axes:
         ax.annotate(text, (place, top), xytext=(0, 5), textcoords="offset points", ha="center")
     ax.set_xticks(places, [drift.algorithm.replace("-", "-\n", 1) for drift in drifts])
     ax.grid(visible=False, axis="x")
-    ax.set_ylabel("size of the drift about the cone's axis, °/h")
+    ax.set_ylabel("magnitude of the drift about the cone's axis, °/h")
     legend_above(ax)
     return ax
 
 
 def coning_errors(outcomes: Sequence[FilterOutcome]) -> Figure:
-    """Draw the errors about the cone's axis inside the filter's ±3σ for each integration algorithm: attitude above, bias below."""
+    """Draw the errors about the cone's axis with the filter's ±3σ for each integration algorithm: attitude above, bias below."""
     figure, axes = new_figure(2, len(outcomes), size=(3.1 * len(outcomes), 5.2), sharex=True, squeeze=False)
     for j, outcome in enumerate(outcomes):
         s = outcome.statistics
@@ -88,7 +88,7 @@ def coning_errors(outcomes: Sequence[FilterOutcome]) -> Figure:
     axes[1, 0].set_ylabel("bias error, °/h")
     legend_below(figure, [axes[0, 0]])
     figure.suptitle(
-        "Errors about the cone's axis. Coning left by the integration is a constant rate, which the filter estimates as gyro bias."
+        "Errors about the cone's axis. The integration drift is a constant rate, which the filter estimates as gyro bias."
     )
     return figure
 
@@ -125,17 +125,17 @@ def coning_consistency(outcomes: Sequence[FilterOutcome]) -> Figure:
         for one in outcomes
         for low, high in [one.statistics.nis_bounds(one.probability)]
     ]
-    axes[2].set_title(f"NIS: {sum(passing)} of {len(outcomes)} pass\nJudged by its mean over all time", loc="left")
+    axes[2].set_title(f"NIS: {sum(passing)} of {len(outcomes)} pass\nTest of the mean over all time", loc="left")
     legend_below(figure, list(axes))
     return figure
 
 
 FREQUENCIES = 60
-"""Coning frequencies that drift is drawn at, evenly spaced on a log axis from a hundredth of the sample rate to 0.4 of it."""
+"""Number of coning frequencies at which drift is drawn, evenly spaced on a log axis from 0.01 to 0.4 of the sample rate."""
 
 
 def algorithms_compared(study: ConingStudy) -> Figure:
-    """Draw the drift of each algorithm over the coning frequency, and its largest error over manoeuvres; one's own are drawn bold."""
+    """Draw the drift of each algorithm over the coning frequency, and its maximum error over manoeuvres; the user's algorithms are bold."""
     figure, (left, right) = new_figure(1, 2, size=(12.0, 4.8))
     p = study.parameters
     frequencies = np.geomspace(0.01, 0.4, FREQUENCIES) * p.rate
@@ -156,25 +156,25 @@ def algorithms_compared(study: ConingStudy) -> Figure:
     right.set_yscale("log")
     right.set_xticks(range(len(MANOEUVRES)), [name.replace(", ", ",\n") for name in MANOEUVRES])
     right.grid(visible=False, axis="x")
-    right.set_ylabel("largest attitude error, arcsec")
+    right.set_ylabel("maximum attitude error, arcsec")
     right.set_title(f"Manoeuvres of {MANOEUVRE_SECONDS:g} s, gyro at {p.rate:g} Hz")
     figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=6, frameon=False)
     return figure
 
 
 def _leaves(outcome: FilterOutcome, subset: str, bounds: tuple[float, float]) -> bool:
-    """Return whether the ANEES of a subset lies outside its bounds at any epoch, judged or not."""
+    """Return whether the ANEES of a subset is outside its bounds at any epoch, tested or not."""
     value = outcome.statistics.anees[:, ("state", "attitude", "bias").index(subset)]
     return bool(((value < bounds[0]) | (value > bounds[1])).any())
 
 
 def draw_coning_study(study: ConingStudy, folder: str | os.PathLike[str], form: str = "png") -> list[Path]:
-    """Write the figures of a coning study to a folder, made if it is missing; return the files."""
+    """Write the figures of a coning study to a folder, which is created if missing; return the files."""
     figure, ax = new_figure(size=(7.0, 4.2))
     drift_by_algorithm(study.drifts, ax)
     p = study.parameters
     figure.suptitle(
-        f"Coning {p.angle / DEGREE:g}° at {p.frequency:g} Hz, gyro at {p.rate:g} Hz ({p.rate / p.frequency:.3g} samples a cycle)"
+        f"Coning {p.angle / DEGREE:g}° at {p.frequency:g} Hz, gyro at {p.rate:g} Hz ({p.rate / p.frequency:.3g} samples per cycle)"
     )
     target = Path(folder)
     figures = {

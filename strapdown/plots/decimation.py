@@ -1,4 +1,4 @@
-"""Long series reduced to what a figure can show: the extremes of each column of pixels, so that no peak is lost."""
+"""Reduction of long series for figures to the extremes of each pixel column, so that no peak is lost."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from strapdown.checks import Array
 
 LINE_COLUMNS = 2000
-"""Columns of equal time that a drawn line is reduced to: at least one for each pixel of a wide figure."""
+"""Number of columns of equal time for a line: at least one per pixel of a wide figure."""
 BAND_COLUMNS = 250
-"""Columns of equal time that a drawn band is reduced to: wide enough to hold a tooth of σ between two measurements."""
+"""Number of columns of equal time for a band: each usually contains a whole increase of σ between two measurements."""
 
 
 class Envelope(NamedTuple):
@@ -21,13 +21,13 @@ class Envelope(NamedTuple):
     time: Array
     """Time of the first sample of each column (k,)."""
     low: Array
-    """Least value in each column (k,); NaN where it holds NaN alone."""
+    """Minimum of each column (k,); NaN if all its values are NaN."""
     high: Array
-    """Largest value in each column (k,); NaN where it holds NaN alone."""
+    """Maximum of each column (k,); NaN if all its values are NaN."""
 
 
 def column_starts(time: Array, columns: int) -> NDArray[np.int64]:
-    """Return the index of the first sample of each column: the span of ``time`` (n,) in equal parts, those without a sample left out."""
+    """Return the index of the first sample of each column of equal duration of ``time`` (n,), without empty columns."""
     span = float(time[-1] - time[0])
     if span <= 0.0:
         return np.zeros(1, np.int64)
@@ -36,7 +36,7 @@ def column_starts(time: Array, columns: int) -> NDArray[np.int64]:
 
 
 def extreme_rows(time: Array, value: Array, columns: int = LINE_COLUMNS) -> NDArray[np.int64]:
-    """Return the indices, in order, of the samples that a line needs: of each column the least and the largest, and both ends."""
+    """Return the sorted indices of the samples of a line to draw: minimum and maximum of each column, and both ends."""
     n = len(value)
     if n <= 2 * columns:
         return np.arange(n)
@@ -46,19 +46,19 @@ def extreme_rows(time: Array, value: Array, columns: int = LINE_COLUMNS) -> NDAr
     for reduce, missing in ((np.fmin, starts), (np.fmax, np.append(starts[1:], n) - 1)):
         hits = np.flatnonzero(value == reduce.reduceat(value, starts)[group])
         rows = missing.copy()
-        rows[group[hits][::-1]] = hits[::-1]  # the first of equal ones, written last
+        rows[group[hits][::-1]] = hits[::-1]  # reversed, so that the first of equal values is kept
         found.append(rows)
     return np.unique(np.concatenate(found))
 
 
 def decimated(time: Array, value: Array, columns: int = LINE_COLUMNS) -> tuple[Array, Array]:
-    """Return the points of a line (n,) that a figure can show, by :func:`extreme_rows`."""
+    """Return the points of a line (n,) to draw, by :func:`extreme_rows`."""
     rows = extreme_rows(time, value, columns)
     return time[rows], value[rows]
 
 
 def envelope(time: Array, low: Array, high: Array | None = None, columns: int = BAND_COLUMNS) -> Envelope:
-    """Return the least of ``low`` and the largest of ``high`` (``low`` if not given) in each column."""
+    """Return the minimum of ``low`` and the maximum of ``high`` (default: ``low``) in each column."""
     high = low if high is None else high
     if len(time) <= columns:
         return Envelope(time, low, high)

@@ -31,11 +31,11 @@ from strapdown.records import Estimate, Truth
 from strapdown.units import DEGREE, angle_unit, rate_unit
 
 THREE_SIGMA = "±3σ (99.7 %)"
-"""Legend of a band of three standard deviations, with the share of normal errors of one axis that it holds."""
+"""Legend of a band of three standard deviations, with the probability of a normal error of one axis within it."""
 
 
 def band(ax: Axes, time: Array, low: Array, high: Array, **style: Any) -> None:
-    """Fill between two series (n,); of a long one between the extremes of each column, which hold over the whole column."""
+    """Fill between two series (n,); for long series between the extremes of each column."""
     found = envelope(time, low, high)
     if len(time) <= BAND_COLUMNS:
         ax.fill_between(*found, linewidth=0, **style)
@@ -45,10 +45,10 @@ def band(ax: Axes, time: Array, low: Array, high: Array, **style: Any) -> None:
 
 
 def errors_in_envelope(time: Array, error: Array, sigma: Array, ax: Axes | None = None) -> Axes:
-    """Draw errors (runs, n) over time (n,), s, inside the filter's ±3σ (n,), in the unit of the axis, which the caller labels.
+    """Draw errors (runs, n) over time (n,), s, with the filter's ±3σ (n,), in the unit of the axis, which the caller labels.
 
-    Of a long series the band is dark up to the least 3σ of each column of pixels and light up to the largest: between two measurements σ
-    grows, and lines through each tooth would be a grey bar that hides the errors.
+    For a long series the band is dark up to the minimum 3σ of each pixel column and light up to the maximum: σ increases between two
+    measurements, and lines that follow it would merge into a grey area that hides the errors.
     """
     ax = axes_or_new(ax)
     bound = 3.0 * sigma
@@ -79,29 +79,29 @@ def errors_in_envelope(time: Array, error: Array, sigma: Array, ax: Axes | None 
 
 
 def angle_labels(fixed_frame: str = "") -> tuple[str, str, str]:
-    """Return what roll, pitch and yaw of the sequence Z-Y-X are, with the sense in which each grows.
+    """Return labels of roll, pitch and yaw of the sequence Z-Y-X, with their positive directions.
 
-    Yaw is from East in a ``fixed_frame`` that begins with "East-North-Up", else from the fixed x axis.
+    Yaw is from East if ``fixed_frame`` begins with "East-North-Up", otherwise from the fixed x axis.
     """
     yaw = "from East to North" if fixed_frame.startswith("East-North-Up") else "from fixed x to y"
     return "roll about body x, y to z", "pitch about y, z to x", f"yaw about fixed z, {yaw}"
 
 
 def wraps(angle: Array, rows: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the places in ``rows`` before which an angle (n,) in degrees wraps round ±180°, so that its line should break."""
+    """Return the places in ``rows`` before which an angle (n,) in degrees wraps at ±180°, where its line must be interrupted."""
     turned = np.unwrap(angle, period=360.0)[rows]
     return np.flatnonzero((np.abs(np.diff(angle[rows])) > 180.0) & (np.abs(np.diff(turned)) < 180.0)) + 1
 
 
 def unbroken(time: Array, angle: Array) -> tuple[Array, Array]:
-    """Return the points of a line of an angle in degrees, reduced as any line, with a gap where it wraps round ±180°."""
+    """Return the points of the line of an angle in degrees, reduced as other lines, with a gap where it wraps at ±180°."""
     rows = extreme_rows(time, angle)
     breaks = wraps(angle, rows)
     return np.insert(time[rows], breaks, time[rows][breaks]), np.insert(angle[rows], breaks, np.nan)
 
 
 def estimate_overview(estimate: Estimate, *, title: str = "", fixed_frame: str = "") -> Figure:
-    """Draw roll, pitch and yaw (sequence Z-Y-X), the gyro bias in its ±3σ, and the attitude's σ over time."""
+    """Draw roll, pitch and yaw (sequence Z-Y-X), the gyro bias with its ±3σ, and the attitude's σ over time."""
     figure, axes = new_figure(5, 1, size=(9.0, 10.0), sharex=True, height_ratios=(1.0, 1.0, 1.0, 1.7, 1.3))
     euler = quaternion.to_rotation(estimate.attitude).as_euler("ZYX", degrees=True)[:, ::-1]
     for ax, angle, name in zip(axes, euler.T, angle_labels(fixed_frame), strict=False):
@@ -128,13 +128,13 @@ def estimate_overview(estimate: Estimate, *, title: str = "", fixed_frame: str =
     words = "root sum square of the three axes"
     if len(total) <= BAND_COLUMNS:
         axes[4].plot(estimate.time, total / size, color=ink(), linewidth=1.0)
-    else:  # a line through each tooth between two measurements would be a black bar
+    else:  # a line that follows the changes of σ between measurements would be a black area
         band(axes[4], estimate.time, total / size, total / size, color=SKY)
         axes[4].plot(*envelope(estimate.time, total / size)[::2], color=ink(), linewidth=0.8)
-        words += ", least to largest of each pixel"
+        words += ", minimum to maximum of each pixel"
     axes[4].set_ylabel(f"attitude σ, {unit}")
     axes[4].set_title(words, loc="right", fontsize="small")
-    if total.max() > 5.0 * total[settled].max():  # a start that would flatten all the rest
+    if total.max() > 5.0 * total[settled].max():  # a large initial σ would make the rest unreadable
         axes[4].set_yscale("log")
         axes[4].yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(2.0, 0.5)))
     else:
@@ -146,7 +146,7 @@ def estimate_overview(estimate: Estimate, *, title: str = "", fixed_frame: str =
 
 
 def states_over_time(estimate: Estimate, *, title: str = "") -> Figure:
-    """Draw the error states of an estimate over time inside their ±3σ, one axes for each declaration and unit, in their order."""
+    """Draw the error states of an estimate over time with their ±3σ, one axes for each declaration and unit, in their order."""
     panels = [
         (name, block, unit, [k for k, one in enumerate(block.units) if one == unit])
         for name, block in estimate.error_states.items()
@@ -163,7 +163,7 @@ def states_over_time(estimate: Estimate, *, title: str = "") -> Figure:
             low, high = values[:, k] - spread[:, k], values[:, k] + spread[:, k]
             if len(members) == 1:
                 band(ax, estimate.time, low, high, color=color, alpha=0.18)
-            else:  # filled, the bands of several would hide one another
+            else:  # filled bands of several components would hide each other
                 bounds = envelope(estimate.time, low, high)
                 for edge in (bounds.low, bounds.high):
                     ax.plot(bounds.time, edge, ":", color=color, linewidth=0.9)
@@ -181,7 +181,7 @@ def states_over_time(estimate: Estimate, *, title: str = "") -> Figure:
 
 
 def recording_errors(time: Array, errors: ReferenceErrors, movement: np.ndarray | None = None) -> Figure:
-    """Draw total, heading and inclination errors, rad, against a reference over time, s; the ``movement`` that is judged is shaded."""
+    """Draw total, heading and inclination errors, rad, relative to a reference over time, s; the tested ``movement`` is shaded."""
     figure, ax = new_figure(size=(9.0, 4.0))
     mask = np.zeros(len(time), int) if movement is None else movement.astype(int)
     inside = np.flatnonzero(np.diff(np.concatenate([[0], mask, [0]])))
@@ -197,28 +197,28 @@ def recording_errors(time: Array, errors: ReferenceErrors, movement: np.ndarray 
     for name, label, color, width in (
         ("total", "total", ink(), 1.8),
         ("heading", "heading, about the vertical", BLUE, 0.8),
-        ("inclination", "inclination, of the vertical", VERMILION, 0.8),
+        ("inclination", "inclination, error of the vertical", VERMILION, 0.8),
     ):
         ax.plot(*decimated(time, getattr(errors, name) / DEGREE), color=color, linewidth=width, label=label)
     ax.set_ylim(bottom=0.0)
     ax.set_xlim(time[0], time[-1])
     ax.set_xlabel("time, s")
-    ax.set_ylabel("error against the reference, °")
+    ax.set_ylabel("error relative to the reference, °")
     legend_above(ax)
     return figure
 
 
 def error_overview(estimate: Estimate, truth: Truth, *, title: str = "") -> Figure:
-    """Draw the six errors against the truth inside the filter's ±3σ: attitude left, bias right.
+    """Draw the six errors relative to the truth with the filter's ±3σ: attitude left, bias right.
 
     Parameters
     ----------
     estimate : Estimate
         Attitude and bias with their σ.
     truth : Truth
-        At the estimate's times.
+        Truth at the times of the estimate.
     title : str
-        What was estimated.
+        Name of the estimate, for the title.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Innovations of one record: their size, their shape, their memory."""
+"""Innovations of one record: magnitude, distribution, autocorrelation."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from strapdown.records import Innovations
 from strapdown.units import angle_unit
 
 HISTOGRAM_REACH = 5.0
-"""Histograms of whitened innovations go so many σ to both sides; what lies beyond is counted in the legend."""
+"""Range of histograms of whitened innovations, ±σ; the number beyond it is in the legend."""
 
 
 def innovation_histogram(whitened: Array, ax: Axes | None = None) -> Axes:
@@ -43,7 +43,7 @@ def innovation_histogram(whitened: Array, ax: Axes | None = None) -> Axes:
 
 
 def innovation_quantiles(pairs: QuantilePairs, ax: Axes | None = None) -> Axes:
-    """Draw sorted whitened innovations over the quantiles of the standard normal, with the bounds of each quantile."""
+    """Draw sorted whitened innovations over the quantiles of the standard normal distribution, with the bounds of each quantile."""
     ax = axes_or_new(ax)
     ax.fill_between(
         pairs.theoretical,
@@ -64,7 +64,7 @@ def innovation_quantiles(pairs: QuantilePairs, ax: Axes | None = None) -> Axes:
 
 
 def innovation_autocorrelation(result: Autocorrelation, ax: Axes | None = None) -> Axes:
-    """Draw the autocorrelation of each component with the bounds of one lag and of all lags together."""
+    """Draw the autocorrelation of each component with the bounds for one lag and for all lags together."""
     ax = axes_or_new(ax)
     lags, number = result.lags, result.values.shape[1]
     width = 0.7 / number
@@ -102,7 +102,7 @@ def nis_over_record(
     window: int = 50,
     probability: float = 0.99,
 ) -> Axes:
-    """Draw the NIS of one sensor per degree of freedom over time, its running mean over ``window``, and the bounds of one measurement."""
+    """Draw the NIS of one sensor per degree of freedom over time, its moving average over ``window``, and the bounds of one measurement."""
     ax = axes_or_new(ax)
     degrees = innovations.innovation.shape[1]
     value = innovations.nis / degrees
@@ -123,7 +123,7 @@ def nis_over_record(
 
 
 def error_distribution(distribution: Distribution, ax: Axes | None = None, *, label: str = "attitude error") -> Axes:
-    """Draw the share of errors, rad, at or below each size, with the median and the 95 % error marked."""
+    """Draw the cumulative distribution of errors, rad, with the median and the 95 % quantile marked."""
     ax = axes_or_new(ax)
     unit, size = angle_unit(np.array([distribution.quantile(0.99)]))
     ax.plot(*decimated(distribution.values / size, 100.0 * distribution.probability), color=BLUE, label=label)
@@ -136,5 +136,5 @@ def error_distribution(distribution: Distribution, ax: Axes | None = None, *, la
     ax.set_xlim(0.0, 1.15 * distribution.quantile(0.999) / size)
     ax.set_ylim(0.0, 102.0)
     ax.set_xlabel(f"{label}, {unit}")
-    ax.set_ylabel("share of the time, %")
+    ax.set_ylabel("fraction of the time, %")
     return ax

@@ -52,19 +52,19 @@ def nees_over_time(
     Parameters
     ----------
     named : sequence of (str, Statistics)
-        What is drawn, with its name in the legend.
+        Statistics, each with its name for the legend.
     bounds : (float, float)
         Lower and upper bound of the ANEES per state.
     subset : {"state", "attitude", "bias"}
     ax : Axes, optional
-        A new figure's if not given.
+        Axes to draw on. Default: those of a new figure.
     label : str
-        Of the bounds in the legend; say their confidence level.
+        Legend of the bounds; should state their confidence level.
 
     Returns
     -------
     Axes
-        What was drawn on.
+        The axes.
     """
     ax = axes_or_new(ax)
     column = ("state", "attitude", "bias").index(subset)
@@ -87,18 +87,18 @@ def nis_over_time(
     Parameters
     ----------
     named : sequence of (str, Statistics)
-        What is drawn, with its name in the legend.
+        Statistics, each with its name for the legend.
     ax : Axes, optional
-        A new figure's if not given.
+        Axes to draw on. Default: those of a new figure.
     probability : float
-        That the mean of a consistent filter over one interval lies inside the bounds.
+        Probability that the mean of a consistent filter over one interval is within the bounds.
     label : str
-        Of the bounds in the legend; their confidence level if not given.
+        Legend of the bounds. Default: their confidence level.
 
     Returns
     -------
     Axes
-        What was drawn on.
+        The axes.
     """
     ax = axes_or_new(ax)
     for k, (name, statistics) in enumerate(named):
@@ -118,7 +118,7 @@ STATES = tuple(f"{what} {axis}" for what in ("attitude", "bias") for axis in AXE
 
 
 def runs_overview(statistics: Statistics, probability: float = 0.99) -> Figure:
-    """Draw ANEES of attitude and bias, and the NIS, over time, with the bounds of a consistent filter; dots are the epochs judged."""
+    """Draw ANEES of attitude and bias, and the NIS, over time, with the bounds of a consistent filter; dots are the tested epochs."""
     figure, axes = new_figure(1, 3, size=(12.0, 4.2))
     axes[1].set_visible(statistics.has_bias)
     findings = statistics.judge(probability=probability).findings
@@ -145,17 +145,17 @@ def runs_overview(statistics: Statistics, probability: float = 0.99) -> Figure:
 
 
 def state_unit(state: int, value: Array) -> tuple[str, float]:
-    """Return the unit that an error of this size of a state (0 to 5) is read in."""
+    """Return the unit in which an error of a state (0 to 5) of this magnitude is printed."""
     return angle_unit(value) if state < 3 else rate_unit(value)
 
 
 def fan(statistics: Statistics, state: int, ax: Axes | None = None) -> Axes:
-    """Draw quantiles of |error| of a ``state`` (0 to 5) over the runs, beside those that the filter predicts."""
+    """Draw quantiles of |error| of a ``state`` (0 to 5) over the runs, and those predicted by the filter."""
     ax = axes_or_new(ax)
     shares = ((0.99, 2.5758), (0.9, 1.6449), (0.5, 0.6745))
     settled = max(1, len(statistics.time) // 20)
     quantiles = [statistics.error_quantile(share)[:, state] for share, _ in shares]
-    # One unit for the three axes beside each other.
+    # The same unit for the three axes.
     unit, size = state_unit(
         state, statistics.error_quantile(shares[0][0])[settled:, state // 3 * 3 : state // 3 * 3 + 3]
     )
@@ -167,7 +167,7 @@ def fan(statistics: Statistics, state: int, ax: Axes | None = None) -> Axes:
             color=SKY,
             alpha=(0.25, 0.45, 0.7)[k],
             linewidth=0,
-            label=f"{100 * share:g} % of the runs below",
+            label=f"{100 * share:g} % quantile of the runs",
         )
         ax.plot(
             statistics.time,
@@ -187,7 +187,7 @@ def fan(statistics: Statistics, state: int, ax: Axes | None = None) -> Axes:
 
 
 def coverage_by_state(statistics: Statistics, epoch: int = -1, ax: Axes | None = None) -> Axes:
-    """Draw the share of the runs inside 1, 2 and 3 σ at one epoch, by state, with the 99 % binomial bounds of a consistent filter."""
+    """Draw the fraction of the runs within 1, 2 and 3 σ at one epoch, by state, with the 99 % binomial bounds of a consistent filter."""
     from scipy.stats import binom
 
     ax = axes_or_new(ax)
@@ -200,13 +200,13 @@ def coverage_by_state(statistics: Statistics, epoch: int = -1, ax: Axes | None =
             100 * statistics.covered[epoch, :, k],
             "o",
             color=CYCLE[k],
-            label=f"inside {k + 1}σ, expected {100 * expected:.1f} %",
+            label=f"within {k + 1}σ, expected {100 * expected:.1f} %",
         )
     ax.set_xticks(range(6), STATES, rotation=20)
     ax.grid(visible=False, axis="x")
     ax.plot([], [], color=ink(), alpha=0.2, linewidth=6, label="99 % bounds of a consistent filter")
     ax.set_ylim(0.0, 104.0)
-    ax.set_ylabel(f"share of {runs} runs, %")
+    ax.set_ylabel(f"fraction of {runs} runs, %")
     legend_above(ax, ncols=2)
     return ax
 
@@ -214,13 +214,13 @@ def coverage_by_state(statistics: Statistics, epoch: int = -1, ax: Axes | None =
 def covariance_ellipses(
     claimed: Array, found: Array, pair: tuple[int, int] = (0, 1), ax: Axes | None = None, *, probability: float = 0.95
 ) -> Axes:
-    """Draw the ellipses that hold ``probability`` of the errors of two states by the filter's covariance, and of the actual errors."""
+    """Draw the ellipses of the given probability for the errors of two states: by the filter's covariance, and of the actual errors."""
     from scipy.stats import chi2
 
     ax = axes_or_new(ax)
     i, j = pair
     largest = np.sqrt(max(claimed[i, i], found[i, i])), np.sqrt(max(claimed[j, j], found[j, j]))
-    alike = i // 3 == j // 3  # two angles, or two rates: in one unit
+    alike = i // 3 == j // 3  # two angles, or two rates: the same unit
     (unit_i, size_i), (unit_j, size_j) = (
         state_unit(s, 3.0 * np.array(largest if alike else [x])) for s, x in zip(pair, largest, strict=True)
     )

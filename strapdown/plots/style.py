@@ -45,11 +45,11 @@ STYLE: Any = {
     "axes.prop_cycle": cycler(color=CYCLE),
     "axes.formatter.min_exponent": 5,  # log axes: 0.01, 1, 1000; powers of ten only beyond
     "axes.formatter.useoffset": False,
-    "pdf.fonttype": 42,  # TrueType, which journals ask for
-    "svg.hashsalt": "strapdown",  # the same figure gives the same file
+    "pdf.fonttype": 42,  # TrueType, required by journals
+    "svg.hashsalt": "strapdown",  # reproducible files
 }
 FORMATS = ("png", "pdf", "svg")
-"""Formats that figures are written in."""
+"""File formats of figures."""
 
 _DARK, _LIGHT = "#16181d", "#e4e6eb"
 THEMES: dict[str, Any] = {
@@ -66,19 +66,19 @@ THEMES: dict[str, Any] = {
         "grid.color": _LIGHT,
     },
 }
-"""Settings by which a theme differs from the plain one."""
+"""Settings of each theme that differ from the default."""
 
 
 @contextlib.contextmanager
 def theme(name: str) -> Iterator[None]:
-    """Draw what is drawn inside in the theme "light" or "dark"."""
+    """Use the theme "light" or "dark" for figures drawn in this context."""
     one_of("theme", name, THEMES)
     with matplotlib.rc_context({**STYLE, **THEMES[name]}):
         yield
 
 
 def ink() -> str:
-    """Return the colour of lines and bands that are neither data nor background: black, or light on a dark ground."""
+    """Return the colour of lines and bands that are neither data nor background: black, or light in the dark theme."""
     return str(matplotlib.rcParams["text.color"])
 
 
@@ -96,12 +96,12 @@ def new_figure(
     size : (float, float)
         Width and height, inches.
     **options
-        Of ``Figure.subplots``, such as ``sharex``.
+        Options of ``Figure.subplots``, such as ``sharex``.
 
     Returns
     -------
     Figure, Axes or array of Axes
-        Laid out so that labels do not overlap.
+        The figure, with constrained layout, and its axes.
     """
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=size, dpi=150, layout="constrained")
@@ -109,14 +109,14 @@ def new_figure(
 
 
 def save(figure: Figure, path: str | os.PathLike[str]) -> Path:
-    """Write a figure as PNG, PDF or SVG by the suffix; the file appears whole or not at all, and holds no date.
+    """Write a figure as PNG, PDF or SVG, by the suffix; atomically, and without a date in the file.
 
     Parameters
     ----------
     figure : Figure
-        Such as the functions of this module return.
+        Figure, as returned by the functions of this package.
     path : path
-        Ends with .png, .pdf or .svg.
+        File with the suffix .png, .pdf or .svg.
 
     Returns
     -------
@@ -125,13 +125,13 @@ def save(figure: Figure, path: str | os.PathLike[str]) -> Path:
     """
     undated: dict[str, Any] = {".pdf": {"CreationDate": None}, ".svg": {"Date": None}}
     with written_beside(path) as temporary, matplotlib.rc_context(STYLE), warnings.catch_warnings():
-        warnings.filterwarnings("ignore", r"Glyph .* missing from font")  # of a file's name: drawn as boxes
+        warnings.filterwarnings("ignore", r"Glyph .* missing from font")  # characters of a file name, drawn as boxes
         figure.savefig(temporary, metadata=undated.get(Path(path).suffix.lower()))
     return Path(path)
 
 
 def save_as(figures: Mapping[Path, Figure], form: str) -> list[Path]:
-    """Write figures, by path, whose suffix is replaced, in one format; return the files."""
+    """Write figures, by path, in one format, which replaces the suffix of the path; return the files."""
     one_of("format", form, FORMATS)
     written = [save(figure, path.with_suffix(f".{form}")) for path, figure in figures.items()]
     for path in figures:
@@ -146,27 +146,27 @@ def axes_or_new(ax: Axes | None) -> Axes:
 
 
 def layered(k: int, number: int) -> dict[str, Any]:
-    """Return the style of line k of several that may lie on each other: the later, the thinner, so that all show."""
+    """Return the style of line k of several that may coincide: later lines are thinner, so that all are visible."""
     return {"color": CYCLE[k % len(CYCLE)], "linewidth": 0.9 + 0.6 * (number - 1 - k)}
 
 
 def legend_above(ax: Axes, *, ncols: int = 4) -> None:
-    """Put the legend of axes above them on the right, where it covers no curve; a title stands on the left."""
+    """Put the legend of axes above them on the right, where it covers no curve; the title is on the left."""
     ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.1, ncols=ncols, frameon=False)
 
 
 def legend_below(figure: Figure, axes: Sequence[Axes], *, ncols: int = 4) -> None:
-    """Put one legend of several axes, each label once, below a figure."""
+    """Put one legend for several axes, each label once, below a figure."""
     found = {label: handle for ax in axes for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
     figure.legend(found.values(), found.keys(), loc="outside lower center", ncols=ncols, frameon=False)
 
 
 ALIKE = 2.0
-"""Vertical scales of axes side by side that differ by less than this factor become one."""
+"""Vertical scales of adjacent axes that differ by less than this factor are made equal."""
 
 
 def match_scales(axes: Sequence[Axes]) -> None:
-    """Give axes side by side one vertical scale where it does not hide a curve, and mark those that need a larger one."""
+    """Give adjacent axes the same vertical scale unless it would hide a curve, and mark those with a larger scale."""
     spans = np.array([float(np.ptp(ax.get_ylim())) for ax in axes])
     alike = spans < ALIKE * spans.min()
     for ax, span, one in zip(axes, spans, alike, strict=True):
@@ -185,6 +185,6 @@ _STATE_UNITS = {
 
 
 def error_state_unit(name: str, unit: str) -> tuple[str, float]:
-    """Return the name and size of the unit that an optional error state is read in, of its block's name and its SI unit."""
+    """Return the name and the factor to SI of the printed unit of an error state, from its name and SI unit."""
     word = "dimensionless" if unit == "1" else unit
     return _STATE_UNITS.get(" ".join(name.split()[:2]), {}).get(unit, (word, 1.0))

@@ -1,4 +1,4 @@
-"""Tuning: the likelihood along each parameter, the filter before and after on held-out data."""
+"""Tuning: the likelihood along each parameter, and the filter before and after tuning on held-out data."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from strapdown.plots.style import BLUE, SKY, VERMILION, axes_or_new, ink, legend
 from strapdown.tuning import Comparison, Slices, Tuning
 
 TALLEST = 15.0
-"""Slices are drawn up to this −2 Δ log likelihood."""
+"""Upper limit of the slices, −2 Δ log likelihood."""
 
 
 def likelihood_slice(slices: Slices, tuning: Tuning, number: int, ax: Axes | None = None) -> Axes:
-    """Draw twice the fall of the log likelihood along one parameter, with its interval and its value before."""
+    """Draw twice the decrease of the log-likelihood along one parameter, with its interval and its previous value."""
     ax = axes_or_new(ax)
     one = tuning.parameters[number]
     unit = one.unit
@@ -77,7 +77,7 @@ def likelihood_slices(slices: Slices, tuning: Tuning) -> Figure:
 
 
 def before_and_after(comparison: Comparison, *, title: str = "") -> Figure:
-    """Draw NIS, and NEES where there is a truth, on the data held out, before and after, with the bounds of a consistent filter."""
+    """Draw NIS, and NEES if there is a truth, on the held-out data before and after tuning, with the bounds of a consistent filter."""
     from strapdown.consistency import mean_bounds
 
     both = (("before", comparison.before, VERMILION), ("after", comparison.after, BLUE))
@@ -105,7 +105,7 @@ def _course(
     bounds: tuple[float, float],
     label: str,
 ) -> None:
-    """Draw means over intervals of time, which are 1 for a consistent filter, of the filter before and after."""
+    """Draw means over intervals of time, whose expectation is 1 for a consistent filter, before and after tuning."""
     for name, color, mean, time, values in courses:
         there = np.isfinite(values)
         ax.plot(time[there], values[there], ".-", color=color, linewidth=1.0, label=f"{name}: mean {mean:.3g}")

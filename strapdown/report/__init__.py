@@ -1,6 +1,6 @@
-"""Reports: one self-contained HTML page for a result file. The verdict in words first, then numbers, figures and provenance.
+"""Reports: one self-contained HTML page for a result file, with verdict, numbers, figures and provenance.
 
-- ``page``: HTML, figures and interactive charts on one page without network. The charts are drawn by uPlot (MIT licence), bundled in
+- ``page``: HTML, figures and interactive charts on one page without network access. The charts are drawn by uPlot (MIT licence), bundled in
   ``uplot/``.
 - ``estimates``: The page of one estimate.
 - ``campaigns``: The page of a Monte Carlo.
@@ -45,16 +45,16 @@ class Report:
 def write(
     result: str | os.PathLike[str], out: str | os.PathLike[str] | None = None, *, probability: float = 0.99
 ) -> Report:
-    """Write the report of a result file, and its statistics as JSON beside it; each appears whole or not at all.
+    """Write the report of a result file, and its statistics as JSON beside it, atomically.
 
     Parameters
     ----------
     result : path
         HDF5 file of an estimate or a Monte Carlo, or the JSON of a tuning.
     out : path, optional
-        The page; ``result`` with the suffix .html if not given.
+        The page. Default: ``result`` with the suffix .html.
     probability : float
-        That no test rejects a consistent filter.
+        Probability that no test rejects a consistent filter.
 
     Returns
     -------
@@ -65,15 +65,15 @@ def write(
     existing_file(source)
     target = source.with_suffix(".html") if out is None else Path(out)
     if target.suffix.lower() not in (".html", ".htm"):
-        raise InputError(f"out is {target}; a report is an .html file")
+        raise InputError(f"out is {target}; give a file with the suffix .html")
     kind = "strapdown tuning" if source.suffix.lower() == ".json" else records.read_attributes(source)["kind"]
     if kind not in _WRITERS:
         known = ", ".join(name.removeprefix("strapdown ") for name in _WRITERS)
-        raise InputError(f"{source} holds: {kind.removeprefix('strapdown ')}; reports are written of: {known}")
-    with from_file(source):  # what is wrong with a number shows at the latest where it is drawn
+        raise InputError(f"{source} holds: {kind.removeprefix('strapdown ')}; reports are available for: {known}")
+    with from_file(source):  # errors while drawing invalid numbers name the file
         content, statistics = _WRITERS[kind](source, probability)
-    beside = target.with_suffix(".report.json")  # not .json alone, which other commands write beside their results
+    beside = target.with_suffix(".report.json")  # not .json, which other commands write beside their results
     with written_beside(target) as temporary:
-        temporary.write_text(content, encoding="utf-8", errors="backslashreplace")  # a name may be no UTF-8
+        temporary.write_text(content, encoding="utf-8", errors="backslashreplace")  # a name may not be UTF-8
     write_json(beside, statistics)
     return Report(page=target, statistics=beside, verdict=str(statistics["judgement"]["verdict"]))

@@ -1,4 +1,4 @@
-"""The page of a Monte Carlo, finished or not."""
+"""The page of a Monte Carlo, complete or not."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from strapdown.report import findings, page
 
 
 def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
-    """Return the page and the statistics of a campaign's file."""
+    """Return the page and the statistics for a campaign file."""
     attributes = records.read_attributes(path)
     held = campaign.read(path)
     statistics = held.statistics
     if statistics is None:
-        raise InputError(f"{path} holds no finished run yet; let the campaign go on (--resume) and report then")
+        raise InputError(f"{path} has no completed run yet; continue the campaign with --resume first")
     judgement = statistics.judge(probability=probability, unmodelled=held.plan.unmodelled)
     bound = verdicts.bound_of(held.plan)
     name = held.plan.scenario.name or "a scenario"
-    unfinished = "" if held.finished else f"; not finished: {statistics.runs} of {held.runs} runs"
+    unfinished = "" if held.finished else f"; incomplete: {statistics.runs} of {held.runs} runs"
     content = page.page(
         f"Monte Carlo: {name}",
         f"{statistics.runs} runs of {held.plan.scenario.duration:g} s, seed {held.plan.seed}, {len(statistics.time) - 1} epochs, machine: "
@@ -44,19 +44,19 @@ def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
             ),
             page.figure(
                 lambda: _fans(statistics),
-                "Quantiles of the errors over the runs, and those that the filter predicts",
+                "Quantiles of the errors over the runs, and those predicted by the filter",
             ),
         ),
         page.section(
             "At the end",
             page.figure(
                 lambda: _end(statistics),
-                "σ-coverage by state, and the covariance of the errors beside the filter's",
+                "σ-coverage by state, and the covariance of the errors and of the filter",
             ),
         ),
         _worst(statistics, path),
         page.section(
-            "How it was made",
+            "Provenance",
             page.provenance({k: v for k, v in attributes.items() if k not in ("plan", "conventions") and v != ""}),
         ),
     )
@@ -82,7 +82,7 @@ def _estimated(statistics: Statistics) -> tuple[str, ...]:
 
 
 def _over_bound(statistics: Statistics, bound: Array) -> Array:
-    """Return the RMS error over the root of the Cramér–Rao bound, by epoch and estimated state."""
+    """Return the RMS error divided by the root of the Cramér–Rao bound, by epoch and estimated state."""
     return verdicts.efficiency(statistics, bound)[:, : len(_estimated(statistics))]
 
 
@@ -130,9 +130,7 @@ def _numbers(statistics: Statistics, bound: Array | None, judgement: consistency
         )
     if statistics.failed:
         parts.append(
-            page.paragraph(
-                f"{statistics.failed} runs failed: their error or covariance was no finite number at some epoch."
-            )
+            page.paragraph(f"{statistics.failed} runs failed: their error or covariance was not finite at some epoch.")
         )
     return page.section("Key numbers", *parts)
 
@@ -152,7 +150,7 @@ def _fans(statistics: Statistics) -> Figure:
 def _end(statistics: Statistics) -> Figure:
     figure, axes = plots.new_figure(1, 3, size=(13.0, 4.4))
     plots.coverage_by_state(statistics, -1, axes[0])
-    # The bias axis whose covariance is furthest from that of its errors, beside the attitude about it.
+    # The bias axis with the largest ratio between actual and filter variance, with the attitude about it.
     ratio = np.diag(statistics.mean_square_error[-1]) / np.diag(statistics.covariance[-1])
     worst = int(np.argmax(np.abs(np.log(np.maximum(ratio[3:], 1e-300)))))
     for ax, pair in zip(axes[1:], ((0, 1), (worst, 3 + worst) if statistics.has_bias else (0, 2)), strict=True):
@@ -167,7 +165,7 @@ def _worst(statistics: Statistics, path: Path) -> str:
     ]
     return page.section(
         "Worst runs",
-        page.table(("run", "largest NEES of the state (6 degrees of freedom)"), rows, numbers=2),
-        page.paragraph("Each can be re-created alone, in full detail and to the bit, by its number:"),
+        page.table(("run", "maximum NEES of the state (6 degrees of freedom)"), rows, numbers=2),
+        page.paragraph("A run can be repeated by its number, bit for bit, with its record and estimate:"),
         page.code(f"strapdown montecarlo {path.name} --replay {int(statistics.worst_run[0])}"),
     )

@@ -19,7 +19,7 @@ _COLOURS = ("--a", "--b", "--c")
 
 
 def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
-    """Return the page and the statistics of an estimate's file."""
+    """Return the page and the statistics for an estimate file."""
     attributes = records.read_attributes(path)
     estimate = records.read_estimate(path)
     truth = records.read_truth(path)
@@ -33,7 +33,7 @@ def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
         f"{'with' if truth is not None else 'without'} truth; strapdown {attributes.get('version', '')}",
         findings.verdict(judgement),
         *(
-            [page.section("What happened", *[page.paragraph(str(event)) for event in estimate.events])]
+            [page.section("Events", *[page.paragraph(str(event)) for event in estimate.events])]
             if estimate.events
             else []
         ),
@@ -43,9 +43,9 @@ def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
         *[_sensor(name, one, probability) for name, one in estimate.innovations.items()],
         *_distribution(estimate, truth),
         page.section(
-            "How it was made",
+            "Provenance",
             page.provenance(attributes),
-            page.paragraph("Judge it again:"),
+            page.paragraph("To repeat the tests:"),
             page.code(f"strapdown check {path.name}\nstrapdown report {path.name}"),
         ),
     )
@@ -119,7 +119,7 @@ def _numbers(estimate: Estimate, truth: Truth | None) -> str:
             "sensor",
             "measurements",
             "not used: missing or outside",
-            "refused by the gate",
+            "rejected by the gate",
             "NIS per degree of freedom",
         ]
         parts.append(page.table(head, sensors, numbers=4))
@@ -150,7 +150,7 @@ def _over_time(estimate: Estimate, truth: Truth | None, fixed_frame: str) -> str
         if estimate.has_bias:
             figure = page.figure(
                 lambda: plots.error_overview(estimate, truth),
-                "Errors against the truth inside the filter's ±3σ, body axes",
+                "Errors relative to the truth with the filter's ±3σ, body axes",
             )
     else:
         euler = quaternion.to_rotation(estimate.attitude).as_euler("ZYX", degrees=True)[:, ::-1]
@@ -168,7 +168,8 @@ def _over_time(estimate: Estimate, truth: Truth | None, fixed_frame: str) -> str
         series = (page.Series(label="σ, root sum square of the three axes", value=spread),)
         charts.append(page.chart("Attitude σ", "attitude σ, °", estimate.time, series))
         figure = page.figure(
-            lambda: plots.estimate_overview(estimate, fixed_frame=fixed_frame), "Attitude, gyro bias in ±3σ, attitude σ"
+            lambda: plots.estimate_overview(estimate, fixed_frame=fixed_frame),
+            "Attitude, gyro bias with ±3σ, attitude σ",
         )
     return page.section("Over time", *charts, figure)
 
@@ -188,7 +189,7 @@ def _sensor(name: str, innovations: Innovations, probability: float) -> str:
         plots.nis_over_record(innovations, consistency.mean_bounds(white.shape[1], 1, 0.99), axes[1, 1])
         return figure
 
-    caption = f"Innovations of {name} over their σ: distribution, quantiles, autocorrelation, NIS over time"
+    caption = f"Innovations of {name} divided by their σ: distribution, quantiles, autocorrelation, NIS over time"
     return page.section(f"Innovations of {name}", page.figure(draw, caption))
 
 
@@ -202,5 +203,5 @@ def _distribution(estimate: Estimate, truth: Truth | None) -> list[str]:
         plots.error_distribution(angle, ax)
         return figure
 
-    caption = "Share of the time at which the whole attitude error is at or below each size"
+    caption = "Cumulative distribution of the total attitude error over time"
     return [page.section("Attitude", page.figure(draw, caption))]

@@ -1,4 +1,4 @@
-"""A judgement as a part of the page."""
+"""The sections of a page for a judgement."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def verdict(judgement: Judgement) -> str:
 
 
 def evidence(judgement: Judgement) -> str:
-    """Return the section with every statistic against its bounds, and what they cannot show."""
+    """Return the section with all statistics, their bounds and their limitations."""
     rows = [
         (
             "fail" if finding.rejected else "pass",
@@ -41,18 +41,18 @@ def evidence(judgement: Judgement) -> str:
     marked = ["fail" if finding.rejected else "pass" for finding in judgement.findings]
     percent = 100.0 * judgement.probability
     note = (
-        f"Bounds, pass and fail take all tests together: a consistent filter fails with at most {100.0 - percent:g} %. Each p-value is "
-        "that of its statistic alone. Samples that are correlated count as the independent ones that show as much."
+        f"Bounds, pass and fail are for all tests together: a consistent filter fails with at most {100.0 - percent:g} %. Each p-value is "
+        "for one statistic. For correlated samples, the number is the effective number of independent samples."
     )
     parts = [page.table(head, rows, numbers=5, marked=marked), page.paragraph(note, faint=True)]
-    parts += [page.paragraph(f"What this does not show: {limit}.", faint=True) for limit in judgement.limits]
-    return page.section("The evidence", *parts)
+    parts += [page.paragraph(f"Limitation: {limit}.", faint=True) for limit in judgement.limits]
+    return page.section("Evidence", *parts)
 
 
 def judged(
     path: Path, attributes: Mapping[str, Any], estimate: Estimate, truth: Truth | None, *, probability: float
 ) -> Judgement:
-    """Return the verdict on an estimate by what its file says of the filter beside it."""
+    """Return the verdict on an estimate, with the filter described in its file."""
     states, unmodelled = _filter_of(path, attributes)
     if truth is None:
         truth = read_reference(path)
@@ -67,7 +67,7 @@ def judged(
 
 
 def _filter_of(path: Path, attributes: Mapping[str, Any]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the error states of the filter of an estimate, and the errors, in words, that its scenario specifies beside them."""
+    """Return the error states of the filter of an estimate, and descriptions of the specified errors that it does not model."""
     if "filter" not in attributes:
         return (), ()
     try:

@@ -1,4 +1,4 @@
-"""One HTML page that needs nothing else: no network, no files beside it. Figures in a light and a dark version, charts to zoom into."""
+"""One self-contained HTML page, without network access or other files. Figures in a light and a dark version, interactive charts."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from strapdown.plots.decimation import column_starts, extreme_rows
 from strapdown.plots.estimates import wraps
 
 CHART_POINTS = 6000
-"""Most times of an interactive chart; longer series are reduced to the extremes of each column."""
+"""Maximum number of times of an interactive chart; longer series are reduced to the extremes of each column."""
 _DOTS_PER_INCH = 120
 _WIDE = 7.0
-"""Inches: wider figures scroll sideways on a narrow page instead of shrinking."""
+"""Width in inches above which a figure scrolls on a narrow page instead of shrinking."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -33,22 +33,22 @@ class Series:
 
     label: str
     value: Array
-    """(n,), in the chart's unit."""
+    """Values (n,), in the unit of the chart."""
     colour: str = "--a"
-    """A colour of page.css."""
+    """Colour, by its name in page.css."""
     band: bool = False
-    """An edge of a band, upper or after it lower, which is filled and not drawn itself."""
+    """Whether it is the upper limit, followed by the lower limit, of a band, which is filled without lines."""
     wraps: bool = False
-    """An angle in degrees, whose line breaks where it wraps round ±180°."""
+    """Whether it is an angle in degrees, whose line is interrupted where it wraps at ±180°."""
 
 
 def text(content: Any) -> str:
-    """Return text safe inside HTML."""
+    """Return text escaped for HTML."""
     return html.escape(str(content))
 
 
 def section(title: str, *parts: str) -> str:
-    """Return a headed section."""
+    """Return a section with a heading."""
     return f"<section><h2>{text(title)}</h2>\n" + "\n".join(parts) + "</section>\n"
 
 
@@ -63,10 +63,10 @@ def code(content: str) -> str:
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[Any]], *, numbers: int = 0, marked: Sequence[str] = ()) -> str:
-    """Return a table, which scrolls sideways where the page is narrower.
+    """Return a table, which scrolls horizontally on a narrow page.
 
-    The last ``numbers`` columns hold numbers and are set to the right; a table without any wraps its texts instead of scrolling. ``marked``
-    is the class of the first cell of each row: "pass", "fail", "unsure" or "" for none.
+    The last ``numbers`` columns contain numbers and are right-aligned; a table without numbers wraps its text instead of scrolling.
+    ``marked`` is the class of the first cell of each row: "pass", "fail", "unsure" or "" for none.
     """
     plain = len(head) - numbers
     heads = [f"<th{' class=number' if j >= plain else ''}>{text(cell)}</th>" for j, cell in enumerate(head)]
@@ -84,12 +84,12 @@ def table(head: Sequence[str], rows: Sequence[Sequence[Any]], *, numbers: int = 
 
 
 def number(value: float, digits: int = 4) -> str:
-    """Return a number for people; nothing for NaN."""
+    """Return a number as text; empty for NaN."""
     return "" if math.isnan(value) else f"{value:.{digits}g}"
 
 
 def figure(draw: Callable[[], Figure], caption: str) -> str:
-    """Return a figure, drawn once in each theme; the page shows the one that the reader's device prefers."""
+    """Return a figure, drawn in each theme; the page shows that of the reader's colour scheme."""
     (light, wide), (dark, _) = (_image(draw, theme) for theme in ("light", "dark"))
     kind = " class=wide" if wide else ""
     return (
@@ -99,7 +99,7 @@ def figure(draw: Callable[[], Figure], caption: str) -> str:
 
 
 def _image(draw: Callable[[], Figure], theme: str) -> tuple[str, bool]:
-    """Return a figure as the address of an image, and whether it is too wide to be read when shrunk to a phone."""
+    """Return a figure as a data URL, and whether it is too wide to be readable when shrunk to a phone."""
     with style.theme(theme):
         buffer = io.BytesIO()
         drawn = draw()
@@ -108,7 +108,7 @@ def _image(draw: Callable[[], Figure], theme: str) -> tuple[str, bool]:
 
 
 def chart(title: str, unit: str, time: Array, series: Sequence[Series], *, reach: float | None = None) -> str:
-    """Return the place of an interactive time series with its data, its vertical axis ±``reach`` at first, or everything."""
+    """Return an interactive time series with its data; the initial vertical axis is ±``reach``, or the range of the data."""
     lines = [one.value for one in series if not one.band]
     bands = [k for k, one in enumerate(series) if one.band][::2]
     columns = CHART_POINTS // (2 * len(lines))
@@ -145,7 +145,7 @@ def _numbers(values: Array) -> list[float | None]:
 
 
 def verdict(answer: str, reason: str, details: Sequence[str] = ()) -> str:
-    """Return the verdict box: the answer, why, and what contradicts it."""
+    """Return the verdict box: the verdict, its reason, and findings against it."""
     kind = {"consistent": "consistent", "not consistent": "not"}.get(answer, "cannot")
     items = "".join(f"<li>{text(detail)}</li>" for detail in details)
     listing = f"<ul>{items}</ul>" if items else ""
@@ -154,7 +154,7 @@ def verdict(answer: str, reason: str, details: Sequence[str] = ()) -> str:
 
 
 def page(title: str, subtitle: str, *parts: str) -> str:
-    """Return the whole page."""
+    """Return the complete page."""
     read = lambda name: (importlib.resources.files("strapdown.report") / name).read_text(encoding="utf-8")  # noqa: E731
     scripts = ""
     if any('class="chart"' in part for part in parts):
@@ -173,7 +173,7 @@ def page(title: str, subtitle: str, *parts: str) -> str:
 
 
 def provenance(attributes: Mapping[str, Any]) -> str:
-    """Return what a result file says of its making: short entries as a table, long ones (a scenario's TOML) in full."""
+    """Return the attributes of a result file: short ones as a table, long ones (such as the TOML of a scenario) in full."""
     short: list[tuple[str, str]] = []
     long: list[tuple[str, str]] = []
     for name, value in attributes.items():
@@ -181,6 +181,6 @@ def provenance(attributes: Mapping[str, Any]) -> str:
             f"{value:.6g}" if isinstance(value, float) else str(value.decode() if isinstance(value, bytes) else value)
         )
         (long if "\n" in content or len(content) > 160 else short).append((name.replace("_", " "), content))
-    parts = [table(("what", "value"), short)] if short else []
+    parts = [table(("attribute", "value"), short)] if short else []
     parts += [f"<p>{text(name)}</p>" + code(content) for name, content in long]
     return "\n".join(parts)

@@ -1,6 +1,6 @@
-"""Tables of studies, written as CSV with every digit and as LaTeX for a paper.
+"""Tables of studies, written as CSV with all digits and as LaTeX.
 
-A study's numbers are rows with the unit in each key, as its JSON has them; LaTeX prints the key in words.
+The numbers of a study are rows with the unit in each key, as in its JSON; in LaTeX the key is printed in words.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from strapdown.files import written_beside
 from strapdown.units import ARCSECOND, DEGREE_PER_HOUR
 
 Value = str | float | int | bool | None
-"""A cell; None and NaN are empty ones."""
+"""Content of a cell; None and NaN are empty."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,19 +29,19 @@ class Table:
     """One table of a study."""
 
     name: str
-    """Name of the files."""
+    """Name of the files without suffix."""
     caption: str
     columns: Sequence[str]
     """Keys of the rows, in the order of the columns; other keys are not written."""
     rows: Sequence[Mapping[str, Any]]
 
     def cells(self) -> list[list[Value]]:
-        """Return the values, one list a row."""
+        """Return the values, one list per row."""
         return [[row[key] for key in self.columns] for row in self.rows]
 
 
 def write(tables: Sequence[Table], folder: str | os.PathLike[str]) -> list[Path]:
-    r"""Write tables to a folder, made if missing, as ``NAME.csv`` and ``NAME.tex``; return the files."""
+    r"""Write tables to a folder, which is created if missing, as ``NAME.csv`` and ``NAME.tex``; return the files."""
     written = []
     for table in tables:
         for suffix, content in (("csv", to_csv(table)), ("tex", to_latex(table))):
@@ -61,7 +61,7 @@ def to_csv(table: Table) -> str:
 
 
 def to_latex(table: Table) -> str:
-    """Return a table as LaTeX: a ``tabular`` with rules of ``booktabs``, texts left and numbers right."""
+    """Return a table as LaTeX: a ``tabular`` with rules of ``booktabs``, text left-aligned and numbers right-aligned."""
     rows = table.cells()
     sides = [
         "l" if any(isinstance(row[k], (str, bool, np.bool_)) for row in rows) else "r"
@@ -79,7 +79,7 @@ def _empty(cell: Value) -> bool:
 
 
 def _line(text: str) -> str:
-    """Return text on one line, as a comment needs it."""
+    """Return text on one line, for a comment."""
     return " ".join(text.split())
 
 
@@ -121,7 +121,7 @@ _SIGNS = {
 
 
 def _escaped(text: str) -> str:
-    parts = re.split(r"√(\w+)", _line(text))  # every second part stands under a root
+    parts = re.split(r"√(\w+)", _line(text))  # every second part is under a root
     plain = ["".join(_SIGNS.get(sign, sign) for sign in part) for part in parts]
     return "".join(rf"$\sqrt{{\mathrm{{{part}}}}}$" if k % 2 else part for k, part in enumerate(plain))
 
@@ -131,7 +131,7 @@ _WORDS = {"rms": "RMS", "sigma": "σ", "anees": "ANEES", "nis": "NIS"}
 
 
 def _heading(key: str) -> str:
-    """Return a key in words, its unit after a comma."""
+    """Return a key in words, followed by a comma and its unit."""
     unit = next((unit for unit in _UNITS if key.endswith(unit)), "")
     words = key.removesuffix(unit).split("_")
     return " ".join(_WORDS.get(word, word) for word in words) + _UNITS.get(unit, "")
@@ -153,7 +153,7 @@ def of_coning(summary: Mapping[str, Any]) -> list[Table]:
         ),
         Table(
             "filters",
-            f"The same filter on each algorithm, {scenario['runs']} runs, {case}",
+            f"The same filter with each algorithm, {scenario['runs']} runs, {case}",
             ("integration", *errors, *tests),
             rows,
         ),
@@ -161,7 +161,7 @@ def of_coning(summary: Mapping[str, Any]) -> list[Table]:
 
 
 def of_algorithms(rows: Sequence[Mapping[str, Any]]) -> list[Table]:
-    """Return the table of the integration algorithms, of the rows of :func:`strapdown.coning.algorithm_rows`, with their times if given."""
+    """Return the table of the integration algorithms from the rows of :func:`strapdown.coning.algorithm_rows`, with times if given."""
     keyed = [{key.replace(" ", "_"): value for key, value in row.items()} for row in rows]
     known = ("name", "needs", "samples", "previous", "following", "order", "drift_order", "drift_constant")
     shown = [key for key in (*known, "ns_per_sample", "source") if all(key in row for row in keyed)]
@@ -172,9 +172,9 @@ def of_algorithms(rows: Sequence[Mapping[str, Any]]) -> list[Table]:
 
 
 def of_vibration(rows: Sequence[Mapping[str, Any]]) -> list[Table]:
-    """Return the table of the drift that a vibration spectrum leaves, of rows ``algorithm, sample_rate_hz, drift_deg_per_hour``."""
+    """Return the table of the drift due to a vibration spectrum, from rows ``algorithm, sample_rate_hz, drift_deg_per_hour``."""
     columns = ("algorithm", "sample_rate_hz", "drift_deg_per_hour")
-    return [Table("coning-budget", "Drift left by a vibration spectrum", columns, rows)]
+    return [Table("coning-budget", "Drift due to a vibration spectrum", columns, rows)]
 
 
 def of_montecarlo(summary: Mapping[str, Any]) -> list[Table]:
@@ -193,7 +193,7 @@ def of_montecarlo(summary: Mapping[str, Any]) -> list[Table]:
     errors = [
         {"state": f"{what} {axis}", "unit": shown, **{key: last[f"{what}_{key}_{unit}"][k] for key in sizes}}
         for what, unit, shown in (("attitude", "arcsec", "arcsec"), ("bias", "deg_per_hour", "°/h"))
-        if f"{what}_rms_error_{unit}" in last  # a filter may estimate no bias
+        if f"{what}_rms_error_{unit}" in last  # not all filters estimate a bias
         for k, axis in enumerate("xyz")
     ]
     inside = [f"inside_{k}_sigma" for k in (1, 2, 3)]
@@ -212,7 +212,7 @@ def of_montecarlo(summary: Mapping[str, Any]) -> list[Table]:
             ("state", "unit", *sizes),
             errors,
         ),
-        Table("coverage", f"Share of errors inside 1, 2 and 3 σ at the judged epochs, {runs}", ("of", *inside), shares),
+        Table("coverage", f"Fraction of errors within 1, 2, 3 σ at the tested epochs, {runs}", ("of", *inside), shares),
     ]
 
 
@@ -225,7 +225,7 @@ def _ends(part: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def of_covariance(budget: Sequence[tuple[str, str, float, float]]) -> list[Table]:
-    """Return the error budget of :meth:`strapdown.covariance.Analysis.budget`, largest attitude error first."""
+    """Return the error budget of :meth:`strapdown.covariance.Analysis.budget`, sorted by decreasing attitude error."""
     columns = ("source", "kind", "attitude_arcsec", "bias_deg_per_hour")
     rows = [
         dict(zip(columns, (source, kind, attitude / ARCSECOND, bias / DEGREE_PER_HOUR), strict=True))
@@ -235,7 +235,7 @@ def of_covariance(budget: Sequence[tuple[str, str, float, float]]) -> list[Table
 
 
 def of_tuning(content: Mapping[str, Any]) -> list[Table]:
-    """Return the tables of a tuning's JSON: ``parameters`` and, where data were held out, ``held-out``."""
+    """Return the tables for the JSON of a tuning: ``parameters`` and, if data were held out, ``held-out``."""
     per = lambda one, key: None if one[key] is None else one[key] / one["si_per_unit"]  # noqa: E731
     rows = [
         {**one, "before": per(one, "start"), "after": per(one, "value")}
@@ -250,13 +250,13 @@ def of_tuning(content: Mapping[str, Any]) -> list[Table]:
             for name, one in content["held_out"].items()
         ]
         statistics = ("log_likelihood_per_innovation", "nis_per_degree", "nis_lower", "nis_upper", "anees_per_state")
-        caption = "The filter before and after tuning on data held out; NIS with 99 % bounds"
+        caption = "The filter before and after tuning on held-out data; NIS with 99 % bounds"
         tables.append(Table("held-out", caption, ("filter", *statistics, "attitude_rms_rad"), held))
     return tables
 
 
 def of_allan(rows: Sequence[Mapping[str, Any]], sensor: str) -> list[Table]:
-    """Return the noise coefficients of a sensor, of the rows of :func:`strapdown.allan.table`, as ``SENSOR-noise``."""
+    """Return the noise coefficients of a sensor, from the rows of :func:`strapdown.allan.table`, as ``SENSOR-noise``."""
     shown = [
         {
             **row,
@@ -279,4 +279,4 @@ STUDIES: dict[str, Callable[..., list[Table]]] = {
     "tuning": of_tuning,
     "allan": of_allan,
 }
-"""Functions that make the tables of each study."""
+"""Functions that return the tables of each study."""

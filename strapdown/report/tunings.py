@@ -1,4 +1,4 @@
-"""The page of a tuning: what `strapdown tune` wrote, parameters with their intervals, and the proof on data held out."""
+"""The page of a tuning: the result of `strapdown tune`, parameters with their intervals, and the validation on held-out data."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from strapdown.files import reading
 from strapdown.report import page
 
 BOUNDS = (
-    "The bounds hold the NIS of a consistent filter, by itself, with 99 %; the verdict takes all tests of a record together, so each "
-    "statistic may lie somewhat outside its own bounds"
+    "The NIS of a consistent filter is within its bounds with a probability of 99 %; the verdict is for all tests of a record together, so "
+    "each statistic may be slightly outside its bounds"
 )
-"""Note below NIS and a verdict on the data held out."""
+"""Note below NIS and a verdict on the held-out data."""
 
 LARGEST_FIGURE = 50_000_000
-"""Bytes of a figure beside the result that goes into the page."""
+"""Maximum size of a figure that is included in the page, bytes."""
 
 
 class _Table(BaseModel):
-    """A table of the JSON: what the page needs of it; more is left alone."""
+    """Part of the JSON that the page needs; other keys are ignored."""
 
     model_config = ConfigDict(strict=True, allow_inf_nan=False)
 
@@ -103,7 +103,7 @@ class _Tuning(_Table):
 
 
 def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
-    """Return the page and the statistics of a tuning's JSON; ``probability`` is that of the tuning's own verdicts, and not used."""
+    """Return the page and the statistics for the JSON of a tuning; ``probability`` is not used, since the verdicts are in the JSON."""
     content = read(path)
     held = content.get("held_out")
     answer = verdict(content)
@@ -113,18 +113,18 @@ def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
         page.section("Parameters", *_parameters(content)),
     ]
     if held:
-        parts.append(page.section("On the data held out", *_held_out(held)))
+        parts.append(page.section("Held-out data", *_held_out(held)))
     drawn = {name: caption for name, caption in _FIGURES.items() if held or name != "heldout"}
     parts += [_image(path.with_name(f"{path.stem}-{name}"), caption) for name, caption in drawn.items()]
     making = [page.provenance({"records": ", ".join(content["records"]), "units of the JSON": content["units"]})]
     if toml.exists():
         making += [page.paragraph(f"The filter, {toml.name}:"), page.code(reading.text(toml, link=False))]
-    making += [page.paragraph("Use it:"), page.code(f"strapdown estimate RECORD.h5 --filter {toml.name}")]
-    parts.append(page.section("How it was made", *making))
+    making += [page.paragraph("To use it:"), page.code(f"strapdown estimate RECORD.h5 --filter {toml.name}")]
+    parts.append(page.section("Provenance", *making))
     searches = content["searches"]
     subtitle = (
         f"Parameters: {len(content['parameters'])}; records: {len(content['records'])}; {searches['at_the_best_point']} of "
-        f"{searches['number']} searches ended at the best point"
+        f"{searches['number']} searches converged to the optimum"
     )
     html = page.page(f"Tuning: {path.name}", subtitle, *parts)
     return html, {"source": path.name, "judgement": {"verdict": answer[0], "reason": answer[1]}, "tuning": content}
@@ -132,7 +132,7 @@ def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
 
 _FIGURES = {
     "likelihood": "Likelihood along each parameter, with its interval",
-    "heldout": "Statistics on the data held out, before and after",
+    "heldout": "Statistics on the held-out data, before and after tuning",
 }
 
 
@@ -145,37 +145,37 @@ def read(path: Path) -> dict[str, Any]:
         first = error.errors()[0]
         place = ".".join(str(part) for part in first["loc"])
         raise InputError(
-            f"{path}: {place or 'its content'}: {first['msg']}; it is not what `strapdown tune` writes beside its filter.toml"
+            f"{path}: {place or 'its content'}: {first['msg']}; give the JSON that `strapdown tune` writes beside its filter.toml"
         ) from None
     return content  # type: ignore[no-any-return]
 
 
 def verdict(content: dict[str, Any]) -> tuple[str, str, list[str]]:
-    """Return the verdict on the tuned filter, its reason, and what contradicts it: on held-out data the worst of its judgements."""
+    """Return the verdict on the tuned filter, its reason, and findings against it; with held-out data, the worst of its judgements."""
     held = content.get("held_out")
     if not held:
         return _on_its_own_data(content)
     after = held["after"]["judgements"]
     if not after:
-        return "cannot tell", "the data held out were not judged", []
+        return "cannot tell", "the held-out data were not judged", []
     worst = max(after, key=lambda one: ("consistent", "cannot tell", "not consistent").index(one["verdict"]))
     details = [finding["means"] for one in after for finding in one["findings"] if finding["rejected"]]
     gain = held["after"]["log_likelihood_per_innovation"] - held["before"]["log_likelihood_per_innovation"]
     if gain < 0.0:
-        details.append("on the data held out the filter before was more likely: keep that one")
-    return worst["verdict"], f"{worst['reason']}, on data that the tuning has not seen", details
+        details.append("on the held-out data the likelihood has decreased: keep the previous filter")
+    return worst["verdict"], f"{worst['reason']}, on held-out data", details
 
 
 def _on_its_own_data(content: dict[str, Any]) -> tuple[str, str, list[str]]:
     examined = content.get("unmodelled", [])
     answers = [one.get("judgement", {}).get("verdict") for one in examined]
-    prove = "--holdout proves a tuning on data that it has not seen"
+    prove = "--holdout validates a tuning on held-out data"
     details = [words for one in examined for words in one["words"]]
     if content.get("innovations_fit") is False or details:
-        return "not consistent", f"the tuned filter does not explain the data that it was tuned on; {prove}", details
+        return "not consistent", f"the tuned filter does not agree with the data used for tuning; {prove}", details
     if "cannot tell" in answers:
-        return "cannot tell", f"the data that the filter was tuned on are too few to judge it; {prove}", []
-    return "consistent", f"the tuned filter explains the data that it was tuned on; {prove}", []
+        return "cannot tell", f"the data used for tuning are too few to judge the filter; {prove}", []
+    return "consistent", f"the tuned filter agrees with the data used for tuning; {prove}", []
 
 
 def _parameters(content: dict[str, Any]) -> list[str]:
@@ -193,7 +193,7 @@ def _parameters(content: dict[str, Any]) -> list[str]:
     marked = ["" if one["identified"] else "unsure" for one in content["parameters"]]
     objective = content["objective"]
     gain = objective["before"] - objective["after"]
-    gained = f"The {objective['name']} rose by {gain:.4g} nats."
+    gained = f"The {objective['name']} increased by {gain:.4g} nats."
     if rms := objective.get("attitude_rms_rad"):
         gained = f"RMS attitude error: {math.degrees(rms[0]):.4g}° before, {math.degrees(rms[1]):.4g}° after."
     return [
@@ -209,8 +209,8 @@ def _gate(found: Any) -> list[str]:
         return []
     thresholds = ", ".join(f"{value:.3g} of {name}" for name, value in found["thresholds"].items())
     words = (
-        f"The gate lets {100.0 * found['probability']:.4g} % of right measurements pass (95 %: {100.0 * found['lower']:.4g} to "
-        f"{100.0 * found['upper']:.4g}): an outlier is the likelier explanation of a NIS above {thresholds}."
+        f"The gate accepts {100.0 * found['probability']:.4g} % of valid measurements (95 %: {100.0 * found['lower']:.4g} to "
+        f"{100.0 * found['upper']:.4g}): a measurement with a NIS above {thresholds} is more likely an outlier than noise."
     )
     return [page.paragraph(words)]
 
@@ -230,16 +230,16 @@ def _held_out(held: dict[str, Any]) -> list[str]:
                 *(page.number(float("nan") if value is None else value) for value in extra),
             )
         )
-    head = ("filter", "log likelihood an innovation", "NIS", "99 % bounds", "ANEES per state", "attitude RMS, rad")
+    head = ("filter", "log-likelihood per innovation", "NIS", "99 % bounds", "ANEES per state", "attitude RMS, rad")
     return [page.table(head, rows, numbers=5), page.paragraph(f"{BOUNDS}.", faint=True)]
 
 
 _KINDS = {"png": ("image/png", b"\x89PNG\r\n\x1a\n"), "svg": ("image/svg+xml", b"<?xml")}
-"""Type and first bytes of the figures that a page can show."""
+"""Media type and first bytes of the image formats that a page can show."""
 
 
 def _image(stem: Path, caption: str) -> str:
-    """Return a figure that the tuning drew beside its result, or the name of its PDF; nothing where there is none."""
+    """Return a figure that the tuning wrote beside its result, or the name of its PDF; empty if there is none."""
     pdf = stem.with_name(f"{stem.name}.pdf")
     if pdf.exists():
         return page.section(
@@ -250,7 +250,7 @@ def _image(stem: Path, caption: str) -> str:
         if path.exists():
             found = reading.content(path, link=False, maximum=LARGEST_FIGURE)
             if not found.startswith(first):
-                raise InputError(f"{path} is no {suffix.upper()}; take it away, or tune again")
+                raise InputError(f"{path} is not a {suffix.upper()} file; remove it, or tune again")
             data = base64.b64encode(found).decode()
             image = f'<img src="data:{kind};base64,{data}" alt="{page.text(caption)}">'
             return page.section(caption, f'<figure class=wide><div class="scroll" tabindex="0">{image}</div></figure>')
