@@ -72,6 +72,11 @@ def vector_at(array, k):
     return (array[k, 0], array[k, 1], array[k, 2])
 
 
+def quaternion_at(array, k):
+    """Return row k of an (n, 4) array as a 4-tuple."""
+    return (array[k, 0], array[k, 1], array[k, 2], array[k, 3])
+
+
 def six_at(array, k):
     """Return row k of an (n, 6) array as a 6-tuple."""
     return (array[k, 0], array[k, 1], array[k, 2], array[k, 3], array[k, 4], array[k, 5])
