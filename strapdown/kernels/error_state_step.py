@@ -36,8 +36,6 @@ from strapdown.kernels.algebra import (
 from strapdown.kernels.filter_step import process_noise, transition
 from strapdown.kernels.lane_values import lanes_of, load_like, store
 from strapdown.kernels.rotation import quaternion_multiply, rotation_matrix, turned
-from strapdown.kernels.series import LARGEST_ANGLE
-from strapdown.kernels.walk import MAX_TURN
 
 CALLED = (
     "response",
@@ -95,15 +93,6 @@ def response(rate, u, decay):
         linear = phi + y * linear
     mean = u * (1.0 + z * phi)
     return skew_polynomial(mean, -u * u * linear, u * u * u * quadratic, rate), mean
-
-
-def longest_step(dt, theta, limit):
-    """Return the longest step within an interval: what the polynomials bear of a turn, and ``limit`` for states that decay."""
-    longest = dt
-    squared = dot(theta, theta)
-    if LARGEST_ANGLE * LARGEST_ANGLE < squared < MAX_TURN * MAX_TURN:
-        longest = dt * (LARGEST_ANGLE / math.sqrt(squared))
-    return min(longest, limit)
 
 
 def error_matrix(gyro, k):
