@@ -232,17 +232,6 @@ def normal_triple(streams, source, ahead, number, like):
     return drawn_triple(ahead, source, 3 * turn, like)
 
 
-def fill_with_normals(pattern, k0, k1, numbers, out):
-    """Fill out (flat, places a multiple of four) with the normals of the streams of these runs under the key (k0, k1)."""
-    like = lanes_of(pattern)
-    n = len(like)
-    s0, s1, s2, s3 = stream_state(k0, k1, load_like(numbers, 0, like))
-    for at in range(0, len(out), 4 * n):
-        x, y, s0, s1, s2, s3 = next_four(s0, s1, s2, s3)
-        store(out, at, x)
-        store(out, at + 2 * n, y)
-
-
 def start_streams(keys, numbers, draws, like):
     """Fill the states of all streams of the runs of these numbers, ``keys`` (sources, 2), and draw what a run starts with."""
     number = load_like(numbers, 0, like)
