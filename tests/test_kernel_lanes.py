@@ -38,7 +38,6 @@ from strapdown.kernels.lane_values import (
     signed_number,
     spread,
     store,
-    store_like,
     store_quadruples,
     total,
 )
@@ -217,11 +216,11 @@ def test_any_number_of_lanes(width, dtype):
         n = len(like)
         x = load_like(a, 1, like)
         y = load_like(doubles, 1, like)
-        store_like(out, 0, x)
-        store_like(out, n, narrowed(y, like))
-        store_like(out, 2 * n, like - 3.0)
-        store_like(words, 0, bits_of(y))
-        store_like(out, 3 * n, number_of_bits(load_like(words, 0, like)))
+        store(out, 0, x)
+        store(out, n, narrowed(y, like))
+        store(out, 2 * n, like - 3.0)
+        store(words, 0, bits_of(y))
+        store(out, 3 * n, number_of_bits(load_like(words, 0, like)))
         counts[0] = n
         counts[1] = number_where(x > 0.0)
         restore_mode(mode)
@@ -249,13 +248,13 @@ def test_words_of_thirty_two_bits(width):
         like = lanes_of(pattern)
         n = len(like)
         low, high = halves(load_like(words, 0, like), load_like(words, n, like))
-        store_like(out, 0, low)
-        store_like(out, 2 * n, high)
-        store_like(out, 4 * n, leading_zeros(low))
-        store_like(out, 6 * n, bits_of(signed_number(high)))
+        store(out, 0, low)
+        store(out, 2 * n, high)
+        store(out, 4 * n, leading_zeros(low))
+        store(out, 6 * n, bits_of(signed_number(high)))
         x = load_like(singles, 0, like)
-        store_like(out, 8 * n, bits_of(x))
-        store_like(singles, n, number_of_bits(bits_of(x)))
+        store(out, 8 * n, bits_of(x))
+        store(singles, n, number_of_bits(bits_of(x)))
 
     words = RANDOM.integers(0, 2**64, 2 * width, dtype=np.uint64) >> RANDOM.integers(0, 64, 2 * width, dtype=np.uint64)
     words[0] = 0
@@ -275,7 +274,7 @@ def test_tiny_numbers_are_flushed_in_single_precision_alone():
     def apply(pattern, a, out):
         like = lanes_of(pattern)
         mode = flush_tiny(like)
-        store_like(out, 0, load_like(a, 0, like) * 0.5)
+        store(out, 0, load_like(a, 0, like) * 0.5)
         restore_mode(mode)
 
     for dtype in (np.float64, np.float32):
@@ -415,18 +414,18 @@ def stepped(pattern, rows, inputs, variance, out):
         q, b, A, B, C, rotation_matrix(q), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), z, variance
     )
     for i in range(4):
-        store_like(out, i * n, q[i])
+        store(out, i * n, q[i])
     for i in range(3):
-        store_like(out, (4 + i) * n, b[i])
+        store(out, (4 + i) * n, b[i])
     for i in range(6):
-        store_like(out, (7 + i) * n, A[i])
-        store_like(out, (22 + i) * n, C[i])
+        store(out, (7 + i) * n, A[i])
+        store(out, (22 + i) * n, C[i])
     for i in range(9):
-        store_like(out, (13 + i) * n, B[i])
-    store_like(out, 28 * n, e1)
-    store_like(out, 29 * n, s1)
-    store_like(out, 30 * n, e2)
-    store_like(out, 31 * n, s2)
+        store(out, (13 + i) * n, B[i])
+    store(out, 28 * n, e1)
+    store(out, 29 * n, s1)
+    store(out, 30 * n, e2)
+    store(out, 31 * n, s2)
 
 
 def stepped_scalars(rows, inputs, variance, out):

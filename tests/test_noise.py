@@ -4,12 +4,15 @@ import math
 import re
 
 import numpy as np
+import plain_kernels
 import pytest
 from scipy import stats
 
-from strapdown.kernels import montecarlo_run, noise
-from strapdown.kernels.lane_values import halves
+from strapdown.kernels import noise
+from strapdown.kernels.lane_values import halves, lanes_of, load_like
 from strapdown.kernels.machine import compiled
+from strapdown.kernels.montecarlo_run import refill, store_several
+from strapdown.kernels.noise import stream_state
 
 WORD = np.uint64
 ALL = WORD(0xFFFFFFFFFFFFFFFF)
@@ -179,6 +182,16 @@ def test_successive_normals_and_the_two_of_a_pair_are_independent(sample):
 # ------------------------------------------------------------------------------------------------ normals of the lanes
 
 
+def fill_with_normals(pattern, k0, k1, numbers, streams, out):
+    """Fill out with the normals of the streams of these runs; a kernel."""
+    like = lanes_of(pattern)
+    store_several(streams, 0, like, stream_state(k0, k1, load_like(numbers, 0, like)))
+    refill(streams, 0, out, len(out) // len(like), like)
+
+
+FILL = plain_kernels.called(fill_with_normals)
+
+
 def lane_normals(runs, count, width=8, real=np.float64, key=(5, 6)):
     """Return normals (runs, count) of the lanes' streams of these runs."""
     pattern = (real(0.0),) * width
@@ -188,7 +201,7 @@ def lane_normals(runs, count, width=8, real=np.float64, key=(5, 6)):
         part = runs[first : first + width]
         numbers[: len(part)] = part
         rows = np.empty((count, width))
-        compiled(montecarlo_run.fill_with_normals)(pattern, WORD(key[0]), WORD(key[1]), numbers, rows.reshape(-1))
+        FILL(pattern, WORD(key[0]), WORD(key[1]), numbers, np.empty(4 * width, WORD), rows.reshape(-1))
         out[first : first + width] = rows.T[: len(part)]
     return out
 

@@ -292,7 +292,7 @@ class _BlockForm:
             first,
             *self.problem.variances,
             np.empty(smoother_loop.WORK_SIZE),
-            *outputs,
+            smoother_loop.Outputs(*outputs),
         )
 
 

@@ -36,6 +36,7 @@ from strapdown.estimation.temperature import need_none
 from strapdown.kernels import chains, error_state_step, sensor_rows
 from strapdown.kernels.measurement import has_heading
 from strapdown.kernels.rotation import rotation_matrix
+from strapdown.kernels.walk import step_within, turn_squared
 from strapdown.records import LARGEST_TURN
 from strapdown.vectors import need_level, need_unit, triad
 
@@ -205,8 +206,8 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         """Propagate in sub-steps, each as long as the series and the decay rates of the states allow."""
         left = step
         while left > 0.0:
-            turn = tuple((increment - left * self.bias).tolist())
-            longest = float(error_state_step.longest_step(left, turn, self._motion.limit))
+            squared = turn_squared(increment, left, self.bias)
+            longest = float(min(step_within(squared, left), self._motion.limit))
             part = increment * (longest / left)
             self._sub_step(part, longest)
             increment, left = increment - part, left - longest if longest < left else 0.0

@@ -47,7 +47,7 @@ from strapdown.kernels.measurement import (
     HEADING,
     KIND,
     VECTOR,
-    frame_row,
+    frame_of,
     has_heading,
     heading_error,
     heading_row,
@@ -180,31 +180,26 @@ def update(state, e, now, measured, body, out):
     at = measured.place[e]
     s = measured.sensor[e]
     kind = measured.series[s, KIND]
-    t = frame_row(measured, at, s)
-    triads = measured.triads
+    frame = frame_of(measured, at, s)
     z = value_of(measured, at, s)
     sigma = sigma_of(measured, at, s)
     variance = sigma * sigma
     if kind == ATTITUDE:
-        attitude = (triads[t, 0], triads[t, 1], triads[t, 2], triads[t, 3])
-        q, b, A, B, C, e1, s1, e2, s2, e3, s3 = update_attitude(q, b, A, B, C, attitude, z)
+        q, b, A, B, C, e1, s1, e2, s2, e3, s3 = update_attitude(q, b, A, B, C, frame[:4], z)
         out.innovation[at, 4] = e3
         out.innovation[at, 5] = s3
         sharp = s1 > body.sharpness * z[0] or s2 > body.sharpness * z[1] or s3 > body.sharpness * z[2]
     elif kind != HEADING:
-        u = (triads[t, 0], triads[t, 1], triads[t, 2])
-        v = (triads[t, 3], triads[t, 4], triads[t, 5])
         if kind == VECTOR:
             # The length has no information about the attitude but is part of the innovation.
-            r = (triads[t, 6], triads[t, 7], triads[t, 8])
-            out.innovation[at, 4] = dot(transpose_times_vector(R, r), z) - 1.0
+            out.innovation[at, 4] = dot(transpose_times_vector(R, frame[6:]), z) - 1.0
             out.innovation[at, 5] = variance
-        q, b, A, B, C, e1, s1, e2, s2 = update_direction(q, b, A, B, C, R, u, v, z, variance)
+        q, b, A, B, C, e1, s1, e2, s2 = update_direction(q, b, A, B, C, R, frame[:3], frame[3:6], z, variance)
         sharp = s1 + s2 > body.sharpness * variance
     else:
         e1, s1, e2, s2 = math.nan, 0.0, 0.0, 1.0
         if has_heading(R, z):
-            error = heading_error(R, z, (triads[t, 6], triads[t, 7], triads[t, 8]))
+            error = heading_error(R, z, frame[6:])
             q, b, A, B, C, e1, s1 = update_heading(q, b, A, B, C, heading_row(R, z), error, variance)
         sharp = s1 > body.sharpness * variance
     out.innovation[at, 0] = e1
@@ -319,7 +314,7 @@ def linearised(form, i, e, now_q, q, M, z, frame, noise, kind, sensor, prior):
     h1, h2, h3, y1, y2, y3, covariance = measurement_rows(kind, now_q, R, z, frame, noise)
     far, along = 1.0, 1.0
     if kind in (DIRECTION, VECTOR):
-        along = dot(transpose_times_vector(R, (frame[6], frame[7], frame[8])), z)
+        along = dot(transpose_times_vector(R, frame[6:]), z)
         far = arc_over_chord(math.sqrt(y1 * y1 + y2 * y2), along)
     h1, h2, h3, y1, y2, y3, variance = independent_rows(h1, h2, h3, y1, y2, y3, covariance)
     predicted = (dot(h1, prior), dot(h2, prior), dot(h3, prior))

@@ -33,10 +33,8 @@ from strapdown.kernels.algebra import (
     transpose_times_vector,
 )
 from strapdown.kernels.filter_step import process_noise, transition
-from strapdown.kernels.lane_values import lanes_of, load_like, store_like
+from strapdown.kernels.lane_values import lanes_of, load_like, store
 from strapdown.kernels.rotation import quaternion_multiply, rotation_matrix, turned
-from strapdown.kernels.series import LARGEST_ANGLE
-from strapdown.kernels.walk import MAX_TURN
 
 CALLED = (
     "response",
@@ -93,15 +91,6 @@ def response(rate, u, decay):
         linear = phi + y * linear
     mean = u * (1.0 + z * phi)
     return skew_polynomial(mean, -u * u * linear, u * u * u * quadratic, rate), mean
-
-
-def longest_step(dt, theta, limit):
-    """Return the longest step within an interval: what the polynomials bear of a turn, and ``limit`` for states that decay."""
-    longest = dt
-    squared = dot(theta, theta)
-    if LARGEST_ANGLE * LARGEST_ANGLE < squared < MAX_TURN * MAX_TURN:
-        longest = dt * (LARGEST_ANGLE / math.sqrt(squared))
-    return min(longest, limit)
 
 
 def error_matrix(gyro, k):
@@ -188,7 +177,7 @@ def move(q, x, dt, part, model, top, factor):
                 column = column + (gyro[k, 3] * a0 + gyro[k, 4] * b0 + gyro[k, 5] * c0)
                 column = column + (gyro[k, 6] * a1 + gyro[k, 7] * b1 + gyro[k, 8] * c1)
                 column = column + (gyro[k, 9] * a2 + gyro[k, 10] * b2 + gyro[k, 11] * c2)
-            store_like(top, 24 + 4 * k, column)
+            store(top, 24 + 4 * k, column)
             if use & OFFSET and decay[k] > 0.0:
                 if decay[k] != held:
                     E, _ = response(rate, dt, decay[k])
@@ -260,7 +249,7 @@ def follow(top, factor, noise, next_top, next_factor, next_noise, size, changing
         t = top[i, 0] * p0 + top[i, 1] * p1 + top[i, 2] * p2
         if i >= 3:
             t = t + kept * load_like(next_top, 4 * i, four)
-        store_like(top, 4 * i, t)
+        store(top, 4 * i, t)
     a0 = noise[0, 0] * p0 + noise[0, 1] * p1 + noise[0, 2] * p2  # rows of Q_θθ Φ11ᵀ
     a1 = noise[1, 0] * p0 + noise[1, 1] * p1 + noise[1, 2] * p2
     a2 = noise[2, 0] * p0 + noise[2, 1] * p1 + noise[2, 2] * p2
@@ -273,16 +262,16 @@ def follow(top, factor, noise, next_top, next_factor, next_noise, size, changing
             ahead = load_like(next_top, 4 * i, four)
             u = noise[i, 0] * p0 + noise[i, 1] * p1 + noise[i, 2] * p2
             v = u + own * ahead  # what the first step's noise has of the attitude after the second
-            store_like(noise, 4 * i, v)
+            store(noise, 4 * i, v)
             b0 = b0 + noise[i, 0] * ahead + next_top[i, 0] * u
             b1 = b1 + noise[i, 1] * ahead + next_top[i, 1] * u
             b2 = b2 + noise[i, 2] * ahead + next_top[i, 2] * u
             kept = next_factor[i - 6] if i >= 6 else 1.0
-            store_like(noise, 4 * i, kept * v + load_like(next_noise, 4 * i, four))
+            store(noise, 4 * i, kept * v + load_like(next_noise, 4 * i, four))
             noise[i, 3] = kept * kept * own + next_noise[i, 3]
-    store_like(noise, 0, b0)
-    store_like(noise, 4, b1)
-    store_like(noise, 8, b2)
+    store(noise, 0, b0)
+    store(noise, 4, b1)
+    store(noise, 8, b2)
     for k in range(changing):
         factor[k] *= next_factor[k]
 
@@ -329,10 +318,10 @@ def carry(F, size, loose, top, factor, changing):
         for r in range(max(j, 6), min(j + 4, size)):  # rows before have nothing there
             for k in range(min(max(r + 1, loose) - 6, changing)):
                 F[r, 6 + k] *= factor[k]
-        store_like(F, width * j, a)
-        store_like(F, width * (j + 1), b)
-        store_like(F, width * (j + 2), c)
-        store_like(F, width * (j + 3), d)
+        store(F, width * j, a)
+        store(F, width * (j + 1), b)
+        store(F, width * (j + 2), c)
+        store(F, width * (j + 3), d)
 
 
 def carry_back(F, size, end, phi11, top, inverse, changing):
@@ -349,10 +338,10 @@ def carry_back(F, size, end, phi11, top, inverse, changing):
         for i in range(3, max(j + 4, 6 + changing) if j + 4 <= size else size):
             t = load_like(top, 4 * i, four)
             a, b, c, d = a - F[j, i] * t, b - F[j + 1, i] * t, c - F[j + 2, i] * t, d - F[j + 3, i] * t
-        store_like(F, width * j, a)
-        store_like(F, width * (j + 1), b)
-        store_like(F, width * (j + 2), c)
-        store_like(F, width * (j + 3), d)
+        store(F, width * j, a)
+        store(F, width * (j + 1), b)
+        store(F, width * (j + 2), c)
+        store(F, width * (j + 3), d)
         for r in range(4):
             F[j + r, 0], F[j + r, 1], F[j + r, 2] = transpose_times_vector(
                 phi11, (F[j + r, 0], F[j + r, 1], F[j + r, 2])

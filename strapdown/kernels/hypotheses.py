@@ -24,7 +24,6 @@ from strapdown.kernels.algebra import (
     skew_polynomial,
     subtract,
     symmetric_times_vector,
-    transpose_times_vector,
 )
 from strapdown.kernels.filter_step import predict as propagated
 from strapdown.kernels.filter_step import update_attitude, update_heading, update_row
@@ -40,6 +39,8 @@ from strapdown.kernels.measurement import (
     frame_of,
     heading_error,
     heading_row,
+    measurement_rows,
+    quaternion_at,
     sigma_of,
     value_of,
     vector_at,
@@ -106,35 +107,22 @@ def updated(kind, q, b, A, B, C, z, frame, variance, weight):
     """
     e1, s1, e2, s2, e3, s3 = 0.0, 1.0, 0.0, 1.0, 0.0, 1.0
     if kind == ATTITUDE:
-        measured = (frame[0], frame[1], frame[2], frame[3])
-        q, b, A, B, C, e1, s1, e2, s2, e3, s3 = update_attitude(q, b, A, B, C, measured, scale(1.0 / weight, z))
-        r = logarithm(quaternion_multiply((q[0], -q[1], -q[2], -q[3]), measured))
-        distance = r[0] * r[0] / z[0] + r[1] * r[1] / z[1] + r[2] * r[2] / z[2]
-        spread = A[0] / z[0] + A[3] / z[1] + A[5] / z[2]
+        q, b, A, B, C, e1, s1, e2, s2, e3, s3 = update_attitude(q, b, A, B, C, frame[:4], scale(1.0 / weight, z))
     elif kind == HEADING:
-        level = (frame[6], frame[7], frame[8])
         R = rotation_matrix(q)
-        h = heading_row(R, z)
-        error = heading_error(R, z, level)
-        q, b, A, B, C, e1, s1 = update_heading(q, b, A, B, C, h, error, variance / weight)
-        R = rotation_matrix(q)
-        h = heading_row(R, z)
-        left = heading_error(R, z, level)
-        distance = left * left / variance
-        spread = dot(h, symmetric_times_vector(A, h)) / variance
+        error = heading_error(R, z, frame[6:])
+        q, b, A, B, C, e1, s1 = update_heading(q, b, A, B, C, heading_row(R, z), error, variance / weight)
     else:
-        u = (frame[0], frame[1], frame[2])
-        v = (frame[3], frame[4], frame[5])
-        q, b, A, B, C, e1, s1, e2, s2 = update_iterated(q, b, A, B, C, u, v, z, variance / weight)
-        R = rotation_matrix(q)
-        h1, y1, h2, y2 = direction_rows(R, u, v, z)
-        distance = (y1 * y1 + y2 * y2) / variance
+        q, b, A, B, C, e1, s1, e2, s2 = update_iterated(q, b, A, B, C, frame[:3], frame[3:6], z, variance / weight)
+    h1, h2, _, y1, y2, y3, _ = measurement_rows(kind, q, rotation_matrix(q), z, frame, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+    if kind == ATTITUDE:
+        distance = y1 * y1 / z[0] + y2 * y2 / z[1] + y3 * y3 / z[2]
+        spread = A[0] / z[0] + A[3] / z[1] + A[5] / z[2]
+    else:
+        distance = (y1 * y1 + y2 * y2) / variance + y3 * y3 / variance
         spread = (dot(h1, symmetric_times_vector(A, h1)) + dot(h2, symmetric_times_vector(A, h2))) / variance
-        if kind == VECTOR:
-            # The length has no information about the attitude but is part of the innovation.
-            e3 = dot(transpose_times_vector(R, (frame[6], frame[7], frame[8])), z) - 1.0
-            s3 = variance / weight
-            distance += e3 * e3 / variance
+    if kind == VECTOR:
+        e3, s3 = y3, variance / weight  # the length has no information about the attitude but is part of the innovation
     return q, b, A, B, C, e1, s1, e2, s2, e3, s3, distance, spread
 
 
@@ -153,13 +141,12 @@ def mean_attitude(states, weight):
     for i in range(len(weight)):
         if weight[i] > weight[heaviest]:
             heaviest = i
-    q = (states[heaviest, 0], states[heaviest, 1], states[heaviest, 2], states[heaviest, 3])
+    q = quaternion_at(states, heaviest)
     for _ in range(20):
         shift = (0.0, 0.0, 0.0)
         for i in range(len(weight)):
             if weight[i] > 0.0:
-                other = (states[i, 0], states[i, 1], states[i, 2], states[i, 3])
-                d = logarithm(quaternion_multiply((q[0], -q[1], -q[2], -q[3]), other))
+                d = logarithm(quaternion_multiply((q[0], -q[1], -q[2], -q[3]), quaternion_at(states, i)))
                 shift = combine(1.0, shift, weight[i], d)
         q, _ = moved(q, shift)
         q = unit(q)

@@ -2,9 +2,18 @@
 
 from __future__ import annotations
 
-from strapdown.kernels.algebra import add, combine, cross, dot, square_root
+from strapdown.kernels.algebra import (
+    add,
+    add_matrices,
+    combine,
+    combine_matrices,
+    cross,
+    dot,
+    scale_matrix,
+    square_root,
+)
 from strapdown.kernels.integration import large_exponential, pair_correction
-from strapdown.kernels.measurement import vector_at
+from strapdown.kernels.measurement import quaternion_at, vector_at
 from strapdown.kernels.rotation import quaternion_multiply, renormalized, unit
 from strapdown.kernels.state import store_row
 
@@ -77,48 +86,34 @@ def interval_quaternion(rates, kept, series):
 
     ``rates`` (4, M) is that of fitted_rates, with ``kept`` powers; ``series`` (terms, 4) is scratch.
     """
-    series[0, 0] = 1.0
-    series[0, 1] = 0.0
-    series[0, 2] = 0.0
-    series[0, 3] = 0.0
     even = (1.0, 0.0, 0.0, 0.0)
     odd = (0.0, 0.0, 0.0, 0.0)
+    store_row(series, 0, even)
     power = 1.0
     ended = False
     for n in range(len(series) - 1):
-        w = 0.0
-        x = 0.0
-        y = 0.0
-        z = 0.0
+        total = (0.0, 0.0, 0.0, 0.0)
         for m in range(min(n + 1, kept)):
-            i = n - m
-            part = quaternion_times_vector(
-                (series[i, 0], series[i, 1], series[i, 2], series[i, 3]), (rates[0, m], rates[1, m], rates[2, m])
-            )
-            w += part[0]
-            x += part[1]
-            y += part[2]
-            z += part[3]
+            rate = (rates[0, m], rates[1, m], rates[2, m])
+            total = add_matrices(total, quaternion_times_vector(quaternion_at(series, n - m), rate))
         s = 0.5 / (n + 1)
-        series[n + 1, 0] = s * w
-        series[n + 1, 1] = s * x
-        series[n + 1, 2] = s * y
-        series[n + 1, 3] = s * z
+        store_row(series, n + 1, scale_matrix(s, total))
         power *= 0.5
         s *= power
         if n % 2:
-            even = (even[0] + s * w, even[1] + s * x, even[2] + s * y, even[3] + s * z)
+            even = combine_matrices(1.0, even, s, total)
         else:
-            odd = (odd[0] + s * w, odd[1] + s * x, odd[2] + s * y, odd[3] + s * z)
-        if (
-            s * (abs(w) + abs(x) + abs(y) + abs(z)) < NEGLIGIBLE
-            and terms_to_come(rates, kept, series, n + 1) < NEGLIGIBLE
-        ):
+            odd = combine_matrices(1.0, odd, s, total)
+        if s * size(total) < NEGLIGIBLE and terms_to_come(rates, kept, series, n + 1) < NEGLIGIBLE:
             ended = True
             break
     backward = (even[0] - odd[0], odd[1] - even[1], odd[2] - even[2], odd[3] - even[3])
-    forward = (even[0] + odd[0], even[1] + odd[1], even[2] + odd[2], even[3] + odd[3])
-    return (quaternion_multiply(backward, forward), ended)
+    return (quaternion_multiply(backward, add_matrices(even, odd)), ended)
+
+
+def size(q):
+    """Return the sum of the magnitudes of four numbers."""
+    return abs(q[0]) + abs(q[1]) + abs(q[2]) + abs(q[3])
 
 
 def terms_to_come(rates, kept, series, n):
@@ -130,8 +125,7 @@ def terms_to_come(rates, kept, series, n):
     total = 0.0
     for m in range(min(kept, n + 1)):
         i = n - m
-        size = abs(series[i, 0]) + abs(series[i, 1]) + abs(series[i, 2]) + abs(series[i, 3])
-        total += rates[3, m] * size * 0.5**i
+        total += rates[3, m] * size(quaternion_at(series, i)) * 0.5**i
     return total / (2.0 * (n + 1))
 
 

@@ -45,7 +45,7 @@ from strapdown.kernels.error_state_step import (
 )
 from strapdown.kernels.filter_step import SHORT_FORM, process_noise, reset, transition
 from strapdown.kernels.lane_angles import arctangent, rotation_vector
-from strapdown.kernels.lane_values import anywhere, chosen, lanes_of, load_like, store_like
+from strapdown.kernels.lane_values import anywhere, chosen, lanes_of, load_like, store
 from strapdown.kernels.measurement import ATTITUDE, HEADING, frame_at, six_at
 from strapdown.kernels.montecarlo_run import four, store_several, triple
 from strapdown.kernels.rotation import right_jacobian, rotation_matrix, turned
@@ -162,7 +162,7 @@ def seen(work, like, place):
 
 def put(array, place, like, value):
     """Write a lane value to its place."""
-    store_like(array, place * len(like), value)
+    store(array, place * len(like), value)
 
 
 def state_at(x, i, like):

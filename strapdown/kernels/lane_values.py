@@ -41,8 +41,8 @@ def load_quadruples(array, start, stride):
 
 
 def store(array, start, value):
-    """Write lanes to ``array[start : start + WIDTH]``, likewise."""
-    array.reshape(-1)[start : start + WIDTH] = value
+    """Write lanes, any number of them, to ``array[start : …]`` likewise, converted to the precision of the array."""
+    array.reshape(-1)[start : start + len(value)] = value
 
 
 def store_quadruples(array, start, stride, q):
@@ -65,11 +65,6 @@ def load_like(array, start, like):
 def element(array, place):
     """Return ``array[place]``; a place outside the array is one of the memory before or behind it, where other arrays stand."""
     return np.lib.stride_tricks.as_strided(array, (2,), (int(place) * array.itemsize,))[1]
-
-
-def store_like(array, start, value):
-    """Write lanes of any number to ``array[start : …]``, converted to the precision of the array."""
-    array.reshape(-1)[start : start + len(value)] = value
 
 
 def narrowed(x, like):

@@ -7,6 +7,7 @@ scalars, so a machine without vectors needs no other code, and the bits of a lan
 
 from __future__ import annotations
 
+import inspect
 import math
 import operator
 import platform
@@ -17,10 +18,12 @@ from typing import Any
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
+from numba.core.registry import cpu_target
 from numba.core.typeconv import Conversion
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.extending import intrinsic, lower_builtin, lower_cast, models, register_model
 
+from strapdown.kernels import lane_values
 from strapdown.kernels.compiler import DATA
 from strapdown.kernels.lane_values import WIDTH
 
@@ -173,24 +176,74 @@ def _length(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
     return context.get_constant(types.intp, sig.args[0].count)
 
 
-# ------------------------------------------------------------------------------------------------ memory and choice
+# ------------------------------------------------------------------------------------------------ memory
 
 
-def _pointer(context: Any, builder: Any, array_type: Any, array: Any, index: Any, vector: ir.VectorType) -> Any:
-    data = builder.extract_value(array, DATA)
-    return builder.bitcast(builder.gep(data, [index]), vector.as_pointer())
+INTRINSICS: dict[str, Any] = {}
+"""What stands for each function of :mod:`strapdown.kernels.lane_values` in compiled code."""
 
 
-def _read(context: Any, builder: Any, array_type: Any, array: Any, index: Any, vector: ir.VectorType) -> Any:
-    instruction = builder.load(_pointer(context, builder, array_type, array, index, vector))
-    instruction.align = _BYTES[array_type.dtype]  # an array starts at any multiple of its element's size
+def _instead_of(function: Callable[..., Any], typed: Callable[..., Any]) -> Callable[..., Any]:
+    """Let the instructions that a function writes stand for one of :mod:`strapdown.kernels.lane_values`.
+
+    ``typed`` returns numba's signature for the types of the arguments. What writes the instructions is given numba's target, LLVM's
+    builder, that signature and the values, and returns the result if there is one.
+    """
+
+    def define(write: Callable[..., Any]) -> Callable[..., Any]:
+        def definition(typing: Any, *given: Any) -> Any:
+            def lower(target: Any, builder: Any, sig: Any, values: Any) -> Any:
+                result = write(target, builder, sig, *values)
+                return target.get_dummy_value() if result is None else result
+
+            return typed(*given), lower
+
+        first = inspect.Parameter("typing", inspect.Parameter.POSITIONAL_ONLY)
+        parameters = [first, *inspect.signature(function).parameters.values()]
+        definition.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        INTRINSICS[function.__name__] = intrinsic(definition)
+        return write
+
+    return define
+
+
+def _read(builder: Any, kind: Any, array: Any, index: Any, vector: ir.VectorType) -> Any:
+    """Return the vector at ``array[index]``; ``kind`` is the array's type."""
+    pointer = builder.gep(builder.extract_value(array, DATA), [index])
+    instruction = builder.load(builder.bitcast(pointer, vector.as_pointer()))
+    instruction.align = _BYTES[kind.dtype]  # an array starts at any multiple of its element's size
     return instruction
 
 
-def _write(context: Any, builder: Any, array_type: Any, array: Any, index: Any, value: Any) -> None:
-    builder.store(value, _pointer(context, builder, array_type, array, index, value.type)).align = _BYTES[
-        array_type.dtype
-    ]
+def _write(builder: Any, kind: Any, array: Any, index: Any, value: Any) -> None:
+    pointer = builder.gep(builder.extract_value(array, DATA), [index])
+    builder.store(value, builder.bitcast(pointer, value.type.as_pointer())).align = _BYTES[kind.dtype]
+
+
+@_instead_of(lane_values.load, lambda array, start: Lanes(array.dtype, WIDTH)(array, types.intp))
+@_instead_of(lane_values.load_like, lambda array, start, like: Lanes(array.dtype, like.count)(array, types.intp, like))
+def _load(target: Any, builder: Any, sig: Any, array: Any, start: Any, like: Any = None) -> Any:
+    return _read(builder, sig.args[0], array, start, _vector(sig.return_type))
+
+
+@_instead_of(lane_values.store, lambda array, start, value: types.void(array, types.intp, value))
+def _store(target: Any, builder: Any, sig: Any, array: Any, start: Any, value: Any) -> None:
+    kind, _, lanes = sig.args
+    _write(builder, kind, array, start, _converted(builder, value, lanes, Lanes(kind.dtype, lanes.count)))
+
+
+@_instead_of(lane_values.element, lambda array, place: array.dtype(array, types.intp))
+def _element(target: Any, builder: Any, sig: Any, array: Any, place: Any) -> Any:
+    return builder.load(builder.gep(builder.extract_value(array, DATA), [place]))
+
+
+@_instead_of(lane_values.fetch, lambda array, start: types.void(array, types.intp))
+def _fetch(target: Any, builder: Any, sig: Any, array: Any, start: Any) -> None:
+    place = builder.gep(builder.extract_value(array, DATA), [start])
+    place = builder.bitcast(place, ir.IntType(8).as_pointer())
+    function = ir.FunctionType(ir.VoidType(), [place.type, *[_INDEX] * 3])
+    name = cgutils.get_or_insert_function(builder.module, function, "llvm.prefetch.p0i8")
+    builder.call(name, [place, *(ir.Constant(_INDEX, k) for k in (0, 3, 1))])
 
 
 def _row(builder: Any, start: Any, stride: Any, i: int, shift: int = 0) -> Any:
@@ -216,80 +269,6 @@ def _columns(builder: Any, rows: list[Any], count: int) -> list[Any]:
     return columns
 
 
-def _tuple_of(dtype: types.Type, count: int) -> Any:
-    return types.UniTuple(Lanes(dtype, WIDTH), count)
-
-
-@intrinsic  # type: ignore[untyped-decorator]
-def load(typingctx: Any, array: Any, start: Any) -> Any:
-    """Lower :func:`lane_values.load`."""
-    lanes = Lanes(array.dtype, WIDTH)
-
-    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        data, first = arguments
-        return _read(context, builder, array, data, first, _vector(lanes))
-
-    return lanes(array, types.intp), lower
-
-
-@intrinsic  # type: ignore[untyped-decorator]
-def fetch(typingctx: Any, array: Any, start: Any) -> Any:
-    """Lower :func:`lane_values.fetch`."""
-
-    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        data = builder.gep(builder.extract_value(arguments[0], DATA), [arguments[1]])
-        place = builder.bitcast(data, ir.IntType(8).as_pointer())
-        function = ir.FunctionType(ir.VoidType(), [place.type, *[_INDEX] * 3])
-        name = cgutils.get_or_insert_function(builder.module, function, "llvm.prefetch.p0i8")
-        builder.call(name, [place, *(ir.Constant(_INDEX, k) for k in (0, 3, 1))])
-        return context.get_dummy_value()
-
-    return types.void(array, types.intp), lower
-
-
-@intrinsic  # type: ignore[untyped-decorator]
-def load_triples(typingctx: Any, array: Any, start: Any, stride: Any) -> Any:
-    """Lower :func:`lane_values.load_triples`: rows of four, the last from one element before it, so that none ends outside the array."""
-    result = _tuple_of(array.dtype, 3)
-
-    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        data, first, step = arguments
-        four = ir.VectorType(_ELEMENTS[array.dtype], 4)
-        rows = [
-            _read(context, builder, array, data, _row(builder, first, step, i, 0 if i < WIDTH - 1 else -1), four)
-            for i in range(WIDTH)
-        ]
-        rows[-1] = _picked(builder, rows[-1], rows[-1], [1, 2, 3, 3])
-        return context.make_tuple(builder, result, _columns(builder, rows, 3))
-
-    return result(array, types.intp, types.intp), lower
-
-
-@intrinsic  # type: ignore[untyped-decorator]
-def load_quadruples(typingctx: Any, array: Any, start: Any, stride: Any) -> Any:
-    """Lower :func:`lane_values.load_quadruples`."""
-    result = _tuple_of(array.dtype, 4)
-
-    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        data, first, step = arguments
-        four = ir.VectorType(_ELEMENTS[array.dtype], 4)
-        rows = [_read(context, builder, array, data, _row(builder, first, step, i), four) for i in range(WIDTH)]
-        return context.make_tuple(builder, result, _columns(builder, rows, 4))
-
-    return result(array, types.intp, types.intp), lower
-
-
-@intrinsic  # type: ignore[untyped-decorator]
-def store(typingctx: Any, array: Any, start: Any, value: Any) -> Any:
-    """Lower :func:`lane_values.store`."""
-
-    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        _write(context, builder, array, *arguments)
-        return context.get_dummy_value()
-
-    return types.void(array, types.intp, Lanes(array.dtype, WIDTH)), lower
-
-
 def _rows_of(builder: Any, columns: list[Any]) -> list[Any]:
     """Return four columns of eight as eight rows of four."""
     w, x, y, z = columns
@@ -305,17 +284,38 @@ def _rows_of(builder: Any, columns: list[Any]) -> list[Any]:
     return rows
 
 
-@intrinsic  # type: ignore[untyped-decorator]
-def store_quadruples(typingctx: Any, array: Any, start: Any, stride: Any, q: Any) -> Any:
-    """Lower :func:`lane_values.store_quadruples`."""
+def _several(array: Any, count: int) -> Any:
+    return types.UniTuple(Lanes(array.dtype, WIDTH), count)
 
-    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        data, first, step, packed = arguments
-        for i, row in enumerate(_rows_of(builder, cgutils.unpack_tuple(builder, packed))):
-            _write(context, builder, array, data, _row(builder, first, step, i), row)
-        return context.get_dummy_value()
 
-    return types.void(array, types.intp, types.intp, _tuple_of(array.dtype, 4)), lower
+@_instead_of(lane_values.load_triples, lambda array, *places: _several(array, 3)(array, types.intp, types.intp))
+@_instead_of(lane_values.load_quadruples, lambda array, *places: _several(array, 4)(array, types.intp, types.intp))
+def _load_rows(target: Any, builder: Any, sig: Any, array: Any, start: Any, stride: Any) -> Any:
+    """Load rows of four; of triples the last from one element before it, so that none ends outside the array."""
+    kind, count = sig.args[0], len(sig.return_type)
+    four = ir.VectorType(_ELEMENTS[kind.dtype], 4)
+    shifts = [*[0] * (WIDTH - 1), count - 4]
+    rows = [_read(builder, kind, array, _row(builder, start, stride, i, shifts[i]), four) for i in range(WIDTH)]
+    if count == 3:
+        rows[-1] = _picked(builder, rows[-1], rows[-1], [1, 2, 3, 3])
+    return target.make_tuple(builder, sig.return_type, _columns(builder, rows, count))
+
+
+@_instead_of(
+    lane_values.store_quadruples,
+    lambda array, start, stride, q: types.void(array, types.intp, types.intp, _several(array, 4)),
+)
+def _store_rows(target: Any, builder: Any, sig: Any, array: Any, start: Any, stride: Any, q: Any) -> None:
+    for i, row in enumerate(_rows_of(builder, cgutils.unpack_tuple(builder, q))):
+        _write(builder, sig.args[0], array, _row(builder, start, stride, i), row)
+
+
+# ------------------------------------------------------------------------------------------------ making, precision, sums
+
+
+def _like(dtype: types.Type, pattern: Any) -> Any:
+    """Return ``dtype`` in as many lanes as ``pattern`` has, a scalar beside a scalar."""
+    return Lanes(dtype, pattern.count) if isinstance(pattern, Lanes) else dtype
 
 
 def _converted(builder: Any, value: Any, source: Any, target: Any) -> Any:
@@ -327,9 +327,10 @@ def _converted(builder: Any, value: Any, source: Any, target: Any) -> Any:
     return (builder.fptrunc if narrower else builder.fpext)(value, kind)
 
 
-def _like(dtype: types.Type, pattern: Any) -> Any:
-    """Return ``dtype`` in as many lanes as ``pattern`` has, a scalar beside a scalar."""
-    return Lanes(dtype, pattern.count) if isinstance(pattern, Lanes) else dtype
+@_instead_of(lane_values.lanes_of, lambda pattern: Lanes(pattern.dtype, pattern.count)(pattern))
+def _lanes_of(target: Any, builder: Any, sig: Any, pattern: Any) -> Any:
+    _align_stack(builder)
+    return ir.Constant(_vector(sig.return_type), [0.0] * sig.return_type.count)
 
 
 def _align_stack(builder: Any) -> None:
@@ -342,20 +343,29 @@ def _align_stack(builder: Any) -> None:
     builder.asm(ir.FunctionType(ir.VoidType(), [place.type]), "", "r", [place], side_effect=True)
 
 
-@intrinsic  # type: ignore[untyped-decorator]
-def lanes_of(typingctx: Any, pattern: Any) -> Any:
-    """Lower :func:`lane_values.lanes_of`."""
-    lanes = Lanes(pattern.dtype, pattern.count)
+@_instead_of(lane_values.spread, lambda x: Lanes(x, WIDTH)(x))
+def _spread_over_lanes(target: Any, builder: Any, sig: Any, x: Any) -> Any:
+    return _spread(builder, x, _vector(sig.return_type))
 
-    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        _align_stack(builder)
-        return ir.Constant(_vector(lanes), [0.0] * lanes.count)
 
-    return lanes(pattern), lower
+@_instead_of(lane_values.narrowed, lambda x, like: _like(getattr(like, "dtype", like), x)(x, like))
+def _narrowed(target: Any, builder: Any, sig: Any, x: Any, like: Any) -> Any:
+    return _converted(builder, x, sig.args[0], sig.return_type)
+
+
+@_instead_of(lane_values.total, lambda x: x.dtype(x))
+def _total(target: Any, builder: Any, sig: Any, value: Any) -> Any:
+    """Add the upper half to the lower until one is left."""
+    n = sig.args[0].count
+    while n > 1:
+        n //= 2
+        value = builder.fadd(*(_picked(builder, value, value, list(range(k, k + n))) for k in (0, n)))
+    return builder.extract_element(value, ir.Constant(_INDEX, 0))
 
 
 _TO_ZERO = 0x8040
 """Bits of the x86 control word: results and operands below the smallest normal number are zero."""
+_X86 = platform.machine() in ("x86_64", "AMD64")
 
 
 def _control(builder: Any, instruction: str, place: Any) -> None:
@@ -365,218 +375,107 @@ def _control(builder: Any, instruction: str, place: Any) -> None:
     builder.call(cgutils.get_or_insert_function(builder.module, function, name), [builder.bitcast(place, pointer)])
 
 
-@intrinsic  # type: ignore[untyped-decorator]
-def flush_tiny(typingctx: Any, like: Any) -> Any:
-    """Lower :func:`lane_values.flush_tiny`; on x86 only."""
-    wanted = like.dtype == types.float32 and platform.machine() in ("x86_64", "AMD64")
+@_instead_of(lane_values.flush_tiny, types.int32)
+def _flush_tiny(target: Any, builder: Any, sig: Any, like: Any) -> Any:
+    if sig.args[0].dtype != types.float32 or not _X86:
+        return target.get_constant(types.int32, 0)
+    place = cgutils.alloca_once(builder, ir.IntType(32))
+    _control(builder, "stmxcsr", place)
+    mode = builder.load(place)
+    builder.store(builder.or_(mode, ir.Constant(mode.type, _TO_ZERO)), place)
+    _control(builder, "ldmxcsr", place)
+    return mode
 
-    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        if not wanted:
-            return context.get_constant(types.int32, 0)
-        place = cgutils.alloca_once(builder, ir.IntType(32))
-        _control(builder, "stmxcsr", place)
-        mode = builder.load(place)
-        builder.store(builder.or_(mode, ir.Constant(mode.type, _TO_ZERO)), place)
-        _control(builder, "ldmxcsr", place)
-        return mode
 
-    return types.int32(like), lower
+@_instead_of(lane_values.restore_mode, lambda mode: types.void(types.int32))
+def _restore_mode(target: Any, builder: Any, sig: Any, mode: Any) -> None:
+    """Undo :func:`_flush_tiny`; a mode of 0 was never read."""
+    if _X86:
+        with builder.if_then(builder.icmp_unsigned("!=", mode, ir.Constant(mode.type, 0))):
+            place = cgutils.alloca_once(builder, ir.IntType(32))
+            builder.store(mode, place)
+            _control(builder, "ldmxcsr", place)
 
 
-@intrinsic  # type: ignore[untyped-decorator]
-def restore_mode(typingctx: Any, mode: Any) -> Any:
-    """Lower :func:`lane_values.restore_mode`; a mode of 0 was never read."""
+# ------------------------------------------------------------------------------------------------ bits
 
-    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        if platform.machine() in ("x86_64", "AMD64"):
-            before = arguments[0]
-            with builder.if_then(builder.icmp_unsigned("!=", before, ir.Constant(before.type, 0))):
-                place = cgutils.alloca_once(builder, ir.IntType(32))
-                builder.store(before, place)
-                _control(builder, "ldmxcsr", place)
-        return context.get_dummy_value()
 
-    return types.void(types.int32), lower
+def _reread(wide: types.Type, narrow: types.Type) -> Callable[..., Any]:
+    """Return the signature of reading the same bits as ``wide``, those of 32 bits as ``narrow``."""
+    return lambda x: _like(narrow if _BYTES[getattr(x, "dtype", x)] == _BYTES[narrow] else wide, x)(x)
 
 
-@intrinsic  # type: ignore[untyped-decorator]
-def load_like(typingctx: Any, array: Any, start: Any, like: Any) -> Any:
-    """Lower :func:`lane_values.load_like`."""
-    lanes = Lanes(array.dtype, like.count)
+@_instead_of(lane_values.bits_of, _reread(types.uint64, types.uint32))
+@_instead_of(lane_values.number_of_bits, _reread(types.float64, types.float32))
+def _same_bits(target: Any, builder: Any, sig: Any, x: Any) -> Any:
+    return builder.bitcast(x, target.get_value_type(sig.return_type))
 
-    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        return _read(context, builder, array, arguments[0], arguments[1], _vector(lanes))
 
-    return lanes(array, types.intp, like), lower
+@_instead_of(lane_values.halves, lambda a, b: types.UniTuple(Lanes(types.uint32, 2 * a.count), 2)(a, b))
+def _halves(target: Any, builder: Any, sig: Any, a: Any, b: Any) -> Any:
+    half = sig.return_type.dtype
+    first, second = (builder.bitcast(word, _vector(half)) for word in (a, b))
+    lower_first = (0, 1) if sys.byteorder == "little" else (1, 0)
+    places = [list(range(begin, 2 * half.count, 2)) for begin in lower_first]
+    return target.make_tuple(builder, sig.return_type, [_picked(builder, first, second, k) for k in places])
 
 
-@intrinsic  # type: ignore[untyped-decorator]
-def element(typingctx: Any, array: Any, place: Any) -> Any:
-    """Lower :func:`lane_values.element`."""
+@_instead_of(lane_values.leading_zeros, lambda word: word(word))
+def _leading_zeros(target: Any, builder: Any, sig: Any, word: Any) -> Any:
+    bit = ir.IntType(1)
+    function = ir.FunctionType(word.type, [word.type, bit])
+    name = f"llvm.ctlz.v{word.type.count}i{word.type.element.width}"
+    return builder.call(cgutils.get_or_insert_function(builder.module, function, name), [word, ir.Constant(bit, 0)])
 
-    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        data = builder.extract_value(arguments[0], DATA)
-        return builder.load(builder.gep(data, [arguments[1]]))
 
-    return array.dtype(array, types.intp), lower
+@_instead_of(lane_values.signed_number, lambda word: Lanes(types.float32, word.count)(word))
+def _signed_number(target: Any, builder: Any, sig: Any, word: Any) -> Any:
+    return builder.sitofp(word, _vector(sig.return_type))
 
 
-@intrinsic  # type: ignore[untyped-decorator]
-def store_like(typingctx: Any, array: Any, start: Any, value: Any) -> Any:
-    """Lower :func:`lane_values.store_like`."""
-    target = Lanes(array.dtype, value.count)
+# ------------------------------------------------------------------------------------------------ conditions and choice
 
-    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        data, first, lanes = arguments
-        _write(context, builder, array, data, first, _converted(builder, lanes, value, target))
-        return context.get_dummy_value()
 
-    return types.void(array, types.intp, value), lower
+def _bits(builder: Any, mask: Any) -> Any:
+    """Return a condition over lanes as a whole number, a bit a lane."""
+    return builder.bitcast(mask, ir.IntType(mask.type.count))
 
 
-@intrinsic  # type: ignore[untyped-decorator]
-def narrowed(typingctx: Any, x: Any, like: Any) -> Any:
-    """Lower :func:`lane_values.narrowed`."""
-    result = _like(like.dtype if isinstance(like, Lanes) else like, x)
+@_instead_of(lane_values.everywhere, types.boolean)
+def _everywhere(target: Any, builder: Any, sig: Any, condition: Any) -> Any:
+    if not isinstance(sig.args[0], Lanes):
+        return condition
+    bits = _bits(builder, condition)
+    return builder.icmp_unsigned("==", bits, ir.Constant(bits.type, (1 << bits.type.width) - 1))
 
-    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        return _converted(builder, arguments[0], x, result)
 
-    return result(x, like), lower
+@_instead_of(lane_values.anywhere, types.boolean)
+def _anywhere(target: Any, builder: Any, sig: Any, condition: Any) -> Any:
+    if not isinstance(sig.args[0], Lanes):
+        return condition
+    bits = _bits(builder, condition)
+    return builder.icmp_unsigned("!=", bits, ir.Constant(bits.type, 0))
 
 
-@intrinsic  # type: ignore[untyped-decorator]
-def total(typingctx: Any, x: Any) -> Any:
-    """Lower :func:`lane_values.total`: the upper half is added to the lower until one is left."""
+@_instead_of(lane_values.number_where, types.int64)
+def _number_where(target: Any, builder: Any, sig: Any, condition: Any) -> Any:
+    return builder.zext(builder.ctpop(_bits(builder, condition)), ir.IntType(64))
 
-    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        value = arguments[0]
-        n = x.count
-        while n > 1:
-            n //= 2
-            value = builder.fadd(*(_picked(builder, value, value, list(range(k, k + n))) for k in (0, n)))
-        return builder.extract_element(value, ir.Constant(_INDEX, 0))
 
-    return x.dtype(x), lower
+def _choice(condition: Any, a: Any, b: Any) -> Any:
+    lanes = _lanes_among(tuple(t for t in (a, b) if isinstance(t, Lanes)))
+    result = lanes or cpu_target.typing_context.unify_types(a, b)
+    return result(condition, result, result)
 
 
-@intrinsic  # type: ignore[untyped-decorator]
-def number_where(typingctx: Any, condition: Any) -> Any:
-    """Lower :func:`lane_values.number_where`."""
-
-    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        bits = builder.bitcast(arguments[0], ir.IntType(condition.count))
-        return builder.zext(builder.ctpop(bits), ir.IntType(64))
-
-    return types.int64(condition), lower
-
-
-def _reinterpreted(wide: types.Type, narrow: types.Type) -> Callable[..., Any]:
-    """Return the lowering that reads the same bits as ``wide``, those of 32 bits as ``narrow``."""
-
-    def reinterpret(typingctx: Any, x: Any) -> Any:
-        result = _like(narrow if _BYTES[getattr(x, "dtype", x)] == _BYTES[narrow] else wide, x)
-
-        def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-            return builder.bitcast(arguments[0], context.get_value_type(result))
-
-        return result(x), lower
-
-    return reinterpret
-
-
-bits_of = intrinsic(_reinterpreted(types.uint64, types.uint32))
-number_of_bits = intrinsic(_reinterpreted(types.float64, types.float32))
-
-
-@intrinsic  # type: ignore[untyped-decorator]
-def halves(typingctx: Any, a: Any, b: Any) -> Any:
-    """Lower :func:`lane_values.halves`."""
-    half = Lanes(types.uint32, 2 * a.count)
-    result = types.UniTuple(half, 2)
-
-    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        first, second = (builder.bitcast(word, _vector(half)) for word in arguments)
-        lower_first = (0, 1) if sys.byteorder == "little" else (1, 0)
-        places = [list(range(begin, 2 * half.count, 2)) for begin in lower_first]
-        return context.make_tuple(builder, result, [_picked(builder, first, second, k) for k in places])
-
-    return result(a, b), lower
-
-
-@intrinsic  # type: ignore[untyped-decorator]
-def leading_zeros(typingctx: Any, word: Any) -> Any:
-    """Lower :func:`lane_values.leading_zeros`."""
-
-    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        (value,), bit = arguments, ir.IntType(1)
-        function = ir.FunctionType(value.type, [value.type, bit])
-        name = f"llvm.ctlz.v{word.count}i{8 * _BYTES[word.dtype]}"
-        return builder.call(
-            cgutils.get_or_insert_function(builder.module, function, name), [value, ir.Constant(bit, 0)]
-        )
-
-    return word(word), lower
-
-
-@intrinsic  # type: ignore[untyped-decorator]
-def signed_number(typingctx: Any, word: Any) -> Any:
-    """Lower :func:`lane_values.signed_number`."""
-    result = Lanes(types.float32, word.count)
-
-    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        return builder.sitofp(arguments[0], _vector(result))
-
-    return result(word), lower
-
-
-@intrinsic  # type: ignore[untyped-decorator]
-def spread(typingctx: Any, x: Any) -> Any:
-    """Lower :func:`lane_values.spread`."""
-    lanes = Lanes(x, WIDTH)
-
-    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        return _spread(builder, arguments[0], _vector(lanes))
-
-    return lanes(x), lower
-
-
-def _counted(nature: str) -> Callable[..., Any]:
-    """Return the lowering of a condition over lanes to one bit; a plain condition stays as it is."""
-
-    def decide(typingctx: Any, condition: Any) -> Any:
-        def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-            mask = arguments[0]
-            if not isinstance(condition, Lanes):
-                return mask
-            bits = builder.bitcast(mask, ir.IntType(condition.count))
-            if nature == "every":
-                return builder.icmp_unsigned("==", bits, ir.Constant(bits.type, (1 << condition.count) - 1))
-            return builder.icmp_unsigned("!=", bits, ir.Constant(bits.type, 0))
-
-        return types.boolean(condition), lower
-
-    return decide
-
-
-everywhere = intrinsic(_counted("every"))
-anywhere = intrinsic(_counted("any"))
-
-
-@intrinsic  # type: ignore[untyped-decorator]
-def chosen(typingctx: Any, condition: Any, a: Any, b: Any) -> Any:
-    """Lower :func:`lane_values.chosen`."""
-    result = _lanes_among(tuple(t for t in (a, b) if isinstance(t, Lanes))) or typingctx.unify_types(a, b)
-
-    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        condition, *values = arguments
-        if isinstance(result, Lanes) and isinstance(result.dtype, types.Float):
-            # Else LLVM takes an operation that both values end in after the choice, and a product that was to fuse with it is rounded by
-            # itself: a run's bits would depend on its neighbours.
-            values = [_fenced(builder, value) for value in values]
-        return builder.select(condition, *values)
-
-    return result(condition, result, result), lower
+@_instead_of(lane_values.chosen, _choice)
+def _chosen(target: Any, builder: Any, sig: Any, condition: Any, *values: Any) -> Any:
+    result = sig.return_type
+    if isinstance(result, Lanes) and isinstance(result.dtype, types.Float):
+        # Else LLVM takes an operation that both values end in after the choice, and a product that was to fuse with it is rounded by
+        # itself: a run's bits would depend on its neighbours.
+        values = tuple(_fenced(builder, value) for value in values)
+    return builder.select(condition, *values)
 
 
 def _fenced(builder: Any, value: Any) -> Any:
@@ -585,31 +484,3 @@ def _fenced(builder: Any, value: Any) -> Any:
     name = f"llvm.arithmetic.fence.v{kind.count}{'f64' if isinstance(kind.element, ir.DoubleType) else 'f32'}"
     function = cgutils.get_or_insert_function(builder.module, ir.FunctionType(kind, [kind]), name)
     return builder.call(function, [value])
-
-
-INTRINSICS = {
-    f.__name__: f
-    for f in (
-        load,
-        fetch,
-        load_triples,
-        load_quadruples,
-        store,
-        store_quadruples,
-        lanes_of,
-        flush_tiny,
-        restore_mode,
-        load_like,
-        element,
-        store_like,
-        narrowed,
-        total,
-        number_where,
-        spread,
-        chosen,
-        halves,
-        leading_zeros,
-        signed_number,
-    )
-} | {"everywhere": everywhere, "anywhere": anywhere, "bits_of": bits_of, "number_of_bits": number_of_bits}
-"""What stands for each function of :mod:`strapdown.kernels.lane_values` in compiled code."""

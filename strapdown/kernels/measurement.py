@@ -72,6 +72,11 @@ def vector_at(array, k):
     return (array[k, 0], array[k, 1], array[k, 2])
 
 
+def quaternion_at(array, k):
+    """Return row k of an (n, 4) array as a 4-tuple."""
+    return (array[k, 0], array[k, 1], array[k, 2], array[k, 3])
+
+
 def six_at(array, k):
     """Return row k of an (n, 6) array as a 6-tuple."""
     return (array[k, 0], array[k, 1], array[k, 2], array[k, 3], array[k, 4], array[k, 5])
@@ -174,20 +179,18 @@ def measurement_rows(kind, q, R, z, frame, noise):
     """
     none = (0.0, 0.0, 0.0)
     if kind == ATTITUDE:
-        y = logarithm(quaternion_multiply((q[0], -q[1], -q[2], -q[3]), (frame[0], frame[1], frame[2], frame[3])))
+        y = logarithm(quaternion_multiply((q[0], -q[1], -q[2], -q[3]), frame[:4]))
         return (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), y[0], y[1], y[2], noise
     if kind == HEADING:
-        error = heading_error(R, z, (frame[6], frame[7], frame[8]))
+        error = heading_error(R, z, frame[6:])
         return heading_row(R, z), none, none, error, 0.0, 0.0, (noise[0], 0.0, 0.0, 1.0, 0.0, 1.0)
-    u = (frame[0], frame[1], frame[2])
-    v = (frame[3], frame[4], frame[5])
-    h1, y1, h2, y2 = direction_rows(R, u, v, z)
+    h1, y1, h2, y2 = direction_rows(R, frame[:3], frame[3:6], z)
     ub = h2
     vb = (-h1[0], -h1[1], -h1[2])
     nu = symmetric_times_vector(noise, ub)
     nv = symmetric_times_vector(noise, vb)
     if kind == VECTOR:
-        rb = transpose_times_vector(R, (frame[6], frame[7], frame[8]))
+        rb = transpose_times_vector(R, frame[6:])
         nr = symmetric_times_vector(noise, rb)
         covariance = (dot(ub, nu), dot(ub, nv), dot(ub, nr), dot(vb, nv), dot(vb, nr), dot(rb, nr))
         return h1, h2, none, y1, y2, dot(rb, z) - 1.0, covariance

@@ -33,7 +33,7 @@ from strapdown.kernels.lane_values import (
     load_like,
     narrowed,
     restore_mode,
-    store_like,
+    store,
 )
 from strapdown.kernels.measurement import ATTITUDE, HEADING, VECTOR, frame_at, heading_row, vector_at
 from strapdown.kernels.noise import next_word, single_normals, stream_state
@@ -185,7 +185,7 @@ def nine(memory, place, like):
 def store_several(memory, place, like, values):
     """Write neighbouring places."""
     for i, value in enumerate(values):
-        store_like(memory, (place + i) * len(like), value)
+        store(memory, (place + i) * len(like), value)
 
 
 def by_axis(v, sizes, row):
@@ -209,8 +209,8 @@ def refill(streams, source, ahead, count, like):
     s0, s1, s2, s3 = four(streams, 4 * source, like)
     for at in range(begin, begin + count * n, 4 * n):
         x, y, s0, s1, s2, s3 = next_four(s0, s1, s2, s3)
-        store_like(ahead, at, x)
-        store_like(ahead, at + 2 * n, y)
+        store(ahead, at, x)
+        store(ahead, at + 2 * n, y)
     store_several(streams, 4 * source, like, (s0, s1, s2, s3))
 
 
@@ -232,17 +232,6 @@ def normal_triple(streams, source, ahead, number, like):
     return drawn_triple(ahead, source, 3 * turn, like)
 
 
-def fill_with_normals(pattern, k0, k1, numbers, out):
-    """Fill out (flat, places a multiple of four) with the normals of the streams of these runs under the key (k0, k1)."""
-    like = lanes_of(pattern)
-    n = len(like)
-    s0, s1, s2, s3 = stream_state(k0, k1, load_like(numbers, 0, like))
-    for at in range(0, len(out), 4 * n):
-        x, y, s0, s1, s2, s3 = next_four(s0, s1, s2, s3)
-        store_like(out, at, x)
-        store_like(out, at + 2 * n, y)
-
-
 def start_streams(keys, numbers, draws, like):
     """Set the states of all streams of the runs ``numbers``, ``keys`` (sources, 2), and draw the normals of their initial values."""
     number = load_like(numbers, 0, like)
@@ -261,7 +250,7 @@ def start_gyro(gyro, draws, like):
     store_several(memory, _TURN_ON, like, by_axis(drawn_triple(ahead, TURN_ON, 0, like), sizes, TURN_ON_SIGMA))
     store_several(memory, _MARKOV, like, by_axis(drawn_triple(ahead, TURN_ON, 3, like), sizes, MARKOV_START))
     for i in range(3 * STATES):
-        store_like(memory, (_STATES + i) * n, like)
+        store(memory, (_STATES + i) * n, like)
     if len(poles_start) > 0:
         for axis in range(3):
             for j in range(0, STATES, 2):
@@ -270,7 +259,7 @@ def start_gyro(gyro, draws, like):
                 for i in range(j, STATES):
                     at = (_STATES + axis * STATES + i) * n
                     state = load_like(memory, at, like) + poles_start[i, j] * x0
-                    store_like(memory, at, state + poles_start[i, j + 1] * x1)
+                    store(memory, at, state + poles_start[i, j + 1] * x1)
     for row in range(3):
         x = drawn_triple(ahead, DISPERSIONS, 3 * row, like)
         store_several(memory, _MATRIX + 3 * row, like, by_axis(x, dispersion, row))
@@ -285,8 +274,8 @@ def flicker_step(poles, gains, memory, axis, w, like):
         at = base + i * n
         a = poles[i] * load_like(memory, at, like) + w
         b = poles[i + 1] * load_like(memory, at + n, like) + w
-        store_like(memory, at, a)
-        store_like(memory, at + n, b)
+        store(memory, at, a)
+        store(memory, at + n, b)
         even = even + gains[i] * a
         odd = odd + gains[i + 1] * b
     return even + odd
@@ -330,7 +319,7 @@ def drift_step(gyro, k, dt, true_increment, draws, like):
         if k == 0:
             for axis in range(3):
                 value = sizes[FLICKER_SIZE, axis] * flicker_value(gains, memory, axis, like)
-                store_like(memory, (_BEFORE + axis) * len(like), value)
+                store(memory, (_BEFORE + axis) * len(like), value)
         x = normal_triple(streams, FLICKER, ahead, k, like)
         before = triple(memory, _BEFORE, like)
         now = (
@@ -416,7 +405,7 @@ def update(q, b, A, B, C, e, events, draws, out, detail, like):
                 e3 = dot(transpose_times_vector(R, r), z) - 1.0
                 s3 = variance * one
                 chi = chi + e3 * e3 / variance
-    store_like(out.nis, place * len(like), load_like(out.nis, place * len(like), like) + chi)
+    store(out.nis, place * len(like), load_like(out.nis, place * len(like), like) + chi)
     if detail is not None:
         store_several(detail.values, 4 * e, like, (z0, z[0], z[1], z[2]))
         store_several(detail.innovations, 6 * e, like, (e1, s1, e2, s2, e3, s3))

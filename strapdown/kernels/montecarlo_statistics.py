@@ -19,7 +19,7 @@ from strapdown.kernels.lane_values import (
     load_like,
     number_of_bits,
     number_where,
-    store_like,
+    store,
 )
 from strapdown.kernels.montecarlo_run import KEPT
 from strapdown.kernels.rotation import quaternion_multiply
@@ -89,7 +89,7 @@ def add_up(sums, row, place, good, values):
     """Add the good lanes of values to neighbouring numbers of an epoch."""
     for i, x in enumerate(values):
         at = (row * SUMS + place + i) * len(x)
-        store_like(sums, at, load_like(sums, at, x) + chosen(good, x, 0.0))
+        store(sums, at, load_like(sums, at, x) + chosen(good, x, 0.0))
 
 
 class Sums(NamedTuple):
@@ -152,12 +152,12 @@ def accumulate(pattern, kept, width, column, valid, truth, error_bins, nees_bins
         add_coverage(out.coverage, row, good, e, (P[0], P[3], P[5], C[0], C[3], C[5]))
         store_bins(out.scratch, error_bins, e, 0)
         store_bins(out.scratch, nees_bins, nees, 6)
-        store_like(score, 0, chosen(good, 1.0, like))
+        store(score, 0, chosen(good, 1.0, like))
         for lane in range(n):
             if score[lane] > 0.0:
                 for c in range(9):
                     out.histogram[row, c, out.scratch[c * n + lane]] += 1
-    store_like(score, 0, worst)
+    store(score, 0, worst)
 
 
 def kept_state(kept, at, width, like):
@@ -179,9 +179,9 @@ def multiply_nees(sums, row, good, nees):
         n = len(x)
         at = (row * SUMS + NEES_PRODUCT + 2 * column) * n
         bits = bits_of(load_like(sums, at, x) * chosen(good, chosen(x > _TINY, x, _TINY), 1.0))
-        store_like(sums, at, number_of_bits((bits & _MANTISSA) | _UNIT))
+        store(sums, at, number_of_bits((bits & _MANTISSA) | _UNIT))
         binades = number_of_bits((bits >> _S52) | _INTEGER) - _EXPONENT_BIAS
-        store_like(sums, at + n, load_like(sums, at + n, x) + binades)
+        store(sums, at + n, load_like(sums, at + n, x) + binades)
 
 
 def add_coverage(coverage, row, good, e, variances):
@@ -196,4 +196,4 @@ def add_coverage(coverage, row, good, e, variances):
 def store_bins(scratch, bounds, values, first):
     """Write the bins of |x| of each value, from place ``first`` on."""
     for i, x in enumerate(values):
-        store_like(scratch, (first + i) * len(x), bin_numbers(chosen(x < 0.0, -x, x), bounds[0], bounds[1]))
+        store(scratch, (first + i) * len(x), bin_numbers(chosen(x < 0.0, -x, x), bounds[0], bounds[1]))

@@ -9,7 +9,6 @@ import numpy as np
 
 from strapdown.kernels.algebra import (
     combine,
-    dot,
     full,
     multiply,
     scale,
@@ -17,8 +16,9 @@ from strapdown.kernels.algebra import (
     times_transpose_upper,
     transpose,
 )
-from strapdown.kernels.rotation import exponential, quaternion_multiply, rotation_matrix, unit
-from strapdown.kernels.series import LARGEST_ANGLE
+from strapdown.kernels.measurement import quaternion_at, vector_at
+from strapdown.kernels.rotation import moved, quaternion_multiply, rotation_matrix, unit
+from strapdown.kernels.state import store_row
 
 
 def average_samples(samples, frame, edge, total, number):
@@ -41,16 +41,6 @@ def average_samples(samples, frame, edge, total, number):
             count += 1
         total[i, 0], total[i, 1], total[i, 2] = sx, sy, sz
         number[i] = count
-
-
-def turned_by(q, v):
-    """Return q ⊗ exp(v), normalised, for a rotation vector v of any length."""
-    square = dot(v, v)
-    if square < LARGEST_ANGLE * LARGEST_ANGLE:
-        return unit(quaternion_multiply(q, exponential(v)))
-    angle = math.sqrt(square)
-    s = math.sin(0.5 * angle) / angle
-    return unit(quaternion_multiply(q, (math.cos(0.5 * angle), s * v[0], s * v[1], s * v[2])))
 
 
 def turn_over(time, rate, late, sums, turn):
@@ -83,8 +73,8 @@ def turn_over(time, rate, late, sums, turn):
 def turn_back(attitude, turn, result):
     """Write the attitudes (n, 4) before the rotations ``turn`` (n, 3)."""
     for i in range(len(turn)):
-        q = (attitude[i, 0], attitude[i, 1], attitude[i, 2], attitude[i, 3])
-        result[i, 0], result[i, 1], result[i, 2], result[i, 3] = turned_by(q, (-turn[i, 0], -turn[i, 1], -turn[i, 2]))
+        q, _ = moved(quaternion_at(attitude, i), (-turn[i, 0], -turn[i, 1], -turn[i, 2]))
+        store_row(result, i, unit(q))
 
 
 class Steps(NamedTuple):
@@ -126,6 +116,11 @@ class Carried(NamedTuple):
     """(n, 6, 6), or (0, 6, 6)."""
 
 
+def block_at(P, first):
+    """Return rows 0 to 2 of three columns of a covariance as a 9-tuple."""
+    return tuple(P[i, first + j] for i in range(3) for j in range(3))
+
+
 def carry_to_stamps(steps, stamps, timing, iron, out):
     """Propagate the estimate at each step with the gyro to the stamps before the next step, and over their delay.
 
@@ -134,43 +129,31 @@ def carry_to_stamps(steps, stamps, timing, iron, out):
     for k in range(len(steps.edge)):
         first = steps.edge[k]
         last = steps.edge[k + 1] if k + 1 < len(steps.edge) else len(stamps.time)
-        begin = (steps.attitude[k, 0], steps.attitude[k, 1], steps.attitude[k, 2], steps.attitude[k, 3])
+        begin = quaternion_at(steps.attitude, k)
         t = stamps.turned
         since = quaternion_multiply(begin, (t[first, 0], -t[first, 1], -t[first, 2], -t[first, 3]))
-        bias = (steps.bias[k, 0], steps.bias[k, 1], steps.bias[k, 2])
-        P = steps.covariance
-        body = (P[k, 0, 0], P[k, 0, 1], P[k, 0, 2], P[k, 1, 1], P[k, 1, 2], P[k, 2, 2])
+        bias = vector_at(steps.bias, k)
+        P = steps.covariance[k]
         R = rotation_matrix(begin)
-        xx, xy, xz, yy, yz, zz = times_transpose_upper(multiply(R, full(body)), R)
+        xx, xy, xz, yy, yz, zz = times_transpose_upper(multiply(R, block_at(P, 0)), R)
         s = steps.tilt[k]
         fixed = full((s * s * xx, s * s * xy, s * xz, s * s * yy, s * yz, zz))
-        across = (
-            P[k, 0, 3],
-            P[k, 0, 4],
-            P[k, 0, 5],
-            P[k, 1, 3],
-            P[k, 1, 4],
-            P[k, 1, 5],
-            P[k, 2, 3],
-            P[k, 2, 4],
-            P[k, 2, 5],
-        )
-        across = multiply(R, across)
-        a, b = scale(s, across[:3]), scale(s, across[3:6])
-        across = (a[0], a[1], a[2], b[0], b[1], b[2], across[6], across[7], across[8])
+        across = multiply(R, block_at(P, 3))
+        across = scale(s, across[:3]) + scale(s, across[3:6]) + across[6:]
         for n in range(first, last):
             late = stamps.time[n] - stamps.time[first] + stamps.late[n]
-            v = combine(1.0, (stamps.ahead[n, 0], stamps.ahead[n, 1], stamps.ahead[n, 2]), -late, bias)
-            q = turned_by(quaternion_multiply(since, (t[n, 0], t[n, 1], t[n, 2], t[n, 3])), v)
+            v = combine(1.0, vector_at(stamps.ahead, n), -late, bias)
+            q, _ = moved(quaternion_multiply(since, quaternion_at(t, n)), v)
+            q = unit(q)
             R = rotation_matrix(q)
             own = times_transpose_upper(multiply(transpose(R), fixed), transpose(R))
-            w = (stamps.rate[n, 0], stamps.rate[n, 1], stamps.rate[n, 2])
+            w = vector_at(stamps.rate, n)
             own = symmetric_minus_outer(own, scale(-timing, w), w)
             up = (R[6], R[7], R[8])  # in body axes
             own = full(symmetric_minus_outer(own, scale(-iron, up), up))
-            out.attitude[n, 0], out.attitude[n, 1], out.attitude[n, 2], out.attitude[n, 3] = q
-            out.bias[n, 0], out.bias[n, 1], out.bias[n, 2] = bias
-            out.variance[n, 0], out.variance[n, 1], out.variance[n, 2] = own[0], own[4], own[8]
+            store_row(out.attitude, n, q)
+            store_row(out.bias, n, bias)
+            store_row(out.variance, n, (own[0], own[4], own[8]))
             for i in range(3, 6):
                 out.variance[n, i] = steps.variance[k, i]
             if n < len(out.covariance):
@@ -180,7 +163,7 @@ def carry_to_stamps(steps, stamps, timing, iron, out):
                         out.covariance[n, i, j] = own[3 * i + j]
                         out.covariance[n, i, 3 + j] = mixed[3 * i + j]
                         out.covariance[n, 3 + j, i] = mixed[3 * i + j]
-                        out.covariance[n, 3 + i, 3 + j] = P[k, 3 + i, 3 + j]
+                        out.covariance[n, 3 + i, 3 + j] = P[3 + i, 3 + j]
 
 
 def low_pass(values, share, result):

@@ -59,12 +59,14 @@ from strapdown.kernels.measurement import (
     KIND,
     frame_of,
     noise_of,
+    quaternion_at,
     sigma_of,
     value_of,
     vector_at,
 )
 from strapdown.kernels.rotation import far_turn, quaternion_multiply, right_jacobian, turned, unit
 from strapdown.kernels.sensor_rows import arm_noise, decorrelate, fill_rows
+from strapdown.kernels.state import store_row
 from strapdown.kernels.triangle import (
     TAKEN,
     covariances,
@@ -227,7 +229,7 @@ def write_row(form, i, q, row, out):
     """Write the filter's state with the i-th factor to a row of the outputs."""
     x, F = form.x[0], form.F[i]
     size = len(x) + 3
-    out.attitude[row, 0], out.attitude[row, 1], out.attitude[row, 2], out.attitude[row, 3] = q
+    store_row(out.attitude, row, q)
     for j in range(len(x)):
         out.x[row, j] = x[j]
     variances(F, size, out.variance, row, form.scratch.lines[WORK])
@@ -421,14 +423,12 @@ def finish(state, row, e, body):
 
 def load(form, i):
     """Return the attitude of state i; the other parts remain in their arrays."""
-    a = form.attitude
-    return (a[i, 0], a[i, 1], a[i, 2], a[i, 3])
+    return quaternion_at(form.attitude, i)
 
 
 def save(form, i, q):
     """Store the attitude of state i."""
-    a = form.attitude
-    a[i, 0], a[i, 1], a[i, 2], a[i, 3] = q
+    store_row(form.attitude, i, q)
 
 
 def become(form):

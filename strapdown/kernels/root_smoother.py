@@ -28,7 +28,7 @@ from strapdown.kernels.error_state_step import (
     turn_rows,
     turn_values,
 )
-from strapdown.kernels.lane_values import WIDTH, chosen, fetch, load, spread, store
+from strapdown.kernels.lane_values import WIDTH, chosen, load, spread, store
 from strapdown.kernels.root_form import loose, row_end
 from strapdown.kernels.rotation import inverse_right_jacobian, logarithm, moved, quaternion_multiply
 from strapdown.kernels.triangle import covariances, padded, triangularise, variances
@@ -121,8 +121,6 @@ def prepare_step(segments, j, model, space):
     noisy = 6 + model.changing
     width, room = noise.shape[1], gain.shape[1]
     q = load_segment(segments, j, x, F, loose(model))
-    for c in range(0, segments.shape[1], WIDTH):  # for the next step back
-        fetch(segments, (j - 1) * segments.shape[1] + c)
     dt = segments[j, 0]
     part = (segments[j, 1], segments[j, 2], segments[j, 3])
     predicted, phi11, rate, D = move(q, x, dt, part, model, top, factor)

@@ -20,11 +20,9 @@ from strapdown.kernels.algebra import (
 )
 from strapdown.kernels.series import LARGEST_ANGLE, cosine, polynomial, second, sinc, third
 
-_A = tuple(math.comb(2 * k, k) / (4.0**k * (2 * k + 1)) for k in range(12))
-_A0, _A1, _A2, _A3, _A4, _A5, _A6, _A7, _A8, _A9, _A10, _A11 = _A
+_ARCSINE = tuple(math.comb(2 * k, k) / (4.0**k * (2 * k + 1)) for k in range(12))
 # |B_2k| / (2k)! for k = 1 … 6, with the Bernoulli numbers 1/6, 1/30, 1/42, 1/30, 5/66, 691/2730.
-_I0, _I1, _I2 = 1.0 / 12.0, 1.0 / 720.0, 1.0 / 30240.0
-_I3, _I4, _I5 = 1.0 / 1209600.0, 1.0 / 47900160.0, 691.0 / 1307674368000.0
+_BERNOULLI = (1.0 / 12.0, 1.0 / 720.0, 1.0 / 30240.0, 1.0 / 1209600.0, 1.0 / 47900160.0, 691.0 / 1307674368000.0)
 SHORT = 1e-4
 """Maximum squared angle, rad², of both rotations for which four terms of the series of their composition are exact to rounding."""
 _SINE_SQUARED = math.sin(0.5 * LARGEST_ANGLE) ** 2
@@ -123,12 +121,13 @@ def far_turn(phi):
 def arcsine(x):
     """Return asin s / s at s = √x, x ≤ sin²(``LARGEST_ANGLE``/2)."""
     xxx = x * x * x
-    return polynomial(x, _A0, _A1, _A2, _A3, _A4, _A5) + xxx * xxx * polynomial(x, _A6, _A7, _A8, _A9, _A10, _A11)
+    return polynomial(x, *_ARCSINE[:6]) + xxx * xxx * polynomial(x, *_ARCSINE[6:])
 
 
 def arcsine_series(x):
     """Return 2 asin s / s at s = √x to the fourth term: exact to rounding for x ≤ ``SHORT``."""
-    return (2.0 + 2.0 * _A1 * x) + (x * x) * (2.0 * _A2 + 2.0 * _A3 * x)
+    _, a1, a2, a3 = _ARCSINE[:4]
+    return (2.0 + 2.0 * a1 * x) + (x * x) * (2.0 * a2 + 2.0 * a3 * x)
 
 
 def logarithm(q):
@@ -145,7 +144,7 @@ def logarithm(q):
 
 def near_inverse_right_jacobian(phi):
     """Return :func:`inverse_right_jacobian` for θ ≤ ``LARGEST_ANGLE``, for floats or lanes."""
-    return skew_polynomial(1.0, 0.5, polynomial(dot(phi, phi), _I0, _I1, _I2, _I3, _I4, _I5), phi)
+    return skew_polynomial(1.0, 0.5, polynomial(dot(phi, phi), *_BERNOULLI), phi)
 
 
 def inverse_right_jacobian(phi):

@@ -19,13 +19,6 @@ _THIRD = tuple((-1.0) ** k / math.factorial(2 * k + 3) for k in range(6))
 _FOURTH = tuple((-1.0) ** k / math.factorial(2 * k + 4) for k in range(6))
 _FIFTH = tuple(2.0 * (-1.0) ** k / math.factorial(2 * k + 5) for k in range(6))
 
-_C0, _C1, _C2, _C3, _C4, _C5 = _COSINE
-_S0, _S1, _S2, _S3, _S4, _S5 = _SINC
-_H0, _H1, _H2, _H3, _H4, _H5 = _SECOND
-_T0, _T1, _T2, _T3, _T4, _T5 = _THIRD
-_F0, _F1, _F2, _F3, _F4, _F5 = _FOURTH
-_G0, _G1, _G2, _G3, _G4, _G5 = _FIFTH
-
 
 def polynomial(x, c0, c1, c2, c3, c4, c5):
     """Return Σ cₖ xᵏ by Estrin's scheme: one multiplication more than Horner's, but a dependency chain half as long."""
@@ -35,29 +28,29 @@ def polynomial(x, c0, c1, c2, c3, c4, c5):
 
 def cosine(x):
     """Return cos √x."""
-    return polynomial(x, _C0, _C1, _C2, _C3, _C4, _C5)
+    return polynomial(x, *_COSINE)
 
 
 def sinc(x):
     """Return sin √x / √x."""
-    return polynomial(x, _S0, _S1, _S2, _S3, _S4, _S5)
+    return polynomial(x, *_SINC)
 
 
 def second(x):
     """Return (1 − cos θ)/θ² at θ = √x; tends to 1/2."""
-    return polynomial(x, _H0, _H1, _H2, _H3, _H4, _H5)
+    return polynomial(x, *_SECOND)
 
 
 def third(x):
     """Return (θ − sin θ)/θ³ at θ = √x; tends to 1/6."""
-    return polynomial(x, _T0, _T1, _T2, _T3, _T4, _T5)
+    return polynomial(x, *_THIRD)
 
 
 def fourth(x):
     """Return (θ²/2 − 1 + cos θ)/θ⁴ at θ = √x; tends to 1/24."""
-    return polynomial(x, _F0, _F1, _F2, _F3, _F4, _F5)
+    return polynomial(x, *_FOURTH)
 
 
 def fifth(x):
     """Return (1/3 − 2(θ − sin θ)/θ³)/θ² at θ = √x; tends to 1/60."""
-    return polynomial(x, _G0, _G1, _G2, _G3, _G4, _G5)
+    return polynomial(x, *_FIFTH)

@@ -9,6 +9,10 @@ each other, so each hides the latency of the other. The next group is prepared i
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
+import numpy as np
+
 from strapdown.kernels.algebra import dot, multiply, scale, times_transpose_upper
 from strapdown.kernels.lane_values import (
     WIDTH,
@@ -36,11 +40,11 @@ from strapdown.kernels.series import LARGEST_ANGLE
 from strapdown.kernels.smoother_step import gain, kept_share, left_noise, step_noise
 from strapdown.kernels.state import (
     SIZE,
+    keep_state,
     load_matrix,
     load_quaternion,
     load_state,
     load_triple,
-    store_row,
     store_several,
 )
 
@@ -97,10 +101,7 @@ FEWEST_ROWS = WIDTH + 1
 
 _NOTHING = 1e-30
 _LARGEST_SQUARE = LARGEST_ANGLE * LARGEST_ANGLE
-_NOT_NEGATIVE = 2**62 - 1
-_LANE = WIDTH - 1
 SIX = (0, 1, 2, 3, 4, 5)
-# An index AND this is unchanged, and known to the compiler as not negative, which it would otherwise test at each read.
 
 
 def locate_edges(edges, event_time, segments, number, starts_out):
@@ -202,7 +203,6 @@ def load_share(work):
 
 def prepare_rows(work, group):
     """Write the matrices of :func:`prepare_gains`, one row per segment, eight numbers of four segments at a time."""
-    group &= _NOT_NEGATIVE
     blocks = MATRICES // WIDTH if anywhere(load(work, group + MOVED) > 0.5) else TURN // WIDTH
     for k in range(blocks):
         for i in range(0, WIDTH, 4):
@@ -234,9 +234,6 @@ def carry_error(work, group, errors, i):
     from the cosine in parallel with G v.
     """
     w = WIDTH
-    i &= _LANE
-    group &= _NOT_NEGATIVE
-    errors &= _NOT_NEGATIVE
     c0, c1, c2, c3, c4, c5 = load_columns(work, group + MATRICES * i, group + MATRICES * i + 18)
     e = errors + w * i + w
     moved_there = work[group + MOVED + i]
@@ -275,7 +272,6 @@ def carry_error(work, group, errors, i):
 def fold_jacobians(work, group, errors):
     """Write the first three columns of G J for a group, J = J_r(a)⁻¹ J_r(ε) with ε the error at the end of each segment."""
     w = WIDTH
-    group &= _NOT_NEGATIVE
     seen = load(work, group + MOVED) > 0.5
     if anywhere(seen):
         e0, e1, e2, _ = load_quadruples(work, errors + w, w)
@@ -323,8 +319,7 @@ def row_times(work, f, g, z, start):
 
 def carry_covariance(work, group, i):
     """Propagate the smoothed covariance from the end of segment i of a group back to its start: P_s ← (G J) P_s (G J)ᵀ + D."""
-    i &= _LANE
-    g = (group & _NOT_NEGATIVE) + MATRICES * i
+    g = group + MATRICES * i
     f = FOLDED + FOLDED_ROW * i
     p = COVARIANCE + COVARIANCE_ROW * i + COVARIANCE_ROW
     d = g + NOISE
@@ -342,7 +337,6 @@ def move_states(work, group, errors, whole):
     B is written only for the ``whole`` covariance; C is unchanged.
     """
     w = WIDTH
-    group &= _NOT_NEGATIVE
     e0, e1, e2, beta0 = load_quadruples(work, errors, w)
     beta1, beta2, _, _ = load_quadruples(work, errors + 4, w)
     b0, b1, b2 = load_triple(work, group + BIAS)
@@ -384,28 +378,12 @@ def diagonal_block(work, start):
     return tuple(work[start + WIDTH * i + j] for i in range(3) for j in range(i, 3))
 
 
-def write_smoothed(work, i, k, attitude_out, bias_out, variance_out, covariance_out):
-    """Write the smoothed state of segment i of a group to row k of the outputs."""
-    i &= _LANE
-    k &= _NOT_NEGATIVE
+def write_smoothed(work, i, k, out):
+    """Write the smoothed state of segment i of a group to row k of the outputs; B has meaning where the whole covariance is wanted."""
     n = lane_numbers(work, SMOOTHED + i)
+    B = lane_numbers(work, SMOOTHED + 13 * WIDTH + i)[:9]
     C = diagonal_block(work, COVARIANCE + COVARIANCE_ROW * i + 27)
-    store_row(attitude_out, k, n[:4])
-    store_row(bias_out, k, n[4:7])
-    store_row(variance_out, k, (n[7], n[10], n[12], C[0], C[3], C[5]))
-    if k < len(covariance_out):
-        B = lane_numbers(work, SMOOTHED + 13 * WIDTH + i)[:9]
-        store_row(covariance_out, k, n[7:] + B + C)
-
-
-def write_filtered(segments, s, k, attitude_out, bias_out, variance_out, covariance_out):
-    """Write the filtered state at ``segments[s]`` to row k of the outputs."""
-    q, b, A, B, C = load_state(segments[s : s + SIZE])
-    store_row(attitude_out, k, q)
-    store_row(bias_out, k, b)
-    store_row(variance_out, k, (A[0], A[3], A[5], C[0], C[3], C[5]))
-    if k < len(covariance_out):
-        store_row(covariance_out, k, A + B + C)
+    keep_state(out, k, n[:4], n[4:7], n[7:], B, C)
 
 
 def start_covariance(work, p, segments, s):
@@ -419,18 +397,17 @@ def start_covariance(work, p, segments, s):
                 work[p + 27 + 8 * i + j] = segments[s + 15 + place]
 
 
-def smooth_back(
-    segments,
-    starts,
-    first,
-    angle_variance,
-    rate_variance,
-    work,
-    attitude_out,
-    bias_out,
-    variance_out,
-    covariance_out,
-):
+class Outputs(NamedTuple):
+    """Output arrays of a pass, a row for each edge."""
+
+    attitude: np.ndarray
+    bias: np.ndarray
+    variance: np.ndarray
+    covariance: np.ndarray
+    """Blocks A, B, C (edges, 21), or (0, 21)."""
+
+
+def smooth_back(segments, starts, first, angle_variance, rate_variance, work, out):
     """Smooth from the last edge back to edge ``first``, and write the results of all edges.
 
     ``segments`` holds the filter's rows (dt, increment, state at the start), flat, at least ``FEWEST_ROWS``, with the end state in the
@@ -444,7 +421,8 @@ def smooth_back(
         work[i] = 0.0
     k = len(starts) - 1
     j = starts[k]
-    write_filtered(segments, ROW * j + 4, k, attitude_out, bias_out, variance_out, covariance_out)
+    q, b, A, B, C = load_state(segments[ROW * j + 4 : ROW * j + 4 + SIZE])
+    keep_state(out, k, q, b, A, B, C)
     k -= 1
     if k < first:
         return
@@ -495,9 +473,9 @@ def smooth_back(
         if t > top:
             begin = max(end - w * t, 0)
             if starts[k] >= begin:
-                move_states(work, group_before, errors_before, len(covariance_out) > 0)
+                move_states(work, group_before, errors_before, len(out.covariance) > 0)
                 while k >= first and starts[k] >= begin:
-                    write_smoothed(work, starts[k] - begin, k, attitude_out, bias_out, variance_out, covariance_out)
+                    write_smoothed(work, starts[k] - begin, k, out)
                     k -= 1
         if top <= t <= bottom:
             fold_jacobians(work, group, errors)

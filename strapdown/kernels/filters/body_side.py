@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from strapdown.kernels.algebra import add, congruent, multiply
-from strapdown.kernels.filter_step import predict as propagated_body_side
-from strapdown.kernels.filters.extended import joseph_row
-from strapdown.kernels.measurement import measurement_rows
+from strapdown.kernels.filter_step import predict as propagated
+from strapdown.kernels.filters.extended import joseph_row as row_update
+from strapdown.kernels.measurement import measurement_rows as error_rows
 from strapdown.kernels.rotation import moved, unit
+
+__all__ = ["closed", "error_rows", "from_body_side", "propagated", "row_update", "to_body_side"]
 
 
 def from_body_side(q, A, B, C):
@@ -14,24 +16,7 @@ def from_body_side(q, A, B, C):
     return A, B, C
 
 
-def to_body_side(q, A, B, C):
-    """Return the blocks unchanged."""
-    return A, B, C
-
-
-def propagated(q, b, A, B, C, delta_theta, dt, angle_variance, rate_variance):
-    """Propagate (δθ, δb) exactly at constant rate."""
-    return propagated_body_side(q, b, A, B, C, delta_theta, dt, angle_variance, rate_variance)
-
-
-def error_rows(kind, q, R, z, frame, noise):
-    """Return a measurement's rows in body axes."""
-    return measurement_rows(kind, q, R, z, frame, noise)
-
-
-def row_update(a, c, A, B, C, h, y, variance):
-    """Update with one scalar row by Joseph's form."""
-    return joseph_row(a, c, A, B, C, h, y, variance)
+to_body_side = from_body_side
 
 
 def closed(q, b, A, B, C, correction, bias_correction):

@@ -15,14 +15,12 @@ from strapdown.kernels.algebra import (
     transpose,
 )
 from strapdown.kernels.filter_step import process_noise, transition
-from strapdown.kernels.filters.extended import (
-    attitude_turned_axes,
-    negated,
-    rows_in_fixed_axes,
-    turned_in_fixed_axes,
-)
+from strapdown.kernels.filters.extended import attitude_turned_axes, negated, turned_in_fixed_axes
+from strapdown.kernels.filters.extended import rows_in_fixed_axes as error_rows
 from strapdown.kernels.iterated_update import IDENTITY
 from strapdown.kernels.rotation import moved, rotation_matrix, turned
+
+__all__ = ["closed", "error_rows", "from_body_side", "propagated", "to_body_side"]
 
 
 def from_body_side(q, A, B, C):
@@ -58,11 +56,6 @@ def propagated(q, b, A, B, C, delta_theta, dt, angle_variance, rate_variance):
         multiply_add(R, q12, theta_bias),
         add_to_diagonal(C, q22),
     )
-
-
-def error_rows(kind, q, R, z, frame, noise):
-    """Return a measurement's rows in fixed axes."""
-    return rows_in_fixed_axes(kind, q, R, z, frame, noise)
 
 
 def closed(q, b, A, B, C, correction, bias_correction):
