@@ -49,8 +49,8 @@ def put(group: Any, name: str, value: Array, unit: str, meaning: str = "") -> No
     """Write an array with its unit, and its meaning if the name does not state it, as attributes; compressed unless it is small.
 
     Attitudes and covariances are not compressed either: they are most of a file, and compression would take a fifth of the time of a warm
-    `strapdown estimate` to save a quarter of the attitudes and a third of the covariances. Chunks are whole rows: repeated rows then take
-    half of the space that they take in chunks by column.
+    `strapdown estimate` to save a quarter of the attitudes and a third of the covariances. Chunks are whole rows: repeated rows then need
+    half of the space of chunks by column.
     """
     options: dict[str, Any] = {}
     if value.size > 256 and value.ndim < 3 and not name.endswith("attitude"):
