@@ -201,7 +201,7 @@ def test_outliers_beside_optional_states(run, tmp_path):
     options = ("--states", "--gate", "--free", "sun.sigma,star.sigma", "--starts", 1, "--holdout", 0.3)
     status, said, complaint = run("tune", tmp_path / "struck.h5", *options, "-o", out)
     assert status == 0, complaint
-    assert "An outlier is the likelier explanation" in said
+    assert "is more likely an outlier than noise" in said
     found, content = setup.read_setup(out), json.loads(out.with_suffix(".json").read_text())
     assert found.states is not None
     assert found.gate is not None
