@@ -1,19 +1,18 @@
-"""The MEKF with optional states, one step at a time: scalars and tuples for the attitude, arrays for the rest.
+"""The MEKF with optional error states, one step at a time: scalars and tuples for the attitude, arrays for the rest.
 
-State: attitude ``q_fb``; ``x`` = (b, c): gyro bias and optional states c; factor ``F`` of the covariance of (δθ, δb, δc)
-(:mod:`strapdown.kernels.triangle`). The error states are described by arrays, so that no kernel depends on their meaning:
+State: attitude ``q_fb``; ``x`` = (b, c): gyro bias and error states c; factor ``F`` of the covariance of (δθ, δb, δc)
+(:mod:`strapdown.kernels.triangle`). The error states are defined by arrays, so that no kernel depends on their meaning:
 
-- each decays at its own rate and is driven by its own white noise, ``ċ = −λ c + √q w``: ``decay`` λ, ``density`` q. Those that change come
-  first, those with neither come last.
-- the gyro measures ``(I + Σ c T) w + b + Σ c e + Σ c G R_fbᵀ f + n``, f the specific force of a body at rest, fixed frame: ``gyro``
+- each has its own decay rate and white noise, ``ċ = −λ c + √q w``: ``decay`` λ, ``density`` q. Constant states come last.
+- the gyro measures ``(I + Σ c T) w + b + Σ c e + Σ c G R_fbᵀ f + n``, f the specific force at rest, fixed frame: ``gyro``
   (states, 12) holds e (3) and T or G (9, by rows), ``gyro_use`` the bits :data:`OFFSET`, :data:`SCALE` and :data:`FORCE`.
 - a sensor measures ``(I + Σ c U) R_fbᵀ (r + Σ c d) + Σ c a + v``: ``sensors`` (sensors, states, 15) holds a (3, body), d (3, fixed) and
-  U (9), ``sensor_use`` the bits :data:`OFFSET`, :data:`FIXED` and :data:`SCALE`. With :data:`CARRIED` besides, d is not firm in the
-  fixed frame but goes along when the estimated attitude is corrected: the derivative with respect to the attitude leaves it out, and each
-  correction turns the states themselves (:func:`turn_values`, :func:`turn_columns`).
-  With :data:`LEVER` in place of OFFSET the offset is W a, ``W = [ẇ] + [w]²``: the acceleration at an arm a from the centre of turning.
+  U (9), ``sensor_use`` the bits :data:`OFFSET`, :data:`FIXED` and :data:`SCALE`. With :data:`CARRIED` in addition, d is not constant in the
+  fixed frame but rotates with corrections of the estimated attitude: the derivative with respect to the attitude omits it, and each
+  correction rotates the states themselves (:func:`turn_values`, :func:`turn_columns`).
+  With :data:`LEVER` instead of OFFSET, the offset is W a, ``W = [ẇ] + [w]²``: the acceleration at lever arm a from the centre of rotation.
 
-All but the square roots is plain arithmetic, so that the same functions serve the step-by-step face.
+The step-by-step filter uses the same functions, uncompiled.
 """
 
 from __future__ import annotations
@@ -60,7 +59,7 @@ FORCE = 16
 LEVER = 32
 
 FOUR = (0.0, 0.0, 0.0, 0.0)
-"""So many lanes."""
+"""Pattern of four lanes."""
 IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 
 FACTORIALS = tuple(1.0 / math.factorial(k) for k in range(16, 1, -1))
@@ -78,12 +77,11 @@ def inverse(A):
 
 
 def response(rate, u, decay):
-    """Return the matrix ``∫₀ᵘ exp(−[ω](u − s)) e^{−λs} ds``, the attitude error that a decaying rate error makes in the time u, and
-    ``∫₀ᵘ e^{−λs} ds``.
+    """Return ``∫₀ᵘ exp(−[ω](u − s)) e^{−λs} ds``, the effect of a decaying rate error on the attitude over u, and ``∫₀ᵘ e^{−λs} ds``.
 
-    With ``φ_k = Σ (−λu)^i/(i + k)!`` and y = −ω²u² the matrix is ``u φ₁ − u² (φ₂ + φ₄ y + …) [ω] + u³ (φ₃ + φ₅ y + …) [ω]²``: to rounding
-    for |ω| u ≤ 1/3 and λ u ≤ 1/2.
-    """  # noqa: D205
+    With ``φ_k = Σ (−λu)^i/(i + k)!`` and y = −ω²u² the first is ``u φ₁ − u² (φ₂ + φ₄ y + …) [ω] + u³ (φ₃ + φ₅ y + …) [ω]²``, accurate to
+    rounding for |ω| u ≤ 1/3 and λ u ≤ 1/2.
+    """
     z = -decay * u
     y = -u * u * dot(rate, rate)
     phi = FACTORIALS[0]
@@ -98,7 +96,7 @@ def response(rate, u, decay):
 
 
 def longest_step(dt, theta, limit):
-    """Return the longest step within an interval: what the polynomials bear of a turn, and ``limit`` for states that decay."""
+    """Return the longest step within an interval, given the range of the polynomials and the ``limit`` of states that decay."""
     longest = dt
     squared = dot(theta, theta)
     if LARGEST_ANGLE * LARGEST_ANGLE < squared < MAX_TURN * MAX_TURN:
@@ -107,17 +105,17 @@ def longest_step(dt, theta, limit):
 
 
 def error_matrix(gyro, k):
-    """Return the matrix T of a state of the gyro."""
+    """Return the matrix T or G of state k."""
     return tuple(gyro[k, i] for i in range(3, 12))
 
 
 def gyro_matrix_times(gyro, k, v):
-    """Return T v of a state's matrix T."""
+    """Return the product of the matrix of state k and v."""
     return matrix_times_vector(error_matrix(gyro, k), v)
 
 
 def turning_matrix(rate, acceleration):
-    """Return W = [ẇ] + [w]², by which a lever arm becomes an acceleration, body axes."""
+    """Return W = [ẇ] + [w]²: the acceleration at lever arm a is W a, body axes."""
     x, y, z = rate
     a, b, c = acceleration
     return (
@@ -203,17 +201,17 @@ def move(q, x, dt, part, model, top, factor):
 
 
 def add_column(top, k, column):
-    """Add what state k makes of the attitude."""
+    """Add a column of Φ, the effect of state k on the attitude, to ``top``."""
     top[6 + k, 0] += column[0]
     top[6 + k, 1] += column[1]
     top[6 + k, 2] += column[2]
 
 
 def step_noise(noise, dt, rate, D, model):
-    """Write the covariance Q of the noise of a step: rows (n, 4), of the attitude Q_θθ, of any other state i Q_θi and Q_ii.
+    """Write the process noise Q of a step to ``noise`` (n, 4): rows 0 to 2 hold Q_θθ, the row of any other state i holds Q_θi and Q_ii.
 
-    Attitude and bias have the exact Q of :func:`strapdown.kernels.filter_step.process_noise` (the white noise of the gyro is given after
-    its scale factor). A state that enters the gyro has its noise at Gauss's three nodes of the step.
+    For attitude and bias it is the exact Q of :func:`strapdown.kernels.filter_step.process_noise` (the white noise of the gyro is specified
+    after its scale factor). For an error state that is a gyro offset, Gauss's rule with three nodes is used.
     """
     decay, density, gyro, gyro_use = model.decay, model.density, model.gyro, model.gyro_use
     q11, q12, q22 = process_noise(scale(dt, rate), dt, model.angle_variance, model.rate_variance)
@@ -222,7 +220,7 @@ def step_noise(noise, dt, rate, D, model):
     E = (IDENTITY, IDENTITY, IDENTITY)
     kept = (1.0, 1.0, 1.0)
     mean = 0.0
-    held = alone = -1.0  # the decays that the former are of, and the mean
+    held = alone = -1.0  # decay rates for which E and kept, and mean, were computed
     for k in range(len(decay)):
         if density[k] > 0.0 and gyro_use[k] & OFFSET:
             if decay[k] != held:
@@ -290,7 +288,7 @@ def follow(top, factor, noise, next_top, next_factor, next_noise, size, changing
 
 
 def fill_noise(F, first, noise, noisy):
-    """Write the rows of noise, N with ``Q = Nᵀ N``, from row ``first`` of F on, of so many states; return the row after them."""
+    """Write N with ``Q = Nᵀ N`` for the first ``noisy`` states to the rows of F from ``first``; return the row after them."""
     q11 = (noise[0, 0], noise[0, 1], noise[0, 2], noise[1, 1], noise[1, 2], noise[2, 2])
     row = first + 3
     for i in range(3, noisy):
@@ -363,22 +361,22 @@ def carry_back(F, size, end, phi11, top, inverse, changing):
 
 
 def turn_rows(F, end, G):
-    """Carry the attitude's columns of rows 0 to ``end`` to another tangent space: ``S_θ ← G S_θ``."""
+    """Transform the attitude columns of rows 0 to ``end`` to another tangent space: ``S_θ ← G S_θ``."""
     for j in range(end):
         F[j, 0], F[j, 1], F[j, 2] = matrix_times_vector(G, (F[j, 0], F[j, 1], F[j, 2]))
 
 
 def fixed_turn(before, after):
-    """Return the turn from one attitude to another, fixed axes, as a matrix."""
+    """Return the rotation from one attitude to another, as a matrix in fixed axes."""
     return rotation_matrix(quaternion_multiply(after, (before[0], -before[1], -before[2], -before[3])))
 
 
 def turn_values(chains, A, values, first):
-    """Turn the vectors that carried states are by A; states stand in ``values`` from ``first`` on.
+    """Rotate by A the vectors formed by carried states, which start at ``first`` in ``values``.
 
-    Such a state k, and those ``chains[k, 2]`` and twice as many after it, are the components of a vector in the axes of the *estimated*
-    attitude, ``c′ = R_est R_fbᵀ c``: what a sensor sees of it, ``R_estᵀ c′``, does not change when the attitude is corrected. So a
-    correction that turns R_est by A makes A c′ of it, exactly, and of its error likewise.
+    Such a state k, and the states p = ``chains[k, 2]`` and 2p after it, are the components of a vector in the axes of the *estimated*
+    attitude, ``c′ = R_est R_fbᵀ c``: the vector in body axes, ``R_estᵀ c′``, does not change when the attitude is corrected. A correction
+    that rotates R_est by A therefore changes c′ to A c′, exactly, and its error likewise.
     """
     for k in range(len(chains)):
         p = int(chains[k, 2])
@@ -388,7 +386,7 @@ def turn_values(chains, A, values, first):
 
 
 def turn_columns(chains, A, F, end):
-    """Turn the columns of carried states, of rows 0 to ``end``, likewise; return the number of columns that are no triangle's then."""
+    """Rotate the columns of carried states in rows 0 to ``end`` likewise; return the number of leading columns no longer triangular."""
     last = 3
     for k in range(len(chains)):
         p = int(chains[k, 2])

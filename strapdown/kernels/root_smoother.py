@@ -1,14 +1,13 @@
-"""The smoother with optional states over whole records: backward passes over the segments that the filter stored.
+"""The smoother with optional error states over whole records: backward passes over the segments that the filter stored.
 
-A step back estimates the step's own noise w from what came later and takes it off. With the prediction's own reflections
-``[Φ S, Nᵀ] Θ = [S⁻, 0]`` and ``[0, I] Θ = [Y, Z]``, later knowledge of the predicted error δ says ``w = Y S⁻⁻¹ δ`` and leaves w the
-covariance ``Z Zᵀ`` (Bierman 1983 does it one noise at a time). So ``δ_before = Φ⁻¹ (δ − Nᵀ w)``, and the covariance is a sum of two
-squares: no difference is formed, and what has no noise is not touched. As in :mod:`strapdown.kernels.smoother_step`, the later factor is
-carried to the tangent space at the predicted attitude before the step, and the result to that at the smoothed one after it; so are
-states that go along with the attitude.
+A step back estimates the process noise w of the step from later measurements and removes it. With the reflections of the prediction,
+``[Φ S, Nᵀ] Θ = [S⁻, 0]`` and ``[0, I] Θ = [Y, Z]``, a smoothed error δ of the predicted state gives ``w = Y S⁻⁻¹ δ``, with the remaining
+covariance ``Z Zᵀ`` (Bierman 1983 processes one noise at a time). Then ``δ_before = Φ⁻¹ (δ − Nᵀ w)``, and the covariance is a sum of two
+squares: no difference is formed, and states without noise are not changed. As in :mod:`strapdown.kernels.smoother_step`, the later factor
+is transformed to the tangent space at the predicted attitude before the step, and the result to that at the smoothed attitude after it;
+so are states that rotate with the attitude.
 
-What depends on the filter alone is Φ, N, ``Y S⁻⁻¹`` and ``Z N`` (:func:`prepare_step`).
-Compiled by :func:`strapdown.kernels.machine.compiled`.
+Φ, N, ``Y S⁻⁻¹`` and ``Z N`` depend only on the filter (:func:`prepare_step`). Compiled by :func:`strapdown.kernels.machine.compiled`.
 """
 
 from __future__ import annotations
@@ -40,15 +39,15 @@ _FIRST = np.repeat([1.0, 0.0], WIDTH)
 
 
 class Workspace(NamedTuple):
-    """Scratch of n states and p rows of noise; columns are :func:`strapdown.kernels.triangle.padded`."""
+    """Work space for n states and p noise rows; columns are :func:`strapdown.kernels.triangle.padded`."""
 
     links: np.ndarray
     x: np.ndarray
-    """(n − 3,), the predicted values of a segment."""
+    """(n − 3,): predicted values at the end of a segment."""
     F: np.ndarray
     """(n + p, columns for n and p)"""
     noise: np.ndarray
-    """(p, columns for n): the rows of noise of a segment."""
+    """(p, columns for n): noise rows of a segment."""
     gain: np.ndarray
     """(n, columns for p): ``Y S⁻⁻¹``, transposed."""
     left: np.ndarray
@@ -58,9 +57,9 @@ class Workspace(NamedTuple):
     factor: np.ndarray
     work: np.ndarray
     later_x: np.ndarray
-    """(n − 3,), as it is known at the end of the segment."""
+    """(n − 3,): smoothed values at the end of a segment."""
     later_F: np.ndarray
-    """(n + p + 4, columns for n), the triangle of the covariance there."""
+    """(n + p + 4, columns for n): triangular factor of the smoothed covariance there."""
 
 
 class Outputs(NamedTuple):
@@ -70,11 +69,11 @@ class Outputs(NamedTuple):
     x: np.ndarray
     variance: np.ndarray
     covariance: np.ndarray
-    """(edges, m, m), of the first m states, or (0, m, m)."""
+    """(edges, m, m) for the first m states, or (0, m, m)."""
 
 
 def workspace(states, rows, chained):
-    """Return room for so many error states, rows of noise and links of chains."""
+    """Return a work space for these numbers of error states, noise rows and states in chains."""
     size = 6 + states
     width = padded(size)
     both = width + padded(rows)
@@ -162,7 +161,7 @@ def prepare_step(segments, j, model, space):
 
 
 def step_back(segments, j, model, space, later_q):
-    """Take what is known at the end of segment j to its start; return the attitude. ``later_x`` and ``later_F`` are left there."""
+    """Propagate the smoothed state (``later_x``, ``later_F``) from the end of segment j back to its start; return the attitude there."""
     predicted, phi11, rows = prepare_step(segments, j, model, space)
     x, noise, gain, left, work = space.x, space.noise, space.gain, space.left, space.work
     later_x, later_F = space.later_x, space.later_F
@@ -178,7 +177,7 @@ def step_back(segments, j, model, space, later_q):
         A = fixed_turn(later_q, predicted)
         turn_values(chains, A, later_x, 3)
         turn_columns(chains, A, later_F, size)
-    # The difference itself goes through the step as one row more.
+    # The difference of the states is processed as one more row.
     later_F[rows, 0], later_F[rows, 1], later_F[rows, 2] = a
     for i in range(len(x)):
         later_F[rows, 3 + i] = later_x[i] - x[i]

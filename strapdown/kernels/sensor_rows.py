@@ -1,7 +1,7 @@
-"""Rows of a measurement with error states, of one filter or of several in lanes; the model is that of :mod:`.error_state_step`.
+"""Rows of a measurement with error states, for one filter or several in lanes (SIMD); the model is that of :mod:`.error_state_step`.
 
-Where states and rows lie, and the functions that lanes take otherwise, are those of one filter unless a kernel's parts say otherwise.
-``like`` is zero: a float, or as many lanes. ``sensor_use`` may be all zero: then the rows are those of the plain filter.
+The functions in ``REPLACEABLE`` are defined here for one filter; a kernel for lanes replaces them. ``like`` is zero, a float or lanes. If
+``sensor_use`` is all zero, the rows are those of the filter without error states.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ CALLED = ("fill_rows", "decorrelate", "arm_noise")
 
 
 def state_at(x, i, like):
-    """Return bias or error state i."""
+    """Return component i of bias and error states."""
     return x[i]
 
 
@@ -60,7 +60,7 @@ def turn_vector(q):
 
 
 def angle_of(y, x):
-    """Return the angle of a point, rad."""
+    """Return the angle of the point (x, y), rad."""
     return math.atan2(y, x)
 
 
@@ -84,7 +84,7 @@ def matrix_at(array, s, k):
 
 
 def offset_of(sensors, sensor_use, s, k, W):
-    """Return how state k shifts the vector of sensor s, body axes."""
+    """Return the offset of sensor s per unit of state k, body axes."""
     a = triple_at(sensors, s, k, 0)
     if sensor_use[s, k] & LEVER:
         return matrix_times_vector(W, a)
@@ -92,14 +92,14 @@ def offset_of(sensors, sensor_use, s, k, W):
 
 
 def put_row(H, row, like, h):
-    """Write the attitude's part of a row."""
+    """Write the attitude columns of a row."""
     set_row_entry(H, row, 0, like, h[0])
     set_row_entry(H, row, 1, like, h[1])
     set_row_entry(H, row, 2, like, h[2])
 
 
 def across(d, like):
-    """Return unit vectors t1, t2 with t1 × t2 = d of a unit vector d."""
+    """Return unit vectors t1, t2 with t1 × t2 = d, for a unit vector d."""
     one = like + 1.0
     x, y, z = chosen(d[0] < 0.0, -d[0], d[0]), chosen(d[1] < 0.0, -d[1], d[1]), chosen(d[2] < 0.0, -d[2], d[2])
     second = chosen(y < x, chosen(y <= z, one, like), like)
@@ -110,9 +110,9 @@ def across(d, like):
 
 
 def sensed(x, s, length, sensors, sensor_use, W, like):
-    """Return what the states make of a sensor's vector, and whether any is about it.
+    """Return the effects of the states on a sensor's vector, and whether any state affects it.
 
-    Offset in body axes, firm offset and carried one in fixed axes, and I + M.
+    The effects are the offset in body axes, the constant and the carried offset in fixed axes, and I + M.
     """
     offset = fixed = carried = (like, like, like)
     M = identity(like)
@@ -134,15 +134,15 @@ def sensed(x, s, length, sensors, sensor_use, W, like):
 
 
 def fill_rows(q, x, H, kind, value, frame, length, s, sensors, sensor_use, W, like):
-    """Write the rows of one measurement to H (3, n or more), which are zero where no state is seen.
+    """Write the rows of one measurement to H (3, n or more), which is zero for states that do not affect it.
 
-    ``value`` is the measured vector over ``length``, and a number more, or the measured attitude; ``frame`` the row of the schedule's
-    frames as a 9-tuple, ``length`` what the vector was divided by, or of a direction or heading the strength of what is measured. ``W`` is
-    the :func:`strapdown.kernels.error_state_step.turning_matrix` of the instant, for lever arms.
+    ``value`` is the measured vector divided by ``length``, with an unused fourth number, or the measured attitude. ``frame`` is the
+    right-handed frame about the reference as a 9-tuple, ``length`` the divisor of the vector or, for a direction or heading, the magnitude
+    of the measured vector. ``W`` is the current :func:`strapdown.kernels.error_state_step.turning_matrix`, for lever arms.
 
-    Returns how many rows: 2 direction, 3 vector, 1 heading, 3 attitude; y (3,); the body axes that they measure along, of a direction
-    that its states make longer or shorter over that length: so its noise is, too; and whether the rows hold: a vertical vector has no
-    heading, and its row stays zero.
+    Returns the number of rows (2 direction, 3 vector, 1 heading, 3 attitude), the residual y (3,), the body axes along which the rows
+    measure (for a direction divided by the predicted magnitude, which scales its noise), and whether the rows are valid: a vertical vector
+    has no heading, and its row remains zero.
     """
     if kind == ATTITUDE:
         return attitude_rows(q, x, H, value, length, s, sensors, sensor_use, W, like)
@@ -152,18 +152,18 @@ def fill_rows(q, x, H, kind, value, frame, length, s, sensors, sensor_use, W, li
 
 
 def body_axes(like):
-    """Return the axes of a measurement along those of the body."""
+    """Return the body axes, as the axes of a measurement."""
     one = like + 1.0
     return ((one, like, like), (like, one, like), (like, like, one))
 
 
 def attitude_rows(q, x, H, value, length, s, sensors, sensor_use, W, like):
-    """Write the rows of an attitude: the offset is a rotation vector between the sensor's axes and the body's."""
+    """Write the rows of an attitude: the offset is a rotation vector between sensor axes and body axes."""
     offset, _, _, _, _ = sensed(x, s, length, sensors, sensor_use, W, like)
     predicted, J = turned_by(q, offset)
     y = turn_vector(quaternion_multiply((predicted[0], -predicted[1], -predicted[2], -predicted[3]), value))
     turn, _ = turned_by((like + 1.0, like, like, like), offset)
-    E = transpose(rotation_matrix(turn))  # exp(−[φ]): what a body-side error is behind a further turn
+    E = transpose(rotation_matrix(turn))  # exp(−[φ]): transforms a body-side error by the further rotation φ
     put_row(H, 0, like, E[:3])
     put_row(H, 1, like, E[3:6])
     put_row(H, 2, like, E[6:])
@@ -189,7 +189,7 @@ def heading_rows(q, x, H, value, frame, length, s, sensors, sensor_use, W, like)
         return 1, (like, like, like), body_axes(like), level > VERTICAL
     y = angle_of(m[0] * r[1] - m[1] * r[0], m[0] * r[0] + m[1] * r[1])
     if coupled:
-        # Derivatives where the heading is what is expected: those at the measured one go by its noise, which the offsets would follow.
+        # Derivatives at the predicted heading: those at the measured one depend on its noise, which would bias the estimated offsets.
         stretch = square_root(level / (r[0] * r[0] + r[1] * r[1]))
         m = (stretch * r[0], stretch * r[1], m[2])
         p = add(m, fixed)
@@ -210,7 +210,7 @@ def heading_rows(q, x, H, value, frame, length, s, sensors, sensor_use, W, like)
 
 
 def vector_rows(q, x, H, kind, value, frame, length, s, sensors, sensor_use, W, like):
-    """Write the rows of a direction or a whole vector."""
+    """Write the rows of a direction or vector."""
     number = 2 if kind == DIRECTION else 3
     z, r = value[:3], frame[6:]
     R = rotation_matrix(q)
@@ -251,7 +251,7 @@ def vector_rows(q, x, H, kind, value, frame, length, s, sensors, sensor_use, W, 
 
 
 def arm_noise(x, s, sensors, sensor_use, length, variance, C, like):
-    """Return C and what the gyro's angular acceleration, of these variances about the axes, adds to it: ``[r] diag(variance) [r]ᵀ``."""
+    """Return C plus the noise from the gyro's angular acceleration at lever arm r: ``[r] diag(variance) [r]ᵀ``, ``variance`` by axis."""
     r = (like, like, like)
     for k in range(sensor_use.shape[1]):
         if sensor_use[s, k] & LEVER:
@@ -267,9 +267,9 @@ def arm_noise(x, s, sensors, sensor_use, length, variance, C, like):
 
 
 def decorrelate(H, use, rows, y, axes, C, like):
-    """Make the rows of a measurement independent, whose noise in body axes has the covariance C (6-tuple); return y and the variances.
+    """Decorrelate the rows of a measurement whose noise in body axes has the covariance C (6-tuple); return y and the variances.
 
-    With ``T C Tᵀ = L D Lᵀ`` for the rows' axes T, the rows ``L⁻¹ H`` have noise of variances D.
+    With ``T C Tᵀ = L D Lᵀ``, T the axes of the rows, the noise of the rows ``L⁻¹ H`` has the diagonal covariance D.
     """
     t0, t1, t2 = axes
     c0, c1 = symmetric_times_vector(C, t0), symmetric_times_vector(C, t1)

@@ -1,16 +1,16 @@
 """One step of the fixed-interval smoother backward in time, on tuples: Rauch–Tung–Striebel on the manifold.
 
-State and error as in :mod:`strapdown.kernels.filter_step`. What is smoothed is the *error* of the filtered state, (ε, β) = (Log(q⁻¹ ⊗ q_s),
-b_s − b), with its covariance in the tangent space at the filtered attitude. So all that depends on the filter alone, the gain G and the
-covariance D below, can be computed for many segments at once, and the recursion proper is ``(ε, β) ← G (a, d)``, ``P_s ← (G J) P_s (G J)ᵀ
-+ D``. Here (a, d) is the smoothed error at the end of the segment seen from the *predicted* state: with r what the filter's updates there
-turned the attitude by and δb what they added to the bias, ``a = Log(r ⊗ exp(ε))``, ``d = δb + β``, and J = J_r(a)⁻¹ J_r(ε) carries the
-tangent space along: exp(a) ⊗ exp(η) = exp(a + J_r(a)⁻¹ η). Where nothing was measured, a = ε and J = I.
+State and error as in :mod:`strapdown.kernels.filter_step`. The smoother estimates the *error* of the filtered state, (ε, β) = (Log(q⁻¹ ⊗
+q_s), b_s − b), with its covariance in the tangent space at the filtered attitude. The gain G and the covariance D below then depend only on
+the filter and are computed for many segments at once; the recursion itself is ``(ε, β) ← G (a, d)``, ``P_s ← (G J) P_s (G J)ᵀ + D``. Here
+(a, d) is the smoothed error at the end of the segment relative to the *predicted* state: with r the rotation and δb the change of bias by
+the filter's updates there, ``a = Log(r ⊗ exp(ε))``, ``d = δb + β``, and J = J_r(a)⁻¹ J_r(ε) transforms the tangent space: exp(a) ⊗ exp(η) =
+exp(a + J_r(a)⁻¹ η). Without a measurement there, a = ε and J = I.
 
-**The gain.** With ``P⁻ = Φ P Φᵀ + Q`` the textbook's is ``P Φᵀ P⁻⁻¹``. With the noise seen from the start of the segment, ``Q̄ = Φ⁻¹ Q Φ⁻ᵀ``
-(which is the Q of a step back in time), it is ``G = N Φ⁻¹``, ``N = I − M``, ``M = Q̄ (P + Q̄)⁻¹``. This is the same number, but nothing is
-predicted, and its rounding error is that of M, which is small where P is ill-conditioned (a diffuse start, one sharp measurement), and the
-textbook's own would be rounding times the condition number. The covariance follows without a difference of covariances:
+**The gain.** With ``P⁻ = Φ P Φᵀ + Q`` the textbook form is ``P Φᵀ P⁻⁻¹``. With the noise referred to the start of the segment, ``Q̄ = Φ⁻¹ Q
+Φ⁻ᵀ`` (the Q of a step back in time), it is ``G = N Φ⁻¹``, ``N = I − M``, ``M = Q̄ (P + Q̄)⁻¹``. The value is the same, but no prediction is
+needed, and its rounding error is that of M. This is small if P is ill-conditioned (diffuse start, one precise measurement), whereas that
+of the textbook form is rounding times the condition number. The covariance needs no difference of covariances:
 ``P + G (P_s − P⁻) Gᵀ = G P_s Gᵀ + D``, a sum of two positive parts, for ``D = N Q̄ = (Q̄⁻¹ + P⁻¹)⁻¹``.
 """
 
@@ -51,7 +51,7 @@ def minus_times_transpose_upper(S, A, B):
 
 
 def noise_share(A, B, C, q11, q12, q22):
-    """Return the blocks of ``M = Q W⁻¹`` (θθ, θb, bθ, bb): how much of the uncertainty W = P + Q the noise brought.
+    """Return the blocks of ``M = Q W⁻¹`` (θθ, θb, bθ, bb): the share of the noise Q in the covariance W = P + Q.
 
     W is (A, B, C). Eliminates the attitude block first: ``W⁻¹`` by the Schur complement ``C − Bᵀ A⁻¹ B``, both 3×3 factored.
     """
@@ -80,19 +80,19 @@ def scale_upper(s, A):
 
 
 def step_noise(phi, dt, angle_variance, rate_variance):
-    """Return Q̄ = Φ⁻¹ Q Φ⁻ᵀ over a turn φ = ω dt (Q̄11, Q̄12, diagonal of Q̄22): the process noise of the same turn back in time."""
+    """Return Q̄ = Φ⁻¹ Q Φ⁻ᵀ over a rotation φ = ω dt (Q̄11, Q̄12, diagonal of Q̄22): the Q of the same rotation back in time."""
     return process_noise(scale(-1.0, phi), -dt, -angle_variance, -rate_variance)
 
 
 def kept_share(A, B, C, q11, q12, q22):
-    """Return the blocks of N = I − M, M = Q̄ (P + Q̄)⁻¹: what of a correction goes back to the state (A, B, C), not to the noise Q̄."""
+    """Return the blocks of N = I − M, M = Q̄ (P + Q̄)⁻¹: share of a correction due to the state (A, B, C), not the noise Q̄."""
     W = add_matrices(A, q11), add_matrices(B, q12), add_to_diagonal(C, q22)
     m_tt, m_tb, m_bt, m_bb = noise_share(*W, q11, q12, q22)
     return identity_minus(m_tt), scale_matrix(-1.0, m_tb), scale_matrix(-1.0, m_bt), identity_minus(m_bb)
 
 
 def gain(N, phi, dt):
-    """Return the blocks of G = N Φ⁻¹ (θθ, θb, bθ, bb) over a turn φ = ω dt; Φ⁻¹ is the transition back in time."""
+    """Return the blocks of G = N Φ⁻¹ (θθ, θb, bθ, bb) over a rotation φ = ω dt; Φ⁻¹ is the transition back in time."""
     n_tt, n_tb, n_bt, n_bb = N
     r, s = transition(scale(-1.0, phi), -dt)
     return multiply(n_tt, r), multiply_add(n_tt, s, n_tb), multiply(n_bt, r), multiply_add(n_bt, s, n_bb)
