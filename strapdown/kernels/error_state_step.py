@@ -96,7 +96,7 @@ def response(rate, u, decay):
 
 
 def longest_step(dt, theta, limit):
-    """Return the longest step within an interval, given the range of the polynomials and the ``limit`` of states that decay."""
+    """Return the longest step within an interval: what the polynomials bear of a turn, and ``limit`` for states that decay."""
     longest = dt
     squared = dot(theta, theta)
     if LARGEST_ANGLE * LARGEST_ANGLE < squared < MAX_TURN * MAX_TURN:

@@ -1,11 +1,11 @@
-"""The filter with error states over several runs at once, a run a lane: the covariance form of :mod:`strapdown.kernels.root_form`.
+"""The filter with error states for several runs at once, one per lane (SIMD): the covariance form of :mod:`strapdown.kernels.root_form`.
 
-All runs have their gyro edges and measurements at the same times, of the same sensors, noise and references; what differs is lanes. Models,
-formulas and their names are those of :mod:`strapdown.kernels.error_state_step`, without chains, and without offsets in fixed axes. Of the
-covariance P, held whole, the upper triangle is used.
+All runs have the same gyro edges and the same times, sensors, noise and references of measurements; the values that differ are lanes.
+Models, formulas and names are those of :mod:`strapdown.kernels.error_state_step`, without chains and without offsets in fixed axes. The
+covariance P is stored in full, but only its upper triangle is used.
 
-A run whose covariance might lose digits, or that leaves the range of the polynomials, is marked as lost, and is left to the factor. No lane
-depends on its neighbours. Lanes in memory lie one after the other, so place p of a flat array begins at ``p · len(like)``.
+A run whose covariance might lose digits, or that leaves the range of the polynomials, is marked as lost; the caller repeats it in root
+form. No lane depends on its neighbours. In memory lanes are contiguous, so place p of a flat array begins at ``p · len(like)``.
 """
 
 from __future__ import annotations
@@ -64,22 +64,22 @@ CALLED = (
     "least_share",
     "keep",
 )
-"""Not inlined: their work is far more than a call."""
+"""Called, not inlined: a call costs little compared with their work."""
 
 MISS, GAIN, STEP, AXES = 0, 1, 2, 3
-"""Lines of n states: P h less the gain times the noise, P h, the correction, and from the last on three of the three axes."""
+"""Rows of ``lines``: the rounding error of P h (:func:`take_row`), P h, the correction, and from the last on three rows, one per axis."""
 OWN, KEPT = 0, 1
-"""Lines of n numbers, the same in all lanes: noise of a state by itself, and what is left of it, in the steps since P's."""
+"""Rows of ``alone``, the same for all lanes: the noise Q_ii and the decay of each state over the steps not yet applied to P."""
 LEFT, MEAN, OF_NOISE, TIME, SERIES = 0, 1, 10, 11, 10
-"""Columns of a state's table: e^{−λu}, ``∫₀ᵘ e^{−λs} ds``, ``∫₀ᵘ e^{−2λs} ds``, u; between them ``Σ (−λu)ⁱ/(i + k)!`` in column k."""
+"""Columns of a state's table: e^{−λu}, ``∫₀ᵘ e^{−λs} ds``, ``∫₀ᵘ e^{−2λs} ds``, u; column k between them: ``Σ (−λu)ⁱ/(i + k)!``."""
 SAME = 1e-9
-"""Part of a step within which another one has the same table."""
+"""Maximum relative difference of two steps that use the same table."""
 MAX_SHARPNESS = 1e9
-"""Largest ratio of an innovation's variance to the measurement's at which P keeps digits enough."""
+"""Maximum ratio of innovation variance to measurement variance at which P keeps enough digits."""
 MIN_SHARE = 1e-6
-"""Smallest part of a state's variance, given the states before it, at which P keeps digits enough."""
+"""Minimum share of a state's variance that remains given the states before it, at which P has enough digits."""
 CHECK = 1024
-"""Intervals from one look at the digits to the next."""
+"""Number of intervals between two checks of the digits."""
 
 
 class Events(NamedTuple):
@@ -95,33 +95,33 @@ class Events(NamedTuple):
     noise: np.ndarray
     """Upper triangles of the covariances in body axes (m, 6)."""
     length: np.ndarray
-    """What the effects are divided by."""
+    """Divisor of the effects of error states."""
 
 
 class Runs(NamedTuple):
-    """What differs from run to run; the last axis is the lanes."""
+    """Data that differ between runs; the last axis is that of the lanes."""
 
     increments: np.ndarray
     """(n, 3, W), rad."""
     value: np.ndarray
     """Measured vectors, or attitudes (m, 4, W)."""
     turning: np.ndarray
-    """Rate, angular acceleration and the latter's variances (m, 9, W), or (0, 9, W) without lever arms."""
+    """Rate, angular acceleration and variances of the latter (m, 9, W), or (0, 9, W) without lever arms."""
 
 
 class Work(NamedTuple):
-    """The filter's state, and work space of n states in all; the last axis is the lanes."""
+    """State of the filter and work space, for n states in all; the last axis is that of the lanes."""
 
     attitude: np.ndarray
     """(4, W)"""
     x: np.ndarray
     """Bias and error states (n − 3, W)."""
     P: np.ndarray
-    """(2, n, n, W): the filter's, and what it is at an edge between two measurements."""
+    """(2, n, n, W): that of the filter, and that at an edge between two measurements."""
     top: np.ndarray
-    """What each state makes of the attitude over the steps since P's (n, 3, W)."""
+    """Effect of each state on the attitude over the steps not yet applied to P (n, 3, W)."""
     cross: np.ndarray
-    """Covariance of the noise of those steps: attitude with each state (n, 3, W)."""
+    """Process noise of those steps: covariance of the attitude with each state (n, 3, W)."""
     rows: np.ndarray
     """H of a measurement (3, n, W)."""
     lines: np.ndarray
@@ -129,15 +129,15 @@ class Work(NamedTuple):
     alone: np.ndarray
     """(2, n): :data:`OWN` and :data:`KEPT`."""
     table: np.ndarray
-    """What a step makes of each state, and last the step that it is of (m + 1, 4, 12)."""
+    """Coefficients of a step for each state, and last the step, s (m + 1, 4, 12)."""
     lost: np.ndarray
-    """1 where the run is lost (W,)."""
+    """1 if the run is lost (W,)."""
     written: np.ndarray
-    """What is to be handed out (2 n + 22, W)."""
+    """Numbers to be written to the outputs (2 n + 22, W)."""
 
 
 class Outputs(NamedTuple):
-    """What is written of each of the first runs, as many as there is room for."""
+    """Outputs of the first runs, as many as the arrays hold."""
 
     kept: np.ndarray
     """q (4), x (n − 3), variances (n) and the covariance of attitude and whole bias (21) at the kept edges (runs, rows, 2 n + 22)."""
@@ -166,7 +166,7 @@ def put(array, place, like, value):
 
 
 def state_at(x, i, like):
-    """Return bias or error state i."""
+    """Return component i of bias and error states."""
     return one_of(x, i, like)
 
 
@@ -181,7 +181,7 @@ def set_row_entry(H, r, i, like, value):
 
 
 def turned_by(q, phi):
-    """Return q ⊗ exp(φ) and J_r(φ) of a small turn."""
+    """Return q ⊗ exp(φ) and J_r(φ) for a small rotation."""
     return turned(q, phi), right_jacobian(phi)
 
 
@@ -191,12 +191,12 @@ def turn_vector(q):
 
 
 def angle_of(y, x):
-    """Return the angle of a point, rad."""
+    """Return the angle of the point (x, y), rad."""
     return arctangent(y, x)
 
 
 def mark(work, like, good):
-    """Mark the runs as lost in which a condition does not hold: of what is no number none does."""
+    """Mark the runs in which a condition does not hold as lost; for NaN no condition holds."""
     lost = one_of(work.lost, 0, like)
     put(work.lost, 0, like, chosen(good, lost, like + 1.0))
 
@@ -205,7 +205,7 @@ def mark(work, like, good):
 
 
 def step(model, work, like, q, turn, noise, dt, part):
-    """Propagate attitude and ``x`` over an increment, and add the step to those since P's; return q, Φ_θθ and Q_θθ of all of them."""
+    """Propagate attitude and ``x`` over an increment; append the step to those not yet applied to P; return q and their Φ_θθ and Q_θθ."""
     gyro, gyro_use, decay, density = model.gyro, model.gyro_use, model.decay, model.density
     x, table = work.x, work.table
     if abs(dt - table[len(decay), 0, 0]) > SAME * dt:
@@ -272,7 +272,7 @@ def step(model, work, like, q, turn, noise, dt, part):
 
 
 def fill_table(table, decay, dt):
-    """Write what a step of dt makes of each state by itself: rows of the nodes of its noise, and of its end."""
+    """Write the coefficients of a step dt for each state: rows for the three nodes of its noise, and one for the whole step."""
     table[len(decay), 0, 0] = dt
     for k in range(len(decay)):
         same = k > 0 and decay[k] == decay[k - 1]
@@ -295,9 +295,9 @@ def fill_table(table, decay, dt):
 
 
 def at_node(table, k, i, rate, D, coupled):
-    """Return :func:`strapdown.kernels.error_state_step.response` up to a node of state k's noise, times (I + M)⁻¹.
+    """Return :func:`strapdown.kernels.error_state_step.response` from node i of state k's noise to the end of the step, times (I + M)⁻¹.
 
-    Of each series four terms: to 1e-10 in the range of a step.
+    Node 3 is the start of the step. Four terms of each series are accurate to 1e-10 in the range of a step.
     """
     f = table[k, i]
     u = f[TIME]
@@ -309,14 +309,14 @@ def at_node(table, k, i, rate, D, coupled):
 
 
 def driven(table, k, i, density, E, e, noise, share):
-    """Add what state k's white noise makes at Gauss's node i: of Q_θθ, and of Q with the attitude."""
+    """Add the contribution of state k's white noise at Gauss's node i to Q_θθ and to its covariance with the attitude."""
     weight = THREE_WEIGHTS[i] * density * table[k, 3, TIME]
     t = matrix_times_vector(E, e)
     return symmetric_minus_outer(noise, scale(-weight, t), t), combine(1.0, share, -weight * table[k, i, LEFT], t)
 
 
 def follow(work, like, i, phi11, column, share, own, kept, noise):
-    """Let a step follow those since P's, as to state i; return Q_θθ with what they have of it. As ``error_state_step.follow``."""
+    """Append a step to those not yet applied to P, for state i; return Q_θθ with its contribution. As ``error_state_step.follow``."""
     alone = work.alone
     u = matrix_times_vector(phi11, triple(work.cross, 3 * i, like))
     v = combine(1.0, u, alone[OWN, i], column)
@@ -329,13 +329,13 @@ def follow(work, like, i, phi11, column, share, own, kept, noise):
 
 
 def crossed(S, a, u, v):
-    """Return S + a uᵀ + v aᵀ, known to be symmetric."""
+    """Return S + a uᵀ + v aᵀ, which is symmetric."""
     T = full(S)
     return tuple(T[3 * i + j] + (a[i] * u[j] + v[i] * a[j]) for i in range(3) for j in range(i, 3))
 
 
 def start_steps(work, like):
-    """Forget the steps since P's."""
+    """Reset the steps not yet applied to P."""
     for i in range(work.alone.shape[1]):
         store_several(work.top, 3 * i, like, (like, like, like))
         store_several(work.cross, 3 * i, like, (like, like, like))
@@ -344,7 +344,7 @@ def start_steps(work, like):
 
 
 def absorb(model, work, like, base, turn, noise):
-    """Take the P that begins at place ``base`` over the steps since: ``Φ P Φᵀ + Q``."""
+    """Apply the steps not yet applied to the P that begins at place ``base``: ``Φ P Φᵀ + Q``."""
     n, last = work.alone.shape[1], 6 + model.changing
     kept = work.alone[KEPT]
     for j in range(n):
@@ -384,7 +384,7 @@ def absorb(model, work, like, base, turn, noise):
 
 
 def axes_at(work, like, n, i):
-    """Return what the three lines of axes hold of state i."""
+    """Return the entries of state i in the three rows of the axes."""
     return tuple(one_of(work.lines, n * (AXES + a) + i, like) for a in range(3))
 
 
@@ -406,7 +406,7 @@ def put_attitude(work, like, base, n, S):
 
 
 def product(work, like, use, r, line):
-    """Write P h of a row of H, of a sensor whose states are marked in ``use``, to a line."""
+    """Write P h to a row of ``lines``, h being row r of H; ``use`` marks the states that affect the sensor."""
     n = work.alone.shape[1]
     for j in range(n):
         put(work.lines, n * line + j, like, like)
@@ -419,7 +419,7 @@ def product(work, like, use, r, line):
 
 
 def against(work, like, use, r, line):
-    """Return the scalar product of a row of H and a line."""
+    """Return the scalar product of a row of H and a row of ``lines``."""
     n = work.alone.shape[1]
     p = like
     for i in range(n):
@@ -429,7 +429,7 @@ def against(work, like, use, r, line):
 
 
 def minus_outer(work, like, left, right, factor):
-    """Subtract the product of two lines, times a factor, from P."""
+    """Subtract the outer product of two rows of ``lines``, times a factor, from P."""
     n = work.alone.shape[1]
     for i in range(n):
         a = factor * one_of(work.lines, n * left + i, like)
@@ -439,9 +439,9 @@ def minus_outer(work, like, left, right, factor):
 
 
 def take_row(work, like, use, r, y, variance):
-    """Update P and the correction with row r of H, which measures y with noise of ``variance``; return its innovation and their variance.
+    """Update P and the correction with y, measured by row r of H with noise ``variance``; return the innovation and its variance.
 
-    Joseph's form, as :func:`strapdown.kernels.filter_step.update_row`.
+    Joseph's form, as in :func:`strapdown.kernels.filter_step.update_row`.
     """
     n = work.alone.shape[1]
     product(work, like, use, r, GAIN)
@@ -518,7 +518,7 @@ def update(model, work, like, q, e, events, runs, out):
 
 
 def hand_out(work, like, out, row, count):
-    """Write the first numbers of ``work.written`` to a row of each run that there is room for."""
+    """Write the first ``count`` numbers of ``work.written`` to a row of each run in ``out``."""
     for i in range(count):
         for lane in range(out.shape[0]):
             out[lane, row, i] = work.written[i, lane]
@@ -532,7 +532,7 @@ def keep(model, work, like, base, q, row, out):
         put(written, 4 + i, like, one_of(work.x, i, like))
     for i in range(n):
         put(written, n + 1 + i, like, seen(work, like, base + n * i + i))
-    # Covariances of each state with attitude and whole bias, b + Σ c e, and of those among themselves.
+    # Covariances of each state with attitude and whole bias, b + Σ c e, then that of attitude and whole bias.
     reported = work.lines.shape[0]
     for a in range(reported):
         for j in range(n):
@@ -554,7 +554,7 @@ def keep(model, work, like, base, q, row, out):
 
 
 def least_share(work, like):
-    """Return the smallest part of a state's variance that the states before it leave, by elimination in the second P."""
+    """Return the smallest share of a state's variance that remains given the states before it, by elimination in the second P."""
     n = work.alone.shape[1]
     base = n * n
     least = like + 1.0
@@ -571,7 +571,7 @@ def least_share(work, like):
 
 
 def advance(pattern, edges, every, model, events, runs, work, out):
-    """Filter ``len(pattern)`` runs from the state in ``work``; a row is kept at every ``every``-th edge.
+    """Filter ``len(pattern)`` runs from the state in ``work``; a row is written at every ``every``-th edge.
 
     Parameters
     ----------

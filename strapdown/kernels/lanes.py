@@ -1,8 +1,8 @@
-"""The machine vector behind :mod:`strapdown.kernels.lane_values`: a numba type for eight (or any power of two) scalars in one value.
+"""The SIMD vector behind :mod:`strapdown.kernels.lane_values`: a numba type for eight (or any power of two) scalars (lanes) in one value.
 
-``Lanes(float64, 8)`` is LLVM's ``<8 x double>``. Arithmetic, comparisons and square roots act lane by lane, each lane rounded as a scalar
-is; a float or integer beside lanes is spread over them. LLVM cuts the vector to the width of the machine, down to single scalars, so that
-there is no other code for a machine without vectors, and a lane has the same bits on each that has fused multiply-add.
+``Lanes(float64, 8)`` is LLVM's ``<8 x double>``. Arithmetic, comparisons and square roots act lane by lane, and each lane is rounded like a
+scalar; a float or integer combined with lanes is copied to all of them. LLVM splits the vector to the width of the machine, down to single
+scalars, so a machine without vectors needs no other code, and the bits of a lane are the same on every machine with fused multiply-add.
 """
 
 from __future__ import annotations
@@ -45,11 +45,11 @@ class Lanes(types.Type):  # type: ignore[misc]
         super().__init__(f"Lanes({dtype}, {count})")
 
     def can_convert_from(self, typingctx: Any, other: types.Type) -> Any:
-        """A number becomes lanes by being spread."""
+        """A number is converted by copying it to all lanes."""
         return Conversion.safe if _is_number(other) else None
 
     def unify(self, typingctx: Any, other: types.Type) -> Any:
-        """A variable that is a number here and lanes there is lanes."""
+        """A variable that is a number in one place and lanes in another is lanes."""
         return self if _is_number(other) else None
 
 
@@ -90,14 +90,14 @@ def _number_to_lanes(context: Any, builder: Any, source: Any, target: Any, value
 
 
 def _lanes_among(arguments: tuple[types.Type, ...]) -> Lanes | None:
-    """Return the one type of lanes among the arguments, None if there is none or something foreign beside it."""
+    """Return the type of the lanes among the arguments; None if it is not unique, or if another argument is not a number."""
     found = {a for a in arguments if isinstance(a, Lanes)}
     others = [a for a in arguments if not isinstance(a, Lanes)]
     return found.pop() if len(found) == 1 and all(map(_is_number, others)) else None
 
 
 def _define(operation: Callable[..., Any], count: int, emit: Callable[..., Any], *, compares: bool = False) -> None:
-    """Teach numba ``operation`` on lanes; ``emit(builder, dtype, *vectors)`` writes its instruction."""
+    """Define ``operation`` on lanes in numba; ``emit(builder, dtype, *vectors)`` writes its instruction."""
 
     @infer_global(operation)
     class Template(AbstractTemplate):  # type: ignore[misc]
@@ -125,7 +125,7 @@ def _arithmetic(float_instruction: str | None, integer_instruction: str | None) 
 def _comparison(sign: str) -> Callable[..., Any]:
     def emit(builder: Any, dtype: types.Type, a: Any, b: Any) -> Any:
         if isinstance(dtype, types.Float):
-            # NaN differs from everything and compares with nothing, as in Python.
+            # As in Python, NaN is unequal to everything, and every other comparison with it is false.
             return (builder.fcmp_unordered if sign == "!=" else builder.fcmp_ordered)(sign, a, b)
         return (builder.icmp_signed if getattr(dtype, "signed", False) else builder.icmp_unsigned)(sign, a, b)
 
@@ -201,8 +201,8 @@ def _row(builder: Any, start: Any, stride: Any, i: int, shift: int = 0) -> Any:
 def _columns(builder: Any, rows: list[Any], count: int) -> list[Any]:
     """Return the first ``count`` columns of eight rows of four.
 
-    Row i is joined with row i + 4, which a load does by itself, and neighbours are interleaved, half the machine's vector at a time:
-    fewer trips through the one port that shuffles than picking each column from all rows.
+    Row i is joined with row i + 4, which the load instruction does, and neighbours are interleaved by half vectors. This needs fewer
+    shuffles, which the processor executes on a single port, than selecting each column from all rows.
     """
     wide = [_picked(builder, rows[i], rows[i + 4], list(range(8))) for i in range(4)]
     columns = []
@@ -333,9 +333,9 @@ def _like(dtype: types.Type, pattern: Any) -> Any:
 
 
 def _align_stack(builder: Any) -> None:
-    """Have the stack aligned to lines of the cache: spilled vectors that lie across two cost more than the arithmetic.
+    """Align the stack to cache lines: spilled vectors that cross two lines cost more than the arithmetic.
 
-    A function is aligned as the strictest of its variables, so one is made, and shown to an empty piece of assembly that keeps it.
+    A stack frame has the strictest alignment of its variables, so an aligned one is made; an empty inline assembly keeps it.
     """
     place = cgutils.alloca_once(builder, ir.ArrayType(ir.IntType(8), 64))
     place.align = 64
@@ -580,7 +580,7 @@ def chosen(typingctx: Any, condition: Any, a: Any, b: Any) -> Any:
 
 
 def _fenced(builder: Any, value: Any) -> Any:
-    """Return a value that no operation is moved into or out of."""
+    """Return a value across which no operation is moved."""
     kind = value.type
     name = f"llvm.arithmetic.fence.v{kind.count}{'f64' if isinstance(kind.element, ir.DoubleType) else 'f32'}"
     function = cgutils.get_or_insert_function(builder.module, ir.FunctionType(kind, [kind]), name)

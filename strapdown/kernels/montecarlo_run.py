@@ -1,11 +1,11 @@
-"""Runs of a Monte Carlo over lanes: gyro errors, sensors and filter of 1, 8 or 16 runs at once, along one motion that all share.
+"""Monte Carlo runs in lanes (SIMD): gyro errors, sensors and filter of 1, 8 or 16 runs at once, along one common motion.
 
-The truth, the times and all that is the same in every run come in as plain arrays; what differs is lanes. Each run draws from streams of
-its own (:func:`strapdown.kernels.noise.stream_state` of a key a source and the run's number), so it is the same whoever its neighbours are.
-Noise is exact in discrete time, by the formulas of :mod:`strapdown.kernels.gyro_errors`; the filter is that of
+Truth, times and all else common to the runs are plain arrays; values that differ between runs are lanes. Each run has its own random
+streams (:func:`strapdown.kernels.noise.stream_state`, with one key per source and the run's number), so it does not depend on its
+neighbours. Noise is exact in discrete time, by the formulas of :mod:`strapdown.kernels.gyro_errors`; the filter is that of
 :mod:`strapdown.kernels.filter_step`.
 
-Lanes in memory lie one after the other, so place p of a flat array begins at ``p · len(like)``.
+In memory lanes are contiguous, so place p of a flat array begins at ``p · len(like)``.
 """
 
 from __future__ import annotations
@@ -40,64 +40,64 @@ from strapdown.kernels.noise import next_word, single_normals, stream_state
 from strapdown.kernels.rotation import exponential, quaternion_multiply, rotation_matrix, unit
 
 GYRO, FLICKER, MARKOV, TURN_ON, START, DISPERSIONS, SENSORS = range(7)
-"""Sources of noise: streams of a run. Two a sensor follow, from SENSORS on: its white noise, and its faults."""
+"""Sources of noise: random streams of a run. From SENSORS on there are two per sensor: its white noise and its faults."""
 
 STATES = 16
-"""States of the flicker of an axis."""
+"""Number of flicker states of an axis."""
 
-# Places in the memory of a group of runs.
+# Offsets in the memory of a group of runs.
 _WALK, _MARKOV, _TURN_ON, _BEFORE, _MATRIX, _STATES = 0, 3, 6, 9, 12, 21
 _SENSORS = _STATES + 3 * STATES
 _OF_A_SENSOR = 3
-"""The correlated noise."""
+"""Length of the memory of a sensor, its correlated noise."""
 
 TRIPLES = 32
 AHEAD = 3 * TRIPLES
-"""Normals that a source has drawn ahead: a loop of their own is faster than a few at a time between the filter's steps."""
+"""Number of normals drawn ahead for each source: drawing many in one loop is faster than a few between the steps of the filter."""
 
 KEPT = 31
-"""Numbers kept at an epoch: q (4), b (3), P in blocks (21), true bias (3)."""
+"""Number of values stored at an epoch: q (4), b (3), P in blocks (21), true bias (3)."""
 
 WHITE_SIGMA, WALK_SIGMA, MARKOV_DECAY, MARKOV_SIGMA, MARKOV_MEAN, MARKOV_START, TURN_ON_SIGMA, FLICKER_SIZE = range(8)
-"""Rows of the sizes: what a step's noise is by axis. σ of the increment given the bias at both ends, σ of the walk's step, decay of the
-Markov bias, σ of its step, what its ends add to the increment, σ at the start, σ of the turn-on bias, flicker B."""
+"""Rows of ``sizes``, the noise of a step by axis: σ of the increment given the bias at both ends, σ of the step of the random walk, decay
+of the Markov bias, σ of its step, weight of its end values in the increment, its initial σ, σ of the turn-on bias, flicker B."""
 
 
 class Gyro(NamedTuple):
-    """The gyro over n steps of the filter."""
+    """Gyro data over n steps of the filter."""
 
     edges: np.ndarray
     """Edges of the steps (n + 1,), s."""
     substeps: np.ndarray
-    """The longest time over which the filter may predict at once in each step (n,), s. Beyond the range of the polynomials a step is made
-    of several: at constant rate they compose exactly, so this is the same model."""
+    """Maximum duration of one prediction of the filter in each step (n,), s. A step beyond the range of the polynomials is divided; at
+    constant rate the parts compose exactly, so the model is the same."""
     increments: np.ndarray
-    """Without the errors that differ from run to run (n, 3), rad."""
+    """Gyro increments without the errors that differ between runs (n, 3), rad."""
     true_increments: np.ndarray
     """(n, 3), rad."""
     true_bias: np.ndarray
-    """The part of the bias that is the same in all runs (n + 1, 3), rad/s."""
+    """Part of the bias common to all runs (n + 1, 3), rad/s."""
     terms: np.ndarray
-    """Which noises there are (4,): walk, Markov, flicker, error matrix."""
+    """Whether each noise is present (4,): random walk, Markov, flicker, error matrix."""
     sizes: np.ndarray
     """Sizes of the noises by axis (8, 3), rows :data:`WHITE_SIGMA` to :data:`FLICKER_SIZE`."""
     poles: np.ndarray
     gains: np.ndarray
     poles_start: np.ndarray
-    """Flicker (:class:`strapdown.gyro.flicker.Shaping`) (16,), (16,), and what makes stationary states of normals (16, 16) or (0, 16)."""
+    """Flicker (:class:`strapdown.gyro.flicker.Shaping`) (16,), (16,), and the root of its stationary covariance (16, 16) or (0, 16)."""
     dispersion: np.ndarray
     """σ of the entries of the error matrix (3, 3)."""
 
 
 class Start(NamedTuple):
-    """The state at the first edge, and the process noise of the filter."""
+    """Initial state, at the first edge, and process noise of the filter."""
 
     attitude: np.ndarray
     """True attitude (4,)."""
     error: np.ndarray
-    """True initial error (8,): σ of δθ and δb, then the part that is the same in all runs (6)."""
+    """True initial error (8,): σ of δθ and δb, then the part common to all runs (6)."""
     variance: np.ndarray
-    """The filter's initial variances of attitude and bias (2,)."""
+    """Initial variances of attitude and bias in the filter (2,)."""
     noise: np.ndarray
     """σ_v² and σ_u² of the filter (2,)."""
 
@@ -110,60 +110,60 @@ class Events(NamedTuple):
     """Code of :mod:`strapdown.kernels.measurement`."""
     sensor: np.ndarray
     span: np.ndarray
-    """Span of time for the NIS."""
+    """Time bin of the NIS."""
     exact: np.ndarray
-    """Without noise (m, 4): a vector or a quaternion."""
+    """Value without noise (m, 4): a vector or a quaternion."""
     sigma: np.ndarray
     """True σ (m, 3)."""
     variance: np.ndarray
-    """The filter's variances (m, 3)."""
+    """Variances in the filter (m, 3)."""
     decay: np.ndarray
     share: np.ndarray
-    """Decay and new part of correlated noise."""
+    """Decay of the correlated noise since the sensor's last measurement, and σ of its new part."""
     number: np.ndarray
-    """Number among the sensor's own."""
+    """Index among the measurements of its sensor."""
     frame: np.ndarray
     """Row of ``frames``."""
     frames: np.ndarray
     """Right-handed frames (u, v, r) by rows about the references (rows, 9)."""
     struck_below: np.ndarray
-    """By sensor, the word below which a measurement is an outlier; 0 for none."""
+    """For each sensor, the random word below which a measurement is an outlier; 0: no outliers."""
     outlier_scale: np.ndarray
 
 
 class Draws(NamedTuple):
-    """What a run draws from and remembers, flat."""
+    """Random streams and memory of a group of runs, flat."""
 
     streams: np.ndarray
     """States of the streams."""
     ahead: np.ndarray
-    """:data:`AHEAD` normals a source, in single precision."""
+    """:data:`AHEAD` normals per source, in single precision."""
     memory: np.ndarray
-    """Places of :func:`memory`."""
+    """See :func:`memory`."""
 
 
 class Outputs(NamedTuple):
-    """What is written of every group of runs, flat."""
+    """Outputs of a group of runs, flat."""
 
     kept: np.ndarray
-    """:data:`KEPT` numbers an epoch."""
+    """:data:`KEPT` numbers per epoch."""
     nis: np.ndarray
-    """By sensor and span of time; it is added to."""
+    """Sum of the NIS by sensor and time bin; updates add to it."""
 
 
 class Detail(NamedTuple):
-    """What is written of runs to look at, flat."""
+    """Detailed outputs for the replay of runs, flat."""
 
     increments: np.ndarray
-    """What the gyro gave, 3 an interval."""
+    """Measured increments, 3 per interval."""
     values: np.ndarray
-    """What the sensors gave, 4 a measurement."""
+    """Measured values, 4 per measurement."""
     innovations: np.ndarray
     """e₁, s₁, e₂, s₂, e₃, s₃ of each measurement."""
 
 
 def memory(sensors):
-    """Return how many places the memory of a group needs."""
+    """Return the number of places in the memory of a group."""
     return _SENSORS + _OF_A_SENSOR * sensors
 
 
@@ -189,7 +189,7 @@ def store_several(memory, place, like, values):
 
 
 def by_axis(v, sizes, row):
-    """Return v with each component times that of a row of sizes."""
+    """Return the product of v and a row of ``sizes``, by component."""
     return tuple(v[i] * sizes[row, i] for i in range(3))
 
 
@@ -215,7 +215,7 @@ def refill(streams, source, ahead, count, like):
 
 
 def drawn(ahead, source, index, like):
-    """Return the normal of a source at a place among those drawn ahead."""
+    """Return a normal of a source by its index among those drawn ahead."""
     return narrowed(load_like(ahead, (AHEAD * source + index) * len(like), like), like)
 
 
@@ -225,7 +225,7 @@ def drawn_triple(ahead, source, index, like):
 
 
 def normal_triple(streams, source, ahead, number, like):
-    """Return the 3-vector of normals of this number, from 0 on, of a source; they are asked for one after the other."""
+    """Return the 3-vector of normals ``number`` of a source; numbers must be requested in order from 0."""
     turn = number & (TRIPLES - 1)
     if turn == 0:
         refill(streams, source, ahead, AHEAD, like)
@@ -244,7 +244,7 @@ def fill_with_normals(pattern, k0, k1, numbers, out):
 
 
 def start_streams(keys, numbers, draws, like):
-    """Fill the states of all streams of the runs of these numbers, ``keys`` (sources, 2), and draw what a run starts with."""
+    """Set the states of all streams of the runs ``numbers``, ``keys`` (sources, 2), and draw the normals of their initial values."""
     number = load_like(numbers, 0, like)
     for source in range(len(keys)):
         store_several(draws.streams, 4 * source, like, stream_state(keys[source, 0], keys[source, 1], number))
@@ -293,7 +293,7 @@ def flicker_step(poles, gains, memory, axis, w, like):
 
 
 def flicker_value(gains, memory, axis, like):
-    """Return the flicker of the states as they are, for B = 1."""
+    """Return the flicker of the current states, for B = 1."""
     n = len(like)
     base = (_STATES + axis * STATES) * n
     value = like
@@ -372,7 +372,7 @@ def sensor_noise(e, events, draws, like):
 
 
 def keep(kept, row, like, q, b, A, B, C, bias):
-    """Write one epoch: :data:`KEPT` places."""
+    """Write the :data:`KEPT` values of an epoch."""
     store_several(kept, row * KEPT, like, (*q, *b, *A, *B, *C, *bias))
 
 
@@ -424,7 +424,7 @@ def update(q, b, A, B, C, e, events, draws, out, detail, like):
 
 
 def filter_start(bias, start, draws, like):
-    """Return the attitude and bias that the filter of a run starts with: the truth less the error drawn."""
+    """Return the initial attitude and bias of the filter: the truth minus the error drawn."""
     x = drawn_triple(draws.ahead, START, 0, like)
     y = drawn_triple(draws.ahead, START, 3, like)
     given = start.error
@@ -435,19 +435,19 @@ def filter_start(bias, start, draws, like):
 
 
 def advance(pattern, numbers, keys, gyro, start, events, every, draws, out, detail):
-    """Run ``len(pattern)`` runs of the given numbers over a whole scenario.
+    """Compute the ``len(pattern)`` runs ``numbers`` over a whole scenario.
 
     Parameters
     ----------
-    pattern : tuple of floats, one a run
-        Its length and type are those of the lanes.
+    pattern : tuple of floats, one per run
+        Its length and type define the lanes.
     numbers : array of words (W,)
     keys : array of words (sources, 2)
     gyro : Gyro
     start : Start
     events : Events
     every : int
-        Steps from one kept epoch to the next.
+        Number of steps between stored epochs.
     draws : Draws
     out : Outputs
     detail : Detail or None

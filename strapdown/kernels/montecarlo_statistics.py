@@ -1,7 +1,7 @@
-"""Sums over the runs of a Monte Carlo, eight runs at a time, in double precision: what :mod:`strapdown.montecarlo.statistics` defines.
+"""Sums over Monte Carlo runs, eight runs at a time in lanes (SIMD), in double precision: see :mod:`strapdown.montecarlo.statistics`.
 
-Every eighth run goes into the same lane of a sum, in the order of the runs, and the lanes are added up at the end of a chunk in one order
-(:func:`strapdown.kernels.lane_values.total`), so the sums have the same bits on every machine and for every number of lanes.
+Every eighth run is added to the same lane of a sum, in the order of the runs, and the lanes are summed at the end of a chunk in a fixed
+order (:func:`strapdown.kernels.lane_values.total`), so the sums have the same bits on every machine and for any number of lanes.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from strapdown.kernels.montecarlo_run import KEPT
 from strapdown.kernels.rotation import quaternion_multiply
 
 SUMS = 6 + 21 + 21 + 3 + 6
-"""Numbers summed at an epoch: e, e eᵀ and P (upper triangles in blocks θθ, θb, bb), the NEES of state, attitude, bias, and the product of
-each NEES over the runs, whose logarithm is the sum of logarithms: a number from 1 to 2, and the powers of two that it lacks."""
+"""Number of sums at an epoch: e, e eᵀ and P (upper triangles in blocks θθ, θb, bb), the NEES of state, attitude and bias, and the product
+of each NEES over the runs, whose logarithm is the sum of logarithms: its mantissa, from 1 to 2, and its exponent of two."""
 NEES_PRODUCT = 51
 
 _TINY = 2.2250738585072014e-308
@@ -78,7 +78,7 @@ def normalized_squares(e_theta, e_bias, A, B, C):
 
 
 def bin_numbers(x, first, last):
-    """Return the bins of non-negative lanes: bits shifted right less ``first``, within 0 and ``last`` less ``first``."""
+    """Return the bins of non-negative lanes: their shifted bits, limited to ``first`` and ``last``, minus ``first``."""
     word = bits_of(x) >> np.uint64(49)
     word = chosen(word < first, first, word)
     word = chosen(word > last, last, word)
@@ -93,12 +93,12 @@ def add_up(sums, row, place, good, values):
 
 
 class Sums(NamedTuple):
-    """What runs are added to, at m epochs."""
+    """Sums over runs at m epochs."""
 
     finite: np.ndarray
-    """Runs that count (m,)."""
+    """Number of runs included (m,)."""
     sums: np.ndarray
-    """By lane (m · SUMS · 8,), from zeros on, the products of NEES from ones."""
+    """By lane (m · SUMS · 8,), initially zero, the products of NEES one."""
     coverage: np.ndarray
     """(m, 6, 3)"""
     histogram: np.ndarray
@@ -161,7 +161,7 @@ def accumulate(pattern, kept, width, column, valid, truth, error_bins, nees_bins
 
 
 def kept_state(kept, at, width, like):
-    """Return the numbers of an epoch of so many runs each."""
+    """Return the stored values of an epoch, which starts at ``at``; ``width`` is the number of runs."""
     return tuple(load_like(kept, at + i * width, like) for i in range(KEPT))
 
 

@@ -1,8 +1,8 @@
 """Attitude under harmonic body rates by Taylor series about evenly spaced nodes, used as truth by :mod:`strapdown.motion`.
 
 About a node the rate is a power series known in closed form, so equation (17), ``q̇ = ½ q ⊗ w_b``, gives the attitude relative to the
-node by recurrence: ``q_{n+1} = ½/(n + 1) Σ q_i ⊗ w_{n−i}``. Deviations from the identity are kept, not quaternions, and summed with
-compensation: a chain of nodes then loses rounding of the deviations only.
+node by recurrence: ``q_{n+1} = ½/(n + 1) Σ q_i ⊗ w_{n−i}``. Deviations from the identity are stored instead of quaternions, and summed
+with compensation, so the error over a chain of nodes is only the rounding of the deviations.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from strapdown.kernels.rotation import quaternion_multiply
 def rate_series(cosines, sines, factors, amplitudes, mean, series):
     """Fill ``series`` (terms, 3) with the Taylor coefficients of ``mean + Σ a_j cos(ω_j t + θ_j)`` about a node.
 
-    ``cosines`` and ``sines`` are those of the phases at the node; ``factors`` (harmonics, terms) holds ω^n/n! rounded once, because an
-    error in them would be the same at every node and add up.
+    ``cosines`` and ``sines`` are those of the phases at the node; ``factors`` (harmonics, terms) holds ω^n/n! rounded once, because
+    their error is the same at every node and accumulates.
     """
     for n in range(series.shape[0]):
         for axis in range(3):
@@ -31,7 +31,7 @@ def rate_series(cosines, sines, factors, amplitudes, mean, series):
 
 
 def attitude_series(rate, series):
-    """Fill ``series`` (terms + 1, 4) with the Taylor coefficients of the attitude relative to the node, the first the identity."""
+    """Fill ``series`` (terms + 1, 4) with the Taylor coefficients of the attitude relative to the node; the first is the identity."""
     series[0, 0] = 1.0
     series[0, 1] = 0.0
     series[0, 2] = 0.0
@@ -87,7 +87,7 @@ def node_deviations(cosines, sines, factors, amplitudes, mean, half, rate, serie
 
 
 def advance(q, low, d):
-    """Return q ⊗ (1 + d) of a quaternion held as the unevaluated sum ``q + low``, in the same form (two-sum, Knuth)."""
+    """Return q ⊗ (1 + d) for a quaternion stored as the unevaluated sum ``q + low``, in the same form (two-sum, Knuth)."""
     p = quaternion_multiply(add_matrices(q, low), d)
     s = add_matrices(q, p)
     b = tuple(x - y for x, y in zip(s, q, strict=True))

@@ -1,7 +1,7 @@
 """Series coefficients of the rotation functions, as polynomials in the squared angle.
 
-A polynomial in ``x = θ²`` has no branch and no square root, and is accurate to rounding where gyro increments live, where the closed
-forms lose their digits. Its degree bounds the angle: see :data:`LARGEST_ANGLE`.
+A polynomial in ``x = θ²`` has no branch and no square root, and is accurate to rounding at the small angles of gyro increments, where the
+closed forms lose digits. Its degree limits the angle: see :data:`LARGEST_ANGLE`.
 """
 
 from __future__ import annotations
@@ -9,8 +9,8 @@ from __future__ import annotations
 import math
 
 LARGEST_ANGLE = 1.0 / 3.0
-"""rad; the polynomials below are good to rounding up to this angle. Loops that meet a larger one take sub-steps. Beyond it they
-degrade gracefully: at 1 rad they are good to 1e-10, at 2 rad to 1e-6."""
+"""Maximum angle, rad, at which the polynomials below are accurate to rounding; larger increments are divided into sub-steps. Beyond it
+their accuracy decreases gradually: 1e-10 at 1 rad, 1e-6 at 2 rad."""
 
 _COSINE = tuple((-1.0) ** k / math.factorial(2 * k) for k in range(6))
 _SINC = tuple((-1.0) ** k / math.factorial(2 * k + 1) for k in range(6))
@@ -28,7 +28,7 @@ _G0, _G1, _G2, _G3, _G4, _G5 = _FIFTH
 
 
 def polynomial(x, c0, c1, c2, c3, c4, c5):
-    """Return Σ cₖ xᵏ by Estrin's scheme: one multiplication more than Horner's, but a chain of dependence half as long."""
+    """Return Σ cₖ xᵏ by Estrin's scheme: one multiplication more than Horner's, but a dependency chain half as long."""
     xx = x * x
     return ((c5 * x + c4) * xx + (c3 * x + c2)) * xx + (c1 * x + c0)
 
