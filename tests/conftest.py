@@ -21,12 +21,12 @@ hypothesis.settings.register_profile("fixed", derandomize=True)
 hypothesis.settings.load_profile("fixed")  # the same examples in every run
 
 gc.set_threshold(50_000, 20, 20)
-"""Objects of compiled kernels and of figures are many and live on: at Python's own 700, 10, 10 the collector takes 7 % of all time."""
-gc.disable()  # until all is collected: what modules hold stays
+"""Compiled kernels and figures have many long-lived objects: with Python's default of 700, 10, 10 the collector takes 7 % of the time."""
+gc.disable()  # until collection of the tests ends: objects of modules are permanent
 
 cli.register()
 typer.main.get_command = functools.cache(typer.main.get_command)
-"""Each call of the program builds the parsers of all commands anew, 16 ms; that this is right once is enough."""
+"""Each call of the program rebuilds the parsers of all commands, 16 ms; testing this once is enough."""
 
 BROAD = Path(__file__).resolve().parents[1] / ".." / "shared" / "data" / "broad"
 
@@ -36,38 +36,38 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--attack-files", type=int, help="number of damaged files that tests/attack makes")
     parser.addoption("--attack-seed", type=int, default=1, help="seed of the damage")
     parser.addoption("--soak", type=int, help="steps of the filter that tests/attack/test_soak.py takes")
-    parser.addoption("--attack-log", help="file for what became of the damaged files")
+    parser.addoption("--attack-log", help="file for the results of the damaged files")
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    # Workers take file after file: with the two halves of the list dealt in turn, two workers seldom compile the same kernels at once,
-    # and neighbours, which share kernels, often run in one process.
+    # Workers process file after file. With the two halves of the list interleaved, two workers seldom compile the same kernels at once,
+    # and neighbouring files, which share kernels, often run in one process.
     files = list(dict.fromkeys(item.path for item in items))
     half = -(-len(files) // 2)
     place = {path: (k % half, k) for k, path in enumerate(files)}
     items.sort(key=lambda item: place[item.path])
     if not config.getoption("--slow"):
-        # By the marker: keywords hold the names of folders too.
+        # By the marker, because keywords include the names of folders.
         slow = [item for item in items if item.get_closest_marker("slow")]
         config.hook.pytest_deselected(items=slow)
         items[:] = [item for item in items if not item.get_closest_marker("slow")]
 
 
 def pytest_collection_finish() -> None:
-    gc.freeze()  # the modules stay
+    gc.freeze()  # objects of modules are permanent
     gc.enable()
 
 
 @pytest.fixture(scope="module", autouse=True)
 def what_is_compiled_is_not_collected() -> Iterator[None]:
-    """Leave what a module has compiled out of garbage collection: in a process that has compiled much, each one takes seconds."""
+    """Exclude the objects compiled by a module from garbage collection, which otherwise takes seconds after many compilations."""
     yield
     gc.collect(1)
     gc.freeze()
 
 
 def pytest_sessionfinish() -> None:
-    gc.freeze()  # pytest collects five times at its end, ten seconds in a process that has compiled much
+    gc.freeze()  # at its end pytest runs five collections: ten seconds after many compilations
 
 
 PIXEL = base64.b64decode("iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAAAAAA6fptVAAAACklEQVR42mP4DwABAQEAHLCMmQAAAABJRU5ErkJggg==")
@@ -76,7 +76,7 @@ PIXEL = base64.b64decode("iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAAAAAA6fptVAAAACklEQV
 
 @pytest.fixture(scope="session")
 def blank() -> Callable[..., None]:
-    """Return what stands for ``Figure.savefig`` where the pixels do not matter: drawing a figure takes half a second."""
+    """Return a replacement of ``Figure.savefig`` for tests that do not depend on the pixels: drawing a figure takes half a second."""
     from matplotlib.figure import Figure
 
     draw = Figure.savefig
@@ -96,7 +96,7 @@ def blank() -> Callable[..., None]:
 def figures_are_blank(
     request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, blank: Callable[..., None]
 ) -> None:
-    """Save blank figures in tests without the mark ``draws``; what fixtures of a whole module save is drawn."""
+    """Save blank figures in tests without the mark ``draws``; figures saved by fixtures of a module are drawn."""
     if not request.node.get_closest_marker("draws"):
         monkeypatch.setattr("matplotlib.figure.Figure.savefig", blank)
 
@@ -119,7 +119,7 @@ def run(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(
         progress, "_quiet", True
-    )  # standard error is what went wrong alone, also where kernels are compiled first
+    )  # standard error then contains only errors, even if kernels are compiled first
 
     def command(*arguments: object) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["strapdown", *map(str, arguments)])
@@ -136,7 +136,7 @@ def run(
 
 @pytest.fixture(scope="session")
 def rotation_vectors() -> Callable[..., np.ndarray]:
-    """Rotation vectors (n, 3) of random direction, their angles log-uniform between two bounds."""
+    """Return a function that draws rotation vectors (n, 3) with random direction and log-uniform angle between two bounds."""
 
     def draw(n: int, smallest: float = 1e-12, largest: float = np.pi, seed: int = 7) -> np.ndarray:
         random = np.random.default_rng(seed)

@@ -1,12 +1,12 @@
-"""The step-by-step filter with gate, recovery and robust weights: what the compiled filter's are compared with.
+"""The step-by-step filter with gate, recovery and robust weights, the reference for those of the compiled filter.
 
-In matrices over any number of states.
+In matrix form, for any number of states.
 
-- :func:`linearize`: the measurement linearised at the estimate that its update leads to (iterated update), its NIS, and its robust weight.
-- :class:`Supervision`: the gate's counters, and the restart candidate that it runs beside the filter.
+- :func:`linearize`: the measurement linearised at the estimate after its update (iterated update), with its NIS and its robust weight.
+- :class:`Supervision`: the counters of the gate, and the restart candidate, which runs in parallel with the filter.
 
 Methods, thresholds and their reasons are those of the kernels: :mod:`strapdown.kernels.iterated_update` and
-:mod:`strapdown.kernels.gate_rules`, whose counting runs here as plain Python.
+:mod:`strapdown.kernels.gate_rules`, whose counters run here as plain Python.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class Rows(NamedTuple):
     angle: float
     """Angle θ of a direction or vector from the predicted one, rad; 0 for other kinds."""
     arc: float
-    """θ over the length of the residual's part across the predicted direction; of other kinds 1."""
+    """θ divided by the magnitude of the transverse residual; 1 for other kinds."""
 
 
 MeasurementModel = Callable[[Array, Array], Rows]
@@ -78,16 +78,16 @@ class Linearization:
     others: Array
     """Its gyro bias and optional error states (n − 3,)."""
     covariance: Array
-    """The prior's P (n, n)."""
+    """P of the prior (n, n)."""
     prior: Array
-    """The prior's mean less that state (n,), attitude in rad."""
+    """Mean of the prior minus that state (n,), attitude in rad."""
     rows: Rows
     converged: bool = True
-    """Whether the iteration came to rest."""
+    """Whether the iteration converged."""
 
     @property
     def innovation(self) -> Array:
-        """The residual less what the prior predicts (d,)."""
+        """The residual minus its prediction from the prior (d,)."""
         return self.rows.residual - self.rows.H @ self.prior
 
     @property
@@ -101,18 +101,18 @@ class Linearization:
         return float(self.innovation @ np.linalg.solve(self.predicted + self.rows.noise, self.innovation))
 
     def acceptable(self, threshold: float) -> bool:
-        """Return whether a gate of this threshold accepts it.
+        """Return whether a gate with this threshold accepts the measurement.
 
-        A direction more than a right angle from the predicted one never is: the rows across that do not show which way it points.
+        A direction more than 90° from the predicted one is never accepted: its rows, transverse to the prediction, do not show its sense.
         """
         behind = len(self.rows.residual) == 2 and self.rows.angle > 0.5 * math.pi and threshold < math.inf
         return self.converged and self.nis <= threshold and not behind
 
     def correction(self) -> tuple[Array, float]:
-        """Return the correction (n,) of one update, and the size that has to fall below the tolerance.
+        """Return the correction (n,) of one update, and the size that must fall below the tolerance.
 
-        That is the attitude's part, rad, and what the optional states change in the rows made independent. The residual of a direction
-        enters by its arc, not its chord, so that an update from afar neither creeps nor stops at the opposite direction.
+        The size comprises the attitude correction, rad, and the effect of the optional states on the decorrelated rows. The residual of a
+        direction is its arc, not its chord, so that a large update neither converges slowly nor stops at the opposite direction.
         """
         residual, H, noise, _, arc = self.rows
         L = np.linalg.cholesky(noise)
@@ -144,20 +144,20 @@ class Linearization:
 def linearize(
     model: MeasurementModel, attitude: Array, others: Array, P: Array, chains: Array, passes: int, threshold: float
 ) -> Linearization:
-    """Return a measurement linearised at the state that its update leads to (:mod:`strapdown.kernels.gate`).
+    """Return a measurement linearised at the state after its update (:mod:`strapdown.kernels.gate`).
 
     Parameters
     ----------
     model : callable
-        The measurement's rows at a state.
+        Rows of the measurement at a state.
     attitude, others, P : ndarray
         The prior: q_fb (4,), gyro bias and optional error states (n − 3,), covariance (n, n).
     chains : ndarray
-        Of :class:`strapdown.estimation.model.Model`: which states turn with the attitude.
+        Of :class:`strapdown.estimation.model.Model`: which states rotate with the attitude.
     passes : int
-        Most linearisations; with one it is the plain extended Kalman filter.
+        Maximum number of linearisations; 1: the plain extended Kalman filter.
     threshold : float
-        The gate's. While the attitude is hardly known, a measurement that would be refused is linearised again from a third of a turn to
+        Threshold of the gate. While the attitude is nearly unknown, a measurement that would be refused is linearised again from 120° to
         either side about the least certain axis.
     """
     zero = np.zeros(len(P))
@@ -190,14 +190,14 @@ def linearize(
 
 
 def prior_at(prior: Linearization, attitude: Array, others: Array, chains: Array) -> tuple[Array, Array]:
-    """Return the prior's covariance (n, n) in the tangent space of another state, and its mean less that state (n,)."""
+    """Return the covariance of the prior (n, n) in the tangent space of another state, and its mean minus that state (n,)."""
     P, back = seen_from(quaternion.multiply(quaternion.conjugate(prior.attitude), attitude), prior.covariance)
     T = turning_matrix(chains, len(P), prior.attitude, attitude)
     return T @ P @ T.T, np.concatenate([back, T[3:, 3:] @ prior.others - others])
 
 
 def seen_from(q: Array, covariance: Array) -> tuple[Array, Array]:
-    """Return a prior's P (n, n) at the attitude that lies the turn q from its mean, and where the mean lies seen from there (3,), rad.
+    """Return P of a prior (n, n) at the attitude rotated by q from its mean, and the rotation vector from there to the mean (3,), rad.
 
     The method is that of :func:`strapdown.kernels.iterated_update.seen_from`, which gives the reasons.
     """
@@ -233,9 +233,9 @@ def tilt_unknown(attitude: Array, covariance: Array) -> bool:
 
 
 class Events:
-    """Descriptor of a filter's ``events``: recoveries and lock-outs so far, in order of time.
+    """Descriptor of the ``events`` of a filter: recoveries and lock-outs up to now, in order of time.
 
-    Not a property: filterpy's ``Saver`` makes an array of every property, for which a growing tuple has no shape.
+    Not a property, because filterpy's ``Saver`` converts every property to an array, and a growing tuple has no fixed shape.
     """
 
     def __get__(self, filter: Any, owner: type) -> Any:
@@ -244,7 +244,7 @@ class Events:
 
 
 class Supervision:
-    """A gate beside a step-by-step filter: counters, restart candidate and the events reported so far."""
+    """The gate of a step-by-step filter: counters, restart candidate and the events reported up to now."""
 
     def __init__(self, gate: Gate | None, memory: GateMemory | None) -> None:
         self.gate = gate
@@ -255,22 +255,22 @@ class Supervision:
 
     @property
     def has_candidate(self) -> bool:
-        """Whether a restart candidate is running; one of an earlier part of a record the filter has to restore itself."""
+        """Whether a restart candidate is running; the filter itself restores a candidate of an earlier part of a record."""
         return bool(self.memory[gate_rules.CANDIDATE])
 
     @property
     def passes(self) -> int:
-        """Most linearisations of an update of the filter: more than one after a recovery."""
+        """Maximum number of linearisations of an update of the filter: more than one after a recovery."""
         return int(self.memory[gate_rules.PASSES])
 
     @property
     def events(self) -> tuple[Event, ...]:
-        """Recoveries and lock-outs so far, in order of time."""
+        """Recoveries and lock-outs up to now, in order of time."""
         found = gate_events(self.recoveries, self.lock_outs, self.sensors)
         return tuple(sorted(found, key=lambda event: event.start))
 
     def judge(self, filter: Any, sensor: str, outcome: int, update: Callable[[Any], int]) -> None:
-        """Count the outcome of a measurement for a filter; ``update`` gives the same measurement to the restart candidate."""
+        """Count the outcome of a measurement for a filter; ``update`` updates the restart candidate with it."""
         if self.gate is None:
             return
         s, recovery, limit = self._row_of(sensor), self.gate.recovery or 0, self.gate.lock_out_limit
@@ -293,7 +293,7 @@ class Supervision:
             self.candidate = None
 
     def _row_of(self, sensor: str) -> int:
-        """Return a sensor's row of the counters."""
+        """Return the row of a sensor in the counters."""
         if sensor not in self.sensors:
             self.sensors = (*self.sensors, sensor)
             self.counters = np.vstack([self.counters, remembered(None, None, (sensor,))[1]])
@@ -315,7 +315,7 @@ class Supervision:
             self._widen(candidate)
 
     def _widen(self, candidate: Any) -> None:
-        """Make the candidate what it would be if its bias had started with a larger σ, where that start holds it back."""
+        """Change the candidate to what it would be with a larger initial σ of its bias, if the initial σ limits it."""
         P = candidate.P.copy()
         if not gate_rules.may_widen(np.diag(P)[3:6], self.memory):
             return
@@ -334,7 +334,7 @@ class Supervision:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Prior:
-    """Prior of the optional error states, from which a restart candidate starts."""
+    """Prior of the optional error states for a restart candidate."""
 
     time: float
     values: Array
@@ -342,7 +342,7 @@ class _Prior:
 
 
 def arc_of(measurement: Any, y: Array, basis: Array) -> tuple[float, float]:
-    """Return the angle θ between measured and predicted vector, rad, and θ over sin θ; 0 and 1 of other kinds."""
+    """Return the angle θ between measured and predicted vector, rad, and θ/sin θ; 0 and 1 for other kinds."""
     if measurement.kind not in ("direction", "vector"):
         return 0.0, 1.0
     along = y[2] + 1.0
@@ -369,7 +369,7 @@ class GatedStepFilter(StepFilter):
     events = Events()
 
     def _begin_gate(self, state: State) -> None:
-        """Set up the gate; continue with the gate's memory and its restart candidate where the state has them."""
+        """Set up the gate; if the state contains the memory of a gate and its restart candidate, continue with them."""
         gate, memory = self.gate, state.gate
         self._restart_bias_variance = restart_bias_variance(gate, state)
         self._supervision: Supervision = Supervision(gate, memory)
@@ -391,7 +391,7 @@ class GatedStepFilter(StepFilter):
             )
 
     def _predict(self, increment: Array, step: float, end: float) -> None:
-        """Propagate the filter, and a restart candidate beside it, in common sub-steps: as long as series and decaying states allow."""
+        """Propagate the filter and the restart candidate in common sub-steps, as long as the series and decaying states allow."""
         candidate = self._supervision.candidate
         running = [self] if candidate is None else [self, candidate]
         left, limit = step, self._motion.limit
@@ -441,7 +441,7 @@ class GatedStepFilter(StepFilter):
         return ACCEPTED
 
     def _accept(self, seen: Linearization, unit: float) -> None:
-        """Correct the state by filterpy's update, from the state at which a measurement is linearised; its rows are in this unit."""
+        """Correct the state at which a measurement is linearised by filterpy's update; the rows are multiplied by ``unit``."""
         self.attitude, self.bias, self.values = seen.attitude, seen.others[:3], seen.others[3:]
         self.P, self.x = seen.covariance, seen.prior
         H, R = unit * seen.rows.H, seen.rows.noise * (unit**2 / self.weight)
@@ -453,7 +453,7 @@ class GatedStepFilter(StepFilter):
         self.P_post = self.P.copy()
 
     def _reset(self, correction: Array, P: Array, *, far: bool) -> None:
-        """Correct the state, and move P to its tangent space; ``far`` where an attitude hardly known has turned by a large angle."""
+        """Correct the state and transform P to its tangent space; ``far``: a large rotation of a nearly unknown attitude."""
         before, turn = self.attitude, quaternion.exp(correction[:3])
         self.attitude = quaternion.normalize(quaternion.multiply(before, turn))
         self.bias, self.values = self.bias + correction[3:6], self.values + correction[6:]
@@ -469,14 +469,14 @@ class GatedStepFilter(StepFilter):
         self.P = P
 
     def _show_refused(self, seen: Linearization, unit: float) -> None:
-        """Set what filterpy shows of an update to that of a refused measurement: its residual and covariance, and no gain."""
+        """Set the attributes of filterpy's update for a refused measurement: its residual and covariance, and zero gain."""
         self.z, self.y = unit * seen.rows.residual, unit * seen.innovation
         self.S = unit**2 * (seen.predicted + seen.rows.noise)
         self.SI, self.K = np.linalg.inv(self.S), np.zeros((len(self.x), len(self.y)))
         self._log_likelihood = self._likelihood = self._mahalanobis = None  # to be computed anew
 
     def _rows_at(self, measurement: Any, model: Any, attitude: Array, others: Array) -> Rows:
-        """Return a measurement's rows at an attitude (4,) and (b, c) (3 + m,), by the kernels' own function."""
+        """Return a measurement's rows at an attitude (4,) and (b, c) (3 + m,), by the function of the kernels."""
         H = np.zeros((3, 3 + len(others)))
         value = measurement.frame[:4] if measurement.kind == "attitude" else (*measurement.z, 0.0)
         given = KIND_CODES[measurement.kind], value, measurement.frame, measurement.length
@@ -487,7 +487,7 @@ class GatedStepFilter(StepFilter):
         return Rows(y[:d].copy(), H[:d].copy(), (basis @ measurement.noise @ basis.T)[:d, :d], angle, arc)
 
     def _restarted(self, attitude_sigma: float, bias_width: float) -> GatedStepFilter:
-        """Return a restart candidate: optional states at their prior, attitude and bias independent of it and as uncertain as given."""
+        """Return a restart candidate: optional states at their prior, attitude and bias independent of them, with the given uncertainty."""
         prior, m = self._restart_prior, len(self.values)
         values, Pc = modelling.aged_prior(self.error_states, prior.values, prior.covariance, self.time - prior.time)
         P = np.zeros((6 + m, 6 + m))

@@ -1,4 +1,4 @@
-"""Changing HDF5 files of the package on purpose."""
+"""Deliberate changes of the HDF5 files of the package."""
 
 import contextlib
 
@@ -9,7 +9,7 @@ from strapdown.files import seal
 
 @contextlib.contextmanager
 def changed(path):
-    """An HDF5 file open for changes, with a digest that fits them afterwards."""
+    """Open an HDF5 file for changes, and update its digest afterwards."""
     with h5py.File(path, "r+") as file:
         yield file
     seal(path)

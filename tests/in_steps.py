@@ -1,4 +1,4 @@
-"""A record through the step-by-step filter, as the tests compare it with the compiled one."""
+"""A record processed by the step-by-step filter, for comparison with the compiled one."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from strapdown.kernels import filter_step
 
 
 def transition_and_noise(phi, dt, process_noise):
-    """Return Φ and Q (6, 6) of attitude and bias over a turn φ at constant rate, by the kernels' own formulas as matrices."""
+    """Return Φ and Q (6, 6) of attitude and bias over a rotation φ at constant rate, as matrices, by the formulas of the kernels."""
     turn = tuple(float(component) for component in phi)
     phi11, phi12 = filter_step.transition(turn, dt)
     q11, q12, q22 = filter_step.process_noise(
@@ -26,7 +26,7 @@ def transition_and_noise(phi, dt, process_noise):
 
 
 def update(f, series, k):
-    """Give sample k of a series to a filter; return whether it was used."""
+    """Update a filter with sample k of a series; return whether it was used."""
     noise = {"covariance": series.covariances[k]} if series.kind != "heading" else {"sigma": series.sigma[k]}
     given = {"sensor": series.sensor, **noise}
     if series.kind == "attitude":
@@ -35,7 +35,7 @@ def update(f, series, k):
 
 
 def fed(f, record, after=lambda used: None):
-    """Give a record to a filter, intervals cut at the measurements; return attitudes, biases and covariances at the intervals' ends.
+    """Process a record, intervals split at the measurements; return attitudes, biases and covariances at the ends of the intervals.
 
     ``after`` is called after each measurement, with whether it was used.
     """
@@ -57,7 +57,7 @@ def fed(f, record, after=lambda used: None):
 
 
 def run(record, process_noise, initial, error_states=(), **options):
-    """Return what the step-by-step filter makes of a record: the states at every edge, and innovations, counts and events."""
+    """Return the result of the step-by-step filter for a record: states at every edge, innovations, counts and events."""
     sensors = [series.sensor for series in record.vectors]
     f = GatedStepFilter(process_noise, initial, error_states, time=record.time[0], sensors=sensors, **options)
     events = sorted((t, i, k) for i, series in enumerate(record.vectors) for k, t in enumerate(series.time))
@@ -105,5 +105,5 @@ def run(record, process_noise, initial, error_states=(), **options):
 
 
 def whitened(y, S):
-    """Return an innovation made independent in the order of its rows, over its standard deviations."""
+    """Return an innovation decorrelated in the order of its rows and divided by its standard deviations."""
     return np.linalg.solve(np.linalg.cholesky(S), y)

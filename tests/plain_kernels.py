@@ -1,4 +1,4 @@
-"""Kernels in plain Python, where compiled ones would hide a fault in their source or could not run (float32)."""
+"""Kernels in plain Python, for tests in which compiled ones would hide a fault in their source or cannot run (float32)."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ KERNELS = "strapdown.kernels"
 
 @cache
 def called(function: FunctionType, parts: tuple[ModuleType, ...] = ()) -> Callable[..., Any]:
-    """Return a compiled function that calls a kernel's helper: helpers themselves have no wrapper for calls from Python."""
+    """Return a compiled function that calls a helper of a kernel: helpers themselves cannot be called from Python."""
     made = helper(function, parts)
     wrapped = numba.njit(pipeline_class=KernelCompiler, _nrt=False)
     return wrapped(lambda *arguments: made(*arguments))  # noqa: PLW0108 (the lambda is what gets the wrapper)
 
 
 def plain(function: FunctionType, *parts: ModuleType) -> FunctionType:
-    """Return what :func:`strapdown.kernels.machine.compiled` would compile: the source, its open functions bound to ``parts``."""
+    """Return the function that :func:`strapdown.kernels.machine.compiled` would compile, its open functions bound to ``parts``."""
     made: dict[FunctionType, FunctionType] = {}
 
     def bound(one: FunctionType) -> FunctionType:

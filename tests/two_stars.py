@@ -1,4 +1,4 @@
-"""Two stars seen once a second by a body that turns at constant rate: what tests of tuning tune on."""
+"""Two stars measured once a second on a body rotating at constant rate: the scenario for tests of tuning."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ BELIEVED = FilterSetup(
 def scenario(
     duration: float = 200.0, *, rate: float = 4.0, walk: float = RRW, outliers: float = 0.0
 ) -> scenarios.Scenario:
-    """The scenario; ``walk`` is the gyro's rate random walk, ``outliers`` their share among the measurements."""
+    """Return the scenario; ``walk`` is the rate random walk of the gyro, ``outliers`` the probability of an outlier."""
     faults = vectors.Faults(outlier_probability=outliers, outlier_scale=10.0)
     return scenarios.Scenario(
         motion=motion.ConstantRate(rate=np.array([0.01, 0.02, 0.05])),
@@ -40,5 +40,5 @@ def scenario(
 
 
 def case(seed: int = 0, duration: float = 200.0, **changes: Any) -> tuning.Case:
-    """A record of it, where a right filter starts on it."""
+    """Return a tuning case: a record of the scenario with the initial state of the correct filter."""
     return tuning.record_case(scenarios.simulate(scenario(duration, **changes), seed), BELIEVED, seed=seed)

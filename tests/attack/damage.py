@@ -1,4 +1,4 @@
-"""Damage to files: bytes, text and structure. Each function takes a source of chance and a file's content, and returns it damaged."""
+"""Damage to files: bytes, text and structure. Each function takes a random generator and the content of a file, and returns it damaged."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ VALUES = (
     *("{}", '""', '"x"', "[1, 2, 3]", "[0, 0, 1]", "[[1], [2, 3]]", '["a"]', "{a = 1}", '{"a": 1}', "1979-05-27T07:32:00Z", "'", '"', ","),
     *("1,5", "\N{MINUS SIGN}1", "\u0661", "1_000", "\ufeff", "#", "[" * 3000, "{a=" * 300, "a." * 3000 + "a = 1", "x" * 200_000),
 )  # fmt: skip
-"""What takes the place of a word of text."""
+"""Replacements of a word of text."""
 
 
 def flip_bits(chance: random.Random, content: bytes) -> bytes:
@@ -84,7 +84,7 @@ TEXT = (replace_word, replace_word, replace_word, damage_lines, *BYTES)
 
 
 def replace_node(chance: random.Random, content: bytes) -> bytes:
-    """Replace a value somewhere in a JSON file by one of another type, or take it away."""
+    """Replace a value somewhere in a JSON file by one of another type, or delete it."""
     tree = json.loads(content)
     node = tree
     while True:
@@ -105,7 +105,7 @@ def replace_node(chance: random.Random, content: bytes) -> bytes:
 
 
 def change_hdf5(chance: random.Random, content: bytes) -> bytes:
-    """Change the structure of an HDF5 file, with a digest that fits it: types, shapes, values, links, bombs."""
+    """Change the structure of an HDF5 file and update its digest: types, shapes, values, links, bombs."""
     held = io.BytesIO(content)
     with h5py.File(held, "r+") as file:
         nodes = [file]

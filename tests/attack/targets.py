@@ -25,15 +25,15 @@ Damage = Callable[..., bytes]
 
 @dataclass(frozen=True)
 class Target:
-    """A file, what reads it, and the damage that is done to it."""
+    """A file, its reader and the kinds of damage applied to it."""
 
     name: str
-    """With the suffix that its reader looks at."""
+    """With the suffix that its reader expects."""
     content: bytes
     read: Callable[[Path], Any]
     damages: tuple[Damage, ...]
     share: float
-    """Of all damaged files."""
+    """Share of all damaged files."""
 
 
 def targets(folder: Path) -> list[Target]:
