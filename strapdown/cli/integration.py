@@ -110,7 +110,7 @@ def integrate(
     console.print(f"{recording.name}: {samples} samples over {time[-1] - time[0]:.6g} s with {chosen.name}.")
     left = samples % chosen.samples
     if left:
-        console.print(f"The last {left} of them do not fill a step of {chosen.samples} and are left out.")
+        console.print(f"Samples left out at the end, which do not fill a step of {chosen.samples}: {left}.")
     if truth is not None:
         reference = truth[:: chosen.samples][: len(attitude)]
         known = np.isfinite(reference).all(axis=1)
