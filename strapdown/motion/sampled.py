@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -38,8 +38,8 @@ class SampledAttitude:
         No condition at the ends, or rate zero there (with degree 5 angular acceleration too).
     """
 
-    time: Array
-    attitudes: Array
+    time: Array = field(repr=False)
+    attitudes: Array = field(repr=False)
     degree: int = 5
     ends: str = "free"
 

@@ -49,7 +49,7 @@ def likelihood_slice(slices: Slices, tuning: Tuning, number: int, ax: Axes | Non
             color=VERMILION,
         )
     ax.set_xlim(values[0], values[-1])
-    if values[-1] < 10.0 * values[0]:
+    if values[-1] < 30.0 * values[0]:  # powers of ten would leave one label
         ax.xaxis.set_major_locator(MaxNLocator(4))
         ax.xaxis.set_major_formatter(lambda value, _: f"{value:.4g}")
     ax.xaxis.set_minor_formatter(NullFormatter())
