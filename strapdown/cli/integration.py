@@ -15,6 +15,7 @@ from strapdown.cli.terminal import (
     TABLES,
     command,
     console,
+    gap_words,
     json_target,
     need_own,
     progress_bar,
@@ -117,8 +118,8 @@ def integrate(
     if truth is not None and known.any():
         error = np.degrees(quaternion.angle_between(quaternion.normalize(reference[known]), attitude[known]))
         console.print(f"Error against the file's attitude: at the end {error[-1]:.4g}°, at most {error.max():.4g}°.")
-    for begin, length in gaps:
-        console.print(f"Gap of {length:.3g} s after {begin:.3f} s: the turn across it is a guess.")
+    if gaps:
+        console.print(f"{gap_words(gaps)}: the turn across one is a guess.")
     if words:
         console.print(words)
     written(out)
