@@ -398,6 +398,14 @@ def test_estimate_reports_missing_samples(run, tmp_path):
     assert "7 of the gyro's samples have no sample of the accelerometer at the same time" in said
 
 
+def test_many_gaps_are_said_in_one_line(run, tmp_path):
+    columns = np.delete(walk(), [*range(200, 220), *range(300, 310), *range(500, 510)], axis=0)
+    path = write_csv(tmp_path / "walk.csv", columns, UNITS)
+    for command, words in (("estimate", "."), ("integrate", ": the rotation during a gap is interpolated.")):
+        _, said, _ = run(command, path, "--out", tmp_path / ("out" if command == "estimate" else "out.h5"))
+        assert f"Gaps between stamps: 3, the longest 0.21 s after 1.990 s{words}" in said
+
+
 def test_estimate_on_broad(run, broad, tmp_path):
     path = broad / "11_undisturbed_slow_translation_B.hdf5"
     status, said, error = run("estimate", path, "--out", tmp_path / "out", "--figures")

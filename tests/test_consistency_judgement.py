@@ -217,8 +217,9 @@ def test_resolution_is_the_factor_that_bounds_leave(samples):
     assert judged.power[0].factor == pytest.approx(math.sqrt(high / low))
     assert judged.verdict == ("consistent" if samples == 200 else "cannot tell")
     # One sample distinguishes nothing.
-    unseen = {200: "", 20: f"a factor of {math.sqrt(high / low):.2g} would not be seen", 1: "a factor of inf would not"}
+    unseen = {200: "", 20: f"a factor of {math.sqrt(high / low):.2g} would not be seen", 1: "by any factor would not"}
     assert unseen[samples] in judged.reason
+    assert judged.reason.startswith("the one test does not contradict the filter")
 
 
 def test_the_summary_is_plain():

@@ -253,7 +253,7 @@ def test_a_run_of_a_filter_without_a_bias_and_at_times_of_its_own_is_replayed_an
     assert "of three states" in capsys.readouterr().out
     files = ["own-run-1-estimate.h5", "--truth", "own-run-1-record.h5"]
     cli.app(["check", *files], standalone_mode=False)
-    assert "none of 1 tests contradicts the filter" in capsys.readouterr().out
+    assert "the one test does not contradict the filter" in capsys.readouterr().out
     read, truth = read_estimate("own-run-1-estimate.h5"), read_truth("own-run-1-estimate.h5")
     turn = quaternion.log(quaternion.multiply(quaternion.conjugate(read.attitude), truth.attitude))
     assert np.max(np.abs(turn)) < 5.0 * np.max(read.sigma[:, :3])  # the truth of these times, not of others

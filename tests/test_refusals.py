@@ -452,7 +452,7 @@ def test_integration_reports_samples_that_fill_no_step(there, tmp_path):
     assert not (tmp_path / "attitude.h5").exists()
     result = CliRunner().invoke(cli.app, ["integrate", str(tmp_path / "short.csv"), *out])
     assert result.exit_code == 0, result.output
-    assert "The last 3 of them do not complete a step of 4 samples and are not used." in result.output
+    assert "Samples not used at the end, an incomplete step of 4: 3." in result.output
     assert "contains its units" in refused(["integrate", "record.h5", "--gyro-unit", "rad/s", *out])
 
 

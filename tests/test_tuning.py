@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
+import time
 import types
 
 import mpmath
@@ -634,6 +635,22 @@ def test_slices_of_a_filter_scaled_afterwards_have_their_least_at_its_values():
     assert slices.values[0][12] == pytest.approx(found["gyro.arw"].most_likely)
     assert slices.fallen[0][12] < 1e-3
     assert slices.fallen[0].max() > 1.0
+
+
+def test_progress_counts_what_has_ended_in_any_order():
+    heard = []
+    stage = fitting._Stage(heard.append)
+
+    def work(job):
+        for _ in range(1000 if job == 0 else 0):  # the first ends last
+            if stage.what == "searches: 1 of 2":
+                break
+            time.sleep(0.001)
+        stage.evaluated()
+        return job
+
+    assert stage.each("searches", work, [0, 1], 2) == [0, 1]
+    assert heard == ["searches: 0 of 2, 1 evaluations", "searches: 1 of 2, 2 evaluations"]
 
 
 def test_against_a_truth_wrong_parameters_come_back():

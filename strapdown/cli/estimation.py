@@ -19,6 +19,7 @@ from strapdown.cli.terminal import (
     command,
     console,
     doubt,
+    gap_words,
     given,
     need_own,
     progress_bar,
@@ -603,8 +604,8 @@ def _say_recording(result: AhrsEstimate, parameters: AhrsParameters, motion: str
         console.print(
             f"Hard iron of ({iron}) {used.magnetic_unit or '(unit of the magnetometer)'}, body axes, at the end, is subtracted."
         )
-    for begin, length in recordings.gaps(used.time):
-        console.print(f"Gap of {length:.3g} s after {begin:.3f} s.")
+    if words := gap_words(recordings.gaps(used.time)):
+        console.print(f"{words}.")
     if used.left_out_words:
         console.print(used.left_out_words)
     for sensor, number in found.skipped.items():

@@ -15,6 +15,7 @@ from strapdown.cli.terminal import (
     TABLES,
     command,
     console,
+    gap_words,
     json_target,
     need_own,
     progress_bar,
@@ -110,15 +111,15 @@ def integrate(
     console.print(f"{recording.name}: {samples} samples over {time[-1] - time[0]:.6g} s with {chosen.name}.")
     left = samples % chosen.samples
     if left:
-        console.print(f"The last {left} of them do not complete a step of {chosen.samples} samples and are not used.")
+        console.print(f"Samples not used at the end, an incomplete step of {chosen.samples}: {left}.")
     if truth is not None:
         reference = truth[:: chosen.samples][: len(attitude)]
         known = np.isfinite(reference).all(axis=1)
     if truth is not None and known.any():
         error = np.degrees(quaternion.angle_between(quaternion.normalize(reference[known]), attitude[known]))
         console.print(f"Error relative to the file's attitude: final {error[-1]:.4g}°, maximum {error.max():.4g}°.")
-    for begin, length in gaps:
-        console.print(f"Gap of {length:.3g} s after {begin:.3f} s: the rotation during it is interpolated.")
+    if gaps:
+        console.print(f"{gap_words(gaps)}: the rotation during a gap is interpolated.")
     if words:
         console.print(words)
     written(out)

@@ -63,11 +63,25 @@ Advance = Callable[[int | str], None]
 def progress_bar(what: str, total: int | None = None, *, rate: str = "") -> Iterator[Advance]:
     """Yield a function that advances the progress; without ``total`` only the time is shown."""
     if _quiet:
-        yield lambda done: None
+        yield lambda step: None
         return
-    ended = Event()
-    with _terminal(what, total, rate) if errors.is_terminal else _lines(what, total) as (advance, say):
-        watcher = Thread(target=_watch, args=(ended, say), daemon=True)
+    done, ended = 0, Event()
+
+    def advance(step: int | str) -> None:
+        nonlocal done, what
+        if isinstance(step, str):
+            what = step
+        else:
+            done += step
+
+    def watch(say: Say) -> None:
+        begin = time.monotonic()
+        while not ended.wait(_POLL):
+            _compiling.listen()
+            say(_compiling.current, what, done, time.monotonic() - begin)
+
+    with _terminal(what, total, rate) if errors.is_terminal else _lines(total) as say:
+        watcher = Thread(target=watch, args=(say,), daemon=True)
         watcher.start()
         try:
             yield advance
@@ -77,43 +91,25 @@ def progress_bar(what: str, total: int | None = None, *, rate: str = "") -> Iter
             _compiling.current = ""
 
 
-Say = Callable[[str, float], None]
-"""Shows the state of the compilation, if any, and the elapsed time, s."""
+Say = Callable[[str, str, int, float], None]
+"""Shows the state of the compilation, if any, the task, the number of completed units, and the elapsed time, s."""
 
 
 @contextmanager
-def _terminal(what: str, total: int | None, rate: str) -> Iterator[tuple[Advance, Say]]:
+def _terminal(what: str, total: int | None, rate: str) -> Iterator[Say]:
     known = (MofNCompleteColumn(), *([_Rate(rate)] if rate else []))
     columns = (TextColumn("{task.description}"), BarColumn(), *(known if total is not None else ()))
     left = (TextColumn("left"), TimeRemainingColumn()) if total is not None else ()
     with Progress(*columns, TimeElapsedColumn(), *left, console=errors, transient=True) as progress:
         task = progress.add_task(what, total=total)
-
-        def say(compiling: str, seconds: float) -> None:
-            progress.update(task, description=compiling or what)
-
-        def advance(step: int | str) -> None:
-            nonlocal what
-            if isinstance(step, str):
-                what = step
-            else:
-                progress.advance(task, step)
-
-        yield advance, say
+        yield lambda compiling, now, done, _: progress.update(task, description=compiling or now, completed=done)
 
 
 @contextmanager
-def _lines(what: str, total: int | None) -> Iterator[tuple[Advance, Say]]:
-    done, next_line, announced = 0, LINE_INTERVAL, False
+def _lines(total: int | None) -> Iterator[Say]:
+    next_line, announced = LINE_INTERVAL, False
 
-    def advance(step: int | str) -> None:
-        nonlocal done, what
-        if isinstance(step, str):
-            what = step
-        else:
-            done += step
-
-    def say(compiling: str, seconds: float) -> None:
+    def say(compiling: str, now: str, done: int, seconds: float) -> None:
         nonlocal next_line, announced
         if compiling and not announced:
             announced = True
@@ -121,17 +117,9 @@ def _lines(what: str, total: int | None) -> Iterator[tuple[Advance, Say]]:
         if seconds >= next_line:
             next_line += LINE_INTERVAL
             share = "" if total is None else f" {done} of {total},"
-            errors.print(f"{compiling or what}:{share} {seconds:.0f} s", soft_wrap=True)
+            errors.print(f"{compiling or now}:{share} {seconds:.0f} s", soft_wrap=True)
 
-    yield advance, say
-
-
-def _watch(ended: Event, say: Say) -> None:
-    """Show the progress until it ends."""
-    begin = time.monotonic()
-    while not ended.wait(_POLL):
-        _compiling.listen()
-        say(_compiling.current, time.monotonic() - begin)
+    yield say
 
 
 class _Compiling:

@@ -8,7 +8,7 @@ import enum
 import functools
 import inspect
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_type_hints
 
@@ -34,6 +34,7 @@ __all__ = [
     "counted",
     "doubt",
     "errors",
+    "gap_words",
     "given",
     "json_target",
     "need_own",
@@ -248,6 +249,14 @@ def doubt(source: Recording, path: Path) -> None:
         doubts = (f"probably {found.reason}",)
     for words in doubts:
         console.print(f"warning: {words}. See `strapdown doctor {path}`.")
+
+
+def gap_words(gaps: Sequence[tuple[float, float]]) -> str:
+    """Return how many gaps between stamps there are, begin and length of each given, and the longest; empty without any."""
+    if not gaps:
+        return ""
+    begin, length = max(gaps, key=lambda gap: gap[1])
+    return f"Gaps between stamps: {len(gaps)}, the longest {length:.3g} s after {begin:.3f} s"
 
 
 STANDARD_OUTPUT = Path("-")

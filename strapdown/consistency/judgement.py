@@ -479,10 +479,12 @@ def concluded(
     else:
         sharpest = min((x for one, x in _factors(marked, probability) if one.samples > 1), default=math.inf)
         unseen = [one.of for one in power if one.of in needed and not one.seen]
-        outcome = f"none of {len(marked)} tests contradicts the filter"
+        which = f"none of {len(marked)} tests contradicts" if len(marked) > 1 else "the one test does not contradict"
+        outcome = f"{which} the filter"
         if sharpest > RESOLUTION:
             verdict = "cannot tell"
-            reason = f"{outcome}, but a σ wrong by a factor of {sharpest:.2g} would not be seen either: too few samples"
+            factor = f"by a factor of {sharpest:.2g}" if math.isfinite(sharpest) else "by any factor"
+            reason = f"{outcome}, but a σ wrong {factor} would not be seen either: too few samples"
         else:
             verdict = "cannot tell" if unseen else "consistent"
             reason = f"{outcome}; {power_words(power)}"

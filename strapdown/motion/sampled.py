@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -38,8 +38,8 @@ class SampledAttitude:
         Condition at the ends: none, or zero rate (for degree 5 also zero angular acceleration).
     """
 
-    time: Array
-    attitudes: Array
+    time: Array = field(repr=False)
+    attitudes: Array = field(repr=False)
     degree: int = 5
     ends: str = "free"
 

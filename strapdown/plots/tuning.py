@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator, NullFormatter
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
 from strapdown.checks import Array
 from strapdown.plots.style import BLUE, SKY, VERMILION, axes_or_new, ink, legend_above, legend_below, new_figure
@@ -49,10 +49,13 @@ def likelihood_slice(slices: Slices, tuning: Tuning, number: int, ax: Axes | Non
             color=VERMILION,
         )
     ax.set_xlim(values[0], values[-1])
+    ax.xaxis.set_minor_formatter(NullFormatter())
     if values[-1] < 10.0 * values[0]:
         ax.xaxis.set_major_locator(MaxNLocator(4))
+    elif values[-1] < 100.0 * values[0]:  # powers of ten alone would leave one label
+        ax.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    if values[-1] < 100.0 * values[0]:
         ax.xaxis.set_major_formatter(lambda value, _: f"{value:.4g}")
-    ax.xaxis.set_minor_formatter(NullFormatter())
     ax.set_ylim(0.0, TALLEST)
     ax.set_title(one.name)
     ax.set_xlabel(unit.name)

@@ -7,11 +7,12 @@ zero is as likely as the best value. Then only an upper bound is reported.
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -319,8 +320,7 @@ def fit(
     stage = _Stage(progress)
     objective = replace(objective, evaluated=stage.evaluated)
 
-    with ThreadPoolExecutor(threads) as pool:
-        optima = stage.each("searches", pool.map(lambda point: search(objective, point, known), points), len(points))
+    optima = stage.each("searches", lambda point: search(objective, point, known), points, threads)
     best = min(optima, key=lambda optimum: optimum.local.value)
     if not best.converged:
         raise InputError(
@@ -333,8 +333,7 @@ def fit(
             return _profiled(objective, best, j, known, float(errors.standard[j]), float(errors.swollen[j]) ** 2)
         return _wald(best, j, float(errors.standard[j]))
 
-    with ThreadPoolExecutor(threads) as pool:
-        ranges = stage.each("intervals", pool.map(interval, range(len(points[0]))), len(points[0]))
+    ranges = stage.each("intervals", interval, range(len(points[0])), threads)
     stage.what = "parameters not identified"
     point = _with_means(objective, best.point, ranges, known)
     misfit = errors.misfit and not objective.composite
@@ -391,13 +390,17 @@ class _Stage:
         if self.progress is not None:
             self.progress(f"{self.what}, {self.evaluations} evaluations")
 
-    def each(self, what: str, results: Iterable[T], number: int) -> list[T]:
-        found: list[T] = []
-        self.what = f"{what}: 0 of {number}"
-        for result in results:
-            found.append(result)
-            self.what = f"{what}: {len(found)} of {number}"
-        return found
+    def each(self, what: str, work: Callable[[Any], T], jobs: Sequence[Any] | Array, threads: int) -> list[T]:
+        done = itertools.count(1)
+        self.what = f"{what}: 0 of {len(jobs)}"
+
+        def counted(job: Any) -> T:
+            found = work(job)
+            self.what = f"{what}: {next(done)} of {len(jobs)}"
+            return found
+
+        with ThreadPoolExecutor(threads) as pool:
+            return list(pool.map(counted, jobs))
 
 
 class _Errors(NamedTuple):
