@@ -15,6 +15,7 @@ from strapdown.estimation import angular_acceleration, error_states, forward
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.states import ProcessNoise
 from strapdown.gyro import GyroSpec
+from strapdown.kernels import error_state_step, sensor_rows
 from strapdown.randomness import generator
 from strapdown.records import ImuRecord, Truth
 from strapdown.scenarios import Scenario
@@ -408,6 +409,19 @@ def test_rate_and_angular_acceleration_are_those_of_the_motion(body, white):
     found, variance = angular_acceleration.turning(record, time)
     assert np.max(np.abs(found[:, :3] - body.body_rate(time))) < 6.0 * white / np.sqrt(0.005) + 1e-4
     assert 0.85 < np.mean((found[:, 3:] - body.body_angular_acceleration(time)) ** 2 / variance) < 1.08
+
+
+def test_the_noise_of_an_angular_acceleration_turns_with_the_arm():
+    """``n × r`` of noise n with a variance about each axis, over the length that the sensor's vector is divided by."""
+    arm, variance, length = np.array([0.2, -0.1, 0.3]), np.array([1.0, 3.0, 7.0]), 2.0
+    sensors = np.zeros((1, 3, 15))
+    sensors[0, :, :3] = np.eye(3)
+    x, upper = np.concatenate([np.zeros(3), arm]), np.triu_indices(3)
+    C = np.array([[2.0, 0.3, 0.1], [0.3, 1.0, -0.2], [0.1, -0.2, 3.0]])
+    use = np.full((1, 3), error_state_step.LEVER)
+    found = sensor_rows.arm_noise(x, 0, sensors, use, length, tuple(variance), tuple(C[upper]), 0.0)
+    r = kinematics.skew(arm / length)
+    np.testing.assert_allclose(found, (C + r @ np.diag(variance) @ r.T)[upper], rtol=1e-14)
 
 
 @pytest.mark.parametrize("kind", ["vector", "direction"])
