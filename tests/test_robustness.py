@@ -484,11 +484,12 @@ def test_a_prior_is_seen_from_elsewhere_as_its_turn_and_tilt_say():
 
         h = 1e-5
         G = np.stack([(error(h * e) - error(-h * e)) / (2.0 * h) for e in np.eye(3)], axis=1)
-        M, back = tangent_at(tuple(now), tuple(A[np.triu_indices(3)]))
-        M = np.reshape(M, (3, 3))
-        assert np.allclose(M @ B, G @ B, atol=1e-3)
-        assert np.allclose(M @ A @ M.T, G @ A @ G.T, atol=1e-3)
-        assert np.allclose(back, G @ (-turn * n - tilt), atol=1e-3)
+        for same in (now, -now):
+            M, back = tangent_at(tuple(same), tuple(A[np.triu_indices(3)]))
+            M = np.reshape(M, (3, 3))
+            assert np.allclose(M @ B, G @ B, atol=1e-3)
+            assert np.allclose(M @ A @ M.T, G @ A @ G.T, atol=1e-3)
+            assert np.allclose(back, G @ (-turn * n - tilt), atol=1e-3)
         # To the first order in the tilt nothing is left out: the unknown axis is where no row of a direction sees it.
         assert np.allclose(G @ n, quaternion.rotate(quaternion.exp(-tilt), n), atol=1e-9)
         known = 3.0 * np.outer(n, n) + 1e-9 * np.eye(3)
