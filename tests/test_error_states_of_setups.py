@@ -553,6 +553,10 @@ def test_what_a_specification_gives_is_matched_entry_by_entry():
     assert found.states.gyro_drift_time == (50.0,)
     assert found.states.gyro_drift_sigma[0] == pytest.approx(1e-6 * 5.0)
     assert found.process_noise.rate_random_walk == 0.0
+    field, iron = np.array([2e-5, 0.0, -4e-5]), np.array([1e-6, 2e-6, 3e-6])
+    compass = vectors.Magnetometer(name="compass", field_f=field, sigma=1e-7, rate=1.0, kind="heading", hard_iron=iron)
+    found = setup.FilterSetup.for_scenario(dataclasses.replace(scenario, sensors=(compass,)), states=True)
+    assert found.states.sensors["compass"].bias_sigma == pytest.approx(tuple(iron / np.linalg.norm(field)))
     falling = setup.FilterSetup.for_scenario(scenarios.load_scenario("tumbling-satellite"), states=True)
     assert "gyro.force" not in falling.states.names
 
