@@ -931,6 +931,7 @@ def test_a_correction_of_any_size_carries_attitude_and_covariance(angle, option)
     found = estimation.run(record, NOISE, initial, OPTIONS[option], full_covariance=True)
     correction = wide**2 / (wide**2 + sigma**2) * turn
     assert quaternion.angle_between(found.attitude[0], quaternion.exp(correction)) < 1e-7
+    assert abs(np.linalg.norm(found.attitude[0]) - 1.0) < (1e-14 if angle > 1.0 else 1e-12)  # the series at their end
     J = kinematics.right_jacobian(correction)
     P = J @ J.T / (wide**-2.0 + sigma**-2.0)
     np.testing.assert_allclose(found.covariance[0, :3, :3], P, rtol=0, atol=1e-12)

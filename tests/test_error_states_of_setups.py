@@ -18,6 +18,7 @@ from strapdown.estimation.setup import states as optional
 from strapdown.estimation.setup.states import SensorStates, States
 from strapdown.estimation.states import ProcessNoise
 from strapdown.gyro import GyroSpec
+from strapdown.kernels import error_state_step, sensor_rows
 from strapdown.randomness import generator
 from strapdown.records import ImuRecord, Truth
 from strapdown.scenarios import Scenario
@@ -410,6 +411,19 @@ def test_rate_and_angular_acceleration_are_those_of_the_motion(body, white):
     assert 0.85 < np.mean((found[:, 3:] - body.body_angular_acceleration(time)) ** 2 / variance) < 1.08
 
 
+def test_the_noise_of_an_angular_acceleration_turns_with_the_arm():
+    """``n × r`` of noise n with a variance about each axis, over the length that the sensor's vector is divided by."""
+    arm, variance, length = np.array([0.2, -0.1, 0.3]), np.array([1.0, 3.0, 7.0]), 2.0
+    sensors = np.zeros((1, 3, 15))
+    sensors[0, :, :3] = np.eye(3)
+    x, upper = np.concatenate([np.zeros(3), arm]), np.triu_indices(3)
+    C = np.array([[2.0, 0.3, 0.1], [0.3, 1.0, -0.2], [0.1, -0.2, 3.0]])
+    use = np.full((1, 3), error_state_step.LEVER)
+    found = sensor_rows.arm_noise(x, 0, sensors, use, length, tuple(variance), tuple(C[upper]), 0.0)
+    r = kinematics.skew(arm / length)
+    np.testing.assert_allclose(found, (C + r @ np.diag(variance) @ r.T)[upper], rtol=1e-14)
+
+
 @pytest.mark.parametrize("kind", ["vector", "direction"])
 def test_a_lever_arm_is_found(kind):
     arm = np.array([0.2, -0.1, 0.3])
@@ -514,6 +528,20 @@ def test_drifts_a_decade_apart_are_flicker():
     assert np.mean(held * w) == pytest.approx(1.0, abs=0.03)
 
 
+def test_the_drifts_that_measurements_follow_are_states_and_the_rest_is_white():
+    """Down to 0.3 of the filter's own time, here by flicker alone, ``r ω³ = B²/2``; a drift that is quicker has the PSD 2σ²τ."""
+    instability, follows = 1e-4, 12.0
+    spec = GyroSpec(angle_random_walk=1e-12, bias_instability=instability)
+    record = ImuRecord(time=5e-4 * np.arange(20001), increments=np.zeros((20000, 3)))
+    found = matching.matched(spec, record, (), np.zeros(3), 0.5 * instability**2 / follows**3)
+    assert found.states.gyro_drift_time == pytest.approx(
+        (10.0, 1.0, 0.1)
+    )  # the next would be 0.01 s, and 0.3/12 is 0.025
+    each = instability * np.sqrt(np.log(10.0) / np.pi)
+    assert found.states.gyro_drift_sigma == pytest.approx((each,) * 3)
+    assert found.white == pytest.approx(sum(2.0 * each**2 * 10.0**-k for k in range(2, 40)))
+
+
 def test_what_a_specification_gives_is_matched_entry_by_entry():
     scenario = scenarios.load_scenario("spin")
     chosen = setup.FilterSetup.for_scenario(scenario, states=True)
@@ -525,6 +553,10 @@ def test_what_a_specification_gives_is_matched_entry_by_entry():
     assert found.states.gyro_drift_time == (50.0,)
     assert found.states.gyro_drift_sigma[0] == pytest.approx(1e-6 * 5.0)
     assert found.process_noise.rate_random_walk == 0.0
+    field, iron = np.array([2e-5, 0.0, -4e-5]), np.array([1e-6, 2e-6, 3e-6])
+    compass = vectors.Magnetometer(name="compass", field_f=field, sigma=1e-7, rate=1.0, kind="heading", hard_iron=iron)
+    found = setup.FilterSetup.for_scenario(dataclasses.replace(scenario, sensors=(compass,)), states=True)
+    assert found.states.sensors["compass"].bias_sigma == pytest.approx(tuple(iron / np.linalg.norm(field)))
     falling = setup.FilterSetup.for_scenario(scenarios.load_scenario("tumbling-satellite"), states=True)
     assert "gyro.force" not in falling.states.names
 

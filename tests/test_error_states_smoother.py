@@ -300,7 +300,7 @@ def test_a_correction_by_a_radian_is_carried_back_with_all_that_turns():
     still = ProcessNoise(angle_random_walk=1e-9, rate_random_walk=1e-12)
     initial = estimation.initial_state(quaternion.IDENTITY, attitude_sigma=[0.1, 0.2, 2.0], bias_sigma=1e-9)
     true = quaternion.exp([0.1, -0.05, 1.0])
-    felt = quaternion.rotate(quaternion.conjugate(true), UP + np.array([0.6, -0.3, 0.2]))
+    felt = quaternion.rotate(quaternion.conjugate(true), np.array([0.6, -0.3, 10.01]))
     found = []
     for run, at in ((estimation.smooth, 1.0), (estimation.run, 0.0)):
         acc = VectorMeasurements(sensor="acc", kind="vector", time=[at], vector_b=[felt], reference_f=UP, sigma=0.05)

@@ -103,19 +103,21 @@ def test_transition_and_noise_are_those_of_van_loan(poles, dt):
 
 @dataclasses.dataclass(frozen=True)
 class Ramp(error_states.ErrorStates):
-    """A block that the package does not have: a slope that never changes feeds an offset that walks besides; a bias; a chain with feeds."""
+    """A block that the package does not have: a slope that never changes feeds an offset that walks besides; a bias; a chain with feeds;
+    two chains that differ by the feed alone.
+    """
 
     name: str = "ramp"
-    components: tuple[str, ...] = ("offset", "slope", "bias", "far", "middle", "near")
-    units: tuple[str, ...] = ("m/s²", "m/s³", "m/s²", "1", "1", "1")
-    sigma = np.array([0.3, 0.02, 0.1, 0.3, 0.2, 0.5])
-    decay = np.array([0.0, 0.0, 0.0, 2.0, 0.0, 5.0])
-    density = np.array([1e-4, 0.0, 0.0, 2e-3, 5e-3, 0.1])
-    feed = np.array([1.0, 0.0, 0.0, -1.5, 0.7, 0.0])
+    components: tuple[str, ...] = ("offset", "slope", "bias", "far", "middle", "near", "one", "its", "other", "its own")
+    units: tuple[str, ...] = ("m/s²", "m/s³", "m/s²", *("1",) * 7)
+    sigma = np.array([0.3, 0.02, 0.1, 0.3, 0.2, 0.5, 0.1, 0.1, 0.1, 0.1])
+    decay = np.array([0.0, 0.0, 0.0, 2.0, 0.0, 5.0, 1.0, 3.0, 1.0, 3.0])
+    density = np.array([1e-4, 0.0, 0.0, 2e-3, 5e-3, 0.1, 0.0, 0.1, 0.0, 0.1])
+    feed = np.array([1.0, 0.0, 0.0, -1.5, 0.7, 0.0, 2.0, 0.0, -0.5, 0.0])
 
     @property
     def effects(self):
-        rows = np.zeros((6, 3))
+        rows = np.zeros((10, 3))
         rows[[0, 2, 3, 4], [0, 1, 2, 0]] = 1.0, 1.0, 0.4, -0.3
         return {"acc": error_states.Effect(offset_b=rows)}
 

@@ -233,18 +233,6 @@ def test_the_heading_of_an_inclined_vector_shifts_with_tilt():
         assert heading_error(R, tuple(seen), tuple(reference)) == pytest.approx(np.dot(h, axis), abs=1e-11)
 
 
-def test_a_correction_of_more_than_a_radian_keeps_the_norm():
-    measured = quaternion.exp([3.0, 0.3, -0.2])
-    series = VectorMeasurements(
-        sensor="t", kind="attitude", time=[0.0], attitude=[measured], sigma_axes=np.full(3, 1e-3)
-    )
-    record = ImuRecord(time=[0.0, 1.0], increments=np.zeros((1, 3)), vectors=(series,))
-    initial = initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=3.0, bias_sigma=1.0)
-    estimate, end = estimation.run_part(record, NOISE, initial)
-    assert abs(np.linalg.norm(estimate.attitude[0]) - 1.0) < 1e-14
-    assert np.linalg.norm(end.attitude) == pytest.approx(1.0, abs=1e-14)
-
-
 def test_one_interval_or_many_at_constant_rate_are_the_same():
     """The model is exact at constant rate: a turn of 3 rad in one interval (sub-steps) equals a thousand small ones."""
     turn = np.array([1.0, -2.0, 2.0])
@@ -320,6 +308,49 @@ def test_a_start_from_vertical_and_heading_knows_what_the_tilt_does_to_the_headi
     blind = ImuRecord(time=[0.0, 1.0], increments=np.zeros((1, 3)), vectors=(up, level))
     with pytest.raises(InputError, match="do not give the attitude"):
         estimation.first_state(blind, ProcessNoise(angle_random_walk=1e-6, rate_random_walk=0.0), bias_sigma=1e-3)
+
+
+def test_a_start_from_a_measured_attitude_goes_back_to_the_first_edge():
+    """Its noise, in body axes of its own time, turns back with it, and grows by the gyro's and by the bias's over the time between."""
+    turn, bias, axes = np.array([0.8, -0.5, 1.1]), np.array([0.01, -0.02, 0.03]), np.array([1e-3, 2e-3, 5e-3])
+    q = quaternion.exp([0.3, 0.2, -0.4])
+    seen = VectorMeasurements(
+        sensor="t",
+        kind="attitude",
+        time=[2.0],
+        attitude=[quaternion.multiply(q, quaternion.exp(turn))],
+        sigma_axes=axes,
+    )
+    increments = np.outer([1.0, 2.0], 0.5 * turn + bias)
+    record = ImuRecord(time=[0.0, 1.0, 3.0], increments=increments, vectors=(seen,))
+    noise = ProcessNoise(angle_random_walk=1e-3, rate_random_walk=0.0)
+    state = estimation.first_state(record, noise, bias_sigma=2e-3, bias=bias)
+    R = quaternion.to_matrix(quaternion.exp(turn))
+    expected = R @ np.diag(axes**2) @ R.T + (1e-6 * 2.0 + (2e-3 * 2.0) ** 2) * np.eye(3)
+    assert quaternion.angle_between(state.attitude, q) < 1e-12
+    np.testing.assert_allclose(state.covariance[:3, :3] / ONCE**2, expected, rtol=1e-10, atol=1e-18)
+
+
+def test_a_start_from_whole_vectors_is_that_from_their_directions():
+    q, references = quaternion.exp([0.3, 0.2, -0.4]), np.array([[1.0, 0.0, 0.0], [0.0, 0.6, -0.8]])
+    noise = ProcessNoise(angle_random_walk=1e-3, rate_random_walk=0.0)
+    found = []
+    for kind, length in (("direction", 1.0), ("vector", 20.0)):
+        series = tuple(
+            VectorMeasurements(
+                sensor=f"{k}",
+                kind=kind,
+                time=[0.0],
+                vector_b=[length * quaternion.rotate(quaternion.conjugate(q), r)],
+                reference_f=length * r,
+                sigma=(k + 1) * 1e-3 * length,
+            )
+            for k, r in enumerate(references)
+        )
+        record = ImuRecord(time=[0.0, 1.0], increments=np.zeros((1, 3)), vectors=series)
+        found.append(estimation.first_state(record, noise, bias_sigma=1e-3))
+    assert quaternion.angle_between(*(state.attitude for state in found)) < 1e-12
+    np.testing.assert_allclose(found[0].covariance, found[1].covariance, rtol=1e-9, atol=1e-18)
 
 
 def test_missing_and_outside_measurements_are_counted():

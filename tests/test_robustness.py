@@ -375,6 +375,7 @@ def test_the_rules_of_a_gate():
         followed,
         followed,
     ]  # of which the other sensor is none refused
+    assert judged([refused, (1, ACCEPTED, ACCEPTED)])[0][gate_rules.HITS] == 1.0  # what the filter accepts too is none
     memory, counters, lock_outs, found = judged([refused, both, both])
     assert found == [followed, followed, dropped]  # two misses are more than 1 + half of one hit
     assert (memory[gate_rules.LEVEL], memory[gate_rules.CANDIDATE]) == (1.0, 0.0)
@@ -383,7 +384,7 @@ def test_the_rules_of_a_gate():
     assert judged([refused] * 3 + [(0, ACCEPTED, ACCEPTED)] * 2)[1][0, gate_rules.EXCESS] == 1.0
     memory, counters, _, _ = judged([(0, REFUSED, PASSED_OVER)] * 4)
     assert not gate_rules.takes_over(0, 3, counters, memory)
-    memory, counters, lock_outs, found = judged([(1, ACCEPTED, None)] * 14 + [refused, both, both, refused])
+    memory, counters, lock_outs, found = judged([(1, ACCEPTED, None)] * 15 + [refused, both, both, refused])
     assert memory[gate_rules.LEVEL] == 1.0
     for accepted, level in ((14, 1.0), (15, 0.0)):  # 5 × 3 accepted since
         memory, _, _, _ = judged([refused, both, both] + [(1, ACCEPTED, ACCEPTED)] * accepted + [refused])
@@ -400,6 +401,14 @@ def test_the_rules_of_a_gate():
     assert lock_outs[0, 3] == 0.0
     assert not counters[:, : gate_rules.REPORTED].any()
     assert memory[gate_rules.PASSES] == gate_rules.WIDE_PASSES
+    memory, counters, lock_outs, _ = judged([(1, REFUSED, ACCEPTED)] + [refused] * 9)
+    assert counters[0, gate_rules.EXCESS] == 8.0  # twice the limit, and no more
+    gate_rules.recover(9.0, 0, 4, counters, memory, row, lock_outs)
+    assert list(row) == [9.0, 0.0, 0.0, 9.0]  # from the first refusal of the other sensor, which started the candidate
+    assert lock_outs[0, 3] == 9.0  # longer than a recovery stands for
+    memory[gate_rules.LEVEL] = gate_rules.WIDEST
+    gate_rules.step_aside(memory)
+    assert memory[gate_rules.LEVEL] == 0.0
     memory, counters, _, _ = judged([refused])
     for nis, expected in ((2.0, followed), (40.0, narrow)):
         assert gate_rules.judge_candidate(ACCEPTED, nis, 2, 0, counters, memory, np.zeros(3)) == expected
@@ -475,11 +484,12 @@ def test_a_prior_is_seen_from_elsewhere_as_its_turn_and_tilt_say():
 
         h = 1e-5
         G = np.stack([(error(h * e) - error(-h * e)) / (2.0 * h) for e in np.eye(3)], axis=1)
-        M, back = tangent_at(tuple(now), tuple(A[np.triu_indices(3)]))
-        M = np.reshape(M, (3, 3))
-        assert np.allclose(M @ B, G @ B, atol=1e-3)
-        assert np.allclose(M @ A @ M.T, G @ A @ G.T, atol=1e-3)
-        assert np.allclose(back, G @ (-turn * n - tilt), atol=1e-3)
+        for same in (now, -now):
+            M, back = tangent_at(tuple(same), tuple(A[np.triu_indices(3)]))
+            M = np.reshape(M, (3, 3))
+            assert np.allclose(M @ B, G @ B, atol=1e-3)
+            assert np.allclose(M @ A @ M.T, G @ A @ G.T, atol=1e-3)
+            assert np.allclose(back, G @ (-turn * n - tilt), atol=1e-3)
         # To the first order in the tilt nothing is left out: the unknown axis is where no row of a direction sees it.
         assert np.allclose(G @ n, quaternion.rotate(quaternion.exp(-tilt), n), atol=1e-9)
         known = 3.0 * np.outer(n, n) + 1e-9 * np.eye(3)

@@ -14,6 +14,8 @@ from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.setup import FilterSetup
 from strapdown.gyro import GyroSpec
 from strapdown.randomness import generator
+from strapdown.records import ImuRecord
+from strapdown.vectors import VectorMeasurements
 
 SETUP = FilterSetup(
     process_noise=estimation.ProcessNoise(angle_random_walk=1.234567e-5, rate_random_walk=3.3e-8),
@@ -152,6 +154,19 @@ def test_measurement_density_counts_what_each_kind_measures():
     expected = (record.time[-1] - record.time[0]) * sigma**2 / (number * 2.0 / 3.0)
     assert setup.measurement_density(record) == pytest.approx(expected)
     assert setup.measurement_density(dataclasses.replace(record, vectors=())) == np.inf
+    x, common = np.array([1.0, 0.0, 0.0]), {"time": np.arange(1.0, 5.0)}
+    compass = VectorMeasurements(
+        sensor="a", kind="heading", vector_b=np.tile(x, (4, 1)), reference_f=x, sigma=0.1, **common
+    )
+    field = VectorMeasurements(
+        sensor="b", kind="vector", vector_b=np.tile(2.0 * x, (4, 1)), reference_f=2.0 * x, sigma=0.2, **common
+    )
+    tracker = VectorMeasurements(
+        sensor="c", kind="attitude", attitude=np.tile(quaternion.IDENTITY, (4, 1)), sigma_axes=[0.1, 0.2, 0.4], **common
+    )
+    for series, information in ((compass, 100.0), (field, 200.0), (tracker, 100.0 + 25.0 + 6.25)):
+        one = ImuRecord(time=np.array([0.0, 8.0]), increments=np.zeros((1, 3)), vectors=(series,))
+        assert setup.measurement_density(one) == pytest.approx(8.0 / (4.0 * information / 3.0))
 
 
 def test_modelled_record_replaces_sigmas_by_name_and_keeps_ratios():

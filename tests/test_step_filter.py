@@ -186,6 +186,25 @@ def test_noise_is_given_by_sigma_or_by_covariance():
         f.update_direction(X, X, np.eye(3), "a")
 
 
+@pytest.mark.parametrize("unit", [1.0, 2e-5])
+def test_a_whole_vector_updates_in_its_own_unit_as_the_record_s(unit):
+    """filterpy's y and S are in the unit of the reference, and what they lead to does not depend on it."""
+    reference, value = unit * np.array([0.0, 0.6, -0.8]), unit * np.array([0.05, 0.58, -0.83])
+    f = StepFilter(NOISE, start())
+    assert f.update_vector(value, reference, 0.01 * unit, "mag")
+    series = VectorMeasurements(
+        sensor="mag", kind="vector", time=[0.0], vector_b=[value], reference_f=reference, sigma=0.01 * unit
+    )
+    record = ImuRecord(time=[0.0, 1.0], increments=np.zeros((1, 3)), vectors=(series,))
+    found = estimation.run(record, NOISE, start(), full_covariance=True)
+    assert quaternion.angle_between(f.attitude, found.attitude[0]) < 1e-12
+    np.testing.assert_allclose(f.bias, found.bias[0], rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(f.P, found.covariance[0], rtol=1e-9, atol=1e-15)
+    assert np.linalg.norm(f.y) == pytest.approx(np.linalg.norm(value - reference), rel=1e-9)
+    for nis in (f.nis, f.y @ np.linalg.solve(f.S, f.y)):
+        assert nis == pytest.approx(found.innovations["mag"].nis[0], rel=1e-9)
+
+
 def test_with_error_states_a_sensor_keeps_its_kind():
     f = StepFilter(NOISE, begun(record_of(1.2), "plain"), (IRON,))
     assert f.update_direction(X, X, 0.1, "a")
