@@ -20,6 +20,10 @@ DIALECT = {
     r"\b_?(LEAST|MOST)_[A-Z]": "MIN_, MAX_",
     r"\b(has|have) seen\b": "the measurements so far",
     r"as good as (it|they) says?\b|too sure\b|too modest\b|says? of (itself|themselves)\b": "consistent, optimistic, pessimistic",
+    r"\btaken for\b": "treated as, modelled as",
+    r"\b(how )?so many\b": "the number of, at most",
+    r"\bby itself\b": "separately",
+    r"\bwhat [^.\n]{1,60} makes? of\b": "effect, contribution, result",
     r"\b[Ss]ource document\b": "Quaternion differentiation",
 }
 
@@ -46,6 +50,8 @@ def test_prose_and_names_are_the_fields():
         "what it believes",
         "is taken in",
         "by so much",
+        "it is taken for one draw",
+        "what a correction makes of the states",
         "LEAST_SIGMA = 1",
         "too sure of itself",
     ],
