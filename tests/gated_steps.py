@@ -29,7 +29,7 @@ from strapdown.estimation.model import turning_matrix
 from strapdown.estimation.schedule import KIND_CODES
 from strapdown.estimation.states import GateMemory, State, check_arguments, restart_bias_variance
 from strapdown.estimation.step_filter import NO_LEVER, StepFilter
-from strapdown.kernels import error_state_step, gate_rules, iterated_update, sensor_rows
+from strapdown.kernels import gate_rules, iterated_update, sensor_rows
 from strapdown.kernels.algebra import cross, dot
 from strapdown.kernels.gate_rules import WIDE_PASSES
 from strapdown.kernels.iterated_update import (
@@ -44,6 +44,7 @@ from strapdown.kernels.iterated_update import (
     UNKNOWN,
     UNKNOWN_TILT,
 )
+from strapdown.kernels.walk import step_within, turn_squared
 from strapdown.records import Event
 from strapdown.vectors import KINDS
 
@@ -396,8 +397,8 @@ class GatedStepFilter(StepFilter):
         running = [self] if candidate is None else [self, candidate]
         left, limit = step, self._motion.limit
         while left > 0.0:
-            turns = [(increment - left * one.bias).tolist() for one in running]
-            longest = float(min(error_state_step.longest_step(left, tuple(turn), limit) for turn in turns))
+            squared = max(turn_squared(increment, left, one.bias) for one in running)
+            longest = float(min(step_within(squared, left), limit))
             part = increment * (longest / left)
             for one in running:
                 one._sub_step(part, longest)
