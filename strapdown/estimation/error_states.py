@@ -14,6 +14,7 @@ import numpy as np
 
 from strapdown.checks import Array, InputError, array, non_negative, one_of, positive
 from strapdown.kernels import chains
+from strapdown.kernels.algebra import full
 from strapdown.results import ByValue
 from strapdown.units import STANDARD_GRAVITY
 from strapdown.vectors import GRAVITY_F
@@ -186,10 +187,10 @@ class ErrorStates(ByValue):
         for k in range(self.size):
             first = chains.chain_start(link, k)
             own = slice(first, k + 1)
-            far, near, itself, n20, n21, n22, n10, n11, n00 = chains.chain_step(decay, link, k, first, h)
-            phi[own, k] = (far, near, itself)[first - k - 1 :]
-            N = np.array([[n00, 0.0, 0.0], [n10, n11, 0.0], [n20, n21, n22]])[:, first - k - 1 :]
-            Q[own, own] += density[k] * N.T @ N
+            column, driven = chains.chain_step(decay, link, k, first, h)
+            there = slice(first - k - 1, None)  # of the last three states those that the chain has
+            phi[own, k] = column[there]
+            Q[own, own] += density[k] * np.reshape(full(driven), (3, 3))[there, there]
         for _ in range(doublings):
             phi, Q = phi @ phi, phi @ Q @ phi.T + Q
         return phi, Q

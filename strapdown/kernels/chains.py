@@ -37,11 +37,10 @@ def chain_start(chains, k):
 
 
 def chain_step(decay, chains, k, first, dt):
-    """Return the effect over dt of state k of a chain on states k − 2, k − 1 and k, and a root of their process noise for unit PSD.
+    """Return the effect over dt of state k of a chain on states k − 2, k − 1 and k, and their process noise covariance for unit PSD.
 
     The first is column k of Φ, (φ_{k−2}, φ_{k−1}, φ_k), by the series of the matrix exponential, also valid for equal or zero poles. The
-    second is N with ``Q = Nᵀ N`` as (n20, n21, n22, n10, n11, n00), rows from that of state k upwards, zero if absent: the same series at
-    the nodes of Gauss's rule, accurate to 3e-14 for λ dt ≤ 1/2.
+    second is Q of the three (6-tuple), zero if absent: the same series at the nodes of Gauss's rule, accurate to 3e-14 for λ dt ≤ 1/2.
     """
     own = -decay[k] * dt
     middle, to_middle, far, to_far = 0.0, 0.0, 0.0, 0.0
@@ -63,17 +62,18 @@ def chain_step(decay, chains, k, first, dt):
         powers = powers * nodes
         A, B, C = A + a * powers, B + b * powers, C + c * powers
     a, b, c = weights * A, weights * B, weights * C
-    q22, q12, q11 = total(c * C), total(c * B), total(b * B)
-    q02, q01, q00 = total(c * A), total(b * A), total(a * A)
-    n22 = math.sqrt(q22)
-    n21, n20 = q12 / n22, q02 / n22
-    n11 = n10 = n00 = 0.0
-    if k - 1 >= first:
-        n11 = math.sqrt(q11 - n21 * n21)
-        n10 = (q01 - n20 * n21) / n11
-    if k - 2 >= first:
-        n00 = math.sqrt(q00 - n20 * n20 - n10 * n10)
-    return af, bf, cf, n20, n21, n22, n10, n11, n00
+    return (af, bf, cf), (total(a * A), total(b * A), total(c * A), total(b * B), total(c * B), total(c * C))
+
+
+def chain_root(Q):
+    """Return N with ``Q = Nᵀ N`` as (n20, n21, n22, n10, n11, n00), by rows from that of the last state up."""
+    n22 = math.sqrt(Q[5])
+    n21 = Q[4] / n22 if n22 > 0.0 else 0.0
+    n20 = Q[2] / n22 if n22 > 0.0 else 0.0
+    n11 = math.sqrt(max(Q[3] - n21 * n21, 0.0))
+    n10 = (Q[1] - n20 * n21) / n11 if n11 > 0.0 else 0.0
+    n00 = math.sqrt(max(Q[0] - n20 * n20 - n10 * n10, 0.0))
+    return n20, n21, n22, n10, n11, n00
 
 
 def alike(decay, chains, k, number):
@@ -102,12 +102,11 @@ def link_chains(decay, chains, dt, links):
                 for i in range(2, 8):
                     links[k, i] = links[k - number, i]
             else:
-                far, near, own, n20, n21, n22, n10, n11, n00 = chain_step(decay, chains, k, first, dt)
+                (far, near, own), Q = chain_step(decay, chains, k, first, dt)
                 links[k - 1, 0] = near / own
                 if number > 2:
                     links[k - 2, 1] = far / own
-                links[k, 2], links[k, 3], links[k, 4] = n20, n21, n22
-                links[k, 5], links[k, 6], links[k, 7] = n10, n11, n00
+                links[k, 2], links[k, 3], links[k, 4], links[k, 5], links[k, 6], links[k, 7] = chain_root(Q)
 
 
 def feed_states(values, first, links):

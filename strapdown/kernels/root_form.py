@@ -16,17 +16,20 @@ import numpy as np
 
 from strapdown.kernels.algebra import (
     add,
+    add_matrices,
     combine,
+    combine_matrices,
     congruent,
     cross,
     dot,
     matrix_times_vector,
     multiply,
     plus_square,
+    scale_matrix,
     transpose,
     transpose_times_vector,
 )
-from strapdown.kernels.chains import chain_start, chain_step, step_chains
+from strapdown.kernels.chains import chain_root, chain_start, chain_step, step_chains
 from strapdown.kernels.error_state_step import (
     OFFSET,
     carry,
@@ -681,29 +684,17 @@ def aged_chain(decay, chains, first, k, age):
     while fastest * h > SHORT:
         h *= 0.5
         doublings += 1
-    _, _, own0, n20, n21, n22, n10, n11, n00 = chain_step(decay, chains, first, first, h)
+    (_, _, own0), _ = chain_step(decay, chains, first, first, h)
     # The driving noise of the first state, which drives no other, is not part of the chain.
-    _, near1, own1, n20, n21, n22, n10, n11, n00 = chain_step(decay, chains, first + 1, first, h)
-    d = chains[first + 1, 1]
-    q00 = d * (n21 * n21 + n11 * n11)
-    q01 = d * n21 * n22
-    q11 = d * n22 * n22
-    q02 = q12 = q22 = 0.0
+    (_, near1, own1), q = chain_step(decay, chains, first + 1, first, h)
+    Q = scale_matrix(chains[first + 1, 1], (q[3], q[4], 0.0, q[5], 0.0, 0.0))
     far2, near2, own2 = 0.0, 0.0, 1.0
     if k - first > 1:
-        far2, near2, own2, n20, n21, n22, n10, n11, n00 = chain_step(decay, chains, k, first, h)
-        d = chains[k, 1]
-        q00 += d * (n20 * n20 + n10 * n10 + n00 * n00)
-        q01 += d * (n20 * n21 + n10 * n11)
-        q02 = d * n20 * n22
-        q11 += d * (n21 * n21 + n11 * n11)
-        q12 = d * n21 * n22
-        q22 = d * n22 * n22
+        (far2, near2, own2), q = chain_step(decay, chains, k, first, h)
+        Q = combine_matrices(1.0, Q, chains[k, 1], q)
     phi = (own0, near1, far2, 0.0, own1, near2, 0.0, 0.0, own2)
-    Q = (q00, q01, q02, q11, q12, q22)
     for _ in range(doublings):
-        more = congruent(phi, Q)
-        Q = (Q[0] + more[0], Q[1] + more[1], Q[2] + more[2], Q[3] + more[3], Q[4] + more[4], Q[5] + more[5])
+        Q = add_matrices(Q, congruent(phi, Q))
         phi = multiply(phi, phi)
     return phi, Q
 
@@ -728,12 +719,7 @@ def age_chains(x, fresh, decay, chains, age):
                 if last:
                     fresh[r, 5 + first] = phi[8] * c
             # A root of Q by rows from the last state upwards; the driving noise of the first is in its row already.
-            n22 = math.sqrt(Q[5])
-            n21 = Q[4] / n22 if n22 > 0.0 else 0.0
-            n20 = Q[2] / n22 if n22 > 0.0 else 0.0
-            n11 = math.sqrt(max(Q[3] - n21 * n21, 0.0))
-            n10 = (Q[1] - n20 * n21) / n11 if n11 > 0.0 else 0.0
-            n00 = math.sqrt(max(Q[0] - n20 * n20 - n10 * n10, 0.0))
+            n20, n21, n22, n10, n11, n00 = chain_root(Q)
             row = 3 + m + first
             if last:
                 fresh[row + 2, 3 + first], fresh[row + 2, 4 + first], fresh[row + 2, 5 + first] = n20, n21, n22
