@@ -120,6 +120,16 @@ def times_transpose_upper_add(A, B, S):
     )
 
 
+def minus_times_transpose_upper(S, A, B):
+    """Return the upper triangle of S − A Bᵀ, known to be symmetric."""
+    T = full(S)
+    return tuple(
+        ((T[i + j // 3] - A[i] * B[j]) - A[i + 1] * B[j + 1]) - A[i + 2] * B[j + 2]
+        for i in (0, 3, 6)
+        for j in range(i, 9, 3)
+    )
+
+
 def minus_outer(A, a, b):
     """Return A − a bᵀ."""
     return tuple(A[3 * i + j] - a[i] * b[j] for i in range(3) for j in range(3))

@@ -10,7 +10,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from strapdown.kernels.algebra import dot, full, subtract
+from strapdown.kernels.algebra import (
+    divided,
+    dot,
+    factored,
+    matrix_times_vector,
+    minus_times_transpose_upper,
+    solved,
+    subtract,
+    transpose,
+)
 from strapdown.kernels.lane_angles import rotation_vector
 from strapdown.kernels.lane_values import (
     bits_of,
@@ -37,44 +46,21 @@ _INFINITE = float("inf")
 _LARGEST = 1.7976931348623157e308
 
 
-def triangular(S):
-    """Return L (3 numbers below the unit diagonal) and 1/D of S = L D Lᵀ, and whether D is positive."""
-    i0 = 1.0 / S[0]
-    l10 = S[1] * i0
-    l20 = S[2] * i0
-    d1 = S[3] - l10 * S[1]
-    i1 = 1.0 / d1
-    t = S[4] - l20 * S[1]
-    l21 = t * i1
-    d2 = S[5] - l20 * S[2] - l21 * t
-    return (l10, l20, l21), (i0, i1, 1.0 / d2), (S[0] > 0.0) & (d1 > 0.0) & (d2 > 0.0)
-
-
-def solved(L, v):
-    """Return L⁻¹ v."""
-    y1 = v[1] - L[0] * v[0]
-    return (v[0], y1, v[2] - L[1] * v[0] - L[2] * y1)
-
-
-def weighted(w, a, b):
-    """Return Σ w_k a_k b_k."""
-    return w[0] * a[0] * b[0] + w[1] * a[1] * b[1] + w[2] * a[2] * b[2]
+def definite(F):
+    """Return whether a matrix with these factors is positive definite."""
+    return (F[3] > 0.0) & (F[4] > 0.0) & (F[5] > 0.0)
 
 
 def normalized_squares(e_theta, e_bias, A, B, C):
     """Return the NEES of state, attitude and bias, and whether P is positive definite; by blocks, with the Schur complement of A."""
-    L, w, definite = triangular(A)
-    y = solved(L, e_theta)
-    attitude = weighted(w, y, y)
-    columns = [solved(L, B[j::3]) for j in range(3)]
-    C_full = full(C)
-    rest = tuple(C_full[3 * i + j] - weighted(w, columns[i], columns[j]) for i in range(3) for j in range(i, 3))
-    r = subtract(e_bias, tuple(weighted(w, c, y) for c in columns))
-    L2, w2, definite2 = triangular(rest)
-    z = solved(L2, r)
-    L3, w3, definite3 = triangular(C)
-    x = solved(L3, e_bias)
-    return (attitude + weighted(w2, z, z), attitude, weighted(w3, x, x)), definite & definite2 & definite3
+    bt = transpose(B)
+    F, H = factored(A), factored(C)
+    K = divided(bt, F)  # Bᵀ A⁻¹
+    G = factored(minus_times_transpose_upper(C, K, bt))
+    r = subtract(e_bias, matrix_times_vector(K, e_theta))
+    attitude = dot(e_theta, solved(F, e_theta))
+    nees = (attitude + dot(r, solved(G, r)), attitude, dot(e_bias, solved(H, e_bias)))
+    return nees, definite(F) & definite(G) & definite(H)
 
 
 def bin_numbers(x, first, last):

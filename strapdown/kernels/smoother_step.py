@@ -22,6 +22,7 @@ from strapdown.kernels.algebra import (
     divided,
     factored,
     full,
+    minus_times_transpose_upper,
     multiply,
     multiply_add,
     scale,
@@ -37,16 +38,6 @@ def minus_product(S, A, B):
     """Return S − A B of 9-tuples, summed so that every product fuses with a subtraction."""
     return tuple(
         ((S[i + j] - A[i] * B[j]) - A[i + 1] * B[j + 3]) - A[i + 2] * B[j + 6] for i in (0, 3, 6) for j in range(3)
-    )
-
-
-def minus_times_transpose_upper(S, A, B):
-    """Return the upper triangle of S − A Bᵀ, which is symmetric."""
-    T = full(S)
-    return tuple(
-        ((T[i + j // 3] - A[i] * B[j]) - A[i + 1] * B[j + 1]) - A[i + 2] * B[j + 2]
-        for i in (0, 3, 6)
-        for j in range(i, 9, 3)
     )
 
 
