@@ -44,6 +44,14 @@ from strapdown.kernels.lane_values import (
 from strapdown.kernels.rotation import rotation_matrix
 
 RANDOM = np.random.default_rng(5)
+
+
+@pytest.fixture(autouse=True)
+def random_numbers(monkeypatch):
+    """The same random numbers in a test, whatever tests ran before it."""
+    monkeypatch.setattr(sys.modules[__name__], "RANDOM", np.random.default_rng(5))
+
+
 A = RANDOM.standard_normal(WIDTH)
 B = RANDOM.standard_normal(WIDTH)
 

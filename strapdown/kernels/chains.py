@@ -66,7 +66,7 @@ def chain_step(decay, chains, k, first, dt):
 
 
 def chain_root(Q):
-    """Return N with ``Q = Nᵀ N`` as (n20, n21, n22, n10, n11, n00), by rows from that of the last state up."""
+    """Return N with ``Q = Nᵀ N`` as (n20, n21, n22, n10, n11, n00), by rows from that of the last state upwards."""
     n22 = math.sqrt(Q[5])
     n21 = Q[4] / n22 if n22 > 0.0 else 0.0
     n20 = Q[2] / n22 if n22 > 0.0 else 0.0

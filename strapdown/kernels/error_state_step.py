@@ -121,13 +121,12 @@ def turning_matrix(rate, acceleration):
 
 
 def move(q, x, dt, part, model, top, factor):
-    """Move attitude and optional states over an increment ``part``; return q, Φ11, the rate and (I + M)⁻¹.
+    """Propagate attitude and error states over an increment ``part``; return q, Φ11, the rate and (I + M)⁻¹.
 
-    Leaves in ``factor`` the states' own e^{−λ dt}, and in ``top`` (n, 4) what each of all n states makes of the attitude and of the first
-    bias, which Φ leaves as it is: the columns of Φ's first four rows.
-    With M = Σ c T the turn is ``φ = (I + M)⁻¹ (Δθ − b dt − Σ e ∫c dt)``, and its error ``−(I + M)⁻¹ (δb + Σ e δc + Σ T ω δc)`` a second.
-    The specific force is taken at the middle of the step; how it changes with the attitude *error* is neglected, as it is small beside
-    the bias that it makes.
+    Writes e^{−λ dt} of the error states to ``factor``, and the columns of Φ's first four rows, those of attitude and first bias, to ``top``
+    (n, 4). With M = Σ c T the rotation is ``φ = (I + M)⁻¹ (Δθ − b dt − Σ e ∫c dt)``, and the rate of its error
+    ``−(I + M)⁻¹ (δb + Σ e δc + Σ T ω δc)``. The specific force is that at the middle of the step; its dependence on the attitude *error* is
+    neglected, as its effect is small compared with that of the bias.
     """
     decay, gyro, gyro_use, force_f = model.decay, model.gyro, model.gyro_use, model.force_f
     r = combine(1.0, part, -dt, (x[0], x[1], x[2]))

@@ -180,14 +180,14 @@ def _length(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
 
 
 INTRINSICS: dict[str, Any] = {}
-"""What stands for each function of :mod:`strapdown.kernels.lane_values` in compiled code."""
+"""Intrinsic of each function of :mod:`strapdown.kernels.lane_values`, by name."""
 
 
 def _instead_of(function: Callable[..., Any], typed: Callable[..., Any]) -> Callable[..., Any]:
-    """Let the instructions that a function writes stand for one of :mod:`strapdown.kernels.lane_values`.
+    """Register the decorated function as the intrinsic for a function of :mod:`strapdown.kernels.lane_values`.
 
-    ``typed`` returns numba's signature for the types of the arguments. What writes the instructions is given numba's target, LLVM's
-    builder, that signature and the values, and returns the result if there is one.
+    ``typed`` returns numba's signature for the types of the arguments. The decorated function is called with numba's target, LLVM's
+    builder, that signature and the values; it emits the instructions and returns the result, if any.
     """
 
     def define(write: Callable[..., Any]) -> Callable[..., Any]:
@@ -472,8 +472,8 @@ def _choice(condition: Any, a: Any, b: Any) -> Any:
 def _chosen(target: Any, builder: Any, sig: Any, condition: Any, *values: Any) -> Any:
     result = sig.return_type
     if isinstance(result, Lanes) and isinstance(result.dtype, types.Float):
-        # Else LLVM takes an operation that both values end in after the choice, and a product that was to fuse with it is rounded by
-        # itself: a run's bits would depend on its neighbours.
+        # Without this LLVM may move a final operation common to both values behind the selection, where it no longer fuses with a product:
+        # the bits of a run would depend on its neighbours.
         values = tuple(_fenced(builder, value) for value in values)
     return builder.select(condition, *values)
 

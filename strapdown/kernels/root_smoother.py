@@ -111,9 +111,9 @@ def load_segment(segments, k, x, F, loose):
 
 
 def prepare_step(segments, j, model, space):
-    """Prepare what segment j makes of any later estimate; return the predicted attitude, Φ11 and the rows of F in use.
+    """Prepare the step back over segment j; return the predicted attitude, Φ11 and the number of rows of F in use.
 
-    Leaves ``noise``, ``gain``, ``left`` and ``x`` of the work space, and Φ's own numbers there.
+    Writes ``noise``, ``gain``, ``left``, ``x`` and Φ to the work space.
     """
     x, F, noise, gain, left = space.x, space.F, space.noise, space.gain, space.left
     top, driven, factor, work = space.step[0], space.step[1], space.factor, space.work
