@@ -218,7 +218,7 @@ def test_a_filter_of_a_python_file_is_run_from_the_command_line(own, folder, cap
         pytest.importorskip("distributed")
     code = command("scene.toml", "--filter", "mine.py", "--runs", 12, "--chunk", 5, "--seed", 3, *workers)
     assert code == 2  # 12 runs cannot tell
-    assert "Executing mine.py: it can do whatever you can." in capsys.readouterr().out
+    assert "Executing mine.py with your permissions." in capsys.readouterr().out
     plan = replace(PLAN, epochs=100, nis_bins=100)
     held = campaign.read(folder / "scene-montecarlo.h5")
     same(montecarlo.run_plan(plan, runs=12, machine="scalar", chunk=5), held.statistics)
@@ -250,7 +250,7 @@ def test_its_campaign_goes_on_and_is_replayed_where_the_code_is_given_again(fold
 
 def test_a_run_of_a_filter_without_a_bias_and_at_times_of_its_own_is_replayed_and_judged(folder, capsys):
     command("scene.toml", "--filter", "mine.py:alone", "--runs", 3, "--out", "own.h5", "--replay", 1)
-    assert "of three states" in capsys.readouterr().out
+    assert "(three states)" in capsys.readouterr().out
     files = ["own-run-1-estimate.h5", "--truth", "own-run-1-record.h5"]
     cli.app(["check", *files], standalone_mode=False)
     assert "the one test does not contradict the filter" in capsys.readouterr().out

@@ -163,7 +163,7 @@ def test_error_of_integrate(run, tmp_path):
     for k in range(len(increments)):
         turn = turn * increments[k]
         size.append((turn.inv() * truth[k + 1]).magnitude())
-    end, most = (float(x) for x in re.search(r"at the end ([\d.e+-]+)°, at most ([\d.e+-]+)°", said).groups())
+    end, most = (float(x) for x in re.search(r"final ([\d.e+-]+)°, maximum ([\d.e+-]+)°", said).groups())
     assert end == pytest.approx(math.degrees(size[-1]), rel=1e-3)
     assert most == pytest.approx(math.degrees(max(size)), rel=1e-3)
 

@@ -315,7 +315,7 @@ def test_a_report_does_not_show_what_a_link_beside_the_result_leads_to(known, tm
 def test_what_lies_beside_a_result_and_is_no_figure_is_not_shown(known, tmp_path):
     (tmp_path / "filter.json").write_bytes(known["tuning.json"].content)
     (tmp_path / "filter-likelihood.png").write_bytes(b"root:x:0:0")
-    with pytest.raises(InputError, match=r"filter-likelihood\.png is no PNG"):
+    with pytest.raises(InputError, match=r"filter-likelihood\.png is not a PNG"):
         tunings.report(tmp_path / "filter.json", 0.99)
 
 
@@ -626,7 +626,7 @@ def test_a_campaign_goes_on_only_on_a_processor_that_rounds_alike(known, tmp_pat
     assert campaign.read(path).arithmetic == engine.arithmetic()
     monkeypatch.setattr(campaign, "arithmetic", lambda: "x86_64, no vectors, no FMA")
     with pytest.raises(
-        InputError, match=r"another campaign: arithmetic is \w+, .* there and x86_64, no vectors, no FMA here"
+        InputError, match=r"another campaign; arithmetic is \w+, .* there and x86_64, no vectors, no FMA here"
     ):
         campaign.run(plan, path, runs=4, resume=True, chunk=4, machine="lanes")
 

@@ -206,7 +206,7 @@ class FilterSetup(ByValue):
             and not (origin.gyro and matching.unmodelled_errors(origin.gyro, sensors, gravity_f=gravity_f))
         ):
             return plain
-        found = matching.matched(spec, record, sensors, np.asarray(gravity_f))
+        found = matching.matched(spec, record, sensors, np.asarray(gravity_f), matching.measurement_density(record))
         noise = ProcessNoise(**matching.noise_beside_states(spec, found.white))
         algorithm = (
             matching.ACCURATE_ALGORITHM if matching.commutes_badly(record, noise.angle_random_walk) else "one-sample"

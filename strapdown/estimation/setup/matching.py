@@ -45,14 +45,15 @@ class Matched:
     """PSD to be added to the gyro's white noise for the flicker above the bandwidth of the states, rad²/s."""
 
 
-def matched(spec: GyroSpec, record: ImuRecord, sensors: Sequence[Any], gravity_f: Array) -> Matched:
+def matched(spec: GyroSpec, record: ImuRecord, sensors: Sequence[Any], gravity_f: Array, density: float) -> Matched:
     """Return the states for the specified errors of a gyro and of sensors on a record.
 
     Each error is modelled as one draw from a normal distribution whose σ is its size, entry by entry; an error of zero is no state. Flicker
     is modelled by states with time constants a decade apart, from the record's duration down to the shortest that the measurements can
     resolve (their sum is 1/f within 6 %); flicker of higher frequency is white noise of the attitude and a σ of the reported bias.
+    ``density`` is that of :func:`measurement_density`.
     """
-    drift_sigma, drift_time, fast, white = _drifts(spec, record, measurement_density(record))
+    drift_sigma, drift_time, fast, white = _drifts(spec, record, density)
     force = np.abs(spec.g_sensitivity) if np.any(gravity_f) else np.zeros((3, 3))
     series = {one.sensor: one for one in record.vectors}
     found = {}
