@@ -87,6 +87,7 @@ def test_compiling_is_said_once_with_how_many_of_how_many(said, monkeypatch):
     numba = pytest.importorskip("numba")
     for name in ("_known", "_left"):  # what other tests compiled in this process
         monkeypatch.setattr(progress._compiling, name, set())
+    monkeypatch.setattr(progress._compiling, "_begun", 0)
     progress._compiling.listen()
     module = "strapdown.kernels.none"  # as machine.compiled binds them: each function's globals are those that it names
     source = {"__name__": module}

@@ -161,7 +161,7 @@ class _Compiling:
     def finished(self, dispatcher: Any) -> None:
         """Count a function as compiled."""
         self._left.discard(dispatcher)
-        self._begun -= 1
+        self._begun = max(self._begun - 1, 0)  # one that began before anyone listened was not counted
         if self._begun == 0:  # the remaining functions were not needed, or an error ended the compilation
             self._left.clear()
         self._say()
