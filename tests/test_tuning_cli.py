@@ -110,7 +110,7 @@ def test_plan_says_how_long_a_record_is_needed(run, tmp_path):
     assert "60 s" in said
     record = tmp_path / "two.h5"
     assert run("simulate", path, "--out", record)[0] == 0
-    assert run("tune", "--plan", record, "--free", "gyro.arw,sun.sigma")[:2] == (0, said)
+    assert run("tune", "--plan", record, "--free", "gyro.arw", "--free", "sun.sigma")[:2] == (0, said)
     assert not (tmp_path / "filter.toml").exists()
 
 

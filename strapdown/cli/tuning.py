@@ -51,11 +51,11 @@ WORSE = 1.05
 class _Filter:
     """Initial filter."""
 
-    free: str | None = typer.Option(
+    free: list[str] | None = typer.Option(
         None,
-        help="Parameters to tune, separated by commas: gyro.arw, gyro.rrw, SENSOR.sigma, initial.attitude, initial.bias, "
-        "gate.probability (as --gate); SENSOR.sigma.x, .y, .z (about one body axis); or only filter.scale. Default: the two of the "
-        "gyro and the sigma of every sensor; for a recording without --truth or --rmse only filter.scale is allowed.",
+        help="Parameters to tune, separated by commas, or the option repeated: gyro.arw, gyro.rrw, SENSOR.sigma, initial.attitude, "
+        "initial.bias, gate.probability (as --gate); SENSOR.sigma.x, .y, .z (about one body axis); or only filter.scale. Default: the "
+        "two of the gyro and the sigma of every sensor; for a recording without --truth or --rmse only filter.scale is allowed.",
     )
     filter_file: Path | None = typer.Option(
         None, "--filter", help="TOML with a table named filter. Default: one that matches the records."
@@ -73,7 +73,7 @@ class _Filter:
     @property
     def names(self) -> list[str] | None:
         """Names of the parameters, if given."""
-        return None if self.free is None else [name.strip() for name in self.free.split(",") if name.strip()]
+        return None if not self.free else [name.strip() for name in ",".join(self.free).split(",") if name.strip()]
 
     def setup(self) -> FilterSetup | None:
         """Return the filter of the file, if there is one."""
@@ -89,7 +89,9 @@ class _Filter:
         from strapdown import tuning
 
         if self.names == []:
-            raise InputError(f"--free is {self.free!r} and names no parameter; name some, or leave it out")
+            raise InputError(
+                f"--free is {','.join(self.free or ())!r} and names no parameter; name some, or leave it out"
+            )
         wanted = [name for name in self.names or [] if name not in tuning.GATED]
         wanted = wanted or list(tuning.default_names([case.record for case in cases]))
         if self.filter_file is None or any(name.startswith(("gyro.", "filter.")) for name in wanted):
@@ -220,7 +222,7 @@ def tune(
     cases, before, gyros = _cases(records, chosen, start, layout)
     if not (goal.truth or goal.rmse or all(recordings.is_record(path) for path in records)):
         names, spacing = tuning.by_innovations(start.names, goal.spacing, gate=goal.gate, prior=start.prior)
-        start, goal = replace(start, free=",".join(names)), replace(goal, spacing=spacing)
+        start, goal = replace(start, free=list(names)), replace(goal, spacing=spacing)
     if (before.gate or before.robust) and not (goal.truth or goal.gate):
         console.print(
             "The filter's gate and weights are not applied: a narrower gate would always increase the likelihood. --gate models outliers, "
