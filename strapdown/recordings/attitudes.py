@@ -67,8 +67,8 @@ def read_attitudes(path: str | os.PathLike[str], *, topic: str = "") -> Attitude
     reading.existing_file(file)
     if reading.is_hdf5(file):
         with reading.hdf5(file) as content:
-            own = "kind" in reading.attributes(content)
-        return _own(file) if own else _of_recording(read_broad(file))
+            kind = str(reading.attributes(content).get("kind", ""))
+        return _own(file, kind) if kind.startswith("strapdown ") else _of_recording(read_broad(file))
     with reading.opened(file) as stream:
         head = stream.read(4096)
     if head.startswith(ros.MAGICS):
@@ -87,9 +87,8 @@ def _whole_ns(time: Array) -> NDArray[np.int64]:
     return np.asarray(np.rint(time * 1e9)).astype(np.int64)
 
 
-def _own(path: Path) -> Attitudes:
-    """Read a result of this package."""
-    kind = str(records.read_attributes(path)["kind"])
+def _own(path: Path, kind: str) -> Attitudes:
+    """Read a result of this package, of this kind."""
     if kind == "strapdown estimate":
         estimate = records.read_estimate(path)
         size = 6 if estimate.has_bias else 3
@@ -105,7 +104,7 @@ def _own(path: Path) -> Attitudes:
             bias=estimate.bias if estimate.has_bias else None,
             innovations=estimate.innovations,
         )
-    if recordfiles.is_record(path):
+    if kind == recordfiles.KIND:
         record = recordfiles.read_record(path)
         if record.truth is None:
             raise InputError(f"{path} is a record without a truth; simulate one, or give another reference")
