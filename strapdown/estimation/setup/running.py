@@ -181,10 +181,7 @@ def smooth(record: ImuRecord, setup: FilterSetup, initial: State, **options: Any
     if not states.gyro_drift_sigma:
         return estimation.smooth(modelled, setup.process_noise, initial, blocks, **chosen)
     start = state_of_whole_bias(initial, blocks, states.gyro_fast_bias_sigma)
-    full = {
-        name: bool(chosen.pop(name, default))
-        for name, default in (("full_covariance", False), ("error_state_covariance", True))
-    }
+    full, of_all = bool(chosen.pop("full_covariance", False)), bool(chosen.pop("error_state_covariance", True))
     found = estimation.smooth(modelled, setup.process_noise, start, blocks, full_covariance=True, **chosen)
     assert found.whole_covariance is not None
     offsets = _offsets(blocks)
@@ -195,8 +192,8 @@ def smooth(record: ImuRecord, setup: FilterSetup, initial: State, **options: Any
         found,
         bias=found.bias + np.concatenate([one.values for one in found.error_states.values()], axis=1) @ offsets.T,
         variance=np.einsum("kii->ki", covariance).copy(),
-        covariance=covariance if full["full_covariance"] else None,
-        whole_covariance=found.whole_covariance if all(full.values()) else None,
+        covariance=covariance if full else None,
+        whole_covariance=found.whole_covariance if full and of_all else None,
     )
 
 
