@@ -321,11 +321,7 @@ def fit(
     objective = replace(objective, evaluated=stage.evaluated)
 
     optima = stage.each("searches", lambda point: search(objective, point, known), points, threads)
-    best = min(optima, key=lambda optimum: optimum.local.value)
-    if not best.converged:
-        raise InputError(
-            "the search did not converge in 200 steps; free fewer parameters, or give priors for those that the record does not determine"
-        )
+    best = _best(optima)
     errors = _errors(objective, best)
 
     def interval(j: int) -> _Known:
@@ -367,6 +363,16 @@ def fit(
         optima_values=np.array([optimum.local.value for optimum in optima]),
         agreeing=sum(1 for optimum in optima if optimum.local.value < best.local.value + NEGLIGIBLE),
     )
+
+
+def _best(optima: Sequence[Optimum]) -> Optimum:
+    """Return the best end of the searches; one that did not converge is refused."""
+    best = min(optima, key=lambda optimum: optimum.local.value)
+    if not best.converged:
+        raise InputError(
+            "the search did not converge in 200 steps; free fewer parameters, or give priors for those that the record does not determine"
+        )
+    return best
 
 
 def _with_means(objective: Objective, point: Array, ranges: Sequence[_Known], priors: Mapping[str, Prior]) -> Array:
