@@ -75,7 +75,7 @@ def at_edges(record: ImuRecord) -> ImuRecord:
     """Return a record of the same rotations with gyro edges at all times: the same predictions and updates, no interval is split."""
     times = np.unique(np.concatenate([record.time, *(series.time for series in record.vectors)]))
     interval = np.searchsorted(record.time, times[:-1], side="right") - 1
-    share = np.diff(times) / np.diff(record.time)[interval]
+    share = np.diff(times) / record.intervals[interval]
     return replace(record, time=times, increments=share[:, None] * record.increments[interval])
 
 

@@ -74,7 +74,7 @@ def simulated(duration: float, seed: int) -> ImuRecord:
 
 def datagrams(record: ImuRecord) -> list[tuple[float, bytes]]:
     """Return the samples of a record, each with the time at which it is to be sent, s."""
-    rates = record.increments / np.diff(record.time)[:, None]
+    rates = record.rates
     due = [(t, GYRO, t, value) for t, value in zip(record.time[1:].tolist(), rates.tolist(), strict=True)]
     for sensor, series in zip(NAMES, record.vectors, strict=True):
         delay = LATENCY if sensor == MAGNETOMETER else 0.0

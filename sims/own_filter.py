@@ -37,7 +37,7 @@ def textbook(record: ImuRecord, initial: State) -> Estimate:
     q, b, P = initial.attitude, initial.bias, initial.covariance
     Q = np.kron(np.diag([GYRO.angle_random_walk**2, GYRO.rate_random_walk**2]), np.eye(3))
     rows = [(q, b, P)]
-    for k, dt in enumerate(np.diff(record.time)):
+    for k, dt in enumerate(record.intervals):
         turn = record.increments[k] - b * dt
         q = quaternion.multiply(q, quaternion.exp(turn))
         F = np.eye(6) + np.block([[-skew(turn), -dt * np.eye(3)], [np.zeros((3, 6))]])

@@ -58,6 +58,8 @@ def record(n: int = 12) -> ImuRecord:
 def test_rates_are_increments_over_intervals():
     r = record()
     np.testing.assert_allclose(r.rates * np.diff(r.time)[:, None], r.increments, rtol=1e-15)
+    np.testing.assert_array_equal(r.intervals, np.diff(r.time))
+    assert not r.intervals.flags.writeable
 
 
 def test_records_are_frozen_and_lists_are_welcome():

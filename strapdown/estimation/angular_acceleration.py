@@ -34,7 +34,7 @@ def turning(record: ImuRecord, time: Array) -> tuple[Array, Array]:
     """
     from scipy.signal import savgol_filter
 
-    dt = np.diff(record.time)
+    dt = record.intervals
     mean = float(dt.mean())
     k = int(np.argmax(np.abs(dt - mean)))
     if abs(dt[k] - mean) > UNEVEN * mean:

@@ -6,8 +6,9 @@ those properties in which it differs from "no effect".
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import accumulate
 from typing import Any, Literal
 
 import numpy as np
@@ -733,6 +734,12 @@ class BoundedVelocity(ErrorStates):
         if len(rates) == 3:
             a = np.array([rates[0] ** 2, -rates[0] - rates[1], 1.0])
         return {self.sensor: Effect(offset_f=np.kron(np.eye(3), a[:, None]) / self.strength, carried=True)}
+
+
+def spans(blocks: Sequence[ErrorStates]) -> list[tuple[ErrorStates, slice]]:
+    """Return each declaration with the place of its states among those of all."""
+    ends = list(accumulate(len(block.components) for block in blocks))
+    return [(block, slice(end - len(block.components), end)) for block, end in zip(blocks, ends, strict=True)]
 
 
 def check(blocks: tuple[ErrorStates, ...]) -> None:

@@ -16,7 +16,7 @@ from strapdown.checks import Array, InputError, count
 from strapdown.estimation import model as modelling
 from strapdown.estimation import temperature
 from strapdown.estimation.angular_acceleration import turning
-from strapdown.estimation.error_states import ErrorStates
+from strapdown.estimation.error_states import ErrorStates, spans
 from strapdown.estimation.gating import LOCK_OUT, Gate, Robust
 from strapdown.estimation.memory import side_by_side
 from strapdown.estimation.model import Model
@@ -756,16 +756,15 @@ def factor_estimate(
     whole = P
     if P is not None and P.shape[1] > 6 and np.any(np.diff(back) != 1):
         whole = P[:, back[:, None], back]
-    found, first = {}, 6
-    for one in problem.error_states:
-        own = back[first : first + one.size]
+    found = {}
+    for one, place in spans(problem.error_states):
+        own = back[6:][place]
         found[one.name] = ErrorStateEstimate(
             components=tuple(one.components),
             units=tuple(one.units),
             values=_columns(x, own - 3),
             variance=_columns(variance, own),
         )
-        first += one.size
     return Estimate(
         time=problem.record.time[::every],
         attitude=attitude,
@@ -911,9 +910,9 @@ def most_segments(problem: Problem) -> int:
     record = problem.record
     most = len(record.increments) + int(problem.events.bounds[-1])
     if np.isinf(problem.model.limit) and (
-        3.0 * max(np.max(record.increments), -np.min(record.increments)) ** 2 <= LARGEST_ANGLE**2
+        3.0 * max(record.increments.max(), -record.increments.min()) ** 2 <= LARGEST_ANGLE**2
     ):
         return most
-    dt = np.diff(record.time)
+    dt = record.intervals
     steps = np.maximum(np.linalg.norm(record.increments, axis=1) / LARGEST_ANGLE, dt / problem.model.limit)
     return most + int(np.sum(np.floor(steps[steps > 1.0]) + 1.0))

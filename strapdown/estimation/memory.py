@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections import deque
 from collections.abc import Sequence
@@ -54,14 +55,8 @@ def side_by_side(*wanted: tuple[Sequence[int], Any]) -> list[np.ndarray]:
     the filtering. One large piece can use large pages; and pieces of earlier results that are no longer needed are reused, up to
     :data:`KEPT` bytes.
     """
-    types = [np.dtype(of) for _, of in wanted]
-    sizes = [math.prod(shape) * of.itemsize for (shape, _), of in zip(wanted, types, strict=True)]
-    starts = [0]
-    for size in sizes:
-        starts.append(starts[-1] + -(-size // _ALIGNMENT) * _ALIGNMENT)
-    whole = _taken(starts[-1] + _ALIGNMENT)
-    whole = whole[-whole.__array_interface__["data"][0] % _ALIGNMENT :]
-    return [
-        whole[start : start + size].view(of).reshape(shape)
-        for start, size, of, (shape, _) in zip(starts, sizes, types, wanted, strict=False)
-    ]
+    sizes = [math.prod(shape) * np.dtype(of).itemsize for shape, of in wanted]
+    places = [0, *itertools.accumulate(-(-size // _ALIGNMENT) * _ALIGNMENT for size in sizes)]
+    whole = _taken(places[-1] + _ALIGNMENT)
+    first = -whole.ctypes.data % _ALIGNMENT
+    return [np.ndarray(shape, of, whole, first + place) for place, (shape, of) in zip(places, wanted, strict=False)]

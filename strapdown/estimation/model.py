@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from strapdown.checks import Array, InputError, array, one_of
-from strapdown.estimation.error_states import Effect, ErrorStates, check
+from strapdown.estimation.error_states import Effect, ErrorStates, check, spans
 from strapdown.estimation.states import Candidate, State, check_arguments
 from strapdown.kernels import error_state_step
 from strapdown.kernels.chains import CHAIN, chain_start
@@ -40,11 +40,8 @@ def with_error_states(initial: State, blocks: Sequence[ErrorStates]) -> State:
     size = sum(block.size for block in blocks)
     P = np.zeros((6 + size, 6 + size))
     P[:6, :6] = initial.covariance
-    first = 6
-    for block in blocks:
-        own = slice(first, first + block.size)
-        P[own, own] = block.covariance
-        first += block.size
+    for block, own in spans(blocks):
+        P[6:, 6:][own, own] = block.covariance
     return State(attitude=initial.attitude, bias=initial.bias, values=np.zeros(size), covariance=P)
 
 
@@ -177,8 +174,7 @@ def _on_sensors(blocks: Sequence[ErrorStates], kinds: Mapping[str, str], states:
     stride, bound = np.zeros(states), np.zeros(states, bool)
     varying = set()
     names = list(kinds)
-    first = 0
-    for block in blocks:
+    for block, own in spans(blocks):
         for sensor, effect in block.effects.items():
             one_of(f"{block.name}: sensor", sensor, names)
             if kinds[sensor] == "attitude" and (effect.offset_f is not None or effect.scale is not None):
@@ -187,17 +183,16 @@ def _on_sensors(blocks: Sequence[ErrorStates], kinds: Mapping[str, str], states:
                     "use VectorBias for its mounting"
                 )
             _check_lever(block, sensor, kinds[sensor], effect)
-            place = names.index(sensor), slice(first, first + block.size)
+            place = names.index(sensor), own
             sensors[place] = _numbers(block, effect)
             carried[place] = effect.carried
             if effect.carried and effect.offset_f is not None:
                 _check_carried(block, effect)
-                stride[first : first + block.size // 3] = block.size // 3
-                bound[place[1]] = True
+                stride[own.start : own.start + block.size // 3] = block.size // 3
+                bound[own] = True
             levered[place] = effect.lever is not None
             if effect.varying and kinds[sensor] in ("direction", "heading"):
                 varying.add(sensor)
-        first += block.size
     use = _uses(sensors[..., :3], sensors[..., 6:], sensors[..., 3:6])
     use += (LEVER - OFFSET) * (levered & (use & OFFSET > 0))
     use += CARRIED * (carried & (use & FIXED > 0))
@@ -226,10 +221,8 @@ def _empty(sensors: int) -> Model:
 def _feeds(blocks: tuple[ErrorStates, ...]) -> Array:
     """Return the coupling of each state to the next, after a check that chains stay within their declaration."""
     feed = _stack(blocks, "feed", ())
-    first = 0
-    for block in blocks:
-        own = feed[first : first + block.size]
-        first += block.size
+    for block, place in spans(blocks):
+        own = feed[place]
         if block.size and own[-1] != 0.0:
             raise InputError(f"{block.name}: feed of the last state is {own[-1]:g}, but no state follows it; give 0")
         longest = max((k - chain_start(own[:, None], k) + 1 for k in range(block.size)), default=0)
@@ -336,9 +329,6 @@ def aged_prior(
 ) -> tuple[Array, Array]:
     """Return values (m,) and covariance (m, m) of the error states after dt, s, without measurements."""
     transition, driven = np.zeros((2, len(values), len(values)))
-    first = 0
-    for one in error_states:
-        own = slice(first, first + one.size)
+    for one, own in spans(error_states):
         transition[own, own], driven[own, own] = one.transition(dt), one.process_noise(dt)
-        first += one.size
     return transition @ values, transition @ covariance @ transition.T + driven

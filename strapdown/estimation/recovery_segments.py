@@ -68,7 +68,7 @@ def part(record: ImuRecord, begin: float, end: float) -> ImuRecord:
     inside = (record.time > begin) & (record.time < end)
     time = np.concatenate([[begin], record.time[inside], [end]])
     k = np.searchsorted(record.time, time[1:], side="left") - 1
-    share = np.diff(time) / np.diff(record.time)[k]
+    share = np.diff(time) / record.intervals[k]
     vectors = []
     for series in record.vectors:
         kept = (series.time >= begin) & (series.time < end)
@@ -117,8 +117,6 @@ class Trajectory:
 
 def stops(time: Array, breaks: Sequence[Break]) -> Array:
     """Return the edges (n,) and the times of breaks."""
-    if not breaks:
-        return time
     return np.unique(np.concatenate([time, *([one.start, one.since, one.end] for one in breaks)]))
 
 
@@ -144,9 +142,6 @@ def trajectories(
 
     ``segments`` are the filter's, ``first`` is the index of the one that starts at each stop, and ``reruns`` are those of each break.
     """
-    if not breaks:
-        every = np.arange(len(time))
-        return [Trajectory(segments=segments, starts=first, edge=every, last=len(time) - 1, row=every)]
     stop = stops(time, breaks)
     place = np.searchsorted(stop, time)
     own = np.searchsorted([one.since for one in breaks], time, side="right")

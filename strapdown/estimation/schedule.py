@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import accumulate
 from typing import Any
 
 import numpy as np
@@ -118,13 +119,12 @@ class Schedule:
         """Measurements as the kernels' argument."""
         (value, values), (sigma, sigmas) = places(self.series_vector_b), places(self.series_sigma)
         first = self.bounds[:-1]
-        columns = (values - 3 * first, sigmas - first, first, self.codes, *self.frames.T)
-        time, place, sensor = self.order
+        series = np.empty((len(first), 6), np.int64)
+        series[:, 0], series[:, 1], series[:, 2] = values - 3 * first, sigmas - first, first
+        series[:, 3], series[:, 4:] = self.codes, self.frames
         noise = np.empty((0, 6)) if self.noise_by_axis is None else self.noise_by_axis
-        series = np.stack([np.asarray(column, np.int64) for column in columns], axis=1)
-        return measurement.Measurements(
-            *(read_only(column) for column in (time, place, sensor, value, sigma, noise, series, self.triads))
-        )
+        columns = (*self.order, value, sigma, noise, series, self.triads)
+        return measurement.Measurements(*map(read_only, columns))
 
     @property
     def body_noise(self) -> Array:
@@ -151,8 +151,8 @@ def schedule(
                 f"{series.sensor}: this filter needs one sigma per sample, not sigma_axes or covariance; use estimation.run, or give sigma"
             )
     parts = [_scheduled(series, start, end) for series in vectors]
-    bounds = np.cumsum([0, *(len(part.time) for part in parts)])
-    first_frames = np.cumsum([0, *(len(part.frames) for part in parts[:-1])])
+    bounds = np.array([0, *accumulate(len(part.time) for part in parts)])
+    first_frames = [0, *accumulate(len(part.frames) for part in parts)]
     return Schedule(
         series_time=tuple(read_only(part.time) for part in parts),
         series_vector_b=tuple(read_only(part.value) for part in parts),
@@ -218,7 +218,7 @@ def _scheduled(series: VectorMeasurements, start: float, end: float) -> _Part:
         used = series.taken(slice(*np.searchsorted(series.time, [start, np.nextafter(end, np.inf)])))
     content = used.vector_b if used.attitude is None else used.attitude
     # One non-finite number makes the sum non-finite; a sum needs no memory.
-    if not np.isfinite(np.sum(content)):
+    if not np.isfinite(content.sum()):
         used = used.taken(np.isfinite(content).all(axis=1))
     if used.attitude is not None:
         assert used.sigma_axes is not None
@@ -252,7 +252,7 @@ def _scheduled(series: VectorMeasurements, start: float, end: float) -> _Part:
 
 def _need_noise(series: VectorMeasurements) -> None:
     """Refuse a series with a noise of zero about some axis."""
-    if len(series.sigma) and not np.min(series.sigma) > 0.0:
+    if len(series.sigma) and not series.sigma.min() > 0.0:
         k = int(np.argmin(series.sigma > 0.0))
         raise InputError(f"{series.sensor}: sigma[{k}] is 0 rad; a filter needs a noise greater than zero")
     if series.sigma_axes is not None and not np.all(series.sigma_axes > 0.0):

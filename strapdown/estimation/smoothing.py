@@ -32,7 +32,7 @@ from strapdown.estimation.error_states import ErrorStates
 from strapdown.estimation.forward import LostDigitsError, Options, Problem
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.memory import side_by_side
-from strapdown.estimation.recovery_segments import Break, Rerun, Trajectory
+from strapdown.estimation.recovery_segments import Break, Rerun
 from strapdown.estimation.states import GateMemory, ProcessNoise, State, check_arguments, covariance_matrices
 from strapdown.kernels import root_smoother, smoother_loop
 from strapdown.kernels.machine import compiled
@@ -115,7 +115,7 @@ def _digits_lost(problem: Problem, estimate: Estimate, share: float) -> int | No
     A backward step subtracts what the interval had added: the process noise, and at the start the uncertainty of the bias.
     """
     angle, rate = problem.variances
-    dt = np.diff(problem.record.time)
+    dt = problem.record.intervals
     start = dt[0] ** 2 * np.diag(problem.initial.covariance)[3:6].max()
     # If the minimum over all rows exceeds the limit of the longest interval, as nearly always, the check takes a tenth of the time.
     longest, smallest = dt.max(), estimate.variance.min()
@@ -179,32 +179,38 @@ class _Smoother:
         estimate, segments = recovery_segments.filtered_whole(self.problem, self.options)
         event_time = self.problem.events.time
         recovered = recovery_segments.recoveries(estimate.events)
-        breaks, reruns = self._reruns(recovered, event_time, segments) if recovered else ([], [])
         edges = len(record.time)
         outputs = self.form.outputs(edges, self.options)
-        if len(segments) == edges and not breaks:  # each interval in one segment
-            first = np.arange(edges)
+        if recovered:
+            self._across_recoveries(*self._reruns(recovered, event_time, segments), segments, outputs)
+        elif len(segments) == edges:  # each interval in one segment
+            self.form.go_back(segments, np.arange(edges), 0, outputs)
         else:
-            first = recovery_segments.starts(recovery_segments.stops(record.time, breaks), event_time, segments)
-        for one in recovery_segments.trajectories(record.time, breaks, first, segments, reruns):
-            written = outputs
-            if breaks:
-                written = [np.empty((len(first) if len(out) else 0, *out.shape[1:])) for out in outputs]
-            smoothed = one.edge <= one.last
-            if smoothed.any():
-                self.form.go_back(one, one.edge[0], one.last, written)
-            for edge in one.edge[~smoothed]:  # the filter's own
-                self.form.go_back(one, edge, edge, written)
-            if breaks:
-                for out, there in zip(outputs, written, strict=True):
-                    if len(out):
-                        out[one.row] = there[one.edge]
+            self.form.go_back(segments, recovery_segments.starts(record.time, event_time, segments), 0, outputs)
         return replace(
             self.form.estimate(outputs, self.options),
             innovations=estimate.innovations,
             skipped=estimate.skipped,
             events=estimate.events,
         )
+
+    def _across_recoveries(
+        self, breaks: Sequence[Break], reruns: Sequence[Rerun], segments: Array, outputs: Sequence[Array]
+    ) -> None:
+        """Smooth each trajectory of a record, and write its rows."""
+        time = self.problem.record.time
+        stop = recovery_segments.stops(time, breaks)
+        first = recovery_segments.starts(stop, self.problem.events.time, segments)
+        for one in recovery_segments.trajectories(time, breaks, first, segments, reruns):
+            written = [np.empty((len(first) if len(out) else 0, *out.shape[1:])) for out in outputs]
+            smoothed = one.edge <= one.last
+            if smoothed.any():
+                self.form.go_back(one.segments, one.starts[: one.last + 1], one.edge[0], written)
+            for edge in one.edge[~smoothed]:  # the filter's own
+                self.form.go_back(one.segments, one.starts[: edge + 1], edge, written)
+            for out, there in zip(outputs, written, strict=True):
+                if len(out):
+                    out[one.row] = there[one.edge]
 
     def _reruns(
         self, recovered: Sequence[Event], event_time: Array, segments: Array
@@ -280,15 +286,17 @@ class _BlockForm:
             covariance=covariance_matrices(blocks) if options.full_covariance else None,
         )
 
-    def go_back(self, one: Trajectory, first: int, last: int, outputs: Sequence[Array]) -> None:
-        """Smooth from the filtered state at stop ``last`` of a trajectory back to ``first``, and write all rows between."""
-        segments = one.segments
+    def go_back(self, segments: Array, starts: np.ndarray, first: int, outputs: Sequence[Array]) -> None:
+        """Smooth from the filtered state at the last stop back to stop ``first``, and write all rows between.
+
+        ``starts``: index of the segment that starts at each stop.
+        """
         if len(segments) < smoother_loop.FEWEST_ROWS:
             short = smoother_loop.FEWEST_ROWS - len(segments)
             segments = np.concatenate([segments, np.tile(segments[-1], (short, 1))])
         compiled(smoother_loop.smooth_back)(
             segments.reshape(-1),
-            one.starts[: last + 1],
+            starts,
             first,
             *self.problem.variances,
             np.empty(smoother_loop.WORK_SIZE),
@@ -315,12 +323,15 @@ class _FactorForm:
         attitude, x, variance, P = outputs
         return forward.factor_estimate(self.problem, 1, attitude, x, variance, P if options.full_covariance else None)
 
-    def go_back(self, one: Trajectory, first: int, last: int, outputs: Sequence[Array]) -> None:
-        """Smooth from the filtered state at stop ``last`` of a trajectory back to ``first``, and write all rows between."""
+    def go_back(self, segments: Array, starts: np.ndarray, first: int, outputs: Sequence[Array]) -> None:
+        """Smooth from the filtered state at the last stop back to stop ``first``, and write all rows between.
+
+        ``starts``: index of the segment that starts at each stop.
+        """
         model = self.problem.model
         compiled(root_smoother.smooth_augmented)(
-            one.segments,
-            one.starts[: last + 1],
+            segments,
+            starts,
             first,
             forward.model_arrays(model, self.problem.variances),
             root_smoother.workspace(model.states, model.noise_rows, len(model.chains)),

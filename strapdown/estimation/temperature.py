@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from strapdown.checks import Array, InputError
-from strapdown.estimation.error_states import ErrorStates, GyroTemperature
+from strapdown.estimation.error_states import ErrorStates, GyroTemperature, spans
 from strapdown.estimation.states import State
 from strapdown.records import Estimate, ImuRecord
 
@@ -27,12 +27,7 @@ BLOCKS = 1000
 
 def slopes(error_states: Sequence[ErrorStates]) -> slice | None:
     """Return the position of the slopes among the error states; None if there are none."""
-    first = 0
-    for one in error_states:
-        if isinstance(one, GyroTemperature):
-            return slice(first, first + one.size)
-        first += one.size
-    return None
+    return next((own for one, own in spans(error_states) if isinstance(one, GyroTemperature)), None)
 
 
 def need_none(error_states: Sequence[ErrorStates], what: str) -> None:
@@ -53,7 +48,7 @@ def of(record: ImuRecord) -> Array:
 def stretches(record: ImuRecord, every: int) -> Iterator[tuple[int, int, float]]:
     """Yield first and last edge and mean temperature, °C, of segments whose length is a multiple of ``every`` intervals."""
     T = of(record)
-    middle, dt = 0.5 * (T[1:] + T[:-1]), np.diff(record.time)
+    middle, dt = 0.5 * (T[1:] + T[:-1]), record.intervals
     starts = np.arange(0, len(dt), every * max(1, -(-len(dt) // (BLOCKS * every))))
     mean = np.add.reduceat(middle * dt, starts) / np.add.reduceat(dt, starts)
     step = np.ptp(mean) / LEVELS
@@ -90,7 +85,7 @@ def shifted(state: State, own: slice, change: float) -> State:
 def at_mean(record: ImuRecord, mean: float, slope: Array) -> tuple[ImuRecord, Array]:
     """Return a segment with increments as if at its mean temperature, and the differences of temperature from it (n + 1,), K."""
     off = of(record) - mean
-    turns = 0.5 * ((off[1:] + off[:-1]) * np.diff(record.time))[:, None] * slope
+    turns = 0.5 * ((off[1:] + off[:-1]) * record.intervals)[:, None] * slope
     return replace(record, increments=record.increments - turns), off
 
 

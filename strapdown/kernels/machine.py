@@ -191,7 +191,8 @@ def read_only(array: np.ndarray) -> np.ndarray:
 
     numba compiles a kernel again for each layout, and for writable arrays.
     """
-    view = np.require(array, requirements=("C", "A")).view()
+    flags = array.flags
+    view = array.view() if flags.c_contiguous and flags.aligned else np.require(array, requirements=("C", "A")).view()
     view.flags.writeable = False
     return view
 

@@ -222,7 +222,7 @@ def _prepare(plan: Plan) -> _Prepared:
 def _substeps(record: ImuRecord) -> Array:
     """Return, for each step of a record (n,), the longest time, s, over which the filter's polynomials hold: at most the step."""
     angle = np.linalg.norm(record.increments, axis=1)
-    return np.asarray(np.diff(record.time) * np.minimum(1.0, LARGEST_ANGLE / np.maximum(angle, LARGEST_ANGLE)))
+    return np.asarray(record.intervals * np.minimum(1.0, LARGEST_ANGLE / np.maximum(angle, LARGEST_ANGLE)))
 
 
 def _real(plan: Plan) -> Any:

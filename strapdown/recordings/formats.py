@@ -331,7 +331,7 @@ def from_record(record: ImuRecord, source: str = "record") -> Recording:
     interval. Series of kind "vector" named accelerometer and magnetometer are included, at the stamps where they have samples; the truth is
     the reference.
     """
-    steps = np.diff(record.time)[:, None]
+    steps = record.intervals[:, None]
     own: dict[str, Any] = {}
     left_out = []
     for series in record.vectors:

@@ -7,6 +7,7 @@ attitude, bias and covariance are values at the edges. This avoids any ambiguity
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -136,10 +137,17 @@ class ImuRecord(Listed):
             notes.append(f"Simulated: {name}, seed {self.origin.seed}, run {self.origin.run}.")
         return Listing(f"Record over {span:.6g} s", ("sensor", "measures", "samples", "Hz"), rows, notes, left=2)
 
+    @functools.cached_property
+    def intervals(self) -> Array:
+        """Duration of each sample interval (n,), s; read-only."""
+        intervals = np.diff(self.time)
+        intervals.flags.writeable = False
+        return intervals
+
     @property
     def rates(self) -> Array:
         """Mean body rate over each interval (n, 3), rad/s."""
-        return np.asarray(self.increments / np.diff(self.time)[:, None])
+        return np.asarray(self.increments / self.intervals[:, None])
 
 
 def compress(record: ImuRecord, algorithm: str | coning.Algorithm) -> ImuRecord:

@@ -7,7 +7,7 @@ every Monte Carlo (threads, processes or Dask, resumed and replayed), and in :fu
 >>> from strapdown import quaternion
 >>> from strapdown.records import Estimate
 >>> def dead_reckoning(record, initial):
-...     turns = quaternion.exp(record.increments - initial.bias * np.diff(record.time)[:, None])
+...     turns = quaternion.exp(record.increments - initial.bias * record.intervals[:, None])
 ...     attitude = [initial.attitude]
 ...     for turn in turns:
 ...         attitude.append(quaternion.normalize(quaternion.multiply(attitude[-1], turn)))

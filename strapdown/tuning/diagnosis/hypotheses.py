@@ -26,7 +26,7 @@ def shown(theta: Array, factor: float = 1.0) -> str:
 def mean_hypotheses(model: Model) -> Iterator[Hypothesis]:
     """Yield the hypotheses that shift innovations."""
     record = model.record
-    interval = float(np.median(np.diff(record.time)))
+    interval = float(np.median(record.intervals))
     seen = [series for series in record.vectors if len(series.time)]
     for series in seen:
         yield _time_offset(series.sensor, (series.sensor,), interval)

@@ -26,7 +26,7 @@ def turns(record: ImuRecord, noise: ProcessNoise, initial: estimation.State) -> 
     from scipy.fft import dct, idct
 
     estimate = estimation.run(record, noise, initial)
-    dt = np.diff(record.time)[:, None]
+    dt = record.intervals[:, None]
     free = record.increments / dt - 0.5 * (estimate.bias[1:] + estimate.bias[:-1])
     # Unlike Fourier's, it does not require equal ends of the record; being orthonormal, it keeps noise white.
     parts = dct(free, axis=0, norm="ortho")
