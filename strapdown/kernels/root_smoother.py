@@ -28,7 +28,7 @@ from strapdown.kernels.error_state_step import (
     turn_rows,
     turn_values,
 )
-from strapdown.kernels.lane_values import WIDTH, chosen, load, spread, store
+from strapdown.kernels.lane_values import WIDTH, chosen, fetch, load, spread, store
 from strapdown.kernels.root_form import loose, row_end
 from strapdown.kernels.rotation import inverse_right_jacobian, logarithm, moved, quaternion_multiply
 from strapdown.kernels.triangle import covariances, padded, triangularise, variances
@@ -86,7 +86,7 @@ def workspace(states, rows, chained):
         left=np.zeros((rows, width)),
         step=np.zeros((2, size, 4)),
         factor=np.empty(states),
-        work=np.zeros(both),
+        work=np.zeros(max(both, 4 * (both - width))),
         later_x=np.empty(size - 3),
         later_F=np.zeros((size + rows + 4, width)),
     )
@@ -142,7 +142,10 @@ def prepare_step(segments, j, model, space):
     for i in range(size):
         for c in range(0, room, WIDTH):
             store(gain, room * i + c, load(F, (width + room) * i + width + c))
+    length = segments.shape[1]
     for i in range(size):
+        for c in range(WIDTH * i, length, WIDTH * size):  # the row before, needed next, is far from the cache
+            fetch(segments, length * (j - 1) + c)
         inverse = 1.0 / F[i, i]
         for c in range(0, room, WIDTH):
             g = load(gain, room * i + c)
@@ -158,6 +161,32 @@ def prepare_step(segments, j, model, space):
     return predicted, phi11, rows
 
 
+def remove_noise(F, r, end, gain, noise, number, noisy, work):
+    """Remove from four rows of F from r on, with columns to ``end``, the process noise that they determine: ``F ← F − (F gain) noise``."""
+    width, room = noise.shape[1], gain.shape[1]
+    for c in range(0, room, WIDTH):
+        p0 = p1 = p2 = p3 = spread(0.0)
+        for i in range(end):  # four rows at once, or each sum would wait for itself
+            g = load(gain, room * i + c)
+            p0, p1, p2, p3 = p0 + F[r, i] * g, p1 + F[r + 1, i] * g, p2 + F[r + 2, i] * g, p3 + F[r + 3, i] * g
+        store(work, c, p0)
+        store(work, room + c, p1)
+        store(work, 2 * room + c, p2)
+        store(work, 3 * room + c, p3)
+    place = width * r
+    for c in range(0, noisy, WIDTH):
+        t0, t1 = load(F, place + c), load(F, place + width + c)
+        t2, t3 = load(F, place + 2 * width + c), load(F, place + 3 * width + c)
+        for k in range(number):
+            n = load(noise, width * k + c)
+            t0, t1 = t0 - work[k] * n, t1 - work[room + k] * n
+            t2, t3 = t2 - work[2 * room + k] * n, t3 - work[3 * room + k] * n
+        store(F, place + c, t0)
+        store(F, place + width + c, t1)
+        store(F, place + 2 * width + c, t2)
+        store(F, place + 3 * width + c, t3)
+
+
 def step_back(segments, j, model, space, later_q):
     """Propagate the smoothed state (``later_x``, ``later_F``) from the end of segment j back to its start; return the attitude there."""
     predicted, phi11, rows = prepare_step(segments, j, model, space)
@@ -166,7 +195,7 @@ def step_back(segments, j, model, space, later_q):
     chains, changing = model.chains, model.changing
     size = len(x) + 3
     noisy = 6 + changing
-    width, room = noise.shape[1], gain.shape[1]
+    width = noise.shape[1]
     # From the tangent space at the smoothed attitude to that at the predicted one: exp(a) ⊗ exp(ε) = exp(a + J_r(a)⁻¹ ε).
     inverse = (predicted[0], -predicted[1], -predicted[2], -predicted[3])
     a = logarithm(quaternion_multiply(inverse, later_q))
@@ -179,22 +208,12 @@ def step_back(segments, j, model, space, later_q):
     later_F[rows, 0], later_F[rows, 1], later_F[rows, 2] = a
     for i in range(len(x)):
         later_F[rows, 3 + i] = later_x[i] - x[i]
+    for r in range(0, size, 4):
+        remove_noise(later_F, r, min(row_end(r + 3, loose(model)), size), gain, noise, rows - size, noisy, work)
+    remove_noise(later_F, rows, size, gain, noise, rows - size, noisy, work)
     for r in range(rows - size):
         for c in range(0, width, WIDTH):
             store(later_F, width * (size + r) + c, load(left, width * r + c))
-    for r in range(rows + 1):
-        if r < size or r == rows:
-            used = size if r == rows else row_end(r, loose(model))
-            for c in range(0, room, WIDTH):
-                product = spread(0.0)
-                for i in range(used):
-                    product = product + later_F[r, i] * load(gain, room * i + c)
-                store(work, c, product)
-            for c in range(0, noisy, WIDTH):
-                t = load(later_F, width * r + c)
-                for w in range(rows - size):
-                    t = t - work[w] * load(noise, width * w + c)
-                store(later_F, width * r + c, t)
     if len(chains) > 0:
         carry_chains_back(later_F, 0, rows + 1, space.links)
     carry_back(later_F, size, rows + 1, phi11, space.step[0], space.factor, changing)
