@@ -12,8 +12,10 @@ from strapdown import estimation, quaternion
 from strapdown.checks import Array, InputError, one_of
 from strapdown.estimation import Observability, filters, forward
 from strapdown.estimation import model as modelling
+from strapdown.estimation.angular_acceleration import turning
 from strapdown.estimation.error_states import ErrorStates
 from strapdown.estimation.filters.own import Own
+from strapdown.estimation.schedule import schedule
 from strapdown.estimation.setup.filter_setup import MEKF, FilterSetup, need_mekf
 from strapdown.estimation.setup.states import States
 from strapdown.estimation.states import State
@@ -33,17 +35,23 @@ MAX_MEMORY = 8e9
 
 def modelled_record(record: ImuRecord, setup: FilterSetup) -> ImuRecord:
     """Return the record as processed by the filter of this setup: at the rate of its integration algorithm, with the setup's σ."""
+    return with_sigma(at_steps(record, setup), setup)
+
+
+def at_steps(record: ImuRecord, setup: FilterSetup) -> ImuRecord:
+    """Return the record at the rate of the setup's integration algorithm."""
+    algorithm = setup.integration
+    return record if algorithm.samples == 1 and algorithm.name == "one-sample" else compress(record, algorithm)
+
+
+def with_sigma(record: ImuRecord, setup: FilterSetup) -> ImuRecord:
+    """Return the record with the setup's σ."""
     names = [series.sensor for series in record.vectors]
     for name in setup.sigma:
         one_of("sigma: sensor", name, names)
-    used = (
-        record
-        if setup.integration.samples == 1 and setup.integration.name == "one-sample"
-        else compress(record, setup.integration)
-    )
     if setup.measurement_sigma_factor == 1.0 and not setup.sigma:
-        return used
-    return replace(used, vectors=tuple(_modelled_series(series, setup) for series in record.vectors))
+        return record
+    return replace(record, vectors=tuple(_modelled_series(series, setup) for series in record.vectors))
 
 
 def _modelled_series(series: VectorMeasurements, setup: FilterSetup) -> VectorMeasurements:
@@ -96,14 +104,37 @@ def run(record: ImuRecord, setup: FilterSetup, initial: State, **options: Any) -
     Estimate
         Attitude, bias and any ``error_states`` of the setup; if drifts are among them, ``bias`` is the whole bias.
     """
-    modelled = modelled_record(record, setup)
+    return run_modelled(modelled_record(record, setup), setup, initial, **options)
+
+
+def run_modelled(
+    record: ImuRecord,
+    setup: FilterSetup,
+    initial: State,
+    *,
+    motion: tuple[Array, Array] | None = None,
+    **options: Any,
+) -> Estimate:
+    """Run the filter of a setup over a :func:`modelled_record`, with its :func:`measured_motion` if known."""
     if setup.estimator != MEKF:
-        return _run_other(modelled, setup, initial, **options)
+        return _run_other(record, setup, initial, **options)
     chosen = {"gate": setup.gate, "robust": setup.robust, **options}
     if setup.states is None:
-        return estimation.run(modelled, setup.process_noise, initial, **chosen)
-    found = forward.filtered(_prepared(modelled, setup, initial), forward.Options(**chosen, **WHOLE_BIAS)).estimate
-    return _reported(found, setup.states, initial)
+        return estimation.run(record, setup.process_noise, initial, **chosen)
+    problem = replace(_prepared(record, setup, initial), motion=motion)
+    return _reported(forward.filtered(problem, forward.Options(**chosen, **WHOLE_BIAS)).estimate, setup.states, initial)
+
+
+def measured_motion(record: ImuRecord, setup: FilterSetup) -> tuple[Array, Array] | None:
+    """Return what runs of setups that differ in noise have in common on a modelled record: the motion of a lever arm at the measurements.
+
+    None if the setup has no lever arm, or runs in segments of constant temperature.
+    """
+    states = setup.states or States()
+    levers = any(np.any(one.lever_arm_sigma) for one in states.sensors.values())
+    if not levers or np.any(states.gyro_temperature_sigma):
+        return None
+    return turning(record, schedule(record.vectors, record.time[0], record.time[-1], anisotropic=True).time)
 
 
 def runs_at_once(setup: FilterSetup) -> int:
