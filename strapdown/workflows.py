@@ -183,7 +183,7 @@ class RecordRun(NamedTuple):
 
     estimate: Estimate
     record: ImuRecord
-    """The record from the start of the filter on, at the sample rate of the gyro."""
+    """The record from the start of the filter on, as processed by it (:func:`strapdown.estimation.setup.modelled_record`)."""
     truth: Truth | None
     """Truth at the epochs of the estimate."""
     initial: State
@@ -207,22 +207,20 @@ def estimate_record(
             f"every is {every}, more than the {len(modelled.increments)} filter steps of the record; only the first epoch would be kept"
         )
     found = for_record.start(modelled, chosen) if start is None else start
-    used = record
     if found.edge > 0:
-        used = records.cut(used, found.edge * chosen.integration.samples, len(used.increments))
         modelled = records.cut(modelled, found.edge, len(modelled.increments))
         if every > len(modelled.increments):
             raise InputError(
                 f"every is {every}, more than the {len(modelled.increments)} filter steps after the start of the filter"
             )
     if smooth:
-        result = setups.smooth(used, chosen, found.state, full_covariance=full_covariance)
+        result = setups.smooth_modelled(modelled, chosen, found.state, full_covariance=full_covariance)
     else:
-        result = setups.run(used, chosen, found.state, every=every, full_covariance=full_covariance)
+        result = setups.run_modelled(modelled, chosen, found.state, every=every, full_covariance=full_covariance)
     truth = None
     if modelled.truth is not None:
         truth = Truth(attitude=modelled.truth.attitude[::every], bias=modelled.truth.bias[::every])
-    return RecordRun(result, used, truth, found.state, found.words)
+    return RecordRun(result, modelled, truth, found.state, found.words)
 
 
 def estimate(

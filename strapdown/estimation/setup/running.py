@@ -194,26 +194,30 @@ def smooth(record: ImuRecord, setup: FilterSetup, initial: State, **options: Any
     InputError
         If the smoother would need more memory than :data:`MAX_MEMORY`.
     """
+    return smooth_modelled(modelled_record(record, setup), setup, initial, **options)
+
+
+def smooth_modelled(record: ImuRecord, setup: FilterSetup, initial: State, **options: Any) -> Estimate:
+    """Run the smoother of a setup over a :func:`modelled_record`."""
     need_mekf(setup, "the smoother")
     chosen = {"gate": setup.gate, "robust": setup.robust, **options}
-    modelled = modelled_record(record, setup)
     states = setup.states or States()
-    blocks = _blocks(modelled, states)
+    blocks = _blocks(record, states)
     n = 6 + sum(one.size for one in blocks)
-    segments = len(modelled.increments) + sum(len(series.time) for series in modelled.vectors)
+    segments = len(record.increments) + sum(len(series.time) for series in record.vectors)
     need = 8 * (n * (n + 1) // 2 + n + 5) * segments
     if states.gyro_drift_sigma:
-        need += 8 * n * n * len(modelled.time)
+        need += 8 * n * n * len(record.time)
     if need > MAX_MEMORY:
         raise InputError(
-            f"smoothing {len(modelled.increments)} samples with {n} states needs {need / 1e9:.3g} GB, more than {MAX_MEMORY / 1e9:g}; "
+            f"smoothing {len(record.increments)} samples with {n} states needs {need / 1e9:.3g} GB, more than {MAX_MEMORY / 1e9:g}; "
             "cut the record, or do not smooth"
         )
     if not states.gyro_drift_sigma:
-        return estimation.smooth(modelled, setup.process_noise, initial, blocks, **chosen)
+        return estimation.smooth(record, setup.process_noise, initial, blocks, **chosen)
     start = state_of_whole_bias(initial, blocks, states.gyro_fast_bias_sigma)
     full, of_all = bool(chosen.pop("full_covariance", False)), bool(chosen.pop("error_state_covariance", True))
-    found = estimation.smooth(modelled, setup.process_noise, start, blocks, full_covariance=True, **chosen)
+    found = estimation.smooth(record, setup.process_noise, start, blocks, full_covariance=True, **chosen)
     assert found.whole_covariance is not None
     offsets = _offsets(blocks)
     sums = np.eye(6, 6 + offsets.shape[1])
@@ -229,14 +233,13 @@ def smooth(record: ImuRecord, setup: FilterSetup, initial: State, **options: Any
 
 
 def observability(record: ImuRecord, setup: FilterSetup, initial: State) -> Observability:
-    """Return the observability of each state of this setup's filter on a record (:func:`strapdown.estimation.observability`)."""
+    """Return the :func:`strapdown.estimation.observability` of each state of this setup's filter on a :func:`modelled_record`."""
     need_mekf(setup, "observability")
-    modelled = modelled_record(record, setup)
     if setup.states is None:
-        return estimation.observability(modelled, setup.process_noise, initial)
-    blocks = _blocks(modelled, setup.states)
+        return estimation.observability(record, setup.process_noise, initial)
+    blocks = _blocks(record, setup.states)
     start = state_of_whole_bias(initial, blocks, setup.states.gyro_fast_bias_sigma)
-    return estimation.observability(modelled, setup.process_noise, start, blocks)
+    return estimation.observability(record, setup.process_noise, start, blocks)
 
 
 def initial_state(
