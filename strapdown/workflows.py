@@ -183,7 +183,7 @@ class RecordRun(NamedTuple):
 
     estimate: Estimate
     record: ImuRecord
-    """The record from the start of the filter on, at the sample rate of the gyro."""
+    """The record from the start of the filter on, as processed by it (:func:`strapdown.estimation.setup.modelled_record`)."""
     truth: Truth | None
     """Truth at the epochs of the estimate."""
     initial: State
@@ -207,22 +207,20 @@ def estimate_record(
             f"every is {every}, more than the {len(modelled.increments)} filter steps of the record; only the first epoch would be kept"
         )
     found = for_record.start(modelled, chosen) if start is None else start
-    used = record
     if found.edge > 0:
-        used = records.cut(used, found.edge * chosen.integration.samples, len(used.increments))
         modelled = records.cut(modelled, found.edge, len(modelled.increments))
         if every > len(modelled.increments):
             raise InputError(
                 f"every is {every}, more than the {len(modelled.increments)} filter steps after the start of the filter"
             )
     if smooth:
-        result = setups.smooth(used, chosen, found.state, full_covariance=full_covariance)
+        result = setups.smooth_modelled(modelled, chosen, found.state, full_covariance=full_covariance)
     else:
-        result = setups.run(used, chosen, found.state, every=every, full_covariance=full_covariance)
+        result = setups.run_modelled(modelled, chosen, found.state, every=every, full_covariance=full_covariance)
     truth = None
     if modelled.truth is not None:
         truth = Truth(attitude=modelled.truth.attitude[::every], bias=modelled.truth.bias[::every])
-    return RecordRun(result, used, truth, found.state, found.words)
+    return RecordRun(result, modelled, truth, found.state, found.words)
 
 
 def estimate(
@@ -287,6 +285,11 @@ def estimate(
         If the gyro's noise is unknown, the initial attitude is not observable from the measurements, a recording has no accelerometer, or
         an option does not apply to the source.
 
+    Warns
+    -----
+    UserWarning
+        If units, axes or signs of a recording seem wrong.
+
     Examples
     --------
     >>> import strapdown as sd
@@ -297,9 +300,8 @@ def estimate(
     robust = Robust(kind=robust) if isinstance(robust, str) else robust  # type: ignore[arg-type]
     if isinstance(source, Recording):
         _refuse("a record", setup=setup, initial=initial, states=states or None)
-        for words in ahrs.check_conventions.at_rest(source):
-            warnings.warn(f"{source.source}: {words}", stacklevel=2)
         begun: Recording | ahrs.Begun = ahrs.begin(source)
+        _doubt(source)
         parameters = _recording_parameters(begun, motion, noise)
         if isinstance(noise, GyroSpec) and noise.temperature is not None:
             begun, parameters = ahrs.without_temperature(source, parameters, noise.temperature, walks=smooth)
@@ -348,6 +350,12 @@ def smooth(source: ImuRecord | Recording, **options: Any) -> Estimate:
     H. E. Rauch, F. Tung, C. T. Striebel, Maximum likelihood estimates of linear dynamic systems, AIAA Journal 3(8), 1965.
     """
     return estimate(source, **options, smooth=True)
+
+
+def _doubt(source: Recording) -> None:
+    """Warn the caller of the calling function if axes, signs or units of a recording seem wrong."""
+    for words in ahrs.check_conventions.examine(source).warnings:
+        warnings.warn(f"{source.source}: {words}", stacklevel=3)
 
 
 def _refuse(what: str, **options: Any) -> None:
@@ -683,6 +691,7 @@ def tune(
         else:
             setup = setup or tuning.recording_setup()
             cases.append(tuning.recording_case(one))
+            _doubt(one)
     assert setup is not None
     if any(isinstance(one, Recording) for one in given) and not (objective.get("truth") or objective.get("rmse")):
         free, objective["spacing"] = tuning.by_innovations(

@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 import math
 import sys
+import warnings
 from dataclasses import replace
 
 import h5py
 import numpy as np
 import pytest
 
+import strapdown as sd
 from strapdown import cli, motion, quaternion, recordings, vectors
 from strapdown.ahrs import check_conventions
 from strapdown.ahrs.check_conventions import AXES, FRAMES
@@ -242,6 +244,34 @@ def test_doctor_ends_with_the_status_of_the_verdict(monkeypatch, capsys, tmp_pat
     saved = json.loads((tmp_path / "doctor.json").read_text())
     assert saved["verdict"] == verdict
     assert saved["candidates"][0]["score"] >= saved["candidates"][1]["score"]
+
+
+@pytest.mark.parametrize(
+    ("mistake", "words"),
+    [
+        ({}, ""),
+        ({"specific_force": np.eye(3) / STANDARD_GRAVITY}, "units={'accelerometer': 'g'} in Python"),
+        ({"specific_force": np.eye(3) / 3.0}, "fits neither m/s² nor g"),
+        ({"rate": np.eye(3) * 180.0 / np.pi}, "units={'gyro': 'deg/s'} in Python"),
+        ({"rate": np.diag([-1.0, 1.0, 1.0])}, "axes of the gyro should be read as (−x, y, z)"),
+        ({"magnetic_field": np.diag([-1.0, 1.0, 1.0])}, "axes of the magnetometer should be read as ("),
+    ],
+)
+def test_python_warns_of_what_the_command_warns_of(run, mistake, words):
+    right = simulated(11, duration=30.0, reference=False)
+    wrong = replace(right, **{name: getattr(right, name) @ matrix.T for name, matrix in mistake.items()})
+    recordings.write(wrong, "walk.csv")
+    said = [line for line in run("estimate", "walk.csv")[1].splitlines() if line.startswith("warning: ")]
+    assert len(said) == bool(words)
+    walk = sd.read("walk.csv")
+    for use in (sd.estimate, sd.smooth, sd.tune):
+        with warnings.catch_warnings(record=True) as found:
+            warnings.simplefilter("always")
+            use(walk)
+        assert [
+            f"warning: {str(one.message).removeprefix('walk.csv: ')}. See `strapdown doctor walk.csv`." for one in found
+        ] == said
+    assert all(words in line for line in said)
 
 
 @pytest.mark.parametrize("angle", [0.03, 0.1])

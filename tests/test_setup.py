@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from strapdown import coning, consistency, estimation, quaternion, records, scenarios, units
+from strapdown import coning, consistency, estimation, quaternion, records, scenarios, units, workflows
 from strapdown.checks import InputError
 from strapdown.estimation import setup
 from strapdown.estimation.gating import Gate, Robust
@@ -287,6 +287,31 @@ def test_smoothing_by_a_setup_is_that_of_the_smoother(states):
     np.testing.assert_array_equal(found.covariance, same.covariance)
     plain = setup.run(record, filter_setup, start)
     assert np.all(found.variance <= plain.variance * (1.0 + 1e-9))
+
+
+@pytest.mark.parametrize("smooth", [False, True])
+def test_a_record_is_modelled_once_also_if_the_filter_starts_late(smooth, monkeypatch):
+    """Initial state and filter have the same increments and σ: an algorithm with samples before its step uses those before the start, and a
+    varying σ is scaled by its mean over the whole record."""
+    record = scenarios.simulate(scenarios.load_scenario("magnetometer-only"), 3)
+    chosen = dataclasses.replace(
+        FilterSetup.for_record(record, states=False),
+        integration=coning.ALGORITHMS["matched-4-11"],
+        sigma={"magnetometer": 0.02},
+    )
+    modelled = setup.modelled_record(record, chosen)
+    calls = []
+    monkeypatch.setattr(setup.running, "compress", lambda *given: calls.append(given) or records.compress(*given))
+    found = workflows.estimate_record(record, chosen, smooth=smooth)
+    assert len(calls) == 1
+    first = len(modelled.increments) - len(found.record.increments)
+    assert first > 0
+    rest = records.cut(modelled, first, len(modelled.increments))
+    work = estimation.smooth if smooth else estimation.run
+    same = work(rest, chosen.process_noise, found.initial, full_covariance=True)
+    np.testing.assert_array_equal(found.estimate.attitude, same.attitude)
+    np.testing.assert_array_equal(found.estimate.covariance, same.covariance)
+    np.testing.assert_array_equal(found.record.increments, rest.increments)
 
 
 def test_what_cannot_be_smoothed_is_refused(monkeypatch):

@@ -10,12 +10,14 @@ from scipy import optimize
 
 from strapdown import coning, consistency, estimation, gyro, motion, scenarios, tuning, vectors
 from strapdown.checks import InputError
-from strapdown.estimation import setup
+from strapdown.estimation import forward, setup
+from strapdown.estimation.setup import running
 from strapdown.estimation.setup.states import SensorStates, States
 from strapdown.montecarlo.scalar import start
 from strapdown.randomness import generator
 from strapdown.scenarios import Scenario
 from strapdown.tuning import parameters
+from strapdown.tuning.objective import thinned
 
 SWAY = motion.HarmonicRates(
     harmonics=(
@@ -108,6 +110,33 @@ def test_score_and_curvature_are_the_derivatives():
     expected = objective.derivatives(objective.start).information[:3, :3]
     observed = objective.curvature(objective.start)[:3, :3]
     np.testing.assert_allclose(np.diag(observed), np.diag(expected), rtol=0.5)
+
+
+@pytest.mark.parametrize("spacing", [0.0, 0.5])
+def test_evaluations_are_ordinary_runs_but_prepare_the_gyro_only_once(spacing, monkeypatch):
+    """Neither the integration of the gyro nor the angular acceleration at the measurements depends on what is tuned."""
+    scenario = swaying(20.0)
+    states = States(sensors={"acc": SensorStates(lever_arm_sigma=(0.0, 0.1, 0.3))})
+    chosen = dataclasses.replace(
+        filter_setup(scenario), states=states, integration=coning.ALGORITHMS["two-sample"], sigma={"mag": 6e-7}
+    )
+    one = case_of(scenario, chosen, 5)
+    objective = tuning.likelihood([one], chosen, ["gyro.arw", "acc.sigma", "acc.lever_sigma"], spacing=spacing)
+    point, epochs = objective.start + 0.1, np.arange(10, 200, 10)
+    used = objective.setup(point)
+    record = setup.modelled_record(one.record, used)
+    record = dataclasses.replace(record, vectors=tuple(thinned(series, spacing) for series in record.vectors))
+    plain = dataclasses.replace(used, sigma={}, integration=coning.ALGORITHMS["one-sample"])
+    expected = setup.run(record, plain, one.initial, full_covariance=True)
+    innovations = expected.innovations.values()
+    value = 0.5 * sum(np.sum(np.log(i.variance) + i.innovation**2 / i.variance) for i in innovations)
+    monkeypatch.setattr(forward, "turning", None)
+    monkeypatch.setattr(running, "compress", None)
+    assert objective.minus_log(point)[0] == pytest.approx(value, rel=1e-12)
+    attitude, bias, P = objective.estimates(0, point[None], epochs)
+    np.testing.assert_allclose(attitude[:, 0], expected.attitude[epochs], rtol=1e-12)
+    np.testing.assert_allclose(bias[:, 0], expected.bias[epochs], rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(P[:, 0], expected.covariance[epochs], rtol=1e-9, atol=1e-18)
 
 
 def test_values_scale_all_axes_alike_and_the_rest_stays():

@@ -159,6 +159,11 @@ class Examination:
         """Verdict and reason in one line."""
         return f"{self.verdict}: {self.reason}"
 
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Warnings for an estimate, in which wrong axes, signs or units are easily overlooked."""
+        return (f"probably {self.reason}",) if self.verdict == "wrong convention" else self.doubts
+
     def summary(self) -> dict[str, Any]:
         """Return everything as plain values for JSON.
 

@@ -525,8 +525,8 @@ def _read_recording(
     warm = None if temperature is None else thermal.read(temperature)
     with progress_bar("reading"):
         source = recordings.read(recording, **layout)
-    doubt(source, recording)
     begun = ahrs.begin(source)
+    doubt(source, recording)
     motion, odds = ahrs.motions.chosen(begun, motion, name="--motion")
     parameters = ahrs.MOTIONS[motion]
     if shared.gyro is not None:

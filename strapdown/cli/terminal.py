@@ -239,15 +239,12 @@ def need_own(target: Path, command: str, own: Callable[[Path], bool]) -> None:
 
 
 def doubt(source: Recording, path: Path) -> None:
-    """Warn if axes, signs or units of a recording seem wrong, which is easily overlooked in its estimate."""
+    """Warn if axes, signs or units of a recording seem wrong."""
     from strapdown.ahrs import check_conventions
 
     with progress_bar("testing conventions"):
         found = check_conventions.examine(source)
-    doubts = found.doubts
-    if found.verdict == "wrong convention":
-        doubts = (f"probably {found.reason}",)
-    for words in doubts:
+    for words in found.warnings:
         console.print(f"warning: {words}. See `strapdown doctor {path}`.")
 
 

@@ -110,6 +110,8 @@ class Problem:
     initial: State
     error_states: tuple[ErrorStates, ...] = ()
     model: Model
+    motion: tuple[Array, Array] | None = None
+    """:func:`strapdown.estimation.angular_acceleration.turning` at the events, if known; None: computed for a lever arm."""
 
     @property
     def variances(self) -> tuple[float, float]:
@@ -617,7 +619,7 @@ def factor_body(problem: Problem, units: Mapping[str, float], *, together: bool 
         x=x,
         F=F,
         length=lengths(problem.record, problem.events, model, units),
-        turning=turns(problem.record, problem.events, model),
+        turning=turns(problem),
         scratch=scratch(model),
         together=together and not len(model.chains),
         sharpness=np.inf,
@@ -848,12 +850,13 @@ def _singular_triangle(P: Array) -> Array:
     return np.asarray(np.linalg.qr(root[:, ::-1], mode="r"))[::-1, ::-1].copy()
 
 
-def turns(record: ImuRecord, events: Schedule, model: Model) -> Array:
+def turns(problem: Problem) -> Array:
     """Return rate, angular acceleration and the latter's variances per axis at the events (events, 9); no rows without a lever arm."""
-    if not model.levers.any():
+    levers, events = problem.model.levers, problem.events
+    if not levers.any():
         return np.empty((0, 9))
-    turns, variance = turning(record, events.time)
-    levered = model.levers[events.sensor]
+    turns, variance = problem.motion or turning(problem.record, events.time)
+    levered = levers[events.sensor]
     return np.concatenate([turns, np.where(levered[:, None], variance, 0.0)], axis=1)
 
 

@@ -155,7 +155,7 @@ def _filtered(problems: Sequence[Problem], every: int) -> list[Estimate | None]:
     work.x[:] = _in_lanes([np.concatenate([one.bias, one.values[model.order]]) for one in initials])
     work.P[0] = _in_lanes([one.covariance[np.ix_(order, order)] for one in initials])
     work.table[-1], work.lost[:] = 0.0, 0.0
-    levers = [turns(problem.record, problem.events, model) for problem in problems]
+    levers = [turns(problem) for problem in problems]
     taken = lane_states.Runs(
         increments=_in_lanes([problem.record.increments for problem in problems]),
         value=_in_lanes([_values(problem) for problem in problems]),

@@ -13,11 +13,10 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from strapdown import coning
 from strapdown.checks import Array
 from strapdown.estimation import setup
 from strapdown.estimation.schedule import Schedule, schedule, selected
@@ -37,7 +36,6 @@ from strapdown.tuning.objective import (
     Objective,
     by_part,
     joined,
-    of_sensors,
     outliers_at,
     posed,
 )
@@ -187,9 +185,21 @@ def _pairs_of_groups(p: int) -> list[tuple[int, ...]]:
     return [(*a, *b) for a, b in itertools.combinations(groups, 2)]
 
 
+class Steps(NamedTuple):
+    """What the runs over a record have in common at all points."""
+
+    case: Case
+    record: ImuRecord
+    """The record at the rate of the filter's steps, with its own σ."""
+    motion: tuple[Array, Array] | None
+    """Rate and angular acceleration at the measurements used, for a lever arm."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RunLikelihood(Objective):
     """The same for a filter with error states, or with noise that differs by axis: one run per point."""
+
+    steps: tuple[Steps, ...] = field(repr=False)
 
     def minus_log(self, points: Array) -> Array:
         """Return minus the log likelihood, without its constant, at several points (k, p): (k,)."""
@@ -220,18 +230,18 @@ class RunLikelihood(Objective):
 
     def judged(self, point: Array) -> list[tuple[str, Array]]:
         """Return of each record and sensor the probability that a measurement is an outlier, and the share of its own noise (m, 2)."""
-        found = [self._innovations(point, case) for case in self.cases]
+        found = [self._innovations(point, one) for one in self.steps]
         return [(name, np.asarray(one.weight)[:, 1:]) for by_sensor in found for name, one in by_sensor.items()]
 
     def _runs(self, points: Array) -> list[list[tuple[Array, ...]]]:
         """Return the value of each term, its part, and innovations with variances, for each point and record."""
-        found = self.each(self._run, [(point, case) for point in points for case in self.cases])
+        found = self.each(self._run, [(point, one) for point in points for one in self.steps])
         return [found[k : k + len(self.cases)] for k in range(0, len(found), len(self.cases))]
 
-    def _run(self, point: Array, case: Case) -> tuple[Array, ...]:
-        first, last = case.span
+    def _run(self, point: Array, steps: Steps) -> tuple[Array, ...]:
+        first, last = steps.case.span
         found = []
-        for one in self._innovations(point, case).values():
+        for one in self._innovations(point, steps).values():
             place = ((one.time - first) / (last - first) * self.parts).astype(np.int64)
             e, s = one.innovation.ravel(), one.variance.ravel()
             value = 0.5 * (np.log(s) + e * e / s) if one.weight is None else one.weight[:, 0]
@@ -239,32 +249,32 @@ class RunLikelihood(Objective):
             found.append((value, places, e, s))
         return tuple(np.concatenate(column) for column in zip(*found, strict=True))
 
-    def _innovations(self, point: Array, case: Case) -> dict[str, Innovations]:
+    def _innovations(self, point: Array, steps: Steps) -> dict[str, Innovations]:
         """Return the innovations of a record that are used, by sensor."""
         chosen = self.setup(point)
         # The filter with error states, also without any, has the innovations of measurements whose noise differs by axis.
         used = replace(chosen, states=States() if chosen.states is None else chosen.states)
         # Only the first and the last state are stored.
-        every = max(1, len(case.record.increments) // used.integration.samples)
+        every = len(steps.record.increments)
         mixture: Any = tuple(map(float, outliers_at(point))) if self.mixed else None
-        estimate = self._estimate(used, case, every=every, gate=None, robust=None, outliers=mixture)
-        first, last = case.span
+        estimate = self._estimate(used, steps, every=every, gate=None, robust=None, outliers=mixture)
+        first, last = steps.case.span
         found = estimate.innovations.items()
         return {name: selected(one, (one.time >= first) & (one.time <= last)) for name, one in found}
 
     def estimates(self, number: int, points: Array, epochs: np.ndarray) -> tuple[Array, Array, Array]:
         """Return q_fb (m, k, 4), bias (m, k, 3) and P (m, k, 6, 6) on record ``number`` at edges (m,), at points (k, p)."""
-        found = [self._estimate(self.setup(point), self.cases[number], full_covariance=True) for point in points]
-        rows = [(one.attitude[epochs], one.bias[epochs], one.covariance[epochs]) for one in found]  # type: ignore[index]
+        every = max(1, int(np.gcd.reduce(epochs)))  # fewer rows, with the steps between them taken together
+        options = {"every": every, "full_covariance": True}
+        found = [self._estimate(self.setup(point), self.steps[number], **options) for point in points]
+        kept = epochs // every
+        rows = [(one.attitude[kept], one.bias[kept], one.covariance[kept]) for one in found]  # type: ignore[index]
         attitude, bias, P = (np.stack(parts, axis=1) for parts in zip(*rows, strict=True))
         return attitude, bias, P
 
-    def _estimate(self, chosen: FilterSetup, case: Case, **options: Any) -> Estimate:
-        initial = self.initial(case, chosen)
-        if self.spacing == 0.0:
-            return setup.run(case.record, of_sensors(chosen, case.record), initial, **options)
-        applied = replace(chosen, sigma={}, measurement_sigma_factor=1.0, integration=coning.ALGORITHMS["one-sample"])
-        return setup.run(self.modelled(case, chosen), applied, initial, **options)
+    def _estimate(self, chosen: FilterSetup, steps: Steps, **options: Any) -> Estimate:
+        record, initial = self.modelled(steps.record, chosen), self.initial(steps.case, chosen)
+        return setup.run_modelled(record, chosen, initial, motion=steps.motion, **options)
 
 
 Likelihood = LaneLikelihood | RunLikelihood
@@ -315,12 +325,14 @@ def likelihood(
 
 def with_engine(problem: Objective, *, lanes: bool = True) -> Likelihood:
     """Return the likelihood of a problem, for eight points at once if the filter and ``lanes`` allow it."""
-    records = [problem.modelled(case, problem.chosen) for case in problem.cases]
+    steps = [setup.at_steps(case.record, problem.chosen) for case in problem.cases]
+    records = [problem.modelled(record, problem.chosen) for record in steps]
     by_axis = any(axis_of(name) for name in problem.names) or any(
         one.anisotropic for record in records for one in record.vectors
     )
     if by_axis or problem.chosen.states is not None or not lanes:
-        return made(RunLikelihood, problem)
+        motions = [setup.measured_motion(record, problem.chosen) for record in records]
+        return made(RunLikelihood, problem, steps=tuple(map(Steps, problem.cases, steps, motions)))
     prepared = [_prepared(problem, *one) for one in zip(problem.cases, records, strict=True)]
     return made(LaneLikelihood, problem, prepared=tuple(prepared))
 

@@ -197,9 +197,9 @@ class Objective:
         with ThreadPoolExecutor(self.threads) as pool:
             return list(pool.map(lambda job: work(*job), jobs))
 
-    def modelled(self, case: Case, chosen: FilterSetup) -> ImuRecord:
-        """Return a record as processed by the filter of a setup, with thinned measurements."""
-        record = setup.modelled_record(case.record, of_sensors(chosen, case.record))
+    def modelled(self, record: ImuRecord, chosen: FilterSetup) -> ImuRecord:
+        """Return a record at the rate of the filter's steps as processed by the filter of a setup, with thinned measurements."""
+        record = setup.with_sigma(record, of_sensors(chosen, record))
         if self.spacing > 0.0:
             record = replace(record, vectors=tuple(thinned(series, self.spacing) for series in record.vectors))
         return record

@@ -222,7 +222,7 @@ def _judged(case: Case, chosen: FilterSetup) -> tuple[Estimate, Truth | None]:
             attitude[~case.judged[edges][: len(record.time)]] = np.nan
         truth = Truth(attitude=attitude, bias=np.full((len(attitude), 3), np.nan))
     initial = setup.initial_state(used, case.initial.attitude, case.initial.bias)
-    estimate = setup.run(case.record, used, initial, every=every, full_covariance=truth is not None)
+    estimate = setup.run_modelled(record, used, initial, every=every, full_covariance=truth is not None)
 
     def within(of: Any, *names: str) -> dict[str, Any]:
         inside = (of.time >= case.first) & (of.time <= case.last)

@@ -24,12 +24,17 @@ from strapdown.estimation.setup.matching import ACCURATE_ALGORITHM as ACCURATE_A
 from strapdown.estimation.setup.matching import measurement_density as measurement_density
 from strapdown.estimation.setup.matching import specified as specified
 from strapdown.estimation.setup.matching import unmodelled_errors as unmodelled_errors
+from strapdown.estimation.setup.running import at_steps as at_steps
 from strapdown.estimation.setup.running import drawn_state as drawn_state
 from strapdown.estimation.setup.running import initial_state, run, smooth
+from strapdown.estimation.setup.running import measured_motion as measured_motion
 from strapdown.estimation.setup.running import modelled_record as modelled_record
 from strapdown.estimation.setup.running import observability as observability
+from strapdown.estimation.setup.running import run_modelled as run_modelled
 from strapdown.estimation.setup.running import run_together as run_together
 from strapdown.estimation.setup.running import runs_at_once as runs_at_once
+from strapdown.estimation.setup.running import smooth_modelled as smooth_modelled
+from strapdown.estimation.setup.running import with_sigma as with_sigma
 from strapdown.estimation.setup.states import SensorStates, States
 
 __all__ = [

@@ -12,8 +12,10 @@ from strapdown import estimation, quaternion
 from strapdown.checks import Array, InputError, one_of
 from strapdown.estimation import Observability, filters, forward
 from strapdown.estimation import model as modelling
+from strapdown.estimation.angular_acceleration import turning
 from strapdown.estimation.error_states import ErrorStates
 from strapdown.estimation.filters.own import Own
+from strapdown.estimation.schedule import schedule
 from strapdown.estimation.setup.filter_setup import MEKF, FilterSetup, need_mekf
 from strapdown.estimation.setup.states import States
 from strapdown.estimation.states import State
@@ -33,17 +35,23 @@ MAX_MEMORY = 8e9
 
 def modelled_record(record: ImuRecord, setup: FilterSetup) -> ImuRecord:
     """Return the record as processed by the filter of this setup: at the rate of its integration algorithm, with the setup's σ."""
+    return with_sigma(at_steps(record, setup), setup)
+
+
+def at_steps(record: ImuRecord, setup: FilterSetup) -> ImuRecord:
+    """Return the record at the rate of the setup's integration algorithm."""
+    algorithm = setup.integration
+    return record if algorithm.samples == 1 and algorithm.name == "one-sample" else compress(record, algorithm)
+
+
+def with_sigma(record: ImuRecord, setup: FilterSetup) -> ImuRecord:
+    """Return the record with the setup's σ."""
     names = [series.sensor for series in record.vectors]
     for name in setup.sigma:
         one_of("sigma: sensor", name, names)
-    used = (
-        record
-        if setup.integration.samples == 1 and setup.integration.name == "one-sample"
-        else compress(record, setup.integration)
-    )
     if setup.measurement_sigma_factor == 1.0 and not setup.sigma:
-        return used
-    return replace(used, vectors=tuple(_modelled_series(series, setup) for series in record.vectors))
+        return record
+    return replace(record, vectors=tuple(_modelled_series(series, setup) for series in record.vectors))
 
 
 def _modelled_series(series: VectorMeasurements, setup: FilterSetup) -> VectorMeasurements:
@@ -96,14 +104,37 @@ def run(record: ImuRecord, setup: FilterSetup, initial: State, **options: Any) -
     Estimate
         Attitude, bias and any ``error_states`` of the setup; if drifts are among them, ``bias`` is the whole bias.
     """
-    modelled = modelled_record(record, setup)
+    return run_modelled(modelled_record(record, setup), setup, initial, **options)
+
+
+def run_modelled(
+    record: ImuRecord,
+    setup: FilterSetup,
+    initial: State,
+    *,
+    motion: tuple[Array, Array] | None = None,
+    **options: Any,
+) -> Estimate:
+    """Run the filter of a setup over a :func:`modelled_record`, with its :func:`measured_motion` if known."""
     if setup.estimator != MEKF:
-        return _run_other(modelled, setup, initial, **options)
+        return _run_other(record, setup, initial, **options)
     chosen = {"gate": setup.gate, "robust": setup.robust, **options}
     if setup.states is None:
-        return estimation.run(modelled, setup.process_noise, initial, **chosen)
-    found = forward.filtered(_prepared(modelled, setup, initial), forward.Options(**chosen, **WHOLE_BIAS)).estimate
-    return _reported(found, setup.states, initial)
+        return estimation.run(record, setup.process_noise, initial, **chosen)
+    problem = replace(_prepared(record, setup, initial), motion=motion)
+    return _reported(forward.filtered(problem, forward.Options(**chosen, **WHOLE_BIAS)).estimate, setup.states, initial)
+
+
+def measured_motion(record: ImuRecord, setup: FilterSetup) -> tuple[Array, Array] | None:
+    """Return what runs of setups that differ in noise have in common on a modelled record: the motion of a lever arm at the measurements.
+
+    None if the setup has no lever arm, or runs in segments of constant temperature.
+    """
+    states = setup.states or States()
+    levers = any(np.any(one.lever_arm_sigma) for one in states.sensors.values())
+    if not levers or np.any(states.gyro_temperature_sigma):
+        return None
+    return turning(record, schedule(record.vectors, record.time[0], record.time[-1], anisotropic=True).time)
 
 
 def runs_at_once(setup: FilterSetup) -> int:
@@ -163,26 +194,30 @@ def smooth(record: ImuRecord, setup: FilterSetup, initial: State, **options: Any
     InputError
         If the smoother would need more memory than :data:`MAX_MEMORY`.
     """
+    return smooth_modelled(modelled_record(record, setup), setup, initial, **options)
+
+
+def smooth_modelled(record: ImuRecord, setup: FilterSetup, initial: State, **options: Any) -> Estimate:
+    """Run the smoother of a setup over a :func:`modelled_record`."""
     need_mekf(setup, "the smoother")
     chosen = {"gate": setup.gate, "robust": setup.robust, **options}
-    modelled = modelled_record(record, setup)
     states = setup.states or States()
-    blocks = _blocks(modelled, states)
+    blocks = _blocks(record, states)
     n = 6 + sum(one.size for one in blocks)
-    segments = len(modelled.increments) + sum(len(series.time) for series in modelled.vectors)
+    segments = len(record.increments) + sum(len(series.time) for series in record.vectors)
     need = 8 * (n * (n + 1) // 2 + n + 5) * segments
     if states.gyro_drift_sigma:
-        need += 8 * n * n * len(modelled.time)
+        need += 8 * n * n * len(record.time)
     if need > MAX_MEMORY:
         raise InputError(
-            f"smoothing {len(modelled.increments)} samples with {n} states needs {need / 1e9:.3g} GB, more than {MAX_MEMORY / 1e9:g}; "
+            f"smoothing {len(record.increments)} samples with {n} states needs {need / 1e9:.3g} GB, more than {MAX_MEMORY / 1e9:g}; "
             "cut the record, or do not smooth"
         )
     if not states.gyro_drift_sigma:
-        return estimation.smooth(modelled, setup.process_noise, initial, blocks, **chosen)
+        return estimation.smooth(record, setup.process_noise, initial, blocks, **chosen)
     start = state_of_whole_bias(initial, blocks, states.gyro_fast_bias_sigma)
     full, of_all = bool(chosen.pop("full_covariance", False)), bool(chosen.pop("error_state_covariance", True))
-    found = estimation.smooth(modelled, setup.process_noise, start, blocks, full_covariance=True, **chosen)
+    found = estimation.smooth(record, setup.process_noise, start, blocks, full_covariance=True, **chosen)
     assert found.whole_covariance is not None
     offsets = _offsets(blocks)
     sums = np.eye(6, 6 + offsets.shape[1])
@@ -198,14 +233,13 @@ def smooth(record: ImuRecord, setup: FilterSetup, initial: State, **options: Any
 
 
 def observability(record: ImuRecord, setup: FilterSetup, initial: State) -> Observability:
-    """Return the observability of each state of this setup's filter on a record (:func:`strapdown.estimation.observability`)."""
+    """Return the :func:`strapdown.estimation.observability` of each state of this setup's filter on a :func:`modelled_record`."""
     need_mekf(setup, "observability")
-    modelled = modelled_record(record, setup)
     if setup.states is None:
-        return estimation.observability(modelled, setup.process_noise, initial)
-    blocks = _blocks(modelled, setup.states)
+        return estimation.observability(record, setup.process_noise, initial)
+    blocks = _blocks(record, setup.states)
     start = state_of_whole_bias(initial, blocks, setup.states.gyro_fast_bias_sigma)
-    return estimation.observability(modelled, setup.process_noise, start, blocks)
+    return estimation.observability(record, setup.process_noise, start, blocks)
 
 
 def initial_state(
