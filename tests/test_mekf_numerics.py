@@ -7,8 +7,10 @@ import mpmath
 import numpy as np
 import pytest
 from plain_kernels import plain
+from scipy.spatial.transform import Rotation
 
-from strapdown import estimation, motion, quaternion, records
+from strapdown import estimation, kinematics, motion, quaternion, records
+from strapdown.estimation.error_states import GyroScale
 from strapdown.estimation.forward import CHECK_INTERVALS
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.schedule import schedule
@@ -236,6 +238,32 @@ def test_factors_are_carried_through_large_corrections():
                 f.update_direction(s.vector_b[at], s.references_f[at], float(s.sigma[at]))
         assert np.max(quaternion.angle_between(f.attitude, estimate.attitude[k + 1])) < 1e-9
         assert np.allclose(np.diag(f.P), estimate.variance[k + 1], rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "states", [(), (GyroScale(scale_sigma=1e-3, misalignment_sigma=1e-3),)], ids=["covariance", "factor"]
+)
+@pytest.mark.parametrize("angle", [0.3, 0.6, 0.95, 1.5])
+def test_a_large_correction_is_exact(states, angle):
+    """P = σ²I and one measured attitude of variance r: the correction is φ σ²/(σ² + r), and P becomes σ² r/(σ² + r) J Jᵀ."""
+    sigma, r, axis = 0.5, 1e-3, np.array([0.6, 0.48, 0.64])
+    measured = VectorMeasurements(
+        sensor="tracker",
+        kind="attitude",
+        time=[0.0],
+        attitude=[Rotation.from_rotvec(angle * axis).as_quat(scalar_first=True)],
+        sigma=np.sqrt(r),
+    )
+    record = ImuRecord(time=[0.0, 0.01], increments=np.zeros((1, 3)), vectors=(measured,))
+    start = initial_state(quaternion.IDENTITY, attitude_sigma=sigma, bias_sigma=1e-6)
+    found = estimation.run(record, NOISE, start, states, full_covariance=True)
+    share = sigma**2 / (sigma**2 + r)
+    theta = mpmath.mpf(share * angle)
+    K = kinematics.skew(axis)
+    J = np.eye(3) - float((1 - mpmath.cos(theta)) / theta) * K + float(1 - mpmath.sin(theta) / theta) * K @ K
+    want = Rotation.from_rotvec(share * angle * axis).as_quat(scalar_first=True)
+    np.testing.assert_allclose(found.attitude[0], want, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(found.covariance[0, :3, :3], r * share * J @ J.T, rtol=0, atol=3e-15 * r)
 
 
 def test_a_stretch_in_factors_is_the_filter_itself():

@@ -67,7 +67,7 @@ from strapdown.kernels.measurement import (
     value_of,
     vector_at,
 )
-from strapdown.kernels.rotation import far_turn, quaternion_multiply, right_jacobian, turned, unit
+from strapdown.kernels.rotation import moved, quaternion_multiply
 from strapdown.kernels.sensor_rows import arm_noise, decorrelate, fill_rows
 from strapdown.kernels.state import store_row
 from strapdown.kernels.triangle import (
@@ -347,14 +347,8 @@ def update(state, e, now, measured, body, out):
         out.innovation[place, 2 * r + 1] = s[r]
     if kind == HEADING and not shown:
         out.innovation[place, 0] = math.nan  # a vertical vector has no heading: skipped
-    a = (step[0], step[1], step[2])
     before = q
-    if dot(a, a) > 1.0:
-        far, G = far_turn(a)
-        q = unit(quaternion_multiply(q, far))
-    else:
-        G = right_jacobian(a)
-        q = turned(q, a)
+    q, G = moved(q, (step[0], step[1], step[2]))
     for i in range(len(x)):
         x[i] += step[3 + i]
     turn_rows(F, size, G)
