@@ -34,8 +34,8 @@ import typer
 
 from strapdown.checks import OF_YOUR_OWN, InputError
 from strapdown.cli.layout import register as register
-from strapdown.cli.progress import be_quiet
-from strapdown.cli.terminal import app, console, errors
+from strapdown.cli.progress import be_quiet, errors
+from strapdown.cli.terminal import app, console
 from strapdown.files.reading import NoDigestWarning
 
 

@@ -15,14 +15,13 @@ import typer
 
 from strapdown.checks import InputError, count
 from strapdown.cli.filters import default_words, filter_of_scenario, own_filter
+from strapdown.cli.progress import progress_bar, rate_text
 from strapdown.cli.terminal import (
     TABLES,
     command,
     console,
     counted,
     given,
-    progress_bar,
-    rate_text,
     scenario_named,
     show,
     table,

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from strapdown.checks import InputError, positive
+from strapdown.cli.progress import progress_bar
 from strapdown.cli.terminal import (
     FORMAT,
     TABLES,
@@ -16,7 +17,6 @@ from strapdown.cli.terminal import (
     command,
     console,
     counted,
-    progress_bar,
     show,
     table,
     tables_folder,
