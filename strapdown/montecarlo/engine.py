@@ -226,14 +226,10 @@ def merged_in_order(finished: Iterator[tuple[int, Parts]]) -> Parts:
     for number, parts in finished:
         early[number] = parts
         while place in early:
-            total = merge_parts(total, early.pop(place))
+            following = early.pop(place)
+            total = tuple(merge(a, b) for a, b in zip(total, following, strict=True)) if total else following
             place += 1
     return total
-
-
-def merge_parts(total: Parts, parts: Parts) -> Parts:
-    """Return both merged, plan by plan; ``total`` is empty at the start."""
-    return tuple(merge(a, b) for a, b in zip(total, parts, strict=True)) if total else parts
 
 
 def run_plan(
