@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import itertools
 import warnings
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,9 +21,6 @@ from strapdown import quaternion
 from strapdown.checks import Array, InputError, array, one_of, unit_quaternions
 from strapdown.kinematics import skew
 from strapdown.units import STANDARD_GRAVITY
-
-if TYPE_CHECKING:
-    pass
 
 __all__ = [
     "Angles",
