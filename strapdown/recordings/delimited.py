@@ -168,7 +168,7 @@ class _Head:
     @staticmethod
     def _second_row(first: Sequence[str], second: Sequence[str]) -> bool:
         """Return whether a second row belongs to the header: it has no number, and the width of the first."""
-        return len(first) == len(second) and not any(_is_number(cell) and cell.strip() for cell in second)
+        return len(first) == len(second) and not any(is_number(cell) and cell.strip() for cell in second)
 
 
 def _date(cell: str) -> int | None:
@@ -208,10 +208,11 @@ def _joined(first: Sequence[str], second: Sequence[str]) -> list[str]:
 def _numeric(line: str) -> bool:
     """Return whether at least half of the non-empty fields of a line are numbers, with any separator."""
     filled = [cell for part in re.split(r"[,;\t|]", line) if (cell := part.strip().strip('"'))]
-    return bool(filled) and 2 * sum(map(_is_number, filled)) >= len(filled)
+    return bool(filled) and 2 * sum(map(is_number, filled)) >= len(filled)
 
 
-def _is_number(cell: str) -> bool:
+def is_number(cell: str) -> bool:
+    """Return whether a cell is a number or empty."""
     try:
         float(cell or "nan")
     except ValueError:

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from strapdown import quaternion
 from strapdown.checks import Array, InputError
 from strapdown.files import reading
-from strapdown.recordings.delimited import read_csv
+from strapdown.recordings.delimited import is_number, read_csv
 from strapdown.records.recording import Recording
 
 TRUTHS = ("state_groundtruth_estimate0", "mocap0")
@@ -90,15 +90,7 @@ def is_tum(head: bytes) -> bool:
     ]
     if not lines:
         return False
-    return all(len(line) == 8 and all(map(_is_number, line)) for line in lines)
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
+    return all(len(line) == 8 and all(map(is_number, line)) for line in lines)
 
 
 def _rows(path: Path, separator: str | None) -> list[list[str]]:
