@@ -363,7 +363,7 @@ def _print_errors(report: dict[str, Any]) -> None:
     for name, unit, text in (("attitude", "arcsec", "arcsec"), ("bias", "deg_per_hour", "°/h")):
         if name not in report["nees"]:  # a user's filter without a bias
             continue
-        axis = _worst_axis(last[f"{name}_rms_error_{unit}"])
+        axis = int(np.argmax([np.inf if x is None else x for x in last[f"{name}_rms_error_{unit}"]]))
         keys = ("rms_error", "sigma", *(f"error_quantile_{q:g}" for q in QUANTILES))
         sizes = [last[f"{name}_{key}_{unit}"][axis] for key in keys]
         large = name == "attitude" and (sizes[0] or 0.0) > 3600.0
@@ -387,11 +387,6 @@ def _print_errors(report: dict[str, Any]) -> None:
             f"RMS error divided by the root of the Cramér–Rao bound, by axis: {ratios} "
             f"(at one epoch {low:.3f} to {high:.3f} for an efficient filter)."
         )
-
-
-def _worst_axis(values: list[float | None]) -> int:
-    sizes = [float("inf") if x is None else x for x in values]
-    return sizes.index(max(sizes))
 
 
 def _replayed(target: Path, run: int) -> list[Path]:

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from strapdown.consistency import Judgement
     from strapdown.consistency.foreign import Checked
     from strapdown.estimation.setup import FilterSetup
-    from strapdown.records import Estimate, ImuRecord, Truth
+    from strapdown.records import Estimate, ImuRecord
     from strapdown.tuning.diagnosis import Diagnosis
 
 CONSISTENT, NOT, CANNOT_TELL = 0, 1, 2
@@ -148,16 +148,12 @@ def _judged_own(result: Path, probability: float, *, with_record: bool) -> tuple
         console.print(
             f"{result.name}: {len(estimate.time)} epochs over {estimate.time[-1] - estimate.time[0]:.6g} s, "
             f"{sum(len(one.time) for one in estimate.innovations.values())} measurements, "
-            f"{_truth_words(truth, records.read_reference(result))}."
+            f"{'with its truth' if truth is not None else 'with a reference attitude' if records.read_reference(result) else 'no truth'}."
         )
         judgement = findings.judged(result, attributes, estimate, truth, probability=probability)
     else:
         raise InputError(f"{result} is a {kind}; give a result of `strapdown estimate` or `strapdown montecarlo`")
     return judgement, {"source": result.name, "kind": kind}
-
-
-def _truth_words(truth: Truth | None, reference: Truth | None) -> str:
-    return "with its truth" if truth is not None else "no truth" if reference is None else "with a reference attitude"
 
 
 def status_of(judgement: Judgement) -> int:

@@ -193,16 +193,11 @@ def allan(
     tables_folder(output.tables)
     names = [*(name for one in chosen for name in _names(one, output.form)), *exports.files]
     writable("out", *(output.out / name for name in names), sources=(recording,))
-    layout = _layout(recording, samples)
+    # For simulated records and arrays the reader raises errors for options that do not apply.
+    plain_units = recording.suffix.lower() == ".npy" or (samples.columns is None and samples.topic is None)
+    layout = {"units": samples.units} if plain_units else samples.options(recording)
     fits = {one: _identify(recording, one, layout, options, output) for one in chosen}
     exports.write(fits, output.out, recording.name, samples.topic)
-
-
-def _layout(recording: Path, samples: Samples) -> dict[str, Any]:
-    """Return the options for reading the file; for simulated records and arrays, the reader raises errors for those that do not apply."""
-    if recording.suffix.lower() == ".npy" or (samples.columns is None and samples.topic is None):
-        return {"units": samples.units}
-    return samples.options(recording)
 
 
 def _names(sensor: str, form: str = FigureFormat.png) -> tuple[str, ...]:

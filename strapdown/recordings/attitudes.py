@@ -64,9 +64,8 @@ def read_attitudes(path: str | os.PathLike[str], *, topic: str = "") -> Attitude
         return _bag(file, topic)
     reading.existing_file(file)
     if reading.is_hdf5(file):
-        with reading.hdf5(file) as content:
-            kind = str(reading.attributes(content).get("kind", ""))
-        return _own(file, kind) if kind.startswith("strapdown ") else _of_recording(read_broad(file))
+        kind = reading.kind(file)
+        return _own(file, kind) if kind else _of_recording(read_broad(file))
     with reading.opened(file) as stream:
         head = stream.read(4096)
     if head.startswith(ros.MAGICS):

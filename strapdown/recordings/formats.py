@@ -167,14 +167,9 @@ def format_of(path: str | os.PathLike[str]) -> Format:
         return by_ending
     if table.recognised(file, head):
         return table
+    known = (f"{one.name} ({' or '.join(one.endings)})" if one.endings else one.name for one in FORMATS if one.read)
     raise InputError(
-        f"{file} has the extension {file.suffix!r} and the content of no known format; known formats are {_known()}"
-    )
-
-
-def _known() -> str:
-    return ", ".join(
-        f"{one.name} ({' or '.join(one.endings)})" if one.endings else one.name for one in FORMATS if one.read
+        f"{file} has the extension {file.suffix!r} and the content of no known format; known formats are {', '.join(known)}"
     )
 
 
@@ -366,11 +361,7 @@ def not_held(path: str | os.PathLike[str]) -> tuple[str, ...]:
 
 def is_estimate(path: str | os.PathLike[str]) -> bool:
     """Return whether a path is an estimate of this package in HDF5."""
-    file = Path(path)
-    if not file.is_file() or format_of(file).name != "BROAD":
-        return False
-    with reading.hdf5(file) as content:
-        return bool(reading.attributes(content).get("kind") == "strapdown estimate")
+    return Path(path).is_file() and reading.kind(path) == "strapdown estimate"
 
 
 def is_record(path: str | os.PathLike[str]) -> bool:
