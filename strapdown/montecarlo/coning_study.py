@@ -45,6 +45,8 @@ STEP_MULTIPLE = 12
 
 A coning-compensated step divided in its middle would be treated as a rotation at constant rate, which it is not under coning."""
 
+MAX_STEPS = 60_000
+"""Maximum number of steps of a run in which a drift is measured."""
 EPOCHS = 100
 VERDICT_EPOCHS = 20
 
@@ -319,7 +321,7 @@ def predicted_drift(motion: Coning, rate: float, algorithm: coning.Algorithm) ->
     return motion.angle**2 * 2.0 * np.pi * motion.frequency * coning.small_angle_drift(algorithm, ratio)
 
 
-def measured_drift(motion: Coning, rate: float, algorithm: coning.Algorithm, steps: int = 60_000) -> float:
+def measured_drift(motion: Coning, rate: float, algorithm: coning.Algorithm) -> float:
     """Return the drift of noise-free integration against the closed form, rad/s along the cone's axis: estimated minus true.
 
     Drift rotates the estimate about the fixed z axis at a constant rate. The run ends where coning cycles and steps most nearly coincide,
@@ -327,7 +329,7 @@ def measured_drift(motion: Coning, rate: float, algorithm: coning.Algorithm, ste
     """
     expected = abs(coning.predicted_coning_drift(algorithm, motion.angle, motion.frequency, 1.0 / rate))
     step = algorithm.samples / rate
-    longest = int(min(steps, max(1.0 / (expected * step), 100.0))) if expected > 0.0 else steps
+    longest = int(min(MAX_STEPS, max(1.0 / (expected * step), 100.0))) if expected > 0.0 else MAX_STEPS
     cycles = np.arange(longest // 2, longest + 1) * (step * motion.frequency)
     chosen = longest // 2 + int(np.argmin(np.abs(cycles - np.round(cycles))))
     edges = np.arange(chosen * algorithm.samples + 1) / rate

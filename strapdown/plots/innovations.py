@@ -13,6 +13,8 @@ from strapdown.plots.style import AXES, BLUE, CYCLE, ORANGE, SKY, VERMILION, axe
 from strapdown.records import Innovations
 from strapdown.units import angle_unit
 
+WINDOW = 50
+"""Number of measurements of a moving average."""
 HISTOGRAM_REACH = 5.0
 """Range of histograms of whitened innovations, ±σ; the number beyond it is in the legend."""
 
@@ -94,25 +96,18 @@ def innovation_autocorrelation(result: Autocorrelation, ax: Axes | None = None) 
     return ax
 
 
-def nis_over_record(
-    innovations: Innovations,
-    bounds: tuple[float, float],
-    ax: Axes | None = None,
-    *,
-    window: int = 50,
-    probability: float = 0.99,
-) -> Axes:
-    """Draw the NIS of one sensor per degree of freedom over time, its moving average over ``window``, and the bounds of one measurement."""
+def nis_over_record(innovations: Innovations, bounds: tuple[float, float], ax: Axes | None = None) -> Axes:
+    """Draw the NIS of one sensor per degree of freedom over time, its moving average, and the 99 % ``bounds`` of one measurement."""
     ax = axes_or_new(ax)
     degrees = innovations.innovation.shape[1]
     value = innovations.nis / degrees
-    ax.axhspan(*bounds, color=ink(), alpha=0.12, linewidth=0, label=f"{100 * probability:g} % bounds, each")
+    ax.axhspan(*bounds, color=ink(), alpha=0.12, linewidth=0, label="99 % bounds, each")
     few, low = decimated(innovations.time, np.maximum(value, 1e-4))
     ax.plot(few, low, ".", color=SKY, markersize=2.5, label="one measurement")
-    if len(value) >= 2 * window:
-        mean = np.convolve(value, np.full(window, 1.0 / window), mode="valid")
-        middle = innovations.time[window // 2 : window // 2 + len(mean)]
-        ax.plot(*decimated(middle, mean), color=VERMILION, linewidth=1.2, label=f"mean of {window}")
+    if len(value) >= 2 * WINDOW:
+        mean = np.convolve(value, np.full(WINDOW, 1.0 / WINDOW), mode="valid")
+        middle = innovations.time[WINDOW // 2 : WINDOW // 2 + len(mean)]
+        ax.plot(*decimated(middle, mean), color=VERMILION, linewidth=1.2, label=f"mean of {WINDOW}")
     ax.axhline(1.0, color=ink(), linewidth=0.6)
     ax.set_yscale("log")
     ax.set_ylim(0.3 * min(bounds[0], float(np.quantile(value, 0.01)) + 1e-4), 3.0 * max(bounds[1], float(value.max())))

@@ -95,9 +95,9 @@ def euler(attitude: ArrayLike, sequence: str = "ZYX", covariance: ArrayLike | No
     return Angles(angles, sigma if intrinsic else sigma[:, ::-1])
 
 
-def euler_axes(attitude: ArrayLike, sequence: str = "ZYX") -> Array:
-    """Return E (n, 3, 3) of ``δθ = E δφ``: its columns are the axes of the three rotations of an intrinsic sequence, body frame."""
-    return _turn_axes(euler(attitude, sequence).angles, sequence)
+def euler_axes(attitude: ArrayLike) -> Array:
+    """Return E (n, 3, 3) of ``δθ = E δφ``: its columns are the axes of the three rotations of the sequence ZYX, body frame."""
+    return _turn_axes(euler(attitude).angles, "ZYX")
 
 
 def _turn_axes(angles: Array, sequence: str) -> Array:
