@@ -6,18 +6,9 @@ that they did not write; ``montecarlo``, whose result may have taken hours, need
 - ``terminal``: Functions shared by all commands.
 - ``progress``: Progress of long computations.
 - ``layout``: Groups, order, modules and examples of the commands.
-- ``studies``: ``coning``
-- ``integration``: ``algorithms``, ``integrate``, ``coning-budget``
-- ``estimation``: ``estimate``
 - ``reading``: Options of every command that reads a recording.
-- ``conversion``: ``convert``
-- ``campaigns``: ``montecarlo``
-- ``judgement``: ``check``, ``doctor``
-- ``planning``: ``covariance``
-- ``reporting``: ``report``
-- ``sensors``: ``simulate``, ``scenarios``, ``allan``
-- ``tuning``: ``tune``
-- ``installation``: ``info``
+
+The other modules define the commands that :data:`strapdown.cli.layout.COMMANDS` assigns to them.
 """
 
 from __future__ import annotations

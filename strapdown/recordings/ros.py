@@ -33,7 +33,7 @@ from strapdown.checks import Array, InputError, one_of
 from strapdown.files import reading
 from strapdown.recordings.extras import library, with_ending
 from strapdown.records import Estimate
-from strapdown.records.recording import MAGNETIC_UNITS, Recording, at_nearest, relative_time, with_gyro
+from strapdown.records.recording import Recording, at_nearest, field_in, relative_time, with_gyro
 
 IMU, FIELD, TEMPERATURE, REFERENCE = (
     "sensor_msgs/msg/Imu",
@@ -338,14 +338,9 @@ def _series(recording: Recording, estimate: Estimate | None) -> list[_Series]:
         imu[:, 25:28] = recording.specific_force
     found: list[_Series] = [(IMU, stamps, imu)]
     if recording.magnetic_field is not None:
-        if not recording.magnetic_unit:
-            raise InputError(
-                f"{recording.source} does not declare the unit of its magnetometer, and a bag uses tesla; declare it in the header or by "
-                f"option ({' or '.join(MAGNETIC_UNITS)})"
-            )
         known = ~np.isnan(recording.magnetic_field).any(axis=1)
         magnetic = np.zeros((int(known.sum()), DOUBLES[FIELD]))
-        magnetic[:, :3] = recording.magnetic_field[known] * MAGNETIC_UNITS[recording.magnetic_unit]
+        magnetic[:, :3] = field_in("T", recording)[known]
         found.append((FIELD, stamps[known], magnetic))
     if recording.temperature is not None:
         known = ~np.isnan(recording.temperature)

@@ -27,7 +27,7 @@ from strapdown.files import reading, written_beside
 from strapdown.recordings.extras import library
 from strapdown.recordings.trajectories import interpolated
 from strapdown.records import outputs
-from strapdown.records.recording import MAGNETIC_UNITS, Recording, at_nearest, relative_time, with_gyro
+from strapdown.records.recording import Recording, at_nearest, field_in, relative_time, with_gyro
 
 UNIT, FIELD, ATTITUDE = "sensor_combined", "vehicle_magnetometer", "vehicle_attitude"
 NO_SAMPLE = 0x7FFFFFFF
@@ -184,14 +184,8 @@ def write_ulog(recording: Recording, path: str | os.PathLike[str]) -> None:
         )
     ]
     if recording.magnetic_field is not None:
-        if not recording.magnetic_unit:
-            raise InputError(
-                f"{recording.source} does not declare the unit of its magnetometer, and a log uses Gauss; declare it in the header or by "
-                f"option ({' or '.join(MAGNETIC_UNITS)})"
-            )
         seen = ~np.isnan(recording.magnetic_field).any(axis=1)
-        gauss = recording.magnetic_field[seen] * (MAGNETIC_UNITS[recording.magnetic_unit] / MAGNETIC_UNITS["G"])
-        topics.append((FIELD, stamps[seen], [stamps[seen], gauss]))
+        topics.append((FIELD, stamps[seen], [stamps[seen], field_in("G", recording)[seen]]))
     if recording.true_attitude is not None:
         seen = ~np.isnan(recording.true_attitude).any(axis=1)
         topics.append((ATTITUDE, stamps[seen], [outputs.to_ned(quaternion.normalize(recording.true_attitude[seen]))]))
