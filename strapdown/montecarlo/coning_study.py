@@ -16,9 +16,11 @@ import numpy as np
 
 from strapdown import coning, montecarlo, quaternion
 from strapdown.checks import Array, InputError, count, non_negative, positive
+from strapdown.consistency import Verdict
 from strapdown.estimation.states import ProcessNoise
 from strapdown.gyro import GyroSpec
 from strapdown.montecarlo import FilterSetup, Statistics
+from strapdown.montecarlo.statistics import SUBSETS
 from strapdown.motion import Coning, Harmonic, HarmonicRates, Motion, SpinRock, TorqueFree
 from strapdown.scenarios import Scenario
 from strapdown.units import (
@@ -185,13 +187,15 @@ class FilterOutcome:
     """Indices of the epochs judged."""
 
     @property
+    def verdicts(self) -> dict[str, Verdict]:
+        """Test of the NEES at the judged epochs, by subset of the states."""
+        return {subset: self.statistics.verdict(self.epochs, subset, self.probability) for subset in SUBSETS}
+
+    @property
     def consistent(self) -> bool:
         """Whether NEES of the state, of the attitude and of the bias and the NIS all lie inside their bounds."""
         low, high = self.statistics.nis_bounds(self.probability)
-        nees = all(
-            self.statistics.verdict(self.epochs, subset, self.probability).consistent
-            for subset in ("state", "attitude", "bias")
-        )
+        nees = all(one.consistent for one in self.verdicts.values())
         return nees and low <= self.statistics.mean_nis <= high
 
     def summary(self) -> dict[str, Any]:
@@ -200,24 +204,16 @@ class FilterOutcome:
         RMS errors are over the judged epochs and axes; ``anees`` is the mean over the judged epochs and its bounds are those of one epoch.
         The verdict compares every epoch with simultaneous bounds.
         """
-        statistics = self.statistics
-        verdicts = {
-            subset: statistics.verdict(self.epochs, subset, self.probability)
-            for subset in ("state", "attitude", "bias")
-        }
-        square = statistics.rms_error[self.epochs] ** 2
+        statistics, verdicts = self.statistics, self.verdicts
+        square, variance = statistics.rms_error[self.epochs] ** 2, statistics.sigma[self.epochs] ** 2
         return {
             "integration": self.integration,
             "runs": statistics.runs,
             "attitude_rms_arcsec": float(np.sqrt(square[:, :3].mean()) / ARCSECOND),
-            "attitude_sigma_arcsec": float(np.sqrt((statistics.sigma[self.epochs, :3] ** 2).mean()) / ARCSECOND),
+            "attitude_sigma_arcsec": float(np.sqrt(variance[:, :3].mean()) / ARCSECOND),
             "bias_rms_deg_per_hour": float(np.sqrt(square[:, 3:].mean()) / DEGREE_PER_HOUR),
-            "bias_sigma_deg_per_hour": float(
-                np.sqrt((statistics.sigma[self.epochs, 3:] ** 2).mean()) / DEGREE_PER_HOUR
-            ),
-            "bias_mean_deg_per_hour": [
-                float(x) for x in statistics.mean_error[self.epochs, 3:].mean(axis=0) / DEGREE_PER_HOUR
-            ],
+            "bias_sigma_deg_per_hour": float(np.sqrt(variance[:, 3:].mean()) / DEGREE_PER_HOUR),
+            "bias_mean_deg_per_hour": (statistics.mean_error[self.epochs, 3:].mean(axis=0) / DEGREE_PER_HOUR).tolist(),
             "anees": float(verdicts["state"].mean.mean()),
             "anees_bounds": list(verdicts["state"].bounds),
             "anees_attitude": float(verdicts["attitude"].mean.mean()),

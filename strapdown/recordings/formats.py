@@ -94,7 +94,7 @@ FORMATS: tuple[Format, ...] = (
         read="dataframes:read_parquet",
         options=("units", "columns", "gyro_alone"),
         write="dataframes:write_parquet",
-        write_estimate="estimates:write_parquet",
+        write_estimate="estimates:write_table",
         estimate_options=("sequence", "frame"),
     ),
     Format(
@@ -138,7 +138,7 @@ FORMATS: tuple[Format, ...] = (
         read="delimited:read_csv",
         options=("units", "columns", "gyro_alone"),
         write="delimited:write_csv",
-        write_estimate="estimates:write_csv",
+        write_estimate="estimates:write_table",
         estimate_options=("sequence", "frame"),
     ),
 )
