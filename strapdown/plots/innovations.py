@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
 from strapdown.checks import Array
-from strapdown.consistency import Autocorrelation, Distribution, QuantilePairs
+from strapdown.consistency import Autocorrelation, QuantilePairs
 from strapdown.plots.decimation import decimated
 from strapdown.plots.style import AXES, BLUE, CYCLE, ORANGE, SKY, VERMILION, axes_or_new, ink, legend_above
 from strapdown.records import Innovations
@@ -117,19 +117,18 @@ def nis_over_record(innovations: Innovations, bounds: tuple[float, float], ax: A
     return ax
 
 
-def error_distribution(distribution: Distribution, ax: Axes | None = None, *, label: str = "attitude error") -> Axes:
-    """Draw the cumulative distribution of errors, rad, with the median and the 95 % quantile marked."""
+def error_distribution(error: Array, ax: Axes | None = None) -> Axes:
+    """Draw the cumulative distribution of attitude errors (n,), rad, with the median and the 95 % quantile marked; NaN is left out."""
     ax = axes_or_new(ax)
-    unit, size = angle_unit(np.array([distribution.quantile(0.99)]))
-    ax.plot(*decimated(distribution.values / size, 100.0 * distribution.probability), color=BLUE, label=label)
-    for share, color in ((0.5, ORANGE), (0.95, VERMILION)):
-        at = distribution.quantile(share) / size
-        ax.plot([at, at, 0.0], [0.0, 100 * share, 100 * share], ":", color=color, linewidth=1.2)
-        ax.annotate(
-            f"{100 * share:g} %: {at:.3g} {unit}", (at, 100 * share), xytext=(6, -12), textcoords="offset points"
-        )
-    ax.set_xlim(0.0, 1.15 * distribution.quantile(0.999) / size)
+    values = np.sort(error[np.isfinite(error)])
+    median, most, nearly_all, all_but_few = np.quantile(values, [0.5, 0.95, 0.99, 0.999], method="inverted_cdf")
+    unit, size = angle_unit(nearly_all)
+    ax.plot(*decimated(values / size, 100.0 * (np.arange(1, len(values) + 1) / len(values))), color=BLUE)
+    for percent, at, color in ((50, median / size, ORANGE), (95, most / size, VERMILION)):
+        ax.plot([at, at, 0.0], [0.0, percent, percent], ":", color=color, linewidth=1.2)
+        ax.annotate(f"{percent} %: {at:.3g} {unit}", (at, percent), xytext=(6, -12), textcoords="offset points")
+    ax.set_xlim(0.0, 1.15 * all_but_few / size)
     ax.set_ylim(0.0, 102.0)
-    ax.set_xlabel(f"{label}, {unit}")
+    ax.set_xlabel(f"attitude error, {unit}")
     ax.set_ylabel("fraction of the time, %")
     return ax

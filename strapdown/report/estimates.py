@@ -189,7 +189,7 @@ def _sensor(name: str, innovations: Innovations, probability: float) -> str:
 def _distribution(estimate: Estimate, truth: Truth | None) -> list[str]:
     if truth is None:
         return []
-    angle = consistency.distribution(quaternion.angle_between(estimate.attitude, truth.attitude))
+    angle = quaternion.angle_between(estimate.attitude, truth.attitude)
 
     def draw() -> Figure:
         figure, ax = plots.new_figure(size=(6.5, 4.2))
