@@ -172,8 +172,6 @@ def _computed(plan: Plan, target: Path, name: str, computing: _Computing, output
     runs = computing.runs
     if runs is None:
         runs = campaigns.read(target).runs if output.resume and target.exists() else _RUNS
-    if computing.workers is not None and computing.cluster is not None:
-        raise InputError("--workers and --cluster exclude each other: a cluster has its own workers")
     choice = engine.choose(plan, computing.machine)
     count("runs", runs)
     engine.in_threads(computing.threads)  # checks the number

@@ -51,10 +51,10 @@ def dask_client(*, workers: int | None = None, address: str | None = None) -> It
     InputError
         If both are given, Dask is not installed, or no scheduler answers at the address.
     """
+    if address is not None and workers is not None:
+        raise InputError("workers and cluster exclude each other: a cluster has its own workers; give only one")
     distributed = library("distributed", "a cluster of workers", "cluster")
     if address is not None:
-        if workers is not None:
-            raise InputError("workers and cluster exclude each other: the cluster has its own workers; give only one")
         try:
             client = distributed.Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
         except (OSError, ValueError, TypeError) as error:

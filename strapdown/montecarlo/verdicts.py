@@ -64,7 +64,6 @@ def summary(
         Plain values for JSON.
     """
     chosen = judged_epochs(len(statistics.time) - 1) if epochs is None else epochs
-    seen = [i for i in range(len(statistics.sensors)) if statistics.sensor_degrees[i].sum() > 0]
     judgement = statistics.judge(epochs=chosen, probability=probability)
     found = {(one.name, one.of): one for one in judgement.findings}
     nees = {}
@@ -80,15 +79,15 @@ def summary(
         }
     nis = [
         {
-            "sensor": statistics.sensors[i],
+            "sensor": sensor,
             "nis": statistics.sensor_nis[i],
-            "bounds": [one.low, one.high],
+            "bounds": [test.low, test.high],
             "degrees_of_freedom": int(statistics.sensor_degrees[i].sum()),
             "refused": int(statistics.sensor_refused[i].sum()),
-            "consistent": not one.rejected,
+            "consistent": not test.rejected,
         }
-        for i in seen
-        for one in [found["NIS", statistics.sensors[i]]]
+        for i, sensor in enumerate(statistics.sensors)
+        if (test := found.get(("NIS", sensor))) is not None
     ]
     covered = statistics.covered[chosen]
     table = {

@@ -102,10 +102,9 @@ def is_folder(path: Path) -> bool:
 
 
 def _storages(path: Path) -> list[Path]:
-    """Return the storage files of a folder in order: with metadata all, else those named as the folder, or with a number appended."""
+    """Return the storage files of a folder without metadata in order: those named as the folder, or with a number appended."""
     found = [one for suffix in (".mcap", ".db3") for one in path.glob(f"*{suffix}")]
-    name = ".*?" if (path / "metadata.yaml").is_file() else re.escape(path.absolute().name)
-    numbers = {one: re.fullmatch(rf"{name}(?:_(\d+))?", one.stem) for one in found}
+    numbers = {one: re.fullmatch(rf"{re.escape(path.absolute().name)}(?:_(\d+))?", one.stem) for one in found}
     return sorted(
         (one for one, number in numbers.items() if number), key=lambda one: int((numbers[one] or [0, 0])[1] or 0)
     )

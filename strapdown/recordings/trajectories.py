@@ -61,7 +61,8 @@ def _read_truth(path: Path) -> tuple[NDArray[np.int64], Array]:
     rows = _rows(path, ",")
     if rows and len(rows[0]) < 8:
         raise InputError(f"{path} has {len(rows[0])} columns; wanted time, position and quaternion, 8 or more")
-    return _whole(path, [row[0] for row in rows], 1), np.array([[float(x) for x in row[4:8]] for row in rows])
+    q = quaternion.normalize(np.array([[float(x) for x in row[4:8]] for row in rows]))
+    return _whole(path, [row[0] for row in rows], 1), q
 
 
 def read_tum(path: str | os.PathLike[str]) -> tuple[NDArray[np.int64], Array]:
@@ -145,17 +146,19 @@ def _with_reference(recording: Recording, stamps: NDArray[np.int64], attitude: A
     return replace(recording, true_attitude=found, remarks=(*recording.remarks, words))
 
 
-def interpolated(time: Array, stamps: Array, attitude: Array) -> Array:
-    """Return attitudes (n, 4) at ``time`` (n,) interpolated between ``stamps`` along the shortest rotation; NaN outside and in gaps."""
+def interpolated(time: Array, stamps: Array, q: Array, bridged: float = BRIDGED) -> Array:
+    """Return attitudes (n, 4) at ``time`` (n,) between unit quaternions at ``stamps`` along the shortest rotation.
+
+    NaN outside, and between stamps that are further than ``bridged`` apart, s.
+    """
     result = np.full((len(time), 4), np.nan)
     if len(stamps) < 2:
         return result
     k = np.clip(np.searchsorted(stamps, time, side="right") - 1, 0, len(stamps) - 2)
-    share = (time - stamps[k]) / (stamps[k + 1] - stamps[k])
-    slack = 1e-9 / (stamps[k + 1] - stamps[k])
-    usable = (share >= -slack) & (share <= 1.0 + slack) & (stamps[k + 1] - stamps[k] <= BRIDGED)
+    width = stamps[k + 1] - stamps[k]
+    share = (time - stamps[k]) / width
+    usable = (share >= -1e-9 / width) & (share <= 1.0 + 1e-9 / width) & (width <= bridged)
     k, share = k[usable], share[usable]
-    q = quaternion.normalize(attitude)
     turn = quaternion.log(quaternion.multiply(quaternion.conjugate(q[k]), q[k + 1]))
     result[usable] = quaternion.multiply(q[k], quaternion.exp(share[:, None] * turn))
     return result
