@@ -23,7 +23,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -90,12 +90,6 @@ class _Topic:
         return len(self.logged)
 
 
-class _Bag(NamedTuple):
-    topics: dict[str, _Topic]
-    ros2: bool
-    remarks: tuple[str, ...]
-
-
 def is_folder(path: Path) -> bool:
     """Return whether a folder is a ROS 2 bag: metadata.yaml, or only storage files, if the recorder was killed."""
     return path.is_dir() and ((path / "metadata.yaml").is_file() or bool(_storages(path)))
@@ -116,10 +110,10 @@ def _storages(path: Path) -> list[Path]:
 def read_bag(path: str | os.PathLike[str], *, topic: str = "") -> Recording:
     """Read the inertial unit of a bag, a file or a folder; ``topic`` selects one of several topics of ``sensor_msgs/Imu``."""
     file = Path(path)
-    bag = _messages(file, wanted=tuple(DOUBLES))
-    chosen = _chosen(file.name, bag.topics, topic)
-    stamps, values, order_words = _joined(file.name, bag.topics[chosen])
-    said = [f"Topic {chosen}: {len(stamps)} messages.", *bag.remarks, *order_words]
+    topics, _, remarks = _messages(file, wanted=tuple(DOUBLES))
+    chosen = _chosen(file.name, topics, topic)
+    stamps, values, order_words = _joined(file.name, topics[chosen])
+    said = [f"Topic {chosen}: {len(stamps)} messages.", *remarks, *order_words]
     if values[0, 3] == -1.0:
         raise InputError(
             f"{file.name}, topic {chosen}: message 1 declares that it has no angular velocity; choose another topic"
@@ -127,7 +121,7 @@ def read_bag(path: str | os.PathLike[str], *, topic: str = "") -> Recording:
     time, epoch = relative_time(stamps)
     own: dict[str, Any] = {} if values[0, 15] == -1.0 else {"specific_force": values[:, 12:15]}
     for kind, name in ((FIELD, "magnetic_field"), (TEMPERATURE, "temperature"), (REFERENCE, "true_attitude")):
-        other = _beside(chosen, [t for t in bag.topics.values() if t.kind == kind and len(t)])
+        other = _beside(chosen, [t for t in topics.values() if t.kind == kind and len(t)])
         if isinstance(other, str):
             said.append(other)
         if not isinstance(other, _Topic) or (kind == REFERENCE and not other.name.endswith("reference")):
@@ -232,8 +226,8 @@ def _joined(name: str, topic: _Topic) -> tuple[NDArray[np.int64], Array, list[st
     return stamps, values, said
 
 
-def _messages(path: Path, wanted: tuple[str, ...] = ()) -> _Bag:
-    """Return the messages of a bag by topic, of the wanted types (empty: all)."""
+def _messages(path: Path, wanted: tuple[str, ...] = ()) -> tuple[dict[str, _Topic], bool, tuple[str, ...]]:
+    """Return the messages of a bag by topic, of the wanted types (empty: all), whether it is of ROS 2, and remarks."""
     files = [path]
     if path.is_dir() and not (path / "metadata.yaml").is_file():
         files = _storages(path)
@@ -251,7 +245,7 @@ def _messages(path: Path, wanted: tuple[str, ...] = ()) -> _Bag:
     words: tuple[str, ...] = ()
     if files != [path]:
         words = (f"{path.name} has no metadata.yaml, as if the recorder was killed: read from its {len(files)} files.",)
-    return _Bag(topics, ros2, words)
+    return topics, ros2, words
 
 
 @contextlib.contextmanager
@@ -308,10 +302,10 @@ def write_estimate(
     series = _series(recording, estimate)
     others: list[_Topic] = []
     if source is not None:
-        bag = _messages(source)
-        if bag.ros2 == (target.suffix.lower() != ".bag"):
+        topics, ros2, _ = _messages(source)
+        if ros2 == (target.suffix.lower() != ".bag"):
             written = {TOPICS[kind] if kind != IMU else WITH_ORIENTATION for kind, _, _ in series}
-            others = [t for t in bag.topics.values() if t.kind != IMU and t.name not in written]
+            others = [t for t in topics.values() if t.kind != IMU and t.name not in written]
     _write(target, series, others, source)
 
 
