@@ -61,8 +61,7 @@ def _read_truth(path: Path) -> tuple[NDArray[np.int64], Array]:
     rows = _rows(path, ",")
     if rows and len(rows[0]) < 8:
         raise InputError(f"{path} has {len(rows[0])} columns; wanted time, position and quaternion, 8 or more")
-    q = quaternion.normalize(np.array([[float(x) for x in row[4:8]] for row in rows]))
-    return _whole(path, [row[0] for row in rows], 1), q
+    return _whole(path, [row[0] for row in rows], 1), np.array([[float(x) for x in row[4:8]] for row in rows])
 
 
 def read_tum(path: str | os.PathLike[str]) -> tuple[NDArray[np.int64], Array]:
@@ -135,7 +134,7 @@ def with_reference(recording: Recording, path: str | os.PathLike[str]) -> Record
 
 def _with_reference(recording: Recording, stamps: NDArray[np.int64], attitude: Array, name: str) -> Recording:
     time = (stamps - recording.epoch_ns) / 1e9
-    found = interpolated(recording.time, time, attitude)
+    found = interpolated(recording.time, time, quaternion.normalize(attitude))
     known = int(np.sum(~np.isnan(found[:, 0])))
     if not known:
         raise InputError(
