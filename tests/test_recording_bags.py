@@ -1,4 +1,4 @@
-"""ROS bags: written by the library's own serialiser and read here, written here and read by the library, of several units."""
+"""ROS bags: written by the library's own serialiser and read here, written here and read by the library, truncated, of several units."""
 
 from __future__ import annotations
 
@@ -169,7 +169,7 @@ def test_bags_without_an_inertial_unit_and_what_is_no_bag_are_refused(bag, tmp_p
         read(bag("bag", [("/chatter", "String", START, "", "x")]))
     fake = tmp_path / "fake.bag"
     fake.write_bytes(b"#ROSBAG V2.0\n" + bytes(100))
-    with pytest.raises(InputError, match=r"fake.bag cannot be read as a ROS bag"):
+    with pytest.raises(InputError, match=r"fake.bag cannot be read as a ROS bag .* has no complete message"):
         read(fake)
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="is a folder; name the file in it"):
@@ -177,13 +177,20 @@ def test_bags_without_an_inertial_unit_and_what_is_no_bag_are_refused(bag, tmp_p
 
 
 @pytest.mark.parametrize("suffix", ["bag", "mcap", "db3"])
-def test_a_truncated_bag_is_refused_with_the_tools_that_repair_it(bag, suffix):
-    path = bag(suffix, imu(2000)[1])
+def test_a_truncated_bag_gives_what_is_whole_and_says_so(bag, suffix):
+    values, content = imu(2000)
+    path = bag(suffix, content)
     whole = path.read_bytes()
+    kept = []
     for share in (0.5, 0.9):
         path.write_bytes(whole[: int(share * len(whole))])
-        with pytest.raises(InputError, match=rf"{path.name} cannot be read as a ROS bag .*reindex.*mcap recover"):
-            read(path)
+        recording = read(path)
+        kept.append(len(recording.time))
+        np.testing.assert_array_equal(recording.rate, values[: kept[-1], :3])
+        assert "truncated or damaged" in " ".join(recording.remarks)
+        assert f"only its {kept[-1]} complete messages are read" in " ".join(recording.remarks)
+    assert 0.4 * 2000 < kept[0] < 0.6 * 2000
+    assert 0.8 * 2000 < kept[1] < 2000
 
 
 def test_a_folder_whose_recorder_was_killed_is_read_from_its_files(bag):
@@ -193,6 +200,18 @@ def test_a_folder_whose_recorder_was_killed_is_read_from_its_files(bag):
     recording = read(path)
     np.testing.assert_array_equal(recording.rate, values[:, :3])
     assert "has no metadata.yaml" in " ".join(recording.remarks)
+
+
+def test_a_truncated_bag_in_a_renamed_folder_gives_what_is_whole(bag, tmp_path):
+    values, content = imu(2000)
+    folder = bag("folder", content).rename(tmp_path / "renamed")
+    (file,) = folder.glob("*.mcap")
+    assert file.stem != "renamed"
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    recording = read(folder)
+    assert 800 < len(recording.time) < 1200
+    np.testing.assert_array_equal(recording.rate, values[: len(recording.time), :3])
+    assert "truncated or damaged" in " ".join(recording.remarks)
 
 
 def test_a_folder_of_several_bags_is_none(bag, tmp_path):

@@ -9,17 +9,21 @@ headers' stamps, ns; if these are all zero, that of the recorder. Stamps out of 
 The covariance of the orientation is written about the axes of the fixed frame, as REP 103 defines it for poses: ``R P Rᵀ`` of the filter's
 body-side covariance. At stamps without an estimate the first element is −1.
 
-The messages have a fixed layout after the name of their frame, so they are decoded as arrays.
+The messages have a fixed layout after the name of their frame, so they are decoded as arrays. A truncated bag, which the library rejects,
+is scanned record by record, and its complete messages are read.
 """
 
 from __future__ import annotations
 
+import bz2
 import contextlib
 import os
 import re
 import shutil
+import sqlite3
+import struct
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
@@ -52,7 +56,8 @@ FRAME = "imu_link"
 BATCH = 1024
 """Number of messages processed at once: processing each one separately would double the time."""
 
-_SUFFIX = {b"#ROSBAG V2.0\n": ".bag", b"\x89MCAP0\r\n": ".mcap", b"SQLite format 3\0": ".db3"}
+ROS1_MAGIC, MCAP_MAGIC, SQLITE_MAGIC = b"#ROSBAG V2.0\n", b"\x89MCAP0\r\n", b"SQLite format 3\0"
+_SUFFIX = {ROS1_MAGIC: ".bag", MCAP_MAGIC: ".mcap", SQLITE_MAGIC: ".db3"}
 MAGICS = tuple(_SUFFIX)
 """First bytes of the kinds of bags."""
 
@@ -96,9 +101,10 @@ def is_folder(path: Path) -> bool:
 
 
 def _storages(path: Path) -> list[Path]:
-    """Return the storage files of a folder without metadata in order: those named as the folder, or with a number appended."""
+    """Return the storage files of a folder in order: with metadata all, else those named as the folder, or with a number appended."""
     found = [one for suffix in (".mcap", ".db3") for one in path.glob(f"*{suffix}")]
-    numbers = {one: re.fullmatch(rf"{re.escape(path.absolute().name)}(?:_(\d+))?", one.stem) for one in found}
+    name = ".*?" if (path / "metadata.yaml").is_file() else re.escape(path.absolute().name)
+    numbers = {one: re.fullmatch(rf"{name}(?:_(\d+))?", one.stem) for one in found}
     return sorted(
         (one for one, number in numbers.items() if number), key=lambda one: int((numbers[one] or [0, 0])[1] or 0)
     )
@@ -226,31 +232,41 @@ def _joined(name: str, topic: _Topic) -> tuple[NDArray[np.int64], Array, list[st
     return stamps, values, said
 
 
-def _messages(path: Path, wanted: tuple[str, ...] = ()) -> tuple[dict[str, _Topic], bool, tuple[str, ...]]:
+_Messages = tuple[dict[str, _Topic], bool, tuple[str, ...]]
+
+
+def _messages(path: Path, wanted: tuple[str, ...] = ()) -> _Messages:
     """Return the messages of a bag by topic, of the wanted types (empty: all), whether it is of ROS 2, and remarks."""
     files = [path]
     if path.is_dir() and not (path / "metadata.yaml").is_file():
         files = _storages(path)
     topics: dict[str, _Topic] = {}
-    with opened(path.name, files) as reader:
-        ros2 = bool(reader.is2)
-        chosen = [c for c in reader.connections if not wanted or c.msgtype in wanted]
-        for c in chosen:
-            topics.setdefault(c.topic, _Topic(c.topic, c.msgtype, ros2=ros2, decodes=bool(wanted)))
-        if chosen:
-            messages = reader.messages(connections=chosen)
-            while batch := list(islice(messages, BATCH)):
-                for name in {connection.topic for connection, _, _ in batch}:
-                    topics[name].add([row for row in batch if row[0].topic == name])
+    try:
+        with opened(path.name, files) as reader:
+            ros2 = bool(reader.is2)
+            chosen = [c for c in reader.connections if not wanted or c.msgtype in wanted]
+            for c in chosen:
+                topics.setdefault(c.topic, _Topic(c.topic, c.msgtype, ros2=ros2, decodes=bool(wanted)))
+            if chosen:
+                messages = reader.messages(connections=chosen)
+                while batch := list(islice(messages, BATCH)):
+                    for name in {connection.topic for connection, _, _ in batch}:
+                        topics[name].add([row for row in batch if row[0].topic == name])
+    except DamagedBagError as error:
+        return _salvaged(path, files, wanted, error)
     words: tuple[str, ...] = ()
     if files != [path]:
         words = (f"{path.name} has no metadata.yaml, as if the recorder was killed: read from its {len(files)} files.",)
     return topics, ros2, words
 
 
+class DamagedBagError(InputError):
+    """The library cannot read a bag."""
+
+
 @contextlib.contextmanager
 def opened(name: str, files: Sequence[Path]) -> Iterator[Any]:
-    """Yield the library's reader of the files of a bag; any exception of its parsers is an InputError."""
+    """Yield the library's reader of the files of a bag; any exception of its parsers is a :class:`DamagedBagError`."""
     highlevel = library("rosbags.highlevel", f"{name} is a ROS bag, which")
     typesys = library("rosbags.typesys", f"{name} is a ROS bag, which")
     try:
@@ -261,12 +277,9 @@ def opened(name: str, files: Sequence[Path]) -> Iterator[Any]:
                 yield reader
     except InputError:
         raise
-    except Exception as error:
+    except Exception as error:  # for a truncated file the library raises any exception of its parsers
         reason = " ".join(str(error).split()) or type(error).__name__
-        raise InputError(
-            f"{name} cannot be read as a ROS bag ({reason}); if it is truncated, restore its index by `rosbag reindex` (ROS 1), "
-            "`ros2 bag reindex` or `mcap recover`"
-        ) from None
+        raise DamagedBagError(f"{name} cannot be read as a ROS bag ({reason})") from None
 
 
 def named_as(path: Path, folder: Path) -> Path:
@@ -277,6 +290,175 @@ def named_as(path: Path, folder: Path) -> Path:
         head = stream.read(16)
     suffix = next((suffix for magic, suffix in _SUFFIX.items() if head.startswith(magic)), path.suffix)
     return with_ending(path, suffix, folder)
+
+
+# ----------------------------------------------------------------------------------------------------------- damaged bags
+
+
+def _salvaged(path: Path, files: list[Path], wanted: tuple[str, ...], error: InputError) -> _Messages:
+    """Return the complete messages of a bag that the library cannot open."""
+    topics: dict[str, _Topic] = {}
+    ros2 = True
+    for file in _storages(path) if path.is_dir() else files:
+        with reading.opened(file) as stream:
+            head = stream.read(16)
+            scan = next((scan for magic, scan in _SCANS.items() if head.startswith(magic)), None)
+            if scan is None:
+                continue
+            ros2 = not head.startswith(ROS1_MAGIC)
+            found = scan(file)
+            while batch := list(islice(found, BATCH)):
+                for name, kind in dict.fromkeys(row[:2] for row in batch):
+                    if not wanted or kind in wanted:
+                        topic = topics.setdefault(name, _Topic(name, kind, ros2=ros2, decodes=bool(wanted)))
+                        topic.add([(None, *row[2:]) for row in batch if row[0] == name])
+    number = sum(len(topic) for topic in topics.values())
+    if not number:
+        raise InputError(f"{error}, and has no complete message; record it again")
+    return topics, ros2, (f"{error}: it is truncated or damaged, and only its {number} complete messages are read.",)
+
+
+_Message = tuple[str, str, int, bytes]
+
+
+def _scan_ros1(path: Path) -> Iterator[_Message]:
+    """Yield the complete messages of a ROS 1 bag, record by record, without its index."""
+    connections: dict[int, tuple[str, str]] = {}
+
+    def records(data: memoryview) -> Iterator[tuple[dict[bytes, bytes], memoryview, bool]]:
+        place = 0
+        while place + 4 <= len(data):
+            (size,) = struct.unpack_from("<I", data, place)
+            end = place + 4 + size
+            if end + 4 > len(data):
+                return
+            fields, at = {}, place + 4
+            while at + 4 <= end:
+                (length,) = struct.unpack_from("<I", data, at)
+                key, _, value = bytes(data[at + 4 : at + 4 + length]).partition(b"=")
+                fields[key] = value
+                at += 4 + length
+            (size,) = struct.unpack_from("<I", data, end)
+            yield fields, data[end + 4 : end + 4 + size], end + 4 + size <= len(data)
+            place = end + 4 + size
+
+    def messages(data: memoryview) -> Iterator[_Message]:
+        for fields, content, whole in records(data):
+            kind = fields.get(b"op", b"")
+            if kind == b"\x05":
+                packed = fields.get(b"compression", b"none")
+                if packed == b"none":
+                    yield from messages(content)
+                elif whole:
+                    yield from messages(memoryview(_unpack(packed.decode(), bytes(content))))
+            elif kind == b"\x07" and whole:
+                number = struct.unpack("<I", fields[b"conn"])[0]
+                own = next(
+                    (f for f, _, _ in records(memoryview(struct.pack("<I", len(content)) + bytes(content) + bytes(4)))),
+                    {},
+                )
+                connections[number] = (fields[b"topic"].decode(), _ros2_name(own.get(b"type", b"").decode()))
+            elif kind == b"\x02" and whole:
+                topic = connections.get(struct.unpack("<I", fields[b"conn"])[0])
+                if topic is not None:
+                    seconds, nanoseconds = struct.unpack("<II", fields[b"time"])
+                    yield *topic, seconds * 10**9 + nanoseconds, bytes(content)
+
+    with reading.opened(path) as stream:
+        stream.seek(len(ROS1_MAGIC))
+        yield from messages(memoryview(stream.read()))
+
+
+def _ros2_name(kind: str) -> str:
+    package, _, name = kind.partition("/")
+    return kind if name.startswith("msg/") else f"{package}/msg/{name}"
+
+
+def _scan_mcap(path: Path) -> Iterator[_Message]:
+    """Yield the complete messages of an MCAP file, record by record, without its summary."""
+    schemas: dict[int, str] = {}
+    channels: dict[int, tuple[str, str]] = {}
+
+    def text(data: memoryview, place: int) -> tuple[str, int]:
+        (size,) = struct.unpack_from("<I", data, place)
+        return bytes(data[place + 4 : place + 4 + size]).decode(), place + 4 + size
+
+    def messages(data: memoryview) -> Iterator[_Message]:
+        place = 0
+        while place + 9 <= len(data):
+            kind, size = struct.unpack_from("<BQ", data, place)
+            content = data[place + 9 : place + 9 + size]
+            whole = len(content) == size
+            place += 9 + size
+            if kind == 0x06 and len(content) > 40:
+                packed, at = text(content, 28)
+                inner = content[at + 8 :]
+                if not packed:
+                    yield from messages(inner)
+                elif whole:
+                    yield from messages(memoryview(_unpack(packed, bytes(inner))))
+            elif kind == 0x03 and whole:
+                schemas[struct.unpack_from("<H", content)[0]] = text(content, 2)[0]
+            elif kind == 0x04 and whole:
+                number, schema = struct.unpack_from("<HH", content)
+                channels[number] = (text(content, 4)[0], schemas.get(schema, ""))
+            elif kind == 0x05 and whole and size >= 22:
+                number, _, logged, _ = struct.unpack_from("<HIQQ", content)
+                if number in channels:
+                    yield *channels[number], logged, bytes(content[22:])
+
+    with reading.opened(path) as stream:
+        stream.seek(len(MCAP_MAGIC))
+        yield from messages(memoryview(stream.read()))
+
+
+def _scan_sqlite(path: Path) -> Iterator[_Message]:
+    """Yield the rows of a ROS 2 database up to where it is damaged.
+
+    SQLite rejects a database shorter than its header states, so a copy is padded with zeros; reading ends at the first of them.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder) / "filled.db3"
+        shutil.copyfile(path, copy)
+        with open(copy, "r+b") as stream:
+            header = stream.read(32)
+            if len(header) < 32:
+                return
+            (size,) = struct.unpack_from(">H", header, 16)
+            size = 65536 if size == 1 else size
+            stream.truncate(copy.stat().st_size // size * size)  # an incomplete page would be read as rows of zeros
+            stream.truncate(struct.unpack_from(">I", header, 28)[0] * size)
+        database = sqlite3.connect(f"{copy.as_uri()}?immutable=1", uri=True)
+        try:
+            topics = {
+                number: (name, kind) for number, name, kind in database.execute("SELECT id, name, type FROM topics")
+            }
+            for number, logged, raw in database.execute("SELECT topic_id, timestamp, data FROM messages ORDER BY id"):
+                if number in topics:
+                    yield *topics[number], logged, raw
+        except sqlite3.DatabaseError:
+            return
+        finally:
+            database.close()
+
+
+def _unpack(compression: str, data: bytes) -> bytes:
+    if compression == "bz2":
+        return bz2.decompress(data)
+    if compression == "lz4":
+        unpacked: bytes = library("lz4.frame", "a bag compressed by lz4").decompress(data)
+        return unpacked
+    if compression == "zstd":
+        unpacked = library("backports.zstd", "a bag compressed by zstd").decompress(data)
+        return unpacked
+    return b""
+
+
+_SCANS: dict[bytes, Callable[[Path], Iterator[_Message]]] = {
+    ROS1_MAGIC: _scan_ros1,
+    MCAP_MAGIC: _scan_mcap,
+    SQLITE_MAGIC: _scan_sqlite,
+}
 
 
 # ----------------------------------------------------------------------------------------------------------- writing
