@@ -5,9 +5,11 @@ from __future__ import annotations
 import base64
 import math
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
-from strapdown.checks import InputError, finite, positive
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from strapdown.checks import InputError
 from strapdown.files import reading
 from strapdown.report import page
 
@@ -21,10 +23,83 @@ LARGEST_FIGURE = 50_000_000
 """Maximum size of a figure that is included in the page, bytes."""
 
 
-VALUES = ("start", "value", "lower", "upper")
-"""Numbers of a parameter, SI; None: none."""
-KEYS = ("records", "parameters", "units", "objective", "searches")
-"""Keys of every tuning; ``gate``, ``held_out`` and ``unmodelled`` are optional."""
+class _Table(BaseModel):
+    """Part of the JSON that the page needs; other keys are ignored."""
+
+    model_config = ConfigDict(strict=True, allow_inf_nan=False)
+
+
+class _Parameter(_Table):
+    name: str
+    note: str
+    identified: bool
+    start: float | None
+    value: float | None
+    lower: float | None
+    upper: float | None
+    unit: str = ""
+    si_per_unit: Annotated[float, Field(gt=0.0)] = 1.0
+
+
+class _Objective(_Table):
+    name: str
+    before: float
+    after: float
+    attitude_rms_rad: tuple[float, float] | None = None
+
+
+class _Searches(_Table):
+    number: int
+    at_the_best_point: int
+
+
+class _Finding(_Table):
+    rejected: bool
+    means: str
+
+
+class _Judgement(_Table):
+    verdict: Literal["consistent", "cannot tell", "not consistent"]
+    reason: str
+    findings: list[_Finding]
+
+
+class _HeldOut(_Table):
+    log_likelihood_per_innovation: float
+    nis_per_degree: float
+    nis_bounds: tuple[float, float]
+    anees_per_state: float | None = None
+    attitude_rms_rad: float | None = None
+    judgements: list[_Judgement]
+
+
+class _Comparison(_Table):
+    before: _HeldOut
+    after: _HeldOut
+
+
+class _Gate(_Table):
+    probability: float | None
+    lower: float | None
+    upper: float | None
+    thresholds: dict[str, float]
+
+
+class _Unmodelled(_Table):
+    words: list[str]
+
+
+class _Tuning(_Table):
+    """The JSON of `strapdown tune`."""
+
+    records: list[str]
+    parameters: list[_Parameter]
+    units: str
+    objective: _Objective
+    searches: _Searches
+    held_out: _Comparison | None = None
+    gate: _Gate | None = None
+    unmodelled: list[_Unmodelled] = []
 
 
 def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
@@ -63,17 +138,16 @@ _FIGURES = {
 
 def read(path: Path) -> dict[str, Any]:
     """Read the JSON of a tuning."""
-    content: dict[str, Any] = reading.json_file(path)
-    if not isinstance(content, dict) or (missing := [key for key in KEYS if key not in content]):
-        what = f"has no {missing[0]!r}" if isinstance(content, dict) else "is no table"
-        raise InputError(f"{path} {what}; give the JSON that `strapdown tune` writes beside its filter.toml")
-    with reading.from_file(path):
-        for k, one in enumerate(content["parameters"]):
-            positive(f"{path}: parameters[{k}].si_per_unit", one.get("si_per_unit", 1.0))
-            for key in VALUES:
-                if one[key] is not None:
-                    finite(f"{path}: parameters[{k}].{key}", one[key])
-    return content
+    content = reading.json_file(path)
+    try:
+        _Tuning.model_validate_json(reading.text(path))
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(str(part) for part in first["loc"])
+        raise InputError(
+            f"{path}: {place or 'its content'}: {first['msg']}; give the JSON that `strapdown tune` writes beside its filter.toml"
+        ) from None
+    return content  # type: ignore[no-any-return]
 
 
 def verdict(content: dict[str, Any]) -> tuple[str, str, list[str]]:
@@ -109,7 +183,10 @@ def _parameters(content: dict[str, Any]) -> list[str]:
         (
             f"{one['name']}, {one['unit']}" if "unit" in one else one["name"],
             one["note"],
-            *(page.number(math.nan if one[key] is None else one[key] / one.get("si_per_unit", 1.0)) for key in VALUES),
+            *(
+                page.number(one[key] / one.get("si_per_unit", 1.0) if one[key] is not None else float("nan"))
+                for key in ("start", "value", "lower", "upper")
+            ),
         )
         for one in content["parameters"]
     ]
@@ -150,7 +227,7 @@ def _held_out(held: dict[str, Any]) -> list[str]:
                 page.number(one["log_likelihood_per_innovation"], 6),
                 page.number(one["nis_per_degree"]),
                 f"{low:.4f} to {high:.4f}",
-                *(page.number(math.nan if value is None else value) for value in extra),
+                *(page.number(float("nan") if value is None else value) for value in extra),
             )
         )
     head = ("filter", "log-likelihood per innovation", "NIS", "99 % bounds", "ANEES per state", "attitude RMS, rad")

@@ -13,11 +13,12 @@ import damage
 import h5py
 import numpy as np
 
-from strapdown import coning, gyro, montecarlo, quaternion, recordings, records, report, scenarios
+from strapdown import coning, gyro, montecarlo, quaternion, recordings, records, scenarios
 from strapdown.estimation import setup
 from strapdown.montecarlo import campaign
 from strapdown.montecarlo import statistics as sums
 from strapdown.recordings import recordfiles
+from strapdown.report import tunings
 
 Damage = Callable[..., bytes]
 
@@ -96,7 +97,7 @@ def targets(folder: Path) -> list[Target]:
         target("gyro.toml", gyro.read_spec, damage.TEXT, 0.05),
         target("dispersions.toml", montecarlo.read_dispersions, damage.TEXT, 0.05),
         target("vibration.csv", coning.read_vibration, damage.TEXT, 0.11),
-        target("tuning.json", lambda path: report.write(path, folder / "a.html"), (*damage.TEXT, *[damage.replace_node] * 2), 0.12),
+        target("tuning.json", lambda path: tunings.report(path, 0.99), (*damage.TEXT, damage.replace_node, damage.replace_node), 0.12),
     ]  # fmt: skip
 
 
