@@ -64,10 +64,6 @@ def _size(name: str, value: float, *, unit: str = "") -> float:
     return size
 
 
-def _no_sensors() -> dict[str, float]:
-    return {}
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Consider(ByValue):
     """Errors that neither the scenario nor the filter models: a standard deviation each, independent on every axis.
@@ -92,9 +88,9 @@ class Consider(ByValue):
     scale_factor: float = 0.0
     misalignment: float = 0.0
     g_sensitivity: float = 0.0
-    sensor_bias: Mapping[str, float] = field(default_factory=_no_sensors)
-    mounting: Mapping[str, float] = field(default_factory=_no_sensors)
-    time_offset: Mapping[str, float] = field(default_factory=_no_sensors)
+    sensor_bias: Mapping[str, float] = field(default_factory=dict)
+    mounting: Mapping[str, float] = field(default_factory=dict)
+    time_offset: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Check every number."""

@@ -36,7 +36,7 @@ from strapdown.estimation import setup as setups
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.setup import FilterSetup, for_record
 from strapdown.estimation.states import ProcessNoise, State
-from strapdown.files import written_beside
+from strapdown.files import reading, written_beside
 from strapdown.gyro import GyroSpec
 from strapdown.recordings import Recording, recordfiles
 from strapdown.records import Estimate, ImuRecord, Truth
@@ -108,9 +108,10 @@ def read(path: Any, **options: Any) -> ImuRecord | Recording | Estimate | Campai
         return recordings.from_table(path, **options)
     instance("path", path, (str, os.PathLike), "give a path, a DataFrame, a Dataset, or arrays by name")
     file = Path(path)
+    kinds = {"strapdown estimate": "estimate", "strapdown montecarlo": "Monte Carlo"}
     kind = ""
     if file.is_file():
-        kind = "record" if recordfiles.is_record(file) else _kind(file)
+        kind = "record" if recordfiles.is_record(file) else kinds.get(reading.kind(file), "")
     if not kind:
         return recordings.read(file, **options)
     if options:
@@ -124,17 +125,6 @@ def read(path: Any, **options: Any) -> ImuRecord | Recording | Estimate | Campai
     from strapdown.montecarlo import campaign
 
     return campaign.read(file)
-
-
-def _kind(file: Path) -> str:
-    """Return the kind of a file of this package that is no record; empty for other files."""
-    from strapdown.files import reading
-
-    if not reading.is_hdf5(file):
-        return ""
-    with reading.hdf5(file) as content:
-        kind = reading.attributes(content).get("kind")
-    return {"strapdown estimate": "estimate", "strapdown montecarlo": "Monte Carlo"}.get(str(kind), "")
 
 
 def write(

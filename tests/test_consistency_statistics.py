@@ -303,13 +303,6 @@ def test_convergence_time_is_that_of_the_last_excursion():
     assert math.isnan(consistency.convergence_time(time, [0, 0, 0, 0, 0, 2.0], 1.0))
 
 
-def test_distribution_and_its_quantiles():
-    found = consistency.distribution([3.0, np.nan, 1.0, 2.0, 4.0])
-    assert np.array_equal(found.values, [1.0, 2.0, 3.0, 4.0])
-    assert np.allclose(found.probability, [0.25, 0.5, 0.75, 1.0])
-    assert found.quantile(0.5) == 2.0
-
-
 @pytest.mark.parametrize(("samples", "inside"), [(10, 3), (10, 9), (10, 10), (50, 40), (50, 30), (7, 0)])
 def test_the_p_value_of_a_coverage_counts_what_is_as_far_off_or_farther(samples, inside):
     """Twice the smaller of P(N ≤ k) and P(N ≥ k), both with k itself, by sums of binomial terms."""

@@ -143,7 +143,7 @@ def test_every_function_draws_into_the_axes_it_is_given(run, statistics):
     innovations = next(iter(estimate.innovations.values()))
     white = innovations.whitened
     error = consistency.errors(estimate.attitude, estimate.bias, truth.attitude, truth.bias)
-    size = consistency.distribution(np.linalg.norm(error[:, :3], axis=1))
+    size = np.linalg.norm(error[:, :3], axis=1)
     for draw in (
         lambda ax: plots.innovation_histogram(white, ax),
         lambda ax: plots.innovation_quantiles(consistency.quantile_pairs(white), ax),
@@ -162,6 +162,12 @@ def test_every_function_draws_into_the_axes_it_is_given(run, statistics):
         assert ax.get_ylabel()
         ax.figure.canvas.draw()
         assert draw(None) is not ax
+
+
+def test_a_distribution_has_its_quantiles_and_leaves_out_what_is_missing():
+    ax = plots.error_distribution(np.array([3.0, np.nan, 1.0, 2.0, 4.0]) * units.DEGREE)
+    np.testing.assert_allclose(ax.lines[0].get_xydata(), [[1.0, 25.0], [2.0, 50.0], [3.0, 75.0], [4.0, 100.0]])
+    assert [text.get_text() for text in ax.texts] == ["50 %: 2 °", "95 %: 4 °"]
 
 
 def test_the_histogram_counts_what_lies_beyond():

@@ -326,7 +326,7 @@ def test_an_estimate_fills_in_orientation_and_covariance_and_keeps_other_topics(
 def test_what_a_bag_cannot_hold_is_refused(tmp_path):
     from dataclasses import replace
 
-    with pytest.raises(InputError, match="does not declare the unit of its magnetometer, and a bag uses tesla"):
+    with pytest.raises(InputError, match="does not declare the unit of its magnetometer, which is needed in T"):
         recordings.write(replace(walk(), magnetic_unit=""), tmp_path / "x.bag")
     with pytest.raises(InputError, match="no negative times"):
         recordings.write(replace(walk(epoch=0), time=np.arange(60.0) - 5.0), tmp_path / "x.bag")

@@ -216,7 +216,7 @@ def test_what_a_flight_log_cannot_hold_is_refused(tmp_path):
     whole = walk(single=True)
     for bad, words in (
         (replace(whole, specific_force=None), "no accelerometer"),
-        (replace(whole, magnetic_unit=""), "uses Gauss"),
+        (replace(whole, magnetic_unit=""), "needed in G"),
         (replace(whole, time=np.arange(60) * 1e-7), "less than 1 µs apart"),
         (replace(whole, time=np.arange(60) - 5.0, epoch_ns=0), "no negative times"),
     ):

@@ -51,7 +51,7 @@ def test_rates_are_corrected_and_corrections_follow_one_another():
         values=values,
         variance=np.full((2, 9), 4e-8),
     )
-    after = known.and_then(block, 0.011, "next")
+    after = unit_calibration.combined(known, block, 0.011, "next")
     further = np.array([[1e-3, 2e-3, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, -1e-3]])
     # what the filter sees after the correction by MATRIX is off by `further`: the gyro itself by both
     np.testing.assert_allclose(np.eye(3) + after.matrix, (np.eye(3) + MATRIX) @ (np.eye(3) + further), atol=1e-15)

@@ -7,9 +7,8 @@ lost by updating at a lower rate than the sensors': the samples of a step are ro
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import Any
-
+from strapdown.ahrs import check_conventions as check_conventions
+from strapdown.ahrs import motions as motions
 from strapdown.ahrs.estimating import AhrsEstimate, estimate
 from strapdown.ahrs.parameters import HAND_HELD as HAND_HELD
 from strapdown.ahrs.parameters import MOTIONS, AhrsParameters
@@ -28,10 +27,3 @@ __all__ = [
     "AhrsParameters",
     "estimate",
 ]
-
-
-def __getattr__(name: str) -> Any:
-    """Load a submodule when it is first used (PEP 562)."""
-    if name in ("check_conventions", "motions"):
-        return import_module(f"{__name__}.{name}")
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -134,13 +134,11 @@ def estimate(
     parameters = parameters.matched(prepared.acceleration)
     filtered = _run(prepared, parameters, faults.turn_variance, gate, robust, smooth)
     found = _at_stamps(filtered, used, prepared, parameters, delays, faults.turn_variance, smooth, full_covariance)
-    scale = filtered.error_states.get("gyro scale")
+    scale, own = filtered.error_states.get("gyro scale"), calibration or unit_calibration.NONE
     return AhrsEstimate(
         recording=used,
         estimate=found,
-        calibration=None
-        if scale is None
-        else (calibration or unit_calibration.NONE).and_then(scale, delays.last_field, used.source),
+        calibration=None if scale is None else unit_calibration.combined(own, scale, delays.last_field, used.source),
         record=prepared.record,
         initial=prepared.initial,
         parameters=parameters,

@@ -44,22 +44,6 @@ def likelihoods(recording: Recording | Begun) -> dict[str, float]:
     In the frame fixed by the integrated gyro, gravity changes only by the gyro's errors: bias, scale factor, clipping. Any other change is
     one of mean acceleration. For a hand with velocity σ_v it is of the order of σ_v over the span, for a vehicle hardly less than the
     acceleration itself.
-
-    Parameters
-    ----------
-    recording : Recording or Begun
-        With an accelerometer.
-
-    Returns
-    -------
-    dict of str to float
-        Log-likelihoods by names of :data:`strapdown.ahrs.MOTIONS`.
-
-    Examples
-    --------
-    >>> found = likelihoods(recording)  # doctest: +SKIP
-    >>> max(found, key=found.get)  # doctest: +SKIP
-    'hand'
     """
     _, quiet, faults = begin(recording)
     used, force = faults.recording, faults.recording.specific_force

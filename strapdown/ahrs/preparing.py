@@ -52,19 +52,10 @@ def prepare(
 ) -> Prepared:
     """Return the record that the filter runs on, and its initial state.
 
-    Parameters
-    ----------
-    recording : Recording
-        From its first quiet second on.
-    quiet : slice
-        The samples of that second, from which gravity and the field at the start are computed.
-    parameters : AhrsParameters
-    field_delay : float or array_like, (n,)
-        Delay of the magnetometer's samples relative to the gyro's, s; each is rotated forward by the gyro.
-    causal : bool
-        Whether to find hard iron only from the samples up to each step; otherwise from all samples, for the initial state too.
-    turned : ndarray (n, 4), optional
-        Attitude from the gyro only at the samples, if already computed.
+    ``recording`` begins with the samples ``quiet``, from which gravity and the field at the start are computed. ``field_delay`` is that of
+    the magnetometer's samples relative to the gyro's, s, one number or one per sample; each is rotated forward by the gyro. ``causal``:
+    hard iron is found only from the samples up to each step; otherwise from all samples, for the initial state too. ``turned`` (n, 4):
+    attitude from the gyro only, if already computed.
     """
     initial = starting.start(recording, quiet, parameters)  # first, because it rejects a sensor without samples
     if turned is None:

@@ -433,8 +433,7 @@ def averaged(values: ArrayLike, sample_interval: float, kind: str) -> tuple[Arra
 
 def _multiples(taus: ArrayLike | None, samples: int, dt: float, order: int) -> NDArray[np.int64]:
     if taus is None:
-        largest = max(1, samples // 3)
-        return np.unique(np.round(np.geomspace(1, largest, 2 + int(12 * math.log10(largest)))).astype(np.int64))
+        return gaps.spread_multiples(samples // 3)
     wanted = np.atleast_1d(checks.array("taus", taus, (...,))).ravel()
     multiples = np.round(wanted / dt)
     for tau, m in zip(wanted, multiples, strict=True):

@@ -52,7 +52,7 @@ def allan_deviation(
     if known.sum() < 3:
         raise InputError(f"values has {int(known.sum())} samples that are not NaN; an Allan deviation needs at least 3")
     samples, record = len(record), np.where(known[:, None], record, 0.0)
-    wanted = dt * _multiples(samples // 10) if taus is None else taus
+    wanted = dt * spread_multiples(samples // 10) if taus is None else taus
     multiples = np.unique(np.rint(np.atleast_1d(checks.array("taus", wanted, (...,))) / dt).astype(np.int64))
     if len(multiples) == 0 or multiples[0] < 1 or multiples[-1] > samples // 2:
         raise InputError(
@@ -60,7 +60,7 @@ def allan_deviation(
         )
     pairs = _Pairs.of(known, int(multiples[-1]))
     variance = np.stack([pairs.variance(record[:, axis], multiples) for axis in range(record.shape[1])])
-    grid = _multiples(min(samples // 10, int(multiples[-1])))
+    grid = spread_multiples(min(samples // 10, int(multiples[-1])))
     alphas = np.stack([_power_laws(grid, pairs.variance(record[:, axis], grid)) for axis in range(record.shape[1])])
     alphas = alphas[:, np.clip(np.searchsorted(grid, multiples), 0, len(grid) - 1)]
     edf, low, high = _spread(known, multiples, alphas, level, seed)
@@ -128,7 +128,7 @@ def _power_laws(multiples: NDArray[np.int64], variance: Array) -> NDArray[np.int
     return np.asarray(law[np.clip(np.searchsorted(usable, np.arange(len(multiples))), 0, len(usable) - 1)])
 
 
-def _multiples(largest: int) -> NDArray[np.int64]:
+def spread_multiples(largest: int) -> NDArray[np.int64]:
     """Return averaging times in samples, 12 per decade up to the largest."""
     top = max(1, largest)
     return np.unique(np.rint(np.geomspace(1, top, 2 + int(12 * np.log10(top)))).astype(np.int64))

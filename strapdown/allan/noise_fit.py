@@ -287,7 +287,8 @@ def expected_errors(parameters: Mapping[str, float], samples: int, sample_interv
         raise InputError("parameters names no random noise; give one of quantization, angle_random_walk, …")
     variance = theta @ basis
     none = np.zeros_like(number)
-    errors = _standard_errors(_information(Bins(number, none, none, none, basis, 0.0), variance))
+    inverse = _inverse(_information(Bins(number, none, none, none, basis, 0.0), variance))
+    errors = np.sqrt(np.maximum(np.diag(inverse), 0.0))
     found = {
         term: float(0.5 * error / math.sqrt(value))  # d√θ/dθ
         for term, error, value in zip(random_terms, errors, theta, strict=True)
@@ -438,10 +439,10 @@ def _information(bins: Bins, variance: Array) -> Array:
     return np.asarray(weighted @ weighted.T)
 
 
-def _standard_errors(information: Array) -> Array:
+def _inverse(information: Array) -> Array:
+    """Return the inverse of an information matrix, scaled to unit diagonal first, so that the units of the terms do not matter."""
     scale = 1.0 / np.sqrt(np.diag(information))
-    inverse = np.linalg.pinv(information * np.outer(scale, scale))
-    return np.asarray(np.sqrt(np.maximum(np.diag(inverse), 0.0)) * scale)
+    return np.asarray(np.linalg.pinv(information * np.outer(scale, scale)) * np.outer(scale, scale))
 
 
 def fit_axis(bins: Bins, with_ramp: bool) -> AxisFit:
@@ -516,9 +517,7 @@ def _covariance(fit: AxisFit, estimate: Array) -> Array:
     supported = ~np.isnan(estimate)
     size = np.where(supported, estimate, np.sqrt(fit.best.theta))
     used = np.flatnonzero(size > 0.0)
-    information = _information(fit.bins, fit.best.variance)[np.ix_(used, used)]
-    shrink = 1.0 / np.sqrt(np.diag(information))
-    inverse = np.linalg.pinv(information * np.outer(shrink, shrink)) * np.outer(shrink, shrink)
+    inverse = _inverse(_information(fit.bins, fit.best.variance)[np.ix_(used, used)])
     covariance = np.full((len(estimate), len(estimate)), np.nan)
     covariance[np.ix_(used, used)] = inverse * np.outer(0.5 / size[used], 0.5 / size[used])  # d√θ/dθ
     covariance[~supported, :] = np.nan

@@ -154,15 +154,13 @@ def to_kalibr(fits: Mapping[str, NoiseFit], *, factor: float = 1.0, topic: str =
     return "\n".join(line for line in lines if line) + "\n"
 
 
-def to_px4(fits: Mapping[str, NoiseFit], *, step: float = PX4_STEP, source: str = "") -> str:
+def to_px4(fits: Mapping[str, NoiseFit], *, source: str = "") -> str:
     """Return parameters of PX4's EKF2 in QGroundControl's format.
 
     Parameters
     ----------
     fits : mapping of str to NoiseFit
         Fits of ``"gyro"`` and ``"accelerometer"``.
-    step : float, default 0.01
-        Step of the filter (EKF2_PREDICT_US), s.
     source : str, default ""
         Origin of the numbers, for a comment.
 
@@ -177,10 +175,10 @@ def to_px4(fits: Mapping[str, NoiseFit], *, step: float = PX4_STEP, source: str 
         If a sensor or a term is missing.
     """
     _both(fits, "PX4")
-    root = math.sqrt(checks.positive("step", step, unit="s"))
+    root = math.sqrt(PX4_STEP)
     lines = [
         *([f"# {_plain(source)}"] if source else []),
-        f"# Noise by `strapdown allan`, the largest of the axes, over steps of {1e6 * step:.0f} us (EKF2_PREDICT_US).",
+        f"# Noise by `strapdown allan`, the largest of the axes, over steps of {1e6 * PX4_STEP:.0f} us (EKF2_PREDICT_US).",
         "# The defaults of PX4 are larger: they include vibration.",
         "# Vehicle-Id Component-Id Name Value Type",
     ]

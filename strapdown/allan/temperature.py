@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from strapdown import checks
-from strapdown.allan.deviation import TERMS, confidence
+from strapdown.allan.deviation import TERMS
 from strapdown.allan.spectrum import bin_starts, mean_power
 from strapdown.checks import Array, InputError
 from strapdown.gyro.temperature import BiasOverTemperature
@@ -33,6 +33,8 @@ MAX_PASSES = 50
 """Maximum number of iterations of the regression, each with the noise of the last residuals."""
 SETTLED = 1e-3
 """Tolerance of convergence: change of a coefficient, in σ, and relative change of the noise spectrum."""
+LEVEL = 0.95
+"""Confidence of the intervals."""
 SMALLEST_SPAN = 0.5
 """Minimum temperature range of a regression, K."""
 
@@ -45,7 +47,7 @@ class TemperatureFit(NamedTuple):
     polynomial : BiasOverTemperature
         ``bias = Σ c_k (T − T_0)^k`` of each axis with its σ; T_0 is the mean temperature of the record.
     reach : ndarray (order + 1, axes)
-        Half-width of the intervals of the coefficients; 0 for c_0, which has none.
+        Half-width of the 95 % intervals of the coefficients; 0 for c_0, which has none.
     left : ndarray (n, axes)
         The record less its dependence on temperature, with its mean.
     """
@@ -56,7 +58,7 @@ class TemperatureFit(NamedTuple):
 
 
 def fit_temperature(
-    values: ArrayLike, temperature: ArrayLike, sample_interval: float, *, order: int = 1, level: float = 0.95
+    values: ArrayLike, temperature: ArrayLike, sample_interval: float, *, order: int = 1
 ) -> TemperatureFit:
     """Return the dependence of the bias of a sensor on temperature.
 
@@ -70,8 +72,6 @@ def fit_temperature(
         Sample interval, s.
     order : int, default 1
         Highest power of the temperature.
-    level : float, default 0.95
-        Confidence of the intervals, 0.5 to 1.
 
     Returns
     -------
@@ -88,7 +88,6 @@ def fit_temperature(
     dt = checks.positive("sample_interval", sample_interval, unit="s")
     T = checks.array("temperature", temperature, (len(x),))
     checks.count("order", order)
-    level = confidence(level)
     span = (float(T.min()), float(T.max()))
     if span[1] - span[0] < SMALLEST_SPAN:
         raise InputError(
@@ -105,7 +104,7 @@ def fit_temperature(
         left[:, axis] = x[:, axis] - (powers - powers.mean(axis=0)) @ found
         coefficients[:, axis] = float(np.mean(x[:, axis] - powers @ found)), *found
     polynomial = BiasOverTemperature(reference=reference, span=span, coefficients=coefficients, sigma=sigma)
-    return TemperatureFit(polynomial, float(norm.ppf(0.5 + 0.5 * level)) * sigma, left)
+    return TemperatureFit(polynomial, float(norm.ppf(0.5 + 0.5 * LEVEL)) * sigma, left)
 
 
 def _regression(x: Array, powers: Array, dt: float) -> tuple[Array, Array]:

@@ -6,18 +6,9 @@ that they did not write; ``montecarlo``, whose result may have taken hours, need
 - ``terminal``: Functions shared by all commands.
 - ``progress``: Progress of long computations.
 - ``layout``: Groups, order, modules and examples of the commands.
-- ``studies``: ``coning``
-- ``integration``: ``algorithms``, ``integrate``, ``coning-budget``
-- ``estimation``: ``estimate``
 - ``reading``: Options of every command that reads a recording.
-- ``conversion``: ``convert``
-- ``campaigns``: ``montecarlo``
-- ``judgement``: ``check``, ``doctor``
-- ``planning``: ``covariance``
-- ``reporting``: ``report``
-- ``sensors``: ``simulate``, ``scenarios``, ``allan``
-- ``tuning``: ``tune``
-- ``installation``: ``info``
+
+The other modules define the commands that :data:`strapdown.cli.layout.COMMANDS` assigns to them.
 """
 
 from __future__ import annotations
@@ -34,8 +25,8 @@ import typer
 
 from strapdown.checks import OF_YOUR_OWN, InputError
 from strapdown.cli.layout import register as register
-from strapdown.cli.progress import be_quiet
-from strapdown.cli.terminal import app, console, errors
+from strapdown.cli.progress import be_quiet, errors
+from strapdown.cli.terminal import app, console
 from strapdown.files.reading import NoDigestWarning
 
 

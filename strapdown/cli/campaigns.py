@@ -15,14 +15,13 @@ import typer
 
 from strapdown.checks import InputError, count
 from strapdown.cli.filters import default_words, filter_of_scenario, own_filter
+from strapdown.cli.progress import progress_bar, rate_text
 from strapdown.cli.terminal import (
     TABLES,
     command,
     console,
     counted,
     given,
-    progress_bar,
-    rate_text,
     scenario_named,
     show,
     table,
@@ -173,8 +172,6 @@ def _computed(plan: Plan, target: Path, name: str, computing: _Computing, output
     runs = computing.runs
     if runs is None:
         runs = campaigns.read(target).runs if output.resume and target.exists() else _RUNS
-    if computing.workers is not None and computing.cluster is not None:
-        raise InputError("--workers and --cluster exclude each other: a cluster has its own workers")
     choice = engine.choose(plan, computing.machine)
     count("runs", runs)
     engine.in_threads(computing.threads)  # checks the number
@@ -364,7 +361,7 @@ def _print_errors(report: dict[str, Any]) -> None:
     for name, unit, text in (("attitude", "arcsec", "arcsec"), ("bias", "deg_per_hour", "°/h")):
         if name not in report["nees"]:  # a user's filter without a bias
             continue
-        axis = _worst_axis(last[f"{name}_rms_error_{unit}"])
+        axis = int(np.argmax([np.inf if x is None else x for x in last[f"{name}_rms_error_{unit}"]]))
         keys = ("rms_error", "sigma", *(f"error_quantile_{q:g}" for q in QUANTILES))
         sizes = [last[f"{name}_{key}_{unit}"][axis] for key in keys]
         large = name == "attitude" and (sizes[0] or 0.0) > 3600.0
@@ -388,11 +385,6 @@ def _print_errors(report: dict[str, Any]) -> None:
             f"RMS error divided by the root of the Cramér–Rao bound, by axis: {ratios} "
             f"(at one epoch {low:.3f} to {high:.3f} for an efficient filter)."
         )
-
-
-def _worst_axis(values: list[float | None]) -> int:
-    sizes = [float("inf") if x is None else x for x in values]
-    return sizes.index(max(sizes))
 
 
 def _replayed(target: Path, run: int) -> list[Path]:

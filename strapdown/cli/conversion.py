@@ -9,7 +9,7 @@ import typer
 
 from strapdown.checks import InputError
 from strapdown.cli.reading import RECORDING_HELP, Layout
-from strapdown.cli.terminal import command, console, writable, written
+from strapdown.cli.terminal import command, console, say, writable, written
 
 if TYPE_CHECKING:
     from strapdown.recordings import Recording
@@ -76,11 +76,11 @@ def convert(
         if reference is not None:
             content = recordings.with_reference(content, reference)
         recordings.write(content, target)
-        _say(content, target)
+        _report(content, target)
     written(target)
 
 
-def _say(recording: Recording, target: Path) -> None:
+def _report(recording: Recording, target: Path) -> None:
     """Print what was read, and which quantities the format of the target cannot store."""
     from strapdown import recordings
 
@@ -94,10 +94,7 @@ def _say(recording: Recording, target: Path) -> None:
     parts = ["gyro", *(name for name, values in held.items() if values is not None)]
     length = recording.time[-1] - recording.time[0]
     console.print(f"{recording.source}: {len(recording.time)} samples over {length:.6g} s of {', '.join(parts)}.")
-    for remark in recording.remarks:
-        console.print(remark)
-    if recording.left_out_words:
-        console.print(recording.left_out_words)
+    say(*recording.remarks, recording.left_out_words)
     lost = [name for name in recordings.not_held(target) if name in parts or (name == "clock" and recording.epoch_ns)]
     if lost:
         console.print(f"{target.name} cannot store {', '.join(lost)}: omitted.")

@@ -12,6 +12,7 @@ import typer
 
 from strapdown.checks import InputError, count, non_negative, one_of
 from strapdown.cli.filters import ChosenStates, filter_for
+from strapdown.cli.progress import progress_bar
 from strapdown.cli.reading import RECORDING_HELP, Layout
 from strapdown.cli.terminal import (
     FORMAT,
@@ -22,7 +23,7 @@ from strapdown.cli.terminal import (
     gap_words,
     given,
     need_own,
-    progress_bar,
+    say,
     show,
     table,
     writable,
@@ -43,13 +44,7 @@ if TYPE_CHECKING:
     Exports = Sequence[tuple[Path, dict[str, Any]]]
     """Additional files of an estimate, with the options of their writers."""
 
-FILES = (
-    "estimate.h5",
-    "errors.json",
-    "states.json",
-    "observability.json",
-    "calibration.toml",
-)
+FILES = ("estimate.h5", "errors.json", "states.json", "observability.json", "calibration.toml")
 """Files that the command may write to its folder, in addition to figures."""
 FIGURES = ("estimate", "errors", "states")
 """Figures that it may write there, without the suffix of their format."""
@@ -202,24 +197,18 @@ def estimate(
     need_own(out / FILES[0], "estimate", lambda path: bool(read_attributes(path)["kind"] == "strapdown estimate"))
     reading_options = layout.options(recording)
     simulated = is_record(recording)
-    _check_kind(recording, given(recorded if simulated else specified), simulated)
+    for name in given(recorded if simulated else specified):
+        what = "contains its specification, as those of `strapdown simulate`"
+        raise InputError(
+            f"{name} goes with a recording without a specification; {recording} contains one, of `strapdown simulate`"
+            if simulated
+            else f"{name} goes with a recording that {what}; {recording} does not"
+        )
     exports = _exports(output, recording, changed=bool(layout.axes or layout.invert))
     if simulated:
         _estimate_specified(recording, shared, specified, output, exports)
     else:
         _estimate_recording(recording, reading_options, shared, recorded, output, exports)
-
-
-def _check_kind(recording: Path, options: list[str], specified: bool) -> None:
-    """Raise an error for options that do not apply to a recording with, or without, a specification."""
-    if options and specified:
-        raise InputError(
-            f"{options[0]} goes with a recording without a specification; {recording} contains one, of `strapdown simulate`"
-        )
-    if options:
-        raise InputError(
-            f"{options[0]} goes with a recording that contains its specification, as those of `strapdown simulate`; {recording} does not"
-        )
 
 
 def _exports(output: _Output, recording: Path, *, changed: bool) -> Exports:
@@ -282,8 +271,7 @@ def _estimate_specified(path: Path, shared: _Shared, options: _Specified, output
         f"{path.name}: {len(record.increments)} gyro samples over {length:.6g} s, "
         f"{', '.join(f'{len(s.time)} of {s.sensor}' for s in record.vectors) or 'no measurements'}. {run.start}"
     )
-    for remark in remarks:
-        console.print(remark)
+    say(*remarks)
     _print_result(run.estimate)
     paths = _write_specified(path, record.origin, chosen, run, shared, output.out)
     paths += _export(exports, run.estimate, None)
@@ -440,8 +428,7 @@ def _print_result(result: Estimate) -> None:
         if number:
             share = number / len(result.innovations[sensor].time)
             console.print(f"{number} samples of the {sensor} ({share:.2%}) were rejected by the gate.")
-    for event in result.events:
-        console.print(str(event))
+    say(*map(str, result.events))
 
 
 def _errors(result: Estimate, truth: Any) -> dict[str, float]:
@@ -491,8 +478,8 @@ def _estimate_recording(
     used, parameters, out = result.recording, result.parameters, output.out
     errors = None if used.true_attitude is None else reference_errors(result.estimate.attitude, used.true_attitude)
     rms = None if errors is None else {name: value / DEGREE for name, value in errors.rms(used.movement).items()}
-    paths = _write_recording(result, parameters, replace(parameters.setup, **robustness), motion, shared.smooth, out)
-    _say_recording(result, parameters, motion, odds)
+    paths = _write_recording(result, replace(parameters.setup, **robustness), motion, shared.smooth, out)
+    _say_recording(result, motion, odds)
     if shared.gyro is not None:
         arw, rrw = parameters.angle_random_walk, parameters.rate_random_walk
         console.print(
@@ -549,9 +536,7 @@ def _fixed_frame(used: Recording) -> str:
     )
 
 
-def _write_recording(
-    result: AhrsEstimate, parameters: AhrsParameters, chosen: FilterSetup, motion: str, smoothed: bool, out: Path
-) -> list[Path]:
+def _write_recording(result: AhrsEstimate, chosen: FilterSetup, motion: str, smoothed: bool, out: Path) -> list[Path]:
     """Write the estimate, its states and the calibration; return the files."""
     from strapdown.estimation import setup
     from strapdown.recordings import unit_calibration
@@ -569,7 +554,7 @@ def _write_recording(
             "motion": motion,
             "smoothed": smoothed,
             "filter": setup.to_toml(chosen),
-            **{f"parameter.{name}": value for name, value in vars(parameters).items()},
+            **{f"parameter.{name}": value for name, value in vars(result.parameters).items()},
             "latency": result.delays.last_gyro,
             "magnetometer_latency": result.delays.last_field,
         },
@@ -584,21 +569,17 @@ def _write_recording(
     return paths
 
 
-def _say_recording(result: AhrsEstimate, parameters: AhrsParameters, motion: str, odds: float) -> None:
+def _say_recording(result: AhrsEstimate, motion: str, odds: float) -> None:
     """Print what was read, the initial state, the motion model, and faults of the samples."""
     from strapdown import recordings
 
     used, found = result.recording, result.estimate
     console.print(
         f"{used.source}: {len(used.time)} samples over {used.time[-1] - used.time[0]:.1f} s, initialised in "
-        f"{'the quiet second' if _rested(parameters, result) else 'its quietest second, which is not at rest,'} from {used.time[0]:.2f} s."
+        f"{'the quiet second' if _rested(result) else 'its quietest second, which is not at rest,'} from {used.time[0]:.2f} s."
     )
-    for remark in used.remarks:
-        console.print(remark)
-    console.print(f"Fixed frame: {_fixed_frame(used)}.")
-    console.print(_model(motion, odds, parameters, result))
-    for sentence in (*result.delays.words, *(f"{one}." for one in result.faults.words)):
-        console.print(sentence)
+    say(*used.remarks, f"Fixed frame: {_fixed_frame(used)}.", _model(motion, odds, result))
+    say(*result.delays.words, *(f"{one}." for one in result.faults.words))
     if result.hard_iron.any():
         iron = ", ".join(f"{value:.3g}" for value in result.hard_iron)
         console.print(
@@ -606,8 +587,7 @@ def _say_recording(result: AhrsEstimate, parameters: AhrsParameters, motion: str
         )
     if words := gap_words(recordings.gaps(used.time)):
         console.print(f"{words}.")
-    if used.left_out_words:
-        console.print(used.left_out_words)
+    say(used.left_out_words)
     for sensor, number in found.skipped.items():
         if number:
             console.print(f"{number} of the gyro's samples have no sample of the {sensor} at the same time.")
@@ -623,18 +603,18 @@ def _rms(out: Path, source: str, rms: dict[str, float], over: str) -> Path:
     return out / "errors.json"
 
 
-def _rested(parameters: AhrsParameters, result: AhrsEstimate) -> bool:
+def _rested(result: AhrsEstimate) -> bool:
     """Return whether the gyro bias was estimated at the start, if the filter is initialised with it."""
-    if parameters.rest_bias_sigma == 0.0:
-        return True
-    return bool(result.initial.covariance[3, 3] <= (0.5 * parameters.bias_sigma) ** 2)
+    p = result.parameters
+    return p.rest_bias_sigma == 0.0 or bool(result.initial.covariance[3, 3] <= (0.5 * p.bias_sigma) ** 2)
 
 
-def _model(moved_by: str, odds: float, parameters: AhrsParameters, result: AhrsEstimate) -> str:
+def _model(moved_by: str, odds: float, result: AhrsEstimate) -> str:
     """Return a description of the motion model and of the initial gyro bias."""
     if moved_by == "any":
         return "Motion: any, its acceleration modelled as white noise."
     bias, sigma = result.initial.bias / DEGREE, np.sqrt(result.initial.covariance[3, 3]) / DEGREE
+    parameters = result.parameters
     shown = " (from the recording)" if parameters.velocity_from_record else ""
     likelier = (
         f" (log-likelihood larger by {odds:.0f} than for a {'hand' if moved_by == 'vehicle' else 'vehicle'})"
@@ -646,6 +626,6 @@ def _model(moved_by: str, odds: float, parameters: AhrsParameters, result: AhrsE
         f"{parameters.velocity_time:g} s. "
         f"Initial gyro bias: {', '.join(f'{value:.3g}' for value in bias)} °/s, σ {sigma:.2g} °/s"
     )
-    if not _rested(parameters, result):
+    if not _rested(result):
         return f"{words}: no second is quiet enough to estimate it, so the heading may drift at first."
     return f"{words}, from that second."

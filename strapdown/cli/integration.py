@@ -10,6 +10,7 @@ import numpy as np
 import typer
 
 from strapdown.checks import InputError
+from strapdown.cli.progress import progress_bar
 from strapdown.cli.reading import RECORDING_HELP, Layout
 from strapdown.cli.terminal import (
     TABLES,
@@ -18,8 +19,8 @@ from strapdown.cli.terminal import (
     gap_words,
     json_target,
     need_own,
-    progress_bar,
     put_json,
+    say,
     show,
     table,
     tables_folder,
@@ -120,8 +121,7 @@ def integrate(
         console.print(f"Error relative to the file's attitude: final {error[-1]:.4g}°, maximum {error.max():.4g}°.")
     if gaps:
         console.print(f"{gap_words(gaps)}: the rotation during a gap is interpolated.")
-    if words:
-        console.print(words)
+    say(words)
     written(out)
 
 

@@ -13,6 +13,7 @@ from rich.text import Text
 
 from strapdown.checks import InputError
 from strapdown.cli.filters import no_state_words
+from strapdown.cli.progress import progress_bar
 from strapdown.cli.reading import RECORDING_HELP, Layout
 from strapdown.cli.terminal import (
     command,
@@ -20,8 +21,8 @@ from strapdown.cli.terminal import (
     counted,
     given,
     json_target,
-    progress_bar,
     put_json,
+    say,
     show,
     show_listing,
     table,
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
     from strapdown.consistency import Judgement
     from strapdown.consistency.foreign import Checked
     from strapdown.estimation.setup import FilterSetup
-    from strapdown.records import Estimate, ImuRecord, Truth
+    from strapdown.records import Estimate, ImuRecord
     from strapdown.tuning.diagnosis import Diagnosis
 
 CONSISTENT, NOT, CANNOT_TELL = 0, 1, 2
@@ -116,9 +117,7 @@ def check(
         content["diagnosis"], found = _diagnosed(result, record, filter_file, judgement)
         if found is not None:
             judgement, words = found.judgement, found.words
-    for limit in judgement.limits:
-        console.print(f"Note: {limit}.")
-    console.print(words)
+    say(*(f"Note: {limit}." for limit in judgement.limits), words)
     content.update(judgement.summary())
     put_json(json, content)
     if foreign.aligned is not None:
@@ -149,16 +148,12 @@ def _judged_own(result: Path, probability: float, *, with_record: bool) -> tuple
         console.print(
             f"{result.name}: {len(estimate.time)} epochs over {estimate.time[-1] - estimate.time[0]:.6g} s, "
             f"{sum(len(one.time) for one in estimate.innovations.values())} measurements, "
-            f"{_truth_words(truth, records.read_reference(result))}."
+            f"{'with its truth' if truth is not None else 'with a reference attitude' if records.read_reference(result) else 'no truth'}."
         )
         judgement = findings.judged(result, attributes, estimate, truth, probability=probability)
     else:
         raise InputError(f"{result} is a {kind}; give a result of `strapdown estimate` or `strapdown montecarlo`")
     return judgement, {"source": result.name, "kind": kind}
-
-
-def _truth_words(truth: Truth | None, reference: Truth | None) -> str:
-    return "with its truth" if truth is not None else "no truth" if reference is None else "with a reference attitude"
 
 
 def status_of(judgement: Judgement) -> int:
@@ -183,8 +178,7 @@ def _judged_foreign(result: Path, options: _Foreign, probability: float) -> tupl
     own = read_attitudes(result, topic=options.topic or "")
     length = (own.stamps_ns[-1] - own.stamps_ns[0]) / 1e9
     console.print(f"{own.source}: {len(own.stamps_ns)} attitudes over {length:.6g} s.")
-    for remark in own.remarks:
-        console.print(remark)
+    say(*own.remarks)
     content: dict[str, Any] = {"source": own.source, "kind": "estimate from elsewhere"}
     if options.truth is None:
         if not own.innovations:
@@ -212,8 +206,7 @@ def _judged_foreign(result: Path, options: _Foreign, probability: float) -> tupl
         probability=probability,
     )
     content.update(found.summary())
-    for remark in found.remarks:
-        console.print(f"Note: {remark}.")
+    say(*(f"Note: {remark}." for remark in found.remarks))
     if frame != options.error_frame:
         console.print(f"Note: the file declares that its covariance is of the {frame} error.")
     _show_explanations(found)
@@ -257,8 +250,7 @@ def _diagnosed(
     held = recordfiles.read_record(record)
     _need_same(result, estimate, record, held)
     missing = unmodelled_errors(held, chosen)
-    for sentence in no_state_words(missing, chosen):
-        console.print(sentence)
+    say(*no_state_words(missing, chosen))
     if chosen.states is not None and chosen.states.names:
         reason = f"the search supports filters of attitude and bias only, and this one has the states {', '.join(chosen.states.names)}"
         console.print(f"Causes were not searched for: {reason}.")
@@ -326,11 +318,11 @@ def doctor(
     source = recordings.read(recording, **layout.options(recording))
     with progress_bar("testing conventions"):
         found = check_conventions.examine(source)
-    console.print(f"{found.source}: {found.words}")
-    for words in found.doubts:
-        console.print(f"warning: {words}.")
-    for remark in source.remarks:
-        console.print(f"Note: {remark}")
+    say(
+        f"{found.source}: {found.words}",
+        *(f"warning: {words}." for words in found.doubts),
+        *(f"Note: {remark}" for remark in source.remarks),
+    )
     if found.candidates:
         names = list(found.candidates[0].misfit)
         rows = table(
@@ -349,7 +341,6 @@ def doctor(
                 *(f"{one.misfit[name]:.3f}" for name in names),
             )
         show(rows)
-    for note in found.notes:
-        console.print(f"Note: {note}.")
+    say(*(f"Note: {note}." for note in found.notes))
     put_json(json, found.summary())
     raise typer.Exit({"as declared": CONSISTENT, "wrong convention": NOT}.get(found.verdict, CANNOT_TELL))

@@ -11,13 +11,13 @@ import typer
 
 from strapdown.checks import InputError, finite, non_negative
 from strapdown.cli.filters import filter_of_scenario
+from strapdown.cli.progress import progress_bar
 from strapdown.cli.terminal import (
     FORMAT,
     TABLES,
     FigureFormat,
     command,
     console,
-    progress_bar,
     scenario_named,
     show_listing,
     tables_folder,

@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from strapdown.cli.terminal import command, console, progress_bar, writable, written
+from strapdown.cli.progress import progress_bar
+from strapdown.cli.terminal import command, console, writable, written
 from strapdown.files.reading import existing_file
 
 

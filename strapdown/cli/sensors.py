@@ -10,6 +10,7 @@ import numpy as np
 import typer
 
 from strapdown.checks import InputError, count, one_of, positive
+from strapdown.cli.progress import progress_bar
 from strapdown.cli.reading import RECORDING_HELP, Samples
 from strapdown.cli.terminal import (
     FORMAT,
@@ -18,7 +19,7 @@ from strapdown.cli.terminal import (
     command,
     console,
     need_own,
-    progress_bar,
+    say,
     scenario_named,
     show,
     show_listing,
@@ -192,16 +193,11 @@ def allan(
     tables_folder(output.tables)
     names = [*(name for one in chosen for name in _names(one, output.form)), *exports.files]
     writable("out", *(output.out / name for name in names), sources=(recording,))
-    layout = _layout(recording, samples)
+    # For simulated records and arrays the reader raises errors for options that do not apply.
+    plain_units = recording.suffix.lower() == ".npy" or (samples.columns is None and samples.topic is None)
+    layout = {"units": samples.units} if plain_units else samples.options(recording)
     fits = {one: _identify(recording, one, layout, options, output) for one in chosen}
     exports.write(fits, output.out, recording.name, samples.topic)
-
-
-def _layout(recording: Path, samples: Samples) -> dict[str, Any]:
-    """Return the options for reading the file; for simulated records and arrays, the reader raises errors for those that do not apply."""
-    if recording.suffix.lower() == ".npy" or (samples.columns is None and samples.topic is None):
-        return {"units": samples.units}
-    return samples.options(recording)
 
 
 def _names(sensor: str, form: str = FigureFormat.png) -> tuple[str, ...]:
@@ -249,8 +245,7 @@ def _identify(
     hours = len(values) * source.sample_interval / 3600.0
     length = f"{len(values)} samples at {1.0 / source.sample_interval:.6g} Hz, {hours:.3g} h"
     console.print(f"{recording.name}: {length}.", highlight=False)
-    for remark in source.remarks:
-        console.print(remark)
+    say(*source.remarks)
     if gaps:
         shortest = identification.noise_fit.SHORTEST
         console.print(
@@ -261,7 +256,18 @@ def _identify(
     console.print("For a term not detected in this record, the last column is an upper bound.")
     with written_beside(out / specification) as temporary:
         temporary.write_text(_specification(fit, f"{recording.name}, {length}"), encoding="utf-8")
-    _write_numbers(out / numbers, recording.name, fit, deviation, rows)
+    content = {
+        "source": recording.name,
+        "sample_interval_s": fit.sample_interval,
+        "level": fit.level,
+        "coefficients": rows,
+        "misfit_probability": fit.misfit_probability,
+        "misfit": fit.misfit,
+        "estimator": deviation.estimator,
+        "tau_s": deviation.taus,
+        f"deviation_{_UNITS[sensor][1]}": deviation.deviation,
+    }
+    write_json(out / numbers, plain(content))
     paths += save_as({out / figure_name: figure}, output.form)
     written(out / specification, out / numbers, *paths, *tables_written(output.tables, "allan", rows, sensor))
     for warning in fit.warnings:
@@ -282,8 +288,9 @@ def _plausible(recording: Path, sensor: str, source: GyroSamples) -> None:
         )
     largest = float(np.nanmax(np.abs(source.values), initial=0.0))
     if largest > _LARGEST_RATE:
-        unit = {"gyro": "rad/s", "accelerometer": "m/s²", "magnetometer": "T"}[sensor]
-        raise InputError(f"{recording.name} holds {largest:g} {unit}, which no {sensor} measures; check its unit")
+        raise InputError(
+            f"{recording.name} holds {largest:g} {_UNITS[sensor][0]}, which no {sensor} measures; check its unit"
+        )
     if not 1.0 / _LARGEST_RATE <= source.sample_interval <= _LARGEST_RATE:
         raise InputError(
             f"{recording.name}: {1.0 / source.sample_interval:g} Hz is no sample rate of a {sensor}; check it and its unit"
@@ -295,7 +302,7 @@ def _regressed(recording: Path, sensor: str, source: GyroSamples, order: int, ou
     import tomli_w
 
     from strapdown.allan import temperature as allan_temperature
-    from strapdown.gyro.temperature import STEM, to_table
+    from strapdown.gyro.temperature import to_table
 
     if source.temperature is None:
         raise InputError("no temperature is recorded; leave --temperature out")
@@ -305,8 +312,7 @@ def _regressed(recording: Path, sensor: str, source: GyroSamples, order: int, ou
     fit = allan_temperature.fit_temperature(
         source.values / scale, source.temperature, source.sample_interval, order=order
     )
-    unit = {"gyro": "rad/s", "accelerometer": "m/s2", "magnetometer": "T"}[sensor]
-    stem = {"gyro": STEM, "accelerometer": "m_per_s2", "magnetometer": "t"}[sensor]
+    unit, stem = _UNITS[sensor]
     found = fit.polynomial
     listing = table(
         f"Bias over temperature, T − {found.reference:.3f} °C",
@@ -333,29 +339,8 @@ def _regressed(recording: Path, sensor: str, source: GyroSamples, order: int, ou
     return fit.left * scale
 
 
-def _write_numbers(
-    path: Path,
-    source: str,
-    fit: identification.NoiseFit,
-    deviation: identification.AllanDeviation,
-    rows: list[dict[str, Any]],
-) -> None:
-    """Write coefficients and deviation as JSON."""
-    unit = {"gyro": "rad_per_s", "accelerometer": "m_per_s2", "magnetometer": "t"}[fit.sensor]
-    table = {
-        "source": source,
-        "sample_interval_s": fit.sample_interval,
-        "level": fit.level,
-        "coefficients": rows,
-        "misfit_probability": fit.misfit_probability,
-        "misfit": fit.misfit,
-        "estimator": deviation.estimator,
-        "tau_s": deviation.taus,
-        f"deviation_{unit}": deviation.deviation,
-    }
-    write_json(path, plain(table))
-
-
+_UNITS = {"gyro": ("rad/s", "rad_per_s"), "accelerometer": ("m/s²", "m_per_s2"), "magnetometer": ("T", "t")}
+"""Unit of the samples of each sensor, in messages and in keys."""
 _LARGEST_RATE = 1e12
 """Maximum rate, rad/s, and sample rate, Hz: far beyond any gyro, and far below overflow of squares in the fit."""
 _DISTRUST = "do not trust these intervals"

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from strapdown.checks import InputError, positive
+from strapdown.cli.progress import progress_bar
 from strapdown.cli.terminal import (
     FORMAT,
     TABLES,
@@ -16,7 +17,7 @@ from strapdown.cli.terminal import (
     command,
     console,
     counted,
-    progress_bar,
+    say,
     show,
     table,
     tables_folder,
@@ -57,6 +58,7 @@ def _show_own(own: tuple[Algorithm, ...]) -> None:
         "C",
         "optimum n, C for the same increments",
     )
+    rounded = []
     for one in own:
         row = own_summary(one)
         constant = one.drift_constant
@@ -69,14 +71,13 @@ def _show_own(own: tuple[Algorithm, ...]) -> None:
             f"{float(constant):.4g}{exact}",
             f"{row['best_drift_order']}, {row['best_drift_constant']:.4g}",
         )
-    show(rows)
-    for one in own:
-        following = own_summary(one)
-        if one.drift_order < following["best_drift_order"] and abs(one.drift_constant) < _ROUNDED:
-            console.print(
+        if one.drift_order < row["best_drift_order"] and abs(constant) < _ROUNDED:
+            rounded.append(
                 f"Note: the drift of {one.name} is of order (ωh)^{one.drift_order} with a small constant, as with rounded coefficients. "
                 "If they are rounded, give them as fractions or with all digits."
             )
+    show(rows)
+    say(*rounded)
 
 
 _SHOWN_DENOMINATOR = 10**7

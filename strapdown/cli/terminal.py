@@ -19,36 +19,13 @@ from rich.table import Table
 from rich.text import Text
 
 from strapdown.checks import InputError
-from strapdown.cli.progress import errors, progress_bar, rate_text
+from strapdown.cli.progress import progress_bar
 from strapdown.files import json_text, output_file, usable_folder, write_json
 
 if TYPE_CHECKING:
     from strapdown.recordings import Recording
     from strapdown.results import Listing
     from strapdown.scenarios import Scenario
-
-__all__ = [
-    "app",
-    "command",
-    "console",
-    "counted",
-    "doubt",
-    "errors",
-    "gap_words",
-    "given",
-    "json_target",
-    "need_own",
-    "progress_bar",
-    "put_json",
-    "rate_text",
-    "scenario_named",
-    "show",
-    "show_listing",
-    "table",
-    "verdict",
-    "writable",
-    "written",
-]
 
 LARGEST_NUMBER = 1e30
 """Maximum of a number in a scenario, in any unit; squares and products of larger ones overflow."""
@@ -127,6 +104,12 @@ TABLES: Any = typer.Option(
 """Option of all commands that print the tables of a study."""
 
 
+def say(*sentences: str) -> None:
+    """Print sentences, each on its line; empty ones are omitted."""
+    for sentence in filter(None, sentences):
+        console.print(sentence)
+
+
 def counted(number: int, what: str) -> str:
     """Return a number with a noun, in the plural unless it is one."""
     return f"{number} {what}" if number == 1 else f"{number} {what}s"
@@ -157,8 +140,7 @@ def show_listing(listing: Listing, title: str | None = None, *, notes: bool = Fa
     for row in listing.rows:
         rows.add_row(*(Text(cell, style=styles.get(cell, "")) for cell in row))
     show(rows)
-    for note in listing.notes if notes else ():
-        console.print(note)
+    say(*(listing.notes if notes else ()))
 
 
 def tables_written(folder: Path | None, study: str, *results: Any) -> list[Path]:
@@ -244,8 +226,7 @@ def doubt(source: Recording, path: Path) -> None:
 
     with progress_bar("testing conventions"):
         found = check_conventions.examine(source)
-    for words in found.warnings:
-        console.print(f"warning: {words}. See `strapdown doctor {path}`.")
+    say(*(f"warning: {words}. See `strapdown doctor {path}`." for words in found.warnings))
 
 
 def gap_words(gaps: Sequence[tuple[float, float]]) -> str:

@@ -11,6 +11,7 @@ import numpy as np
 import typer
 
 from strapdown.checks import InputError, count, one_of
+from strapdown.cli.progress import progress_bar
 from strapdown.cli.reading import Layout
 from strapdown.cli.terminal import (
     FORMAT,
@@ -20,7 +21,7 @@ from strapdown.cli.terminal import (
     console,
     doubt,
     need_own,
-    progress_bar,
+    say,
     show_listing,
     tables_folder,
     tables_written,
@@ -235,8 +236,7 @@ def tune(
         console.print(f"RMS attitude error: {old:.4g}° before, {new:.4g}° after.")
     if found.gate is not None:
         _print_gate(found.gate)
-    for sentence in () if found.worst is None else found.worst.words:
-        console.print(sentence)
+    say(*(() if found.worst is None else found.worst.words))
     if found.comparison is not None:
         _print_comparison(found.comparison, truth=goal.truth or goal.rmse)
     _write(found, records, goal.name, output)
@@ -274,7 +274,13 @@ def _tuned(
             threads=workers,
             progress=advance,
         )
-    comparison = _compared(held, before, objective, result, workers, gated=gated)
+    comparison = None
+    if held:
+        with progress_bar("judging on the held-out data"):
+            comparison = tuning.compare(held, before, result.setup, threads=workers)
+    if comparison is not None and gated:  # the likelihood after tuning includes the gate
+        likely = tuning.log_likelihood(held, objective, result)  # type: ignore[arg-type]
+        comparison = replace(comparison, after=replace(comparison.after, log_likelihood=likely))
     examined, worst = _examined(train, before, result)
     if worst is not None:
         result = tuning.doubted(result, worst)
@@ -299,22 +305,6 @@ def _check_files(records: Sequence[Path], filter_file: Path | None, output: _Out
     tables_folder(output.tables)
     for target in (out, report):
         need_own(target, "tune", lambda _: bool(tunings.read(report)))
-
-
-def _compared(
-    held: Sequence[Case], before: FilterSetup, objective: Any, result: Tuning, threads: int, *, gated: bool
-) -> Comparison | None:
-    """Compare the filter before and after tuning on the held-out data, if any; ``gated``: the likelihood after includes the gate."""
-    from strapdown import tuning
-
-    if not held:
-        return None
-    with progress_bar("judging on the held-out data"):
-        comparison = tuning.compare(held, before, result.setup, threads=threads)
-    if not gated:
-        return comparison
-    likely = tuning.log_likelihood(held, objective, result)
-    return replace(comparison, after=replace(comparison.after, log_likelihood=likely))
 
 
 def _examined(train: Sequence[Case], before: FilterSetup, result: Tuning) -> tuple[list[Unmodelled], Unmodelled | None]:
@@ -362,8 +352,7 @@ def _cases(
                         f"{path} does not contain its gyro's specification; give an initial filter, --filter filter.toml"
                     )
                 chosen, remarks = filter_for(path, record, None, None, () if start.states else False)
-                for remark in remarks:
-                    console.print(remark)
+                say(*remarks)
             elif start.filter_file is not None:
                 need_angles(start.filter_file, chosen, record)
             if gyro is not None:
@@ -374,8 +363,7 @@ def _cases(
                 raise InputError(f"{path} is a recording, which specifies no errors; --states is for simulated records")
             recording = recordings.read(path, **layout.options(path))
             chosen = chosen or tuning.recording_setup()
-            if recording.left_out_words:
-                console.print(recording.left_out_words)
+            say(recording.left_out_words)
             cases.append(tuning.recording_case(recording))
             doubt(recording, path)
     assert chosen is not None
@@ -400,8 +388,7 @@ def _print_comparison(comparison: Comparison, *, truth: bool) -> None:
     show_listing(comparison.listing())
     console.print(f"{tunings.BOUNDS}.")
     for judgement in comparison.after.judgements[:1]:
-        for line in judgement.words.splitlines()[1:]:
-            console.print("After:" + line[3:])
+        say(*("After:" + line[3:] for line in judgement.words.splitlines()[1:]))
     if not comparison.better and not truth:
         console.print("On the held-out data the likelihood has decreased: keep the previous filter.")
     elif comparison.after.attitude_rms > WORSE * comparison.before.attitude_rms:

@@ -560,23 +560,18 @@ def matched(samples: int, previous: int, following: int = 0) -> Algorithm:
     )
 
 
-def scheme(name: str, solver: str, samples: int, order: int, source: str) -> Algorithm:
-    """Return an integrator of the quaternion equation for smooth rates, on the rate polynomial through the N increments of a step."""
-    return Algorithm(name=name, solver=solver, samples=samples, order=order, source=source)
-
-
-_SCHEMES = {
+_SCHEMES: dict[str, dict[str, Any]] = {
     # From moments of the polynomial.
-    "magnus-4": ("magnus-4", 3, 4, "Blanes, Casas, Ros 2000"),
-    "magnus-6": ("magnus-6", 4, 6, "Blanes, Casas, Ros 2000"),
+    "magnus-4": {"solver": "magnus-4", "samples": 3, "order": 4, "source": "Blanes, Casas, Ros 2000"},
+    "magnus-6": {"solver": "magnus-6", "samples": 4, "order": 6, "source": "Blanes, Casas, Ros 2000"},
     # exp(½B₀ − 2B₁) ⊗ exp(½B₀ + 2B₁).
-    "commutator-free-4": ("commutator-free-4", 3, 4, "Blanes, Moan 2006"),
+    "commutator-free-4": {"solver": "commutator-free-4", "samples": 3, "order": 4, "source": "Blanes, Moan 2006"},
     # From equation (17), with rates at 0, T/2, T.
-    "runge-kutta-4": ("runge-kutta-4", 3, 4, "Kutta 1901"),
+    "runge-kutta-4": {"solver": "runge-kutta-4", "samples": 3, "order": 4, "source": "Kutta 1901"},
     # q + ½ q ⊗ Δθ, normalised, as in many small projects.
-    "quaternion-euler": ("euler", 1, 2, "Euler 1768"),
+    "quaternion-euler": {"solver": "euler", "samples": 1, "order": 2, "source": "Euler 1768"},
 }
-"""Solver, samples, order and source of each."""
+"""Integrators of the quaternion equation for smooth rates, on the rate polynomial through the increments of a step."""
 
 
 def _fitted_order(samples: int) -> int:
@@ -623,7 +618,7 @@ def _makers() -> dict[str, Callable[[], Algorithm]]:
         makers[f"uncompressed-{n}"] = functools.partial(uncompressed_optimal, n)
     for n in range(2, 9):
         makers[f"polynomial-{n}"] = functools.partial(polynomial, n)
-    makers |= {name: functools.partial(scheme, name, *of) for name, of in _SCHEMES.items()}
+    makers |= {name: functools.partial(Algorithm, name=name, **of) for name, of in _SCHEMES.items()}
     makers |= {
         "one-sample-rate-2": functools.partial(compressed, 1, 0, 2),
         "two-sample-rate-2": functools.partial(compressed, 2, 0, 2),

@@ -119,36 +119,33 @@ def read_vibration(path: str | os.PathLike[str]) -> tuple[VibrationLine, ...]:
     """Read vibration lines from CSV with the columns ``frequency_hz, angle_deg[, angle_across_deg][, phase_deg]``."""
     file = Path(path)
     with reading.from_file(file):
-        return _vibration(file, reading.text(file).splitlines())
-
-
-def _vibration(file: Path, text: list[str]) -> tuple[VibrationLine, ...]:
-    rows = csv.reader(line for line in text if line.strip() and not line.lstrip().startswith("#"))
-    names = [name.strip() for name in next(rows, [])]
-    checks.known_keys(f"{file.name}: columns", names, _COLUMNS)
-    lacking = [name for name in _COLUMNS[:2] if name not in names]
-    if lacking:
-        raise InputError(f"{file.name} lacks the column {' and '.join(lacking)}; give {', '.join(_COLUMNS)}")
-    lines = []
-    for k, row in enumerate(rows):
-        if len(row) != len(names):
-            raise InputError(f"{file.name}: data row {k + 1} has {len(row)} fields, the header {len(names)}")
-        cell = {
-            name: _number(f"{file.name}: data row {k + 1}, {name}", field)
-            for name, field in zip(names, row, strict=True)
-        }
-        across = cell.get("angle_across_deg")
-        lines.append(
-            VibrationLine(
-                frequency=cell["frequency_hz"],
-                angle=cell["angle_deg"] * DEGREE,
-                angle_across=None if across is None else across * DEGREE,
-                phase=cell.get("phase_deg", 90.0) * DEGREE,
+        text = reading.text(file).splitlines()
+        rows = csv.reader(line for line in text if line.strip() and not line.lstrip().startswith("#"))
+        names = [name.strip() for name in next(rows, [])]
+        checks.known_keys(f"{file.name}: columns", names, _COLUMNS)
+        lacking = [name for name in _COLUMNS[:2] if name not in names]
+        if lacking:
+            raise InputError(f"{file.name} lacks the column {' and '.join(lacking)}; give {', '.join(_COLUMNS)}")
+        lines = []
+        for k, row in enumerate(rows):
+            if len(row) != len(names):
+                raise InputError(f"{file.name}: data row {k + 1} has {len(row)} fields, the header {len(names)}")
+            cell = {
+                name: _number(f"{file.name}: data row {k + 1}, {name}", field)
+                for name, field in zip(names, row, strict=True)
+            }
+            across = cell.get("angle_across_deg")
+            lines.append(
+                VibrationLine(
+                    frequency=cell["frequency_hz"],
+                    angle=cell["angle_deg"] * DEGREE,
+                    angle_across=None if across is None else across * DEGREE,
+                    phase=cell.get("phase_deg", 90.0) * DEGREE,
+                )
             )
-        )
-    if not lines:
-        raise InputError(f"{file.name} has a header but no lines")
-    return tuple(lines)
+        if not lines:
+            raise InputError(f"{file.name} has a header but no lines")
+        return tuple(lines)
 
 
 def _number(name: str, field: str) -> float:

@@ -185,13 +185,13 @@ def rotation_vectors(
     return vectors
 
 
-def time_per_sample(algorithm: str | Algorithm, samples: int = 20_160, repeats: int = 5) -> float:
+def time_per_sample(algorithm: str | Algorithm, samples: int = 20_160) -> float:
     """Return the minimum time per sample of :func:`integrate` on this machine, s, without compilation."""
     table = named(algorithm)
     checks.count("samples", samples, minimum=table.window)
     increments = 1e-3 * np.random.default_rng(0).standard_normal((samples, 3))
     best = math.inf
-    for _ in range(checks.count("repeats", repeats) + 1):
+    for _ in range(6):
         start = time.perf_counter()
         integrate(increments, table)
         best = min(best, time.perf_counter() - start)

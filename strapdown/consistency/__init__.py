@@ -4,16 +4,14 @@
 - ``bounds``: Exact two-sided bounds of averages over independent runs: ANEES and NIS, log-NEES, coverage.
 - ``whiteness``: Tests of the innovations: white, normal, of mean zero, independent of those of other sensors.
 - ``timeaverage``: Averages over the time of one run, whose errors are correlated, and their effective sample size.
-- ``accuracy``: Errors against a reference, their convergence time and distribution.
+- ``accuracy``: Errors against a reference, and their convergence time.
 - ``foreign``: The verdict on the estimate of another program: alignment of clocks and frames, definition of its covariance.
 - ``judgement``: The verdict in words, with its evidence, at a stated probability of a false alarm. For independent runs see
   :meth:`strapdown.montecarlo.Statistics.judge`.
 """
 
-from strapdown.consistency.accuracy import Distribution as Distribution
 from strapdown.consistency.accuracy import ReferenceErrors as ReferenceErrors
 from strapdown.consistency.accuracy import convergence_time as convergence_time
-from strapdown.consistency.accuracy import distribution as distribution
 from strapdown.consistency.accuracy import reference_errors
 from strapdown.consistency.bounds import Verdict as Verdict
 from strapdown.consistency.bounds import log_mean_bounds as log_mean_bounds

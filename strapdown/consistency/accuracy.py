@@ -1,4 +1,4 @@
-"""Errors of an estimate: against a reference, convergence time, distribution."""
+"""Errors of an estimate: against a reference, convergence time."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from strapdown import quaternion
-from strapdown.checks import Array, InputError, array, count, increasing, positive
+from strapdown.checks import Array, InputError, array, increasing, positive
 
 
 def convergence_time(time: ArrayLike, magnitude: ArrayLike, threshold: float) -> float:
@@ -19,28 +19,6 @@ def convergence_time(time: ArrayLike, magnitude: ArrayLike, threshold: float) ->
     above = np.flatnonzero(np.abs(size) > positive("threshold", threshold))
     first = int(above[-1]) + 1 if len(above) else 0
     return float(stamps[first]) if first < len(stamps) else math.nan
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Distribution:
-    """The empirical distribution of error magnitudes."""
-
-    values: Array
-    """Sorted error magnitudes (n,)."""
-    probability: Array
-    """Fraction of the errors at or below each value (n,)."""
-
-    def quantile(self, fraction: float) -> float:
-        """Return the quantile of the errors at ``fraction``: 0.5 is the median, 0.95 the 95 % error."""
-        return float(np.quantile(self.values, fraction, method="inverted_cdf"))
-
-
-def distribution(error: ArrayLike) -> Distribution:
-    """Return the distribution of errors (n,); NaN (no reference) is left out."""
-    given = np.asarray(error, np.float64).ravel()
-    values = np.sort(given[np.isfinite(given)])
-    count("the number of errors", len(values))
-    return Distribution(values=values, probability=np.arange(1, len(values) + 1) / len(values))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -21,6 +21,7 @@ from strapdown.checks import Array, InputError, array, increasing, one_of, unit_
 from strapdown.consistency.judgement import WITHOUT_TRUTH, Judgement, judge
 from strapdown.consistency.manifold import whitened
 from strapdown.consistency.timeaverage import effective_samples
+from strapdown.recordings import trajectories
 from strapdown.records import Estimate, Innovations, Truth
 from strapdown.records.outputs import euler_axes
 from strapdown.units import DEGREE
@@ -34,8 +35,6 @@ ALIGNED = ("time", "fixed", "body")
 """Parts of an alignment: clocks, fixed frames, body frames."""
 GROSS = 5.0 * DEGREE
 """A constant rotation above this is a difference of frames and not an error of a filter, rad."""
-BRIDGED = 0.1
-"""Maximum interval of the truth to interpolate over, s; for a slower truth 1.5 times its median interval."""
 SCALE = "σ wrong by one factor"
 LIKELY = 1e-3
 """p-value below which an explanation is likely."""
@@ -375,22 +374,17 @@ def _turns(one: Array, other: Array) -> Array:
 
 
 def interpolated(time: Array, stamps: Array, attitude: Array, bridged: float) -> Array:
-    """Return attitudes (n, 4) at ``time`` along the shortest rotation; NaN outside, and in gaps longer than ``bridged``, s."""
-    k = np.clip(np.searchsorted(stamps, time, side="right") - 1, 0, len(stamps) - 2)
-    width = stamps[k + 1] - stamps[k]
-    share = (time - stamps[k]) / width
-    usable = (share >= -1e-9 / width) & (share <= 1.0 + 1e-9 / width) & (width <= bridged)
-    turn = _turns(attitude[k], attitude[k + 1])
-    result = quaternion.multiply(attitude[k], quaternion.exp(share[:, None] * turn))
-    for end in (0, 1):  # at the truth's own times the attitude is copied exactly
-        exact = time == stamps[k + end]
-        result[exact] = attitude[k[exact] + end]
-        usable |= exact
-    return np.where(usable[:, None], result, np.nan)
+    """Return attitudes (n, 4) at ``time``, interpolated; at the truth's own times they are copied exactly, next to gaps too."""
+    result = trajectories.interpolated(time, stamps, attitude, bridged)
+    k = np.clip(np.searchsorted(stamps, time), 0, len(stamps) - 1)
+    exact = time == stamps[k]
+    result[exact] = attitude[k[exact]]
+    return result
 
 
 def _bridged(series: _Series) -> float:
-    return max(BRIDGED, 1.5 * float(np.median(np.diff(series.time))))
+    """Return the maximum interval to interpolate over, s: 1.5 times the median one if the series is slow."""
+    return max(trajectories.BRIDGED, 1.5 * float(np.median(np.diff(series.time))))
 
 
 def _at_common_times(own: _Series, theirs: _Series, offset: float) -> tuple[_Series, Truth]:

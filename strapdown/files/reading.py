@@ -257,6 +257,15 @@ def is_hdf5(path: Name) -> bool:
     return False
 
 
+def kind(path: Name) -> str:
+    """Return the kind of an HDF5 file of this package, such as "strapdown estimate"; empty for any other file."""
+    if not is_hdf5(path):
+        return ""
+    with hdf5(path) as file:
+        found = str(attributes(file).get("kind", ""))
+    return found if found.startswith("strapdown ") else ""
+
+
 def has_digest(path: Name) -> bool:
     """Return whether a file begins with a digest; if the digest does not match the rest of the file, it is rejected."""
     with opened(path) as handle:

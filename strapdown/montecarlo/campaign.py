@@ -27,7 +27,7 @@ from strapdown import scenarios
 from strapdown.checks import InputError, count, finite, one_of
 from strapdown.estimation import setup
 from strapdown.files import locked, reading, set_attributes, whole_hdf5
-from strapdown.montecarlo.engine import MACHINES, Chunks, Work, Workers, arithmetic, choose, in_threads, machine_named
+from strapdown.montecarlo.engine import MACHINES, Chunks, Work, Workers, arithmetic, choose, in_threads
 from strapdown.montecarlo.plan import Plan, from_table
 from strapdown.montecarlo.statistics import BINS, Statistics, merge
 from strapdown.records import CONVENTIONS, put
@@ -106,7 +106,7 @@ class Campaign(Listed):
     version : str, optional
         Version of this package that computed it. Default: the running one.
     arithmetic : str, default ""
-        Processor features that the rounding depends on (:func:`strapdown.montecarlo.engine.arithmetic`); empty for earlier versions.
+        Processor features that the rounding depends on (:func:`strapdown.montecarlo.engine.arithmetic`).
     seconds : float, default 0.0
         Time spent computing, s, over all resumptions.
     """
@@ -226,7 +226,7 @@ def run(
     with locked(target):
         held = _stored(target) if resume and target.exists() else None
         if held is None:
-            size = machine_named(chosen.machine).CHUNK if chunk is None else count("chunk", chunk)
+            size = MACHINES[chosen.machine].CHUNK if chunk is None else count("chunk", chunk)
             state, before = _Progress(None, {}, size), 0.0
         else:
             stored, state = held
@@ -283,10 +283,11 @@ def _compute(
 
 def _need_same(target: Path, held: Campaign, plan: Plan, machine: str, chunk: int, runs: int) -> None:
     """Raise if the file is of another plan, naming the first difference."""
-    given = {**_flat(plan.to_table()), "machine": machine, "chunk": chunk, "version": strapdown.__version__}
-    there = {**_flat(held.plan.to_table()), "machine": held.machine, "chunk": held.chunk, "version": held.version}
-    if held.arithmetic:
-        given["arithmetic"], there["arithmetic"] = arithmetic(), held.arithmetic
+    names = ("machine", "chunk", "version", "arithmetic")
+    given = _flat(plan.to_table()) | dict(
+        zip(names, (machine, chunk, strapdown.__version__, arithmetic()), strict=True)
+    )
+    there = _flat(held.plan.to_table()) | {name: getattr(held, name) for name in names}
     for name in sorted(given.keys() | there.keys()):
         if given.get(name) != there.get(name):
             raise InputError(
@@ -454,7 +455,7 @@ def _stored(path: Path) -> tuple[Campaign, _Progress]:
             runs=count("runs", attributes["runs"]),
             statistics=_statistics_of(file["statistics"], plan) if "statistics" in file else None,
             version=str(attributes["version"]),
-            arithmetic=str(attributes.get("arithmetic", "")),
+            arithmetic=str(attributes["arithmetic"]),
             seconds=finite("seconds", attributes["seconds"], unit="s"),
         )
         early = file.get("resume", {})

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import importlib
 import pickle
 from collections.abc import Iterator
 from typing import Any
@@ -21,6 +20,7 @@ from typing import Any
 import strapdown
 from strapdown.checks import InputError, count
 from strapdown.montecarlo.engine import Chunks, Parts, Window, Work, Workers, arithmetic
+from strapdown.recordings.extras import library
 
 __all__ = [
     "dask_client",
@@ -51,10 +51,10 @@ def dask_client(*, workers: int | None = None, address: str | None = None) -> It
     InputError
         If both are given, Dask is not installed, or no scheduler answers at the address.
     """
-    distributed = _distributed()
+    if address is not None and workers is not None:
+        raise InputError("workers and cluster exclude each other: a cluster has its own workers; give only one")
+    distributed = library("distributed", "a cluster of workers", "cluster")
     if address is not None:
-        if workers is not None:
-            raise InputError("workers and cluster exclude each other: the cluster has its own workers; give only one")
         try:
             client = distributed.Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
         except (OSError, ValueError, TypeError) as error:
@@ -98,7 +98,7 @@ def on_dask(client: Any) -> Workers:
     InputError
         If the cluster has no workers, or another version of this package.
     """
-    distributed = _distributed()
+    distributed = library("distributed", "a cluster of workers", "cluster")
 
     def work_through(work: Work, chunks: Chunks) -> Iterator[tuple[int, Parts]]:
         payload = distributed.protocol.pickle.dumps(work)  # the user's classes and functions are pickled by value
@@ -156,12 +156,3 @@ def _work(payload: bytes) -> Work:
     """Return the unpickled work, one object for all chunks of a worker, so that a plan is prepared once per worker."""
     work: Work = pickle.loads(payload)
     return work
-
-
-def _distributed() -> Any:
-    try:
-        return importlib.import_module("distributed")
-    except ModuleNotFoundError as error:
-        raise InputError(
-            f"workers and clusters need Dask, and {error.name} is not installed: pip install 'strapdown[cluster]'"
-        ) from None

@@ -16,9 +16,11 @@ import numpy as np
 
 from strapdown import coning, montecarlo, quaternion
 from strapdown.checks import Array, InputError, count, non_negative, positive
+from strapdown.consistency import Verdict
 from strapdown.estimation.states import ProcessNoise
 from strapdown.gyro import GyroSpec
 from strapdown.montecarlo import FilterSetup, Statistics
+from strapdown.montecarlo.statistics import SUBSETS
 from strapdown.motion import Coning, Harmonic, HarmonicRates, Motion, SpinRock, TorqueFree
 from strapdown.scenarios import Scenario
 from strapdown.units import (
@@ -45,6 +47,8 @@ STEP_MULTIPLE = 12
 
 A coning-compensated step divided in its middle would be treated as a rotation at constant rate, which it is not under coning."""
 
+MAX_STEPS = 60_000
+"""Maximum number of steps of a run in which a drift is measured."""
 EPOCHS = 100
 VERDICT_EPOCHS = 20
 
@@ -183,13 +187,15 @@ class FilterOutcome:
     """Indices of the epochs judged."""
 
     @property
+    def verdicts(self) -> dict[str, Verdict]:
+        """Test of the NEES at the judged epochs, by subset of the states."""
+        return {subset: self.statistics.verdict(self.epochs, subset, self.probability) for subset in SUBSETS}
+
+    @property
     def consistent(self) -> bool:
         """Whether NEES of the state, of the attitude and of the bias and the NIS all lie inside their bounds."""
         low, high = self.statistics.nis_bounds(self.probability)
-        nees = all(
-            self.statistics.verdict(self.epochs, subset, self.probability).consistent
-            for subset in ("state", "attitude", "bias")
-        )
+        nees = all(one.consistent for one in self.verdicts.values())
         return nees and low <= self.statistics.mean_nis <= high
 
     def summary(self) -> dict[str, Any]:
@@ -198,24 +204,16 @@ class FilterOutcome:
         RMS errors are over the judged epochs and axes; ``anees`` is the mean over the judged epochs and its bounds are those of one epoch.
         The verdict compares every epoch with simultaneous bounds.
         """
-        statistics = self.statistics
-        verdicts = {
-            subset: statistics.verdict(self.epochs, subset, self.probability)
-            for subset in ("state", "attitude", "bias")
-        }
-        square = statistics.rms_error[self.epochs] ** 2
+        statistics, verdicts = self.statistics, self.verdicts
+        square, variance = statistics.rms_error[self.epochs] ** 2, statistics.sigma[self.epochs] ** 2
         return {
             "integration": self.integration,
             "runs": statistics.runs,
             "attitude_rms_arcsec": float(np.sqrt(square[:, :3].mean()) / ARCSECOND),
-            "attitude_sigma_arcsec": float(np.sqrt((statistics.sigma[self.epochs, :3] ** 2).mean()) / ARCSECOND),
+            "attitude_sigma_arcsec": float(np.sqrt(variance[:, :3].mean()) / ARCSECOND),
             "bias_rms_deg_per_hour": float(np.sqrt(square[:, 3:].mean()) / DEGREE_PER_HOUR),
-            "bias_sigma_deg_per_hour": float(
-                np.sqrt((statistics.sigma[self.epochs, 3:] ** 2).mean()) / DEGREE_PER_HOUR
-            ),
-            "bias_mean_deg_per_hour": [
-                float(x) for x in statistics.mean_error[self.epochs, 3:].mean(axis=0) / DEGREE_PER_HOUR
-            ],
+            "bias_sigma_deg_per_hour": float(np.sqrt(variance[:, 3:].mean()) / DEGREE_PER_HOUR),
+            "bias_mean_deg_per_hour": (statistics.mean_error[self.epochs, 3:].mean(axis=0) / DEGREE_PER_HOUR).tolist(),
             "anees": float(verdicts["state"].mean.mean()),
             "anees_bounds": list(verdicts["state"].bounds),
             "anees_attitude": float(verdicts["attitude"].mean.mean()),
@@ -319,7 +317,7 @@ def predicted_drift(motion: Coning, rate: float, algorithm: coning.Algorithm) ->
     return motion.angle**2 * 2.0 * np.pi * motion.frequency * coning.small_angle_drift(algorithm, ratio)
 
 
-def measured_drift(motion: Coning, rate: float, algorithm: coning.Algorithm, steps: int = 60_000) -> float:
+def measured_drift(motion: Coning, rate: float, algorithm: coning.Algorithm) -> float:
     """Return the drift of noise-free integration against the closed form, rad/s along the cone's axis: estimated minus true.
 
     Drift rotates the estimate about the fixed z axis at a constant rate. The run ends where coning cycles and steps most nearly coincide,
@@ -327,7 +325,7 @@ def measured_drift(motion: Coning, rate: float, algorithm: coning.Algorithm, ste
     """
     expected = abs(coning.predicted_coning_drift(algorithm, motion.angle, motion.frequency, 1.0 / rate))
     step = algorithm.samples / rate
-    longest = int(min(steps, max(1.0 / (expected * step), 100.0))) if expected > 0.0 else steps
+    longest = int(min(MAX_STEPS, max(1.0 / (expected * step), 100.0))) if expected > 0.0 else MAX_STEPS
     cycles = np.arange(longest // 2, longest + 1) * (step * motion.frequency)
     chosen = longest // 2 + int(np.argmin(np.abs(cycles - np.round(cycles))))
     edges = np.arange(chosen * algorithm.samples + 1) / rate

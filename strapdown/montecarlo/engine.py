@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -12,7 +11,7 @@ from typing import Any
 
 from strapdown.checks import InputError, count, one_of
 from strapdown.estimation.setup import FilterSetup
-from strapdown.montecarlo import scalar
+from strapdown.montecarlo import lanes, scalar
 from strapdown.montecarlo.plan import Plan
 from strapdown.montecarlo.statistics import Replay, Statistics, merge
 from strapdown.records import Origin
@@ -21,17 +20,11 @@ from strapdown.scenarios import Scenario
 Parts = tuple[Statistics, ...]
 """Statistics of the same runs, one per plan."""
 
-MACHINES = ("lanes", "scalar")
-"""Machines, the fast one first."""
+MACHINES: dict[str, Any] = {lanes.NAME: lanes, scalar.NAME: scalar}
+"""Machines by name, the fast one first: modules as described in :mod:`strapdown.montecarlo.statistics`."""
 
 AHEAD = 4
 """Maximum number of chunks per worker ahead of the first unfinished one; bounds the memory."""
-
-
-def machine_named(name: str) -> Any:
-    """Return a machine by name: a module as described in :mod:`strapdown.montecarlo.statistics`."""
-    one_of("machine", name, MACHINES)
-    return scalar if name == "scalar" else importlib.import_module("strapdown.montecarlo.lanes")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,10 +48,7 @@ def choose(plan: Plan, machine: str = "auto") -> Choice:
     one_of("machine", machine, ("auto", *MACHINES))
     reasons: dict[str, str] = {}
     for name in MACHINES if machine == "auto" else (machine,):
-        try:
-            reason = machine_named(name).supports(plan)
-        except ModuleNotFoundError as error:
-            reason = f"a machine without {error.name}"
+        reason = MACHINES[name].supports(plan)
         if reason is None:
             return Choice(machine=name, reason=reasons.get("lanes", ""))
         reasons[name] = reason
@@ -100,7 +90,7 @@ def replay(plan: Plan, run: int, *, machine: str = "auto") -> Replay:
     Replay
         Record, initial state and estimate.
     """
-    found: Replay = machine_named(choose(plan, machine).machine).replay(plan, count("run", run, minimum=0))
+    found: Replay = MACHINES[choose(plan, machine).machine].replay(plan, count("run", run, minimum=0))
     spec = scalar.dispersed(plan.scenario.gyro, plan.dispersions, plan.seed, run)
     of_this_run = plan.scenario
     if spec is not plan.scenario.gyro:  # dispersed, so no longer a preset
@@ -147,8 +137,7 @@ class Work:
         """Return the statistics of a chunk, one per plan."""
         if self.machine == scalar.NAME:  # simulates each run once
             return scalar.run_chunks(self.plans, first_run, runs)
-        chosen = machine_named(self.machine)
-        return tuple(chosen.run_chunk(plan, first_run, runs) for plan in self.plans)
+        return tuple(MACHINES[self.machine].run_chunk(plan, first_run, runs) for plan in self.plans)
 
 
 Workers = Callable[[Work, Chunks], Iterator[tuple[int, Parts]]]
@@ -226,14 +215,10 @@ def merged_in_order(finished: Iterator[tuple[int, Parts]]) -> Parts:
     for number, parts in finished:
         early[number] = parts
         while place in early:
-            total = merge_parts(total, early.pop(place))
+            following = early.pop(place)
+            total = tuple(merge(a, b) for a, b in zip(total, following, strict=True)) if total else following
             place += 1
     return total
-
-
-def merge_parts(total: Parts, parts: Parts) -> Parts:
-    """Return both merged, plan by plan; ``total`` is empty at the start."""
-    return tuple(merge(a, b) for a, b in zip(total, parts, strict=True)) if total else parts
 
 
 def run_plan(
@@ -270,7 +255,7 @@ def run_plan(
         Sums over all runs, merged in the order of the chunks.
     """
     chosen = choose(plan, machine).machine
-    size = machine_named(chosen).CHUNK if chunk is None else count("chunk", chunk)
+    size = MACHINES[chosen].CHUNK if chunk is None else count("chunk", chunk)
     work = Work(plans=(plan,), machine=chosen)
     return _run(work, count("runs", runs), size, in_threads(threads) if workers is None else workers, progress)[0]
 
@@ -319,7 +304,7 @@ def run(
     plans = tuple(Plan(scenario=scenario, setup=one, seed=seed, **options) for one in setups)
     names = {choose(plan, machine).machine for plan in plans}
     work = Work(plans=plans, machine=names.pop() if len(names) == 1 else scalar.NAME)
-    size = machine_named(work.machine).CHUNK if chunk is None else count("chunk", chunk)
+    size = MACHINES[work.machine].CHUNK if chunk is None else count("chunk", chunk)
     return list(_run(work, runs, size, in_threads(threads), progress))
 
 

@@ -35,7 +35,7 @@ from strapdown.kernels import gyro_errors, machine, montecarlo_run, montecarlo_s
 from strapdown.kernels.machine import compiled
 from strapdown.kernels.noise import minus_two_log
 from strapdown.kernels.series import LARGEST_ANGLE
-from strapdown.montecarlo.plan import Plan
+from strapdown.montecarlo.plan import Plan, initial_sigmas
 from strapdown.montecarlo.statistics import (
     BINS,
     ERROR_EXPONENT,
@@ -105,7 +105,7 @@ def _reasons(plan: Plan) -> Iterator[str]:
     for option in ("gate", "robust", "states"):
         if getattr(plan.setup, option, None) is not None:
             yield f"the filter's {option} option"
-    if plan.dispersions.initial_sigmas(plan.setup)[0] > LARGEST_START:
+    if initial_sigmas(plan.dispersions, plan.setup)[0] > LARGEST_START:
         yield f"an initial attitude error of more than {LARGEST_START} rad, 1 sigma"
     if plan.setup.integration.samples > 1 and plan.dispersions.of_the_gyro:
         yield "gyro parameters that differ from run to run with several gyro samples a filter step"
@@ -193,7 +193,7 @@ def _prepare(plan: Plan) -> _Prepared:
         attitude=np.ascontiguousarray(quiet.truth.attitude[0]),
         error=np.array(
             [
-                *plan.dispersions.initial_sigmas(plan.setup),
+                *initial_sigmas(plan.dispersions, plan.setup),
                 *plan.dispersions.attitude_error,
                 *plan.dispersions.bias_error,
             ]

@@ -21,10 +21,6 @@ from strapdown.scenarios import Scenario
 PRECISIONS = ("float64", "float32")
 
 
-def _zeros() -> Array:
-    return np.zeros(3)
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Dispersions:
     """Independent normal dispersions between runs besides the noise. Default: initial errors from the filter's prior.
@@ -50,8 +46,8 @@ class Dispersions:
 
     attitude_sigma: float | None = None
     bias_sigma: float | None = None
-    attitude_error: Array = field(default_factory=_zeros)
-    bias_error: Array = field(default_factory=_zeros)
+    attitude_error: Array = field(default_factory=lambda: np.zeros(3))
+    bias_error: Array = field(default_factory=lambda: np.zeros(3))
     scale_factor_sigma: float = 0.0
     misalignment_sigma: float = 0.0
     turn_on_bias_sigma: float = 0.0
@@ -65,24 +61,6 @@ class Dispersions:
             object.__setattr__(self, name, array(f"dispersions: {name}", getattr(self, name), (3,)))
         for name, unit in (("scale_factor_sigma", ""), ("misalignment_sigma", "rad"), ("turn_on_bias_sigma", "rad/s")):
             object.__setattr__(self, name, non_negative(f"dispersions: {name}", getattr(self, name), unit=unit))
-
-    def initial_sigmas(self, setup: FilterSetup) -> tuple[float, float]:
-        """Return the σ of the initial attitude error, rad, and bias error, rad/s: by default those of the filter's prior.
-
-        Parameters
-        ----------
-        setup : FilterSetup
-            Filter whose prior is the default.
-
-        Returns
-        -------
-        tuple of float
-            σ of the attitude error, rad, and of the bias error, rad/s, each axis.
-        """
-        return (
-            setup.attitude_sigma if self.attitude_sigma is None else self.attitude_sigma,
-            setup.bias_sigma if self.bias_sigma is None else self.bias_sigma,
-        )
 
     @property
     def of_the_gyro(self) -> bool:
@@ -98,6 +76,14 @@ class Dispersions:
             Values by key; the suffix of a key is its unit (``attitude_sigma_deg``).
         """
         return tables.encode(self, _FORM)
+
+
+def initial_sigmas(dispersions: Dispersions, setup: FilterSetup) -> tuple[float, float]:
+    """Return the σ of the initial attitude error, rad, and bias error, rad/s: by default those of the filter's prior."""
+    return (
+        setup.attitude_sigma if dispersions.attitude_sigma is None else dispersions.attitude_sigma,
+        setup.bias_sigma if dispersions.bias_sigma is None else dispersions.bias_sigma,
+    )
 
 
 _FORM: tables.Form = {

@@ -25,7 +25,7 @@ from strapdown.estimation import setup
 from strapdown.estimation.filters.own import Own
 from strapdown.estimation.setup import FilterSetup
 from strapdown.gyro import GyroSpec
-from strapdown.montecarlo.plan import Dispersions, Plan
+from strapdown.montecarlo.plan import Dispersions, Plan, initial_sigmas
 from strapdown.montecarlo.statistics import (
     BINS,
     ERROR_EXPONENT,
@@ -60,7 +60,7 @@ def start(
     given = Dispersions() if dispersions is None else dispersions
     fixed = given.attitude_error, given.bias_error
     return setup.drawn_state(
-        filter_setup, record, seed, run, sigmas=given.initial_sigmas(filter_setup), fixed_errors=fixed
+        filter_setup, record, seed, run, sigmas=initial_sigmas(given, filter_setup), fixed_errors=fixed
     )
 
 

@@ -11,7 +11,7 @@ from strapdown import consistency, covariance, units
 from strapdown.checks import Array, InputError
 from strapdown.estimation.setup import MEKF, FilterSetup
 from strapdown.files import plain
-from strapdown.montecarlo.plan import Plan
+from strapdown.montecarlo.plan import Plan, initial_sigmas
 from strapdown.montecarlo.statistics import COVERED, Counts, Statistics, judged_epochs
 
 QUANTILES = (0.5, 0.95, 0.997)
@@ -26,7 +26,7 @@ def bound_of(plan: Plan) -> Array | None:
     given = plan.dispersions
     if plan.setup.estimator == MEKF or np.any(given.attitude_error) or np.any(given.bias_error):
         return None
-    attitude_sigma, bias_sigma = given.initial_sigmas(plan.setup)
+    attitude_sigma, bias_sigma = initial_sigmas(given, plan.setup)
     chosen = replace(FilterSetup.for_scenario(plan.scenario), attitude_sigma=attitude_sigma, bias_sigma=bias_sigma)
     try:
         return covariance.analyse(plan.scenario, chosen, epochs=plan.epochs).cramer_rao
@@ -64,7 +64,6 @@ def summary(
         Plain values for JSON.
     """
     chosen = judged_epochs(len(statistics.time) - 1) if epochs is None else epochs
-    seen = [i for i in range(len(statistics.sensors)) if statistics.sensor_degrees[i].sum() > 0]
     judgement = statistics.judge(epochs=chosen, probability=probability)
     found = {(one.name, one.of): one for one in judgement.findings}
     nees = {}
@@ -80,16 +79,17 @@ def summary(
         }
     nis = [
         {
-            "sensor": statistics.sensors[i],
+            "sensor": sensor,
             "nis": statistics.sensor_nis[i],
-            "bounds": [one.low, one.high],
+            "bounds": [test.low, test.high],
             "degrees_of_freedom": int(statistics.sensor_degrees[i].sum()),
             "refused": int(statistics.sensor_refused[i].sum()),
-            "consistent": not one.rejected,
+            "consistent": not test.rejected,
         }
-        for i in seen
-        for one in [found["NIS", statistics.sensors[i]]]
+        for i, sensor in enumerate(statistics.sensors)
+        if (test := found.get(("NIS", sensor))) is not None
     ]
+    covered = statistics.covered[chosen]
     table = {
         "runs": statistics.runs,
         "failed_runs": statistics.failed,
@@ -97,7 +97,11 @@ def summary(
         "epochs_judged": len(chosen),
         "nees": nees,
         "nis": nis,
-        "coverage": {"expected": list(COVERED), **_coverage(statistics, chosen)},
+        "coverage": {
+            "expected": list(COVERED),
+            "attitude": covered[:, :3].mean(axis=(0, 1)),
+            "bias": covered[:, 3:].mean(axis=(0, 1)),
+        },
         "last_epoch": _last_epoch(statistics),
         **({} if bound is None else {"rms_over_root_cramer_rao_bound": _efficiency(statistics, bound, chosen)}),
         "worst_runs": [
@@ -107,12 +111,6 @@ def summary(
         "consistent": statistics.failed == 0 and judgement.verdict != "not consistent",
     }
     return plain(table)  # type: ignore[no-any-return]
-
-
-def _coverage(statistics: Statistics, epochs: Counts) -> dict[str, Any]:
-    """Return the fraction of errors inside 1, 2, 3 σ over the axes and the judged epochs."""
-    covered = statistics.covered[epochs]
-    return {"attitude": covered[:, :3].mean(axis=(0, 1)), "bias": covered[:, 3:].mean(axis=(0, 1))}
 
 
 def _efficiency(statistics: Statistics, bound: Array, epochs: Counts) -> dict[str, Any]:

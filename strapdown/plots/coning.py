@@ -100,7 +100,7 @@ def coning_consistency(outcomes: Sequence[FilterOutcome]) -> Figure:
     first = outcomes[0]
     percent = f"{100 * first.probability:g} %"
     for ax, subset in zip(axes[:2], ("attitude", "bias"), strict=True):
-        verdicts = [one.statistics.verdict(one.epochs, subset, one.probability) for one in outcomes]
+        verdicts = [one.verdicts[subset] for one in outcomes]
         bounds = verdicts[0].simultaneous_bounds
         nees_over_time(named, bounds, subset, ax, label=f"NEES: {percent} bounds, all judged epochs")
         ax.plot(

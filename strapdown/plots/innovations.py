@@ -7,12 +7,14 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
 from strapdown.checks import Array
-from strapdown.consistency import Autocorrelation, Distribution, QuantilePairs
+from strapdown.consistency import Autocorrelation, QuantilePairs
 from strapdown.plots.decimation import decimated
 from strapdown.plots.style import AXES, BLUE, CYCLE, ORANGE, SKY, VERMILION, axes_or_new, ink, legend_above
 from strapdown.records import Innovations
 from strapdown.units import angle_unit
 
+WINDOW = 50
+"""Number of measurements of a moving average."""
 HISTOGRAM_REACH = 5.0
 """Range of histograms of whitened innovations, ±σ; the number beyond it is in the legend."""
 
@@ -94,25 +96,18 @@ def innovation_autocorrelation(result: Autocorrelation, ax: Axes | None = None) 
     return ax
 
 
-def nis_over_record(
-    innovations: Innovations,
-    bounds: tuple[float, float],
-    ax: Axes | None = None,
-    *,
-    window: int = 50,
-    probability: float = 0.99,
-) -> Axes:
-    """Draw the NIS of one sensor per degree of freedom over time, its moving average over ``window``, and the bounds of one measurement."""
+def nis_over_record(innovations: Innovations, bounds: tuple[float, float], ax: Axes | None = None) -> Axes:
+    """Draw the NIS of one sensor per degree of freedom over time, its moving average, and the 99 % ``bounds`` of one measurement."""
     ax = axes_or_new(ax)
     degrees = innovations.innovation.shape[1]
     value = innovations.nis / degrees
-    ax.axhspan(*bounds, color=ink(), alpha=0.12, linewidth=0, label=f"{100 * probability:g} % bounds, each")
+    ax.axhspan(*bounds, color=ink(), alpha=0.12, linewidth=0, label="99 % bounds, each")
     few, low = decimated(innovations.time, np.maximum(value, 1e-4))
     ax.plot(few, low, ".", color=SKY, markersize=2.5, label="one measurement")
-    if len(value) >= 2 * window:
-        mean = np.convolve(value, np.full(window, 1.0 / window), mode="valid")
-        middle = innovations.time[window // 2 : window // 2 + len(mean)]
-        ax.plot(*decimated(middle, mean), color=VERMILION, linewidth=1.2, label=f"mean of {window}")
+    if len(value) >= 2 * WINDOW:
+        mean = np.convolve(value, np.full(WINDOW, 1.0 / WINDOW), mode="valid")
+        middle = innovations.time[WINDOW // 2 : WINDOW // 2 + len(mean)]
+        ax.plot(*decimated(middle, mean), color=VERMILION, linewidth=1.2, label=f"mean of {WINDOW}")
     ax.axhline(1.0, color=ink(), linewidth=0.6)
     ax.set_yscale("log")
     ax.set_ylim(0.3 * min(bounds[0], float(np.quantile(value, 0.01)) + 1e-4), 3.0 * max(bounds[1], float(value.max())))
@@ -122,19 +117,18 @@ def nis_over_record(
     return ax
 
 
-def error_distribution(distribution: Distribution, ax: Axes | None = None, *, label: str = "attitude error") -> Axes:
-    """Draw the cumulative distribution of errors, rad, with the median and the 95 % quantile marked."""
+def error_distribution(error: Array, ax: Axes | None = None) -> Axes:
+    """Draw the cumulative distribution of attitude errors (n,), rad, with the median and the 95 % quantile marked; NaN is left out."""
     ax = axes_or_new(ax)
-    unit, size = angle_unit(np.array([distribution.quantile(0.99)]))
-    ax.plot(*decimated(distribution.values / size, 100.0 * distribution.probability), color=BLUE, label=label)
-    for share, color in ((0.5, ORANGE), (0.95, VERMILION)):
-        at = distribution.quantile(share) / size
-        ax.plot([at, at, 0.0], [0.0, 100 * share, 100 * share], ":", color=color, linewidth=1.2)
-        ax.annotate(
-            f"{100 * share:g} %: {at:.3g} {unit}", (at, 100 * share), xytext=(6, -12), textcoords="offset points"
-        )
-    ax.set_xlim(0.0, 1.15 * distribution.quantile(0.999) / size)
+    values = np.sort(error[np.isfinite(error)])
+    median, most, nearly_all, all_but_few = np.quantile(values, [0.5, 0.95, 0.99, 0.999], method="inverted_cdf")
+    unit, size = angle_unit(nearly_all)
+    ax.plot(*decimated(values / size, 100.0 * (np.arange(1, len(values) + 1) / len(values))), color=BLUE)
+    for percent, at, color in ((50, median / size, ORANGE), (95, most / size, VERMILION)):
+        ax.plot([at, at, 0.0], [0.0, percent, percent], ":", color=color, linewidth=1.2)
+        ax.annotate(f"{percent} %: {at:.3g} {unit}", (at, percent), xytext=(6, -12), textcoords="offset points")
+    ax.set_xlim(0.0, 1.15 * all_but_few / size)
     ax.set_ylim(0.0, 102.0)
-    ax.set_xlabel(f"{label}, {unit}")
+    ax.set_xlabel(f"attitude error, {unit}")
     ax.set_ylabel("fraction of the time, %")
     return ax

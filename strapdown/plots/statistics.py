@@ -211,10 +211,8 @@ def coverage_by_state(statistics: Statistics, epoch: int = -1, ax: Axes | None =
     return ax
 
 
-def covariance_ellipses(
-    claimed: Array, found: Array, pair: tuple[int, int] = (0, 1), ax: Axes | None = None, *, probability: float = 0.95
-) -> Axes:
-    """Draw the ellipses of the given probability for the errors of two states: by the filter's covariance, and of the actual errors."""
+def covariance_ellipses(claimed: Array, found: Array, pair: tuple[int, int] = (0, 1), ax: Axes | None = None) -> Axes:
+    """Draw the 95 % ellipses of the errors of two states: by the filter's covariance, and of the actual errors."""
     from scipy.stats import chi2
 
     ax = axes_or_new(ax)
@@ -225,7 +223,7 @@ def covariance_ellipses(
         state_unit(s, 3.0 * np.array(largest if alike else [x])) for s, x in zip(pair, largest, strict=True)
     )
     scale = np.array([size_i, size_j])
-    reach = float(np.sqrt(chi2.ppf(probability, 2)))
+    reach = float(np.sqrt(chi2.ppf(0.95, 2)))
     styles: tuple[tuple[str, Array, dict[str, Any]], ...] = (
         ("filter", claimed, {"edgecolor": VERMILION, "linewidth": 2.0}),
         ("actual errors", found, {"edgecolor": ink(), "linewidth": 1.2, "linestyle": "--"}),
@@ -248,6 +246,6 @@ def covariance_ellipses(
     ax.set_ylim(-spread[1], spread[1])
     ax.set_xlabel(f"{STATES[i]} error, {unit_i}")
     ax.set_ylabel(f"{STATES[j]} error, {unit_j}")
-    ax.set_title(f"{100 * probability:g} % ellipses", loc="left")
+    ax.set_title("95 % ellipses", loc="left")
     legend_above(ax)
     return ax

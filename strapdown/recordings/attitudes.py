@@ -12,11 +12,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import io
+import operator
 import os
 import re
-import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -28,9 +27,8 @@ from numpy.typing import NDArray
 from strapdown import quaternion, records
 from strapdown.checks import Array, InputError, array, one_of
 from strapdown.files import reading
-from strapdown.recordings import delimited, recordfiles, ros, trajectories
+from strapdown.recordings import delimited, recordfiles, ros, trajectories, ulog
 from strapdown.recordings.broad import read_broad
-from strapdown.recordings.extras import library
 from strapdown.records import Innovations, Recording, outputs
 from strapdown.units import DEGREE, DEGREE_PER_HOUR
 
@@ -66,9 +64,8 @@ def read_attitudes(path: str | os.PathLike[str], *, topic: str = "") -> Attitude
         return _bag(file, topic)
     reading.existing_file(file)
     if reading.is_hdf5(file):
-        with reading.hdf5(file) as content:
-            kind = str(reading.attributes(content).get("kind", ""))
-        return _own(file, kind) if kind.startswith("strapdown ") else _of_recording(read_broad(file))
+        kind = reading.kind(file)
+        return _own(file, kind) if kind else _of_recording(read_broad(file))
     with reading.opened(file) as stream:
         head = stream.read(4096)
     if head.startswith(ros.MAGICS):
@@ -269,26 +266,17 @@ _ORIENTED = {
 
 def _bag(path: Path, topic: str) -> Attitudes:
     """Read the orientations of a bag. By REP 103, covariances of poses are about fixed axes; drivers of Imu messages differ."""
-    highlevel = library("rosbags.highlevel", f"{path.name} is a ROS bag, which")
-    typesys = library("rosbags.typesys", f"{path.name} is a ROS bag, which")
     rows: list[tuple[int, list[float], Array | None]] = []
-    try:
-        with tempfile.TemporaryDirectory() as folder:
-            store = typesys.get_typestore(typesys.Stores.LATEST)
-            with highlevel.AnyReader([ros.named_as(path, Path(folder))], default_typestore=store) as reader:
-                found = {c.topic: c for c in reader.connections if c.msgtype in _ORIENTED}
-                chosen = _topic(path.name, found, topic)
-                where, beside = _ORIENTED[found[chosen].msgtype]
-                for connection, logged, raw in reader.messages(connections=[found[chosen]]):
-                    message = reader.deserialize(raw, connection.msgtype)
-                    stamp = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
-                    q = _at(message, where)
-                    P = np.asarray(_at(message, beside), np.float64) if beside else None
-                    rows.append((stamp or logged, [q.w, q.x, q.y, q.z], P))
-    except InputError:
-        raise
-    except Exception as error:  # the library raises any exception of its parsers
-        raise InputError(f"{path.name} cannot be read as a ROS bag ({' '.join(str(error).split())})") from None
+    with ros.opened(path.name, [path]) as reader:
+        found = {c.topic: c for c in reader.connections if c.msgtype in _ORIENTED}
+        chosen = _topic(path.name, found, topic)
+        where, beside = _ORIENTED[found[chosen].msgtype]
+        for connection, logged, raw in reader.messages(connections=[found[chosen]]):
+            message = reader.deserialize(raw, connection.msgtype)
+            stamp = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+            q = operator.attrgetter(where)(message)
+            P = np.asarray(operator.attrgetter(beside)(message), np.float64) if beside else None
+            rows.append((stamp or logged, [q.w, q.x, q.y, q.z], P))
     known = [row for row in rows if any(row[1]) and not (row[2] is not None and row[2][0] == -1.0)]
     if len(known) < 2:
         raise InputError(f"{path.name}: topic {chosen} has no orientation in its {len(rows)} messages")
@@ -326,57 +314,40 @@ def _topic(name: str, found: Mapping[str, Any], topic: str) -> str:
     return next(iter(found))
 
 
-def _at(message: Any, where: str) -> Any:
-    for part in where.split("."):
-        message = getattr(message, part)
-    return message
-
-
 # -------------------------------------------------------------------------------------------------------------- ULog
 
-_STATES_TOPIC, _ATTITUDE_TOPIC = "estimator_states", "vehicle_attitude"
+_STATES_TOPIC = "estimator_states"
 _INNOVATIONS, _VARIANCES = "estimator_innovations", "estimator_innovation_variances"
 
 
 def _ulog(path: Path) -> Attitudes:
     """Read the attitude estimated by PX4, body axes forward, right, down, transformed to East-North-Up, and its innovations."""
-    pyulog = library("pyulog", f"{path.name} is a flight log of PX4, which")
-    wanted = [_STATES_TOPIC, _ATTITUDE_TOPIC, _INNOVATIONS, _VARIANCES]
-    try:
-        with contextlib.redirect_stdout(io.StringIO()):
-            log = pyulog.ULog(str(path), wanted)
-    except Exception as error:  # for a damaged log the library raises any exception of its parsers
-        raise InputError(
-            f"{path.name} cannot be read as ULog ({' '.join(str(error).split())}); the log is damaged"
-        ) from None
+    log = ulog.opened(path, [_STATES_TOPIC, ulog.ATTITUDE, _INNOVATIONS, _VARIANCES])
     data = {one.name: one.data for one in log.data_list if one.multi_id == 0 and len(one.data["timestamp"]) > 1}
     remarks: list[str] = []
     covariance = None
     if _STATES_TOPIC in data:
         rows = data[_STATES_TOPIC]
-        stamps, kept = _fresh(rows)
-        ned = np.stack([np.asarray(rows[f"states[{k}]"], np.float64) for k in range(4)], axis=1)[kept]
-        known = np.stack(
-            [np.asarray(rows[f"covariances[{k}]"], np.float64) for k in range(4) if f"covariances[{k}]" in rows], axis=1
-        )[kept]
+        stamps, kept, _ = ulog.in_order(_STATES_TOPIC, rows.get("timestamp_sample", rows["timestamp"]))
+        ned = _unit(path.name, ulog.columns(rows, "states", 4)[kept])
         number = sum(name.startswith("covariances[") for name in rows)
-        ned = _unit(path.name, ned)
         if number == 24:  # variances of the quaternion: δθ = 2 Ξ(q)ᵀ δq
             xi = np.stack([_quaternion_columns(one) for one in ned])
-            covariance = 4.0 * np.einsum("mqi,mq,mqj->mij", xi, known, xi)
+            variance = ulog.columns(rows, "covariances", 4)[kept]
+            covariance = 4.0 * np.einsum("mqi,mq,mqj->mij", xi, variance, xi)
             remarks.append(
                 "The log has the variances of the quaternion without their correlations: σ of the attitude is approximate."
             )
         elif number > 0:
-            covariance = np.apply_along_axis(np.diag, 1, known[:, :3])
+            covariance = np.apply_along_axis(np.diag, 1, ulog.columns(rows, "covariances", 3)[kept])
             remarks.append("The log has the variances of the attitude error without their correlations.")
-    elif _ATTITUDE_TOPIC in data:
-        rows = data[_ATTITUDE_TOPIC]
-        stamps, kept = _fresh(rows)
-        ned = _unit(path.name, np.stack([np.asarray(rows[f"q[{k}]"], np.float64) for k in range(4)], axis=1)[kept])
-        remarks.append(f"{_ATTITUDE_TOPIC}: no covariance.")
+    elif ulog.ATTITUDE in data:
+        rows = data[ulog.ATTITUDE]
+        stamps, kept, _ = ulog.in_order(ulog.ATTITUDE, rows.get("timestamp_sample", rows["timestamp"]))
+        ned = _unit(path.name, ulog.columns(rows, "q", 4)[kept])
+        remarks.append(f"{ulog.ATTITUDE}: no covariance.")
     else:
-        raise InputError(f"{path.name} has neither {_STATES_TOPIC} nor {_ATTITUDE_TOPIC}; log one of them")
+        raise InputError(f"{path.name} has neither {_STATES_TOPIC} nor {ulog.ATTITUDE}; log one of them")
     if covariance is not None and not (np.diagonal(covariance, axis1=1, axis2=2) > 0.0).all():
         covariance = None
         remarks.append("Its variances are not all above zero and are left out.")
@@ -392,14 +363,6 @@ def _ulog(path: Path) -> Attitudes:
         innovations=innovations,
         remarks=tuple(remarks),
     )
-
-
-def _fresh(rows: Mapping[str, Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return stamps, µs, sorted and without duplicates, and their rows; the stamps are those of the samples if the file gives them."""
-    stamps = np.asarray(rows.get("timestamp_sample", rows["timestamp"])).astype(np.int64)
-    order = np.argsort(stamps, kind="stable")
-    kept = order[np.concatenate([[True], np.diff(stamps[order]) > 0])]
-    return stamps[kept], kept
 
 
 def _quaternion_columns(q: Array) -> Array:

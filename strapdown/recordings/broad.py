@@ -15,7 +15,7 @@ import numpy as np
 from strapdown.checks import InputError, positive
 from strapdown.files import reading, whole_hdf5, written_beside
 from strapdown.recordings import recordfiles
-from strapdown.records.recording import MAGNETIC_UNITS, Recording, with_gyro
+from strapdown.records.recording import Recording, field_in, with_gyro
 
 
 def read_broad(path: str | os.PathLike[str]) -> Recording:
@@ -74,17 +74,14 @@ def sample_interval(recording: Recording) -> float:
 def write_broad(recording: Recording, path: str | os.PathLike[str]) -> None:
     """Write a recording with equal sample intervals in the layout of BROAD, which has no clock."""
     interval = sample_interval(recording)
+    known = recording.magnetic_field is not None and recording.magnetic_unit
     content = {
         "imu_gyr": recording.rate,
         "imu_acc": recording.specific_force,
-        "imu_mag": None
-        if recording.magnetic_field is None or not recording.magnetic_unit
-        else recording.magnetic_field * (MAGNETIC_UNITS[recording.magnetic_unit] / MAGNETIC_UNITS["uT"]),
+        "imu_mag": field_in("uT", recording) if known else recording.magnetic_field,
         "opt_quat": recording.true_attitude,
         "movement": recording.movement,
     }
-    if recording.magnetic_field is not None and content["imu_mag"] is None:
-        content["imu_mag"] = recording.magnetic_field  # of unknown unit
     with written_beside(path) as temporary, whole_hdf5(temporary) as file:
         file.attrs["sampling_rate"] = 1.0 / interval
         for name, value in content.items():

@@ -14,6 +14,7 @@ declared otherwise; the values of a magnetometer without a unit are kept unchang
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -149,14 +150,19 @@ def recording(
         instance(name, given, Mapping, "give a mapping, such as units={'gyro': 'deg/s'} or columns={'gx': 'gyro_x'}")
     known_keys("units", units or {}, [group for group in UNITS if group != "temperature"])
     columns = [column(cell) for cell in header]
-    _no_doubles(source, columns)
+    names = Counter(one.name.lower() for one in columns if one.name)
+    if twice := [name for name, number in names.items() if number > 1]:
+        raise InputError(f"{source}: the header names the column {twice[0]!r} twice; rename or drop one")
     roles, declared, remark = _roles(source, columns, mapping or {})
     if gyro_alone:
         roles = {role: k for role, k in roles.items() if _group(role) in ("time", "gyro", "temperature", "reference")}
     for group, members in GROUPS.items():
         missing = [role for role in members if role not in roles]
         if missing and (group in ("time", "gyro") or len(missing) < len(members)):
-            raise InputError(_lacks(source, missing, columns))
+            raise InputError(
+                f"{source}: the header lacks {', '.join(missing)} (it has: {', '.join(one.name for one in columns)}); name the columns, as "
+                f"in --columns {missing[0]}=NAME,… (columns= in Python)"
+            )
     present = {_group(role) for role in roles}
     chosen = _units(source, present, declared, units or {})
     values = load(sorted(set(roles.values())), roles["time"]).__getitem__
@@ -191,24 +197,8 @@ def recording(
     )
 
 
-def _no_doubles(source: str, columns: Sequence[Column]) -> None:
-    seen: set[str] = set()
-    for one in columns:
-        if one.name and one.name.lower() in seen:
-            raise InputError(f"{source}: the header names the column {one.name.lower()!r} twice; rename or drop one")
-        seen.add(one.name.lower())
-
-
 def _group(role: str) -> str:
     return next(group for group, members in GROUPS.items() if role in members)
-
-
-def _lacks(source: str, missing: Sequence[str], columns: Sequence[Column]) -> str:
-    has = ", ".join(one.name for one in columns)
-    return (
-        f"{source}: the header lacks {', '.join(missing)} (it has: {has}); name the columns, as in "
-        f"--columns {missing[0]}=NAME,… (columns= in Python)"
-    )
 
 
 def _roles(

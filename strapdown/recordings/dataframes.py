@@ -124,11 +124,7 @@ def _columns(source: str, table: Any) -> dict[str, NDArray[np.generic]]:
 def _plain(series: Any) -> NDArray[np.generic]:
     """Return a column as an array; dates with a time zone as UTC, missing values of nullable types as NaN."""
     if getattr(getattr(series, "dt", series), "tz", None) is not None:
-        series = (
-            series.dt.tz_convert("UTC").dt.tz_localize(None)
-            if hasattr(series, "dt")
-            else series.tz_convert("UTC").tz_localize(None)
-        )
+        return np.asarray(series.to_numpy("M8[ns]"))
     if hasattr(series, "to_numpy"):
         kind = getattr(series.dtype, "kind", "O")
         if kind in "iuf" and not isinstance(series.dtype, np.dtype):  # the nullable types of pandas

@@ -72,12 +72,10 @@ class Table:
 
     def __init__(self, source: str, lines: Iterator[str]) -> None:
         self.source = source
-        head = _Head(source, lines)
-        self.header = head.names
-        self._separator = head.separator
+        self.header, self._separator, first = _head(source, lines)
         self._whole: dict[int, list[int]] = {}  # columns of large integers
         self._rows_read = 0
-        self._rows = csv.reader(_rest(head.first, lines), delimiter=head.separator)
+        self._rows = csv.reader(_rest(first, lines), delimiter=self._separator)
 
     def load(self, places: Sequence[int], time: int) -> dict[int, Array]:
         """Return the numbers (n,) of columns; empty fields are NaN, dates in the time column are ns since 1970."""
@@ -128,47 +126,38 @@ class Table:
         return (stamps - stamps[0]) / 1e9, whole[0]
 
 
-class _Head:
-    """Header of a table: the names of the columns, the separator, and the first lines of numbers."""
-
-    def __init__(self, source: str, lines: Iterator[str]) -> None:
-        titles: list[str] = []
-        comment = ""
-        self.first: list[str] = []
-        for line in lines:
-            if not line.strip():
-                continue
-            if line.lstrip().startswith("#"):
-                comment = line.lstrip().lstrip("#").strip() or comment
-                continue
-            if titles and _numeric(line):
-                self.first = [line]
-                break
-            if not titles and _numeric(line):  # no header line: the last comment may be the header
-                titles, self.first = [comment], [line]
-                break
-            titles.append(line.rstrip("\r\n"))
-            if len(titles) == 3:
-                self.first = [titles.pop()]
-                break
-        if not any(title.strip() for title in titles):
-            words = "has no header" if self.first else "is empty"
-            raise InputError(f"{source} {words}; wanted a header like time,gx,gy,gz,ax,ay,az")
-        self.separator = max(SEPARATORS, key=titles[0].count)
-        cells = [next(csv.reader([title], delimiter=self.separator)) for title in titles]
-        if len(cells) == 2 and not self._second_row(cells[0], cells[1]):
-            self.first, cells = (
-                [titles[1], *self.first],
-                cells[:1],
-            )  # a data row that is not numeric: the error names its place
-        self.names = [cell.strip() for cell in cells[0]] if len(cells) == 1 else _joined(*cells)
-        while self.names and not self.names[-1]:
-            self.names.pop()
-
-    @staticmethod
-    def _second_row(first: Sequence[str], second: Sequence[str]) -> bool:
-        """Return whether a second row belongs to the header: it has no number, and the width of the first."""
-        return len(first) == len(second) and not any(_is_number(cell) and cell.strip() for cell in second)
+def _head(source: str, lines: Iterator[str]) -> tuple[list[str], str, list[str]]:
+    """Return the names of the columns of a table, its separator, and its first lines of numbers."""
+    titles: list[str] = []
+    comment = ""
+    first: list[str] = []
+    for line in lines:
+        if not line.strip():
+            continue
+        if line.lstrip().startswith("#"):
+            comment = line.lstrip().lstrip("#").strip() or comment
+            continue
+        if _numeric(line):
+            titles, first = titles or [comment], [line]  # without a header line, the last comment may be the header
+            break
+        titles.append(line.rstrip("\r\n"))
+        if len(titles) == 3:
+            first = [titles.pop()]
+            break
+    if not any(title.strip() for title in titles):
+        words = "has no header" if first else "is empty"
+        raise InputError(f"{source} {words}; wanted a header like time,gx,gy,gz,ax,ay,az")
+    separator = max(SEPARATORS, key=titles[0].count)
+    cells = [next(csv.reader([title], delimiter=separator)) for title in titles]
+    # A second row belongs to the header if it has no number, and the width of the first.
+    if len(cells) == 2 and (
+        len(cells[0]) != len(cells[1]) or any(is_number(cell) and cell.strip() for cell in cells[1])
+    ):
+        first, cells = [titles[1], *first], cells[:1]  # a data row that is not numeric: the error names its place
+    names = [cell.strip() for cell in cells[0]] if len(cells) == 1 else _joined(*cells)
+    while names and not names[-1]:
+        names.pop()
+    return names, separator, first
 
 
 def _date(cell: str) -> int | None:
@@ -208,10 +197,11 @@ def _joined(first: Sequence[str], second: Sequence[str]) -> list[str]:
 def _numeric(line: str) -> bool:
     """Return whether at least half of the non-empty fields of a line are numbers, with any separator."""
     filled = [cell for part in re.split(r"[,;\t|]", line) if (cell := part.strip().strip('"'))]
-    return bool(filled) and 2 * sum(map(_is_number, filled)) >= len(filled)
+    return bool(filled) and 2 * sum(map(is_number, filled)) >= len(filled)
 
 
-def _is_number(cell: str) -> bool:
+def is_number(cell: str) -> bool:
+    """Return whether a cell is a number or empty."""
     try:
         float(cell or "nan")
     except ValueError:

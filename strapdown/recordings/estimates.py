@@ -19,18 +19,12 @@ from strapdown.records.recording import Recording
 from strapdown.units import DEGREE
 
 
-def write_csv(
+def write_table(
     estimate: Estimate, path: str | os.PathLike[str], *, recording: Recording | None = None, **options: Any
 ) -> None:
-    """Write an estimate as a text table; options ``sequence`` and ``frame`` as for :meth:`strapdown.records.Estimate.table`."""
-    write_columns(path, estimate.table(recording=recording, **options))
-
-
-def write_parquet(
-    estimate: Estimate, path: str | os.PathLike[str], *, recording: Recording | None = None, **options: Any
-) -> None:
-    """Write an estimate as Parquet; options ``sequence`` and ``frame`` as for :meth:`strapdown.records.Estimate.table`."""
-    write_parquet_columns(path, estimate.table(recording=recording, **options))
+    """Write an estimate as Parquet or text, by the suffix; options as for :meth:`strapdown.records.Estimate.table`."""
+    write = write_parquet_columns if Path(path).suffix.lower() == ".parquet" else write_columns
+    write(path, estimate.table(recording=recording, **options))
 
 
 def write_hdf5(estimate: Estimate, path: str | os.PathLike[str], *, recording: Recording | None = None) -> None:

@@ -94,7 +94,7 @@ FORMATS: tuple[Format, ...] = (
         read="dataframes:read_parquet",
         options=("units", "columns", "gyro_alone"),
         write="dataframes:write_parquet",
-        write_estimate="estimates:write_parquet",
+        write_estimate="estimates:write_table",
         estimate_options=("sequence", "frame"),
     ),
     Format(
@@ -138,7 +138,7 @@ FORMATS: tuple[Format, ...] = (
         read="delimited:read_csv",
         options=("units", "columns", "gyro_alone"),
         write="delimited:write_csv",
-        write_estimate="estimates:write_csv",
+        write_estimate="estimates:write_table",
         estimate_options=("sequence", "frame"),
     ),
 )
@@ -167,14 +167,9 @@ def format_of(path: str | os.PathLike[str]) -> Format:
         return by_ending
     if table.recognised(file, head):
         return table
+    known = (f"{one.name} ({' or '.join(one.endings)})" if one.endings else one.name for one in FORMATS if one.read)
     raise InputError(
-        f"{file} has the extension {file.suffix!r} and the content of no known format; known formats are {_known()}"
-    )
-
-
-def _known() -> str:
-    return ", ".join(
-        f"{one.name} ({' or '.join(one.endings)})" if one.endings else one.name for one in FORMATS if one.read
+        f"{file} has the extension {file.suffix!r} and the content of no known format; known formats are {', '.join(known)}"
     )
 
 
@@ -366,11 +361,7 @@ def not_held(path: str | os.PathLike[str]) -> tuple[str, ...]:
 
 def is_estimate(path: str | os.PathLike[str]) -> bool:
     """Return whether a path is an estimate of this package in HDF5."""
-    file = Path(path)
-    if not file.is_file() or format_of(file).name != "BROAD":
-        return False
-    with reading.hdf5(file) as content:
-        return bool(reading.attributes(content).get("kind") == "strapdown estimate")
+    return Path(path).is_file() and reading.kind(path) == "strapdown estimate"
 
 
 def is_record(path: str | os.PathLike[str]) -> bool:

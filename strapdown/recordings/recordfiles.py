@@ -86,12 +86,7 @@ def write_record(
 
 def is_record(path: str | os.PathLike[str]) -> bool:
     """Return whether a file is marked as written by :func:`write_record` or :func:`export_csv`; its content is not checked."""
-    if _begins(path, f"{_MARK} record".encode()):
-        return True
-    if not reading.is_hdf5(path):
-        return False
-    with reading.hdf5(path) as file:
-        return bool(reading.attributes(file).get("kind") == KIND)
+    return _begins(path, f"{_MARK} record".encode()) or reading.kind(path) == KIND
 
 
 def _begins(path: str | os.PathLike[str], mark: bytes) -> bool:
@@ -397,13 +392,9 @@ def _read_csv(path: Path, *, link: bool = True) -> tuple[str, tuple[str, ...], A
     for number, line in enumerate(lines[2:]):
         cells = line.split(",")
         try:
-            rows[number] = (
-                [float(cell) for cell in cells] if len(cells) == len(names) else _ragged(len(cells), len(names))
-            )
+            if len(cells) != len(names):
+                raise ValueError(f"{len(cells)} cells instead of {len(names)}")
+            rows[number] = [float(cell) for cell in cells]
         except ValueError as error:
             raise InputError(f"{path}, line {number + 3}: {error}; the file is truncated or was edited") from None
     return lines[0], names, rows
-
-
-def _ragged(have: int, wanted: int) -> Array:
-    raise ValueError(f"{have} cells instead of {wanted}")

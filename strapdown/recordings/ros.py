@@ -16,6 +16,7 @@ is scanned record by record, and its complete messages are read.
 from __future__ import annotations
 
 import bz2
+import contextlib
 import os
 import re
 import shutil
@@ -26,7 +27,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +37,7 @@ from strapdown.checks import Array, InputError, one_of
 from strapdown.files import reading
 from strapdown.recordings.extras import library, with_ending
 from strapdown.records import Estimate
-from strapdown.records.recording import MAGNETIC_UNITS, Recording, at_nearest, relative_time, with_gyro
+from strapdown.records.recording import Recording, at_nearest, field_in, relative_time, with_gyro
 
 IMU, FIELD, TEMPERATURE, REFERENCE = (
     "sensor_msgs/msg/Imu",
@@ -56,8 +57,9 @@ BATCH = 1024
 """Number of messages processed at once: processing each one separately would double the time."""
 
 ROS1_MAGIC, MCAP_MAGIC, SQLITE_MAGIC = b"#ROSBAG V2.0\n", b"\x89MCAP0\r\n", b"SQLite format 3\0"
-MAGICS = (ROS1_MAGIC, MCAP_MAGIC, SQLITE_MAGIC)
 _SUFFIX = {ROS1_MAGIC: ".bag", MCAP_MAGIC: ".mcap", SQLITE_MAGIC: ".db3"}
+MAGICS = tuple(_SUFFIX)
+"""First bytes of the kinds of bags."""
 
 
 @dataclass(eq=False)
@@ -93,12 +95,6 @@ class _Topic:
         return len(self.logged)
 
 
-class _Bag(NamedTuple):
-    topics: dict[str, _Topic]
-    ros2: bool
-    remarks: tuple[str, ...]
-
-
 def is_folder(path: Path) -> bool:
     """Return whether a folder is a ROS 2 bag: metadata.yaml, or only storage files, if the recorder was killed."""
     return path.is_dir() and ((path / "metadata.yaml").is_file() or bool(_storages(path)))
@@ -120,10 +116,10 @@ def _storages(path: Path) -> list[Path]:
 def read_bag(path: str | os.PathLike[str], *, topic: str = "") -> Recording:
     """Read the inertial unit of a bag, a file or a folder; ``topic`` selects one of several topics of ``sensor_msgs/Imu``."""
     file = Path(path)
-    bag = _messages(file, wanted=tuple(DOUBLES))
-    chosen = _chosen(file.name, bag.topics, topic)
-    stamps, values, order_words = _joined(file.name, bag.topics[chosen])
-    said = [f"Topic {chosen}: {len(stamps)} messages.", *bag.remarks, *order_words]
+    topics, _, remarks = _messages(file, wanted=tuple(DOUBLES))
+    chosen = _chosen(file.name, topics, topic)
+    stamps, values, order_words = _joined(file.name, topics[chosen])
+    said = [f"Topic {chosen}: {len(stamps)} messages.", *remarks, *order_words]
     if values[0, 3] == -1.0:
         raise InputError(
             f"{file.name}, topic {chosen}: message 1 declares that it has no angular velocity; choose another topic"
@@ -131,7 +127,7 @@ def read_bag(path: str | os.PathLike[str], *, topic: str = "") -> Recording:
     time, epoch = relative_time(stamps)
     own: dict[str, Any] = {} if values[0, 15] == -1.0 else {"specific_force": values[:, 12:15]}
     for kind, name in ((FIELD, "magnetic_field"), (TEMPERATURE, "temperature"), (REFERENCE, "true_attitude")):
-        other = _beside(chosen, [t for t in bag.topics.values() if t.kind == kind and len(t)])
+        other = _beside(chosen, [t for t in topics.values() if t.kind == kind and len(t)])
         if isinstance(other, str):
             said.append(other)
         if not isinstance(other, _Topic) or (kind == REFERENCE and not other.name.endswith("reference")):
@@ -236,36 +232,54 @@ def _joined(name: str, topic: _Topic) -> tuple[NDArray[np.int64], Array, list[st
     return stamps, values, said
 
 
-def _messages(path: Path, wanted: tuple[str, ...] = ()) -> _Bag:
-    """Return the messages of a bag by topic, of the wanted types (empty: all); for a damaged bag only the complete messages."""
-    highlevel = library("rosbags.highlevel", f"{path.name} is a ROS bag, which")
-    typesys = library("rosbags.typesys", f"{path.name} is a ROS bag, which")
+_Messages = tuple[dict[str, _Topic], bool, tuple[str, ...]]
+
+
+def _messages(path: Path, wanted: tuple[str, ...] = ()) -> _Messages:
+    """Return the messages of a bag by topic, of the wanted types (empty: all), whether it is of ROS 2, and remarks."""
     files = [path]
     if path.is_dir() and not (path / "metadata.yaml").is_file():
         files = _storages(path)
     topics: dict[str, _Topic] = {}
     try:
-        with tempfile.TemporaryDirectory() as folder:
-            named = [named_as(one, Path(folder)) for one in files]
-            store = typesys.get_typestore(typesys.Stores.LATEST)
-            with highlevel.AnyReader(named, default_typestore=store) as reader:
-                ros2 = bool(reader.is2)
-                chosen = [c for c in reader.connections if not wanted or c.msgtype in wanted]
-                for c in chosen:
-                    topics.setdefault(c.topic, _Topic(c.topic, c.msgtype, ros2=ros2, decodes=bool(wanted)))
-                if chosen:
-                    messages = reader.messages(connections=chosen)
-                    while batch := list(islice(messages, BATCH)):
-                        for name in {connection.topic for connection, _, _ in batch}:
-                            topics[name].add([row for row in batch if row[0].topic == name])
-    except InputError:
-        raise
-    except Exception as error:  # for a truncated file the library raises any exception of its parsers
+        with opened(path.name, files) as reader:
+            ros2 = bool(reader.is2)
+            chosen = [c for c in reader.connections if not wanted or c.msgtype in wanted]
+            for c in chosen:
+                topics.setdefault(c.topic, _Topic(c.topic, c.msgtype, ros2=ros2, decodes=bool(wanted)))
+            if chosen:
+                messages = reader.messages(connections=chosen)
+                while batch := list(islice(messages, BATCH)):
+                    for name in {connection.topic for connection, _, _ in batch}:
+                        topics[name].add([row for row in batch if row[0].topic == name])
+    except DamagedBagError as error:
         return _salvaged(path, files, wanted, error)
     words: tuple[str, ...] = ()
     if files != [path]:
         words = (f"{path.name} has no metadata.yaml, as if the recorder was killed: read from its {len(files)} files.",)
-    return _Bag(topics, ros2, words)
+    return topics, ros2, words
+
+
+class DamagedBagError(InputError):
+    """The library cannot read a bag."""
+
+
+@contextlib.contextmanager
+def opened(name: str, files: Sequence[Path]) -> Iterator[Any]:
+    """Yield the library's reader of the files of a bag; any exception of its parsers is a :class:`DamagedBagError`."""
+    highlevel = library("rosbags.highlevel", f"{name} is a ROS bag, which")
+    typesys = library("rosbags.typesys", f"{name} is a ROS bag, which")
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            store = typesys.get_typestore(typesys.Stores.LATEST)
+            named = [named_as(one, Path(folder)) for one in files]
+            with highlevel.AnyReader(named, default_typestore=store) as reader:
+                yield reader
+    except InputError:
+        raise
+    except Exception as error:  # for a truncated file the library raises any exception of its parsers
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise DamagedBagError(f"{name} cannot be read as a ROS bag ({reason})") from None
 
 
 def named_as(path: Path, folder: Path) -> Path:
@@ -281,7 +295,7 @@ def named_as(path: Path, folder: Path) -> Path:
 # ----------------------------------------------------------------------------------------------------------- damaged bags
 
 
-def _salvaged(path: Path, files: list[Path], wanted: tuple[str, ...], error: Exception) -> _Bag:
+def _salvaged(path: Path, files: list[Path], wanted: tuple[str, ...], error: InputError) -> _Messages:
     """Return the complete messages of a bag that the library cannot open."""
     topics: dict[str, _Topic] = {}
     ros2 = True
@@ -299,16 +313,9 @@ def _salvaged(path: Path, files: list[Path], wanted: tuple[str, ...], error: Exc
                         topic = topics.setdefault(name, _Topic(name, kind, ros2=ros2, decodes=bool(wanted)))
                         topic.add([(None, *row[2:]) for row in batch if row[0] == name])
     number = sum(len(topic) for topic in topics.values())
-    reason = " ".join(str(error).split()) or type(error).__name__
     if not number:
-        raise InputError(
-            f"{path.name} cannot be read as a ROS bag ({reason}), and has no complete message; record it again"
-        ) from None
-    return _Bag(
-        topics,
-        ros2,
-        (f"{path.name} is truncated or damaged ({reason}): only its {number} complete messages are read.",),
-    )
+        raise InputError(f"{error}, and has no complete message; record it again")
+    return topics, ros2, (f"{error}: it is truncated or damaged, and only its {number} complete messages are read.",)
 
 
 _Message = tuple[str, str, int, bytes]
@@ -477,10 +484,10 @@ def write_estimate(
     series = _series(recording, estimate)
     others: list[_Topic] = []
     if source is not None:
-        bag = _messages(source)
-        if bag.ros2 == (target.suffix.lower() != ".bag"):
+        topics, ros2, _ = _messages(source)
+        if ros2 == (target.suffix.lower() != ".bag"):
             written = {TOPICS[kind] if kind != IMU else WITH_ORIENTATION for kind, _, _ in series}
-            others = [t for t in bag.topics.values() if t.kind != IMU and t.name not in written]
+            others = [t for t in topics.values() if t.kind != IMU and t.name not in written]
     _write(target, series, others, source)
 
 
@@ -506,14 +513,9 @@ def _series(recording: Recording, estimate: Estimate | None) -> list[_Series]:
         imu[:, 25:28] = recording.specific_force
     found: list[_Series] = [(IMU, stamps, imu)]
     if recording.magnetic_field is not None:
-        if not recording.magnetic_unit:
-            raise InputError(
-                f"{recording.source} does not declare the unit of its magnetometer, and a bag uses tesla; declare it in the header or by "
-                f"option ({' or '.join(MAGNETIC_UNITS)})"
-            )
         known = ~np.isnan(recording.magnetic_field).any(axis=1)
         magnetic = np.zeros((int(known.sum()), DOUBLES[FIELD]))
-        magnetic[:, :3] = recording.magnetic_field[known] * MAGNETIC_UNITS[recording.magnetic_unit]
+        magnetic[:, :3] = field_in("T", recording)[known]
         found.append((FIELD, stamps[known], magnetic))
     if recording.temperature is not None:
         known = ~np.isnan(recording.temperature)
@@ -599,12 +601,9 @@ def _writer(place: Path, suffix: str, what: str) -> Any:
 
 def _copied(writer: Any, topics: list[_Topic], source: Path) -> list[tuple[int, Any, bytes]]:
     """Return the messages of topics that are copied unchanged, with their types from the source."""
-    highlevel, typesys = library("rosbags.highlevel", source.name), library("rosbags.typesys", source.name)
     queue = []
-    with tempfile.TemporaryDirectory() as folder:
-        store = typesys.get_typestore(typesys.Stores.LATEST)
-        with highlevel.AnyReader([named_as(source, Path(folder))], default_typestore=store) as reader:
-            for topic in topics:
-                connection = writer.add_connection(topic.name, topic.kind, typestore=reader.typestore)
-                queue += [(logged, connection, raw) for logged, raw in zip(topic.logged, topic.raw, strict=True)]
+    with opened(source.name, [source]) as reader:
+        for topic in topics:
+            connection = writer.add_connection(topic.name, topic.kind, typestore=reader.typestore)
+            queue += [(logged, connection, raw) for logged, raw in zip(topic.logged, topic.raw, strict=True)]
     return queue

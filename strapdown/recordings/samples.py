@@ -12,11 +12,12 @@ import numpy as np
 from strapdown.checks import Array, InputError, array, one_of, positive
 from strapdown.files import reading
 from strapdown.recordings import formats, recordfiles
+from strapdown.recordings.body_axes import SENSORS as COLUMN_OF
 from strapdown.recordings.broad import sample_interval
 from strapdown.recordings.columns import SENSORS, UNITS
 from strapdown.recordings.gyro_temperature import temperature_at_samples
 from strapdown.records import ImuRecord
-from strapdown.records.recording import GAP, Recording
+from strapdown.records.recording import GAP, Recording, field_in
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -131,23 +132,13 @@ def _read_array(file: Path, sensor: str, rate: float | None, given: Mapping[str,
 
 def _of_recording(recording: Recording, sensor: str, gaps: bool) -> GyroSamples:
     """Return one sensor's samples, SI; for a sensor of lower rate, only the stamps where it has samples."""
-    values = {
-        "gyro": recording.rate,
-        "accelerometer": recording.specific_force,
-        "magnetometer": recording.magnetic_field,
-    }[sensor]
+    values = getattr(recording, COLUMN_OF[sensor])
     if values is None:
         raise InputError(f"{recording.source} has no {sensor}; choose another sensor or file")
-    factor = 1.0
     if sensor == "magnetometer":
-        if not recording.magnetic_unit:
-            raise InputError(
-                f"{recording.source} does not declare the unit of its magnetometer; declare it in the header or by option "
-                f"({' or '.join(UNITS['magnetometer'])})"
-            )
-        factor = UNITS["magnetometer"][recording.magnetic_unit]
+        values = field_in("T", recording)
     known = np.asarray(~np.isnan(values).any(axis=1))
-    time, samples = recording.time[known], values[known] * factor
+    time, samples = recording.time[known], values[known]
     temperature = None if recording.temperature is None else temperature_at_samples(recording)[known]
     remarks = recording.remarks
     own = Recording(source=recording.source, time=time, rate=np.zeros((len(time), 3)))

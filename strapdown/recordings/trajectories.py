@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from strapdown import quaternion
 from strapdown.checks import Array, InputError
 from strapdown.files import reading
-from strapdown.recordings.delimited import read_csv
+from strapdown.recordings.delimited import is_number, read_csv
 from strapdown.records.recording import Recording
 
 TRUTHS = ("state_groundtruth_estimate0", "mocap0")
@@ -90,15 +90,7 @@ def is_tum(head: bytes) -> bool:
     ]
     if not lines:
         return False
-    return all(len(line) == 8 and all(map(_is_number, line)) for line in lines)
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
+    return all(len(line) == 8 and all(map(is_number, line)) for line in lines)
 
 
 def _rows(path: Path, separator: str | None) -> list[list[str]]:
@@ -142,7 +134,7 @@ def with_reference(recording: Recording, path: str | os.PathLike[str]) -> Record
 
 def _with_reference(recording: Recording, stamps: NDArray[np.int64], attitude: Array, name: str) -> Recording:
     time = (stamps - recording.epoch_ns) / 1e9
-    found = interpolated(recording.time, time, attitude)
+    found = interpolated(recording.time, time, quaternion.normalize(attitude))
     known = int(np.sum(~np.isnan(found[:, 0])))
     if not known:
         raise InputError(
@@ -153,17 +145,19 @@ def _with_reference(recording: Recording, stamps: NDArray[np.int64], attitude: A
     return replace(recording, true_attitude=found, remarks=(*recording.remarks, words))
 
 
-def interpolated(time: Array, stamps: Array, attitude: Array) -> Array:
-    """Return attitudes (n, 4) at ``time`` (n,) interpolated between ``stamps`` along the shortest rotation; NaN outside and in gaps."""
+def interpolated(time: Array, stamps: Array, q: Array, bridged: float = BRIDGED) -> Array:
+    """Return attitudes (n, 4) at ``time`` (n,) between unit quaternions at ``stamps`` along the shortest rotation.
+
+    NaN outside, and between stamps that are further than ``bridged`` apart, s.
+    """
     result = np.full((len(time), 4), np.nan)
     if len(stamps) < 2:
         return result
     k = np.clip(np.searchsorted(stamps, time, side="right") - 1, 0, len(stamps) - 2)
-    share = (time - stamps[k]) / (stamps[k + 1] - stamps[k])
-    slack = 1e-9 / (stamps[k + 1] - stamps[k])
-    usable = (share >= -slack) & (share <= 1.0 + slack) & (stamps[k + 1] - stamps[k] <= BRIDGED)
+    width = stamps[k + 1] - stamps[k]
+    share = (time - stamps[k]) / width
+    usable = (share >= -1e-9 / width) & (share <= 1.0 + 1e-9 / width) & (width <= bridged)
     k, share = k[usable], share[usable]
-    q = quaternion.normalize(attitude)
     turn = quaternion.log(quaternion.multiply(quaternion.conjugate(q[k]), q[k + 1]))
     result[usable] = quaternion.multiply(q[k], quaternion.exp(share[:, None] * turn))
     return result

@@ -27,7 +27,7 @@ from strapdown.files import reading, written_beside
 from strapdown.recordings.extras import library
 from strapdown.recordings.trajectories import interpolated
 from strapdown.records import outputs
-from strapdown.records.recording import MAGNETIC_UNITS, Recording, at_nearest, relative_time, with_gyro
+from strapdown.records.recording import Recording, at_nearest, field_in, relative_time, with_gyro
 
 UNIT, FIELD, ATTITUDE = "sensor_combined", "vehicle_magnetometer", "vehicle_attitude"
 NO_SAMPLE = 0x7FFFFFFF
@@ -43,20 +43,13 @@ LATE = 0.5
 def read_ulog(path: str | os.PathLike[str], *, topic: str = "") -> Recording:
     """Read the inertial unit of a flight log."""
     file = Path(path)
-    pyulog = library("pyulog", f"{file.name} is a flight log of PX4, which")
-    try:
-        with contextlib.redirect_stdout(io.StringIO()):  # the library prints its findings
-            log = pyulog.ULog(str(file), [UNIT, FIELD, ATTITUDE])
-    except Exception as error:  # for a damaged log the library raises any exception of its parsers
-        raise InputError(
-            f"{file.name} cannot be read as ULog ({' '.join(str(error).split())}); the log is damaged"
-        ) from None
+    log = opened(file, [UNIT, FIELD, ATTITUDE])
     data = {one.name if one.multi_id == 0 else f"{one.name}:{one.multi_id}": one.data for one in log.data_list}
     units = [name for name in data if name.startswith(UNIT) and len(data[name]["timestamp"])]
     if not units:
         raise InputError(f"{file.name} has no message of {UNIT} (it has: {', '.join(data) or 'none that is read'})")
     chosen = one_of(f"{file.name}: topic", topic or units[0], units)
-    stamps, order, remarks = _stamps(chosen, data[chosen])
+    stamps, order, remarks = in_order(chosen, data[chosen]["timestamp"])
     remarks = [f"Topic {chosen}: {len(stamps)} messages.", *remarks]
     if _is_cut(file):
         remarks.append(f"{file.name} is truncated: only complete messages are read.")
@@ -67,8 +60,8 @@ def read_ulog(path: str | os.PathLike[str], *, topic: str = "") -> Recording:
         remarks.append(f"The logger lost {lost} ms in {len(log.dropouts)} dropouts.")
     time, epoch = relative_time(stamps * 1000)
     rows = data[chosen]
-    rate = _columns(rows, "gyro_rad", 3)[order]
-    force = _columns(rows, "accelerometer_m_s2", 3)[order]
+    rate = columns(rows, "gyro_rad", 3)[order]
+    force = columns(rows, "accelerometer_m_s2", 3)[order]
     relative = np.asarray(rows.get("accelerometer_timestamp_relative", np.zeros(len(order))))[order]
     force[relative == NO_SAMPLE] = np.nan
     usual = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 1.0
@@ -81,7 +74,7 @@ def read_ulog(path: str | os.PathLike[str], *, topic: str = "") -> Recording:
     if FIELD in data:
         own["magnetic_field"] = _beside(FIELD, data[FIELD], "magnetometer_ga", time, epoch, remarks)
     elif "magnetometer_ga[0]" in rows:
-        field = _columns(rows, "magnetometer_ga", 3)[order]
+        field = columns(rows, "magnetometer_ga", 3)[order]
         field[np.asarray(rows.get("magnetometer_timestamp_relative", np.zeros(len(order))))[order] == NO_SAMPLE] = (
             np.nan
         )
@@ -89,13 +82,25 @@ def read_ulog(path: str | os.PathLike[str], *, topic: str = "") -> Recording:
     if "magnetic_field" in own:
         own["magnetic_unit"] = "G"
     if ATTITUDE in data and len(data[ATTITUDE]["timestamp"]) > 1:
-        at, kept, words = _stamps(ATTITUDE, data[ATTITUDE])
-        ned = quaternion.normalize(_columns(data[ATTITUDE], "q", 4)[kept])
+        at, kept, words = in_order(ATTITUDE, data[ATTITUDE]["timestamp"])
+        ned = quaternion.normalize(columns(data[ATTITUDE], "q", 4)[kept])
         own["true_attitude"] = interpolated(time, (at * 1000 - epoch) / 1e9, outputs.to_ned(ned))
         remarks += [f"Reference: {ATTITUDE}, the vehicle's estimate.", *words]
     return with_gyro(
         source=file.name, time=time, rate=rate, specific_force=force, epoch_ns=epoch, remarks=tuple(remarks), **own
     )
+
+
+def opened(file: Path, topics: list[str]) -> Any:
+    """Return a flight log with these topics, read by the library."""
+    pyulog = library("pyulog", f"{file.name} is a flight log of PX4, which")
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):  # the library prints its findings
+            return pyulog.ULog(str(file), topics)
+    except Exception as error:  # for a damaged log the library raises any exception of its parsers
+        raise InputError(
+            f"{file.name} cannot be read as ULog ({' '.join(str(error).split())}); the log is damaged"
+        ) from None
 
 
 def _is_cut(file: Path) -> bool:
@@ -114,13 +119,14 @@ def _is_cut(file: Path) -> bool:
     return False
 
 
-def _columns(rows: dict[str, Any], name: str, size: int) -> Array:
+def columns(rows: dict[str, Any], name: str, size: int) -> Array:
+    """Return the elements of an array field, one row per message."""
     return np.stack([np.asarray(rows[f"{name}[{k}]"], np.float64) for k in range(size)], axis=1)
 
 
-def _stamps(topic: str, rows: dict[str, Any]) -> tuple[NDArray[np.int64], NDArray[np.int64], list[str]]:
+def in_order(topic: str, given: Any) -> tuple[NDArray[np.int64], NDArray[np.int64], list[str]]:
     """Return stamps, µs, in order, their rows, and remarks; of repeated stamps only the first is kept."""
-    stamps = np.asarray(rows["timestamp"]).astype(np.int64)
+    stamps = np.asarray(given).astype(np.int64)
     order = np.argsort(stamps, kind="stable")
     fresh = np.concatenate([[True], np.diff(stamps[order]) > 0])
     words = []
@@ -135,9 +141,8 @@ def _stamps(topic: str, rows: dict[str, Any]) -> tuple[NDArray[np.int64], NDArra
 
 def _beside(topic: str, rows: dict[str, Any], name: str, time: Array, epoch: int, remarks: list[str]) -> Array:
     """Return a sensor's samples at the nearest stamps of the inertial unit, by ``timestamp_sample`` if the topic has it."""
-    stamped = {**rows, "timestamp": rows.get("timestamp_sample", rows["timestamp"])}
-    stamps, kept, words = _stamps(topic, stamped)
-    values, lost = at_nearest(time, (stamps * 1000 - epoch) / 1e9, _columns(rows, name, 3)[kept])
+    stamps, kept, words = in_order(topic, rows.get("timestamp_sample", rows["timestamp"]))
+    values, lost = at_nearest(time, (stamps * 1000 - epoch) / 1e9, columns(rows, name, 3)[kept])
     remarks.append(f"Topic {topic}: {len(stamps)} messages{f', {lost} of them beyond its stamps' if lost else ''}.")
     remarks += words
     return values
@@ -171,7 +176,7 @@ def write_ulog(recording: Recording, path: str | os.PathLike[str]) -> None:
             f"{recording.source}: stamps are less than 1 µs apart, the resolution of a log's clock; choose another extension"
         )
     known = np.asarray(~np.isnan(recording.specific_force).any(axis=1))
-    columns: list[tuple[str, NDArray[np.int64], list[NDArray[Any]]]] = [
+    topics: list[tuple[str, NDArray[np.int64], list[NDArray[Any]]]] = [
         (
             UNIT,
             stamps,
@@ -179,26 +184,20 @@ def write_ulog(recording: Recording, path: str | os.PathLike[str]) -> None:
         )
     ]
     if recording.magnetic_field is not None:
-        if not recording.magnetic_unit:
-            raise InputError(
-                f"{recording.source} does not declare the unit of its magnetometer, and a log uses Gauss; declare it in the header or by "
-                f"option ({' or '.join(MAGNETIC_UNITS)})"
-            )
         seen = ~np.isnan(recording.magnetic_field).any(axis=1)
-        gauss = recording.magnetic_field[seen] * (MAGNETIC_UNITS[recording.magnetic_unit] / MAGNETIC_UNITS["G"])
-        columns.append((FIELD, stamps[seen], [stamps[seen], gauss]))
+        topics.append((FIELD, stamps[seen], [stamps[seen], field_in("G", recording)[seen]]))
     if recording.true_attitude is not None:
         seen = ~np.isnan(recording.true_attitude).any(axis=1)
-        columns.append((ATTITUDE, stamps[seen], [outputs.to_ned(quaternion.normalize(recording.true_attitude[seen]))]))
+        topics.append((ATTITUDE, stamps[seen], [outputs.to_ned(quaternion.normalize(recording.true_attitude[seen]))]))
     content = [b"ULog\x01\x12\x35\x01" + struct.pack("<Q", int(stamps[0])), _message("B", bytes(40))]
-    for name, _, _ in columns:
+    for name, _, _ in topics:
         fields = "".join(f"{kind}{f'[{size}]' if size else ''} {field};" for kind, field, size in _LAYOUTS[name])
         content.append(_message("F", f"{name}:uint64_t timestamp;{fields}".encode()))
     content += [
-        _message("A", struct.pack("<BH", 0, number) + name.encode()) for number, (name, _, _) in enumerate(columns)
+        _message("A", struct.pack("<BH", 0, number) + name.encode()) for number, (name, _, _) in enumerate(topics)
     ]
     rows: list[tuple[int, bytes]] = []
-    for number, (name, at, values) in enumerate(columns):
+    for number, (name, at, values) in enumerate(topics):
         rows += zip(at.tolist(), _rows(name, number, at, values), strict=True)
     rows.sort(key=lambda row: row[0])
     with written_beside(path) as temporary, open(temporary, "wb") as stream:

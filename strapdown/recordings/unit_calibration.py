@@ -73,31 +73,6 @@ class UnitCalibration:
         """
         return replace(recording, rate=recording.rate @ np.linalg.inv(np.eye(3) + self.matrix).T)
 
-    def and_then(self, block: ErrorStateEstimate, magnetometer_delay: float, source: str) -> UnitCalibration:
-        """Return the calibration combined with the residual errors that a filter estimated with it applied.
-
-        Parameters
-        ----------
-        block : ErrorStateEstimate
-            States of gyro scale and misalignment; their last values are used.
-        magnetometer_delay : float
-            Delay of the magnetometer relative to the gyro, s.
-        source : str
-            Name of the recording.
-
-        Returns
-        -------
-        UnitCalibration
-            The combined calibration.
-        """
-        found = (np.eye(3) + self.matrix) @ (np.eye(3) + matrix_of(block)) - np.eye(3)
-        return UnitCalibration(
-            matrix=found,
-            sigma=float(np.sqrt(np.mean(block.variance[-1]))),
-            magnetometer_delay=magnetometer_delay,
-            source=source,
-        )
-
 
 NONE = UnitCalibration(matrix=np.zeros((3, 3)), sigma=0.0)
 """Calibration of an unknown unit: no correction."""
@@ -110,6 +85,18 @@ def matrix_of(block: ErrorStateEstimate) -> Array:
         row, column = name[0], name[-1]
         M["xyz".index(row), "xyz".index(column)] = value
     return M
+
+
+def combined(
+    calibration: UnitCalibration, block: ErrorStateEstimate, magnetometer_delay: float, source: str
+) -> UnitCalibration:
+    """Return a calibration combined with the last values of the states of gyro scale and misalignment that a filter estimated with it."""
+    return UnitCalibration(
+        matrix=(np.eye(3) + calibration.matrix) @ (np.eye(3) + matrix_of(block)) - np.eye(3),
+        sigma=float(np.sqrt(np.mean(block.variance[-1]))),
+        magnetometer_delay=magnetometer_delay,
+        source=source,
+    )
 
 
 def to_toml(calibration: UnitCalibration) -> str:

@@ -398,7 +398,9 @@ class Estimate(Listed):
         one_of("frame", frame, outputs.FRAMES)
         P = self.attitude_covariance
         q = self.attitude if frame == "ENU" else outputs.to_ned(self.attitude)
-        found: dict[str, NDArray[np.generic]] = _clock(self.time, recording)
+        found: dict[str, NDArray[np.generic]] = {"time_s": self.time}
+        if recording is not None and recording.epoch_ns:
+            found = {"time_ns": np.rint(self.time * 1e9).astype(np.int64) + recording.epoch_ns}
         found |= {f"q{name}": q[:, k] for k, name in enumerate("wxyz")}
         angles = outputs.euler(q, sequence, P)
         assert angles.sigma is not None
@@ -459,9 +461,3 @@ def _angle_names(sequence: str) -> list[str]:
         if len(set(axes)) == 3
         else [f"angle_{k + 1}_{axis.lower()}" for k, axis in enumerate(axes)]
     )
-
-
-def _clock(time: Array, recording: Recording | None) -> dict[str, NDArray[np.generic]]:
-    if recording is None or not recording.epoch_ns:
-        return {"time_s": time}
-    return {"time_ns": np.rint(time * 1e9).astype(np.int64) + recording.epoch_ns}

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import itertools
 import warnings
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,9 +21,6 @@ from strapdown import quaternion
 from strapdown.checks import Array, InputError, array, one_of, unit_quaternions
 from strapdown.kinematics import skew
 from strapdown.units import STANDARD_GRAVITY
-
-if TYPE_CHECKING:
-    pass
 
 __all__ = [
     "Angles",
@@ -98,9 +95,9 @@ def euler(attitude: ArrayLike, sequence: str = "ZYX", covariance: ArrayLike | No
     return Angles(angles, sigma if intrinsic else sigma[:, ::-1])
 
 
-def euler_axes(attitude: ArrayLike, sequence: str = "ZYX") -> Array:
-    """Return E (n, 3, 3) of ``δθ = E δφ``: its columns are the axes of the three rotations of an intrinsic sequence, body frame."""
-    return _turn_axes(euler(attitude, sequence).angles, sequence)
+def euler_axes(attitude: ArrayLike) -> Array:
+    """Return E (n, 3, 3) of ``δθ = E δφ``: its columns are the axes of the three rotations of the sequence ZYX, body frame."""
+    return _turn_axes(euler(attitude).angles, "ZYX")
 
 
 def _turn_axes(angles: Array, sequence: str) -> Array:

@@ -265,6 +265,17 @@ def at_nearest(time: Array, other: Array, values: Array) -> tuple[Array, int]:
     return placed, int(len(other) - len(np.unique(nearest[usable])))
 
 
+def field_in(unit: str, recording: Recording) -> Array:
+    """Return the magnetic field of a recording (n, 3) in a unit, a key of :data:`MAGNETIC_UNITS`; its own unit must be known."""
+    assert recording.magnetic_field is not None
+    if not recording.magnetic_unit:
+        raise InputError(
+            f"{recording.source} does not declare the unit of its magnetometer, which is needed in {unit}; declare it in the header or by "
+            f"option ({' or '.join(MAGNETIC_UNITS)})"
+        )
+    return np.asarray(recording.magnetic_field * (MAGNETIC_UNITS[recording.magnetic_unit] / MAGNETIC_UNITS[unit]))
+
+
 def increments(recording: Recording) -> Array:
     """Return body increments (n − 1, 3), rad, over the intervals between the stamps, by the trapezoid rule.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from strapdown import consistency, plots, quaternion, records
+from strapdown.checks import Array
 from strapdown.plots.estimates import angle_labels
 from strapdown.plots.style import AXES
 from strapdown.records import Estimate, Innovations, Truth
@@ -23,6 +25,9 @@ def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
     attributes = records.read_attributes(path)
     estimate = records.read_estimate(path)
     truth = records.read_truth(path)
+    error = None
+    if truth is not None:
+        error = consistency.errors(estimate.attitude, estimate.bias, truth.attitude, truth.bias)
     judgement = findings.judged(path, attributes, estimate, truth, probability=probability)
     span = estimate.time[-1] - estimate.time[0]
     used = sum(len(one.time) for one in estimate.innovations.values())
@@ -33,13 +38,13 @@ def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
         f"{'with' if truth is not None else 'without'} truth; strapdown {attributes.get('version', '')}",
         findings.verdict(judgement),
         *(
-            [page.section("Events", *[page.paragraph(str(event)) for event in estimate.events])]
+            [page.section("Events", *(page.paragraph(str(event)) for event in estimate.events))]
             if estimate.events
             else []
         ),
-        _numbers(estimate, truth),
+        _numbers(estimate, error),
         findings.evidence(judgement),
-        _over_time(estimate, truth, str(attributes.get("fixed_frame", ""))),
+        _over_time(estimate, truth, error, str(attributes.get("fixed_frame", ""))),
         *[_sensor(name, one, probability) for name, one in estimate.innovations.items()],
         *_distribution(estimate, truth),
         page.section(
@@ -52,11 +57,17 @@ def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
     return content, {
         "source": path.name,
         "judgement": judgement.summary(),
-        "key_numbers": _key_numbers(estimate, truth),
+        "key_numbers": _key_numbers(estimate, error),
     }
 
 
-def _key_numbers(estimate: Estimate, truth: Truth | None) -> dict[str, Any]:
+def _parts(estimate: Estimate) -> tuple[tuple[slice, Callable[[Array], tuple[str, float]]], ...]:
+    """Return the states of the attitude and, if it is estimated, of the bias, with the function that chooses their unit."""
+    parts = ((slice(0, 3), angle_unit), (slice(3, 6), rate_unit))
+    return parts if estimate.has_bias else parts[:1]
+
+
+def _key_numbers(estimate: Estimate, error: Array | None) -> dict[str, Any]:
     numbers: dict[str, Any] = {
         "states": len(estimate.time),
         "duration_s": float(estimate.time[-1] - estimate.time[0]),
@@ -68,40 +79,29 @@ def _key_numbers(estimate: Estimate, truth: Truth | None) -> dict[str, Any]:
     if estimate.has_bias:
         numbers["final_bias_rad_per_s"] = estimate.bias[-1].tolist()
         numbers["final_bias_sigma_rad_per_s"] = estimate.sigma[-1, 3:].tolist()
-    if truth is not None:
-        error = consistency.errors(estimate.attitude, estimate.bias, truth.attitude, truth.bias)
-        half = len(error) // 2
-        numbers["rms_attitude_error_second_half_rad"] = np.sqrt(np.mean(error[half:, :3] ** 2, axis=0)).tolist()
-    if truth is not None and estimate.has_bias:
-        numbers["rms_bias_error_second_half_rad_per_s"] = np.sqrt(np.mean(error[half:, 3:] ** 2, axis=0)).tolist()
+    if error is not None:
+        rms = np.sqrt(np.mean(error[len(error) // 2 :] ** 2, axis=0))
+        numbers["rms_attitude_error_second_half_rad"] = rms[:3].tolist()
+        if estimate.has_bias:
+            numbers["rms_bias_error_second_half_rad_per_s"] = rms[3:].tolist()
     return numbers
 
 
-def _numbers(estimate: Estimate, truth: Truth | None) -> str:
+def _numbers(estimate: Estimate, error: Array | None) -> str:
     half = len(estimate.time) // 2
     sigma = np.sqrt(np.mean(estimate.variance[half:], axis=0))
     rows = []
-    error = None
-    if truth is not None:
-        error = consistency.errors(estimate.attitude, estimate.bias, truth.attitude, truth.bias)[half:]
-    parts_of_state = (("attitude", slice(0, 3), angle_unit), ("gyro bias", slice(3, 6), rate_unit))
-    for what, states, unit_of in parts_of_state if estimate.has_bias else parts_of_state[:1]:
+    for what, (states, unit_of) in zip(("attitude", "gyro bias"), _parts(estimate), strict=False):
         unit, size = unit_of(3.0 * sigma[states])
         for axis, name in enumerate(AXES):
             k = states.start + axis
             row = [f"{what} {name}, {unit}", page.number(float(sigma[k] / size))]
             if error is not None:
-                row += [
-                    page.number(float(np.sqrt(np.mean(error[:, k] ** 2)) / size)),
-                    page.number(float(np.mean(error[:, k]) / size)),
-                    page.number(float(np.abs(error[:, k]).max() / size)),
-                ]
+                own = error[half:, k] / size
+                row += [page.number(float(x)) for x in (np.sqrt(np.mean(own**2)), np.mean(own), np.abs(own).max())]
             rows.append(row)
-    head = [
-        "second half of the run",
-        "σ of the filter",
-        *(["RMS error", "mean error", "largest"] if error is not None else []),
-    ]
+    head = ["second half of the run", "σ of the filter"]
+    head += ["RMS error", "mean error", "largest"] if error is not None else []
     parts = [page.table(head, rows, numbers=len(head) - 1)]
     sensors = [
         (
@@ -115,26 +115,19 @@ def _numbers(estimate: Estimate, truth: Truth | None) -> str:
         if len(one.time)
     ]
     if sensors:
-        head = [
-            "sensor",
-            "measurements",
-            "not used: missing or outside",
-            "rejected by the gate",
-            "NIS per degree of freedom",
-        ]
+        why = ("not used: missing or outside", "rejected by the gate")
+        head = ["sensor", "measurements", *why, "NIS per degree of freedom"]
         parts.append(page.table(head, sensors, numbers=4))
     return page.section("Key numbers", *parts)
 
 
-def _over_time(estimate: Estimate, truth: Truth | None, fixed_frame: str) -> str:
+def _over_time(estimate: Estimate, truth: Truth | None, error: Array | None, fixed_frame: str) -> str:
     sigma = estimate.sigma
     charts = []
     figure = ""
     settled = slice(len(estimate.time) // 20, None)
-    if truth is not None:
-        error = consistency.errors(estimate.attitude, estimate.bias, truth.attitude, truth.bias)
-        parts = (("Attitude error", slice(0, 3), angle_unit), ("Bias error", slice(3, 6), rate_unit))
-        for what, states, unit_of in parts if estimate.has_bias else parts[:1]:
+    if truth is not None and error is not None:
+        for what, (states, unit_of) in zip(("Attitude error", "Bias error"), _parts(estimate), strict=False):
             unit, size = unit_of(3.0 * sigma[settled, states])
             for k, axis in enumerate(AXES):
                 state = states.start + k
@@ -196,7 +189,7 @@ def _sensor(name: str, innovations: Innovations, probability: float) -> str:
 def _distribution(estimate: Estimate, truth: Truth | None) -> list[str]:
     if truth is None:
         return []
-    angle = consistency.distribution(quaternion.angle_between(estimate.attitude, truth.attitude))
+    angle = quaternion.angle_between(estimate.attitude, truth.attitude)
 
     def draw() -> Figure:
         figure, ax = plots.new_figure(size=(6.5, 4.2))
