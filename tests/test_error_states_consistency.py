@@ -7,6 +7,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from measured import series_of
 
 from strapdown import consistency, estimation, gyro, motion, quaternion
 from strapdown.estimation import error_states
@@ -15,7 +16,7 @@ from strapdown.estimation.states import ProcessNoise
 from strapdown.randomness import generator
 from strapdown.records import ImuRecord
 from strapdown.scenarios import Scenario, simulate
-from strapdown.vectors import Accelerometer, Faults, Magnetometer, VectorMeasurements
+from strapdown.vectors import Accelerometer, Faults, Magnetometer
 
 HAND = motion.HarmonicRates(
     harmonics=(
@@ -261,16 +262,7 @@ def swaying(seed: int, sigma: float, tau: float, duration: float = 60.0):
     series = []
     for name, reference, noise, extra in (("acc", up, 0.05, sway), ("mag", FIELD, 5e-7, np.zeros(3))):
         z = quaternion.rotate(back, reference + extra) + noise * rng.standard_normal(sway.shape)
-        series.append(
-            VectorMeasurements(
-                sensor=name,
-                kind="vector",
-                time=time,
-                vector_b=z,
-                reference_f=reference,
-                sigma=np.full(len(time), noise),
-            )
-        )
+        series.append(series_of(name, "vector", time, z, reference, noise))
     increments = HAND.increments(edges) + ARW * np.sqrt(0.02) * rng.standard_normal((len(edges) - 1, 3))
     block = error_states.GaussMarkov(sensor="acc", noise_sigma=sigma, correlation_time=tau, frame="fixed", unit="m/s²")
     return ImuRecord(time=edges, increments=increments, vectors=tuple(series)), sway, block

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from measured import series_of
 
 from strapdown import estimation
 from strapdown.checks import InputError
@@ -12,7 +13,6 @@ from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.states import ProcessNoise
 from strapdown.estimation.step_filter import StepFilter
 from strapdown.records import ImuRecord
-from strapdown.vectors import VectorMeasurements
 
 NOISE = ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-5)
 X, _, UP = np.eye(3)
@@ -30,8 +30,8 @@ def test_vertical_headings_and_missing_samples_are_skipped_and_counted(options):
     odd = np.arange(8) % 2 == 0
     seen, up = np.where(odd[:, None], UP, X), np.tile(UP, (8, 1))
     up[3] = np.nan
-    north = VectorMeasurements(sensor="north", kind="heading", time=time, vector_b=seen, reference_f=X, sigma=0.1)
-    vertical = VectorMeasurements(sensor="up", kind="direction", time=time, vector_b=up, reference_f=UP, sigma=0.1)
+    north = series_of("north", "heading", time, seen, X, 0.1)
+    vertical = series_of("up", "direction", time, up, UP, 0.1)
     record = ImuRecord(time=np.linspace(0.0, 1.0, 11), increments=np.zeros((10, 3)), vectors=(north, vertical))
     rest = replace(record, vectors=(north.taken(~odd), vertical.taken(np.arange(8) != 3)))
     both, without = (estimation.run(r, NOISE, START, BLOCKS, full_covariance=True, **options) for r in (record, rest))

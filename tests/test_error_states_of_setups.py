@@ -8,6 +8,7 @@ import in_steps
 import numpy as np
 import pytest
 from gated_steps import GatedStepFilter
+from measured import resting, series_of
 
 from strapdown import consistency, estimation, kinematics, motion, quaternion, records, scenarios, vectors
 from strapdown.checks import InputError
@@ -22,7 +23,6 @@ from strapdown.kernels import error_state_step, sensor_rows
 from strapdown.randomness import generator
 from strapdown.records import ImuRecord, Truth
 from strapdown.scenarios import Scenario
-from strapdown.vectors import VectorMeasurements
 
 NOISE = ProcessNoise(angle_random_walk=1e-3, rate_random_walk=1e-5)
 SWAY = motion.HarmonicRates(
@@ -482,15 +482,8 @@ def test_hard_iron_in_a_field_that_changes_is_found_in_its_own_unit():
 def test_a_direction_that_its_states_make_longer_has_the_less_noise():
     """Of a sensor that normalises its vector, noise across it is over the length of what it really sees."""
     strong = error_states.VectorBias(sensor="a", bias_sigma=1e-9)
-    series = VectorMeasurements(
-        sensor="a",
-        kind="direction",
-        time=np.array([0.0]),
-        vector_b=np.array([[1.0, 0.0, 0.0]]),
-        reference_f=np.array([1.0, 0.0, 0.0]),
-        sigma=np.array([1e-3]),
-    )
-    record = ImuRecord(time=np.array([0.0, 1.0]), increments=np.zeros((1, 3)), vectors=(series,))
+    series = series_of("a", "direction", [0.0], [[1.0, 0.0, 0.0]], [1.0, 0.0, 0.0], 1e-3)
+    record = resting(series)
     start = estimation.with_error_states(
         estimation.initial_state([1.0, 0, 0, 0], attitude_sigma=1e-9, bias_sigma=1e-9), (strong,)
     )
@@ -504,14 +497,7 @@ def test_the_strength_of_a_heading_s_field_leaves_its_level_part_out():
     level = np.array([0.3, 0.6, 0.9])
     reference = np.stack([level, np.zeros(3), -np.sqrt(1.0 - level**2)], axis=1)
     field = np.array([2.0, 5.0, 3.0])
-    series = VectorMeasurements(
-        sensor="m",
-        kind="heading",
-        time=np.arange(3.0),
-        vector_b=reference,
-        reference_f=reference,
-        sigma=0.1 / (field * level),
-    )
+    series = series_of("m", "heading", np.arange(3.0), reference, reference, 0.1 / (field * level))
     np.testing.assert_allclose(forward.strength(series) / field, forward.strength(series)[0] / field[0], rtol=1e-12)
 
 

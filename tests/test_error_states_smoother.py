@@ -8,6 +8,7 @@ import math
 import numpy as np
 import pytest
 import scipy.linalg
+from measured import resting, series_of
 
 from strapdown import consistency, estimation, kinematics, motion, quaternion, records
 from strapdown.estimation import error_states, forward, recovery_segments
@@ -218,9 +219,7 @@ def small_record(blocks, scale, *, seed=3, steps=8, dt=0.1, late=False, off=(1.0
         ("mag", FIELD, 0.02 * scale, np.array([steps]) if late else np.arange(2, steps + 1, 2)),
     ):
         nothing = np.zeros((len(at), 3))
-        one = VectorMeasurements(
-            sensor=name, kind="vector", time=time[at], vector_b=nothing, reference_f=reference, sigma=sigma
-        )
+        one = series_of(name, "vector", time[at], nothing, reference, sigma)
         z = predicted_vectors(blocks, one, q[at], c[at], turning_matrices(blocks, bare, one))
         series.append(dataclasses.replace(one, vector_b=z + sigma * rng.standard_normal(z.shape)))
     start = quaternion.multiply(q[0], quaternion.exp(0.1 * scale * np.array(off)))
@@ -303,9 +302,9 @@ def test_a_correction_by_a_radian_is_carried_back_with_all_that_turns():
     felt = quaternion.rotate(quaternion.conjugate(true), np.array([0.6, -0.3, 10.01]))
     found = []
     for run, at in ((estimation.smooth, 1.0), (estimation.run, 0.0)):
-        acc = VectorMeasurements(sensor="acc", kind="vector", time=[at], vector_b=[felt], reference_f=UP, sigma=0.05)
+        acc = series_of("acc", "vector", [at], [felt], UP, 0.05)
         seen = VectorMeasurements(sensor="seen", kind="attitude", time=[at], attitude=[true], sigma=0.05)
-        record = ImuRecord(time=np.array([0.0, 1.0]), increments=np.zeros((1, 3)), vectors=(acc, seen))
+        record = resting(acc, seen)
         found.append(run(record, still, initial, blocks, full_covariance=True))
     assert difference(*found, 0, 0) < 1e-6
 
@@ -363,9 +362,7 @@ def swaying(duration=2.0, seed=1, start_error=(0.05, -0.02, 0.03)):
     ):
         seen = quaternion.rotate(quaternion.conjugate(BODY.attitude(at)), reference)
         seen = seen + sigma * rng.standard_normal(seen.shape)
-        series.append(
-            VectorMeasurements(sensor=name, kind="vector", time=at, vector_b=seen, reference_f=reference, sigma=sigma)
-        )
+        series.append(series_of(name, "vector", at, seen, reference, sigma))
     attitude = quaternion.multiply(BODY.attitude(np.array(0.0)), quaternion.exp(start_error))
     truth = records.Truth(attitude=BODY.attitude(time), bias=np.zeros((len(time), 3)))
     record = ImuRecord(time=time, increments=turns, vectors=tuple(series), truth=truth)
@@ -391,7 +388,7 @@ def test_a_bias_that_turns_more_than_the_increments_say_loses_no_segments():
     time = np.arange(21.0)
     z = np.tile([0.0, 0.0, 1.0], (20, 1)) + 0.02 * rng.standard_normal((20, 3))
     up = [0.0, 0.0, 1.0]
-    series = VectorMeasurements(sensor="mag", kind="vector", time=time[1:], vector_b=z, reference_f=up, sigma=0.02)
+    series = series_of("mag", "vector", time[1:], z, up, 0.02)
     start = estimation.State(
         attitude=quaternion.IDENTITY, bias=np.array([0.0, 0.0, 3.0]), covariance=np.diag([1e-4] * 3 + [1e-12] * 3)
     )
@@ -490,11 +487,7 @@ def jumped(lost: float, blocks) -> tuple[ImuRecord, estimation.State]:
     ):
         seen = quaternion.rotate(back[at], reference) + error[at]
         seen = seen + sigma * rng.standard_normal(seen.shape)
-        series.append(
-            VectorMeasurements(
-                sensor=name, kind="vector", time=time[at], vector_b=seen, reference_f=reference, sigma=sigma
-            )
-        )
+        series.append(series_of(name, "vector", time[at], seen, reference, sigma))
     start = SPUN.attitude(np.array(0.0))
     initial = estimation.initial_state(start, attitude_sigma=0.03, bias=bias, bias_sigma=3e-3)
     initial = estimation.with_error_states(initial, blocks)

@@ -4,47 +4,15 @@ from __future__ import annotations
 
 import math
 
-import mpmath as mp
 import numpy as np
 import pytest
 
 from strapdown import estimation, gyro, motion, quaternion, records
 
 
-def exact_jacobian(phi):
-    """∂δθ/∂ν (3, 3) of exp(δθ) = exp(−(φ + ν)) exp(φ) at ν = 0, to 30 digits by differences of the product itself."""
-
-    def exponential(v):
-        angle = mp.sqrt(sum(x * x for x in v))
-        s = mp.sin(angle / 2) / angle if angle else mp.mpf(0.5)
-        return (mp.cos(angle / 2), *(s * x for x in v))
-
-    def error(v):
-        a, b = exponential([-x for x in v]), exponential([mp.mpf(x) for x in phi])
-        w = a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3]
-        x = a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2]
-        y = a[0] * b[2] - a[1] * b[3] + a[2] * b[0] + a[3] * b[1]
-        z = a[0] * b[3] + a[1] * b[2] - a[2] * b[1] + a[3] * b[0]
-        return [2 * x / w, 2 * y / w, 2 * z / w]
-
-    with mp.workdps(40):
-        step = mp.mpf(10) ** -20
-        columns = []
-        for j in range(3):
-            v = [mp.mpf(x) + (step if i == j else 0) for i, x in enumerate(phi)]
-            columns.append([float(x / step) for x in error(v)])
-    return np.array(columns).T
-
-
 def across(x):
     """Variance across the axis of turn over σ_v² dt: |J_r|² = 2(1 − cos x)/x²."""
     return 2.0 * (1.0 - math.cos(x)) / x**2
-
-
-@pytest.mark.parametrize("x", [1e-3, 0.35, 1.0, 2.0, 3.0])
-def test_an_increments_noise_is_that_of_the_right_jacobian(x):
-    J = exact_jacobian([0.0, 0.0, x])
-    np.testing.assert_allclose(J @ J.T, np.diag([across(x), across(x), 1.0]), rtol=1e-9, atol=1e-15)
 
 
 def test_the_simulated_gyros_errors_have_that_covariance():

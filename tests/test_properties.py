@@ -10,6 +10,7 @@ import numpy as np
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from measured import series_of
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
@@ -19,7 +20,6 @@ from strapdown.files import reading
 from strapdown.gyro import datasheets
 from strapdown.recordings import recordfiles
 from strapdown.records import ImuRecord, Truth
-from strapdown.vectors import VectorMeasurements
 
 numbers = st.floats(-1e3, 1e3, allow_nan=False, width=64)
 vectors = arrays(np.float64, 3, elements=st.floats(-10.0, 10.0))
@@ -145,10 +145,7 @@ def recorded(draw) -> ImuRecord:
         name = draw(st.text(st.characters(categories=("L", "N")), min_size=1, max_size=10))
         unit = values / np.linalg.norm(values, axis=1, keepdims=True)
         series.append(
-            VectorMeasurements(
-                sensor=name, kind="direction", time=time[0] + np.arange(m), vector_b=unit, reference_f=np.array([0.0, 0.0, 1.0]),
-                sigma=np.full(m, draw(st.floats(1e-9, 1.0))),
-            )
+            series_of(name, "direction", time[0] + np.arange(m), unit, [0.0, 0.0, 1.0], draw(st.floats(1e-9, 1.0)))
         )  # fmt: skip
     truth = None
     if draw(st.booleans()):
@@ -244,11 +241,7 @@ def test_without_process_noise_and_with_small_errors_the_filter_is_batch_least_s
         b = reference + sigma * chance.standard_normal((n, 3))
         b /= np.linalg.norm(b, axis=1, keepdims=True)
         time = dt * np.arange(1, n + 1)
-        sensors.append(
-            VectorMeasurements(
-                sensor=f"s{k}", kind="direction", time=time, vector_b=b, reference_f=reference, sigma=np.full(n, sigma)
-            )
-        )
+        sensors.append(series_of(f"s{k}", "direction", time, b, reference, sigma))
         for one, t in zip(b, time, strict=True):
             # b = exp(-δθ) r = r + r × δθ; of the gyro's increments, all zero, the filter takes its bias: δθ(t) = δθ(0) - t δb.
             skew = np.array(

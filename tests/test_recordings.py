@@ -5,6 +5,7 @@ from __future__ import annotations
 import h5py
 import numpy as np
 import pytest
+from measured import series_of
 from typer.testing import CliRunner
 
 from strapdown import estimation, recordings
@@ -12,7 +13,6 @@ from strapdown.checks import InputError
 from strapdown.cli import app
 from strapdown.recordings import Recording, read, recordfiles, samples
 from strapdown.records import ImuRecord
-from strapdown.vectors import VectorMeasurements
 
 HEADER = "time,gx [rad/s],gy,gz,ax [m/s2],ay,az"
 ROWS = ("0.00,0.1,0.2,0.3,1,2,9", "0.01,0.4,0.5,0.6,3,4,8", "0.02,0.7,0.8,0.9,5,6,7")
@@ -500,14 +500,7 @@ def test_stamps_that_stray_by_more_than_a_quarter_of_the_interval_are_assumed_ev
 
 def test_samples_of_a_simulated_record_are_its_increments_and_what_its_sensors_measured(tmp_path):
     random, time = np.random.default_rng(4), 0.01 * np.arange(201)
-    force = VectorMeasurements(
-        sensor="accelerometer",
-        kind="vector",
-        time=time[4::4],
-        reference_f=[0.0, 0.0, 9.8],
-        vector_b=random.standard_normal((50, 3)),
-        sigma=0.1,
-    )
+    force = series_of("accelerometer", "vector", time[4::4], random.standard_normal((50, 3)), [0.0, 0.0, 9.8], 0.1)
     record = ImuRecord(time=time, increments=1e-3 * random.standard_normal((200, 3)), vectors=(force,))
     recordfiles.write_record(tmp_path / "record.h5", record)
     gyro = recordings.read_samples(tmp_path / "record.h5", "gyro")

@@ -12,6 +12,7 @@ import mpmath
 import numpy as np
 import pytest
 import two_stars
+from measured import series_of
 from scipy.optimize import brentq
 from two_stars import ARW, BELIEVED, FREE, RRW, case, scenario
 
@@ -323,14 +324,7 @@ def test_thinned_measurements_weigh_as_much_as_all():
     assert tuning.thinned(thin, 0.1) is thin
     # The likelihood of a record is that of its thinned series, at less than a second too.
     time = 0.1 * np.arange(1, 100)
-    star = VectorMeasurements(
-        sensor="star",
-        kind="direction",
-        time=time,
-        vector_b=np.tile([1.0, 0.0, 0.0], (99, 1)),
-        reference_f=[1.0, 0, 0],
-        sigma=1e-3,
-    )
+    star = series_of("star", "direction", time, np.tile([1.0, 0.0, 0.0], (99, 1)), [1.0, 0, 0], 1e-3)
     record = ImuRecord(time=0.1 * np.arange(101), increments=np.zeros((100, 3)), vectors=(star,))
     sparse = dataclasses.replace(record, vectors=(tuning.thinned(star, 0.5),))
     assert len(sparse.vectors[0].time) == 20
@@ -354,13 +348,8 @@ def test_thinning_finds_the_sigma_that_disturbances_which_last_ask_for():
         error = np.repeat(1e-3 * random.standard_normal((120, 3)), 10, axis=0)[: len(time)]
         seen = quaternion.rotate(quaternion.conjugate(body), np.array(reference)) + error
         series.append(
-            VectorMeasurements(
-                sensor=name,
-                kind="direction",
-                time=time,
-                vector_b=seen / np.linalg.norm(seen, axis=1, keepdims=True),
-                reference_f=np.array(reference),
-                sigma=np.full(len(time), 1e-3),
+            series_of(
+                name, "direction", time, seen / np.linalg.norm(seen, axis=1, keepdims=True), np.array(reference), 1e-3
             )
         )
     record = dataclasses.replace(record, vectors=tuple(series))
@@ -396,14 +385,7 @@ def white_noise(n: int, seed: int = 3) -> tuple[tuning.Case, np.ndarray]:
     random = np.random.default_rng(seed)
     noise = 1e-3 * random.standard_normal((n, 2))
     seen = np.column_stack([noise, np.sqrt(1.0 - np.sum(noise**2, axis=1))])
-    series = VectorMeasurements(
-        sensor="star",
-        kind="direction",
-        time=np.arange(1.0, n + 1.0),
-        vector_b=seen,
-        reference_f=np.array([0.0, 0.0, 1.0]),
-        sigma=np.full(n, 2e-3),
-    )
+    series = series_of("star", "direction", np.arange(1.0, n + 1.0), seen, [0.0, 0.0, 1.0], 2e-3)
     record = ImuRecord(time=np.arange(n + 1.0), increments=np.zeros((n, 3)), vectors=(series,))
     return tuning.Case(record=record, initial=setup.initial_state(SURE, np.array([1.0, 0.0, 0.0, 0.0]))), noise
 

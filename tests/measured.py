@@ -1,0 +1,111 @@
+"""What many tests are made of: bodies, references, series of measurements, records at rest, starts drawn from their own σ, and errors."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from strapdown import consistency, estimation, motion, quaternion
+from strapdown.records import ImuRecord
+from strapdown.vectors import VectorMeasurements
+
+UP = np.array([0.0, 0.0, 9.81])
+FIELD = np.array([0.0, 2e-5, -4e-5])
+STAR = np.array([0.6, 0.64, 0.48])
+SWAY = motion.HarmonicRates(
+    harmonics=(
+        motion.Harmonic(amplitude=(0.9, 0.4, -0.6), frequency=0.21),
+        motion.Harmonic(amplitude=(-0.4, 0.8, 0.5), frequency=0.37),
+    )
+)
+HAND = motion.HarmonicRates(
+    harmonics=(
+        motion.Harmonic(amplitude=(1.2, 0.2, -0.3), frequency=0.21),
+        motion.Harmonic(amplitude=(-0.3, 1.1, 0.4), frequency=0.37),
+        motion.Harmonic(amplitude=(0.3, -0.2, 1.3), frequency=0.29, phase=1.0),
+    )
+)
+"""A hand that turns its unit about all three axes."""
+
+
+def series_of(sensor, kind, time, vector_b, reference_f, sigma) -> VectorMeasurements:
+    """Return a series of directions, headings or vectors."""
+    return VectorMeasurements(
+        sensor=sensor, kind=kind, time=time, vector_b=vector_b, reference_f=reference_f, sigma=sigma
+    )
+
+
+def resting(*vectors, time=(0.0, 1.0)) -> ImuRecord:
+    """Return the record of a body that does not turn."""
+    return ImuRecord(time=time, increments=np.zeros((len(time) - 1, 3)), vectors=vectors)
+
+
+def seen(attitude, reference):
+    """Return references of the fixed frame in body axes."""
+    return quaternion.rotate(quaternion.conjugate(attitude), reference)
+
+
+def unit(v):
+    """Return vectors (..., 3) over their length."""
+    return v / np.linalg.norm(v, axis=-1, keepdims=True)
+
+
+def record_of(body=SWAY, duration=4.0, rate=50.0, seed=1, anisotropic=False) -> ImuRecord:
+    """Return a record with every kind of measurement, at times of their own."""
+    rng = np.random.default_rng(seed)
+    edges = np.arange(round(duration * rate) + 1) / rate
+    dt = np.diff(edges)[:, None]
+    increments = body.increments(edges) + 1e-3 * np.sqrt(dt) * rng.standard_normal((len(dt), 3))
+
+    def seen_at(interval, phase, reference, sigma):
+        t = np.arange(phase, duration, interval)
+        return t, seen(body.attitude(t), reference) + sigma * rng.standard_normal((len(t), 3))
+
+    t, mag = seen_at(0.11, 0.013, FIELD, 5e-7)
+    mag = series_of("mag", "vector", t, mag + np.array([3e-6, -2e-6, 1e-6]), FIELD, 5e-7)
+    if anisotropic:
+        whole = 2.5e-13 * np.array([[2.0, 0.5, 0.0], [0.5, 1.0, 0.2], [0.0, 0.2, 0.7]])
+        mag = replace(mag, sigma=0.0, covariance=whole)
+    t, force = seen_at(0.07, 0.05, UP, 0.05)
+    force = series_of("force", "direction", t, unit(force), UP, 5e-3)
+    t, star = seen_at(0.31, 0.17, STAR, 2e-2)
+    compass = series_of("compass", "heading", t, unit(star), STAR, 3e-2)
+    t, axes = np.arange(0.2, duration, 0.43), np.array([2e-3, 3e-3, 9e-3])
+    attitude = quaternion.multiply(body.attitude(t), quaternion.exp(axes * rng.standard_normal((len(t), 3))))
+    tracker = VectorMeasurements(sensor="tracker", kind="attitude", time=t, attitude=attitude, sigma_axes=axes)
+    t = np.arange(0.11, duration, 0.23)
+    moving = np.stack([np.cos(t), np.sin(t), 0.5 + 0.1 * t], axis=-1)
+    beacon = series_of("beacon", "vector", t, seen(body.attitude(t), moving), moving, 0.02)
+    return ImuRecord(time=edges, increments=increments, vectors=(mag, force, compass, tracker, beacon))
+
+
+def turn_to(q, other):
+    """Return the rotation vector, body axes of q, from an attitude q to another."""
+    return quaternion.log(quaternion.multiply(quaternion.conjugate(q), other))
+
+
+def drawn_start(truth, draw, attitude_sigma, bias_sigma) -> estimation.State:
+    """Return the state whose errors are ``draw`` (6,) times its σ."""
+    attitude, bias = truth.attitude[0], truth.bias[0]
+    return estimation.initial_state(
+        quaternion.multiply(attitude, quaternion.exp(-attitude_sigma * draw[:3])),
+        attitude_sigma=attitude_sigma,
+        bias_sigma=bias_sigma,
+        bias=bias - bias_sigma * draw[3:],
+    )
+
+
+def errors(estimate, truth, every=1):
+    """Return the errors of attitude and bias (m, 6) of an estimate that holds each so-many-th edge."""
+    return consistency.errors(estimate.attitude, estimate.bias, truth.attitude[::every], truth.bias[::every])
+
+
+def recoveries(estimate):
+    """Return the recoveries among the events of an estimate."""
+    return [event for event in estimate.events if event.kind == "recovery"]
+
+
+def correlation(P, sigma):
+    """Return a covariance, or a difference of two, over the product of the σ of its states."""
+    return P / (sigma[..., :, None] * sigma[..., None, :])
