@@ -10,7 +10,7 @@ import in_steps
 import numpy as np
 import pytest
 from gated_steps import GatedStepFilter
-from measured import FIELD, HAND, STAR, UP, drawn_start, recoveries, seen, series_of, unit
+from measured import FIELD, HAND, STAR, UP, drawn_start, errors, recoveries, seen, series_of, turn_to, unit
 
 from strapdown import consistency, estimation, montecarlo, quaternion, records
 from strapdown.estimation import error_states, forward, setup
@@ -36,23 +36,6 @@ SCALE = error_states.GyroScale(scale_sigma=0.01, misalignment_sigma=0.01)
 SWAY = error_states.GaussMarkov(sensor="acc", noise_sigma=0.2, correlation_time=1.0, unit="m/s²")
 
 
-@dataclasses.dataclass(frozen=True)
-class Mounting(error_states.ErrorStates):
-    """The axes of a sensor of whole attitudes are turned from the body's by a constant small angle."""
-
-    name: str = "mounting"
-    components: tuple[str, ...] = ("x", "y", "z")
-    units: tuple[str, ...] = ("rad",) * 3
-
-    @property
-    def sigma(self):
-        return np.full(3, 0.02)
-
-    @property
-    def effects(self):
-        return {"tracker": error_states.Effect(offset_b=np.eye(3))}
-
-
 CASES: dict[str, tuple[tuple[str, ...], tuple[error_states.ErrorStates, ...]]] = {
     "hard iron": (("mag", "acc"), (IRON,)),
     "all": (("mag", "acc"), (IRON, SCALE, SWAY)),
@@ -61,7 +44,7 @@ CASES: dict[str, tuple[tuple[str, ...], tuple[error_states.ErrorStates, ...]]] =
         (error_states.VectorBias(sensor="mag direction", bias_sigma=0.02),),
     ),
     "biased heading": (("compass", "star"), (error_states.VectorBias(sensor="compass", bias_sigma=0.02),)),
-    "mounting": (("tracker", "star"), (Mounting(),)),
+    "mounting": (("tracker", "star"), (error_states.VectorBias(sensor="tracker", bias_sigma=0.02),)),
 }
 """Which sensors measure, and the states."""
 
@@ -134,7 +117,7 @@ def measured(name, time, truth, rng, magnet) -> VectorMeasurements:
     if name == "star":
         reference = np.array([0.3, -0.2, 1.0])
         return series("direction", reference, unit(seen_by(unit(reference)) + white(3e-3)), 3e-3)
-    turned = quaternion.multiply(HAND.attitude(time), quaternion.exp(truth["mounting"]))
+    turned = quaternion.multiply(HAND.attitude(time), quaternion.exp(truth["tracker bias"]))
     value = quaternion.multiply(turned, quaternion.exp(white(3e-3)))
     return VectorMeasurements(
         sensor=name, kind="attitude", time=time, attitude=value, sigma_axes=np.full((len(time), 3), 3e-3)
@@ -501,8 +484,8 @@ def test_attitude_and_hard_iron_from_nothing_are_the_batch_solution(seed):
     rng = np.random.default_rng(seed)
     true, guess = unit(rng.standard_normal(4)), unit(rng.standard_normal(4))
     iron = 1e-6 * rng.standard_normal(3)
-    mag = quaternion.rotate(quaternion.conjugate(true), FIELD) + iron + 3e-7 * rng.standard_normal(3)
-    acc = quaternion.rotate(quaternion.conjugate(true), UP) + 0.05 * rng.standard_normal(3)
+    mag = seen(true, FIELD) + iron + 3e-7 * rng.standard_normal(3)
+    acc = seen(true, UP) + 0.05 * rng.standard_normal(3)
     start = estimation.initial_state(guess, attitude_sigma=UNIFORM_SIGMA, bias_sigma=BIAS_SIGMA)
     face = GatedStepFilter(NOISE, start, (IRON,), sensors=("mag", "acc"))
     face._passes = WIDE_PASSES
@@ -510,14 +493,14 @@ def test_attitude_and_hard_iron_from_nothing_are_the_batch_solution(seed):
     assert face.update_vector(acc, UP, 0.05, "acc")
 
     def residuals(p):
-        back = quaternion.conjugate(quaternion.multiply(true, quaternion.exp(p[:3])))
-        field = quaternion.rotate(back, FIELD) + 1e-6 * p[3:]
-        return np.concatenate([(mag - field) / 3e-7, (acc - quaternion.rotate(back, UP)) / 0.05, p[3:]])
+        q = quaternion.multiply(true, quaternion.exp(p[:3]))
+        field = seen(q, FIELD) + 1e-6 * p[3:]
+        return np.concatenate([(mag - field) / 3e-7, (acc - seen(q, UP)) / 0.05, p[3:]])
 
     found = least_squares(residuals, np.zeros(6), xtol=1e-14, ftol=1e-14, gtol=1e-14)
     best = quaternion.multiply(true, quaternion.exp(found.x[:3]))
     P = np.linalg.inv(found.jac.T @ found.jac)
-    turn = quaternion.log(quaternion.multiply(quaternion.conjugate(face.attitude), best))
+    turn = turn_to(face.attitude, best)
     error = np.concatenate([turn, found.x[3:] - 1e6 * face.values])
     assert np.max(np.abs(error) / np.sqrt(np.diag(P))) < 0.3
     kept, unit_of = [0, 1, 2, 6, 7, 8], np.array([1.0, 1.0, 1.0, 1e-6, 1e-6, 1e-6])
@@ -666,8 +649,7 @@ def test_a_setup_with_states_and_a_gate_recovers_and_reports_the_whole_bias(tmp_
     assert first.value >= 7
     assert [event.start for event in estimate.events] == sorted(event.start for event in estimate.events)
     assert {"gap", "recovery"} == {event.kind for event in estimate.events}
-    error = consistency.errors(estimate.attitude, estimate.bias, one.record.truth.attitude, one.record.truth.bias)
-    assert np.all(np.abs(error[-1]) < 4.5 * estimate.sigma[-1])
+    assert np.all(np.abs(errors(estimate, one.record.truth)[-1]) < 4.5 * estimate.sigma[-1])
     iron = estimate.error_states["mag bias"]
     assert np.all(np.abs(iron.values[-1] - one.truth[IRON.name]) < 4.5 * iron.sigma[-1])
 
@@ -678,12 +660,9 @@ def test_a_lever_arm_recovers():
     filter_setup = FilterSetup(process_noise=NOISE, bias_sigma=BIAS_SIGMA, states=states, gate=Gate())
     estimate = setup.run(one.record, filter_setup, lost(one.initial, 5), full_covariance=True)
     assert len(recoveries(estimate)) == 1
-    error = consistency.errors(estimate.attitude, estimate.bias, one.record.truth.attitude, one.record.truth.bias)
-    assert np.all(np.abs(error[-1]) < 4.5 * estimate.sigma[-1])
-    assert np.all(
-        np.abs(estimate.error_states["acc lever arm"].values[-1])
-        < 4.5 * estimate.error_states["acc lever arm"].sigma[-1]
-    )
+    assert np.all(np.abs(errors(estimate, one.record.truth)[-1]) < 4.5 * estimate.sigma[-1])
+    arm = estimate.error_states["acc lever arm"]
+    assert np.all(np.abs(arm.values[-1]) < 4.5 * arm.sigma[-1])
 
 
 def test_a_campaign_of_lost_starts_with_states_ends_consistent():

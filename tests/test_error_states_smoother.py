@@ -8,9 +8,10 @@ import math
 import numpy as np
 import pytest
 import scipy.linalg
-from measured import resting, series_of
+from measured import SWAY as BODY
+from measured import UP, recoveries, resting, seen, series_of, turn_to
 
-from strapdown import consistency, estimation, kinematics, motion, quaternion, records
+from strapdown import consistency, estimation, kinematics, quaternion, records
 from strapdown.estimation import error_states, forward, recovery_segments
 from strapdown.estimation.angular_acceleration import turning
 from strapdown.estimation.gating import Gate
@@ -19,7 +20,7 @@ from strapdown.estimation.states import ProcessNoise
 from strapdown.records import ImuRecord
 from strapdown.vectors import VectorMeasurements
 
-UP, FIELD = np.array([0.0, 0.0, 9.81]), np.array([0.0, 0.6, -0.8])
+FIELD = np.array([0.0, 0.6, -0.8])
 
 
 # --------------------------------------------------------------------------------------------- one least-squares problem over the record
@@ -98,9 +99,9 @@ def root_inverse(P):
 def predicted_vectors(blocks, series, q, c, W):
     a, d, U, lever = effects_on(blocks, series.sensor)
     r = series.reference_f + np.einsum("mk,ki->mi", c, d)
-    seen = quaternion.rotate(quaternion.conjugate(q), r)
-    seen = seen + np.einsum("mk,kij,mj->mi", c, U, seen) + c @ a
-    return seen + np.einsum("mij,kj,mk->mi", W, lever, c)
+    z = seen(q, r)
+    z = z + np.einsum("mk,kij,mj->mi", c, U, z) + c @ a
+    return z + np.einsum("mij,kj,mk->mi", W, lever, c)
 
 
 def turning_matrices(blocks, record, series):
@@ -124,11 +125,11 @@ def optimum(small: Small, guess: np.ndarray, q0: np.ndarray):
 
     def residuals(x):
         q, b, c = quaternion.multiply(q0, quaternion.exp(x[:, :3])), x[:, 3:6], x[:, 6:]
-        off = quaternion.log(quaternion.multiply(quaternion.conjugate(initial.attitude), q[0]))
+        off = turn_to(initial.attitude, q[0])
         there = quaternion.multiply(
             q[:-1], quaternion.exp(turns_of(blocks, record.increments, dt, q[:-1], b[:-1], c[:-1]))
         )
-        step = quaternion.log(quaternion.multiply(quaternion.conjugate(there), q[1:]))
+        step = turn_to(there, q[1:])
         step = np.concatenate([step, np.diff(b, axis=0), c[1:] - c[:-1] @ phi.T], axis=1)
         parts = [
             prior @ np.concatenate([off, b[0] - initial.bias, c[0] - initial.values]),
@@ -180,7 +181,7 @@ def beside_the_optimum(small: Small, attitude: np.ndarray, rest: np.ndarray, P: 
                 T[:, 6 + own, :3] = kinematics.skew(right[:, 3 + own]) @ quaternion.to_matrix(q)
             covariance = T @ covariance @ np.swapaxes(T, 1, 2)
     sigma = np.sqrt(np.einsum("kii->ki", covariance))
-    off = quaternion.log(quaternion.multiply(quaternion.conjugate(attitude), q))
+    off = turn_to(attitude, q)
     off = np.concatenate([off, right - rest], axis=1)
     return np.abs(off) / sigma, np.sqrt(np.einsum("kii->ki", P)) / sigma
 
@@ -303,8 +304,8 @@ def test_a_correction_by_a_radian_is_carried_back_with_all_that_turns():
     found = []
     for run, at in ((estimation.smooth, 1.0), (estimation.run, 0.0)):
         acc = series_of("acc", "vector", [at], [felt], UP, 0.05)
-        seen = VectorMeasurements(sensor="seen", kind="attitude", time=[at], attitude=[true], sigma=0.05)
-        record = resting(acc, seen)
+        tracker = VectorMeasurements(sensor="seen", kind="attitude", time=[at], attitude=[true], sigma=0.05)
+        record = resting(acc, tracker)
         found.append(run(record, still, initial, blocks, full_covariance=True))
     assert difference(*found, 0, 0) < 1e-6
 
@@ -342,12 +343,6 @@ SWAY = error_states.GaussMarkov(sensor="acc", noise_sigma=0.3, correlation_time=
 MOVED = error_states.BoundedVelocity(
     sensor="acc", velocity_time=0.3, velocity_sigma=0.1, acceleration_time=0.1, strength=1.0
 )
-BODY = motion.HarmonicRates(
-    harmonics=(
-        motion.Harmonic(amplitude=(0.9, 0.4, -0.6), frequency=0.21),
-        motion.Harmonic(amplitude=(-0.4, 0.8, 0.5), frequency=0.37),
-    )
-)
 
 
 def swaying(duration=2.0, seed=1, start_error=(0.05, -0.02, 0.03)):
@@ -360,9 +355,8 @@ def swaying(duration=2.0, seed=1, start_error=(0.05, -0.02, 0.03)):
         ("acc", UP, 0.05, np.arange(0.013, duration, 0.11)),
         ("mag", FIELD, 0.02, np.nextafter(time[5::10], np.where(np.arange(len(time[5::10])) % 3 == 0, 9.0, 0.0))),
     ):
-        seen = quaternion.rotate(quaternion.conjugate(BODY.attitude(at)), reference)
-        seen = seen + sigma * rng.standard_normal(seen.shape)
-        series.append(series_of(name, "vector", at, seen, reference, sigma))
+        z = seen(BODY.attitude(at), reference)
+        series.append(series_of(name, "vector", at, z + sigma * rng.standard_normal(z.shape), reference, sigma))
     attitude = quaternion.multiply(BODY.attitude(np.array(0.0)), quaternion.exp(start_error))
     truth = records.Truth(attitude=BODY.attitude(time), bias=np.zeros((len(time), 3)))
     record = ImuRecord(time=time, increments=turns, vectors=tuple(series), truth=truth)
@@ -375,7 +369,7 @@ def difference(one, other, k=slice(None), j=slice(None)):
         e.covariance[r] if e.whole_covariance is None else e.whole_covariance[r] for e, r in ((one, k), (other, j))
     )
     sigma = np.sqrt(np.einsum("...ii->...i", theirs))
-    off = quaternion.log(quaternion.multiply(quaternion.conjugate(one.attitude[k]), other.attitude[j]))
+    off = turn_to(one.attitude[k], other.attitude[j])
     parts = [off, one.bias[k] - other.bias[j]]
     parts += [block.values[k] - other.error_states[name].values[j] for name, block in one.error_states.items()]
     P = (mine - theirs) / (sigma[..., :, None] * sigma[..., None, :])
@@ -420,12 +414,6 @@ STILL = error_states.VectorBias(sensor="mag", bias_sigma=0.05)
 GATE = Gate(recovery=4, restart_bias_sigma=3e-3)
 
 
-def recovery_of(estimate):
-    found = [event for event in estimate.events if event.kind == "recovery"]
-    assert len(found) == 1
-    return found[0]
-
-
 def test_a_part_of_a_record_between_any_two_times():
     record, _ = swaying()
     mag = record.vectors[1]
@@ -446,7 +434,7 @@ def test_what_is_smoothed_of_a_recovery_and_what_is_not():
     record, iron, initial = lost_start(1)
     ahead = estimation.run(record, NOISE, initial, (STILL,), gate=GATE, full_covariance=True)
     both = estimation.smooth(record, NOISE, initial, (STILL,), gate=GATE, full_covariance=True)
-    event = recovery_of(ahead)
+    (event,) = recoveries(ahead)
     assert both.events == ahead.events
     assert both.innovations["mag"].weight == pytest.approx(ahead.innovations["mag"].weight)
     first, last = np.searchsorted(record.time, [event.start, event.end])
@@ -506,7 +494,7 @@ def test_a_trajectory_begins_with_its_candidate(lost, since, blocks):
     ahead = estimation.run(record, NOISY, initial, blocks, gate=gate)
     both = estimation.smooth(record, NOISY, initial, blocks, gate=gate, full_covariance=True)
     begin = record.time[since]
-    assert begin - recovery_of(both).start == pytest.approx(0.08)
+    assert begin - recoveries(both)[0].start == pytest.approx(0.08)
     rest = ImuRecord(
         time=record.time[since:],
         increments=record.increments[since:],
@@ -547,7 +535,8 @@ def test_the_parts_about_a_recovery_keep_the_unit_of_the_start():
         )
         found.append(estimation.smooth(record, NOISE, start, blocks, gate=GATE))
     one, other = found
-    assert recovery_of(one) == recovery_of(other)
+    assert recoveries(one) == recoveries(other)
+    assert len(recoveries(one)) == 1
     np.testing.assert_allclose(one.attitude, other.attitude, rtol=0, atol=1e-10)
     np.testing.assert_allclose(one.variance, other.variance, rtol=1e-7)
 

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 import scipy.integrate
 import scipy.linalg
-from measured import series_of
+from measured import UP, drawn_start, seen, series_of, unit
 
 from sims import hand_held
-from strapdown import ahrs, consistency, estimation, kinematics, motion, quaternion, records, scenarios
+from strapdown import ahrs, consistency, estimation, kinematics, motion, quaternion, scenarios
 from strapdown.checks import InputError
 from strapdown.consistency import reference_errors
 from strapdown.estimation import error_states, setup
@@ -28,12 +28,11 @@ from strapdown.estimation.step_filter import StepFilter
 from strapdown.gyro import GyroSpec
 from strapdown.kernels.gate_rules import WIDE_PASSES
 from strapdown.recordings import Recording, read
-from strapdown.records import ImuRecord
+from strapdown.records import ImuRecord, Truth
 from strapdown.units import DEGREE
 from strapdown.vectors import Accelerometer
 
 NOISE = ProcessNoise(angle_random_walk=2e-3, rate_random_walk=1e-4)
-UP = np.array([0.0, 0.0, 9.81])
 HAND = motion.HarmonicRates(
     harmonics=(
         motion.Harmonic(amplitude=(1.1, 0.3, -0.4), frequency=0.21),
@@ -336,25 +335,15 @@ def record_of(
     every = np.union1d(np.round(edges, 9), np.round(time, 9))
     path = acceleration_path(block, every, rng)
     felt = path["acceleration"][np.searchsorted(every, np.round(time, 9))] + UP
-    inverse = quaternion.conjugate(HAND.attitude(time))
-    force = quaternion.rotate(inverse, felt) + sigma * rng.standard_normal((len(time), 3))
+    force = seen(HAND.attitude(time), felt) + sigma * rng.standard_normal((len(time), 3))
     north = np.array([0.0, 1.0, 0.0])
-    compass = quaternion.rotate(quaternion.conjugate(HAND.attitude(edges[5::10])), north)
+    compass = seen(HAND.attitude(edges[5::10]), north)
     compass = compass + 0.05 * rng.standard_normal(compass.shape)
-    whole = kind == "vector"
-    series = (
-        series_of(
-            "acc",
-            kind,
-            time,
-            force if whole else force / np.linalg.norm(force, axis=1, keepdims=True),
-            UP,
-            sigma / (1.0 if whole else 9.81),
-        ),
-        series_of(
-            "compass", "heading", edges[5::10], compass / np.linalg.norm(compass, axis=1, keepdims=True), north, 0.05
-        ),
-    )
+    if kind == "vector":
+        acc = series_of("acc", kind, time, force, UP, sigma)
+    else:
+        acc = series_of("acc", kind, time, unit(force), UP, sigma / 9.81)
+    series = acc, series_of("compass", "heading", edges[5::10], unit(compass), north, 0.05)
     truth = {"attitude": HAND.attitude(edges), "bias": bias}
     truth["states"] = path["states"][np.searchsorted(every, np.round(edges, 9))]
     return ImuRecord(time=edges, increments=increments, vectors=series), truth
@@ -385,18 +374,6 @@ def test_no_time_changes_nothing(option):
     for block in BLOCKS[option]:
         assert np.array_equal(block.transition(0.0), np.eye(block.size))
         assert np.array_equal(block.process_noise(0.0), np.zeros((block.size, block.size)))
-
-
-def test_a_record_may_be_cut_anywhere():
-    block = (block_of("position"),)
-    record, _ = record_of(block[0], duration=2.0)
-    whole = estimation.run(record, NOISE, start(), block)
-    first, middle = estimation.run_part(records.cut(record, 0, 77), NOISE, start(), block)
-    second = estimation.run(records.cut(record, 77, 200), NOISE, middle, block)
-    name = block[0].name
-    np.testing.assert_array_equal(second.attitude[-1], whole.attitude[-1])
-    np.testing.assert_array_equal(second.error_states[name].values[-1], whole.error_states[name].values[-1])
-    np.testing.assert_array_equal(first.error_states[name].values[-1], whole.error_states[name].values[77])
 
 
 # ---------------------------------------------------------------------------------------------- smoother, observability, gaps
@@ -450,16 +427,10 @@ def test_the_smoother_is_one_least_squares_problem(poles):
     increments = small * 1e-3 * rng.standard_normal((40, 3))
     felt = UP + small * rng.standard_normal((13, 3))
     east = small * 0.05 * rng.standard_normal(8)
+    north = np.stack([np.sin(east), np.cos(east), np.zeros(8)], axis=-1)
     series = (
         series_of("acc", "vector", time[2::3], felt, UP, 0.05),
-        series_of(
-            "compass",
-            "heading",
-            time[4::5],
-            np.stack([np.sin(east), np.cos(east), np.zeros(8)], axis=-1),
-            [0.0, 1.0, 0.0],
-            0.05,
-        ),
+        series_of("compass", "heading", time[4::5], north, [0.0, 1.0, 0.0], 0.05),
     )
     record = ImuRecord(time=time, increments=increments, vectors=series)
     initial = estimation.initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=0.03, bias_sigma=3e-3)
@@ -534,14 +505,8 @@ def judged(
         record, truth = record_of(truth_block, seed, duration=duration)
         series = (dataclasses.replace(record.vectors[0], sigma=np.full(len(record.vectors[0].time), sigma)),)
         record = dataclasses.replace(record, vectors=series + record.vectors[1:])
-        rng = np.random.default_rng(1000 + seed)
-        error = rng.standard_normal(6) * np.repeat([0.03, 3e-3], 3)
-        initial = estimation.initial_state(
-            quaternion.multiply(truth["attitude"][0], quaternion.exp(-error[:3])),
-            attitude_sigma=0.03,
-            bias=truth["bias"][0] - error[3:],
-            bias_sigma=3e-3,
-        )
+        known = Truth(attitude=truth["attitude"], bias=truth["bias"])
+        initial = drawn_start(known, np.random.default_rng(1000 + seed).standard_normal(6), 0.03, 3e-3)
         face = estimation.smooth if smoothed else estimation.run
         estimate = face(record, NOISE, initial, blocks, full_covariance=True)
         epochs = (np.linspace(0.5, 0.97, 5) * (len(record.time) - 1)).astype(int)

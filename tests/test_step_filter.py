@@ -19,7 +19,6 @@ from strapdown.estimation.states import ProcessNoise, initial_state
 from strapdown.estimation.step_filter import StepFilter
 from strapdown.gyro import GyroSpec
 from strapdown.randomness import generator
-from strapdown.records import ImuRecord
 from strapdown.scenarios import Scenario, simulate
 from strapdown.vectors import AttitudeSensor, Faults, VectorMeasurements, VectorSensor
 
@@ -280,39 +279,44 @@ def test_a_vertical_measured_heading_is_skipped_and_counted(options):
     assert f.update_heading(X, X, 0.1, sensor="north")
 
 
+UNBIASED = (error_states.VectorBias(sensor="up", bias_sigma=1e-3),)
+
+
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("options", VERTICAL_OPTIONS, ids=["plain", "gate", "robust"])
-def test_both_faces_skip_a_vertical_heading_alike(options):
+@pytest.mark.parametrize("blocks", [(), UNBIASED], ids=["no states", "states"])
+def test_both_faces_skip_a_vertical_heading_and_a_missing_sample_alike(blocks, options):
     """One heading in two is measured of a vertical vector; the run is that of the record without them, and says how many."""
     time = 0.1 * np.arange(1.0, 9.0)
-    vertical = np.arange(8) % 2 == 0
-    seen = np.where(vertical[:, None], UP, X)
-    north = series_of("north", "heading", time, seen, X, 0.1)
-    up = series_of("up", "direction", time, [UP] * 8, UP, 0.1)
-    edges = ImuRecord(time=np.linspace(0.0, 1.0, 11), increments=np.zeros((10, 3)), vectors=(north, up))
-    rest = replace(edges, vectors=(north.taken(~vertical), up))
-    both, without = (estimation.run(r, NOISE, start(), full_covariance=True, **options) for r in (edges, rest))
-    assert both.skipped == {"north": 4, "up": 0}
+    vertical, lost = np.arange(8) % 2 == 0, np.arange(8) == 3
+    seen, up = np.where(vertical[:, None], UP, X), np.where(lost[:, None], np.nan, UP)
+    north, level = series_of("north", "heading", time, seen, X, 0.1), series_of("up", "direction", time, up, UP, 0.1)
+    edges = resting(north, level, time=np.linspace(0.0, 1.0, 11))
+    rest = replace(edges, vectors=(north.taken(~vertical), level.taken(~lost)))
+    both, without = (estimation.run(r, NOISE, start(), blocks, full_covariance=True, **options) for r in (edges, rest))
+    assert both.skipped == {"north": 4, "up": 1}
     assert both.refused == {"north": 0, "up": 0}
     assert both.events == without.events
     assert np.array_equal(both.innovations["north"].time, time[~vertical])
     assert np.array_equal(both.innovations["north"].nis, without.innovations["north"].nis)
     assert np.array_equal(both.covariance, without.covariance)
-    f = GatedStepFilter(NOISE, start(), **options)
+    assert estimation.smooth(edges, NOISE, start(), blocks, **options).skipped == both.skipped
+    f = GatedStepFilter(NOISE, start(), blocks, sensors=("north", "up"), **options)
     for k, t in enumerate(time):
         f.predict(np.zeros(3), time=t)
         f.update_heading(seen[k], X, 0.1, sensor="north")
-        f.update_direction(UP, UP, 0.1, sensor="up")
-    assert f.skipped == {"north": 4}
-    assert np.allclose(f.P, both.covariance[8], rtol=1e-10, atol=1e-18)
+        f.update_direction(up[k], UP, 0.1, sensor="up")
+    assert f.skipped == both.skipped
+    assert np.allclose(f.P[:6, :6], both.covariance[8], rtol=1e-10, atol=1e-18)
 
 
 NAN = np.full(3, np.nan)
 
 
+@pytest.mark.parametrize("blocks", [(), UNBIASED], ids=["no states", "states"])
 @pytest.mark.parametrize("kind", ["direction", "vector", "heading", "attitude"])
-def test_a_missing_sample_is_skipped_and_counted(kind):
-    f = StepFilter(NOISE, start())
+def test_a_missing_sample_is_skipped_and_counted(kind, blocks):
+    f = StepFilter(NOISE, start(), blocks, sensors=("up", "s"))
     f.predict(np.zeros(3), time=0.5)
     P, noise = f.P.copy(), np.nan
     for value in (NAN, [0.0, np.nan, 1.0]):
@@ -323,8 +327,8 @@ def test_a_missing_sample_is_skipped_and_counted(kind):
         assert taken is False
     assert f.skipped == {"s": 2}
     assert np.array_equal(f.P, P)
-    for bad in (lambda: f.update_direction([np.inf, 0.0, 0.0], X, 0.1), lambda: f.update_direction(X, X, np.nan)):
-        refusal(bad)
+    for value, sigma in (([np.inf, 0.0, 0.0], 0.1), (X, np.nan)):
+        refusal(lambda value=value, sigma=sigma: f.update_direction(value, X, sigma, "s"))
 
 
 def test_missing_attitudes_are_counted_and_leave_the_others_as_they_are():
@@ -429,6 +433,11 @@ WRONG = {
         r"bias_sigma has shape \(2,\)",
     ),
     "sigma in words": (lambda: initial_state(IDENTITY, attitude_sigma="1°", bias_sigma=1.0), "attitude_sigma is not"),
+    "a bare block": (lambda: StepFilter(NOISE, start(), UNBIASED[0]), "single declaration .*; give a tuple"),
+    "a bare block of a start": (
+        lambda: estimation.with_error_states(start(), UNBIASED[0]),
+        "single declaration .*; give a tuple",
+    ),
     "sigma (2,)": (lambda: StepFilter(NOISE, start()).update_direction(X, X, [0.1, 0.1]), r"sigma has shape \(2,\)"),
     "sigma (3, 3)": (lambda: StepFilter(NOISE, start()).update_direction(X, X, np.eye(3)), "as covariance"),
     "a bare series": (lambda: replace(RECORD, vectors=SERIES), r"\(series,\)"),

@@ -7,12 +7,13 @@ import json
 
 import numpy as np
 import pytest
+from measured import FIELD
+from two_stars import drawn_case as case_of
 
 from strapdown import covariance, gyro, montecarlo, motion, quaternion, scenarios, tuning, units, vectors
 from strapdown.checks import InputError
 from strapdown.estimation import setup
 from strapdown.montecarlo import lanes
-from strapdown.montecarlo.scalar import start
 from strapdown.recordings import recordfiles
 from strapdown.scenarios import Scenario
 from strapdown.tuning import parameters
@@ -20,7 +21,6 @@ from strapdown.tuning import parameters
 ARCSEC = units.ARCSECOND
 STAR = np.array([10.0, 10.0, 60.0]) * ARCSEC
 AXES = ("star.sigma.x", "star.sigma.y", "star.sigma.z")
-FIELD = np.array([0.0, 2e-5, -4e-5])
 SWAY = motion.HarmonicRates(
     harmonics=(
         motion.Harmonic(amplitude=(0.8, 0.2, -0.3), frequency=0.21),
@@ -51,11 +51,6 @@ def swaying(kind="vector", duration=40.0) -> Scenario:
         rate=20.0,
         duration=duration,
     )
-
-
-def case_of(scenario, chosen, seed) -> tuning.Case:
-    record = scenarios.simulate(scenario, seed)
-    return tuning.Case(record=record, initial=start(record, chosen, seed, 0), name=f"seed {seed}")
 
 
 # -------------------------------------------------------------------------------------------------------------- the modelled noise
