@@ -101,6 +101,11 @@ def errors(estimate, truth, every=1):
     return consistency.errors(estimate.attitude, estimate.bias, truth.attitude[::every], truth.bias[::every])
 
 
+def errors_at(estimate, truth, rows):
+    """Return the errors at rows of an estimate that holds every edge."""
+    return consistency.errors(estimate.attitude[rows], estimate.bias[rows], truth.attitude[rows], truth.bias[rows])
+
+
 def recoveries(estimate):
     """Return the recoveries among the events of an estimate."""
     return [event for event in estimate.events if event.kind == "recovery"]
@@ -109,3 +114,9 @@ def recoveries(estimate):
 def correlation(P, sigma):
     """Return a covariance, or a difference of two, over the product of the σ of its states."""
     return P / (sigma[..., :, None] * sigma[..., None, :])
+
+
+def assert_inside(mean, degrees, samples, probability=0.99) -> None:
+    """Assert that means of NEES or NIS over their degrees of freedom lie inside their two-sided bounds."""
+    low, high = consistency.mean_bounds(degrees, samples, probability)
+    assert np.all((low < mean) & (mean < high)), (mean, low, high)

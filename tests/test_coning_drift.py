@@ -92,13 +92,7 @@ def test_one_sample_drift_is_exact_at_any_angle():
     )
 
 
-@pytest.mark.parametrize(
-    ("angle_degrees", "ratio"),
-    [
-        (3.0, 0.6),
-        (45.0, 0.02),
-    ],
-)
+@pytest.mark.parametrize(("angle_degrees", "ratio"), [(3.0, 0.6), (45.0, 0.02)])
 def test_own_best_beats_every_published_algorithm(angle_degrees, ratio):
     """Lower drift and lower periodic error than any algorithm published, or at rounding. The sim covers the whole grid."""
     angle = math.radians(angle_degrees)

@@ -249,9 +249,7 @@ def scenario():
 @pytest.fixture(scope="module")
 def plan():
     filter_setup = setup.FilterSetup(
-        process_noise=ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-6),
-        attitude_sigma=2e-3,
-        bias_sigma=1e-4,
+        process_noise=ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-6), attitude_sigma=2e-3, bias_sigma=1e-4
     )
     return montecarlo.Plan(scenario=scenario(), setup=filter_setup, seed=3, epochs=20, nis_bins=10)
 
@@ -340,11 +338,7 @@ def test_bounds_are_those_that_decide(plan):
 
 @pytest.mark.parametrize(
     ("made", "status", "verdict"),
-    [
-        ({}, 0, "consistent: none"),
-        ({"scale": 1.3}, 1, "not consistent: "),
-        ({"samples": 8}, 2, "cannot tell: "),
-    ],
+    [({}, 0, "consistent: none"), ({"scale": 1.3}, 1, "not consistent: "), ({"samples": 8}, 2, "cannot tell: ")],
 )
 def test_check_ends_with_the_status_of_the_verdict(run, tmp_path, made, status, verdict):
     result, _ = estimate(**made)

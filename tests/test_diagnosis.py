@@ -47,13 +47,7 @@ def scenario(gyro=None, magnetometer=None, star=None) -> scenarios.Scenario:
                 **{"name": "magnetometer", "field_f": FIELD, "sigma": 1e-7, "rate": 10.0, **(magnetometer or {})}
             ),
             vectors.VectorSensor(
-                **{
-                    "name": "star",
-                    "reference_f": np.array([0.0, 0.6, 0.8]),
-                    "sigma": 1e-3,
-                    "rate": 5.0,
-                    **(star or {}),
-                }
+                **{"name": "star", "reference_f": np.array([0.0, 0.6, 0.8]), "sigma": 1e-3, "rate": 5.0, **(star or {})}
             ),
         ),
         rate=50.0,
@@ -173,11 +167,7 @@ CASES = {
         near=1.5e-3,
     ),
     "gyro misalignment": Case(
-        "misalignment",
-        "gyro",
-        scenario({"misalignment": SKEWED}),
-        estimate=SKEWED[~np.eye(3, dtype=bool)],
-        near=2e-3,
+        "misalignment", "gyro", scenario({"misalignment": SKEWED}), estimate=SKEWED[~np.eye(3, dtype=bool)], near=2e-3
     ),
     "star mounting": Case(
         "mounting",

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 from measured import SWAY as BODY
-from measured import UP, recoveries, resting, seen, series_of, turn_to
+from measured import UP, assert_inside, recoveries, resting, seen, series_of, turn_to
 
 from strapdown import consistency, estimation, kinematics, quaternion, records
 from strapdown.estimation import error_states, forward, recovery_segments
@@ -333,8 +333,7 @@ def pushed(kind: str, runs: int) -> np.ndarray:
 def test_what_is_carried_is_consistent(kind):
     """Of a heading found at the end; without the turn carried along, the filter's push of several tenths of g was off by 3 of its σ."""
     found = pushed(kind, 60)
-    low, high = consistency.mean_bounds(CARRIED[kind].size, 60, 0.999)
-    assert np.all((low < found.mean(axis=0)) & (found.mean(axis=0) < high)), found.mean(axis=0)
+    assert_inside(found.mean(axis=0), CARRIED[kind].size, 60, 0.999)
 
 
 NOISE = ProcessNoise(angle_random_walk=1e-3, rate_random_walk=1e-4)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import scipy.integrate
 import scipy.linalg
-from measured import UP, drawn_start, seen, series_of, unit
+from measured import UP, assert_inside, drawn_start, seen, series_of, unit
 
 from sims import hand_held
 from strapdown import ahrs, consistency, estimation, kinematics, motion, quaternion, scenarios
@@ -436,10 +436,7 @@ def test_the_smoother_is_one_least_squares_problem(poles):
     initial = estimation.initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=0.03, bias_sigma=3e-3)
     found = estimation.smooth(record, NOISE, initial, (block,), full_covariance=True)
     wanted, variance = least_squares(record, block)
-    values = np.concatenate(
-        [quaternion.log(found.attitude), found.bias, found.error_states[block.name].values],
-        axis=1,
-    )
+    values = np.concatenate([quaternion.log(found.attitude), found.bias, found.error_states[block.name].values], axis=1)
     sigma = np.sqrt(variance)
     assert np.max(np.abs(values - wanted) / sigma) < 1e-3 * np.max(np.abs(wanted) / sigma)
     np.testing.assert_allclose(np.einsum("kii->ki", found.whole_covariance), variance, rtol=1e-4)
@@ -569,8 +566,7 @@ def test_consistency_over_many_runs(poles, smoothed):
     found = judged(poles, "bounded velocity", 400, 6.0, smoothed, speed=0.1)
     size = block_of(poles).size
     for part, degrees in (("attitude", 3), ("bias", 3), ("block", size), ("all", 6 + size)):
-        low, high = consistency.mean_bounds(degrees, 400, 0.999)
-        assert low < found[part][:, -1].mean() < high, (part, found[part].mean(axis=0), low, high)
+        assert_inside(found[part][:, -1].mean(), degrees, 400, 0.999)
 
 
 @pytest.mark.parametrize("passes", [1, WIDE_PASSES], ids=["once", "iterated"])

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib.util
 import json
 import pkgutil
-import sys
 from functools import cache
-from pathlib import Path
 
 import mpmath
 import numpy as np
@@ -21,6 +18,7 @@ from scipy.linalg import expm, solve_discrete_are
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
+from sims import filter_family as comparison
 from strapdown import consistency, estimation, kinematics, motion, quaternion
 from strapdown.checks import InputError
 from strapdown.consistency import Verdict
@@ -655,11 +653,7 @@ def test_the_equivariant_error_does_not_hang_on_the_trajectory(name):
             increments[k] = (body_rate + b) * dt
             R = R @ expm(kinematics.skew(body_rate * dt))
         to_body = np.kron(np.eye(2), quaternion.to_matrix(q).T)  # δθ = Rᵀ δφ, δb = Rᵀ β
-        true = estimation.State(
-            attitude=quaternion.multiply(E, q),
-            bias=b + seen(q, epsilon),
-            covariance=np.eye(6),
-        )
+        true = estimation.State(attitude=quaternion.multiply(E, q), bias=b + seen(q, epsilon), covariance=np.eye(6))
         own = estimation.State(attitude=q, bias=b, covariance=to_body @ M @ M.T @ to_body.T)
         record = ImuRecord(time=time, increments=increments, vectors=())
         truth = filters.run(name, record, noise, true)
@@ -1198,18 +1192,7 @@ def test_comparing_all_is_one_line_with_a_table():
             filters.compare(record, BELIEF, initial, filters=names)
 
 
-@pytest.fixture(scope="module")
-def comparison():
-    spec = importlib.util.spec_from_file_location(
-        "filter_family", Path(__file__).parents[1] / "sims" / "filter_family.py"
-    )
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["filter_family"] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-def test_study_runs_small_and_draws(comparison, tmp_path):
+def test_study_runs_small_and_draws(tmp_path):
     result = comparison.main(**comparison.SMALL, out=tmp_path)
     assert [path.name for path in result.figures] == ["filter_family.png"]
     assert (tmp_path / "filter_family.png").exists()
@@ -1225,7 +1208,7 @@ def test_study_runs_small_and_draws(comparison, tmp_path):
     assert all(line in text for line in saved["findings"])
 
 
-def test_findings_are_those_of_the_numbers(comparison):
+def test_findings_are_those_of_the_numbers():
     """Errors and NEES made up: the quicker, the more accurate and the consistent one are three filters."""
     time = np.arange(0.0, 101.0)
 

@@ -23,29 +23,19 @@ import strapdown as sd
 from strapdown import results
 
 NAMES = {
-    "FilterSetup",
-    "Gate",
-    "GyroSpec",
-    "InputError",
-    "LiveFilter",
-    "ProcessNoise",
-    "Robust",
-    "Scenario",
-    "StepFilter",
-    "VectorSensor",
-    "allan_deviation",
-    "check",
-    "covariance_analysis",
-    "estimate",
-    "fit_noise",
-    "initial_state",
-    "integrate",
-    "monte_carlo",
-    "read",
-    "simulate",
-    "smooth",
-    "tune",
-    "write",
+    *(
+        "FilterSetup",
+        "Gate",
+        "GyroSpec",
+        "InputError",
+        "LiveFilter",
+        "ProcessNoise",
+        "Robust",
+        "Scenario",
+        "StepFilter",
+    ),
+    *("VectorSensor", "allan_deviation", "check", "covariance_analysis", "estimate", "fit_noise", "initial_state"),
+    *("integrate", "monte_carlo", "read", "simulate", "smooth", "tune", "write"),
 }
 
 
@@ -202,18 +192,8 @@ def test_estimate_of_a_record_is_that_of_the_command(tmp_path, options, keywords
 
 def test_estimate_of_a_recording_is_that_of_the_command(tmp_path):
     path = phone_recording(tmp_path)
-    run_command(
-        "estimate",
-        path,
-        "--gyro-unit",
-        "deg/s",
-        "--accelerometer-unit",
-        "g",
-        "--time-unit",
-        "s",
-        "--out",
-        tmp_path / "o",
-    )
+    units = ("--gyro-unit", "deg/s", "--accelerometer-unit", "g", "--time-unit", "s")
+    run_command("estimate", path, *units, "--out", tmp_path / "o")
     command = sd.read(tmp_path / "o" / "estimate.h5")
     call = sd.estimate(sd.read(path, units={"time": "s", "gyro": "deg/s", "accelerometer": "g"}))
     np.testing.assert_array_equal(call.attitude, command.attitude)
@@ -497,17 +477,8 @@ def test_dir_shows_the_names_and_the_public_submodules_alone():
     package = Path(sd.__file__).parent
     present = {path.stem for path in package.iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()}
     assert modules <= present
-    assert not modules & {
-        "kernels",
-        "cli",
-        "checks",
-        "files",
-        "tables",
-        "equality",
-        "reading",
-        "workflows",
-        "randomness",
-    }
+    private = {"kernels", "cli", "checks", "files", "tables", "equality", "reading", "workflows", "randomness"}
+    assert not modules & private
     for name in shown:
         assert getattr(sd, name) is not None
     with pytest.raises(AttributeError, match="mekf"):
@@ -559,32 +530,26 @@ def test_type_checkers_see_what_is_there():
     assert {name: home for name, home in seen.items() if home} == sd._HOMES
 
 
+def python(*arguments, **options):
+    """Return the words that another interpreter prints."""
+    command = [sys.executable, *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=True, timeout=60, **options).stdout.split()
+
+
 def test_import_loads_nothing_else():
     code = "import sys; before = set(sys.modules); import strapdown; print(sorted(set(sys.modules) - before))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
-    assert done.stdout.split() == ["['strapdown']"]
+    assert python("-c", code) == ["['strapdown']"]
 
 
 # ----------------------------------------------------------------------------------------------------------------- the program
 
 
 def test_python_dash_m_is_the_program():
-    done = subprocess.run(
-        [sys.executable, "-m", "strapdown", "--version"], capture_output=True, text=True, check=True, timeout=60
-    )
-    assert done.stdout.split() == ["strapdown", sd.__version__]
+    assert python("-m", "strapdown", "--version") == ["strapdown", sd.__version__]
 
 
 def test_shells_complete_commands():
     """As a shell asks: the words so far in the environment, the program's own name before them."""
     words = {"_STRAPDOWN_COMPLETE": "complete_bash", "COMP_WORDS": "strapdown mon", "COMP_CWORD": "1"}
     code = "import sys; sys.argv = ['strapdown']; from strapdown.__main__ import main; main()"
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        capture_output=True,
-        text=True,
-        check=True,
-        timeout=60,
-        env={**os.environ, **words},
-    )
-    assert done.stdout.split() == ["montecarlo"]
+    assert python("-c", code, env={**os.environ, **words}) == ["montecarlo"]

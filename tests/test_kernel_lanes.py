@@ -13,7 +13,7 @@ import plain_kernels
 import pytest
 from numba.core.errors import TypingError
 
-from strapdown.kernels import integration, lane_values, machine, rotation
+from strapdown.kernels import lane_values
 from strapdown.kernels.algebra import square_root
 from strapdown.kernels.filter_step import predict, update_direction
 from strapdown.kernels.lane_angles import arctangent, inverse_root, rotation_vector
@@ -445,16 +445,7 @@ def stepped_scalars(rows, inputs, variance, out):
     q = (rows[0], rows[1], rows[2], rows[3])
     q, A, B, C = predict(q, b, A, B, C, (inputs[0], inputs[1], inputs[2]), 0.01, 1e-8, 1e-12)
     q, b, A, B, C, e1, s1, e2, s2 = update_direction(
-        q,
-        b,
-        A,
-        B,
-        C,
-        rotation_matrix(q),
-        (1.0, 0.0, 0.0),
-        (0.0, 1.0, 0.0),
-        (inputs[3], inputs[4], inputs[5]),
-        variance,
+        q, b, A, B, C, rotation_matrix(q), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (inputs[3], inputs[4], inputs[5]), variance
     )
     for i in range(4):
         out[i] = q[i]
@@ -536,18 +527,3 @@ def test_bits_do_not_depend_on_the_width_of_the_machine():
     here: dict = {}
     exec(BITS, here)
     assert digest_on("haswell", "+avx2,+fma,-avx512f") == here["digest"]  # four lanes an instruction, not eight
-
-
-def test_the_block_equals_one_chain():
-    n = integration.BLOCK + 100
-    vectors = 0.02 * RANDOM.standard_normal((n, 3))
-    attitude = np.empty((n + 1, 4))
-    initial = np.array([0.6, 0.0, 0.8, 0.0])
-    machine.compiled(integration.accumulate_vectors)(
-        vectors.reshape(-1), initial, np.empty(integration.WORK), attitude.reshape(-1)
-    )
-    q = tuple(initial)
-    for k in range(n):
-        q = rotation.turned(q, tuple(vectors[k]))
-        # Each of the products before it has rounded once, in one order or the other.
-        np.testing.assert_allclose(attitude[k + 1], q, rtol=0.0, atol=4e-16 * math.sqrt(k + 1))

@@ -8,28 +8,20 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import fields, replace
+from dataclasses import replace
 
-import numpy as np
 import pytest
+from spin_plan import PLAN, SCENARIO, assert_same
 
 import strapdown
-from strapdown import cli, montecarlo, scenarios
+from strapdown import cli, montecarlo
 from strapdown.checks import InputError
 from strapdown.estimation import setup as setups
-from strapdown.montecarlo import cluster, engine, statistics
+from strapdown.montecarlo import cluster, engine
 
 distributed = pytest.importorskip(
     "distributed", reason="the extra `cluster` is not installed: pip install '.[cluster]'"
 )
-
-SCENARIO = replace(scenarios.load_scenario("spin"), duration=2.4)
-PLAN = montecarlo.Plan(scenario=SCENARIO, setup=setups.FilterSetup.for_scenario(SCENARIO), seed=4, epochs=6, nis_bins=5)
-
-
-def assert_same(a, b):
-    for field in fields(statistics.Statistics):
-        assert np.array_equal(getattr(a, field.name), getattr(b, field.name)), field.name
 
 
 def alone(runs, chunk, plan=PLAN):

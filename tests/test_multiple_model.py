@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from measured import errors, resting, seen, series_of, turn_to, unit
+from measured import assert_inside, errors, resting, seen, series_of, turn_to, unit
 from plain_kernels import plain
 from scipy.spatial.transform import Rotation
 from scipy.stats import multivariate_normal
@@ -291,8 +291,7 @@ def check_starts(outcomes, epochs):
         innovations = found.estimate.innovations["magnetometer"]
         after = innovations.time > found.became_one
         total, number = total + innovations.nis[after].sum(), number + innovations.innovation[after].size
-    low, high = consistency.mean_bounds(1, number)
-    assert low < total / number < high
+    assert_inside(total / number, 1, number)
 
 
 def test_from_a_hundred_starts_anywhere_it_finds_the_attitude_and_is_consistent():
@@ -451,8 +450,7 @@ def test_wild_first_directions_do_not_mislead_it(number, size, option):
         e, each = judged(found, record)
         assert np.linalg.norm(e[-1, :3]) < 1.0 * DEGREE
         nees.append(each[[int(np.searchsorted(found.estimate.time, seconds)) for seconds in (80.0, 200.0, 1490.0)]])
-    low, high = consistency.mean_bounds(6, 12, 0.999)
-    assert np.all((low < np.mean(nees, axis=0) / 6.0) & (np.mean(nees, axis=0) / 6.0 < high))
+    assert_inside(np.mean(nees, axis=0) / 6.0, 6, 12, 0.999)
 
 
 @pytest.mark.parametrize("headings", [0, 6])

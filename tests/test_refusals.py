@@ -239,10 +239,7 @@ FOLDERS = {
         ["coning", "--runs", 2, "--duration", 12],
         ("coning.json", "drift.png", "errors.png", "consistency.png"),
     ),
-    "allan": (
-        ["allan", "gyro.npy", "--rate", 100, "--gyro-unit", "rad/s"],
-        ("gyro.toml", "allan.json", "allan.png"),
-    ),
+    "allan": (["allan", "gyro.npy", "--rate", 100, "--gyro-unit", "rad/s"], ("gyro.toml", "allan.json", "allan.png")),
     "covariance": (["covariance", "short.toml", "--epochs", 2], ("covariance.json", "budget.png")),
     "estimate": (
         ["estimate", "record.h5", "--from-truth"],

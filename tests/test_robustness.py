@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from measured import drawn_start, errors, recoveries, turn_to
+from measured import assert_inside, drawn_start, errors, recoveries, turn_to
 from scipy.stats import binom, chi2
 
 from strapdown import consistency, estimation, motion, quaternion, records
@@ -51,12 +51,6 @@ def lost_start(record, run, bias_sigma=1e-3):
 
 def turned(start, rotation_vector=(0.0, 1.57, 0.0)):
     return replace(start, attitude=quaternion.multiply(start.attitude, quaternion.exp(rotation_vector)))
-
-
-def assert_inside(mean, degrees, runs, probability=0.999):
-    """Each mean NEES over its degrees lies inside its two-sided bounds."""
-    low, high = consistency.mean_bounds(degrees, runs, probability)
-    assert np.all((low < mean) & (mean < high)), (mean, low, high)
 
 
 def anees(estimates, records_, rows, every):
@@ -198,7 +192,7 @@ def test_a_bias_step_is_recovered_from(runs):
         (event,) = recoveries(estimate)
         assert 6.0 < event.start < 6.5
         assert event.end - event.start <= 0.1 * 12 + 1e-9
-    assert_inside(anees(estimates, made, [12, 14, 16], 50)[:, 0], 3, runs)
+    assert_inside(anees(estimates, made, [12, 14, 16], 50)[:, 0], 3, runs, 0.999)
     blind = estimation.run(made[0], NOISE, started(made[0], 0), gate=Gate(recovery=None))
     assert quaternion.angle_between(blind.attitude[-1], made[0].truth.attitude[-1]) > 0.05
 
@@ -513,7 +507,7 @@ def test_a_recovery_on_one_direction_knows_what_it_does_not_know(runs):
         error, n = turn_and_tilt(estimate, record, STARS[0], 50)
         nees.append(consistency.nees(error, estimate.covariance)[[2, 4, 8, 16]] / 6.0)
         turns.append(np.sqrt(np.einsum("ki,kij,kj->k", n, estimate.covariance[:, :3, :3], n))[2:])
-    assert_inside(np.mean(nees, axis=0), 6, runs)
+    assert_inside(np.mean(nees, axis=0), 6, runs, 0.999)
     assert np.allclose(turns, gating.UNIFORM_SIGMA, rtol=0.02)
 
 
@@ -534,7 +528,7 @@ def test_after_a_recovery_on_one_direction_a_second_one_measures_the_turn(runs, 
         made.append(record)
         estimates.append(estimation.run(record, NOISE, lost, gate=Gate(), every=25, full_covariance=True))
         assert len(recoveries(estimates[-1])) == 1
-    assert_inside(anees(estimates, made, [13, 14, 20], 25)[:, 1], 6, runs)
+    assert_inside(anees(estimates, made, [13, 14, 20], 25)[:, 1], 6, runs, 0.999)
 
 
 def test_a_sensor_that_contradicts_two_others_is_refused_and_not_followed():

@@ -11,7 +11,7 @@ import mpmath
 import numpy as np
 import pytest
 from in_steps import transition_and_noise
-from measured import drawn_start, errors, recoveries, seen, series_of, unit
+from measured import assert_inside, drawn_start, errors, recoveries, seen, series_of, unit
 
 from strapdown import coning, consistency, estimation, kinematics, motion, quaternion, records
 from strapdown.checks import InputError
@@ -514,8 +514,7 @@ def nees_of_recoveries(runs: int) -> np.ndarray:
 
 def test_lost_stretches_are_consistent() -> None:
     mean = nees_of_recoveries(40).mean(axis=0) / 6.0
-    low, high = consistency.mean_bounds(6, 40, 0.999)
-    assert np.all((low < mean) & (mean < high)), (mean, low, high)
+    assert_inside(mean, 6, 40, 0.999)
 
 
 @pytest.mark.slow

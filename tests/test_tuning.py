@@ -399,10 +399,7 @@ def test_priors_from_a_specification_match_its_noise():
     spec = gyro.GyroSpec(angle_random_walk=2e-5, rate_random_walk=1e-8)
     record = scenarios.simulate(scenario())
     found = tuning.priors_from_gyro(spec, record, factor=2.0)
-    assert found == {
-        "gyro.arw": tuning.Prior(value=2e-5, factor=2.0),
-        "gyro.rrw": tuning.Prior(value=1e-8, factor=2.0),
-    }
+    assert found == {"gyro.arw": tuning.Prior(value=2e-5, factor=2.0), "gyro.rrw": tuning.Prior(value=1e-8, factor=2.0)}
     assert set(tuning.priors_from_gyro(gyro.GyroSpec(angle_random_walk=2e-5), record)) == {"gyro.arw"}
     flicker = dataclasses.replace(spec, bias_instability=2e-5)
     assert tuning.priors_from_gyro(flicker, record)["gyro.rrw"].value > 1e-8
