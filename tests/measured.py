@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, is_dataclass, replace
 
 import numpy as np
 
@@ -109,6 +109,19 @@ def errors_at(estimate, truth, rows):
 def recoveries(estimate):
     """Return the recoveries among the events of an estimate."""
     return [event for event in estimate.events if event.kind == "recovery"]
+
+
+def differing(a, b):
+    """Return the fields in which two records differ in any bit, their origins apart."""
+    if is_dataclass(a) and type(a) is type(b):
+        pairs = [(field.name, getattr(a, field.name), getattr(b, field.name)) for field in fields(a)]
+    elif isinstance(a, tuple) and isinstance(b, tuple) and len(a) == len(b):
+        pairs = list(zip(map(str, range(len(a))), a, b, strict=True))
+    elif isinstance(a, np.ndarray) or isinstance(b, np.ndarray):
+        return [] if np.array_equal(a, b, equal_nan=True) else [""]
+    else:
+        return [] if a == b else [""]
+    return [f"{name} {part}" for name, x, y in pairs if name != "origin" for part in differing(x, y)]
 
 
 def correlation(P, sigma):

@@ -156,15 +156,14 @@ def test_a_truth_at_other_times_is_refused():
         consistency.judge(result, Truth(attitude=truth.attitude[:5], bias=truth.bias[:5]))
 
 
-def test_holm_steps_down():
-    findings = [
-        Finding(name="NIS", of=str(k), value=1.0, p_value=p, samples=10) for k, p in enumerate((0.02, 0.01, 0.04))
-    ]
-    assert [f.rejected for f in holm(findings, 0.05)] == [True, True, True]  # 0.01 ≤ 0.05/3, 0.02 ≤ 0.05/2, 0.04 ≤ 0.05
-    findings = [
-        Finding(name="NIS", of=str(k), value=1.0, p_value=p, samples=10) for k, p in enumerate((0.03, 0.01, 0.04))
-    ]
-    assert [f.rejected for f in holm(findings, 0.05)] == [False, True, False]
+@pytest.mark.parametrize(
+    ("p_values", "rejected"),
+    [((0.02, 0.01, 0.04), [True, True, True]), ((0.03, 0.01, 0.04), [False, True, False])],
+)
+def test_holm_steps_down(p_values, rejected):
+    """0.01 ≤ 0.05/3, then 0.02 ≤ 0.05/2 and 0.03 > 0.05/2, then 0.04 ≤ 0.05."""
+    findings = [Finding(name="NIS", of="star", value=1.0, p_value=p, samples=10) for p in p_values]
+    assert [f.rejected for f in holm(findings, 0.05)] == rejected
 
 
 def test_a_sigma_wrong_by_the_power_stated_is_found():

@@ -75,12 +75,6 @@ def test_log_moments_are_those_of_log_chi_square(degrees):
     assert np.sum(weight * (grid - mean) ** 2) == pytest.approx(variance, rel=1e-6)
 
 
-def test_log_moments_of_a_whole_state():
-    mean, variance = consistency.log_moments(6)  # ψ(3) = 3/2 − γ, ψ′(3) = π²/6 − 5/4
-    assert mean == pytest.approx(1.5 - 0.5772156649015329 + math.log(2.0), abs=1e-14)
-    assert variance == pytest.approx(math.pi**2 / 6.0 - 1.25, abs=1e-14)
-
-
 @pytest.mark.parametrize("degrees", [1, 2, 3, 6])
 def test_the_distribution_of_one_log_is_the_log_of_chi_square(degrees):
     for x in (-12.0, -4.0, -1.0, 0.5, 1.5, 2.5, 3.5):
@@ -150,29 +144,12 @@ def test_ljung_box_of_several_components_is_hoskings():
     assert degrees == 36
 
 
-def test_whiteness_sees_what_is_correlated_and_not_what_is_large():
-    generator = np.random.default_rng(9)
-    white = 5.0 * generator.standard_normal((600, 2))
-    coloured = scipy.signal.lfilter([1.0], [1.0, -0.3], generator.standard_normal((600, 2)), axis=0)
-    assert consistency.ljung_box(white)[2] > 0.01
-    assert consistency.ljung_box(coloured)[2] < 1e-6
-
-
 def test_anderson_darling_by_the_sum():
     x = np.sort(np.random.default_rng(10).standard_normal(250) + 3.0)
     u = scipy.stats.norm.cdf((x - x.mean()) / x.std(ddof=1))
     total = sum((2 * i + 1) * (math.log(u[i]) + math.log1p(-u[249 - i])) for i in range(250))
     statistic, _ = consistency.anderson_darling(x)
     assert statistic == pytest.approx((-250 - total / 250) * (1.0 + 0.75 / 250 + 2.25 / 250**2), rel=1e-9)
-
-
-@pytest.mark.parametrize(("critical", "p"), [(0.631, 0.10), (0.752, 0.05), (0.873, 0.025), (1.035, 0.01), (0.341, 0.5)])
-def test_anderson_darling_p_values_are_the_tables(critical, p):
-    """D'Agostino & Stephens (1986), table 4.7: upper tail of A²*."""
-    values = np.random.default_rng(11).standard_normal((400, 200))
-    pairs = sorted(whiteness.anderson_darling(x) for x in values)
-    near = min(pairs, key=lambda pair: abs(pair[0] - critical))
-    assert near[1] == pytest.approx(p, rel=0.12)
 
 
 def test_normality_sees_outliers():
@@ -320,7 +297,9 @@ def test_the_p_value_of_a_coverage_counts_what_is_as_far_off_or_farther(samples,
         assert found[k] == pytest.approx(wanted, rel=1e-9)
 
 
-@pytest.mark.parametrize(("critical", "level"), [(0.631, 0.1), (0.752, 0.05), (0.873, 0.025), (1.035, 0.01)])
+@pytest.mark.parametrize(
+    ("critical", "level"), [(0.631, 0.1), (0.752, 0.05), (0.873, 0.025), (1.035, 0.01), (0.341, 0.5)]
+)
 def test_the_p_value_of_anderson_and_darling_is_that_of_the_table(critical, level):
     """D'Agostino & Stephens (1986), table 4.7: the levels of A²*, on samples bent until they have just that statistic."""
     normal = scipy.stats.norm.ppf((np.arange(300) + 0.5) / 300)[:, None]
