@@ -134,6 +134,30 @@ def run(
     return command
 
 
+@pytest.fixture
+def succeeds(run: Callable[..., tuple[int, str, str]]) -> Callable[..., str]:
+    """Run ``strapdown ARGUMENTS``, which must end well and without an error; return what it said."""
+
+    def command(*arguments: object) -> str:
+        status, said, error = run(*arguments)
+        assert (status, error) == (0, ""), error
+        return said
+
+    return command
+
+
+@pytest.fixture
+def refusal(run: Callable[..., tuple[int, str, str]]) -> Callable[..., str]:
+    """Run ``strapdown ARGUMENTS``, which must be refused; return the error."""
+
+    def command(*arguments: object) -> str:
+        status, _, error = run(*arguments)
+        assert status == 2, error
+        return error
+
+    return command
+
+
 @pytest.fixture(scope="session")
 def rotation_vectors() -> Callable[..., np.ndarray]:
     """Return a function that draws rotation vectors (n, 3) with random direction and log-uniform angle between two bounds."""

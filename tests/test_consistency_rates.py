@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from benchmarks import power
-from strapdown import consistency, estimation, montecarlo, motion, quaternion, scenarios, units, vectors
+from strapdown import consistency, estimation, montecarlo, motion, scenarios, units, vectors
 from strapdown.estimation import setup
 from strapdown.gyro import GyroSpec
-from strapdown.randomness import generator
 from strapdown.records import Truth
 
 
@@ -107,13 +106,8 @@ def right_run(seed):
         attitude_sigma=1e-3,
         bias_sigma=1e-5,
     )
-    draw = generator(seed, 0, "initial error").standard_normal(6)
-    start = setup.initial_state(
-        filter_setup,
-        quaternion.multiply(record.truth.attitude[0], quaternion.exp(-1e-3 * draw[:3])),
-        record.truth.bias[0] - 1e-5 * draw[3:],
-    )
-    estimate = setup.run(record, filter_setup, start, every=5, full_covariance=True)
+    initial = montecarlo.start(record, filter_setup, seed, 0)
+    estimate = setup.run(record, filter_setup, initial, every=5, full_covariance=True)
     return estimate, Truth(attitude=record.truth.attitude[::5], bias=record.truth.bias[::5])
 
 

@@ -666,18 +666,17 @@ def test_a_setup_runs_it():
     )
 
 
-def test_the_command_line_takes_it_from_a_filter_file(run):
+def test_the_command_line_takes_it_from_a_filter_file(succeeds):
     """As a user would: a simulated record, a filter file whose accelerometer has the states."""
     scenario = dataclasses.replace(scenarios.load_scenario("hand-held"), duration=8.0)
     Path("hand.toml").write_text(scenarios.scenario_to_toml(scenario), encoding="utf-8")
-    assert run("simulate", "hand.toml", "--out", "record.h5")[0] == 0
+    succeeds("simulate", "hand.toml", "--out", "record.h5")
     (acc,) = (sensor.name for sensor in scenario.sensors if "acc" in sensor.name)
     chosen = setup.FilterSetup.for_scenario(scenario, states=True)
     held = dataclasses.replace(chosen.states.sensors.get(acc, SensorStates()), **dataclasses.asdict(TOLD))
     chosen = dataclasses.replace(chosen, states=dataclasses.replace(chosen.states, sensors={acc: held}))
     Path("filter.toml").write_text(setup.to_toml(chosen), encoding="utf-8")
-    status, output, error = run("estimate", "record.h5", "--filter", "filter.toml", "--out", "out")
-    assert status == 0, error
+    output = succeeds("estimate", "record.h5", "--filter", "filter.toml", "--out", "out")
     assert f"{acc} velocity" in output
     found = json.loads(Path("out/states.json").read_text(encoding="utf-8"))[f"{acc} velocity"]
     assert found["components"][:2] == ["velocity x", "drive x"]

@@ -368,43 +368,8 @@ def states():
 
 def run_of(rows, like):
     """Return (q, b, A, B, C) of so many runs, from 28 rows of them."""
-    n = len(like)
-    return (
-        (
-            load_like(rows, 0, like),
-            load_like(rows, n, like),
-            load_like(rows, 2 * n, like),
-            load_like(rows, 3 * n, like),
-        ),
-        (load_like(rows, 4 * n, like), load_like(rows, 5 * n, like), load_like(rows, 6 * n, like)),
-        (
-            load_like(rows, 7 * n, like),
-            load_like(rows, 8 * n, like),
-            load_like(rows, 9 * n, like),
-            load_like(rows, 10 * n, like),
-            load_like(rows, 11 * n, like),
-            load_like(rows, 12 * n, like),
-        ),
-        (
-            load_like(rows, 13 * n, like),
-            load_like(rows, 14 * n, like),
-            load_like(rows, 15 * n, like),
-            load_like(rows, 16 * n, like),
-            load_like(rows, 17 * n, like),
-            load_like(rows, 18 * n, like),
-            load_like(rows, 19 * n, like),
-            load_like(rows, 20 * n, like),
-            load_like(rows, 21 * n, like),
-        ),
-        (
-            load_like(rows, 22 * n, like),
-            load_like(rows, 23 * n, like),
-            load_like(rows, 24 * n, like),
-            load_like(rows, 25 * n, like),
-            load_like(rows, 26 * n, like),
-            load_like(rows, 27 * n, like),
-        ),
-    )
+    x = tuple(load_like(rows, i * len(like), like) for i in range(28))
+    return x[:4], x[4:7], x[7:13], x[13:22], x[22:]
 
 
 run_of.__module__ = "strapdown.kernels.probe"  # so that kernels of this file may call it

@@ -15,7 +15,7 @@ import scipy.stats
 from measured import errors_at, turn_to
 from spin_plan import PLAN, SCENARIO, SETUP, different
 
-from strapdown import estimation, montecarlo, scenarios
+from strapdown import coning, estimation, montecarlo, scenarios
 from strapdown.checks import InputError
 from strapdown.estimation import setup as setups
 from strapdown.montecarlo import campaign, engine, plan, scalar, statistics
@@ -360,7 +360,7 @@ def test_bad_dispersions_are_refused(tmp_path):
 
 
 def test_whole_epochs_cut_into_whole_steps():
-    four = replace(SETUP, integration=__import__("strapdown").coning.ALGORITHMS["four-sample"])
+    four = replace(SETUP, integration=coning.ALGORITHMS["four-sample"])
     assert montecarlo.whole_epochs(SCENARIO, SETUP) == 80
     assert montecarlo.whole_epochs(SCENARIO, four) == 60
     with pytest.raises(InputError, match="whole number of four-sample steps"):
@@ -410,26 +410,18 @@ def test_initial_errors_are_as_dispersed():
 COUNTED = ["runs", "finite", "coverage", "histogram", "sensor_degrees", "worst_run", "worst_score", "example_error"]
 
 
-@pytest.mark.parametrize("chunk", [7, 1000])
-def test_runs_are_the_same_to_the_bit_in_chunks_of_any_size(chunk):
-    """Every run counts, and the worst and the first ones in all their bits."""
-    one = montecarlo.run_plan(PLAN, runs=30, chunk=10, threads=1, machine="scalar")
-    other = montecarlo.run_plan(PLAN, runs=30, chunk=chunk, threads=2, machine="scalar")
-    assert not different(one, other, COUNTED)
-    assert np.allclose(one.nees_sum, other.nees_sum, rtol=1e-12)
-
-
-def test_statistics_are_the_same_to_the_bit_on_any_number_of_threads():
-    one = montecarlo.run_plan(PLAN, runs=45, chunk=4, threads=1, machine="scalar")
-    for threads in (2, 5):
-        assert not different(one, montecarlo.run_plan(PLAN, runs=45, chunk=4, threads=threads, machine="scalar"))
-
-
-@pytest.mark.slow
-def test_on_lanes_too_runs_are_the_same_to_the_bit_in_chunks_of_any_size():
-    one = montecarlo.run_plan(PLAN, runs=60, chunk=8, threads=1, machine="lanes")
-    for chunk, threads in ((1, 2), (7, 1), (8, 2), (1000, 2)):
-        other = montecarlo.run_plan(PLAN, runs=60, chunk=chunk, threads=threads, machine="lanes")
+@pytest.mark.parametrize(
+    ("machine", "others"),
+    [
+        ("scalar", [(8, 2), (8, 5), (7, 2), (1000, 2)]),
+        pytest.param("lanes", [(1, 2), (7, 1), (8, 2), (1000, 2)], marks=pytest.mark.slow),
+    ],
+)
+def test_runs_are_the_same_to_the_bit_in_chunks_of_any_size_on_any_number_of_threads(machine, others):
+    """Every run counts, and the worst and the first ones in all their bits; in chunks of the same size all sums too."""
+    one = montecarlo.run_plan(PLAN, runs=60, chunk=8, threads=1, machine=machine)
+    for chunk, threads in others:
+        other = montecarlo.run_plan(PLAN, runs=60, chunk=chunk, threads=threads, machine=machine)
         assert not different(one, other, COUNTED if chunk != 8 else None)
         assert np.allclose(one.nees_sum, other.nees_sum, rtol=1e-12)
 
@@ -555,15 +547,6 @@ def test_the_machine_is_chosen_by_the_plan_and_reported():
 
 
 # ------------------------------------------------------------------------------------------------------------ replay
-
-
-def test_a_replayed_run_is_the_same_to_the_bit():
-    total = scalar.run_chunk(PLAN, 0, 8)
-    for run in (0, 5):
-        again = montecarlo.replay(PLAN, run, machine="scalar")
-        edges = np.arange(0, 241, 40)
-        assert np.array_equal(errors_at(again.estimate, again.record.truth, edges), total.example_error[run])
-        assert np.array_equal(np.sqrt(again.estimate.variance[edges]), total.example_sigma[run])
 
 
 @pytest.mark.parametrize("machine", ["scalar", "lanes"])

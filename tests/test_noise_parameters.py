@@ -63,9 +63,8 @@ def rest(tmp_path_factory):
     ],
     ids=["gyro", "accelerometer", "magnetometer"],
 )  # fmt: skip
-def test_each_sensor_is_identified_in_its_units(run, rest, sensor, truth, names, factors, tmp_path):
-    status, said, error = run("allan", rest, "--sensor", sensor)
-    assert status == 0, error
+def test_each_sensor_is_identified_in_its_units(succeeds, rest, sensor, truth, names, factors, tmp_path):
+    said = succeeds("allan", rest, "--sensor", sensor)
     table = tomllib.loads((tmp_path / "allan-results" / f"{sensor}.toml").read_text())[sensor]
     stem = "allan" if sensor == "gyro" else sensor
     numbers = json.loads((tmp_path / "allan-results" / f"{stem}.json").read_text())
@@ -79,10 +78,9 @@ def test_each_sensor_is_identified_in_its_units(run, rest, sensor, truth, names,
     assert noise_fit.name(sensor, "angle_random_walk") in said
 
 
-def test_the_files_of_other_programs(run, rest, tmp_path):
+def test_the_files_of_other_programs(succeeds, rest, tmp_path):
     options = ("--sensor", "gyro", "--sensor", "accelerometer")
-    status, said, error = run("allan", rest, *options, "--kalibr", "--px4", "--matlab", "--factor", 5)
-    assert status == 0, error
+    said = succeeds("allan", rest, *options, "--kalibr", "--px4", "--matlab", "--factor", 5)
     out = tmp_path / "allan-results"
     pairs = (
         line.partition("#")[0].split(":") for line in (out / "imu.yaml").read_text().splitlines() if line[0] != "#"
@@ -141,22 +139,21 @@ def test_what_does_not_go_is_refused_before_anything_is_written(run, rest, tmp_p
     assert not list(tmp_path.rglob("*.toml"))
 
 
-def test_a_magnetometer_without_a_unit_is_refused(run, tmp_path):
+def test_a_magnetometer_without_a_unit_is_refused(run, succeeds, tmp_path):
     whole = replace(at_rest(200), magnetic_unit="")
     recordings.write(whole, tmp_path / "x.csv")
     status, _, error = run("allan", tmp_path / "x.csv", "--sensor", "magnetometer")
     assert (status, "does not declare the unit of its magnetometer" in error) == (2, True)
-    assert run("allan", tmp_path / "x.csv", "--sensor", "magnetometer", "--magnetometer-unit", "uT")[0] == 0
+    succeeds("allan", tmp_path / "x.csv", "--sensor", "magnetometer", "--magnetometer-unit", "uT")
 
 
-def test_gaps_are_said_and_the_noise_is_right(run, tmp_path):
+def test_gaps_are_said_and_the_noise_is_right(run, succeeds, tmp_path):
     whole = at_rest(20_000)
     keep = np.ones(20_000, bool)
     keep[3000:3700] = keep[9000:9001] = keep[15_000:15_100] = False
     cut = Recording(source="gappy", time=whole.time[keep], rate=whole.rate[keep])
     recordings.write(cut, tmp_path / "gappy.csv")
-    status, said, error = run("allan", "gappy.csv")
-    assert status == 0, error
+    said = succeeds("allan", "gappy.csv")
     assert "801 samples are missing in 3 gaps." in said
     assert "Because of gaps the fit uses 19199 samples" in said
     table = tomllib.loads((tmp_path / "allan-results" / "gyro.toml").read_text())["gyro"]
@@ -180,13 +177,12 @@ def test_stamps_that_stray_are_taken_for_even_and_said():
         samples._of_recording(replace(whole, time=late), "gyro", False)
 
 
-def test_temperature_is_regressed_out_and_written(run, tmp_path):
+def test_temperature_is_regressed_out_and_written(run, succeeds, tmp_path):
     whole = at_rest(20_000)
     T = 25.0 + 10.0 * (1.0 - np.exp(-whole.time / 60.0))
     warm = replace(whole, rate=whole.rate + 2e-3 * (T - T.mean())[:, None] * [1.0, -1.0, 0.0], temperature=T)
     recordings.write(warm, tmp_path / "warm.csv")
-    status, said, error = run("allan", "warm.csv", "--temperature", 1)
-    assert status == 0, error
+    said = succeeds("allan", "warm.csv", "--temperature", 1)
     assert "Bias over temperature" in said
     table = tomllib.loads((tmp_path / "allan-results" / "gyro-temperature.toml").read_text())["gyro"]["temperature"]
     slope, sigma = np.array(table["bias_rad_per_s_per_k"]), np.array(table["sigma_rad_per_s_per_k"])
@@ -231,7 +227,7 @@ def test_the_bias_over_temperature_is_subtracted_and_its_error_becomes_a_walk():
         from_table({k: v for k, v in given.items() if k != "bias_rad_per_s"}, "file: gyro")
 
 
-def test_a_simulated_unit_goes_through_allan_and_its_table_into_the_filter(run, tmp_path):
+def test_a_simulated_unit_goes_through_allan_and_its_table_into_the_filter(succeeds, tmp_path):
     """Round trip: the scenario's polynomial lies inside the intervals, and the filter that reads the table finds the turn-on bias."""
     rest = """
     rate_hz = 100.0
@@ -262,9 +258,8 @@ def test_a_simulated_unit_goes_through_allan_and_its_table_into_the_filter(run, 
     (tmp_path / "lab.toml").write_text(rest.format(duration=300.0, bias=[0.0] * 3, start=20.0, end=40.0))
     (tmp_path / "use.toml").write_text(rest.format(duration=60.0, bias=[360.0, 0.0, -360.0], start=38.0, end=12.0))
     for name in ("lab", "use"):
-        assert run("simulate", f"{name}.toml")[0] == 0
-    status, _, error = run("allan", "lab.h5", "--temperature", 2)
-    assert status == 0, error
+        succeeds("simulate", f"{name}.toml")
+    succeeds("allan", "lab.h5", "--temperature", 2)
     path = tmp_path / "allan-results" / "gyro-temperature.toml"
     found = tomllib.loads(path.read_text())["gyro"]["temperature"]
     T0 = found["reference_degc"] - 30.0
@@ -274,16 +269,15 @@ def test_a_simulated_unit_goes_through_allan_and_its_table_into_the_filter(run, 
     text = (tmp_path / "allan-results" / "gyro.toml").read_text()
     both = tomllib.loads(text + path.read_text())["gyro"]  # the two files in one are a gyro's table
     assert gyro.from_table(both).temperature.span == (found["lowest_degc"], found["highest_degc"])
-    assert run("convert", "use.h5", "use.db3")[0] == 0
-    status, _, error = run("estimate", "use.db3", "--temperature", path)
-    assert status == 0, error
+    succeeds("convert", "use.h5", "use.db3")
+    succeeds("estimate", "use.db3", "--temperature", path)
     estimate = records.read_estimate(tmp_path / "estimate-results" / "estimate.h5")
     slope = records.read_states(tmp_path / "estimate-results" / "estimate.h5")["gyro temperature"]
     assert (slope.sigma[0] < 1e-4).all()
     # The two files in one, as the gyro's noise, do the same.
     (tmp_path / "whole.toml").write_text(text + path.read_text())
     again = sd.estimate(recordings.read(tmp_path / "use.db3"), noise=gyro.read_spec(tmp_path / "whole.toml"))
-    assert run("estimate", "use.db3", "--gyro", "whole.toml")[0] == 0
+    succeeds("estimate", "use.db3", "--gyro", "whole.toml")
     by_command = records.read_estimate(tmp_path / "estimate-results" / "estimate.h5")
     np.testing.assert_array_equal(again.bias, by_command.bias)
     np.testing.assert_allclose(again.bias[-1], estimate.bias[-1], atol=3.0 * estimate.sigma[-1, 3])

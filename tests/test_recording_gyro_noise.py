@@ -23,12 +23,11 @@ def table(tmp_path):
     return path, roll
 
 
-def test_the_file_of_an_allan_fit_with_flicker_serves_a_recording(table, run, tmp_path):
+def test_the_file_of_an_allan_fit_with_flicker_serves_a_recording(table, succeeds, tmp_path):
     path, roll = table
     text = "[gyro]\nangle_random_walk_deg_per_sqrt_hour = [0.3, 0.3, 0.3]\nbias_instability_deg_per_hour = [20.0, 20.0, 20.0]\n"
     (tmp_path / "gyro.toml").write_text(text)
-    status, _, said = run("estimate", path, "--gyro", "gyro.toml", "--out", "found")
-    assert status == 0, said
+    succeeds("estimate", path, "--gyro", "gyro.toml", "--out", "found")
     estimate = sd.read(tmp_path / "found" / "estimate.h5")
     error = estimate.rotation.as_euler("ZYX")[:, 2] - roll[-len(estimate.time) :]
     assert np.sqrt(np.mean(error**2)) < np.radians(0.5)

@@ -391,12 +391,11 @@ def test_bad_input_is_refused():
 # -------------------------------------------------------------------------------------------------- the command line
 
 
-def test_tune_with_a_gate_writes_it_into_the_filter(run, tmp_path):
+def test_tune_with_a_gate_writes_it_into_the_filter(run, succeeds, tmp_path):
     path, out = tmp_path / "sat.h5", tmp_path / "tuned.toml"
     recordfiles.write_record(path, scenarios.simulate(scenario(300.0), 1))
     options = ("--free", "gate.probability,star 1.sigma,star 2.sigma", "--holdout", 0.3, "--starts", 1)
-    status, said, complaint = run("tune", path, *options, "-o", out)
-    assert status == 0, complaint
+    said = succeeds("tune", path, *options, "-o", out)
     assert "outliers.share" in said
     assert "is more likely an outlier than noise" in said
     content = json.loads(out.with_suffix(".json").read_text())
@@ -413,9 +412,8 @@ def test_tune_with_a_gate_writes_it_into_the_filter(run, tmp_path):
 
 
 @pytest.mark.parametrize("other", ["--truth", "--rmse"])
-def test_a_gate_needs_all_innovations(run, tmp_path, other):
+def test_a_gate_needs_all_innovations(refusal, tmp_path, other):
     path = tmp_path / "sat.h5"
     recordfiles.write_record(path, scenarios.simulate(scenario(60.0), 1))
-    status, _, complaint = run("tune", path, "--gate", other, "-o", tmp_path / "f.toml")
-    assert status == 2
+    complaint = refusal("tune", path, "--gate", other, "-o", tmp_path / "f.toml")
     assert "likelihood of all innovations" in complaint.replace("\n", " ")
