@@ -13,19 +13,17 @@ from strapdown.vectors import VectorMeasurements
 UP = np.array([0.0, 0.0, 9.81])
 FIELD = np.array([0.0, 2e-5, -4e-5])
 STAR = np.array([0.6, 0.64, 0.48])
-SWAY = motion.HarmonicRates(
-    harmonics=(
-        motion.Harmonic(amplitude=(0.9, 0.4, -0.6), frequency=0.21),
-        motion.Harmonic(amplitude=(-0.4, 0.8, 0.5), frequency=0.37),
-    )
-)
-HAND = motion.HarmonicRates(
-    harmonics=(
-        motion.Harmonic(amplitude=(1.2, 0.2, -0.3), frequency=0.21),
-        motion.Harmonic(amplitude=(-0.3, 1.1, 0.4), frequency=0.37),
-        motion.Harmonic(amplitude=(0.3, -0.2, 1.3), frequency=0.29, phase=1.0),
-    )
-)
+
+
+def waves(*each, **more) -> motion.HarmonicRates:
+    """Return a motion from amplitude, frequency and phase of each harmonic of its rate."""
+    names = ("amplitude", "frequency", "phase")
+    harmonics = [motion.Harmonic(**dict(zip(names, one, strict=False))) for one in each]
+    return motion.HarmonicRates(harmonics=harmonics, **more)
+
+
+SWAY = waves(((0.9, 0.4, -0.6), 0.21), ((-0.4, 0.8, 0.5), 0.37))
+HAND = waves(((1.2, 0.2, -0.3), 0.21), ((-0.3, 1.1, 0.4), 0.37), ((0.3, -0.2, 1.3), 0.29, 1.0))
 """A hand that turns its unit about all three axes."""
 
 

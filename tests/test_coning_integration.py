@@ -9,7 +9,7 @@ from fractions import Fraction
 import mpmath as mp
 import numpy as np
 import pytest
-from measured import turn_to
+from measured import turn_to, waves
 
 from sims.coning_algorithms import exact_step, polynomial_step
 from strapdown import coning, kinematics, motion, quaternion
@@ -24,13 +24,7 @@ MOTIONS = {
     "coning": motion.Coning(angle=0.5, frequency=0.45),
     "spin-cone": motion.SpinCone(precession_rate=2.5, spin_rate=-1.4, angle=0.7),
     "torque-free": motion.TorqueFree(inertia=(1.0, 1.7, 2.4), initial_rate=(1.2, 1.5, -0.9)),
-    "harmonics": motion.HarmonicRates(
-        harmonics=(
-            motion.Harmonic(amplitude=(1.1, -0.3, 0.2), frequency=0.4),
-            motion.Harmonic(amplitude=(0.2, 0.9, -0.5), frequency=0.31, phase=1.1),
-        ),
-        mean=(0.3, -0.2, 0.6),
-    ),
+    "harmonics": waves(((1.1, -0.3, 0.2), 0.4), ((0.2, 0.9, -0.5), 0.31, 1.1), mean=(0.3, -0.2, 0.6)),
 }
 SECONDS = 12.0
 

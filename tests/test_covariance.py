@@ -311,17 +311,11 @@ def considered(name, size):
 
 
 CASES = {
-    "scale factor, y": 1e-4,
-    "misalignment, x of z": 1e-4,
+    **dict.fromkeys(("scale factor, y", "misalignment, x of z"), 1e-4),
+    **dict.fromkeys((f"{sensor} mounting, y" for sensor in ("sun", "compass", "tracker")), 1e-4),
+    **dict.fromkeys(("mag bias, x", "compass bias, x"), 1e-8),
+    **dict.fromkeys((f"{sensor} time offset" for sensor in ("sun", "mag", "compass")), 1e-3),
     "g-sensitivity, z of y": 1e-7,
-    "mag bias, x": 1e-8,
-    "compass bias, x": 1e-8,
-    "sun mounting, y": 1e-4,
-    "compass mounting, y": 1e-4,
-    "tracker mounting, y": 1e-4,
-    "sun time offset": 1e-3,
-    "mag time offset": 1e-3,
-    "compass time offset": 1e-3,
 }
 
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from measured import waves
 
 from strapdown import coning, consistency, estimation, motion, quaternion, records, scenarios, units, vectors
 from strapdown.checks import InputError
@@ -32,15 +33,8 @@ SIGMA = 1e-7 / STRENGTH
 
 def scenario(gyro=None, magnetometer=None, star=None) -> scenarios.Scenario:
     """A hand-held motion of a minute with a magnetometer and a star."""
-    wave = motion.Harmonic
     return scenarios.Scenario(
-        motion=motion.HarmonicRates(
-            harmonics=[
-                wave(amplitude=(0.5, 0.0, 0.0), frequency=0.11),
-                wave(amplitude=(0.0, 0.4, 0.0), frequency=0.07, phase=1.0),
-                wave(amplitude=(0.0, 0.0, 0.6), frequency=0.05, phase=2.0),
-            ]
-        ),
+        motion=waves(((0.5, 0.0, 0.0), 0.11), ((0.0, 0.4, 0.0), 0.07, 1.0), ((0.0, 0.0, 0.6), 0.05, 2.0)),
         gyro=GyroSpec(**{"angle_random_walk": WALK, "rate_random_walk": 1e-5, **(gyro or {})}),
         sensors=(
             vectors.Magnetometer(

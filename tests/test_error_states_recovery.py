@@ -247,14 +247,8 @@ def test_by_default_a_candidate_doubts_the_bias_as_at_the_start():
     gate = Gate()
     P = np.diag([1.0, 1.0, 1.0, 1e-4, 2e-4, 3e-4, 5.0])
     assert np.array_equal(gate.restart_bias_variance(P[:6, :6]), [1e-4, 2e-4, 3e-4])
-    _, mean = judged(
-        "hard iron",
-        20,
-        lambda run: without_gyro(made("hard iron", run, 32.0), 20.0, 22.0),
-        (0.1, 9.0),
-        20.0,
-        BIAS_SIGMA,
-    )
+    gap = lambda run: without_gyro(made("hard iron", run, 32.0), 20.0, 22.0)  # noqa: E731
+    _, mean = judged("hard iron", 20, gap, (0.1, 9.0), 20.0, BIAS_SIGMA)
     high = consistency.mean_bounds(3, 20, 0.9999)[1]
     assert mean[0, 1] < 0.5
     assert np.all(mean < high)

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 import scipy.integrate
 import scipy.linalg
-from measured import UP, assert_inside, drawn_start, seen, series_of, unit
+from measured import UP, assert_inside, drawn_start, seen, series_of, unit, waves
 
 from sims import hand_held
-from strapdown import ahrs, consistency, estimation, kinematics, motion, quaternion, scenarios
+from strapdown import ahrs, consistency, estimation, kinematics, quaternion, scenarios
 from strapdown.checks import InputError
 from strapdown.consistency import reference_errors
 from strapdown.estimation import error_states, setup
@@ -33,12 +33,7 @@ from strapdown.units import DEGREE
 from strapdown.vectors import Accelerometer
 
 NOISE = ProcessNoise(angle_random_walk=2e-3, rate_random_walk=1e-4)
-HAND = motion.HarmonicRates(
-    harmonics=(
-        motion.Harmonic(amplitude=(1.1, 0.3, -0.4), frequency=0.21),
-        motion.Harmonic(amplitude=(-0.4, 0.9, 0.8), frequency=0.37, phase=0.4),
-    )
-)
+HAND = waves(((1.1, 0.3, -0.4), 0.21), ((-0.4, 0.9, 0.8), 0.37, 0.4))
 POLES = {
     "velocity": {"velocity_time": 0.3, "acceleration_time": 0.1},
     "equal times": {"velocity_time": 0.2, "acceleration_time": 0.2},

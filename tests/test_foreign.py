@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy.stats
+from measured import waves
 from scipy.spatial.transform import Rotation
 
 from sims import peer_judged
@@ -16,7 +17,6 @@ from strapdown.checks import InputError
 from strapdown.consistency import check_arrays, foreign
 from strapdown.estimation import setup
 from strapdown.gyro import GyroSpec
-from strapdown.motion import Harmonic, HarmonicRates
 from strapdown.recordings import attitudes, recordfiles, ulog
 from strapdown.recordings.attitudes import read_attitudes
 from strapdown.records import Truth, read_estimate, read_truth, write_estimate
@@ -24,13 +24,7 @@ from strapdown.records.outputs import euler, euler_axes, to_ned
 from strapdown.units import DEGREE, DEGREE_PER_HOUR_PER_ROOT_HOUR, DEGREE_PER_ROOT_HOUR
 
 FLIGHT = scenarios.Scenario(
-    motion=HarmonicRates(
-        mean=(0.02, -0.03, 0.05),
-        harmonics=(
-            Harmonic(amplitude=(0.3, 0.1, 0.0), frequency=0.07),
-            Harmonic(amplitude=(0.0, 0.2, 0.25), frequency=0.11, phase=1.0),
-        ),
-    ),
+    motion=waves(((0.3, 0.1, 0.0), 0.07), ((0.0, 0.2, 0.25), 0.11, 1.0), mean=(0.02, -0.03, 0.05)),
     # A gyro so poor that errors forget each other within seconds: one run then has much power.
     gyro=GyroSpec(angle_random_walk=20.0 * DEGREE_PER_ROOT_HOUR, rate_random_walk=20.0 * DEGREE_PER_HOUR_PER_ROOT_HOUR),
     sensors=(

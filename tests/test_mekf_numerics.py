@@ -101,15 +101,8 @@ def reference_variances(record, noise, prior):
                 for at in np.flatnonzero(series.time == now):
                     r = mp.matrix([mp.mpf(float(x)) for x in series.references_f[at]])
                     H = mp.zeros(3, 6)
-                    for (i, j), x in {
-                        (0, 1): -r[2],
-                        (0, 2): r[1],
-                        (1, 0): r[2],
-                        (1, 2): -r[0],
-                        (2, 0): -r[1],
-                        (2, 1): r[0],
-                    }.items():
-                        H[i, j] = x
+                    for i, j, m in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+                        H[i, j], H[j, i] = -r[m], r[m]
                     across = mp.qr(mp.matrix([[r[0], 1, 0], [r[1], 0, 1], [r[2], 1, 1]]))[0][:, 1:]
                     H = across.T * H  # two directions across r: along it nothing is measured
                     S = H * P * H.T + mp.mpf(float(series.sigma[at])) ** 2 * mp.eye(2)

@@ -512,9 +512,7 @@ def test_a_signal_whose_exception_python_drops_is_heeded_after_the_chunk(command
 
     def cleared(_):
         signal.raise_signal(number)
-        for _ in range(
-            1000
-        ):  # the handler is called between two turns, and what it raises is dropped with the callback
+        for _ in range(1000):  # the handler is called between two turns; what it raises is dropped with the callback
             pass
 
     def interrupted(*arguments):
@@ -555,18 +553,8 @@ def test_the_installed_command_killed_again_and_again(tmp_path):
     """Killed a while after it has begun to write, for how long it takes to start and to compile is no matter of the campaign."""
     path = tmp_path / "spin-montecarlo.h5"
     script = Path(sys.executable).with_name("strapdown")
-    arguments = [
-        script,
-        "montecarlo",
-        "spin",
-        "--machine",
-        "scalar",
-        "--chunk",
-        "3",
-        "--no-states",
-        "--resume",
-        "--runs",
-    ]
+    arguments = [script, "montecarlo", "spin", "--machine", "scalar", "--chunk", "3", "--no-states"]
+    arguments += ["--resume", "--runs"]
     few = subprocess.run([*arguments, "3"], cwd=tmp_path, stdout=subprocess.DEVNULL, check=False)  # compiled
     assert few.returncode in (1, 2)
     random = np.random.default_rng(5)

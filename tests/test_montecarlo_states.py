@@ -7,10 +7,10 @@ from functools import cache
 
 import numpy as np
 import pytest
-from measured import errors_at
+from measured import errors_at, waves
 from spin_plan import assert_same, different
 
-from strapdown import consistency, montecarlo, motion, scenarios, vectors
+from strapdown import consistency, montecarlo, scenarios, vectors
 from strapdown.estimation import setup, together
 from strapdown.estimation.setup import FilterSetup, SensorStates, States
 from strapdown.estimation.states import ProcessNoise
@@ -26,12 +26,7 @@ GYRO = GyroSpec(
     misalignment=1e-3 * (1.0 - np.eye(3)),
     g_sensitivity=np.diag([2e-6, -1e-6, 3e-6]),
 )
-MOTION = motion.HarmonicRates(
-    harmonics=(
-        motion.Harmonic(amplitude=np.array([1.0, 0.1, 0.3]), frequency=0.4),
-        motion.Harmonic(amplitude=np.array([0.0, 0.8, 0.5]), frequency=0.27, phase=1.2),
-    )
-)
+MOTION = waves((np.array([1.0, 0.1, 0.3]), 0.4), (np.array([0.0, 0.8, 0.5]), 0.27, 1.2))
 GYRO_STATES = States(
     gyro_scale_sigma=3e-3,
     gyro_misalignment_sigma=((0.0, 1e-3, 1e-3), (1e-3, 0.0, 1e-3), (1e-3, 1e-3, 0.0)),

@@ -49,18 +49,8 @@ def known(tmp_path_factory):
 # --------------------------------------------------------------------------------------------------------- no regular files
 
 
-KINDS = (
-    "record.h5",
-    "estimate.h5",
-    "campaign.h5",
-    "broad.hdf5",
-    "alone.csv",
-    "walk.csv",
-    "gyro.npy",
-    "scenario.toml",
-    "filter.toml",
-)
-KINDS += ("gyro.toml", "dispersions.toml", "vibration.csv", "tuning.json")
+KINDS = ("record.h5", "estimate.h5", "campaign.h5", "broad.hdf5", "alone.csv", "walk.csv", "gyro.npy", "scenario.toml")
+KINDS += ("filter.toml", "gyro.toml", "dispersions.toml", "vibration.csv", "tuning.json")
 
 
 @pytest.mark.parametrize("name", KINDS)

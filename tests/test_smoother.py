@@ -11,7 +11,7 @@ import mpmath
 import numpy as np
 import pytest
 from in_steps import transition_and_noise
-from measured import assert_inside, drawn_start, errors, recoveries, seen, series_of, unit
+from measured import assert_inside, drawn_start, errors, recoveries, seen, series_of, unit, waves
 
 from strapdown import coning, consistency, estimation, kinematics, motion, quaternion, records
 from strapdown.checks import InputError
@@ -88,12 +88,7 @@ def simulated(case: Case, rng: np.random.Generator) -> tuple[ImuRecord, estimati
     return record, initial
 
 
-SWAY = motion.HarmonicRates(
-    harmonics=(
-        motion.Harmonic(amplitude=(0.5, 0.2, -0.3), frequency=0.21),
-        motion.Harmonic(amplitude=(-0.2, 0.4, 0.3), frequency=0.37),
-    )
-)
+SWAY = waves(((0.5, 0.2, -0.3), 0.21), ((-0.2, 0.4, 0.3), 0.37))
 TURN = motion.ConstantRate(rate=(0.3, -0.5, 0.8))
 CASES = {
     "directions": Case(

@@ -7,7 +7,7 @@ import json
 
 import numpy as np
 import pytest
-from measured import FIELD
+from measured import FIELD, waves
 from two_stars import drawn_case as case_of
 
 from strapdown import covariance, gyro, montecarlo, motion, quaternion, scenarios, tuning, units, vectors
@@ -21,12 +21,7 @@ from strapdown.tuning import parameters
 ARCSEC = units.ARCSECOND
 STAR = np.array([10.0, 10.0, 60.0]) * ARCSEC
 AXES = ("star.sigma.x", "star.sigma.y", "star.sigma.z")
-SWAY = motion.HarmonicRates(
-    harmonics=(
-        motion.Harmonic(amplitude=(0.8, 0.2, -0.3), frequency=0.21),
-        motion.Harmonic(amplitude=(-0.3, 0.7, 0.4), frequency=0.37),
-    )
-)
+SWAY = waves(((0.8, 0.2, -0.3), 0.21), ((-0.3, 0.7, 0.4), 0.37))
 
 
 def tracked(duration=120.0) -> Scenario:
