@@ -7,6 +7,7 @@ from dataclasses import fields, is_dataclass, replace
 import numpy as np
 
 from strapdown import consistency, estimation, motion, quaternion
+from strapdown.recordings import Recording
 from strapdown.records import ImuRecord
 from strapdown.vectors import VectorMeasurements
 
@@ -131,3 +132,23 @@ def assert_inside(mean, degrees, samples, probability=0.99) -> None:
     """Assert that means of NEES or NIS over their degrees of freedom lie inside their two-sided bounds."""
     low, high = consistency.mean_bounds(degrees, samples, probability)
     assert np.all((low < mean) & (mean < high)), (mean, low, high)
+
+
+def walk(n=60, epoch=1_700_000_000_123_456_789, single=False) -> Recording:
+    """Return a recording of all there is, its numbers of single precision and stamps of whole µs if wanted."""
+    random = np.random.default_rng(2)
+    to = (lambda x: x.astype(np.float32).astype(np.float64)) if single else (lambda x: x)
+    field, force, rate = to(random.standard_normal((3, n, 3)))
+    field[1::2], force[5] = np.nan, np.nan
+    return Recording(
+        source="walk",
+        time=np.cumsum(random.integers(4_000, 6_000, n)) * 1000 / 1e9,
+        rate=rate,
+        specific_force=force,
+        magnetic_field=field,
+        magnetic_unit="G",
+        temperature=random.standard_normal(n),
+        true_attitude=quaternion.exp(np.cumsum(0.02 * random.standard_normal((n, 3)), axis=0)),
+        movement=random.random(n) > 0.5,
+        epoch_ns=epoch // 1000 * 1000 if single else epoch,
+    )

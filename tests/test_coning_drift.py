@@ -92,9 +92,6 @@ def test_second_order_forms_have_a_floor_and_own_best_has_not():
     assert all(abs(exact_error(name, angle, ratio).drift) < 1e-9 for name in OWN)
 
 
-# ------------------------------------------------------------------------------------------------------------------ budget
-
-
 def simulated_drift(line, rate, name, seconds):
     """Return the z drift that the code makes of a two-axis vibration with exact increments; the truth by fine two-sample steps."""
     omega = 2 * math.pi * line.frequency

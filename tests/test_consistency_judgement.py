@@ -9,8 +9,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy.stats
+from two_stars import stars
 
-from strapdown import consistency, montecarlo, motion, records, scenarios, vectors
+from strapdown import consistency, montecarlo, motion, records, scenarios
 from strapdown.checks import InputError
 from strapdown.consistency.judgement import Finding, holm
 from strapdown.estimation import ProcessNoise, setup
@@ -235,10 +236,7 @@ def scenario():
     return scenarios.Scenario(
         motion=motion.rest(),
         gyro=GyroSpec(angle_random_walk=1e-4, rate_random_walk=1e-6),
-        sensors=(
-            vectors.VectorSensor(name="star 1", reference_f=np.array([1.0, 0.0, 0.0]), sigma=1e-3, rate=1.0),
-            vectors.VectorSensor(name="star 2", reference_f=np.array([0.0, 1.0, 1.0]), sigma=1e-3, rate=1.0),
-        ),
+        sensors=stars(1e-3, 1e-3),
         rate=10.0,
         duration=40.0,
         name="rest",

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from two_stars import stars
 
 from benchmarks import power
 from strapdown import consistency, estimation, montecarlo, motion, scenarios, units, vectors
@@ -91,10 +92,7 @@ def right_run(seed):
             rock_angle=10.0 * units.DEGREE, rock_frequency=0.1, spin_rate=5.0 * units.DEGREE, rock_phase=0.0
         ),
         gyro=GyroSpec(angle_random_walk=0.3 * units.DEGREE_PER_ROOT_HOUR, rate_random_walk=1e-6),
-        sensors=(
-            vectors.VectorSensor(name="star 1", reference_f=np.array([1.0, 0.0, 0.0]), sigma=1e-4, rate=2.0),
-            vectors.VectorSensor(name="star 2", reference_f=np.array([0.0, 1.0, 1.0]), sigma=1e-4, rate=2.0),
-        ),
+        sensors=stars(1e-4, 1e-4, rate=2.0),
         rate=10.0,
         duration=300.0,
     )
@@ -134,9 +132,6 @@ def test_the_real_filter_a_thousand_times():
     assert wrong >= 10  # Holm is conservative, not idle
     for p_values in alone.values():
         within_binomial(np.array(p_values), 3.5)
-
-
-# ------------------------------------------------------------------------------------------ verdicts: what `check` and `montecarlo` say
 
 
 def satellite(duration=300.0):

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from measured import waves
+from two_stars import stars
 
 from strapdown import coning, consistency, estimation, motion, quaternion, records, scenarios, units, vectors
 from strapdown.checks import InputError
@@ -210,10 +211,7 @@ def test_a_right_filter_is_given_no_cause_in_95_of_100():
 CONING = scenarios.Scenario(
     motion=motion.Coning(angle=0.7 * units.DEGREE, frequency=10.0),
     gyro=GyroSpec(angle_random_walk=0.08 * units.DEGREE_PER_ROOT_HOUR, rate_random_walk=5e-9),
-    sensors=(
-        vectors.VectorSensor(name="star 1", reference_f=np.array([1.0, 0.0, 0.0]), sigma=1e-4, rate=1.0),
-        vectors.VectorSensor(name="star 2", reference_f=np.array([0.0, 1.0, 1.0]), sigma=1e-4, rate=1.0),
-    ),
+    sensors=stars(1e-4, 1e-4),
     rate=100.0,
     duration=120.0,
 )

@@ -1009,6 +1009,15 @@ def test_the_largest_correction_is_where_the_geometric_bias_begins_to_grow():
     )
 
 
+def begun_off(record, axis, angle, rng):
+    """A start turned by an angle, with a covariance of any size."""
+    return estimation.initial_state(
+        quaternion.multiply(record.truth.attitude[0], quaternion.exp(angle * axis / np.linalg.norm(axis))),
+        attitude_sigma=10.0 ** rng.uniform(-3.0, 1.0),
+        bias_sigma=10.0 ** rng.uniform(-6.0, 0.0),
+    )
+
+
 def wild(seed, intervals):
     """A record and a start from anywhere: errors up to 180°, covariances from far too small to far too large, good and bad sensors."""
     rng = np.random.default_rng([32, seed])
@@ -1022,13 +1031,7 @@ def wild(seed, intervals):
         sigma=10.0 ** rng.uniform(-5.0, -1.0),
     )
     axis = rng.standard_normal(3)
-    turn = (np.pi - 10.0 ** rng.uniform(-8.0, 0.4)) * axis / np.linalg.norm(axis)
-    initial = estimation.initial_state(
-        quaternion.multiply(record.truth.attitude[0], quaternion.exp(turn)),
-        attitude_sigma=10.0 ** rng.uniform(-3.0, 1.0),
-        bias_sigma=10.0 ** rng.uniform(-6.0, 0.0),
-    )
-    return record, initial
+    return record, begun_off(record, axis, np.pi - 10.0 ** rng.uniform(-8.0, 0.4), rng)
 
 
 def assert_sound(estimate):
@@ -1040,10 +1043,12 @@ def assert_sound(estimate):
     assert np.linalg.eigvalsh(estimate.covariance / (sigma[:, :, None] * sigma[:, None, :])).min() > -1e-9
 
 
+@pytest.mark.parametrize("many", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["few", "thousands"])
 @pytest.mark.parametrize("name", filters.FILTERS)
-def test_every_filter_stays_finite_from_any_start(name):
-    for seed in range(8 if name == "usque" else 24):
-        record, initial = wild(seed, 60 if name == "usque" else 300)
+def test_every_filter_stays_finite_from_any_start(name, many):
+    quick = name != "usque"
+    for seed in range(100, 3000 if quick else 300) if many else range(24 if quick else 8):
+        record, initial = wild(seed, (2000 if many else 300) if quick else 60)
         assert_sound(filters.run(name, record, BELIEF, initial, full_covariance=True))
 
 
@@ -1062,12 +1067,7 @@ def test_every_filter_stays_finite_whatever_it_measures(kind, form):
             sigma=10.0 ** rng.uniform(-5.0, -1.0),
             together=together,
         )
-        axis = rng.standard_normal(3)
-        initial = estimation.initial_state(
-            quaternion.multiply(record.truth.attitude[0], quaternion.exp(3.1 * axis / np.linalg.norm(axis))),
-            attitude_sigma=10.0 ** rng.uniform(-3.0, 1.0),
-            bias_sigma=10.0 ** rng.uniform(-6.0, 0.0),
-        )
+        initial = begun_off(record, rng.standard_normal(3), 3.1, rng)
         for name in names:
             assert_sound(filters.run(name, record, BELIEF, initial, full_covariance=True))
 
@@ -1077,14 +1077,6 @@ def test_the_geometric_filter_stays_finite_where_its_bias_would_run_away(seed):
     """Starts from which the bias grows without end if corrections of any length are applied."""
     record, initial = wild(seed, 2000)
     assert_sound(filters.run("geometric", record, BELIEF, initial, full_covariance=True))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", filters.FILTERS)
-def test_every_filter_stays_finite_from_thousands_of_starts(name):
-    for seed in range(100, 300 if name == "usque" else 3000):
-        record, initial = wild(seed, 60 if name == "usque" else 2000)
-        assert_sound(filters.run(name, record, BELIEF, initial, full_covariance=True))
 
 
 @pytest.mark.parametrize("name", filters.FILTERS)

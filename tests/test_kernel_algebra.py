@@ -55,9 +55,6 @@ def test_turns_of_any_angle_against_the_public_algebra(rotation_vectors, largest
                 assert np.allclose(np.reshape(inverse, (3, 3)) @ J, np.eye(3), rtol=0.0, atol=1e-13)
 
 
-# ---------------------------------------------------------------------------------------------------- rotations over all angles
-
-
 def test_exponential_against_mpmath_over_all_angles(rotation_vectors):
     with mp.workdps(50):
         for phi in rotation_vectors(200, 1e-12, LARGEST_ANGLE):

@@ -17,9 +17,6 @@ def random(shape: tuple[int, ...], last: int, seed: int) -> np.ndarray:
     return np.random.default_rng(seed).standard_normal((*shape, last))
 
 
-# ---------------------------------------------------------------------------------------------------- rates
-
-
 @pytest.mark.parametrize("shape", SHAPES)
 def test_rates_and_derivatives_are_inverse(shape):
     q, w = quaternion.normalize(random(shape, 4, 1)), random(shape, 3, 2)
@@ -37,9 +34,6 @@ def test_skew_is_the_cross_product(shape):
     a, b = random(shape, 3, 3), random(shape, 3, 4)
     np.testing.assert_allclose((kinematics.skew(a) @ b[..., None])[..., 0], np.cross(a, b), atol=4 * EPS)
     np.testing.assert_array_equal(kinematics.skew(a), -np.swapaxes(kinematics.skew(a), -1, -2))
-
-
-# ---------------------------------------------------------------------------------------------------- Jacobians
 
 
 def mp_skew(v):

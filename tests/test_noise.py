@@ -134,9 +134,6 @@ def test_successive_normals_and_the_two_of_a_pair_are_independent(sample):
         assert abs(np.corrcoef(a, b)[0, 1]) * math.sqrt(len(a)) < 4.0
 
 
-# ------------------------------------------------------------------------------------------------ normals of the lanes
-
-
 def fill_with_normals(pattern, k0, k1, numbers, streams, out):
     """Fill out with the normals of the streams of these runs; a kernel."""
     like = lanes_of(pattern)

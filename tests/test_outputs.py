@@ -106,9 +106,6 @@ def test_acceleration_without_gravity():
     assert np.isnan(outputs.free_acceleration(q, force)[3]).all()
 
 
-# ------------------------------------------------------------------------------------------------------ tables and files
-
-
 @pytest.fixture
 def case():
     n = 30

@@ -33,9 +33,6 @@ few = settings(
 )
 
 
-# --------------------------------------------------------------------------------------------------------------------- units
-
-
 @quick
 @given(st.floats(1e-9, 1e6))
 def test_a_density_and_a_random_walk_are_one_quantity(value):
@@ -54,8 +51,6 @@ def test_a_specification_goes_through_its_table_to_the_last_bit(walk, scale):
     assert back.angle_random_walk == walk
     assert np.array_equal(back.scale_factor, scale)
 
-
-# --------------------------------------------------------------------------------------------------------------------- files
 
 texts = st.text(st.characters(blacklist_categories=("Cs",), blacklist_characters="\0"), max_size=40)
 
@@ -144,9 +139,6 @@ def test_any_bytes_are_read_or_refused_by_name(tmp_path, content):
             read(path)
         except InputError as error:
             assert "any.file" in str(error)  # noqa: PT017
-
-
-# ----------------------------------------------------------------------------------------------- filter = batch least squares
 
 
 @settings(max_examples=15, deadline=None)

@@ -249,9 +249,6 @@ def test_an_estimate_of_a_setup_with_states_holds_them():
     assert np.all(estimate.variance[-1, 5] > 2.0 * plain.variance[-1, 5])
 
 
-# ---------------------------------------------------------------------------------------------------- smoothing
-
-
 @pytest.mark.parametrize("states", [False, True])
 def test_smoothing_by_a_setup_is_that_of_the_smoother(states):
     chosen = dataclasses.replace(scenarios.load_scenario("spin" if states else "coning"), duration=10.0)

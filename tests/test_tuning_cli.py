@@ -7,6 +7,7 @@ import json
 
 import numpy as np
 import pytest
+from two_stars import stars
 
 import strapdown as sd
 from sims import hand_held
@@ -21,10 +22,7 @@ SCENARIO = scenarios.Scenario(
     name="two stars",
     motion=motion.ConstantRate(rate=np.array([0.01, 0.02, 0.05])),
     gyro=gyro.GyroSpec(angle_random_walk=1e-4, rate_random_walk=3e-6, turn_on_bias_sigma=1e-5),
-    sensors=(
-        vectors.VectorSensor(name="sun", reference_f=np.array([1.0, 0.0, 0.0]), sigma=1e-4, rate=1.0),
-        vectors.VectorSensor(name="star", reference_f=np.array([0.0, 1.0, 1.0]), sigma=2e-4, rate=1.0),
-    ),
+    sensors=stars(1e-4, 2e-4),
     rate=4.0,
     duration=300.0,
 )
@@ -42,7 +40,7 @@ def wrong(tmp_path):
     """A filter wrong by ten."""
     path = tmp_path / "wrong.toml"
     filter_setup = setup.FilterSetup.for_scenario(SCENARIO)
-    values = {"gyro.arw": 1e-3, "gyro.rrw": 3e-7, "sun.sigma": 1e-5, "star.sigma": 2e-3}
+    values = {"gyro.arw": 1e-3, "gyro.rrw": 3e-7, "star 1.sigma": 1e-5, "star 2.sigma": 2e-3}
     path.write_text(setup.to_toml(tuning.with_values(filter_setup, values)), encoding="utf-8")
     return path
 
@@ -56,9 +54,9 @@ def test_tune_writes_the_filter_the_report_and_the_figures(succeeds, tmp_path, r
     found = setup.read_setup(out)
     assert isinstance(found, FilterSetup)
     assert found.process_noise.angle_random_walk == pytest.approx(1e-4, rel=0.3)
-    assert found.sigma["star"] == pytest.approx(2e-4, rel=0.2)
+    assert found.sigma["star 2"] == pytest.approx(2e-4, rel=0.2)
     content = json.loads(out.with_suffix(".json").read_text())
-    assert [one["name"] for one in content["parameters"]] == ["gyro.arw", "gyro.rrw", "sun.sigma", "star.sigma"]
+    assert [one["name"] for one in content["parameters"]] == ["gyro.arw", "gyro.rrw", "star 1.sigma", "star 2.sigma"]
     assert content["innovations_fit"]
     held = content["held_out"]
     assert held["after"]["log_likelihood_per_innovation"] > held["before"]["log_likelihood_per_innovation"]
@@ -70,9 +68,9 @@ def test_tune_writes_the_filter_the_report_and_the_figures(succeeds, tmp_path, r
 
 def test_tune_against_the_truth_and_with_a_prior(succeeds, tmp_path, record, wrong):
     out = tmp_path / "tuned.toml"
-    said = succeeds("tune", record, "--truth", "--free", "gyro.arw,star.sigma", "--starts", 1, "-o", out)
+    said = succeeds("tune", record, "--truth", "--free", "gyro.arw,star 2.sigma", "--starts", 1, "-o", out)
     assert "gyro.arw" in said
-    assert set(setup.read_setup(out).sigma) == {"star"}
+    assert set(setup.read_setup(out).sigma) == {"star 2"}
     spec = tmp_path / "gyro.toml"
     spec.write_text("[gyro]\nangle_random_walk_rad_per_sqrt_s = 1e-4\nrate_random_walk_rad_per_s_per_sqrt_s = 3e-7\n")
     succeeds("tune", record, "--filter", wrong, "--prior", spec, "-o", out)
@@ -99,12 +97,12 @@ def test_plan_says_how_long_a_record_is_needed(run, succeeds, tmp_path):
     path.write_text(scenarios.scenario_to_toml(dataclasses.replace(SCENARIO, duration=60.0)), encoding="utf-8")
     said = succeeds("tune", "--plan", path, "--length", "30,60")
     assert "10 % needs" in said
-    assert "star.sigma" in said
-    said = succeeds("tune", "--plan", path, "--free", "gyro.arw,sun.sigma")
+    assert "star 2.sigma" in said
+    said = succeeds("tune", "--plan", path, "--free", "gyro.arw,star 1.sigma")
     assert "60 s" in said
     record = tmp_path / "two.h5"
     succeeds("simulate", path, "--out", record)
-    assert run("tune", "--plan", record, "--free", "gyro.arw", "--free", "sun.sigma")[:2] == (0, said)
+    assert run("tune", "--plan", record, "--free", "gyro.arw", "--free", "star 1.sigma")[:2] == (0, said)
     assert not (tmp_path / "filter.toml").exists()
 
 
@@ -189,7 +187,7 @@ def test_outliers_beside_optional_states(succeeds, tmp_path):
     sensors = tuple(dataclasses.replace(one, faults=faults) for one in SCENARIO.sensors)
     struck = scenarios.simulate(dataclasses.replace(SCENARIO, gyro=spec, sensors=sensors), 2)
     recordfiles.write_record(tmp_path / "struck.h5", struck)
-    options = ("--states", "--gate", "--free", "sun.sigma,star.sigma", "--starts", 1, "--holdout", 0.3)
+    options = ("--states", "--gate", "--free", "star 1.sigma,star 2.sigma", "--starts", 1, "--holdout", 0.3)
     said = succeeds("tune", tmp_path / "struck.h5", *options, "-o", out)
     assert "is more likely an outlier than noise" in said
     found, content = setup.read_setup(out), json.loads(out.with_suffix(".json").read_text())

@@ -58,18 +58,26 @@ def wrong(chosen, factors) -> setup.FilterSetup:
 # ------------------------------------------------------------------------------------------------------------------- the likelihood
 
 
-def test_without_states_it_is_the_likelihood_of_the_plain_filter():
+@pytest.mark.parametrize(
+    "options",
+    [{"parts": 7}, {"spacing": 3.0}],
+    ids=["parts", "thinned"],  # whose edges are at no measurement
+)
+def test_without_states_it_is_the_likelihood_of_the_plain_filter(options):
     scenario = dataclasses.replace(scenarios.load_scenario("two-stars"), duration=60.0)
-    chosen = setup.FilterSetup.for_scenario(scenario)
+    chosen = dataclasses.replace(
+        setup.FilterSetup.for_scenario(scenario), sigma={"star 1": 2e-4}, measurement_sigma_factor=1.5
+    )
     cases = [case_of(scenario, chosen, 3, run) for run in range(2)]
     names = ["gyro.arw", "gyro.rrw", "star 1.sigma"]
-    # Seven parts, whose edges are at no measurement.
-    plain = tuning.likelihood(cases, chosen, names, parts=7)
-    other = tuning.likelihood(cases, dataclasses.replace(chosen, states=States()), names, parts=7)
+    plain = tuning.likelihood(cases, chosen, names, **options)
+    other = tuning.likelihood(cases, dataclasses.replace(chosen, states=States()), names, **options)
     assert other.names == plain.names
     np.testing.assert_allclose(other.start, plain.start, rtol=1e-15)
     points = plain.start + np.array([[0.0, 0.0, 0.0], [0.3, -0.5, 0.2]])
     np.testing.assert_allclose(other.minus_log(points), plain.minus_log(points), rtol=1e-9)
+    whole = tuning.likelihood(cases, chosen, names).minus_log(points[0])[0]
+    assert (other.minus_log(points[0])[0] != pytest.approx(whole)) == ("spacing" in options)
     for point in points:
         one, two = plain.derivatives(point), other.derivatives(point)
         np.testing.assert_allclose(two.value, one.value, rtol=1e-9)
@@ -276,22 +284,6 @@ def test_the_smallest_error_of_a_filter_with_states_then_the_scale_of_its_innova
     # It leaves the estimates, and so their errors, as they are.
     assert attitude_rms(cases, found.setup) == pytest.approx(attitude_rms(cases, used), rel=1e-9)
     assert list(tuning.values_of(found.setup, names, []).values()) == pytest.approx([found[n].value for n in names])
-
-
-def test_a_filter_with_states_is_thinned_as_one_without():
-    scenario = dataclasses.replace(scenarios.load_scenario("two-stars"), duration=60.0)
-    chosen = dataclasses.replace(
-        setup.FilterSetup.for_scenario(scenario), sigma={"star 1": 2e-4}, measurement_sigma_factor=1.5
-    )
-    cases = [case_of(scenario, chosen, 3)]
-    names = ["gyro.arw", "star 1.sigma", "star 2.sigma"]
-    plain = tuning.likelihood(cases, chosen, names, spacing=3.0)
-    other = tuning.likelihood(cases, dataclasses.replace(chosen, states=States()), names, spacing=3.0)
-    points = plain.start + np.array([[0.0, 0.0, 0.0], [0.3, -0.5, 0.2]])
-    np.testing.assert_allclose(other.minus_log(points), plain.minus_log(points), rtol=1e-9)
-    assert other.minus_log(points[0])[0] != pytest.approx(
-        tuning.likelihood(cases, chosen, names).minus_log(points[0])[0]
-    )
 
 
 def test_a_plan_knows_that_one_record_has_three_draws_of_a_hard_iron():

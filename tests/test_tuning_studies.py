@@ -93,9 +93,6 @@ def test_a_noise_that_records_hardly_show_gets_a_bound_over_200_records():
     assert np.all(found.rms[rest] <= 1.15 * found.bound[rest])
 
 
-# --------------------------------------------------------------------------------------------- built-in scenarios
-
-
 SCENARIOS = ("coning", "hand-held", "low-orbit", "magnetometer-only", "slew-vibration", "spin", "tumbling-satellite")
 
 
@@ -172,9 +169,6 @@ def test_after_tuning_held_out_innovations_of_the_scenarios_as_they_are_pass(nam
     assert nis_bounds[0] < nis < nis_bounds[1]
 
 
-# --------------------------------------------------------------------------------------------- against the Cramér–Rao bound
-
-
 def efficiencies(chosen: scenarios.Scenario, tuned: FilterSetup) -> tuple[np.ndarray, np.ndarray]:
     """Return RMSE/√PCRB of a filter's attitude and bias at the epochs after the start, both predicted.
 
@@ -216,9 +210,6 @@ def test_tuned_from_thirty_times_wrong_the_errors_reach_their_bound_in_every_sce
     assert max(np.sqrt(np.mean(ratio**2)) for ratio in before) > 1.5
     assert np.max(after[0]) <= 1.03, after[0]
     assert np.sqrt(np.mean(after[1] ** 2)) <= 1.03, after[1]
-
-
-# --------------------------------------------------------------------------------------------- real recordings
 
 
 def recorded(broad, files: slice) -> list[tuning.Case]:

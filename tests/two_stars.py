@@ -24,6 +24,15 @@ BELIEVED = FilterSetup(
 )
 
 
+def stars(first: float, second: float, rate: float = 1.0, **changes: Any) -> tuple[vectors.VectorSensor, ...]:
+    """Return two sensors of directions 90° apart with these σ."""
+    references = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 1.0]])
+    return tuple(
+        vectors.VectorSensor(name=f"star {k}", reference_f=reference, sigma=sigma, rate=rate, **changes)
+        for k, reference, sigma in zip((1, 2), references, (first, second), strict=True)
+    )
+
+
 def scenario(
     duration: float = 200.0, *, rate: float = 4.0, walk: float = RRW, outliers: float = 0.0
 ) -> scenarios.Scenario:
@@ -32,12 +41,7 @@ def scenario(
     return scenarios.Scenario(
         motion=motion.ConstantRate(rate=np.array([0.01, 0.02, 0.05])),
         gyro=gyro.GyroSpec(angle_random_walk=ARW, rate_random_walk=walk, turn_on_bias_sigma=1e-4),
-        sensors=tuple(
-            vectors.VectorSensor(
-                name=f"star {k}", reference_f=np.array(reference), sigma=sigma, rate=1.0, faults=faults
-            )
-            for k, reference, sigma in zip((1, 2), ([1.0, 0.0, 0.0], [0.0, 1.0, 1.0]), SIGMAS, strict=True)
-        ),
+        sensors=stars(*SIGMAS, faults=faults),
         rate=rate,
         duration=duration,
     )
