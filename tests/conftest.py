@@ -1,7 +1,5 @@
 """Options and fixtures that several test files use."""
 
-from __future__ import annotations
-
 import base64
 import functools
 import gc

@@ -1,7 +1,5 @@
 """A record processed by the step-by-step filter, for comparison with the compiled one."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What many tests are made of: bodies, references, series of measurements, records at rest, starts drawn from their own σ, and errors."""
 
-from __future__ import annotations
-
 from dataclasses import fields, is_dataclass, replace
 
 import numpy as np

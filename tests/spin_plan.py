@@ -1,7 +1,5 @@
 """A short Monte Carlo of a spinning body, and whether two statistics are equal to the bit."""
 
-from __future__ import annotations
-
 from dataclasses import fields, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Attitude and heading from recordings: one of known truth, and the shared BROAD trials."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """`strapdown allan`: what it writes, what it says of terms not seen and of records not at rest, and how it refuses."""
 
-from __future__ import annotations
-
 import json
 import tomllib
 

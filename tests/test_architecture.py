@@ -1,7 +1,5 @@
 """The house: imports run downwards, faces stay on the top floor, and what is heavy loads when it is first needed."""
 
-from __future__ import annotations
-
 import ast
 import graphlib
 import re

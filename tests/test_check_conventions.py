@@ -1,7 +1,5 @@
 """Recordings with one convention broken: the check names it; whole ones it finds as declared; poor ones it does not call wrong."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

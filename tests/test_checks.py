@@ -1,7 +1,5 @@
 """Checks at the rim: what passes unchanged, and errors that name the value, the place and the remedy."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Progress: lines off a terminal, a bar on one, what is compiled, and silence where it is asked for."""
 
-from __future__ import annotations
-
 import io
 import json
 import sys

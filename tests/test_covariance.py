@@ -1,7 +1,5 @@
 """Covariance analysis: against the filter itself, a Lyapunov equation, experiments without noise, and Monte Carlo."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 

@@ -1,7 +1,5 @@
 """A vector that is normalised has less noise than its components: how much, and what a filter of directions makes of it."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

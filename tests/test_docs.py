@@ -3,8 +3,6 @@
 The pages' code is run by the build of the site (``docs/conf.py``), not here.
 """
 
-from __future__ import annotations
-
 import importlib
 import json
 import pkgutil

@@ -1,7 +1,5 @@
 """The reference: every public name is documented as numpydoc wants it, and every example in it runs."""
 
-from __future__ import annotations
-
 import doctest
 import functools
 import importlib

@@ -1,7 +1,5 @@
 """Optional states: the plain filter without them, one filter on both faces, exact models, sharp measurements, foreign blocks, bad input."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math

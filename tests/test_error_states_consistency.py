@@ -1,7 +1,5 @@
 """Monte Carlo of the filter with optional states: its covariance is consistent with each error state, and not with one left out."""
 
-from __future__ import annotations
-
 import dataclasses
 from functools import cache
 

@@ -1,7 +1,5 @@
 """Optional states of a filter setup: their files, the blocks they become, gates and robust weights, the whole bias; refusals."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import in_steps

@@ -1,7 +1,5 @@
 """A gate that recovers beside optional states: lock-in by a wrong start, a gap, a magnet; what a candidate knows; both faces; outliers."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """The smoother with error states: one least-squares problem for each kind of block, and recoveries."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

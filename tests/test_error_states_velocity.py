@@ -1,7 +1,5 @@
 """The bounded velocity of an accelerometer on a moving hand, and states in chains: exact models, both faces, consistency, files."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import json

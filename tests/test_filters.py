@@ -1,7 +1,5 @@
 """The family of filters: each formula by itself, each pair that must agree, and all of them against truth and χ²."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import pkgutil

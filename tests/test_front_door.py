@@ -1,7 +1,5 @@
 """``import strapdown as sd``: the five commonest programs, what the package shows, and that it loads nothing before it is used."""
 
-from __future__ import annotations
-
 import ast
 import base64
 import dataclasses

@@ -1,7 +1,5 @@
 """The noise of a gyro's increment in the attitude at large turns a sample, and how far the filter's σ_v² dt I is from it."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Rotations of tuple kernels over all angles against the public algebra, mpmath and SciPy."""
 
-from __future__ import annotations
-
 import mpmath as mp
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Compiling kernels: what is compiled, what is refused, and a disk cache that is never stale."""
 
-from __future__ import annotations
-
 import ast
 import importlib
 import math

@@ -1,7 +1,5 @@
 """Series coefficients of the kernels against mpmath: to rounding up to the angle they promise, and no worse than they say beyond."""
 
-from __future__ import annotations
-
 import mpmath as mp
 import numpy as np
 import pytest

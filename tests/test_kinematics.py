@@ -1,7 +1,5 @@
 """Rates and Jacobians. The numbered equations have their own file; here: shapes, round trips, and the Jacobians against mpmath."""
 
-from __future__ import annotations
-
 import mpmath as mp
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Campaigns and their files: killed, interrupted, resumed, extended, and refused where they do not fit."""
 
-from __future__ import annotations
-
 import json
 import multiprocessing
 import os

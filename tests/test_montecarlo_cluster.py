@@ -1,7 +1,5 @@
 """Chunks on Dask: the bits of one process, whoever computes them and whoever is killed meanwhile."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal

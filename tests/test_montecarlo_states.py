@@ -1,7 +1,5 @@
 """Filters with error states over eight runs at once: each run is what the filter of the factor makes of it, and its own bits."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

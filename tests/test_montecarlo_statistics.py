@@ -1,7 +1,5 @@
 """Plans, mergeable statistics, and the engine that merges them: definitions held against plain reference code."""
 
-from __future__ import annotations
-
 import functools
 import math
 import threading

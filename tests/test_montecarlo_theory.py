@@ -1,7 +1,5 @@
 """Filters that model a known multiple of Q or R: the Monte Carlo fails them by as much as theory says, and passes the right one."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

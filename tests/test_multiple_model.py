@@ -1,7 +1,5 @@
 """The bank of hypotheses: any start, one vector at a time; consistent once it is one; and no attitude where none can be known."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Noise of any sensor at rest: other sensors' units, gaps, temperature, the files of other programs, and the whole way through a bag."""
 
-from __future__ import annotations
-
 import json
 import re
 import tomllib

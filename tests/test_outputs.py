@@ -1,7 +1,5 @@
 """An estimate in other forms: angles and σ against SciPy and finite differences, frames against closed forms, files read back."""
 
-from __future__ import annotations
-
 import csv
 import itertools
 

@@ -142,7 +142,6 @@ def test_a_too_modest_filter_is_found_out():
 
 
 MINE = """
-from __future__ import annotations
 
 from dataclasses import dataclass, replace
 

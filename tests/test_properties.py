@@ -1,7 +1,5 @@
 """Properties that hold for any input, sought by hypothesis: units, files, filter = batch least squares."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math

@@ -1,7 +1,5 @@
 """The one layer that every file passes: what it lets through, and what it refuses in time and by name."""
 
-from __future__ import annotations
-
 import dataclasses
 import faulthandler
 import gc

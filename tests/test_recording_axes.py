@@ -1,7 +1,5 @@
 """Recordings of other conventions: warned of before the remedy, right after it. Truth is SciPy's rotation of a closed form."""
 
-from __future__ import annotations
-
 import csv
 
 import numpy as np

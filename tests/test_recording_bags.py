@@ -1,7 +1,5 @@
 """ROS bags: written by the library's own serialiser and read here, written here and read by the library, truncated, of several units."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

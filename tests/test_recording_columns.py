@@ -1,7 +1,5 @@
 """Which column of a table is what: mapped, guessed and said, or refused."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

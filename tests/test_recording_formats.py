@@ -1,7 +1,5 @@
 """Formats beside bags and text: Parquet, data frames, flight logs, EuRoC folders, trajectories; conversion between all of them."""
 
-from __future__ import annotations
-
 import sys
 import types
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Reading recordings: CSV and BROAD HDF5, their units, and clear words where a file is not what it should be."""
 
-from __future__ import annotations
-
 import h5py
 import numpy as np
 import pytest

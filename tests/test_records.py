@@ -1,7 +1,5 @@
 """The IMU record and the estimate: checks, compressing, cutting, and the estimate's file."""
 
-from __future__ import annotations
-
 import dataclasses
 import re
 

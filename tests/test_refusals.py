@@ -1,7 +1,5 @@
 """What commands and readers refuse before anything is computed or replaced: damaged results, inputs for outputs, numbers too large."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import os

@@ -1,7 +1,5 @@
 """Reports: self-contained pages whose words, numbers and figures are those of the result."""
 
-from __future__ import annotations
-
 import dataclasses
 import html.parser
 import json

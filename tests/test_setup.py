@@ -1,7 +1,5 @@
 """Filter setups: the model of a right filter for a scenario, and their files."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -4,8 +4,6 @@ A script may define ``SMALL``, keyword arguments that make its ``main`` quick; w
 as a reader would give it, and so many seconds.
 """
 
-from __future__ import annotations
-
 import ast
 import os
 import subprocess

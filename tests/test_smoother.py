@@ -1,7 +1,5 @@
 """Smoother: equal to its fixed-side twin; consistent; never worse than the filter. Least squares: test_error_states_smoother.py."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

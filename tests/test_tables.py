@@ -1,7 +1,5 @@
 """Tables of studies: CSV that reads back to the bit, LaTeX that compiles, and the commands that write both, and figures in every format."""
 
-from __future__ import annotations
-
 import csv
 import json
 import math

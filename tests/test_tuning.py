@@ -1,7 +1,5 @@
 """Tuning: the likelihood and its derivatives against independent filters, the search, what is identified, what is held out."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import math

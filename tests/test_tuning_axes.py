@@ -1,7 +1,5 @@
 """A sensor's σ of each body axis: how a filter models it, who refuses it, and that tuning recovers it."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 

@@ -1,7 +1,5 @@
 """``strapdown tune`` as its users run it: files in, table and files out, mistakes reported in one line."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 

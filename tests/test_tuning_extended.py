@@ -1,7 +1,5 @@
 """Tuning a filter with optional states: the same likelihood as without them, its derivatives, what is recovered, what is held out."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

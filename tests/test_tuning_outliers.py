@@ -1,7 +1,5 @@
 """Outliers in tuning: the mixture's likelihood against a plain filter of matrices, what it recovers, and the gate that follows."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 

@@ -1,7 +1,5 @@
 """Tuning over many records: the errors against the Cramér–Rao bound, the coverage of the intervals, held-out verdicts, real recordings."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

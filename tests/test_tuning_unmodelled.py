@@ -1,7 +1,5 @@
 """What the tuned filter leaves unexplained: a scale factor that the gyro's noise stands for, gyros of two kinds in one tuning."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 

@@ -1,7 +1,5 @@
 """What tests of tuning use: two stars seen once a second on a body rotating at constant rate, every kind of measurement, angles alone."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 
