@@ -336,8 +336,6 @@ def test_faces_agree_with_force_and_gyro_scale_of_some_axes():
 
 # ------------------------------------------------------------------------------------------------------------- the step face
 
-X, _, UP = np.eye(3)
-KNOWN = estimation.initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=0.1, bias_sigma=1e-3)
 IRON = error_states.VectorBias(sensor="mag", bias_sigma=3e-6, unit="T")
 HELD = error_states.GaussMarkov(sensor="acc", noise_sigma=0.3, correlation_time=1.0, unit="m/s²")
 

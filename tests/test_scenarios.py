@@ -12,15 +12,7 @@ from strapdown import gyro, motion, quaternion, scenarios, vectors
 from strapdown.checks import InputError
 from strapdown.gyro import GyroSpec
 from strapdown.motion import orbit
-from strapdown.scenarios import (
-    SCENARIOS,
-    Scenario,
-    load_scenario,
-    scenario_from_toml,
-    scenario_to_table,
-    scenario_to_toml,
-    simulate,
-)
+from strapdown.scenarios import Scenario, load_scenario, scenario_from_toml, scenario_to_table, scenario_to_toml
 
 FIRST = "rate_hz = 10.0\nduration_s = 2.0\n"
 REST = FIRST + '[motion]\ntype = "rest"\n'
@@ -28,25 +20,25 @@ REST = FIRST + '[motion]\ntype = "rest"\n'
 
 def test_the_built_in_ones_are_those_asked_for():
     moving = {"coning", "spin", "slew-vibration", "tumbling-satellite", "low-orbit", "magnetometer-only", "hand-held"}
-    assert set(SCENARIOS) == moving | {"rest", "two-stars", "earth-observer", "ship"}
+    assert set(scenarios.SCENARIOS) == moving | {"rest", "two-stars", "earth-observer", "ship"}
     rows = scenarios.builtin_rows()
-    assert [row["name"] for row in rows] == list(SCENARIOS)
+    assert [row["name"] for row in rows] == list(scenarios.SCENARIOS)
     assert all(row["description"] for row in rows)
 
 
-@pytest.mark.parametrize("name", SCENARIOS)
+@pytest.mark.parametrize("name", scenarios.SCENARIOS)
 def test_built_in_scenarios_simulate_and_survive_a_file(name, tmp_path):
     short = dataclasses.replace(load_scenario(name), duration=4.0)
     path = tmp_path / "own.toml"
     path.write_text(scenario_to_toml(short), encoding="utf-8")
     read = load_scenario(path)
     assert scenario_to_table(read) == scenario_to_table(short)
-    record = simulate(short)
-    assert not differing(record, simulate(read))
+    record = scenarios.simulate(short)
+    assert not differing(record, scenarios.simulate(read))
     assert len(record.increments) == round(4.0 * short.rate)
     np.testing.assert_array_equal(record.truth.attitude, short.motion.attitude(record.time))
-    assert differing(record, simulate(short, seed=99))
-    assert differing(record, simulate(short, run=1))
+    assert differing(record, scenarios.simulate(short, seed=99))
+    assert differing(record, scenarios.simulate(short, run=1))
 
 
 MOTIONS = [
@@ -112,7 +104,7 @@ def test_every_motion_and_sensor_survives_a_file(body):
     assert scenario_to_table(read) == scenario_to_table(whole)
     assert read.motion == body
     assert read.gyro == whole.gyro
-    assert not differing(simulate(whole), simulate(read))
+    assert not differing(scenarios.simulate(whole), scenarios.simulate(read))
 
 
 @pytest.mark.parametrize(
@@ -184,12 +176,12 @@ def test_a_preset_may_be_changed_in_a_file():
 def test_adding_a_sensor_changes_no_other_stream():
     spec = GyroSpec(angle_random_walk=1e-4, rate_random_walk=1e-5, bias_instability=1e-6)
     base = Scenario(motion=MOTIONS[0], gyro=spec, sensors=SENSORS[:2], rate=50.0, duration=3.0)
-    alone, more = simulate(base, 3, 7), simulate(dataclasses.replace(base, sensors=SENSORS), 3, 7)
+    alone, more = scenarios.simulate(base, 3, 7), scenarios.simulate(dataclasses.replace(base, sensors=SENSORS), 3, 7)
     assert np.array_equal(alone.increments, more.increments)
     for a, b in zip(alone.vectors, more.vectors[:2], strict=True):
         assert np.array_equal(a.vector_b, b.vector_b)
     twins = tuple(dataclasses.replace(SENSORS[1], name=name) for name in ("one", "other"))
-    one, other = simulate(dataclasses.replace(base, sensors=twins), 3, 7).vectors
+    one, other = scenarios.simulate(dataclasses.replace(base, sensors=twins), 3, 7).vectors
     assert not np.any(one.vector_b == other.vector_b)
     with pytest.raises(InputError, match="two sensors"):
         dataclasses.replace(base, sensors=(SENSORS[0], SENSORS[0]))
@@ -201,18 +193,18 @@ def test_jitter_has_the_truth_where_it_sampled_and_losses_are_bridged():
     base = Scenario(
         motion=fast, gyro=dataclasses.replace(spec, drop_probability=0.0), sensors=(), rate=50.0, duration=20.0
     )
-    record = simulate(base, 1)
+    record = scenarios.simulate(base, 1)
     np.testing.assert_allclose(record.time, base.edges + 0.5)
     sampled = 2.0 * np.unwrap(np.arctan2(record.truth.attitude[:, 3], record.truth.attitude[:, 0]), period=np.pi) / 3.0
     assert np.std(sampled - base.edges) == pytest.approx(1e-3, rel=0.1)
     np.testing.assert_allclose(np.diff(sampled) * 3.0, record.increments[:, 2], atol=1e-9)
-    lossy = simulate(dataclasses.replace(base, gyro=spec), 1)
+    lossy = scenarios.simulate(dataclasses.replace(base, gyro=spec), 1)
     assert len(lossy.increments) == pytest.approx(800, abs=60)
     np.testing.assert_allclose(lossy.rates[:, 2], 3.0, atol=1.0)
     assert set(lossy.time) <= set(record.time)
     left = np.searchsorted(record.time, lossy.time)
     np.testing.assert_array_equal(lossy.truth.attitude, record.truth.attitude[left])
-    steady = simulate(dataclasses.replace(base, gyro=GyroSpec(drop_probability=0.2)), 1)
+    steady = scenarios.simulate(dataclasses.replace(base, gyro=GyroSpec(drop_probability=0.2)), 1)
     np.testing.assert_allclose(steady.rates[:, 2], 3.0, rtol=1e-12)
 
 
@@ -220,9 +212,9 @@ def test_a_g_sensitive_gyro_feels_gravity_and_not_in_free_fall():
     spec = GyroSpec(g_sensitivity=1e-4 * np.eye(3))
     base = Scenario(motion=motion.rest(), gyro=spec, sensors=(), rate=10.0, duration=1.0)
     np.testing.assert_allclose(
-        simulate(base, 1).rates, np.tile([0.0, 0.0, 9.80665e-4], (10, 1)), rtol=1e-12, atol=1e-18
+        scenarios.simulate(base, 1).rates, np.tile([0.0, 0.0, 9.80665e-4], (10, 1)), rtol=1e-12, atol=1e-18
     )
-    assert not np.any(simulate(dataclasses.replace(base, gravity_f=(0.0, 0.0, 0.0)), 1).rates)
+    assert not np.any(scenarios.simulate(dataclasses.replace(base, gravity_f=(0.0, 0.0, 0.0)), 1).rates)
 
 
 @pytest.mark.parametrize(
@@ -261,7 +253,7 @@ def test_a_byte_order_mark_is_no_matter(tmp_path):
 
 
 def test_lists_of_numbers_stand_on_one_line():
-    for name in SCENARIOS:
+    for name in scenarios.SCENARIOS:
         scenario = load_scenario(name)
         text = scenario_to_toml(scenario)
         assert tomllib.loads(text) == scenario_to_table(scenario)
@@ -352,7 +344,7 @@ def test_a_flight_in_samples_is_a_motion_of_a_file():
     scenario = dataclasses.replace(load_scenario("two-stars"), motion=again, duration=20.0)
     read = scenario_from_toml(scenario_to_toml(scenario))
     np.testing.assert_array_equal(read.motion.attitudes, again.attitudes)
-    record = simulate(read)
+    record = scenarios.simulate(read)
     np.testing.assert_array_equal(record.truth.attitude, again.attitude(record.time))
     # A spline of degree 5 through samples a tenth of a second apart, of a cone of ten seconds.
     assert np.max(quaternion.angle_between(record.truth.attitude, flown.attitude(record.time))) < 1e-6

@@ -13,18 +13,7 @@ from strapdown.checks import InputError
 from strapdown.gyro import GyroSpec
 from strapdown.motion import orbit
 from strapdown.randomness import generator
-from strapdown.vectors import (
-    Accelerometer,
-    AttitudeSensor,
-    Faults,
-    HeadingPair,
-    HorizonSensor,
-    Magnetometer,
-    VectorMeasurements,
-    VectorSensor,
-    specific_force,
-    triad,
-)
+from strapdown.vectors import Accelerometer, AttitudeSensor, Faults, HeadingPair, Magnetometer, VectorSensor, triad
 from strapdown.vectors.sensors import sample_times
 
 CONE = motion.Coning(angle=0.3, frequency=0.7)
@@ -51,7 +40,7 @@ EVERY = [
     Accelerometer(name="vertical", sigma=0.01, rate=4.0),
     Accelerometer(name="whole force", sigma=0.01, rate=4.0, kind="vector"),
     HeadingPair(name="antennas", baseline_b=[2.0, 0.0, 0.0], sigma=0.01, rate=4.0),
-    HorizonSensor(name="horizon", orbit=orbit.CircularOrbit(), sigma=1e-3, rate=4.0),
+    vectors.HorizonSensor(name="horizon", orbit=orbit.CircularOrbit(), sigma=1e-3, rate=4.0),
 ]
 
 
@@ -175,7 +164,7 @@ def test_specific_force_at_a_lever_arm_is_the_second_derivative_of_the_position(
     weights = np.array([-1.0, 16.0, -30.0, 16.0, -1.0]) / 12.0
     moved = sum(w * place(time + k * step) for w, k in zip(weights, range(-2, 3), strict=True)) / step**2
     wanted = rotation(body, time).inv().apply(moved + pushed(time) - np.array(vectors.GRAVITY_F))
-    got = specific_force(body, time, lever_arm_b=arm, acceleration_f=pushed)
+    got = vectors.specific_force(body, time, lever_arm_b=arm, acceleration_f=pushed)
     np.testing.assert_allclose(got, wanted, atol=2e-8)
 
 
@@ -271,21 +260,21 @@ ATTITUDES = {
     ],
 )
 def test_what_does_not_fit_the_samples_is_named(change, message):
-    VectorMeasurements(**GOOD)
+    vectors.VectorMeasurements(**GOOD)
     with pytest.raises(InputError, match=message):
-        VectorMeasurements(**{**GOOD, **change})
+        vectors.VectorMeasurements(**{**GOOD, **change})
 
 
 def test_one_sigma_of_an_attitude_is_that_about_each_axis():
-    one = VectorMeasurements(**{**ATTITUDES, "sigma": 0.01})
+    one = vectors.VectorMeasurements(**{**ATTITUDES, "sigma": 0.01})
     np.testing.assert_array_equal(one.sigma_axes, np.full((5, 3), 0.01))
     np.testing.assert_array_equal(one.sigma, np.full(5, 0.01))
     each = 0.01 * np.arange(1.0, 6.0)
-    varying = VectorMeasurements(**{**ATTITUDES, "sigma": each})
+    varying = vectors.VectorMeasurements(**{**ATTITUDES, "sigma": each})
     np.testing.assert_array_equal(varying.covariances, each[:, None, None] ** 2 * np.eye(3))
     np.testing.assert_allclose(varying.noise_scaled(3.0).sigma_axes[:, 1], 3.0 * each, rtol=1e-15)
     empty = {"time": [], "attitude": np.empty((0, 4))}
-    assert VectorMeasurements(**{**ATTITUDES, **empty}).sigma_axes.shape == (0, 3)
+    assert vectors.VectorMeasurements(**{**ATTITUDES, **empty}).sigma_axes.shape == (0, 3)
 
 
 def missing(kind, *, also):
@@ -317,7 +306,7 @@ def missing(kind, *, also):
 @pytest.mark.parametrize("kind", vectors.KINDS)
 def test_what_belongs_to_a_missing_sample_may_be_missing_too(kind, also):
     gone, given = missing(kind, also=also)
-    series = VectorMeasurements(**given)
+    series = vectors.VectorMeasurements(**given)
     content = series.attitude if kind == "attitude" else series.vector_b
     np.testing.assert_array_equal(np.isnan(content).any(axis=1), gone)
     known = series.taken(~gone)
@@ -339,7 +328,7 @@ def test_what_belongs_to_a_missing_sample_may_be_missing_too(kind, also):
 
 def test_the_reference_of_a_missing_sample_is_that_of_the_only_one_there_is():
     reference, vector = np.array([[np.nan] * 3, [0.6, 0.8, 0.0]]), np.array([[np.nan] * 3, [0.0, 0.0, 1.0]])
-    series = VectorMeasurements(**{**GOOD, "time": [0.0, 1.0], "reference_f": reference, "vector_b": vector})
+    series = vectors.VectorMeasurements(**{**GOOD, "time": [0.0, 1.0], "reference_f": reference, "vector_b": vector})
     np.testing.assert_array_equal(series.references_f, [[0.6, 0.8, 0.0]] * 2)
 
 
@@ -349,7 +338,7 @@ def test_a_series_may_be_missing_altogether(kind):
     given = {**GOOD, "vector_b": missing, "kind": kind, "sigma": missing[:, 0], "reference_f": missing}
     if kind == "attitude":
         given = {**given, "vector_b": np.empty((0, 3)), "attitude": np.full((5, 4), np.nan)}
-    series = VectorMeasurements(**given)
+    series = vectors.VectorMeasurements(**given)
     assert np.isfinite(series.sigma).all()
     assert np.isfinite(series.references_f).all()
 
@@ -422,7 +411,7 @@ def test_a_field_without_a_direction_is_reported(field, kind):
 def test_masked_measurements_are_missing_ones():
     vector = np.ma.masked_array(np.eye(3), mask=[[0, 0, 0], [1, 1, 1], [0, 0, 0]])
     sigma = np.ma.masked_array([1e-3, 7.0, 1e-3], mask=[0, 1, 0])
-    found = VectorMeasurements(**{**GOOD, "time": [0.0, 1.0, 2.0], "vector_b": vector, "sigma": sigma})
+    found = vectors.VectorMeasurements(**{**GOOD, "time": [0.0, 1.0, 2.0], "vector_b": vector, "sigma": sigma})
     np.testing.assert_array_equal(np.isnan(found.vector_b).all(axis=1), [False, True, False])
     np.testing.assert_allclose(found.sigma, 1e-3)
 
