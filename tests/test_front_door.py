@@ -145,13 +145,6 @@ def test_monte_carlo_verdict():
 # ---------------------------------------------------------------------------------------------------- as the commands do it
 
 
-def run_command(*arguments: object) -> None:
-    """Run the command line in this process."""
-    from strapdown.cli.terminal import app
-
-    app([str(one) for one in arguments], standalone_mode=False)
-
-
 @pytest.mark.parametrize(
     ("options", "keywords"),
     [
@@ -163,11 +156,11 @@ def run_command(*arguments: object) -> None:
         (("--smooth", "--variances"), {"smooth": True, "full_covariance": False}),
     ],
 )
-def test_estimate_of_a_record_is_that_of_the_command(tmp_path, options, keywords):
+def test_estimate_of_a_record_is_that_of_the_command(succeeds, tmp_path, options, keywords):
     errors = {"scale_factor": (3e-4, 0.0, 0.0), "misalignment": np.full((3, 3), 1e-4) - 1e-4 * np.eye(3)}
     made = dataclasses.replace(scenario(), gyro=dataclasses.replace(scenario().gyro, **errors))
     sd.write(sd.simulate(made, seed=9), tmp_path / "record.h5")
-    run_command("estimate", tmp_path / "record.h5", "--out", tmp_path / "out", *options)
+    succeeds("estimate", tmp_path / "record.h5", "--out", tmp_path / "out", *options)
     command = sd.read(tmp_path / "out" / "estimate.h5")
     call = sd.estimate(sd.read(tmp_path / "record.h5"), **keywords)
     for name in ("time", "attitude", "bias", "variance", "covariance"):
@@ -178,19 +171,20 @@ def test_estimate_of_a_record_is_that_of_the_command(tmp_path, options, keywords
     assert sizes == ({"gyro scale": 7} if states is True else {"gyro scale": 1} if states else {})
 
 
-def test_estimate_of_a_recording_is_that_of_the_command(tmp_path):
+def test_estimate_of_a_recording_is_that_of_the_command(succeeds, tmp_path):
     path = phone_recording(tmp_path)
     units = ("--gyro-unit", "deg/s", "--accelerometer-unit", "g", "--time-unit", "s")
-    run_command("estimate", path, *units, "--out", tmp_path / "o")
+    succeeds("estimate", path, *units, "--out", tmp_path / "o")
     command = sd.read(tmp_path / "o" / "estimate.h5")
     call = sd.estimate(sd.read(path, units={"time": "s", "gyro": "deg/s", "accelerometer": "g"}))
     np.testing.assert_array_equal(call.attitude, command.attitude)
     np.testing.assert_array_equal(call.variance, command.variance)
 
 
-def test_monte_carlo_is_that_of_the_command(tmp_path):
+def test_monte_carlo_is_that_of_the_command(run, tmp_path):
     sd.write(scenario(10.0), tmp_path / "small.toml")
-    run_command("montecarlo", tmp_path / "small.toml", "--runs", 10, "--out", tmp_path / "runs.h5", "--threads", 1)
+    options = ("--runs", 10, "--out", tmp_path / "runs.h5", "--threads", 1)
+    assert run("montecarlo", tmp_path / "small.toml", *options)[0] == 2  # ten runs cannot tell
     campaign = sd.read(tmp_path / "runs.h5")
     call = sd.monte_carlo(tmp_path / "small.toml", runs=10, threads=1)
     np.testing.assert_array_equal(call.nees_sum, campaign.statistics.nees_sum)
@@ -225,10 +219,10 @@ def test_a_record_of_a_motion_of_ones_own_is_written_without_its_scenario(tmp_pa
     np.testing.assert_array_equal(sd.estimate(again).attitude, sd.estimate(record).attitude)
 
 
-def test_tune_is_that_of_the_command(tmp_path):
+def test_tune_is_that_of_the_command(succeeds, tmp_path):
     sd.write(sd.simulate(scenario(60.0)), tmp_path / "record.h5")
     options = ("--free", "star 1.sigma", "--starts", "2", "--threads", "1", "--out", tmp_path / "filter.toml")
-    run_command("tune", tmp_path / "record.h5", *options)
+    succeeds("tune", tmp_path / "record.h5", *options)
     call = sd.tune(sd.read(tmp_path / "record.h5"), free=["star 1.sigma"], starts=2, threads=1)
     assert sd.estimation.setup.read_setup(tmp_path / "filter.toml") == call.setup
 
