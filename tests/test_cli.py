@@ -253,7 +253,7 @@ def test_bad_options_end_with_one_clear_line_and_nothing_written(run, tmp_path, 
     assert not list(tmp_path.iterdir())
 
 
-def test_an_output_folder_that_cannot_be_is_said_before_the_work(run, refusal, monkeypatch, tmp_path):
+def test_an_output_folder_that_cannot_be_is_said_before_the_work(refusal, monkeypatch, tmp_path):
     from strapdown.montecarlo import coning_study
 
     monkeypatch.setattr(coning_study, "run", lambda *_, **__: pytest.fail("computed before the folder was looked at"))
@@ -448,7 +448,6 @@ def bad_csv(folder: Path, case: str) -> Path:
         ("short", "lasts 0.49 s; the start needs at least 1 s"),
         ("truncated", "data row 300 has 9 fields, the header 10; the file is truncated"),
     ],
-    ids=["undeclared", "unsorted", "infinite", "repeated", "short", "truncated"],
 )
 def test_bad_recordings_end_with_one_clear_line_and_nothing_written(run, tmp_path, case, words):
     status, said, error = run("estimate", bad_csv(tmp_path, case), "--out", tmp_path / "out")

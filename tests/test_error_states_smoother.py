@@ -265,18 +265,16 @@ def smoothed_beside_the_optimum(small: Small):
     return beside_the_optimum(small, found.attitude, rest, P)
 
 
-@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "lever arm"])
+@pytest.mark.parametrize(
+    "kind", [pytest.param(kind, marks=pytest.mark.slow) if kind == "lever arm" else kind for kind in KINDS]
+)
 def test_the_smoother_is_least_squares_to_first_order(kind):
-    """Of the whole trajectory, prior and gyro noise and measurements together, by Gauss–Newton."""
-    off, ratio = smoothed_beside_the_optimum(small_record(KINDS[kind](0.01), 0.01, steps=6))
-    assert np.max(off) < 0.02
-    np.testing.assert_allclose(ratio, 1.0, rtol=1e-2)
+    """Of the whole trajectory, prior and gyro noise and measurements together, by Gauss–Newton.
 
-
-@pytest.mark.slow
-def test_the_smoother_is_least_squares_with_a_lever_arm():
-    """Rates and angular accelerations are those that the filter takes from the gyro, which wants a hundred samples."""
-    off, ratio = smoothed_beside_the_optimum(small_record(KINDS["lever arm"](0.01), 0.01, steps=100, dt=0.03))
+    With a lever arm rates and angular accelerations are taken from the gyro, which wants a hundred samples.
+    """
+    size = {"steps": 100, "dt": 0.03} if kind == "lever arm" else {"steps": 6}
+    off, ratio = smoothed_beside_the_optimum(small_record(KINDS[kind](0.01), 0.01, **size))
     assert np.max(off) < 0.02
     np.testing.assert_allclose(ratio, 1.0, rtol=1e-2)
 

@@ -389,7 +389,7 @@ def test_bad_input_is_refused():
 # -------------------------------------------------------------------------------------------------- the command line
 
 
-def test_tune_with_a_gate_writes_it_into_the_filter(run, succeeds, tmp_path):
+def test_tune_with_a_gate_writes_it_into_the_filter(succeeds, tmp_path):
     path, out = tmp_path / "sat.h5", tmp_path / "tuned.toml"
     recordfiles.write_record(path, scenarios.simulate(scenario(300.0), 1))
     options = ("--free", "gate.probability,star 1.sigma,star 2.sigma", "--holdout", 0.3, "--starts", 1)
