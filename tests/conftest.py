@@ -1,7 +1,5 @@
 """Options and fixtures that several test files use."""
 
-from __future__ import annotations
-
 import base64
 import functools
 import gc
@@ -130,6 +128,30 @@ def run(
             status = int(end.code or 0)
         said = capsys.readouterr()
         return status, said.out, said.err
+
+    return command
+
+
+@pytest.fixture
+def succeeds(run: Callable[..., tuple[int, str, str]]) -> Callable[..., str]:
+    """Run ``strapdown ARGUMENTS``, which must end well and without an error; return what it said."""
+
+    def command(*arguments: object) -> str:
+        status, said, error = run(*arguments)
+        assert (status, error) == (0, ""), error
+        return said
+
+    return command
+
+
+@pytest.fixture
+def refusal(run: Callable[..., tuple[int, str, str]]) -> Callable[..., str]:
+    """Run ``strapdown ARGUMENTS``, which must be refused; return the error."""
+
+    def command(*arguments: object) -> str:
+        status, _, error = run(*arguments)
+        assert status == 2, error
+        return error
 
     return command
 

@@ -1,11 +1,10 @@
 """A record processed by the step-by-step filter, for comparison with the compiled one."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np
 from gated_steps import GatedStepFilter
+from measured import correlation
 
 from strapdown import estimation
 from strapdown.estimation.states import covariance_matrices
@@ -102,6 +101,14 @@ def run(record, process_noise, initial, error_states=(), **options):
         events=tuple(sorted([*estimation.gaps(record.time), *f.events], key=lambda event: event.start)),
         state=f.state(),
     )
+
+
+def apart(whole, step):
+    """Return how far the result of the compiled filter is from this one's, in σ, and its covariance in correlations: the largest."""
+    P = whole.covariance if whole.whole_covariance is None else whole.whole_covariance
+    sigma = np.sqrt(np.einsum("kii->ki", P))
+    off = np.abs(whole.errors(step.attitude, step.bias, step.values)) / sigma
+    return max(np.max(off), np.max(np.abs(correlation(P - step.whole_covariance, sigma))))
 
 
 def whitened(y, S):

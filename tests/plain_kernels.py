@@ -1,7 +1,5 @@
 """Kernels in plain Python, for tests in which compiled ones would hide a fault in their source or cannot run (float32)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import cache
 from types import FunctionType, ModuleType

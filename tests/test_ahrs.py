@@ -1,7 +1,5 @@
 """Attitude and heading from recordings: one of known truth, and the shared BROAD trials."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from collections.abc import Callable
@@ -29,19 +27,18 @@ DIP = 1.1
 START = Rotation.from_euler("ZYX", [40.0, 12.0, -25.0], degrees=True)
 
 
-def path(time: np.ndarray) -> Rotation:
-    """Attitude, body to East-North-Up: two seconds of rest, then turns about changing axes."""
+def path(time: np.ndarray, turns: tuple[tuple[float, float], ...] = ((1.4, 0.9), (0.6, 1.3), (0.8, 0.7))) -> Rotation:
+    """Attitude, body to East-North-Up: two seconds of rest, then turns of a size and a rate about changing axes."""
     t = np.maximum(time - 2.0, 0.0)
     swing = t**2 / (1.0 + t**2)  # smooth at the start
-    angles = np.stack([1.4 * np.sin(0.9 * t), 0.6 * np.sin(1.3 * t), 0.8 * (1.0 - np.cos(0.7 * t))], -1)
+    (a, f), (b, g), (c, h) = turns
+    angles = np.stack([a * np.sin(f * t), b * np.sin(g * t), c * (1.0 - np.cos(h * t))], -1)
     return START * Rotation.from_euler("XYZ", swing[:, None] * angles)
 
 
 def brisk(time: np.ndarray) -> Rotation:
     """The same of a hand in a hurry: up to 9 rad/s."""
-    t = np.maximum(time - 2.0, 0.0)
-    angles = np.stack([0.9 * np.sin(5.7 * t), 0.6 * np.sin(8.2 * t), 0.8 * (1.0 - np.cos(4.4 * t))], -1)
-    return START * Rotation.from_euler("XYZ", (t**2 / (1.0 + t**2))[:, None] * angles)
+    return path(time, ((0.9, 5.7), (0.6, 8.2), (0.8, 4.4)))
 
 
 def rates(time: np.ndarray, path: Callable[[np.ndarray], Rotation] = path) -> np.ndarray:

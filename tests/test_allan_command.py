@@ -1,7 +1,5 @@
 """`strapdown allan`: what it writes, what it says of terms not seen and of records not at rest, and how it refuses."""
 
-from __future__ import annotations
-
 import json
 import tomllib
 
@@ -33,10 +31,9 @@ def commented(text):
     return tomllib.loads("\n".join(lines))
 
 
-def test_the_scenario_at_rest_gives_its_preset_back(run, tmp_path):
-    assert run("simulate", "rest")[0] == 0
-    status, said, _ = run("allan", "rest.h5")
-    assert status == 0
+def test_the_scenario_at_rest_gives_its_preset_back(succeeds, tmp_path):
+    succeeds("simulate", "rest")
+    said = succeeds("allan", "rest.h5")
     assert "432000 samples at 10 Hz, 12 h" in said
     spec, text = written(tmp_path)
     preset = datasheets.preset("adis16470").spec
@@ -54,11 +51,11 @@ def test_the_scenario_at_rest_gives_its_preset_back(run, tmp_path):
     assert "WARNING" not in text
 
 
-def test_terms_not_seen_are_left_out_and_bounded_in_comments(run, tmp_path):
+def test_terms_not_seen_are_left_out_and_bounded_in_comments(succeeds, tmp_path):
     walking = white()
     walking[:, 2] += np.cumsum(3e-5 * np.random.default_rng(2).standard_normal(20_000))
     np.save(tmp_path / "gyro.npy", walking)
-    assert run("allan", "gyro.npy", *AT_100_HZ)[0] == 0
+    succeeds("allan", "gyro.npy", *AT_100_HZ)
     spec, text = written(tmp_path)
     table = tomllib.loads(text)["gyro"]
     assert sorted(table) == ["angle_random_walk_deg_per_sqrt_hour", "rate_random_walk_deg_per_hour_per_sqrt_hour"]
@@ -76,23 +73,22 @@ def test_terms_not_seen_are_left_out_and_bounded_in_comments(run, tmp_path):
     assert table["angle_random_walk_deg_per_sqrt_hour"] == [float(f"{v / NOISE:.6g}") for v in fit.estimate[:, 1]]
 
 
-def test_one_column_gives_one_number_for_all_axes(run, tmp_path):
+def test_one_column_gives_one_number_for_all_axes(succeeds, tmp_path):
     np.save(tmp_path / "gyro.npy", white(axes=1)[:, 0])
-    assert run("allan", "gyro.npy", *AT_100_HZ)[0] == 0
+    succeeds("allan", "gyro.npy", *AT_100_HZ)
     spec, text = written(tmp_path)
     assert np.ndim(spec.angle_random_walk) == 0
     assert all(isinstance(value, float | int) for value in commented(text).values())
 
 
-def test_a_record_of_something_else_is_said_in_the_file_and_last(run, tmp_path):
+def test_a_record_of_something_else_is_said_in_the_file_and_last(succeeds, tmp_path):
     rates = white()
     rates[8000:12_000, 1] += 0.3  # two steps: a spectrum as f⁻², like that of a rate random walk
     words = (
         "axis y has other errors than these noise terms: its noise is not stationary, and largest from 78.12 to 81.25 s"
     )
     np.save(tmp_path / "gyro.npy", rates)
-    status, said, _ = run("allan", "gyro.npy", *AT_100_HZ)
-    assert status == 0
+    said = succeeds("allan", "gyro.npy", *AT_100_HZ)
     assert "do not trust" in said.splitlines()[-1]
     assert words in " ".join(said.split())
     assert "axis x" not in said
@@ -104,12 +100,11 @@ def test_a_record_of_something_else_is_said_in_the_file_and_last(run, tmp_path):
     assert min(content["misfit_probability"][0], content["misfit_probability"][2]) > 1e-3
 
 
-def test_highest_frequency_leaves_a_line_out(run, tmp_path):
+def test_highest_frequency_leaves_a_line_out(run, succeeds, tmp_path):
     rates = white(4000, axes=1) + 3e-3 * np.sin(2.0 * np.pi * 31.0 * 0.01 * np.arange(4000))[:, None]
     np.save(tmp_path / "gyro.npy", rates)
     assert "do not trust" in run("allan", "gyro.npy", *AT_100_HZ)[1]
-    status, said, _ = run("allan", "gyro.npy", *AT_100_HZ, "--highest-frequency", 25, "--robust")
-    assert status == 0
+    said = succeeds("allan", "gyro.npy", *AT_100_HZ, "--highest-frequency", 25, "--robust")
     assert "do not trust" not in said
     spec, _ = written(tmp_path)
     assert np.all(np.abs(spec.angle_random_walk / NOISE - 1.0) < 0.05)
@@ -117,23 +112,23 @@ def test_highest_frequency_leaves_a_line_out(run, tmp_path):
     assert content["estimator"] == "robust"
 
 
-def test_npy_csv_and_units_agree(run, tmp_path):
+def test_npy_csv_and_units_agree(succeeds, tmp_path):
     rates = white(4096)
     np.save(tmp_path / "gyro.npy", rates)
     time = 0.01 * np.arange(4096)
     header = "time [ms],gx [deg/s],gy [deg/s],gz [deg/s]"
     columns = np.column_stack([1000.0 * time, np.degrees(rates)])
     np.savetxt(tmp_path / "gyro.csv", columns, delimiter=",", header=header, comments="", fmt="%.17g")
-    assert run("allan", "gyro.npy", *AT_100_HZ, "--out", "a")[0] == 0
-    assert run("allan", "gyro.csv", "--out", "b")[0] == 0
+    succeeds("allan", "gyro.npy", *AT_100_HZ, "--out", "a")
+    succeeds("allan", "gyro.csv", "--out", "b")
     one, other = written(tmp_path, "a")[0], written(tmp_path, "b")[0]
     np.testing.assert_allclose(one.angle_random_walk, other.angle_random_walk, rtol=3e-6)
 
 
-def test_a_name_with_a_line_break_still_gives_toml(run, tmp_path):
+def test_a_name_with_a_line_break_still_gives_toml(succeeds, tmp_path):
     name = "at\nrest = 1\t.npy"
     np.save(tmp_path / name, white(4096))
-    assert run("allan", name, *AT_100_HZ)[0] == 0
+    succeeds("allan", name, *AT_100_HZ)
     assert list(tomllib.loads(written(tmp_path)[1])) == ["gyro"]
 
 
@@ -152,10 +147,9 @@ def test_a_name_with_a_line_break_still_gives_toml(run, tmp_path):
         (white(300), (*AT_100_HZ, "--highest-frequency", 1e-3), "raise it"),
     ],
 )
-def test_bad_records_end_with_one_clear_line_and_nothing_written(run, tmp_path, values, options, words):
+def test_bad_records_end_with_one_clear_line_and_nothing_written(refusal, tmp_path, values, options, words):
     np.save(tmp_path / "gyro.npy", values)
-    status, _, error = run("allan", "gyro.npy", *options)
-    assert status == 2
+    error = refusal("allan", "gyro.npy", *options)
     assert words in error
     assert error.startswith("error: ")
     assert error.count("\n") == 1

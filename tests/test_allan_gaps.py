@@ -1,7 +1,5 @@
 """Allan deviation and noise coefficients with gaps: equal to those without where there are none, unbiased, and covered."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The bias over temperature: exact without noise, intervals that cover with noises that wander, and what plain least squares would say."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

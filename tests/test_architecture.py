@@ -1,7 +1,5 @@
 """The house: imports run downwards, faces stay on the top floor, and what is heavy loads when it is first needed."""
 
-from __future__ import annotations
-
 import ast
 import graphlib
 import re
@@ -135,17 +133,8 @@ def test_strangers_never_meet(one, other):
             assert not seen & ({one, other} - {unit(module)}), f"{module} imports its stranger"
 
 
-PARSERS = (
-    "np.load",
-    "np.loadtxt",
-    "np.genfromtxt",
-    "np.fromfile",
-    "tomllib.load",
-    "tomllib.loads",
-    "json.load",
-    "json.loads",
-    "pickle.load",
-)
+PARSERS = ("np.load", "np.loadtxt", "np.genfromtxt", "np.fromfile", "tomllib.load", "tomllib.loads")
+PARSERS += ("json.load", "json.loads", "pickle.load")
 READERS = ("open", "io.open", "os.open", "h5py.File", *PARSERS)
 OF_A_PATH = (".read_text", ".read_bytes", ".open")
 NOT_OF_THE_USER = ("kernels.machine", "report.page")
@@ -246,16 +235,8 @@ def loaded_by(code: str) -> set[str]:
 
 
 def test_import_strapdown_is_quick():
-    assert not loaded_by("import strapdown") & {
-        "numba",
-        "llvmlite",
-        "matplotlib",
-        "scipy",
-        "h5py",
-        "numpy",
-        "filterpy",
-        "rich",
-    }
+    heavy = {"numba", "llvmlite", "matplotlib", "scipy", "h5py", "numpy", "filterpy", "rich"}
+    assert not loaded_by("import strapdown") & heavy
 
 
 HELP = """

@@ -1,10 +1,7 @@
 """Recordings with one convention broken: the check names it; whole ones it finds as declared; poor ones it does not call wrong."""
 
-from __future__ import annotations
-
 import json
 import math
-import sys
 import warnings
 from dataclasses import replace
 
@@ -13,7 +10,7 @@ import numpy as np
 import pytest
 
 import strapdown as sd
-from strapdown import cli, motion, quaternion, recordings, vectors
+from strapdown import motion, quaternion, recordings, vectors
 from strapdown.ahrs import check_conventions
 from strapdown.ahrs.check_conventions import AXES, FRAMES
 from strapdown.checks import InputError
@@ -217,27 +214,20 @@ def test_all_axes_are_signed_permutations_the_identity_first():
     assert check_conventions.axes_words(np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])) == "y, −x, z"
 
 
-# ---------------------------------------------------------------------------------------------------------------- the command
-
-
 @pytest.mark.parametrize(
     ("mistake", "status", "verdict"),
     [(None, 0, "as declared"), ("conjugated", 1, "wrong convention"), ("force twice", 1, "wrong convention")],
 )
-def test_doctor_ends_with_the_status_of_the_verdict(monkeypatch, capsys, tmp_path, mistake, status, verdict):
+def test_doctor_ends_with_the_status_of_the_verdict(run, tmp_path, mistake, status, verdict):
     recording = simulated(1, duration=30.0)
     if mistake:
         recording = broken(recording, 1)[mistake][0]
-    monkeypatch.chdir(tmp_path)
     with h5py.File("trial.hdf5", "w") as file:
         file.attrs["sampling_rate"] = 100.0
         file["imu_gyr"], file["imu_acc"] = recording.rate, recording.specific_force
         file["imu_mag"], file["opt_quat"] = recording.magnetic_field, recording.true_attitude
-    monkeypatch.setattr(sys, "argv", ["strapdown", "doctor", "trial.hdf5", "--json", "doctor.json"])
-    with pytest.raises(SystemExit) as ended:
-        cli.main()
-    assert (ended.value.code or 0) == status
-    said = capsys.readouterr().out
+    ended, said, _ = run("doctor", "trial.hdf5", "--json", "doctor.json")
+    assert ended == status
     assert f"trial.hdf5: {verdict}: " in said
     rows = said.partition("Explanations")[2].partition("Note:")[0]
     assert "--" not in rows  # the options are said once, with the verdict

@@ -1,7 +1,5 @@
 """Checks at the rim: what passes unchanged, and errors that name the value, the place and the remedy."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -19,9 +17,6 @@ def refused(call, *words: str) -> None:
 
 def test_input_errors_are_value_errors():
     assert issubclass(InputError, ValueError)
-
-
-# ---------------------------------------------------------------------------------------------------- arrays
 
 
 def test_array_passes_what_fits():
@@ -88,9 +83,6 @@ def test_nan_may_mark_missing_samples_but_infinity_never_passes():
     refused(lambda: checks.array("x", [np.nan, np.inf], (2,), allow_nan=True), "x[1] is inf")
 
 
-# ---------------------------------------------------------------------------------------------------- numbers
-
-
 def test_numbers_pass():
     assert checks.positive("x", np.float32(0.5)) == 0.5
     assert checks.non_negative("x", 0) == 0.0
@@ -137,9 +129,6 @@ def test_what_is_no_count_is_refused(value):
     refused(lambda: checks.count("runs", value), "runs is", "whole number of 1 or more")
 
 
-# ---------------------------------------------------------------------------------------------------- quaternions
-
-
 def test_unit_quaternions_keep_double_rounding_to_the_bit():
     q = np.array([0.5, 0.5, 0.5, 0.5 + 4e-16])
     np.testing.assert_array_equal(checks.unit_quaternions("q", q), q)
@@ -156,9 +145,6 @@ def test_other_norms_are_refused_with_their_place(scale):
     q = np.tile([1.0, 0.0, 0.0, 0.0], (2, 3, 1))
     q[1, 2] *= scale
     refused(lambda: checks.unit_quaternions("q", q), "q[1, 2] has norm", "not 1", "normalise", "scalar first")
-
-
-# ---------------------------------------------------------------------------------------------------- time
 
 
 def test_increasing():
@@ -181,9 +167,6 @@ def test_stamps_out_of_order_are_refused(stamps, words):
 
 def test_too_few_stamps_are_refused():
     refused(lambda: checks.increasing("time", [0.0], minimum=2), "time has 1 stamps", "at least 2")
-
-
-# ---------------------------------------------------------------------------------------------------- covariance
 
 
 def test_covariance_passes_with_units_of_very_different_size():
@@ -219,9 +202,6 @@ def test_covariance_asymmetric_by_rounding_passes():
 )
 def test_bad_covariances_are_refused(P, words):
     refused(lambda: checks.covariance("P", P, 2), *words)
-
-
-# ---------------------------------------------------------------------------------------------------- names
 
 
 def test_one_of():

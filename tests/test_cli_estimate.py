@@ -66,9 +66,8 @@ def record(tmp_path):
     return path
 
 
-def test_a_simulated_record_is_estimated_by_the_filter_that_matches_it(run, record, tmp_path):
-    status, said, error = run("estimate", record, "--out", tmp_path / "out", "--figures")
-    assert (status, error) == (0, "")
+def test_a_simulated_record_is_estimated_by_the_filter_that_matches_it(succeeds, record, tmp_path):
+    said = succeeds("estimate", record, "--out", tmp_path / "out", "--figures")
     assert "Started from the first measurements" in said
     assert "mean NEES per state" in said
     assert {path.name for path in (tmp_path / "out").iterdir()} == {
@@ -88,7 +87,7 @@ def test_a_simulated_record_is_estimated_by_the_filter_that_matches_it(run, reco
         assert np.array_equal(file["truth/attitude"][:], truth.attitude)
 
 
-def test_a_filter_from_a_file_and_the_options(run, record, tmp_path):
+def test_a_filter_from_a_file_and_the_options(succeeds, record, tmp_path):
     own = setup.FilterSetup(
         process_noise=NOISE,
         attitude_sigma=0.1,
@@ -98,8 +97,7 @@ def test_a_filter_from_a_file_and_the_options(run, record, tmp_path):
     )
     (tmp_path / "filter.toml").write_text(setup.to_toml(own))
     options = ("--filter", tmp_path / "filter.toml", "--from-truth", "--every", 10, "--variances", "--gate", 0.999)
-    status, said, error = run("estimate", record, "--out", tmp_path / "out", *options, "--robust", "huber")
-    assert (status, error) == (0, "")
+    said = succeeds("estimate", record, "--out", tmp_path / "out", *options, "--robust", "huber")
     assert "with errors drawn" in said
     estimate = read_estimate(tmp_path / "out" / "estimate.h5")
     assert estimate.covariance is None
@@ -108,14 +106,13 @@ def test_a_filter_from_a_file_and_the_options(run, record, tmp_path):
     assert np.isclose(np.median(estimate.innovations["a"].variance), 9e-6, rtol=0.2)
 
 
-def test_a_lost_filter_says_that_it_recovered(run, record, tmp_path):
-    status, said, _ = run("estimate", record, "--out", tmp_path / "out", "--attitude", "0,0,1,0.1", "--gate", 0.999)
-    assert status == 0
+def test_a_lost_filter_says_that_it_recovered(succeeds, record, tmp_path):
+    said = succeeds("estimate", record, "--out", tmp_path / "out", "--attitude", "0,0,1,0.1", "--gate", 0.999)
     assert "Recovered at" in said
     assert "were rejected by the gate" in said
 
 
-def test_what_a_record_does_not_hold_is_asked_for(run, record, tmp_path):
+def test_what_a_record_does_not_hold_is_asked_for(refusal, record, tmp_path):
     bare = tmp_path / "bare.h5"
     whole = simulate(made(STARS[:1]), 4)
     write_record(bare, ImuRecord(time=whole.time, increments=whole.increments, vectors=whole.vectors))
@@ -132,13 +129,11 @@ def test_what_a_record_does_not_hold_is_asked_for(run, record, tmp_path):
         ((tmp_path / "none.csv", "--every", 2), "none.csv does not exist"),
     )
     for arguments, words in cases:
-        status, _, error = run("estimate", *arguments, "--out", tmp_path / "out")
-        assert status == 2
+        error = refusal("estimate", *arguments, "--out", tmp_path / "out")
         assert words in error
     alone = tmp_path / "alone.h5"
     write_record(alone, specified(whole))
-    status, _, error = run("estimate", alone, "--out", tmp_path / "out")
-    assert status == 2
+    error = refusal("estimate", alone, "--out", tmp_path / "out")
     assert "two directions are needed" in error
     assert "--from-truth" in error
     assert not (tmp_path / "out").exists()
@@ -195,7 +190,7 @@ def spinning(tmp_path):
 
 
 @pytest.mark.draws
-def test_states_that_the_errors_call_for(run, spinning, tmp_path, monkeypatch, blank):
+def test_states_that_the_errors_call_for(run, succeeds, spinning, tmp_path, monkeypatch, blank):
     status, said, error = run(
         "estimate", spinning, "--out", tmp_path / "out", "--states", "--from-truth", "--every", 100, "--figures"
     )
@@ -217,23 +212,19 @@ def test_states_that_the_errors_call_for(run, spinning, tmp_path, monkeypatch, b
     assert (tmp_path / "out" / "states.png").stat().st_size > 10_000
     saved = setup.from_toml(records.read_attributes(tmp_path / "out" / "estimate.h5")["filter"])
     assert saved == setup.FilterSetup.for_record(simulate(scenarios.load_scenario("spin"), 3), states=True)
-    status, _, _ = run("check", tmp_path / "out" / "estimate.h5")
-    assert status == 0
+    succeeds("check", tmp_path / "out" / "estimate.h5")
     monkeypatch.setattr(Figure, "savefig", blank)
-    status, _, _ = run("report", tmp_path / "out" / "estimate.h5")
-    assert status == 0
+    succeeds("report", tmp_path / "out" / "estimate.h5")
     (tmp_path / "filter.toml").write_text(setup.to_toml(saved))
     options = ("--filter", tmp_path / "filter.toml", "--from-truth", "--every", 100)
-    status, _, error = run("estimate", spinning, "--out", tmp_path / "again", *options)
-    assert (status, error) == (0, "")
+    succeeds("estimate", spinning, "--out", tmp_path / "again", *options)
     one, other = (read_estimate(tmp_path / name / "estimate.h5") for name in ("out", "again"))
     assert np.array_equal(one.attitude, other.attitude)
     assert np.array_equal(one.covariance, other.covariance)
 
 
-def test_what_a_record_shows_of_each_state(run, spinning, tmp_path):
-    status, said, _ = run("estimate", spinning, "--out", tmp_path / "out", "--observability", "--states")
-    assert status == 0
+def test_what_a_record_shows_of_each_state(succeeds, spinning, tmp_path):
+    said = succeeds("estimate", spinning, "--out", tmp_path / "out", "--observability", "--states")
     assert "directions are observed" in said
     saved = json.loads((tmp_path / "out" / "observability.json").read_text())
     names = [one["state"] for one in saved["states"]]
@@ -257,11 +248,11 @@ def test_what_the_filter_has_no_state_for_is_reported(spinning, record, tmp_path
     assert message.startswith("The filter has states for the specified errors, gyro.scale: without them")
 
 
-def test_the_verdict_names_what_the_filter_has_no_state_for(run, spinning, tmp_path):
+def test_the_verdict_names_what_the_filter_has_no_state_for(run, succeeds, spinning, tmp_path):
     scenario = scenarios.load_scenario("spin")
     no_state = "; the filter has no state for the gyro's scale factor of 100 ppm"
     for options, missing in (((), False), (("--no-states",), True)):
-        assert run("estimate", spinning, "--out", tmp_path / "out", "--every", 10, *options)[0] == 0
+        succeeds("estimate", spinning, "--out", tmp_path / "out", "--every", 10, *options)
         said = run("check", tmp_path / "out" / "estimate.h5")[1]
         assert (no_state in said) == missing
         assert ("the σ of gyro.scale is not tested: no truth for it" in said) == (not missing)
@@ -293,12 +284,11 @@ def satellite(tmp_path_factory):
     return path
 
 
-def test_the_verdict_on_a_satellite_says_no_more_than_one_record_shows(run, satellite, tmp_path):
+def test_the_verdict_on_a_satellite_says_no_more_than_one_record_shows(succeeds, satellite, tmp_path):
     """Without states the bias σ is wrong by 1.5 (a Monte Carlo says so), which one record of ten minutes cannot show."""
-    assert run("simulate", satellite, "--seed", 6, "--out", tmp_path / "sat.h5")[0] == 0
-    assert run("estimate", tmp_path / "sat.h5", "--no-states", "--out", tmp_path / "plain")[0] == 0
-    status, said, _ = run("check", tmp_path / "plain" / "estimate.h5", "--json", tmp_path / "check.json")
-    assert status == 0
+    succeeds("simulate", satellite, "--seed", 6, "--out", tmp_path / "sat.h5")
+    succeeds("estimate", tmp_path / "sat.h5", "--no-states", "--out", tmp_path / "plain")
+    said = succeeds("check", tmp_path / "plain" / "estimate.h5", "--json", tmp_path / "check.json")
     headline = said[said.index("consistent: none of") :]
     assert "1.08 of the innovations of tracker" in headline
     assert "this cannot show the σ of the bias" in headline
@@ -308,7 +298,7 @@ def test_the_verdict_on_a_satellite_says_no_more_than_one_record_shows(run, sate
     assert power["bias"] > 10.0
 
 
-def test_the_default_filter_of_a_satellite_passes_and_says_why_it_has_states(run, satellite, tmp_path):
+def test_the_default_filter_of_a_satellite_passes_and_says_why_it_has_states(run, succeeds, satellite, tmp_path):
     status, said, _ = run("montecarlo", satellite, "--no-states", "--runs", 120, "--out", tmp_path / "plain.h5")
     assert status == 1
     assert "the filter has no state for the gyro's scale factor of 200 ppm" in said
@@ -319,25 +309,22 @@ def test_the_default_filter_of_a_satellite_passes_and_says_why_it_has_states(run
     assert "consistent: none of" in said
     assert "of the bias" in said
     assert status == 0
-    assert run("montecarlo", tmp_path / "states.h5")[0] == 0
-    assert run("check", tmp_path / "states.h5")[0] == 0
+    succeeds("montecarlo", tmp_path / "states.h5")
+    succeeds("check", tmp_path / "states.h5")
 
 
-def test_states_of_a_record_without_a_scenario_and_a_gate(run, record, tmp_path):
-    status, said, error = run("estimate", record, "--out", tmp_path / "out", "--states", "--gate", 0.999)
-    assert (status, error) == (0, "")
+def test_states_of_a_record_without_a_scenario_and_a_gate(succeeds, record, tmp_path):
+    said = succeeds("estimate", record, "--out", tmp_path / "out", "--states", "--gate", 0.999)
     assert "does not contain its scenario" in said
     assert "the filter has none" in said
     assert not (tmp_path / "out" / "states.json").exists()
 
 
-def test_a_lost_filter_with_states_recovers(run, spinning, tmp_path):
+def test_a_lost_filter_with_states_recovers(succeeds, spinning, tmp_path):
     options = ("--states", "--gate", 0.999, "--every", 100)
-    status, said, error = run("estimate", spinning, "--out", tmp_path / "right", *options)
-    assert (status, error) == (0, "")
+    said = succeeds("estimate", spinning, "--out", tmp_path / "right", *options)
     assert "Recovered at" not in said
-    status, said, error = run("estimate", spinning, "--out", tmp_path / "lost", *options, "--attitude", "0,0,1,0.1")
-    assert (status, error) == (0, "")
+    said = succeeds("estimate", spinning, "--out", tmp_path / "lost", *options, "--attitude", "0,0,1,0.1")
     assert "Recovered at" in said
     one, other = (read_estimate(tmp_path / name / "estimate.h5") for name in ("right", "lost"))
     assert one.innovations["star"].weight is not None
@@ -345,7 +332,7 @@ def test_a_lost_filter_with_states_recovers(run, spinning, tmp_path):
     assert quaternion.angle_between(one.attitude[-1], other.attitude[-1]) < 0.01
 
 
-def test_states_are_refused_where_they_make_no_sense(run, spinning, tmp_path):
+def test_states_are_refused_where_they_make_no_sense(refusal, spinning, tmp_path):
     (tmp_path / "filter.toml").write_text(
         setup.to_toml(setup.FilterSetup.for_scenario(scenarios.load_scenario("spin")))
     )
@@ -356,51 +343,47 @@ def test_states_are_refused_where_they_make_no_sense(run, spinning, tmp_path):
         ((tmp_path / "rec.csv", "--states"), "goes with a record"),
     )
     for arguments, words in cases:
-        status, _, error = run("estimate", *arguments, "--out", tmp_path / "out")
-        assert status == 2
+        error = refusal("estimate", *arguments, "--out", tmp_path / "out")
         assert words in error
     assert not (tmp_path / "out").exists()
 
 
-def test_an_estimate_replaces_all_of_an_earlier_one_and_nothing_else(run, record, tmp_path):
+def test_an_estimate_replaces_all_of_an_earlier_one_and_nothing_else(succeeds, refusal, record, tmp_path):
     out = tmp_path / "out"
-    assert run("estimate", record, "--observability", "--out", out)[0] == 0
+    succeeds("estimate", record, "--observability", "--out", out)
     left = (out / "observability.json", out / "estimate.html")
     left[1].write_text("a report of the first estimate")
     (out / "notes.txt").write_text("mine")
     assert left[0].exists()
-    assert run("estimate", record, "--out", out)[0] == 0
+    succeeds("estimate", record, "--out", out)
     assert not left[0].exists()
     assert not left[1].exists()
     assert (out / "notes.txt").read_text() == "mine"
     (out / "estimate.h5").write_text("mine too")
-    status, _, error = run("estimate", record, "--out", out)
-    assert status == 2
+    error = refusal("estimate", record, "--out", out)
     assert "was not written by `strapdown estimate`" in error
     assert (out / "estimate.h5").read_text() == "mine too"
 
 
-def test_directions_that_contradict_each_other_start_nothing(run, tmp_path):
+def test_directions_that_contradict_each_other_start_nothing(refusal, tmp_path):
     """A star taken for another: no bank makes a start of that, unless the filter has states for what sensors get wrong."""
     whole = simulate(made(), 4)
     first, *others = whole.vectors
     wrong = dataclasses.replace(first, reference_f=np.array([0.6, 0.8, 0.0]))
     path = tmp_path / "mixed.h5"
     write_record(path, specified(dataclasses.replace(whole, vectors=(wrong, *others))))
-    status, _, error = run("estimate", path, "--out", tmp_path / "out")
-    assert status == 2
+    error = refusal("estimate", path, "--out", tmp_path / "out")
     assert "check for a mixed-up pair" in error
     assert "--attitude" in error
     assert not (tmp_path / "out").exists()
 
 
-def test_one_direction_that_turns_starts_by_a_bank(run, tmp_path):
+def test_one_direction_that_turns_starts_by_a_bank(run, succeeds, tmp_path):
     scenario = dataclasses.replace(scenarios.load_scenario("magnetometer-only"), duration=2400.0)
     path = tmp_path / "alone.h5"
     whole = simulate(scenario, 1)
     write_record(path, whole)
-    status, said, error = run("estimate", path, "--out", tmp_path / "out")
-    assert (status, error) == (0, "")
+    said = succeeds("estimate", path, "--out", tmp_path / "out")
     assert "96 hypotheses were merged into one at" in said
     assert "the estimate begins there" in said
     estimate = read_estimate(tmp_path / "out" / "estimate.h5")
@@ -419,11 +402,10 @@ def test_one_direction_that_turns_starts_by_a_bank(run, tmp_path):
 # ---------------------------------------------------------------------------------------------------- smoothed
 
 
-def test_a_record_is_smoothed(run, record, tmp_path):
-    status, _, error = run("estimate", record, "--out", tmp_path / "out", "--smooth")
-    assert (status, error) == (0, "")
+def test_a_record_is_smoothed(succeeds, record, tmp_path):
+    succeeds("estimate", record, "--out", tmp_path / "out", "--smooth")
     smoothed = read_estimate(tmp_path / "out" / "estimate.h5")
-    assert run("estimate", record, "--out", tmp_path / "plain")[0] == 0
+    succeeds("estimate", record, "--out", tmp_path / "plain")
     plain = read_estimate(tmp_path / "plain" / "estimate.h5")
     np.testing.assert_array_equal(smoothed.time, plain.time)
     assert np.all(smoothed.variance <= plain.variance * (1.0 + 1e-9))
@@ -447,12 +429,11 @@ def test_hard_iron_and_a_start_are_reported_in_units_that_people_know(run, tmp_p
     assert states["north bias"]["first_sigma"][0] == pytest.approx(0.04472, rel=1e-3)
 
 
-def test_smoothing_with_states_holds_them(run, tmp_path):
+def test_smoothing_with_states_holds_them(succeeds, tmp_path):
     path = tmp_path / "record.h5"
     scenario = dataclasses.replace(scenarios.load_scenario("spin"), duration=20.0)
     write_record(path, simulate(scenario, 2))
-    status, _, error = run("estimate", path, "--out", tmp_path / "out", "--smooth", "--state", "gyro.scale")
-    assert (status, error) == (0, "")
+    succeeds("estimate", path, "--out", tmp_path / "out", "--smooth", "--state", "gyro.scale")
     assert "gyro scale" in json.loads((tmp_path / "out" / "states.json").read_text())
 
 
@@ -486,9 +467,8 @@ def off(folder, shift):
     )
 
 
-def test_a_recording_is_taken_for_that_of_a_hand(run, recording, tmp_path):
-    status, said, error = run("estimate", recording, "--out", tmp_path / "out")
-    assert (status, error) == (0, "")
+def test_a_recording_is_taken_for_that_of_a_hand(succeeds, recording, tmp_path):
+    said = succeeds("estimate", recording, "--out", tmp_path / "out")
     moved = re.search(
         r"of a hand \(log-likelihood larger by [0-9.]+ than for a vehicle\), velocity σ ([0-9.]+) m/s "
         r"\(from the recording\), correlation time 0.3 s\.",
@@ -531,10 +511,9 @@ def test_any_motion_smoothing_and_latency(run, recording, tmp_path):
     assert abs(errors["later"] - errors["hand"]) < 0.3
 
 
-def test_a_recording_that_is_not_what_it_says_is_doubted(run, recording, tmp_path):
+def test_a_recording_that_is_not_what_it_says_is_doubted(run, succeeds, recording, tmp_path):
     recording.write_text(recording.read_text().replace("[rad/s]", "[deg/s]").replace("[m/s2]", "[g]"))
-    status, said, error = run("estimate", recording, "--out", tmp_path / "out")
-    assert (status, error) == (0, "")
+    said = succeeds("estimate", recording, "--out", tmp_path / "out")
     words = (
         "warning: probably gyro rates are 57.3 times too small (rad/s read as deg/s: --gyro-unit rad/s; units={'gyro': 'rad/s'} in "
         "Python); specific force is 9.81"
@@ -544,10 +523,9 @@ def test_a_recording_that_is_not_what_it_says_is_doubted(run, recording, tmp_pat
     assert f"See `strapdown doctor {recording}`." in said
 
 
-def test_gate_robust_weights_and_observability_of_a_recording(run, recording, tmp_path):
+def test_gate_robust_weights_and_observability_of_a_recording(succeeds, recording, tmp_path):
     options = ("--gate", 0.999, "--robust", "student", "--observability")
-    status, _, error = run("estimate", recording, "--out", tmp_path / "out", *options)
-    assert (status, error) == (0, "")
+    succeeds("estimate", recording, "--out", tmp_path / "out", *options)
     assert {path.name for path in (tmp_path / "out").iterdir()} == {
         "estimate.h5",
         "states.json",
@@ -562,33 +540,30 @@ def test_gate_robust_weights_and_observability_of_a_recording(run, recording, tm
     assert off(tmp_path / "out", 0.0) < 1.5
 
 
-def test_a_calibration_is_written_and_used(run, recording, tmp_path):
-    assert run("estimate", recording, "--out", tmp_path / "first", "--smooth")[0] == 0
+def test_a_calibration_is_written_and_used(succeeds, recording, tmp_path):
+    succeeds("estimate", recording, "--out", tmp_path / "first", "--smooth")
     first = unit_calibration.read(tmp_path / "first" / "calibration.toml")
     again = ("--calibration", tmp_path / "first" / "calibration.toml")
-    status, _, error = run("estimate", recording, "--out", tmp_path / "again", *again)
-    assert (status, error) == (0, "")
+    succeeds("estimate", recording, "--out", tmp_path / "again", *again)
     second = unit_calibration.read(tmp_path / "again" / "calibration.toml")
     assert second.sigma < first.sigma < 2e-3
     assert np.abs(second.matrix - first.matrix).max() < 2e-3
 
 
-def test_a_clipped_gyro_is_reported(run, recording, tmp_path):
+def test_a_clipped_gyro_is_reported(succeeds, recording, tmp_path):
     header, *rows = recording.read_text().splitlines()
     values = np.loadtxt(rows, delimiter=",")
     values[:, 1] = np.clip(values[:, 1], -1.2, 1.2)
     np.savetxt(recording, values, delimiter=",", header=header, comments="")
-    status, said, error = run("estimate", recording, "--out", tmp_path / "out")
-    assert (status, error) == (0, "")
+    said = succeeds("estimate", recording, "--out", tmp_path / "out")
     assert "The gyro was clipped: x at 68.75 °/s" in said
 
 
-def test_a_hand_that_never_rests_is_reported(run, recording, tmp_path):
+def test_a_hand_that_never_rests_is_reported(succeeds, recording, tmp_path):
     lines = recording.read_text().splitlines()
     moving = tmp_path / "moving.csv"
     moving.write_text("\n".join([lines[0], *lines[800:]]) + "\n")
-    status, said, error = run("estimate", moving, "--out", tmp_path / "out")
-    assert (status, error) == (0, "")
+    said = succeeds("estimate", moving, "--out", tmp_path / "out")
     assert "no second is quiet enough to estimate it, so the heading may drift at first." in said
 
 
@@ -605,9 +580,8 @@ def test_a_hand_that_never_rests_is_reported(run, recording, tmp_path):
         (("--calibration", "none.toml"), "none.toml does not exist"),
     ],
 )
-def test_bad_options_of_a_recording_are_refused(run, recording, tmp_path, options, words):
-    status, _, error = run("estimate", recording, "--out", tmp_path / "out", *options)
-    assert status == 2
+def test_bad_options_of_a_recording_are_refused(refusal, recording, tmp_path, options, words):
+    error = refusal("estimate", recording, "--out", tmp_path / "out", *options)
     assert words in error, error
     assert not (tmp_path / "out").exists()
 
@@ -621,7 +595,6 @@ def test_bad_options_of_a_recording_are_refused(run, recording, tmp_path, option
         (("--smooth", "--every", 2), "leave one of them out"),
     ],
 )
-def test_options_of_a_recording_are_refused_with_a_record(run, record, tmp_path, options, words):
-    status, _, error = run("estimate", record, "--out", tmp_path / "out", *options)
-    assert status == 2
+def test_options_of_a_recording_are_refused_with_a_record(refusal, record, tmp_path, options, words):
+    error = refusal("estimate", record, "--out", tmp_path / "out", *options)
     assert words in error, error

@@ -1,7 +1,5 @@
 """Progress: lines off a terminal, a bar on one, what is compiled, and silence where it is asked for."""
 
-from __future__ import annotations
-
 import io
 import json
 import sys
@@ -108,11 +106,11 @@ def test_compiling_is_said_once_with_how_many_of_how_many(said, monkeypatch):
     assert lines_of(said)[:1] == ["compiling for this machine; the compiled code is cached for later runs"]
 
 
-def test_quiet_may_stand_anywhere(run, monkeypatch):
+def test_quiet_may_stand_anywhere(succeeds, monkeypatch):
     heard = []
     for arguments in (("scenarios", "--quiet"), ("--quiet", "scenarios"), ("scenarios",)):
         monkeypatch.setattr(progress, "_quiet", False)
-        assert run(*arguments)[0] == 0
+        succeeds(*arguments)
         heard.append(progress._quiet)
     assert heard == [True, True, False]
     assert sys.argv[-1] == "scenarios"

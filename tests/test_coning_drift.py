@@ -46,25 +46,6 @@ def test_double_precision_agrees_with_thirty_digits(name):
     assert double_precision_drift(name, angle, ratio) == pytest.approx(true, rel=0.01, abs=rounding)
 
 
-COMPRESSED = [
-    name for name in ALGORITHMS if ALGORITHMS[name].solver == "compressed" and not ALGORITHMS[name].rate_points
-]
-
-
-@pytest.mark.parametrize("name", COMPRESSED)
-def test_drift_is_the_closed_form_and_its_order_is_2m(name):
-    # With digits enough β can be so small that no second-order floor shows, for every N and p.
-    m = ALGORITHMS[name].samples + ALGORITHMS[name].previous
-    ratios = np.array([0.003, 0.03])
-    drifts = np.array(
-        [float(exact_error(name, 1e-30, float(lam), digits=150).drift / mp.mpf(1e-30) ** 2) for lam in ratios]
-    )
-    c = math.factorial(m) ** 2 / (2 * math.factorial(2 * m + 1))
-    np.testing.assert_allclose(drifts, -c * ratios ** (2.0 * m), rtol=0.02)
-    slope = np.polyfit(np.log(ratios), np.log(-drifts), 1)[0]
-    assert slope == pytest.approx(2 * m, abs=0.05)
-
-
 @pytest.mark.parametrize("name", list(ALGORITHMS))
 def test_drift_order_and_constant_of_every_table(name):
     """With digits enough β can be so small that no second-order floor shows; a wrong order is a factor of 2,500."""
@@ -92,13 +73,7 @@ def test_one_sample_drift_is_exact_at_any_angle():
     )
 
 
-@pytest.mark.parametrize(
-    ("angle_degrees", "ratio"),
-    [
-        (3.0, 0.6),
-        (45.0, 0.02),
-    ],
-)
+@pytest.mark.parametrize(("angle_degrees", "ratio"), [(3.0, 0.6), (45.0, 0.02)])
 def test_own_best_beats_every_published_algorithm(angle_degrees, ratio):
     """Lower drift and lower periodic error than any algorithm published, or at rounding. The sim covers the whole grid."""
     angle = math.radians(angle_degrees)
@@ -115,9 +90,6 @@ def test_second_order_forms_have_a_floor_and_own_best_has_not():
         exact_error("three-sample", angle, ratio).drift
     )
     assert all(abs(exact_error(name, angle, ratio).drift) < 1e-9 for name in OWN)
-
-
-# ------------------------------------------------------------------------------------------------------------------ budget
 
 
 def simulated_drift(line, rate, name, seconds):

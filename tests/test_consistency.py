@@ -1,12 +1,19 @@
-"""NEES, bounds and verdicts against scipy and brute force."""
+"""Each statistic, its bounds and its verdict against a closed form, scipy, or a slow plain reference."""
 
+import math
+
+import mpmath
 import numpy as np
 import pytest
+import scipy.integrate
+import scipy.linalg
+import scipy.optimize
+import scipy.signal
 import scipy.stats
 
 from strapdown import consistency, quaternion
 from strapdown.checks import InputError
-from strapdown.consistency import Verdict
+from strapdown.consistency import Verdict, bounds, timeaverage, whiteness
 
 
 def test_errors_are_zero_for_the_truth_and_signed_true_minus_estimate():
@@ -20,13 +27,15 @@ def test_errors_are_zero_for_the_truth_and_signed_true_minus_estimate():
     assert np.allclose(e[:, 3:], 0.25)
 
 
-def test_nees_is_the_quadratic_form():
+@pytest.mark.parametrize("states", [None, (5, 0, 2), *consistency.SUBSETS.values()])
+def test_nees_is_the_quadratic_form(states):
+    """Of a subset that in the marginal covariance."""
     generator = np.random.default_rng(1)
-    root = generator.normal(size=(5, 4, 6, 6)) + 2.0 * np.eye(6)
-    P = root @ np.swapaxes(root, -1, -2)
-    e = generator.normal(size=(5, 4, 6))
-    expected = np.einsum("...i,...ij,...j->...", e, np.linalg.inv(P), e)
-    assert np.allclose(consistency.nees(e, P), expected, rtol=1e-10)
+    P, e = random_covariances(generator, (5, 4)), generator.normal(size=(5, 4, 6))
+    kept = list(range(6)) if states is None else list(states)
+    block = P[..., kept, :][..., kept]
+    expected = np.einsum("...i,...ij,...j->...", e[..., kept], np.linalg.inv(block), e[..., kept])
+    assert np.allclose(consistency.nees(e, P, *(() if states is None else (states,))), expected, rtol=1e-10)
     assert consistency.nees(e[0, 0], P[0, 0]).shape == ()
 
 
@@ -73,3 +82,279 @@ def test_a_verdict_has_two_sides():
 def test_a_probability_lies_between_0_and_1(bad):
     with pytest.raises(InputError, match="probability"):
         consistency.mean_bounds(6, 10, bad)
+
+
+def random_covariances(generator, shape, n=6):
+    root = generator.normal(size=(*shape, n, n)) + 2.0 * np.eye(n)
+    return root @ np.swapaxes(root, -1, -2)
+
+
+# ------------------------------------------------------------------------------------------------------------------ manifold
+
+
+@pytest.mark.parametrize("states", [(), (0, 0), (6,), (-1,)])
+def test_nees_refuses_subsets_that_are_none(states):
+    with pytest.raises(InputError, match="states"):
+        consistency.nees(np.zeros(6), np.eye(6), states)
+
+
+def test_whitened_errors_begin_with_those_of_the_marginal():
+    generator = np.random.default_rng(2)
+    P = random_covariances(generator, (5,))
+    e = generator.normal(size=(5, 6))
+    white = consistency.whitened(e, P)
+    assert np.allclose(np.sum(white[:, :3] ** 2, axis=1), consistency.nees(e[:, :3], P[:, :3, :3]))
+
+
+# -------------------------------------------------------------------------------------------------------------------- bounds
+
+
+def test_p_value_and_bounds_agree():
+    for degrees, samples in ((6, 50), (3, 1), (2, 1234.5)):
+        for probability in (0.95, 0.99):
+            for end in consistency.mean_bounds(degrees, samples, probability):
+                assert consistency.mean_p_value(end, degrees, samples) == pytest.approx(1.0 - probability, rel=1e-6)
+    assert consistency.mean_p_value(math.inf, 6, 10) == 0.0
+    assert consistency.mean_p_value(math.nan, 6, 10) == 0.0
+
+
+@pytest.mark.parametrize("degrees", [1, 2, 3, 6])
+def test_log_moments_are_those_of_log_chi_square(degrees):
+    mean, variance = consistency.log_moments(degrees)
+    with mpmath.workdps(30):
+        assert mean == pytest.approx(float(mpmath.digamma(degrees / mpmath.mpf(2)) + mpmath.log(2)), rel=1e-14)
+        assert variance == pytest.approx(float(mpmath.psi(1, degrees / mpmath.mpf(2))), rel=1e-14)
+    density = scipy.stats.chi2(degrees)
+    grid = np.linspace(-60.0, 6.0, 200_001)
+    weight = density.pdf(np.exp(grid)) * np.exp(grid) * (grid[1] - grid[0])
+    assert np.sum(weight * grid) == pytest.approx(mean, abs=1e-6)
+    assert np.sum(weight * (grid - mean) ** 2) == pytest.approx(variance, rel=1e-6)
+
+
+@pytest.mark.parametrize("degrees", [1, 2, 3, 6])
+def test_the_distribution_of_one_log_is_the_log_of_chi_square(degrees):
+    for x in (-12.0, -4.0, -1.0, 0.5, 1.5, 2.5, 3.5):
+        expected = scipy.stats.chi2.cdf(math.exp(x), degrees)
+        assert bounds.log_mean_distribution(x, degrees, 1) == pytest.approx(expected, abs=1e-10)
+
+
+def test_the_mean_of_two_logs_by_convolution():
+    """P(½ (ln a + ln b) ≤ x) = E P(a ≤ e^{2x}/b)."""
+    for degrees in (2, 6):
+        law = scipy.stats.chi2(degrees)
+        for x in (-0.5, 1.0, 2.0):
+            expected = scipy.integrate.quad(
+                lambda b, x=x, law=law: law.cdf(math.exp(2.0 * x) / b) * law.pdf(b), 0.0, 80.0
+            )
+            assert bounds.log_mean_distribution(x, degrees, 2) == pytest.approx(expected[0], abs=1e-7)
+
+
+@pytest.mark.parametrize(("degrees", "samples"), [(1, 1), (6, 1), (6, 50), (3, 1000)])
+def test_log_mean_bounds_hold_their_tails(degrees, samples):
+    for probability in (0.95, 0.99):
+        low, high = consistency.log_mean_bounds(degrees, samples, probability)
+        assert bounds.log_mean_distribution(low, degrees, samples) == pytest.approx(0.5 * (1 - probability), rel=1e-6)
+        assert 1.0 - bounds.log_mean_distribution(high, degrees, samples) == pytest.approx(
+            0.5 * (1 - probability), rel=1e-6
+        )
+        for end in (low, high):
+            assert consistency.log_mean_p_value(end, degrees, samples) == pytest.approx(1.0 - probability, rel=1e-5)
+    if samples == 1000:  # nearly normal
+        mean, variance = consistency.log_moments(degrees)
+        assert low == pytest.approx(mean - 2.5758 * math.sqrt(variance / samples), rel=2e-3)
+
+
+# ----------------------------------------------------------------------------------------------------------------- whiteness
+
+
+def test_autocorrelation_by_the_sum():
+    z = np.random.default_rng(6).standard_normal((200, 2))
+    found = consistency.autocorrelation(z, 5)
+    for lag in range(1, 6):
+        for k in range(2):
+            expected = sum(z[i + lag, k] * z[i, k] for i in range(200 - lag)) / sum(z[:, k] ** 2)
+            assert found.values[lag - 1, k] == pytest.approx(expected)
+    assert found.bounds[0] == pytest.approx(2.5758 * math.sqrt(199 / (200 * 202)), rel=1e-4)
+    assert np.all(found.simultaneous_bounds > found.bounds)
+
+
+def test_ljung_box_of_one_component_is_the_textbook_one():
+    z = np.random.default_rng(7).standard_normal(300)
+    r = [np.sum(z[lag:] * z[:-lag]) / np.sum(z * z) for lag in range(1, 7)]
+    expected = 300 * 302 * sum(x * x / (300 - lag) for lag, x in enumerate(r, start=1))
+    statistic, degrees, p = consistency.ljung_box(z, 6)
+    assert statistic == pytest.approx(expected)
+    assert degrees == 6
+    assert p == pytest.approx(scipy.stats.chi2.sf(expected, 6))
+
+
+def test_ljung_box_of_several_components_is_hoskings():
+    z = np.random.default_rng(8).standard_normal((150, 3)) @ np.array(
+        [[1.0, 0.4, 0.0], [0.0, 2.0, 0.1], [0.0, 0.0, 0.3]]
+    )
+    C = [z[lag:].T @ z[: 150 - lag] / 150 for lag in range(5)]
+    inverse = np.linalg.inv(C[0])
+    expected = sum(np.trace(C[lag].T @ inverse @ C[lag] @ inverse) / (150 - lag) for lag in range(1, 5))
+    statistic, degrees, _ = consistency.ljung_box(z, 4)
+    assert statistic == pytest.approx(150 * (150 + 2 / 3) * expected)
+    assert degrees == 36
+
+
+def test_anderson_darling_by_the_sum():
+    x = np.sort(np.random.default_rng(10).standard_normal(250) + 3.0)
+    u = scipy.stats.norm.cdf((x - x.mean()) / x.std(ddof=1))
+    total = sum((2 * i + 1) * (math.log(u[i]) + math.log1p(-u[249 - i])) for i in range(250))
+    statistic, _ = consistency.anderson_darling(x)
+    assert statistic == pytest.approx((-250 - total / 250) * (1.0 + 0.75 / 250 + 2.25 / 250**2), rel=1e-9)
+
+
+def test_normality_sees_outliers():
+    generator = np.random.default_rng(12)
+    x = generator.standard_normal((500, 2))
+    x[::50] *= 8.0
+    assert consistency.anderson_darling(x)[1] < 1e-6
+    with pytest.raises(InputError, match="do not vary"):
+        consistency.anderson_darling(np.ones(20))
+
+
+def test_quantile_pairs_are_order_statistics_in_their_band():
+    x = np.random.default_rng(13).standard_normal((5000, 2))
+    found = consistency.quantile_pairs(x)
+    assert len(found.observed) <= 2100
+    assert found.observed[0] == x.min()
+    assert found.observed[-1] == x.max()
+    inside = np.mean((found.observed >= found.low) & (found.observed <= found.high))
+    assert inside > 0.9
+    small = consistency.quantile_pairs(x[:20, 0])
+    expected = scipy.stats.norm.ppf(scipy.stats.beta.ppf(0.005, 1, 20))
+    assert small.low[0] == pytest.approx(expected)
+    assert small.theoretical[0] == pytest.approx(scipy.stats.norm.ppf(0.5 / 20))
+
+
+def test_mean_innovation_is_hotellings():
+    z = np.random.default_rng(14).standard_normal((40, 1)) + 0.4
+    mean, p = consistency.mean_innovation_p_value(z)
+    assert mean[0] == pytest.approx(z.mean())
+    assert p == pytest.approx(scipy.stats.ttest_1samp(z[:, 0], 0.0).pvalue)  # T² of one component is t²
+    shifted = np.random.default_rng(15).standard_normal((400, 3)) + np.array([0.0, 0.3, 0.0])
+    assert consistency.mean_innovation_p_value(shifted)[1] < 1e-4
+
+
+def test_cross_correlation_pairs_by_time():
+    generator = np.random.default_rng(16)
+    a, b = generator.standard_normal((300, 2)), generator.standard_normal((300, 1))
+    time = np.arange(300.0)
+    correlation, pairs, p = consistency.cross_correlation_p_value(time, a, time, b)
+    assert pairs == 300
+    assert p > 0.01
+    assert correlation[0, 0] == pytest.approx(
+        np.sum(a[:, 0] * b[:, 0]) / math.sqrt(np.sum(a[:, 0] ** 2) * np.sum(b**2))
+    )
+    shared = b + 0.5 * a[:, :1]
+    assert consistency.cross_correlation_p_value(time, a, time + 0.25, shared)[2] < 1e-6  # later, but before the next
+    assert consistency.cross_correlation_p_value(time, a, time - 0.25, shared)[2] > 0.01  # the next one's neighbour
+    _, pairs, _ = consistency.cross_correlation_p_value(time, a, time[::3] + 0.5, b[::3])
+    assert pairs == 100
+    _, pairs, p = consistency.cross_correlation_p_value(time[:5], a[:5], time, b)
+    assert pairs == 5
+    assert math.isnan(p)
+
+
+# --------------------------------------------------------------------------------------------------------------- time average
+
+
+def test_effective_samples_of_an_autoregression_are_known():
+    """Of z with correlation ρ^τ, |z|² has ρ^{2τ}: N (1 − ρ²)/(1 + ρ²) of them count."""
+    generator = np.random.default_rng(17)
+    for rho in (0.0, 0.6, 0.9):
+        drive = math.sqrt(1.0 - rho**2) * generator.standard_normal((20_000, 3))
+        z = scipy.signal.lfilter([1.0], [1.0, -rho], drive, axis=0)
+        expected = 20_000 * (1.0 - rho**2) / (1.0 + rho**2)
+        assert timeaverage.effective_samples(z) == pytest.approx(expected, rel=0.06)
+
+
+@pytest.mark.parametrize(("m", "memory"), [(30, 0.95), (700, 0.999), (3000, 0.5), (3000, 0.9999)])
+@pytest.mark.parametrize("first", [None, 1])
+def test_effective_samples_are_the_sum_over_lags(m, memory, first):
+    """The documented formula, term by term, of the same matrix."""
+    drive = np.random.default_rng(m).standard_normal((m, 3))
+    z = scipy.signal.lfilter([1.0], [1.0, -memory], drive, axis=0) * math.sqrt(1.0 - memory**2)
+    z[1:, 0] += 0.3 * z[:-1, 1]
+    A, k = (1.0 + 2.0 / m) * np.linalg.lstsq(z[:-1], z[1:], rcond=None)[0].T, first or 3
+    power, total = np.eye(3), 0.0
+    for lag in range(1, m):
+        power = A @ power
+        total += (1.0 - lag / m) * min(np.sum(power[:k, :k] ** 2) / k, 1.0)
+    assert timeaverage.effective_samples(z, first) == pytest.approx(max(1.0, m / (1.0 + 2.0 * total)), rel=2e-4)
+
+
+def test_effective_samples_of_part_of_a_markov_process():
+    """The first component is no Markov process: its correlation is known from the whole matrix."""
+    A = np.array([[0.3, 0.5], [0.0, 0.98]])
+    P = scipy.linalg.solve_discrete_lyapunov(A, np.eye(2))
+    generator = np.random.default_rng(18)
+    z = np.zeros((40_000, 2))
+    for k in range(1, len(z)):
+        z[k] = A @ z[k - 1] + generator.standard_normal(2)
+    power, total = np.eye(2), 0.0
+    for _ in range(1000):
+        power = A @ power
+        total += ((power @ P)[0, 0] / P[0, 0]) ** 2
+    white = consistency.whitened(z, np.broadcast_to(P, (len(z), 2, 2)))
+    assert timeaverage.effective_samples(white, 1) == pytest.approx(40_000 / (1.0 + 2.0 * total), rel=0.1)
+
+
+@pytest.mark.parametrize("factor", [0.7, 1.0, 1.2, 1.41])
+@pytest.mark.parametrize("epochs", [400, 1000])
+def test_a_wrong_sigma_leaves_the_effective_samples_of_white_errors(epochs, factor):
+    """A constant excess of the NEES is no correlation: nearly every epoch counts, and the average shows the factor."""
+    random = np.random.default_rng(int(1000 * factor) + epochs)
+    error = factor * random.standard_normal((epochs, 3))
+    found = consistency.timeaverage.time_average(error, np.tile(np.eye(3), (epochs, 1, 1)))
+    assert found.reliable
+    assert 0.6 * epochs < found.effective <= epochs
+    assert found.mean == pytest.approx(factor**2, rel=0.15)
+    assert (consistency.mean_p_value(found.mean, 3, found.effective) < 1e-3) == (factor != 1.0)
+
+
+def test_time_average_of_a_short_run_says_that_it_is_not_reliable():
+    walk = np.cumsum(np.random.default_rng(19).standard_normal((60, 2)), axis=0)
+    found = consistency.time_average(walk, np.broadcast_to(30.0 * np.eye(2), (60, 2, 2)))
+    assert not found.reliable
+    assert 0.001 < consistency.mean_p_value(found.mean, 2, max(found.effective, 1.0)) < 1.0
+    with pytest.raises(InputError, match="too few"):
+        consistency.time_average(walk[:4], np.broadcast_to(np.eye(2), (4, 2, 2)))
+
+
+# ------------------------------------------------------------------------------------------------------------------ accuracy
+
+
+def test_convergence_time_is_that_of_the_last_excursion():
+    time = np.arange(6.0)
+    assert consistency.convergence_time(time, [5.0, 1.0, 3.0, 1.0, -1.0, 0.5], 1.0) == 3.0
+    assert consistency.convergence_time(time, np.zeros(6), 1.0) == 0.0
+    assert math.isnan(consistency.convergence_time(time, [0, 0, 0, 0, 0, 2.0], 1.0))
+
+
+@pytest.mark.parametrize(("samples", "inside"), [(10, 3), (10, 9), (10, 10), (50, 40), (50, 30), (7, 0)])
+def test_the_p_value_of_a_coverage_counts_what_is_as_far_off_or_farther(samples, inside):
+    """Twice the smaller of P(N ≤ k) and P(N ≥ k), both with k itself, by sums of binomial terms."""
+    found = bounds.coverage_p_values(np.full(3, inside / samples), samples)
+    for k, p in enumerate(math.erf(s / math.sqrt(2.0)) for s in (1, 2, 3)):
+        terms = [math.comb(samples, j) * p**j * (1.0 - p) ** (samples - j) for j in range(samples + 1)]
+        wanted = min(1.0, 2.0 * min(math.fsum(terms[: inside + 1]), math.fsum(terms[inside:])))
+        assert found[k] == pytest.approx(wanted, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("critical", "level"), [(0.631, 0.1), (0.752, 0.05), (0.873, 0.025), (1.035, 0.01), (0.341, 0.5)]
+)
+def test_the_p_value_of_anderson_and_darling_is_that_of_the_table(critical, level):
+    """D'Agostino & Stephens (1986), table 4.7: the levels of A²*, on samples bent until they have just that statistic."""
+    normal = scipy.stats.norm.ppf((np.arange(300) + 0.5) / 300)[:, None]
+
+    def found(bent):
+        return whiteness.anderson_darling(np.sinh(bent * normal))
+
+    bent = scipy.optimize.brentq(lambda x: found(x)[0] - critical, 0.05, 3.0)
+    assert found(bent)[1] == pytest.approx(level, rel=0.04)

@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from two_stars import stars
 
 from benchmarks import power
-from strapdown import consistency, estimation, montecarlo, motion, quaternion, scenarios, units, vectors
+from strapdown import consistency, estimation, montecarlo, motion, scenarios, units, vectors
 from strapdown.estimation import setup
 from strapdown.gyro import GyroSpec
-from strapdown.randomness import generator
 from strapdown.records import Truth
 
 
@@ -92,10 +92,7 @@ def right_run(seed):
             rock_angle=10.0 * units.DEGREE, rock_frequency=0.1, spin_rate=5.0 * units.DEGREE, rock_phase=0.0
         ),
         gyro=GyroSpec(angle_random_walk=0.3 * units.DEGREE_PER_ROOT_HOUR, rate_random_walk=1e-6),
-        sensors=(
-            vectors.VectorSensor(name="star 1", reference_f=np.array([1.0, 0.0, 0.0]), sigma=1e-4, rate=2.0),
-            vectors.VectorSensor(name="star 2", reference_f=np.array([0.0, 1.0, 1.0]), sigma=1e-4, rate=2.0),
-        ),
+        sensors=stars(1e-4, 1e-4, rate=2.0),
         rate=10.0,
         duration=300.0,
     )
@@ -107,13 +104,8 @@ def right_run(seed):
         attitude_sigma=1e-3,
         bias_sigma=1e-5,
     )
-    draw = generator(seed, 0, "initial error").standard_normal(6)
-    start = setup.initial_state(
-        filter_setup,
-        quaternion.multiply(record.truth.attitude[0], quaternion.exp(-1e-3 * draw[:3])),
-        record.truth.bias[0] - 1e-5 * draw[3:],
-    )
-    estimate = setup.run(record, filter_setup, start, every=5, full_covariance=True)
+    initial = montecarlo.start(record, filter_setup, seed, 0)
+    estimate = setup.run(record, filter_setup, initial, every=5, full_covariance=True)
     return estimate, Truth(attitude=record.truth.attitude[::5], bias=record.truth.bias[::5])
 
 
@@ -140,9 +132,6 @@ def test_the_real_filter_a_thousand_times():
     assert wrong >= 10  # Holm is conservative, not idle
     for p_values in alone.values():
         within_binomial(np.array(p_values), 3.5)
-
-
-# ------------------------------------------------------------------------------------------ verdicts: what `check` and `montecarlo` say
 
 
 def satellite(duration=300.0):

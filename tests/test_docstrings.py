@@ -1,7 +1,5 @@
 """The reference: every public name is documented as numpydoc wants it, and every example in it runs."""
 
-from __future__ import annotations
-
 import doctest
 import functools
 import importlib
@@ -30,19 +28,10 @@ CHECKS = {
 }
 
 UNITS = {
-    "altitude": "m",
-    "angle": "rad",
-    "angle_random_walk": "rad/√s",
-    "duration": "s",
-    "edges": "s",
-    "frequency": "Hz",
-    "increments": "rad",
-    "rate_random_walk": "rad/s/√s",
-    "rotation_vector": "rad",
-    "sample_interval": "s",
-    "specific_force": "m/s²",
-    "taus": "s",
-    "temperature": "(°C|K)",
+    **dict.fromkeys(("duration", "edges", "sample_interval", "taus"), "s"),
+    **dict.fromkeys(("angle", "increments", "rotation_vector"), "rad"),
+    **{"altitude": "m", "frequency": "Hz", "specific_force": "m/s²", "temperature": "(°C|K)"},
+    **{"angle_random_walk": "rad/√s", "rate_random_walk": "rad/s/√s"},
 }
 """Units that the parameters of these names have everywhere, and their descriptions name."""
 

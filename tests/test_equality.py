@@ -1,7 +1,5 @@
 """Every dataclass of the package can be compared, looked for in a tuple and hashed, whatever its fields hold."""
 
-from __future__ import annotations
-
 import collections.abc
 import dataclasses
 import importlib

@@ -3,8 +3,6 @@
 Equations (1)–(18) of *Quaternion differentiation* are held in ``test_reference_equations.py``.
 """
 
-from __future__ import annotations
-
 import math
 
 import mpmath as mp

@@ -1,30 +1,21 @@
 """Monte Carlo of the filter with optional states: its covariance is consistent with each error state, and not with one left out."""
 
-from __future__ import annotations
-
 import dataclasses
 from functools import cache
 
 import numpy as np
 import pytest
+from measured import FIELD, HAND, UP, drawn_start, seen, series_of
 
-from strapdown import consistency, estimation, gyro, motion, quaternion
+from strapdown import consistency, estimation, gyro, quaternion
 from strapdown.estimation import error_states
 from strapdown.estimation.observability import state_names
 from strapdown.estimation.states import ProcessNoise
 from strapdown.randomness import generator
-from strapdown.records import ImuRecord
+from strapdown.records import ImuRecord, Truth
 from strapdown.scenarios import Scenario, simulate
-from strapdown.vectors import Accelerometer, Faults, Magnetometer, VectorMeasurements
+from strapdown.vectors import Accelerometer, Faults, Magnetometer
 
-HAND = motion.HarmonicRates(
-    harmonics=(
-        motion.Harmonic(amplitude=(1.2, 0.2, -0.3), frequency=0.21),
-        motion.Harmonic(amplitude=(-0.3, 1.1, 0.4), frequency=0.37),
-        motion.Harmonic(amplitude=(0.3, -0.2, 1.3), frequency=0.29, phase=1.0),
-    )
-)
-FIELD = np.array([0.0, 2e-5, -4e-5])
 ATTITUDE_SIGMA, BIAS_SIGMA = 0.02, 3e-3
 ARW, RRW = 1e-3, 1e-4
 
@@ -116,13 +107,8 @@ def simulated(case: str, seed: int, run: int, duration: float) -> Run:
         truth[SWAY.name] = None
     if drifts:
         truth[DRIFT.name] = record.truth.bias - turn_on
-    error = rng.standard_normal(6) * np.repeat([ATTITUDE_SIGMA, BIAS_SIGMA], 3)
-    initial = estimation.initial_state(
-        quaternion.multiply(record.truth.attitude[0], quaternion.exp(-error[:3])),
-        attitude_sigma=ATTITUDE_SIGMA,
-        bias_sigma=BIAS_SIGMA,
-        bias=(turn_on if drifts else record.truth.bias[0]) - error[3:],
-    )
+    begin = Truth(attitude=record.truth.attitude, bias=turn_on[None]) if drifts else record.truth
+    initial = drawn_start(begin, rng.standard_normal(6), ATTITUDE_SIGMA, BIAS_SIGMA)
     noise = ProcessNoise(angle_random_walk=ARW, rate_random_walk=0.0 if drifts else RRW)
     return Run(record=record, initial=initial, noise=noise, truth=truth)
 
@@ -184,51 +170,26 @@ def test_it_is_not_with_the_block_left_out(case):
     assert np.all(verdict.mean > 1.5)
 
 
+def otherwise(block, **effect):
+    """A block with another effect on the magnetometer."""
+    names = {name: getattr(block, name) for name in ("name", "components", "units", "sigma")}
+    effects = {"mag": error_states.Effect(**effect)}
+    return type("Otherwise", (error_states.ErrorStates,), {**names, "effects": effects})()
+
+
 BROKEN = {
     "a prior too narrow": ("gyro scale", error_states.GyroScale(scale_sigma=0.002, misalignment_sigma=0.002)),
-    "the wrong sign": ("hard iron", None),
+    "the wrong sign": ("hard iron", otherwise(IRON, offset_b=-np.eye(3))),
     "a correlation too short": ("acceleration", dataclasses.replace(SWAY, correlation_time=0.1)),
     "a drift too small": ("gyro drift", dataclasses.replace(DRIFT, bias_sigma=1e-3)),
-    "rows for columns": ("soft iron", None),
+    "rows for columns": ("soft iron", otherwise(SOFT, scale=np.swapaxes(np.eye(9).reshape(9, 3, 3), 1, 2))),
     "a mounting of another sensor": ("mounting", dataclasses.replace(MOUNTING, sensor="acc")),
 }
-
-
-@dataclasses.dataclass(frozen=True)
-class WrongSign(error_states.ErrorStates):
-    name: str = IRON.name
-    components: tuple[str, ...] = ("x", "y", "z")
-    units: tuple[str, ...] = ("T",) * 3
-
-    @property
-    def sigma(self):
-        return IRON.sigma
-
-    @property
-    def effects(self):
-        return {"mag": error_states.Effect(offset_b=-np.eye(3))}
-
-
-@dataclasses.dataclass(frozen=True)
-class Transposed(error_states.ErrorStates):
-    name: str = SOFT.name
-    components: tuple[str, ...] = SOFT.components
-    units: tuple[str, ...] = SOFT.units
-
-    @property
-    def sigma(self):
-        return SOFT.sigma
-
-    @property
-    def effects(self):
-        return {"mag": error_states.Effect(scale=np.swapaxes(np.eye(9).reshape(9, 3, 3), 1, 2))}
 
 
 @pytest.mark.parametrize("how", BROKEN)
 def test_it_is_not_with_the_block_broken(how):
     case, block = BROKEN[how]
-    if block is None:
-        block = WrongSign() if case == "hard iron" else Transposed()
     assert not judged(case, (block,), 40, 12.0).consistent
 
 
@@ -256,21 +217,10 @@ def swaying(seed: int, sigma: float, tau: float, duration: float = 60.0):
     sway = sigma * rng.standard_normal((len(time), 3))
     for k in range(1, len(time)):
         sway[k] = phi * sway[k - 1] + np.sqrt(1.0 - phi**2) * sway[k]
-    up = np.array([0.0, 0.0, 9.81])
-    back = quaternion.conjugate(HAND.attitude(time))
     series = []
-    for name, reference, noise, extra in (("acc", up, 0.05, sway), ("mag", FIELD, 5e-7, np.zeros(3))):
-        z = quaternion.rotate(back, reference + extra) + noise * rng.standard_normal(sway.shape)
-        series.append(
-            VectorMeasurements(
-                sensor=name,
-                kind="vector",
-                time=time,
-                vector_b=z,
-                reference_f=reference,
-                sigma=np.full(len(time), noise),
-            )
-        )
+    for name, reference, noise, extra in (("acc", UP, 0.05, sway), ("mag", FIELD, 5e-7, np.zeros(3))):
+        z = seen(HAND.attitude(time), reference + extra) + noise * rng.standard_normal(sway.shape)
+        series.append(series_of(name, "vector", time, z, reference, noise))
     increments = HAND.increments(edges) + ARW * np.sqrt(0.02) * rng.standard_normal((len(edges) - 1, 3))
     block = error_states.GaussMarkov(sensor="acc", noise_sigma=sigma, correlation_time=tau, frame="fixed", unit="m/s²")
     return ImuRecord(time=edges, increments=increments, vectors=tuple(series)), sway, block

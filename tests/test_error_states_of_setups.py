@@ -1,13 +1,13 @@
 """Optional states of a filter setup: their files, the blocks they become, gates and robust weights, the whole bias; refusals."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import in_steps
 import numpy as np
 import pytest
 from gated_steps import GatedStepFilter
+from measured import FIELD, drawn_start, resting, series_of, turn_to
+from measured import HAND as SWAY
 
 from strapdown import consistency, estimation, kinematics, motion, quaternion, records, scenarios, vectors
 from strapdown.checks import InputError
@@ -22,16 +22,8 @@ from strapdown.kernels import error_state_step, sensor_rows
 from strapdown.randomness import generator
 from strapdown.records import ImuRecord, Truth
 from strapdown.scenarios import Scenario
-from strapdown.vectors import VectorMeasurements
 
 NOISE = ProcessNoise(angle_random_walk=1e-3, rate_random_walk=1e-5)
-SWAY = motion.HarmonicRates(
-    harmonics=(
-        motion.Harmonic(amplitude=(1.2, 0.2, -0.3), frequency=0.21),
-        motion.Harmonic(amplitude=(-0.3, 1.1, 0.4), frequency=0.37),
-        motion.Harmonic(amplitude=(0.3, -0.2, 1.3), frequency=0.29, phase=1.0),
-    )
-)
 WHOLE = States(
     gyro_scale_sigma=(1e-3, 0.0, 1.23456789e-4),
     gyro_misalignment_sigma=((0.0, 1e-3, 0.0), (0.0, 0.0, 2e-3), (1.7e-4, 0.0, 0.0)),
@@ -57,7 +49,7 @@ def simulated(seed=3, duration=20.0, kind="vector", outlier_probability=0.0, **g
         sensors=(
             vectors.Magnetometer(
                 name="mag",
-                field_f=np.array([0.0, 2e-5, -4e-5]),
+                field_f=FIELD,
                 sigma=5e-7,
                 rate=10.0,
                 kind=kind,
@@ -74,12 +66,7 @@ def simulated(seed=3, duration=20.0, kind="vector", outlier_probability=0.0, **g
 
 def begun(record, attitude_sigma=0.02, bias_sigma=3e-3, seed=1) -> estimation.State:
     draw = np.random.default_rng(seed).standard_normal(6)
-    return estimation.initial_state(
-        quaternion.multiply(record.truth.attitude[0], quaternion.exp(-attitude_sigma * draw[:3])),
-        attitude_sigma=attitude_sigma,
-        bias_sigma=bias_sigma,
-        bias=record.truth.bias[0] - bias_sigma * draw[3:],
-    )
+    return drawn_start(record.truth, draw, attitude_sigma, bias_sigma)
 
 
 # ------------------------------------------------------------------------------------------------------------------------ files
@@ -329,7 +316,7 @@ def test_force_s_transition_is_the_derivative():
     face = moved(values)
     for k in range(9):
         ahead, back = (moved(values + sign * 1e-5 * np.eye(9)[k]) for sign in (1.0, -1.0))
-        numeric = quaternion.log(quaternion.multiply(quaternion.conjugate(back.attitude), ahead.attitude)) / 2e-5
+        numeric = turn_to(back.attitude, ahead.attitude) / 2e-5
         np.testing.assert_allclose(face.F[:3, 6 + k], numeric, rtol=0, atol=1e-5 * np.max(np.abs(numeric)) + 1e-9)
 
 
@@ -342,17 +329,13 @@ def test_faces_agree_with_force_and_gyro_scale_of_some_axes():
     one = estimation.run(record, NOISE, begun(record), blocks, full_covariance=True)
     other = in_steps.run(record, NOISE, begun(record), blocks)
     np.testing.assert_allclose(one.attitude, other.attitude, atol=1e-11)
-    sigma = np.sqrt(np.einsum("kii->ki", one.whole_covariance))
-    scaled = (one.whole_covariance - other.whole_covariance) / (sigma[:, :, None] * sigma[:, None, :])
-    assert np.max(np.abs(scaled)) < 1e-8
+    assert in_steps.apart(one, other) < 1e-8
     smoothed = estimation.smooth(record, NOISE, begun(record), blocks, full_covariance=True)
     np.testing.assert_allclose(smoothed.whole_covariance[-1], one.whole_covariance[-1], rtol=1e-8, atol=1e-16)
 
 
 # ------------------------------------------------------------------------------------------------------------- the step face
 
-X, _, UP = np.eye(3)
-KNOWN = estimation.initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=0.1, bias_sigma=1e-3)
 IRON = error_states.VectorBias(sensor="mag", bias_sigma=3e-6, unit="T")
 HELD = error_states.GaussMarkov(sensor="acc", noise_sigma=0.3, correlation_time=1.0, unit="m/s²")
 
@@ -482,15 +465,8 @@ def test_hard_iron_in_a_field_that_changes_is_found_in_its_own_unit():
 def test_a_direction_that_its_states_make_longer_has_the_less_noise():
     """Of a sensor that normalises its vector, noise across it is over the length of what it really sees."""
     strong = error_states.VectorBias(sensor="a", bias_sigma=1e-9)
-    series = VectorMeasurements(
-        sensor="a",
-        kind="direction",
-        time=np.array([0.0]),
-        vector_b=np.array([[1.0, 0.0, 0.0]]),
-        reference_f=np.array([1.0, 0.0, 0.0]),
-        sigma=np.array([1e-3]),
-    )
-    record = ImuRecord(time=np.array([0.0, 1.0]), increments=np.zeros((1, 3)), vectors=(series,))
+    series = series_of("a", "direction", [0.0], [[1.0, 0.0, 0.0]], [1.0, 0.0, 0.0], 1e-3)
+    record = resting(series)
     start = estimation.with_error_states(
         estimation.initial_state([1.0, 0, 0, 0], attitude_sigma=1e-9, bias_sigma=1e-9), (strong,)
     )
@@ -504,14 +480,7 @@ def test_the_strength_of_a_heading_s_field_leaves_its_level_part_out():
     level = np.array([0.3, 0.6, 0.9])
     reference = np.stack([level, np.zeros(3), -np.sqrt(1.0 - level**2)], axis=1)
     field = np.array([2.0, 5.0, 3.0])
-    series = VectorMeasurements(
-        sensor="m",
-        kind="heading",
-        time=np.arange(3.0),
-        vector_b=reference,
-        reference_f=reference,
-        sigma=0.1 / (field * level),
-    )
+    series = series_of("m", "heading", np.arange(3.0), reference, reference, 0.1 / (field * level))
     np.testing.assert_allclose(forward.strength(series) / field, forward.strength(series)[0] / field[0], rtol=1e-12)
 
 
@@ -598,18 +567,13 @@ def test_an_estimate_with_states_is_judged_like_any_other(tmp_path):
     filter_setup = setup.FilterSetup.for_scenario(scenario, states=True)
     record = scenarios.simulate(scenarios.drawn(scenario, 2), 2)
     draw = generator(2, 0, "start").standard_normal(6)
-    initial = setup.initial_state(
-        filter_setup,
-        quaternion.multiply(record.truth.attitude[0], quaternion.exp(-filter_setup.attitude_sigma * draw[:3])),
-        record.truth.bias[0] - filter_setup.bias_sigma * draw[3:],
-    )
+    initial = drawn_start(record.truth, draw, filter_setup.attitude_sigma, filter_setup.bias_sigma)
     estimate = setup.run(record, filter_setup, initial, full_covariance=True)
     write_estimate(tmp_path / "e.h5", estimate, {})
     again = read_estimate(tmp_path / "e.h5")
     truth = Truth(attitude=record.truth.attitude, bias=record.truth.bias)
     assert consistency.judge(again, truth).verdict == "consistent"
     assert np.array_equal(again.covariance, estimate.covariance)
-    assert kinematics.skew(estimate.bias[0]).shape == (3, 3)
 
 
 def test_the_acceleration_of_a_vibration_is_not_reported_too_small():

@@ -1,7 +1,5 @@
 """The built-in scenarios with the states that their errors call for: NIS and ANEES are right together, and are not without the states."""
 
-from __future__ import annotations
-
 import dataclasses
 from functools import cache
 

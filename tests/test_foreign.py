@@ -1,39 +1,30 @@
 """Estimates of other filters against a truth: clocks, frames and the reading of their covariance found, faults named."""
 
-import importlib.util
 import json
 import struct
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import scipy.stats
+from measured import waves
 from scipy.spatial.transform import Rotation
 
+from sims import peer_judged
 from strapdown import cli, consistency, montecarlo, quaternion, recordings, report, scenarios, vectors
 from strapdown.checks import InputError
 from strapdown.consistency import check_arrays, foreign
 from strapdown.estimation import setup
 from strapdown.gyro import GyroSpec
-from strapdown.motion import Harmonic, HarmonicRates
 from strapdown.recordings import attitudes, recordfiles, ulog
 from strapdown.recordings.attitudes import read_attitudes
 from strapdown.records import Truth, read_estimate, read_truth, write_estimate
 from strapdown.records.outputs import euler, euler_axes, to_ned
 from strapdown.units import DEGREE, DEGREE_PER_HOUR_PER_ROOT_HOUR, DEGREE_PER_ROOT_HOUR
 
-SIMS = Path(__file__).resolve().parents[1] / "sims"
-
 FLIGHT = scenarios.Scenario(
-    motion=HarmonicRates(
-        mean=(0.02, -0.03, 0.05),
-        harmonics=(
-            Harmonic(amplitude=(0.3, 0.1, 0.0), frequency=0.07),
-            Harmonic(amplitude=(0.0, 0.2, 0.25), frequency=0.11, phase=1.0),
-        ),
-    ),
+    motion=waves(((0.3, 0.1, 0.0), 0.07), ((0.0, 0.2, 0.25), 0.11, 1.0), mean=(0.02, -0.03, 0.05)),
     # A gyro so poor that errors forget each other within seconds: one run then has much power.
     gyro=GyroSpec(angle_random_walk=20.0 * DEGREE_PER_ROOT_HOUR, rate_random_walk=20.0 * DEGREE_PER_HOUR_PER_ROOT_HOUR),
     sensors=(
@@ -584,10 +575,7 @@ def test_peers_are_right_where_all_is_and_found_out_where_it_is_not():
     """Over 40 runs; the errors are on the body side, as smsfusion's source says."""
     for package in ("smsfusion", "attipy", "gtsam"):
         pytest.importorskip(package)
-    spec = importlib.util.spec_from_file_location("peer_judged", SIMS / "peer_judged.py")
-    sim = sys.modules["peer_judged"] = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(sim)
-    found = sim.main(runs=40, duration=40.0)
+    found = peer_judged.main(runs=40, duration=40.0)
     for right in ("AttiPy, heading's derivative mended", "GTSAM"):
         assert found.judgements[right].verdict != "not consistent"
     for wrong in ("smsfusion, noises of another sensor", "GTSAM, gyro with a bias"):
@@ -598,11 +586,8 @@ def test_peers_are_right_where_all_is_and_found_out_where_it_is_not():
 
 def test_the_heading_gradient_of_the_sim_is_the_derivative():
     """By differences of the yaw angle, at any yaw."""
-    spec = importlib.util.spec_from_file_location("peer_judged", SIMS / "peer_judged.py")
-    sim = sys.modules["peer_judged"] = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(sim)
     for yaw in (0.0, 1.5, 3.0):
         q = quaternion.multiply(quaternion.exp([0.0, 0.0, yaw]), quaternion.exp([0.1, 0.2, 0.0]))
         turned = quaternion.multiply(q, quaternion.exp(1e-6 * np.eye(3)))
         difference = (euler(turned).angles[:, 0] - euler(q[None]).angles[0, 0]) / 1e-6
-        np.testing.assert_allclose(sim.heading_gradient(q), difference, atol=1e-5)
+        np.testing.assert_allclose(peer_judged.heading_gradient(q), difference, atol=1e-5)

@@ -1,7 +1,5 @@
 """``import strapdown as sd``: the five commonest programs, what the package shows, and that it loads nothing before it is used."""
 
-from __future__ import annotations
-
 import ast
 import base64
 import dataclasses
@@ -23,29 +21,9 @@ import strapdown as sd
 from strapdown import results
 
 NAMES = {
-    "FilterSetup",
-    "Gate",
-    "GyroSpec",
-    "InputError",
-    "LiveFilter",
-    "ProcessNoise",
-    "Robust",
-    "Scenario",
-    "StepFilter",
-    "VectorSensor",
-    "allan_deviation",
-    "check",
-    "covariance_analysis",
-    "estimate",
-    "fit_noise",
-    "initial_state",
-    "integrate",
-    "monte_carlo",
-    "read",
-    "simulate",
-    "smooth",
-    "tune",
-    "write",
+    *("FilterSetup", "Gate", "GyroSpec", "InputError", "LiveFilter", "ProcessNoise", "Robust", "Scenario"),
+    *("StepFilter", "VectorSensor", "allan_deviation", "check", "covariance_analysis", "estimate", "fit_noise"),
+    *("initial_state", "integrate", "monte_carlo", "read", "simulate", "smooth", "tune", "write"),
 }
 
 
@@ -167,13 +145,6 @@ def test_monte_carlo_verdict():
 # ---------------------------------------------------------------------------------------------------- as the commands do it
 
 
-def run_command(*arguments: object) -> None:
-    """Run the command line in this process."""
-    from strapdown.cli.terminal import app
-
-    app([str(one) for one in arguments], standalone_mode=False)
-
-
 @pytest.mark.parametrize(
     ("options", "keywords"),
     [
@@ -185,11 +156,11 @@ def run_command(*arguments: object) -> None:
         (("--smooth", "--variances"), {"smooth": True, "full_covariance": False}),
     ],
 )
-def test_estimate_of_a_record_is_that_of_the_command(tmp_path, options, keywords):
+def test_estimate_of_a_record_is_that_of_the_command(succeeds, tmp_path, options, keywords):
     errors = {"scale_factor": (3e-4, 0.0, 0.0), "misalignment": np.full((3, 3), 1e-4) - 1e-4 * np.eye(3)}
     made = dataclasses.replace(scenario(), gyro=dataclasses.replace(scenario().gyro, **errors))
     sd.write(sd.simulate(made, seed=9), tmp_path / "record.h5")
-    run_command("estimate", tmp_path / "record.h5", "--out", tmp_path / "out", *options)
+    succeeds("estimate", tmp_path / "record.h5", "--out", tmp_path / "out", *options)
     command = sd.read(tmp_path / "out" / "estimate.h5")
     call = sd.estimate(sd.read(tmp_path / "record.h5"), **keywords)
     for name in ("time", "attitude", "bias", "variance", "covariance"):
@@ -200,29 +171,20 @@ def test_estimate_of_a_record_is_that_of_the_command(tmp_path, options, keywords
     assert sizes == ({"gyro scale": 7} if states is True else {"gyro scale": 1} if states else {})
 
 
-def test_estimate_of_a_recording_is_that_of_the_command(tmp_path):
+def test_estimate_of_a_recording_is_that_of_the_command(succeeds, tmp_path):
     path = phone_recording(tmp_path)
-    run_command(
-        "estimate",
-        path,
-        "--gyro-unit",
-        "deg/s",
-        "--accelerometer-unit",
-        "g",
-        "--time-unit",
-        "s",
-        "--out",
-        tmp_path / "o",
-    )
+    units = ("--gyro-unit", "deg/s", "--accelerometer-unit", "g", "--time-unit", "s")
+    succeeds("estimate", path, *units, "--out", tmp_path / "o")
     command = sd.read(tmp_path / "o" / "estimate.h5")
     call = sd.estimate(sd.read(path, units={"time": "s", "gyro": "deg/s", "accelerometer": "g"}))
     np.testing.assert_array_equal(call.attitude, command.attitude)
     np.testing.assert_array_equal(call.variance, command.variance)
 
 
-def test_monte_carlo_is_that_of_the_command(tmp_path):
+def test_monte_carlo_is_that_of_the_command(run, tmp_path):
     sd.write(scenario(10.0), tmp_path / "small.toml")
-    run_command("montecarlo", tmp_path / "small.toml", "--runs", 10, "--out", tmp_path / "runs.h5", "--threads", 1)
+    options = ("--runs", 10, "--out", tmp_path / "runs.h5", "--threads", 1)
+    assert run("montecarlo", tmp_path / "small.toml", *options)[0] == 2  # ten runs cannot tell
     campaign = sd.read(tmp_path / "runs.h5")
     call = sd.monte_carlo(tmp_path / "small.toml", runs=10, threads=1)
     np.testing.assert_array_equal(call.nees_sum, campaign.statistics.nees_sum)
@@ -257,10 +219,10 @@ def test_a_record_of_a_motion_of_ones_own_is_written_without_its_scenario(tmp_pa
     np.testing.assert_array_equal(sd.estimate(again).attitude, sd.estimate(record).attitude)
 
 
-def test_tune_is_that_of_the_command(tmp_path):
+def test_tune_is_that_of_the_command(succeeds, tmp_path):
     sd.write(sd.simulate(scenario(60.0)), tmp_path / "record.h5")
     options = ("--free", "star 1.sigma", "--starts", "2", "--threads", "1", "--out", tmp_path / "filter.toml")
-    run_command("tune", tmp_path / "record.h5", *options)
+    succeeds("tune", tmp_path / "record.h5", *options)
     call = sd.tune(sd.read(tmp_path / "record.h5"), free=["star 1.sigma"], starts=2, threads=1)
     assert sd.estimation.setup.read_setup(tmp_path / "filter.toml") == call.setup
 
@@ -497,38 +459,17 @@ def test_dir_shows_the_names_and_the_public_submodules_alone():
     package = Path(sd.__file__).parent
     present = {path.stem for path in package.iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()}
     assert modules <= present
-    assert not modules & {
-        "kernels",
-        "cli",
-        "checks",
-        "files",
-        "tables",
-        "equality",
-        "reading",
-        "workflows",
-        "randomness",
-    }
+    private = {"kernels", "cli", "checks", "files", "tables", "equality", "reading", "workflows", "randomness"}
+    assert not modules & private
     for name in shown:
         assert getattr(sd, name) is not None
     with pytest.raises(AttributeError, match="mekf"):
         _ = sd.mekf
 
 
-BELOW = (
-    "ahrs.check_conventions",
-    "allan.parameters",
-    "allan.temperature",
-    "estimation.error_states",
-    "estimation.filters",
-    "estimation.multiple_model",
-    "gyro.datasheets",
-    "montecarlo.campaign",
-    "montecarlo.cluster",
-    "motion.orbit",
-    "recordings.unit_calibration",
-    "records.outputs",
-    "vectors.wahba",
-)
+BELOW = ("ahrs.check_conventions", "allan.parameters", "allan.temperature", "estimation.error_states")
+BELOW += ("estimation.filters", "estimation.multiple_model", "gyro.datasheets", "montecarlo.campaign")
+BELOW += ("montecarlo.cluster", "motion.orbit", "recordings.unit_calibration", "records.outputs", "vectors.wahba")
 """Public modules below the public submodules."""
 
 
@@ -559,32 +500,26 @@ def test_type_checkers_see_what_is_there():
     assert {name: home for name, home in seen.items() if home} == sd._HOMES
 
 
+def python(*arguments, **options):
+    """Return the words that another interpreter prints."""
+    command = [sys.executable, *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=True, timeout=60, **options).stdout.split()
+
+
 def test_import_loads_nothing_else():
     code = "import sys; before = set(sys.modules); import strapdown; print(sorted(set(sys.modules) - before))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
-    assert done.stdout.split() == ["['strapdown']"]
+    assert python("-c", code) == ["['strapdown']"]
 
 
 # ----------------------------------------------------------------------------------------------------------------- the program
 
 
 def test_python_dash_m_is_the_program():
-    done = subprocess.run(
-        [sys.executable, "-m", "strapdown", "--version"], capture_output=True, text=True, check=True, timeout=60
-    )
-    assert done.stdout.split() == ["strapdown", sd.__version__]
+    assert python("-m", "strapdown", "--version") == ["strapdown", sd.__version__]
 
 
 def test_shells_complete_commands():
     """As a shell asks: the words so far in the environment, the program's own name before them."""
     words = {"_STRAPDOWN_COMPLETE": "complete_bash", "COMP_WORDS": "strapdown mon", "COMP_CWORD": "1"}
     code = "import sys; sys.argv = ['strapdown']; from strapdown.__main__ import main; main()"
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        capture_output=True,
-        text=True,
-        check=True,
-        timeout=60,
-        env={**os.environ, **words},
-    )
-    assert done.stdout.split() == ["montecarlo"]
+    assert python("-c", code, env={**os.environ, **words}) == ["montecarlo"]

@@ -1,7 +1,5 @@
 """Hard iron from a magnetometer whose turns the gyro shows: against iron of known size."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

@@ -13,7 +13,7 @@ import plain_kernels
 import pytest
 from numba.core.errors import TypingError
 
-from strapdown.kernels import integration, lane_values, machine, rotation
+from strapdown.kernels import lane_values
 from strapdown.kernels.algebra import square_root
 from strapdown.kernels.filter_step import predict, update_direction
 from strapdown.kernels.lane_angles import arctangent, inverse_root, rotation_vector
@@ -368,43 +368,8 @@ def states():
 
 def run_of(rows, like):
     """Return (q, b, A, B, C) of so many runs, from 28 rows of them."""
-    n = len(like)
-    return (
-        (
-            load_like(rows, 0, like),
-            load_like(rows, n, like),
-            load_like(rows, 2 * n, like),
-            load_like(rows, 3 * n, like),
-        ),
-        (load_like(rows, 4 * n, like), load_like(rows, 5 * n, like), load_like(rows, 6 * n, like)),
-        (
-            load_like(rows, 7 * n, like),
-            load_like(rows, 8 * n, like),
-            load_like(rows, 9 * n, like),
-            load_like(rows, 10 * n, like),
-            load_like(rows, 11 * n, like),
-            load_like(rows, 12 * n, like),
-        ),
-        (
-            load_like(rows, 13 * n, like),
-            load_like(rows, 14 * n, like),
-            load_like(rows, 15 * n, like),
-            load_like(rows, 16 * n, like),
-            load_like(rows, 17 * n, like),
-            load_like(rows, 18 * n, like),
-            load_like(rows, 19 * n, like),
-            load_like(rows, 20 * n, like),
-            load_like(rows, 21 * n, like),
-        ),
-        (
-            load_like(rows, 22 * n, like),
-            load_like(rows, 23 * n, like),
-            load_like(rows, 24 * n, like),
-            load_like(rows, 25 * n, like),
-            load_like(rows, 26 * n, like),
-            load_like(rows, 27 * n, like),
-        ),
-    )
+    x = tuple(load_like(rows, i * len(like), like) for i in range(28))
+    return x[:4], x[4:7], x[7:13], x[13:22], x[22:]
 
 
 run_of.__module__ = "strapdown.kernels.probe"  # so that kernels of this file may call it
@@ -445,16 +410,7 @@ def stepped_scalars(rows, inputs, variance, out):
     q = (rows[0], rows[1], rows[2], rows[3])
     q, A, B, C = predict(q, b, A, B, C, (inputs[0], inputs[1], inputs[2]), 0.01, 1e-8, 1e-12)
     q, b, A, B, C, e1, s1, e2, s2 = update_direction(
-        q,
-        b,
-        A,
-        B,
-        C,
-        rotation_matrix(q),
-        (1.0, 0.0, 0.0),
-        (0.0, 1.0, 0.0),
-        (inputs[3], inputs[4], inputs[5]),
-        variance,
+        q, b, A, B, C, rotation_matrix(q), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (inputs[3], inputs[4], inputs[5]), variance
     )
     for i in range(4):
         out[i] = q[i]
@@ -536,18 +492,3 @@ def test_bits_do_not_depend_on_the_width_of_the_machine():
     here: dict = {}
     exec(BITS, here)
     assert digest_on("haswell", "+avx2,+fma,-avx512f") == here["digest"]  # four lanes an instruction, not eight
-
-
-def test_the_block_equals_one_chain():
-    n = integration.BLOCK + 100
-    vectors = 0.02 * RANDOM.standard_normal((n, 3))
-    attitude = np.empty((n + 1, 4))
-    initial = np.array([0.6, 0.0, 0.8, 0.0])
-    machine.compiled(integration.accumulate_vectors)(
-        vectors.reshape(-1), initial, np.empty(integration.WORK), attitude.reshape(-1)
-    )
-    q = tuple(initial)
-    for k in range(n):
-        q = rotation.turned(q, tuple(vectors[k]))
-        # Each of the products before it has rounded once, in one order or the other.
-        np.testing.assert_allclose(attitude[k + 1], q, rtol=0.0, atol=4e-16 * math.sqrt(k + 1))

@@ -1,7 +1,5 @@
 """Compiling kernels: what is compiled, what is refused, and a disk cache that is never stale."""
 
-from __future__ import annotations
-
 import ast
 import importlib
 import math
@@ -22,6 +20,7 @@ import numba
 import numpy as np
 import plain_kernels
 import pytest
+from measured import series_of
 
 import strapdown
 from strapdown import estimation
@@ -40,7 +39,6 @@ from strapdown.kernels import (
 from strapdown.kernels.filters import body_side, extended
 from strapdown.kernels.walk import walk
 from strapdown.records import ImuRecord
-from strapdown.vectors import VectorMeasurements
 
 PACKAGE = Path(strapdown.__file__).parent
 
@@ -111,9 +109,7 @@ def test_compiled_loop_equals_plain_python(monkeypatch):
         measured = [1.0, 0.0, 0.0] + 0.05 * random.standard_normal((10, 3))
         measured /= np.linalg.norm(measured, axis=1, keepdims=True)
         reference = np.array([1.0, 0.0, 0.0])
-        vectors.append(
-            VectorMeasurements(sensor=kind, kind=kind, time=time, vector_b=measured, reference_f=reference, sigma=0.01)
-        )
+        vectors.append(series_of(kind, kind, time, measured, reference, 0.01))
     record = ImuRecord(time=edges, increments=increments, vectors=tuple(vectors))
     noise = estimation.ProcessNoise(angle_random_walk=1e-3, rate_random_walk=1e-4)
     initial = estimation.initial_state([1.0, 0.0, 0.0, 0.0], attitude_sigma=0.1, bias_sigma=0.01)

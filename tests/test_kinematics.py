@@ -1,7 +1,5 @@
 """Rates and Jacobians. The numbered equations have their own file; here: shapes, round trips, and the Jacobians against mpmath."""
 
-from __future__ import annotations
-
 import mpmath as mp
 import numpy as np
 import pytest
@@ -15,9 +13,6 @@ EPS = np.finfo(float).eps
 
 def random(shape: tuple[int, ...], last: int, seed: int) -> np.ndarray:
     return np.random.default_rng(seed).standard_normal((*shape, last))
-
-
-# ---------------------------------------------------------------------------------------------------- rates
 
 
 @pytest.mark.parametrize("shape", SHAPES)
@@ -37,9 +32,6 @@ def test_skew_is_the_cross_product(shape):
     a, b = random(shape, 3, 3), random(shape, 3, 4)
     np.testing.assert_allclose((kinematics.skew(a) @ b[..., None])[..., 0], np.cross(a, b), atol=4 * EPS)
     np.testing.assert_array_equal(kinematics.skew(a), -np.swapaxes(kinematics.skew(a), -1, -2))
-
-
-# ---------------------------------------------------------------------------------------------------- Jacobians
 
 
 def mp_skew(v):

@@ -1,7 +1,5 @@
 """Names and prose are in the field's words, not in the dialect that the package once had."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from measured import series_of
 from test_step_filter import NOISE, OPTIONS, STATES, begun, record_of, start
 
 from strapdown import estimation, motion
@@ -214,7 +215,7 @@ def test_covariances_of_sensors():
     z /= np.linalg.norm(z, axis=-1, keepdims=True)
     vectors = (
         VectorMeasurements(sensor="a", kind="direction", time=times, vector_b=z[0], reference_f=r[0], covariance=whole),
-        VectorMeasurements(sensor="b", kind="direction", time=times, vector_b=z[1], reference_f=r[1], sigma=0.01),
+        series_of("b", "direction", times, z[1], r[1], 0.01),
         VectorMeasurements(
             sensor="c", kind="vector", time=times, vector_b=3.0 * z[1], reference_f=3.0 * r[1], covariance=whole
         ),

@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from measured import series_of
 
 from strapdown import estimation
 from strapdown.estimation import memory
 from strapdown.estimation.memory import side_by_side
 from strapdown.estimation.schedule import schedule
 from strapdown.records import ImuRecord
-from strapdown.vectors import VectorMeasurements
 
 MEGABYTE = 1 << 20
 NOISE = estimation.ProcessNoise(angle_random_walk=1e-3, rate_random_walk=1e-5)
@@ -31,13 +31,8 @@ def record(seed, intervals=20_000):
     generator = np.random.default_rng(seed)
     edges = np.arange(intervals + 1) * 0.01
     up = np.array([0.0, 0.0, 1.0]) + 0.01 * generator.standard_normal((intervals, 3))
-    series = VectorMeasurements(
-        sensor="up",
-        kind="direction",
-        time=edges[1:],
-        vector_b=up / np.linalg.norm(up, axis=1, keepdims=True),
-        reference_f=[0.0, 0.0, 1.0],
-        sigma=np.full(intervals, 0.01),
+    series = series_of(
+        "up", "direction", edges[1:], up / np.linalg.norm(up, axis=1, keepdims=True), [0.0, 0.0, 1.0], 0.01
     )
     return ImuRecord(time=edges, increments=1e-4 * generator.standard_normal((intervals, 3)), vectors=(series,))
 

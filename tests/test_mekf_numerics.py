@@ -6,6 +6,7 @@ from dataclasses import replace
 import mpmath
 import numpy as np
 import pytest
+from measured import resting, series_of
 from plain_kernels import plain
 from scipy.spatial.transform import Rotation
 
@@ -42,9 +43,7 @@ def sharp_record(sigma, steps=400):
     for k, r in enumerate(([1.0, 0.0, 0.0], [0.0, 0.6, 0.8], [0.6, -0.8, 0.0])):
         at = time[1 + k :: 3]
         seen = quaternion.rotate(quaternion.conjugate(body.attitude(at)), np.array(r))
-        series.append(
-            VectorMeasurements(sensor=f"s{k}", kind="direction", time=at, vector_b=seen, reference_f=r, sigma=sigma)
-        )
+        series.append(series_of(f"s{k}", "direction", at, seen, r, sigma))
     return ImuRecord(time=time, increments=body.increments(time), vectors=tuple(series)), body.attitude(time)
 
 
@@ -72,11 +71,8 @@ def test_the_covariance_is_that_of_the_information_form(exponent, gate):
     """(I/σ₀² + Σ (I − r rᵀ)/σ²)⁻¹ of three directions at one time."""
     sigma = 10.0**exponent
     references = np.array([[1.0, 0.0, 0.0], [0.0, 0.6, 0.8], [0.6, -0.8, 0.0]])
-    series = tuple(
-        VectorMeasurements(sensor=f"s{k}", kind="direction", time=[0.0], vector_b=[r], reference_f=r, sigma=sigma)
-        for k, r in enumerate(references)
-    )
-    record = ImuRecord(time=[0.0, 1.0], increments=np.zeros((1, 3)), vectors=series)
+    series = tuple(series_of(f"s{k}", "direction", [0.0], [r], r, sigma) for k, r in enumerate(references))
+    record = resting(*series)
     start = initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=1.0, bias_sigma=0.1)
     P = estimation.run(record, NOISE, start, full_covariance=True, gate=gate).covariance[0, :3, :3]
     information = np.eye(3) + sum(np.eye(3) - np.outer(r, r) for r in references) / sigma**2
@@ -107,15 +103,8 @@ def reference_variances(record, noise, prior):
                 for at in np.flatnonzero(series.time == now):
                     r = mp.matrix([mp.mpf(float(x)) for x in series.references_f[at]])
                     H = mp.zeros(3, 6)
-                    for (i, j), x in {
-                        (0, 1): -r[2],
-                        (0, 2): r[1],
-                        (1, 0): r[2],
-                        (1, 2): -r[0],
-                        (2, 0): -r[1],
-                        (2, 1): r[0],
-                    }.items():
-                        H[i, j] = x
+                    for i, j, m in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+                        H[i, j], H[j, i] = -r[m], r[m]
                     across = mp.qr(mp.matrix([[r[0], 1, 0], [r[1], 0, 1], [r[2], 1, 1]]))[0][:, 1:]
                     H = across.T * H  # two directions across r: along it nothing is measured
                     S = H * P * H.T + mp.mpf(float(series.sigma[at])) ** 2 * mp.eye(2)
@@ -147,12 +136,8 @@ def sparse_record(sensors, sigma, noise):
         r = generator.standard_normal(3)
         r /= np.linalg.norm(r)
         at = time[[0, 10, 20, 32]] if k == 0 else time[[0, 10]]
-        series.append(
-            VectorMeasurements(
-                sensor=f"s{k}", kind="direction", time=at, vector_b=np.tile(r, (len(at), 1)), reference_f=r, sigma=sigma
-            )
-        )
-    record = ImuRecord(time=time, increments=np.zeros((len(time) - 1, 3)), vectors=tuple(series))
+        series.append(series_of(f"s{k}", "direction", at, np.tile(r, (len(at), 1)), r, sigma))
+    record = resting(*series, time=time)
     process = ProcessNoise(angle_random_walk=noise[0], rate_random_walk=noise[1])
     return record, process, reference_variances(record, process, [1.0] * 3 + [0.1] * 3)
 
@@ -179,9 +164,7 @@ def test_an_outage_that_makes_attitude_and_bias_one_leaves_the_covariance_defini
     """After 1e7 s the attitude's error is the bias's, to 1e-18 of its variance; a measurement then determines both."""
     time = np.concatenate([[0.0, 1.0], 1e7 + np.arange(3.0)])
     series = tuple(
-        VectorMeasurements(
-            sensor=name, kind="direction", time=time[[0, 3]], vector_b=np.tile(r, (2, 1)), reference_f=r, sigma=1e-3
-        )
+        series_of(name, "direction", time[[0, 3]], np.tile(r, (2, 1)), r, 1e-3)
         for name, r in (("x", [1.0, 0.0, 0.0]), ("y", [0.0, 0.6, 0.8]))
     )
     process = ProcessNoise(angle_random_walk=1e-12, rate_random_walk=0.0)
@@ -273,9 +256,7 @@ def test_a_stretch_in_factors_is_the_filter_itself():
     middle = float(record.time[at_step])
     body = motion.ConstantRate(rate=(0.3, -0.5, 0.4))
     seen = quaternion.rotate(quaternion.conjugate(body.attitude(middle)), np.array([0.0, 0.0, 1.0]))
-    sharp = VectorMeasurements(
-        sensor="sharp", kind="direction", time=[middle], vector_b=[seen], reference_f=[0.0, 0.0, 1.0], sigma=1e-9
-    )
+    sharp = series_of("sharp", "direction", [middle], [seen], [0.0, 0.0, 1.0], 1e-9)
     whole = replace(record, vectors=(*record.vectors, sharp))
     start = initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=0.1, bias_sigma=0.01)
     without, estimate = estimation.run(record, NOISE, start), estimation.run(whole, NOISE, start, full_covariance=True)
@@ -304,13 +285,13 @@ def test_positive_definite_and_steady_over_a_long_run(parts, steps):
     body = motion.ConstantRate(rate=(0.0, 0.0, 2.0 * np.pi / 10.0))
     time = 0.1 * np.arange(steps + 1)
     series = tuple(
-        VectorMeasurements(
-            sensor=name,
-            kind="direction",
-            time=time[1:],
-            vector_b=quaternion.rotate(quaternion.conjugate(body.attitude(time[1:])), np.array(r)),
-            reference_f=r,
-            sigma=1e-4,
+        series_of(
+            name,
+            "direction",
+            time[1:],
+            quaternion.rotate(quaternion.conjugate(body.attitude(time[1:])), np.array(r)),
+            r,
+            1e-4,
         )
         for name, r in (("x", [1.0, 0.0, 0.0]), ("y", [0.0, 0.6, 0.8]))
     )

@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy.stats
+from measured import errors, turn_to
 
-from strapdown import coning, estimation, montecarlo, motion, quaternion
-from strapdown.checks import InputError
+from sims import campaign as sim
+from strapdown import coning, estimation, montecarlo, motion
 from strapdown.estimation.states import ProcessNoise
 from strapdown.montecarlo import FilterSetup
 from strapdown.montecarlo.coning_study import ConingParameters
@@ -91,18 +92,12 @@ def test_a_wrong_filter_is_found_out(name):
     assert (verdict.mean.mean() > 1.0) == too_sure
 
 
-def large_errors(runs, seed, strip_reset=False):
-    """NEES after a few updates from large initial errors, where the covariance reset matters."""
+def test_the_filter_is_consistent_from_large_errors_too():
+    """Initial errors of 0.1 rad an axis, known to a fifth of that after one measurement."""
     sensors = tuple(replace(s, sigma=0.02, rate=25.0) for s in SCENARIO.sensors)
     scenario = replace(SCENARIO, motion=motion.rest(), sensors=sensors, duration=12.0)
     big = replace(setup("one-sample"), attitude_sigma=0.1, bias_sigma=0.05)
-    (statistics,) = montecarlo.run(scenario, (big,), runs=runs, seed=seed)
-    return statistics
-
-
-def test_the_filter_is_consistent_from_large_errors_too():
-    """Initial errors of 0.1 rad an axis, known to a fifth of that after one measurement."""
-    statistics = large_errors(100, 6)
+    (statistics,) = montecarlo.run(scenario, (big,), runs=100, seed=6)
     verdict = statistics.verdict(np.arange(1, 100, 5), "attitude")
     assert verdict.consistent, verdict.mean
 
@@ -122,8 +117,7 @@ def test_statistics_are_plain_sums():
         result = estimation.run(
             short, NOISE, montecarlo.start(record, setup(), 9, run), every=every, full_covariance=True
         )
-        truth = short.truth
-        e = consistency.errors(result.attitude, result.bias, truth.attitude[::every], truth.bias[::every])
+        e = errors(result, short.truth, every)
         nees = nees + consistency.nees(e, result.covariance)
         square = square + e**2
     assert np.allclose(statistics.anees[:, 0], nees / 18.0, rtol=1e-12)
@@ -137,16 +131,53 @@ def test_the_start_is_drawn_from_the_prior():
     draws = []
     for run in range(400):
         state = montecarlo.start(record, setup(), 1, run)
-        delta = quaternion.log(quaternion.multiply(quaternion.conjugate(state.attitude), record.truth.attitude[0]))
-        draws.append(
-            np.concatenate(
-                [delta / PARAMETERS.attitude_sigma, (record.truth.bias[0] - state.bias) / PARAMETERS.bias_sigma]
-            )
-        )
+        delta = turn_to(state.attitude, record.truth.attitude[0]) / PARAMETERS.attitude_sigma
+        draws.append(np.concatenate([delta, (record.truth.bias[0] - state.bias) / PARAMETERS.bias_sigma]))
     assert np.all(np.abs(np.mean(draws, axis=0)) < 4.0 / 20.0)
     assert np.all(np.abs(np.var(draws, axis=0) - 1.0) < 4.0 * np.sqrt(2.0 / 400.0))
 
 
-def test_epochs_must_be_whole_steps():
-    with pytest.raises(InputError, match="multiple of"):
-        montecarlo.run(replace(SCENARIO, duration=1.01), (setup("three-sample"),), runs=1, seed=1)
+def held_against_theory(runs, seed, machine):
+    result = sim.main(runs=runs, seed=seed, machine=machine)
+    for name, predicted in result.predictions.items():
+        found = result.statistics[name]
+        # 100 epochs × 3 subsets × 5 filters, and 300 spans of NIS: 4.5σ is passed by chance in one of some 50 such tests.
+        for column, subset in enumerate(("state", "attitude", "bias")):
+            off = (found.anees[1:, column] - predicted.anees(subset)[1:]) / predicted.standard_error(subset, runs)[1:]
+            assert np.abs(off).max() < 4.5, (name, subset)
+        off = (found.nis / predicted.nis - 1.0) / np.sqrt(2.0 / (3.0 * runs))
+        assert np.abs(off).max() < 4.5, name
+        P = np.einsum("mii->mi", found.covariance)
+        modelled = np.einsum("mii->mi", predicted.covariance)
+        assert np.allclose(P[:, :3], modelled[:, :1], rtol=1e-4)
+        assert np.allclose(P[:, 3:], modelled[:, 1:], rtol=1e-4)
+        # the true spread, Σ e eᵀ over the runs, against its own sampling error
+        square = np.einsum("mii->mi", found.mean_square_error)[1:]
+        true = np.einsum("mii->mi", predicted.true_covariance)[1:]
+        ratio = square.reshape(-1, 2, 3).mean(axis=2) / true
+        assert np.abs(ratio - 1.0).max() < 4.5 * np.sqrt(2.0 / (3.0 * runs)), name
+        assert montecarlo.summary(found)["consistent"] == (name == "right"), name
+
+
+def test_mismatched_filters_fail_by_as_much_as_theory_says():
+    held_against_theory(150, 3, "lanes")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("machine", ["scalar", "lanes"])
+def test_mismatched_filters_fail_by_as_much_as_theory_says_over_5000_runs(machine):
+    held_against_theory(5000, 4, machine)
+
+
+def test_theory_ends_in_the_steady_state_of_farrenkopf():
+    """The filter's own covariance, against the closed form of one axis at rest."""
+    T, sigma_v, sigma_u = sim.INTERVAL, float(sim.GYRO.angle_random_walk), float(sim.GYRO.rate_random_walk)
+    s_u, s_v = sigma_u * T**1.5 / sim.SIGMA, sigma_v * np.sqrt(T) / sim.SIGMA
+    gamma = np.sqrt(1.0 + s_v**2 / 4.0 + s_u**2 / 48.0)
+    zeta = gamma + s_u / 4.0 + 0.5 * np.sqrt(2.0 * gamma * s_u + s_v**2 + s_u**2 / 3.0)
+    end = sim.predict(1.0, 1.0, 100)
+    assert end.covariance[-1, 0, 0] == pytest.approx(sim.SIGMA**2 * (1.0 - zeta**-2), rel=1e-6)
+    bias = sigma_u * sim.SIGMA / np.sqrt(T) * (zeta - 1.0 / zeta) - 0.5 * sigma_u**2 * T
+    assert end.covariance[-1, 1, 1] == pytest.approx(bias, rel=1e-5)
+    assert np.allclose(end.covariance, end.true_covariance, rtol=1e-12)
+    assert np.allclose(end.nis, 1.0, rtol=1e-12)

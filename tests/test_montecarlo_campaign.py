@@ -1,7 +1,5 @@
 """Campaigns and their files: killed, interrupted, resumed, extended, and refused where they do not fit."""
 
-from __future__ import annotations
-
 import json
 import multiprocessing
 import os
@@ -18,17 +16,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hdf5 import changed
+from measured import errors_at
+from spin_plan import PLAN, SCENARIO, SETUP, assert_same
 
-from strapdown import consistency, montecarlo, records, scenarios
+from strapdown import montecarlo, records, scenarios
 from strapdown.checks import InputError
 from strapdown.estimation import setup as setups
 from strapdown.files import reading
 from strapdown.montecarlo import campaign, engine, scalar, statistics
 from strapdown.recordings import recordfiles
 
-SCENARIO = replace(scenarios.load_scenario("spin"), duration=2.4)
-SETUP = setups.FilterSetup.for_scenario(SCENARIO)
-PLAN = montecarlo.Plan(scenario=SCENARIO, setup=SETUP, seed=4, epochs=6, nis_bins=5)
 CHUNK = 8
 
 
@@ -39,11 +36,6 @@ def go(path, runs, plan=PLAN, **options):
 @cache
 def straight(runs, chunk=CHUNK):
     return montecarlo.run_plan(PLAN, runs=runs, chunk=chunk, threads=1, machine="scalar")
-
-
-def assert_same(a, b):
-    for field in fields(statistics.Statistics):
-        assert np.array_equal(getattr(a, field.name), getattr(b, field.name)), field.name
 
 
 def one_by_one(order, stop_after):
@@ -450,10 +442,7 @@ def test_a_replay_is_the_run_of_the_campaign_to_the_bit(command, machine):
     record = recordfiles.read_record("short-montecarlo-run-5-record.h5")
     step = (len(estimate.time) - 1) // held.plan.epochs
     rows = slice(None, None, step)
-    error = consistency.errors(
-        estimate.attitude[rows], estimate.bias[rows], record.truth.attitude[rows], record.truth.bias[rows]
-    )
-    assert np.array_equal(error, held.statistics.example_error[5])
+    assert np.array_equal(errors_at(estimate, record.truth, rows), held.statistics.example_error[5])
     assert np.array_equal(np.sqrt(estimate.variance[rows]), held.statistics.example_sigma[5])
     # Causes can be sought in it: it holds its filter as any estimate does.
     assert setups.from_toml(records.read_attributes("short-montecarlo-run-5-estimate.h5")["filter"]) == held.plan.setup
@@ -521,9 +510,7 @@ def test_a_signal_whose_exception_python_drops_is_heeded_after_the_chunk(command
 
     def cleared(_):
         signal.raise_signal(number)
-        for _ in range(
-            1000
-        ):  # the handler is called between two turns, and what it raises is dropped with the callback
+        for _ in range(1000):  # the handler is called between two turns; what it raises is dropped with the callback
             pass
 
     def interrupted(*arguments):
@@ -564,18 +551,8 @@ def test_the_installed_command_killed_again_and_again(tmp_path):
     """Killed a while after it has begun to write, for how long it takes to start and to compile is no matter of the campaign."""
     path = tmp_path / "spin-montecarlo.h5"
     script = Path(sys.executable).with_name("strapdown")
-    arguments = [
-        script,
-        "montecarlo",
-        "spin",
-        "--machine",
-        "scalar",
-        "--chunk",
-        "3",
-        "--no-states",
-        "--resume",
-        "--runs",
-    ]
+    arguments = [script, "montecarlo", "spin", "--machine", "scalar", "--chunk", "3", "--no-states"]
+    arguments += ["--resume", "--runs"]
     few = subprocess.run([*arguments, "3"], cwd=tmp_path, stdout=subprocess.DEVNULL, check=False)  # compiled
     assert few.returncode in (1, 2)
     random = np.random.default_rng(5)

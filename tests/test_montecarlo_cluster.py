@@ -1,35 +1,25 @@
 """Chunks on Dask: the bits of one process, whoever computes them and whoever is killed meanwhile."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal
 import subprocess
 import sys
 import time
-from dataclasses import fields, replace
+from dataclasses import replace
 
-import numpy as np
 import pytest
+from spin_plan import PLAN, SCENARIO, assert_same
 
 import strapdown
-from strapdown import cli, montecarlo, scenarios
+from strapdown import cli, montecarlo
 from strapdown.checks import InputError
 from strapdown.estimation import setup as setups
-from strapdown.montecarlo import cluster, engine, statistics
+from strapdown.montecarlo import cluster, engine
 
 distributed = pytest.importorskip(
     "distributed", reason="the extra `cluster` is not installed: pip install '.[cluster]'"
 )
-
-SCENARIO = replace(scenarios.load_scenario("spin"), duration=2.4)
-PLAN = montecarlo.Plan(scenario=SCENARIO, setup=setups.FilterSetup.for_scenario(SCENARIO), seed=4, epochs=6, nis_bins=5)
-
-
-def assert_same(a, b):
-    for field in fields(statistics.Statistics):
-        assert np.array_equal(getattr(a, field.name), getattr(b, field.name)), field.name
 
 
 def alone(runs, chunk, plan=PLAN):
@@ -84,20 +74,16 @@ def test_an_error_on_a_worker_comes_out(client):
         list(cluster.on_dask(client)(Broken(plans=(PLAN,), machine="scalar"), engine.chunks_of(8, 2)))
 
 
-def test_a_worker_of_another_version_is_refused(client, monkeypatch):
-    monkeypatch.setattr(cluster, "_chunk", lambda payload, first, runs: ("0.0.1", engine.arithmetic(), ()))
-    with pytest.raises(InputError, match=r"a worker has strapdown 0\.0\.1"):
-        montecarlo.run_plan(PLAN, runs=4, chunk=2, machine="scalar", workers=cluster.on_dask(client))
-
-
-def test_a_worker_whose_processor_rounds_otherwise_is_refused(client, monkeypatch):
-    monkeypatch.setattr(
-        cluster, "_chunk", lambda payload, first, runs: (strapdown.__version__, "x86_64, no vectors, no FMA", ())
-    )
-    with pytest.raises(
-        InputError,
-        match=r"a worker computes on x86_64, no vectors, no FMA, this process on .*, which round differently",
-    ):
+@pytest.mark.parametrize(
+    ("version", "arithmetic", "words"),
+    [
+        ("0.0.1", engine.arithmetic(), r"a worker has strapdown 0\.0\.1"),
+        (strapdown.__version__, "no FMA", "a worker computes on no FMA, this process on .*, which round differently"),
+    ],
+)
+def test_a_worker_of_another_version_or_rounding_is_refused(client, monkeypatch, version, arithmetic, words):
+    monkeypatch.setattr(cluster, "_chunk", lambda payload, first, runs: (version, arithmetic, ()))
+    with pytest.raises(InputError, match=words):
         montecarlo.run_plan(PLAN, runs=4, chunk=2, machine="scalar", workers=cluster.on_dask(client))
 
 

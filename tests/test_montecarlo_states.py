@@ -1,19 +1,19 @@
 """Filters with error states over eight runs at once: each run is what the filter of the factor makes of it, and its own bits."""
 
-from __future__ import annotations
-
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
+from measured import errors_at, waves
+from spin_plan import assert_same, different
 
-from strapdown import consistency, montecarlo, motion, scenarios, vectors
+from strapdown import consistency, montecarlo, scenarios, vectors
 from strapdown.estimation import setup, together
 from strapdown.estimation.setup import FilterSetup, SensorStates, States
 from strapdown.estimation.states import ProcessNoise
 from strapdown.gyro import GyroSpec
-from strapdown.montecarlo import scalar, statistics
+from strapdown.montecarlo import scalar
 
 FIELD = np.array([20000.0, 3000.0, -43000.0])
 GYRO = GyroSpec(
@@ -24,12 +24,7 @@ GYRO = GyroSpec(
     misalignment=1e-3 * (1.0 - np.eye(3)),
     g_sensitivity=np.diag([2e-6, -1e-6, 3e-6]),
 )
-MOTION = motion.HarmonicRates(
-    harmonics=(
-        motion.Harmonic(amplitude=np.array([1.0, 0.1, 0.3]), frequency=0.4),
-        motion.Harmonic(amplitude=np.array([0.0, 0.8, 0.5]), frequency=0.27, phase=1.2),
-    )
-)
+MOTION = waves((np.array([1.0, 0.1, 0.3]), 0.4), (np.array([0.0, 0.8, 0.5]), 0.27, 1.2))
 GYRO_STATES = States(
     gyro_scale_sigma=3e-3,
     gyro_misalignment_sigma=((0.0, 1e-3, 1e-3), (1e-3, 0.0, 1e-3), (1e-3, 1e-3, 0.0)),
@@ -229,27 +224,14 @@ def test_statistics_do_not_depend_on_chunks_and_threads_and_a_replay_is_the_run(
     whole = montecarlo.run_plan(one, runs=20, chunk=20, threads=1)
     for chunk, threads in ((8, 2), (3, 1)):
         other = montecarlo.run_plan(one, runs=20, chunk=chunk, threads=threads)
-        for name in (
-            "finite",
-            "coverage",
-            "histogram",
-            "worst_run",
-            "worst_score",
-            "example_run",
-            "example_error",
-            "example_sigma",
-        ):
-            assert np.array_equal(getattr(whole, name), getattr(other, name)), name
+        exact = ["finite", "coverage", "histogram", "worst_run", "worst_score"]
+        assert not different(whole, other, [*exact, "example_run", "example_error", "example_sigma"])
     again = montecarlo.run_plan(one, runs=20, chunk=20, threads=2)
-    assert all(np.array_equal(getattr(whole, f.name), getattr(again, f.name)) for f in fields(statistics.Statistics))
+    assert_same(whole, again)
     for run in (0, 5):
         found = montecarlo.replay(one, run)
         rows = slice(None, None, one.every)
-        truth = found.record.truth
-        error = consistency.errors(
-            found.estimate.attitude[rows], found.estimate.bias[rows], truth.attitude[rows], truth.bias[rows]
-        )
-        assert np.array_equal(error, whole.example_error[run])
+        assert np.array_equal(errors_at(found.estimate, found.record.truth, rows), whole.example_error[run])
         assert np.array_equal(np.sqrt(found.estimate.variance[rows]), whole.example_sigma[run])
 
 

@@ -1,40 +1,27 @@
 """Plans, mergeable statistics, and the engine that merges them: definitions held against plain reference code."""
 
-from __future__ import annotations
-
 import functools
 import math
 import threading
 import time
 import tracemalloc
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import scipy.stats
+from measured import errors_at, turn_to
+from spin_plan import PLAN, SCENARIO, SETUP, different
 
-from strapdown import consistency, estimation, montecarlo, quaternion, scenarios
+from strapdown import coning, estimation, montecarlo, scenarios
 from strapdown.checks import InputError
 from strapdown.estimation import setup as setups
 from strapdown.montecarlo import campaign, engine, plan, scalar, statistics
 from strapdown.montecarlo.statistics import BINS, ERROR_EXPONENT, NEES_EXPONENT, bin_edges, bin_of
 
-SCENARIO = replace(scenarios.load_scenario("spin"), duration=2.4)
-SETUP = setups.FilterSetup.for_scenario(SCENARIO)
-
 
 def planned(**changes):
-    given = {"scenario": SCENARIO, "setup": SETUP, "seed": 4, "epochs": 6, "nis_bins": 5}
-    return montecarlo.Plan(**{**given, **changes})
-
-
-PLAN = planned()
-
-
-def same(a, b, names=None):
-    """Names of the fields in which two statistics differ in any bit."""
-    names = names or [field.name for field in fields(statistics.Statistics)]
-    return [name for name in names if not np.array_equal(getattr(a, name), getattr(b, name))]
+    return replace(PLAN, **changes)
 
 
 # ------------------------------------------------------------------------------------------------------------ histogram
@@ -104,7 +91,7 @@ def test_every_sum_is_what_its_definition_says():
             step = k * 240 // PLAN.epochs
             q, b, P = estimate.attitude[step], estimate.bias[step], estimate.covariance[step]
             e = np.empty(6)
-            e[:3] = quaternion.log(quaternion.multiply(quaternion.conjugate(q), record.truth.attitude[step]))
+            e[:3] = turn_to(q, record.truth.attitude[step])
             e[3:] = record.truth.bias[step] - b
             error[k] += e
             product[k] += np.outer(e, e)
@@ -171,7 +158,7 @@ def test_merging_parts_is_the_whole():
     merged = functools.reduce(montecarlo.merge, parts)
     exact = ["runs", "finite", "coverage", "histogram", "sensor_degrees", "sensor_refused", "time", "sensors"]
     exact += ["worst_run", "worst_score", "example_run", "example_error", "example_sigma"]
-    assert not same(whole, merged, exact)
+    assert not different(whole, merged, exact)
     other = montecarlo.merge(parts[0], montecarlo.merge(parts[1], parts[2]))
     for name in ("error_sum", "error_product_sum", "covariance_sum", "nees_sum", "log_nees_sum", "sensor_nis_sum"):
         a = getattr(whole, name)
@@ -320,7 +307,7 @@ def test_a_plan_goes_through_its_table_and_back():
         again = plan.from_table(one.to_table())
         assert again.to_table() == one.to_table()
         assert again.digest == one.digest
-        assert not same(scalar.run_chunk(one, 0, 2), scalar.run_chunk(again, 0, 2))
+        assert not different(scalar.run_chunk(one, 0, 2), scalar.run_chunk(again, 0, 2))
 
 
 def test_every_part_of_a_plan_counts_in_its_digest():
@@ -371,7 +358,7 @@ def test_bad_dispersions_are_refused(tmp_path):
 
 
 def test_whole_epochs_cut_into_whole_steps():
-    four = replace(SETUP, integration=__import__("strapdown").coning.ALGORITHMS["four-sample"])
+    four = replace(SETUP, integration=coning.ALGORITHMS["four-sample"])
     assert montecarlo.whole_epochs(SCENARIO, SETUP) == 80
     assert montecarlo.whole_epochs(SCENARIO, four) == 60
     with pytest.raises(InputError, match="whole number of four-sample steps"):
@@ -421,27 +408,19 @@ def test_initial_errors_are_as_dispersed():
 COUNTED = ["runs", "finite", "coverage", "histogram", "sensor_degrees", "worst_run", "worst_score", "example_error"]
 
 
-@pytest.mark.parametrize("chunk", [7, 1000])
-def test_runs_are_the_same_to_the_bit_in_chunks_of_any_size(chunk):
-    """Every run counts, and the worst and the first ones in all their bits."""
-    one = montecarlo.run_plan(PLAN, runs=30, chunk=10, threads=1, machine="scalar")
-    other = montecarlo.run_plan(PLAN, runs=30, chunk=chunk, threads=2, machine="scalar")
-    assert not same(one, other, COUNTED)
-    assert np.allclose(one.nees_sum, other.nees_sum, rtol=1e-12)
-
-
-def test_statistics_are_the_same_to_the_bit_on_any_number_of_threads():
-    one = montecarlo.run_plan(PLAN, runs=45, chunk=4, threads=1, machine="scalar")
-    for threads in (2, 5):
-        assert not same(one, montecarlo.run_plan(PLAN, runs=45, chunk=4, threads=threads, machine="scalar"))
-
-
-@pytest.mark.slow
-def test_on_lanes_too_runs_are_the_same_to_the_bit_in_chunks_of_any_size():
-    one = montecarlo.run_plan(PLAN, runs=60, chunk=8, threads=1, machine="lanes")
-    for chunk, threads in ((1, 2), (7, 1), (8, 2), (1000, 2)):
-        other = montecarlo.run_plan(PLAN, runs=60, chunk=chunk, threads=threads, machine="lanes")
-        assert not same(one, other, COUNTED if chunk != 8 else None)
+@pytest.mark.parametrize(
+    ("machine", "others"),
+    [
+        ("scalar", [(8, 2), (8, 5), (7, 2), (1000, 2)]),
+        pytest.param("lanes", [(1, 2), (7, 1), (8, 2), (1000, 2)], marks=pytest.mark.slow),
+    ],
+)
+def test_runs_are_the_same_to_the_bit_in_chunks_of_any_size_on_any_number_of_threads(machine, others):
+    """Every run counts, and the worst and the first ones in all their bits; in chunks of the same size all sums too."""
+    one = montecarlo.run_plan(PLAN, runs=60, chunk=8, threads=1, machine=machine)
+    for chunk, threads in others:
+        other = montecarlo.run_plan(PLAN, runs=60, chunk=chunk, threads=threads, machine=machine)
+        assert not different(one, other, COUNTED if chunk != 8 else None)
         assert np.allclose(one.nees_sum, other.nees_sum, rtol=1e-12)
 
 
@@ -451,7 +430,7 @@ def test_several_filters_see_the_same_sensors():
     options = {"runs": 12, "seed": 4, "epochs": 6, "nis_bins": 5}
     together = montecarlo.run(SCENARIO, setups_, **options)
     for one, found in zip(setups_, together, strict=True):
-        assert not same(found, montecarlo.run_plan(planned(setup=one), runs=12, machine="scalar"))
+        assert not different(found, montecarlo.run_plan(planned(setup=one), runs=12, machine="scalar"))
 
 
 def test_memory_does_not_grow_with_the_runs():
@@ -503,7 +482,7 @@ def test_chunks_that_finish_out_of_order_are_merged_in_order():
         for place in reversed(range(len(chunks))):
             yield place, work(*chunks[place])
 
-    assert not same(one, montecarlo.run_plan(PLAN, runs=30, chunk=5, machine="scalar", workers=backwards))
+    assert not different(one, montecarlo.run_plan(PLAN, runs=30, chunk=5, machine="scalar", workers=backwards))
 
 
 def test_an_error_in_a_thread_comes_out_and_ends_the_others():
@@ -568,18 +547,6 @@ def test_the_machine_is_chosen_by_the_plan_and_reported():
 # ------------------------------------------------------------------------------------------------------------ replay
 
 
-def test_a_replayed_run_is_the_same_to_the_bit():
-    total = scalar.run_chunk(PLAN, 0, 8)
-    for run in (0, 5):
-        again = montecarlo.replay(PLAN, run, machine="scalar")
-        edges = np.arange(0, 241, 40)
-        truth = again.record.truth
-        estimate = again.estimate
-        e = consistency.errors(estimate.attitude[edges], estimate.bias[edges], truth.attitude[edges], truth.bias[edges])
-        assert np.array_equal(e, total.example_error[run])
-        assert np.array_equal(np.sqrt(estimate.variance[edges]), total.example_sigma[run])
-
-
 @pytest.mark.parametrize("machine", ["scalar", "lanes"])
 def test_the_examples_are_the_first_runs_by_their_numbers(machine):
     """Chunks begin and end among them."""
@@ -590,11 +557,8 @@ def test_the_examples_are_the_first_runs_by_their_numbers(machine):
 def test_degrees_of_freedom_are_those_of_the_states_judged():
     total = scalar.run_chunk(PLAN, 0, 8)
     epochs = np.array([2, 4])
-    assert {name: total.verdict(epochs, name).degrees for name in total.subsets} == {
-        "state": 6,
-        "attitude": 3,
-        "bias": 3,
-    }
+    found = {name: total.verdict(epochs, name).degrees for name in total.subsets}
+    assert found == {"state": 6, "attitude": 3, "bias": 3}
 
 
 def test_lost_samples_and_jitter_go_through_too():
@@ -606,11 +570,7 @@ def test_lost_samples_and_jitter_go_through_too():
     again = montecarlo.replay(one, 3, machine="scalar")
     assert len(again.record.increments) < 240
     rows = np.searchsorted(again.estimate.time, one.time + 1e-6, side="right") - 1
-    truth = again.record.truth
-    e = consistency.errors(
-        again.estimate.attitude[rows], again.estimate.bias[rows], truth.attitude[rows], truth.bias[rows]
-    )
-    assert np.array_equal(e, total.example_error[3])
+    assert np.array_equal(errors_at(again.estimate, again.record.truth, rows), total.example_error[3])
 
 
 def test_what_the_motion_is_remembered_to_say_is_what_it_says():

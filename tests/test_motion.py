@@ -1,7 +1,5 @@
 """Exact motions: one conformance suite over all of them, then what each claims for itself."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from dataclasses import FrozenInstanceError, dataclass, fields

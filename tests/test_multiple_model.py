@@ -1,11 +1,10 @@
 """The bank of hypotheses: any start, one vector at a time; consistent once it is one; and no attitude where none can be known."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np
 import pytest
+from measured import assert_inside, errors, resting, seen, series_of, turn_to, unit
 from plain_kernels import plain
 from scipy.spatial.transform import Rotation
 from scipy.stats import multivariate_normal
@@ -22,17 +21,11 @@ from strapdown.kernels.machine import compiled, read_only
 from strapdown.kernels.series import LARGEST_ANGLE
 from strapdown.kernels.walk import walk
 from strapdown.motion import ConstantRate
-from strapdown.records import ImuRecord
+from strapdown.records import ImuRecord, Truth
 from strapdown.units import DEGREE, DEGREE_PER_HOUR
 from strapdown.vectors import Faults, VectorMeasurements, wahba
 
 QUIET = ProcessNoise(angle_random_walk=1e-7, rate_random_walk=1e-10)
-
-
-def series(name, time, vector_b, reference_f, sigma, kind="direction"):
-    return VectorMeasurements(
-        sensor=name, kind=kind, time=time, vector_b=vector_b, reference_f=reference_f, sigma=sigma
-    )
 
 
 def still(attitude, references, sigma, random, *, seconds=20, phases=None):
@@ -42,8 +35,8 @@ def still(attitude, references, sigma, random, *, seconds=20, phases=None):
     for k, reference in enumerate(references):
         r = np.asarray(reference) / np.linalg.norm(reference)
         at = time[:-1] + (0.0 if phases is None else phases[k])
-        noisy = quaternion.rotate(quaternion.conjugate(attitude), r) + sigma * random.standard_normal((len(at), 3))
-        vectors.append(series(f"star {k}", at, noisy / np.linalg.norm(noisy, axis=1, keepdims=True), r, sigma))
+        noisy = seen(attitude, r) + sigma * random.standard_normal((len(at), 3))
+        vectors.append(series_of(f"star {k}", "direction", at, unit(noisy), r, sigma))
     return ImuRecord(time=time, increments=np.zeros((seconds, 3)), vectors=tuple(vectors))
 
 
@@ -59,10 +52,8 @@ def orbit(run, *, duration=1500.0, seed=11, **changes):
 
 
 def judged(found, record):
-    truth = record.truth
-    e = consistency.errors(
-        found.estimate.attitude, found.estimate.bias, truth.attitude[found.edges], truth.bias[found.edges]
-    )
+    truth = Truth(attitude=record.truth.attitude[found.edges], bias=record.truth.bias[found.edges])
+    e = errors(found.estimate, truth)
     return e, consistency.nees(e, found.estimate.covariance)
 
 
@@ -76,12 +67,6 @@ def tracker(time, attitude, sigma):
         attitude=attitude,
         sigma_axes=np.broadcast_to(sigma, 3).astype(float),
     )
-
-
-def resting(*vectors):
-    """A body that rests for as long as the last of the series says."""
-    time = np.arange(vectors[-1].time[-1] + 1.0)
-    return ImuRecord(time=time, increments=np.zeros((len(time) - 1, 3)), vectors=vectors)
 
 
 def goes_on(found, row, record, process, **options):
@@ -304,8 +289,7 @@ def check_starts(outcomes, epochs):
         innovations = found.estimate.innovations["magnetometer"]
         after = innovations.time > found.became_one
         total, number = total + innovations.nis[after].sum(), number + innovations.innovation[after].size
-    low, high = consistency.mean_bounds(1, number)
-    assert low < total / number < high
+    assert_inside(total / number, 1, number)
 
 
 def test_from_a_hundred_starts_anywhere_it_finds_the_attitude_and_is_consistent():
@@ -375,9 +359,7 @@ def test_with_full_geometry_it_agrees_with_wahba(phases):
         if row == 1:  # the first sensor measures at that edge again
             used, r = [*used, record.vectors[0].vector_b[1]], np.concatenate([references, references[:1]])
         solution = wahba.solve(np.array(used), r, sigma)
-        apart = quaternion.log(
-            quaternion.multiply(quaternion.conjugate(solution.attitude), found.estimate.attitude[row])
-        )
+        apart = turn_to(solution.attitude, found.estimate.attitude[row])
         root = np.linalg.cholesky(solution.covariance)
         assert np.linalg.norm(np.linalg.solve(root, apart)) < 0.05
         assert np.allclose(found.estimate.covariance[row, :3, :3], solution.covariance, rtol=0.05, atol=0.05 * sigma**2)
@@ -466,8 +448,7 @@ def test_wild_first_directions_do_not_mislead_it(number, size, option):
         e, each = judged(found, record)
         assert np.linalg.norm(e[-1, :3]) < 1.0 * DEGREE
         nees.append(each[[int(np.searchsorted(found.estimate.time, seconds)) for seconds in (80.0, 200.0, 1490.0)]])
-    low, high = consistency.mean_bounds(6, 12, 0.999)
-    assert np.all((low < np.mean(nees, axis=0) / 6.0) & (np.mean(nees, axis=0) / 6.0 < high))
+    assert_inside(np.mean(nees, axis=0) / 6.0, 6, 12, 0.999)
 
 
 @pytest.mark.parametrize("headings", [0, 6])
@@ -479,8 +460,8 @@ def test_a_wild_first_attitude_is_no_attitude_yet(headings):
     attitude = quaternion.exp(1e-3 * np.random.default_rng(4).standard_normal((11, 3)))
     attitude[0] = quaternion.exp(np.array([0.5, 0.0, 0.0] if headings else [0.3, -0.5, 0.8]))
     at, north = np.linspace(0.1, 0.9, headings), np.array([1.0, 0.0, 0.0])
-    compass = series("compass", at, np.tile(north, (headings, 1)), north, 1e-2, "heading")
-    record = resting(*([compass] if headings else []), tracker(time, attitude, 1e-3))
+    compass = series_of("compass", "heading", at, np.tile(north, (headings, 1)), north, 1e-2)
+    record = resting(*([compass] if headings else []), tracker(time, attitude, 1e-3), time=time)
     found = multiple_model.run(record, QUIET, bias_sigma=1e-4, gate=Gate())
     assert not found.estimate.events
     assert 2.0 <= found.became_one <= (4.0 if headings else 3.0)
@@ -571,8 +552,8 @@ def test_for_small_errors_its_weights_are_the_plain_filters(kind, robust, monkey
     else:
         seen = r + noise
         if kind != "vector":
-            seen /= np.linalg.norm(seen, axis=1, keepdims=True)
-        second = series("second", at, seen, r, 1e-3, kind)
+            seen = unit(seen)
+        second = series_of("second", kind, at, seen, r, 1e-3)
     record = ImuRecord(time=time, increments=np.zeros((40, 3)), vectors=(first, second))
     noise_of_gyro = ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-6)
     monkeypatch.setattr(multiple_model, "DOUBT", 1e-30)
@@ -607,7 +588,7 @@ def test_whole_vectors_count_by_their_direction():
 
 def test_a_measured_attitude_needs_no_bank_and_counts_once():
     time, q, sigma = np.arange(11.0), quaternion.exp(np.array([0.3, 0.2, -0.5])), np.array([1e-4, 1e-4, 1e-3])
-    record = resting(tracker(time, q, sigma))
+    record = resting(tracker(time, q, sigma), time=time)
     found = multiple_model.run(record, QUIET, bias_sigma=1e-4)
     assert found.became_one == 0.0
     assert quaternion.angle_between(found.estimate.attitude, q).max() < 1e-12
@@ -623,9 +604,7 @@ def test_it_starts_at_the_first_direction_and_counts_what_came_before():
     record, belief = orbit(7, duration=600.0)
     one = record.vectors[0]
     gap = dataclasses.replace(one, vector_b=np.where(np.arange(len(one.time))[:, None] < 3, np.nan, one.vector_b))
-    compass = series(
-        "compass", np.array([5.0, 17.0]), np.tile([1.0, 0.0, 0.0], (2, 1)), np.array([1.0, 0.0, 0.0]), 9.0, "heading"
-    )
+    compass = series_of("compass", "heading", [5.0, 17.0], np.tile([1.0, 0.0, 0.0], (2, 1)), [1.0, 0.0, 0.0], 9.0)
     found = multiple_model.run(dataclasses.replace(record, vectors=(gap, compass)), belief, every=7)
     assert found.estimate.skipped == {"magnetometer": 3, "compass": 2}
     assert found.estimate.time[0] == 42.0  # the first kept edge not before 40 s
@@ -642,9 +621,8 @@ def test_one_direction_between_edges_starts_there():
     references = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.6, 0.8, 0.0], [0.0, 0.6, 0.8]])
     attitude = quaternion.multiply(q, quaternion.exp(at[:, None] * rate))
     measured = quaternion.rotate(quaternion.conjugate(attitude), references)
-    record = ImuRecord(
-        time=time, increments=np.tile(rate, (8, 1)), vectors=(series("star", at, measured, references, 1e-4),)
-    )
+    star = series_of("star", "direction", at, measured, references, 1e-4)
+    record = ImuRecord(time=time, increments=np.tile(rate, (8, 1)), vectors=(star,))
     found = multiple_model.run(record, QUIET, bias_sigma=1e-8)
     assert found.estimate.time[0] == 1.0
     truth = quaternion.multiply(q, quaternion.exp(found.estimate.time[:, None] * rate))

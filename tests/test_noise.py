@@ -123,51 +123,6 @@ def test_extreme_words_give_finite_normals():
     assert np.max(np.abs(pairs)) < 8.5
 
 
-@pytest.fixture(scope="module")
-def sample():
-    return normals(0, 4_000_000)
-
-
-def test_moments(sample):
-    n = len(sample)
-    # Standard deviation of the mean of x^k is √((E x^2k − (E x^k)²)/n).
-    even = {0: 1.0, 2: 1.0, 4: 3.0, 6: 15.0, 8: 105.0, 10: 945.0, 12: 10395.0, 14: 135135.0, 16: 2027025.0}
-    power = np.ones(n)
-    for k in range(1, 9):
-        power *= sample
-        expected = even.get(k, 0.0)
-        score = (np.mean(power) - expected) / math.sqrt((even[2 * k] - expected**2) / n)
-        assert abs(score) < 4.0, (k, score)
-
-
-def test_distribution_by_kolmogorov_and_smirnov(sample):
-    for part in np.split(sample[:1_000_000], 10):
-        assert stats.kstest(part, "norm").pvalue > 1e-4
-    assert stats.kstest(sample, "norm").pvalue > 1e-3
-
-
-@pytest.mark.parametrize("edge", [3.0, 4.0, 4.5, 5.0])
-def test_tails(sample, edge):
-    for count, probability in (
-        (np.sum(sample > edge), stats.norm.sf(edge)),
-        (np.sum(sample < -edge), stats.norm.sf(edge)),
-    ):
-        low, high = stats.binom.ppf([5e-5, 1.0 - 5e-5], len(sample), probability)
-        assert low <= count <= high
-
-
-@pytest.mark.slow
-def test_tails_to_six_sigma():
-    counts, total = np.zeros(3), 0
-    for number in range(100):
-        part = np.abs(normals(number, 1 << 24))
-        counts += [np.sum(part > edge) for edge in (5.0, 5.5, 6.0)]
-        total += len(part)
-    for count, edge in zip(counts, (5.0, 5.5, 6.0), strict=True):
-        low, high = stats.binom.ppf([5e-4, 1.0 - 5e-4], total, 2.0 * stats.norm.sf(edge))
-        assert low <= count <= high
-
-
 def test_successive_normals_and_the_two_of_a_pair_are_independent(sample):
     n = 1 << 15  # a block: first half sines or cosines, second half their partners
     blocks = sample[: len(sample) // n * n].reshape(-1, n)
@@ -177,9 +132,6 @@ def test_successive_normals_and_the_two_of_a_pair_are_independent(sample):
     pairs += [(sample[:-lag] ** 2, sample[lag:] ** 2) for lag in (1, 2, n // 2)]
     for a, b in pairs:
         assert abs(np.corrcoef(a, b)[0, 1]) * math.sqrt(len(a)) < 4.0
-
-
-# ------------------------------------------------------------------------------------------------ normals of the lanes
 
 
 def fill_with_normals(pattern, k0, k1, numbers, streams, out):
@@ -207,8 +159,56 @@ def lane_normals(runs, count, width=8, real=np.float64, key=(5, 6)):
 
 
 @pytest.fixture(scope="module")
+def sample():
+    return normals(0, 4_000_000)
+
+
+@pytest.fixture(scope="module")
 def lane_sample():
     return lane_normals(np.arange(64), 1 << 16)
+
+
+@pytest.fixture(params=["sample", "lane_sample"])
+def drawn(request):
+    """Return normals of one stream, and of the streams of the lanes."""
+    return request.getfixturevalue(request.param).ravel()
+
+
+def test_moments(drawn):
+    # Standard deviation of the mean of x^k is √((E x^2k − (E x^k)²)/n).
+    even = {2 * k: float(math.factorial(2 * k) // (2**k * math.factorial(k))) for k in range(9)}
+    power = np.ones(len(drawn))
+    for k in range(1, 9):
+        power *= drawn
+        expected = even.get(k, 0.0)
+        score = (np.mean(power) - expected) / math.sqrt((even[2 * k] - expected**2) / len(drawn))
+        assert abs(score) < 4.0, (k, score)
+
+
+def test_distribution_by_kolmogorov_and_smirnov(drawn):
+    for part in np.split(drawn[:1_000_000], 10):
+        assert stats.kstest(part, "norm").pvalue > 1e-4
+    assert stats.kstest(drawn, "norm").pvalue > 1e-3
+
+
+@pytest.mark.parametrize("edge", [3.0, 4.0, 4.5, 5.0])
+def test_tails(drawn, edge):
+    low, high = stats.binom.ppf([5e-5, 1.0 - 5e-5], len(drawn), stats.norm.sf(edge))
+    for count in (np.sum(drawn > edge), np.sum(drawn < -edge)):
+        assert low <= count <= high
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lanes", [False, True])
+def test_tails_to_six_sigma(lanes):
+    counts, total = np.zeros(3), 0
+    for k in range(100):
+        part = np.abs(lane_normals(np.arange(16 * k, 16 * k + 16), 1 << 20) if lanes else normals(k, 1 << 24))
+        counts += [np.sum(part > edge) for edge in (5.0, 5.5, 6.0)]
+        total += part.size
+    for count, edge in zip(counts, (5.0, 5.5, 6.0), strict=True):
+        low, high = stats.binom.ppf([5e-4, 1.0 - 5e-4], total, 2.0 * stats.norm.sf(edge))
+        assert low <= count <= high
 
 
 def test_lane_normals_have_the_same_bits_in_any_lane_and_precision():
@@ -260,22 +260,6 @@ def test_the_series_of_the_normals_are_as_good_as_they_say():
         assert 0.9 * error < np.abs(series / exact - 1.0).max() < error
 
 
-def test_moments_and_distribution_of_lane_normals(lane_sample):
-    x = lane_sample.ravel()
-    even = {0: 1.0, 2: 1.0, 4: 3.0, 6: 15.0, 8: 105.0, 10: 945.0, 12: 10395.0, 14: 135135.0, 16: 2027025.0}
-    power = np.ones(len(x))
-    for k in range(1, 9):
-        power *= x
-        expected = even.get(k, 0.0)
-        score = (np.mean(power) - expected) / math.sqrt((even[2 * k] - expected**2) / len(x))
-        assert abs(score) < 4.0, (k, score)
-    assert stats.kstest(x, "norm").pvalue > 1e-3
-    for edge in (3.0, 4.0, 4.5, 5.0):
-        for count in (np.sum(x > edge), np.sum(x < -edge)):
-            low, high = stats.binom.ppf([5e-5, 1.0 - 5e-5], len(x), stats.norm.sf(edge))
-            assert low <= count <= high
-
-
 def test_lanes_and_runs_are_independent(lane_sample):
     n = lane_sample.shape[1]
     correlation = np.corrcoef(lane_sample) - np.eye(64)
@@ -288,18 +272,6 @@ def test_lanes_and_runs_are_independent(lane_sample):
         assert abs(np.corrcoef(x[:-lag] ** 2, x[lag:] ** 2)[0, 1]) * math.sqrt(len(x)) < 4.0
     other = lane_normals(np.arange(8), n, key=(5, 7))
     assert np.abs(np.corrcoef(other, lane_sample[:8])[:8, 8:]).max() * math.sqrt(n) < 4.5
-
-
-@pytest.mark.slow
-def test_tails_of_lane_normals_to_six_sigma():
-    counts, total = np.zeros(3), 0
-    for first in range(0, 1600, 16):
-        part = np.abs(lane_normals(np.arange(first, first + 16), 1 << 20))
-        counts += [np.sum(part > edge) for edge in (5.0, 5.5, 6.0)]
-        total += part.size
-    for count, edge in zip(counts, (5.0, 5.5, 6.0), strict=True):
-        low, high = stats.binom.ppf([5e-4, 1.0 - 5e-4], total, 2.0 * stats.norm.sf(edge))
-        assert low <= count <= high
 
 
 def test_octants_are_even(sample):

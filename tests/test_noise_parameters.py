@@ -1,7 +1,5 @@
 """Noise of any sensor at rest: other sensors' units, gaps, temperature, the files of other programs, and the whole way through a bag."""
 
-from __future__ import annotations
-
 import json
 import re
 import tomllib
@@ -11,7 +9,7 @@ import numpy as np
 import pytest
 
 import strapdown as sd
-from strapdown import allan, gyro, recordings, records, scenarios
+from strapdown import ahrs, allan, gyro, recordings, records, scenarios, units, workflows
 from strapdown.allan import noise_fit
 from strapdown.allan import parameters as noise_parameters
 from strapdown.checks import InputError
@@ -63,9 +61,8 @@ def rest(tmp_path_factory):
     ],
     ids=["gyro", "accelerometer", "magnetometer"],
 )  # fmt: skip
-def test_each_sensor_is_identified_in_its_units(run, rest, sensor, truth, names, factors, tmp_path):
-    status, said, error = run("allan", rest, "--sensor", sensor)
-    assert status == 0, error
+def test_each_sensor_is_identified_in_its_units(succeeds, rest, sensor, truth, names, factors, tmp_path):
+    said = succeeds("allan", rest, "--sensor", sensor)
     table = tomllib.loads((tmp_path / "allan-results" / f"{sensor}.toml").read_text())[sensor]
     stem = "allan" if sensor == "gyro" else sensor
     numbers = json.loads((tmp_path / "allan-results" / f"{stem}.json").read_text())
@@ -79,10 +76,9 @@ def test_each_sensor_is_identified_in_its_units(run, rest, sensor, truth, names,
     assert noise_fit.name(sensor, "angle_random_walk") in said
 
 
-def test_the_files_of_other_programs(run, rest, tmp_path):
+def test_the_files_of_other_programs(succeeds, rest, tmp_path):
     options = ("--sensor", "gyro", "--sensor", "accelerometer")
-    status, said, error = run("allan", rest, *options, "--kalibr", "--px4", "--matlab", "--factor", 5)
-    assert status == 0, error
+    said = succeeds("allan", rest, *options, "--kalibr", "--px4", "--matlab", "--factor", 5)
     out = tmp_path / "allan-results"
     pairs = (
         line.partition("#")[0].split(":") for line in (out / "imu.yaml").read_text().splitlines() if line[0] != "#"
@@ -141,22 +137,21 @@ def test_what_does_not_go_is_refused_before_anything_is_written(run, rest, tmp_p
     assert not list(tmp_path.rglob("*.toml"))
 
 
-def test_a_magnetometer_without_a_unit_is_refused(run, tmp_path):
+def test_a_magnetometer_without_a_unit_is_refused(run, succeeds, tmp_path):
     whole = replace(at_rest(200), magnetic_unit="")
     recordings.write(whole, tmp_path / "x.csv")
     status, _, error = run("allan", tmp_path / "x.csv", "--sensor", "magnetometer")
     assert (status, "does not declare the unit of its magnetometer" in error) == (2, True)
-    assert run("allan", tmp_path / "x.csv", "--sensor", "magnetometer", "--magnetometer-unit", "uT")[0] == 0
+    succeeds("allan", tmp_path / "x.csv", "--sensor", "magnetometer", "--magnetometer-unit", "uT")
 
 
-def test_gaps_are_said_and_the_noise_is_right(run, tmp_path):
+def test_gaps_are_said_and_the_noise_is_right(run, succeeds, tmp_path):
     whole = at_rest(20_000)
     keep = np.ones(20_000, bool)
     keep[3000:3700] = keep[9000:9001] = keep[15_000:15_100] = False
     cut = Recording(source="gappy", time=whole.time[keep], rate=whole.rate[keep])
     recordings.write(cut, tmp_path / "gappy.csv")
-    status, said, error = run("allan", "gappy.csv")
-    assert status == 0, error
+    said = succeeds("allan", "gappy.csv")
     assert "801 samples are missing in 3 gaps." in said
     assert "Because of gaps the fit uses 19199 samples" in said
     table = tomllib.loads((tmp_path / "allan-results" / "gyro.toml").read_text())["gyro"]
@@ -180,13 +175,12 @@ def test_stamps_that_stray_are_taken_for_even_and_said():
         samples._of_recording(replace(whole, time=late), "gyro", False)
 
 
-def test_temperature_is_regressed_out_and_written(run, tmp_path):
+def test_temperature_is_regressed_out_and_written(run, succeeds, tmp_path):
     whole = at_rest(20_000)
     T = 25.0 + 10.0 * (1.0 - np.exp(-whole.time / 60.0))
     warm = replace(whole, rate=whole.rate + 2e-3 * (T - T.mean())[:, None] * [1.0, -1.0, 0.0], temperature=T)
     recordings.write(warm, tmp_path / "warm.csv")
-    status, said, error = run("allan", "warm.csv", "--temperature", 1)
-    assert status == 0, error
+    said = succeeds("allan", "warm.csv", "--temperature", 1)
     assert "Bias over temperature" in said
     table = tomllib.loads((tmp_path / "allan-results" / "gyro-temperature.toml").read_text())["gyro"]["temperature"]
     slope, sigma = np.array(table["bias_rad_per_s_per_k"]), np.array(table["sigma_rad_per_s_per_k"])
@@ -231,7 +225,7 @@ def test_the_bias_over_temperature_is_subtracted_and_its_error_becomes_a_walk():
         from_table({k: v for k, v in given.items() if k != "bias_rad_per_s"}, "file: gyro")
 
 
-def test_a_simulated_unit_goes_through_allan_and_its_table_into_the_filter(run, tmp_path):
+def test_a_simulated_unit_goes_through_allan_and_its_table_into_the_filter(succeeds, tmp_path):
     """Round trip: the scenario's polynomial lies inside the intervals, and the filter that reads the table finds the turn-on bias."""
     rest = """
     rate_hz = 100.0
@@ -262,9 +256,8 @@ def test_a_simulated_unit_goes_through_allan_and_its_table_into_the_filter(run, 
     (tmp_path / "lab.toml").write_text(rest.format(duration=300.0, bias=[0.0] * 3, start=20.0, end=40.0))
     (tmp_path / "use.toml").write_text(rest.format(duration=60.0, bias=[360.0, 0.0, -360.0], start=38.0, end=12.0))
     for name in ("lab", "use"):
-        assert run("simulate", f"{name}.toml")[0] == 0
-    status, _, error = run("allan", "lab.h5", "--temperature", 2)
-    assert status == 0, error
+        succeeds("simulate", f"{name}.toml")
+    succeeds("allan", "lab.h5", "--temperature", 2)
     path = tmp_path / "allan-results" / "gyro-temperature.toml"
     found = tomllib.loads(path.read_text())["gyro"]["temperature"]
     T0 = found["reference_degc"] - 30.0
@@ -274,16 +267,15 @@ def test_a_simulated_unit_goes_through_allan_and_its_table_into_the_filter(run, 
     text = (tmp_path / "allan-results" / "gyro.toml").read_text()
     both = tomllib.loads(text + path.read_text())["gyro"]  # the two files in one are a gyro's table
     assert gyro.from_table(both).temperature.span == (found["lowest_degc"], found["highest_degc"])
-    assert run("convert", "use.h5", "use.db3")[0] == 0
-    status, _, error = run("estimate", "use.db3", "--temperature", path)
-    assert status == 0, error
+    succeeds("convert", "use.h5", "use.db3")
+    succeeds("estimate", "use.db3", "--temperature", path)
     estimate = records.read_estimate(tmp_path / "estimate-results" / "estimate.h5")
     slope = records.read_states(tmp_path / "estimate-results" / "estimate.h5")["gyro temperature"]
     assert (slope.sigma[0] < 1e-4).all()
     # The two files in one, as the gyro's noise, do the same.
     (tmp_path / "whole.toml").write_text(text + path.read_text())
     again = sd.estimate(recordings.read(tmp_path / "use.db3"), noise=gyro.read_spec(tmp_path / "whole.toml"))
-    assert run("estimate", "use.db3", "--gyro", "whole.toml")[0] == 0
+    succeeds("estimate", "use.db3", "--gyro", "whole.toml")
     by_command = records.read_estimate(tmp_path / "estimate-results" / "estimate.h5")
     np.testing.assert_array_equal(again.bias, by_command.bias)
     np.testing.assert_allclose(again.bias[-1], estimate.bias[-1], atol=3.0 * estimate.sigma[-1, 3])
@@ -366,3 +358,52 @@ def test_the_interval_of_the_largest_axis_covers_it(axes, others):
         low, high = noise_parameters.largest_interval(fit, "angle_random_walk")
         inside.append(low <= 2.0 <= high)
     assert abs(np.mean(inside) - 0.95) < 4.0 * np.sqrt(0.95 * 0.05 / 5_000)
+
+
+FLICKER = 20.0 * units.DEGREE_PER_HOUR
+
+
+@pytest.fixture
+def table(tmp_path):
+    """Twenty seconds of a unit that lies still for three and is then rolled about, with its true roll, rad."""
+    random, time = np.random.default_rng(5), 0.01 * np.arange(2000)
+    rate = np.where(time > 3.0, 40.0 * np.sin(np.pi * (time - 3.0)), 0.0)
+    roll = np.radians(np.cumsum(rate) * 0.01)
+    turn = np.stack([rate, 0.0 * time, 0.0 * time], axis=1) + 0.05 * random.standard_normal((2000, 3))
+    force = np.stack([0.0 * time, np.sin(roll), np.cos(roll)], axis=1) + 2e-3 * random.standard_normal((2000, 3))
+    path = tmp_path / "walk.csv"
+    header = "time,gx [deg/s],gy [deg/s],gz [deg/s],ax [g],ay [g],az [g]"
+    np.savetxt(path, np.column_stack([time, turn, force]), delimiter=",", header=header, comments="")
+    return path, roll
+
+
+def test_the_file_of_an_allan_fit_with_flicker_serves_a_recording(table, succeeds, tmp_path):
+    path, roll = table
+    text = "[gyro]\nangle_random_walk_deg_per_sqrt_hour = [0.3, 0.3, 0.3]\nbias_instability_deg_per_hour = [20.0, 20.0, 20.0]\n"
+    (tmp_path / "gyro.toml").write_text(text)
+    succeeds("estimate", path, "--gyro", "gyro.toml", "--out", "found")
+    estimate = sd.read(tmp_path / "found" / "estimate.h5")
+    error = estimate.rotation.as_euler("ZYX")[:, 2] - roll[-len(estimate.time) :]
+    assert np.sqrt(np.mean(error**2)) < np.radians(0.5)
+
+
+def test_flicker_is_covered_at_every_frequency_that_the_filter_of_the_tilt_follows():
+    """At the natural frequency ω of the filter the covering spectrum σ_v² + σ_u²/ω² is at least 2/π of the flicker's, B²/ω."""
+    spec = gyro.GyroSpec(angle_random_walk=1e-4, bias_instability=FLICKER)
+    for parameters in ahrs.MOTIONS.values():
+        found = workflows.with_gyro_noise(parameters, spec)
+        white = found.angle_random_walk**2 - spec.angle_random_walk**2
+        walk = found.rate_random_walk**2
+        assert white > 0.0
+        assert walk > 0.0
+        natural = np.sqrt(walk / white)  # where the two parts of the covering spectrum cross
+        share = (white + walk / natural**2) / (FLICKER**2 / natural)
+        assert 2.0 / np.pi <= share <= 1.0 + 1e-12
+        density = (parameters.specific_force_noise / units.STANDARD_GRAVITY) ** 2
+        assert natural**4 == pytest.approx(walk / density, rel=1e-6)  # Farrenkopf's limit: ω⁴ = σ_u²/r
+
+
+def test_a_gyro_without_flicker_keeps_its_own_noise():
+    spec = gyro.GyroSpec(angle_random_walk=1e-4, rate_random_walk=2e-6)
+    found = workflows.with_gyro_noise(ahrs.MOTIONS["hand"], spec)
+    assert (found.angle_random_walk, found.rate_random_walk) == (1e-4, 2e-6)

@@ -1,7 +1,5 @@
 """An estimate in other forms: angles and σ against SciPy and finite differences, frames against closed forms, files read back."""
 
-from __future__ import annotations
-
 import csv
 import itertools
 
@@ -104,9 +102,6 @@ def test_acceleration_without_gravity():
     np.testing.assert_allclose(outputs.free_acceleration(q, force), truth, atol=1e-13)
     force[3] = np.nan
     assert np.isnan(outputs.free_acceleration(q, force)[3]).all()
-
-
-# ------------------------------------------------------------------------------------------------------ tables and files
 
 
 @pytest.fixture

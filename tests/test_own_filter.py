@@ -1,6 +1,5 @@
 """A filter of one's own wherever the package's filter goes: the same filter, wrapped, must give the same to the bit."""
 
-import importlib.util
 import json
 import sys
 from dataclasses import dataclass, fields, replace
@@ -9,19 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import two_stars
+from measured import errors, turn_to
 
-from strapdown import (
-    cli,
-    consistency,
-    covariance,
-    estimation,
-    montecarlo,
-    motion,
-    quaternion,
-    scenarios,
-    tuning,
-    vectors,
-)
+from sims import own_filter
+from strapdown import cli, consistency, covariance, estimation, montecarlo, motion, scenarios, tuning, vectors
 from strapdown.checks import InputError
 from strapdown.estimation import filters, setup
 from strapdown.estimation.filters import extended
@@ -31,17 +21,7 @@ from strapdown.records import Estimate, Truth, read_estimate, read_truth
 from strapdown.report import campaigns
 
 ROOT = Path(__file__).resolve().parents[1]
-
-
-def sim():
-    spec = importlib.util.spec_from_file_location("own_filter_sim", ROOT / "sims" / "own_filter.py")
-    module = sys.modules["own_filter_sim"] = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-SIM = sim()
-SCENARIO = SIM.scenario(20.0)
+SCENARIO = own_filter.scenario(20.0)
 SETUP = setup.FilterSetup.for_scenario(SCENARIO)
 PLAN = Plan(scenario=SCENARIO, setup=SETUP, seed=3, epochs=20, nis_bins=5)
 
@@ -162,7 +142,6 @@ def test_a_too_modest_filter_is_found_out():
 
 
 MINE = """
-from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
@@ -255,8 +234,9 @@ def test_a_run_of_a_filter_without_a_bias_and_at_times_of_its_own_is_replayed_an
     cli.app(["check", *files], standalone_mode=False)
     assert "the one test does not contradict the filter" in capsys.readouterr().out
     read, truth = read_estimate("own-run-1-estimate.h5"), read_truth("own-run-1-estimate.h5")
-    turn = quaternion.log(quaternion.multiply(quaternion.conjugate(read.attitude), truth.attitude))
-    assert np.max(np.abs(turn)) < 5.0 * np.max(read.sigma[:, :3])  # the truth of these times, not of others
+    assert np.max(np.abs(turn_to(read.attitude, truth.attitude))) < 5.0 * np.max(
+        read.sigma[:, :3]
+    )  # the truth of these times
 
 
 @pytest.mark.parametrize(
@@ -326,7 +306,7 @@ def test_a_compiled_body_outside_the_package_is_a_filter_of_ones_own(tmp_path, m
 def test_it_is_compared_with_the_packages_filters():
     record = montecarlo.replay(PLAN, 0, machine="scalar")
     table = filters.compare(
-        record.record, SETUP.process_noise, record.initial, filters=["mekf", wrapped, SIM.textbook], every=5
+        record.record, SETUP.process_noise, record.initial, filters=["mekf", wrapped, own_filter.textbook], every=5
     )
     rows = table.summary()
     assert list(rows) == ["mekf", "wrapped", "textbook"]
@@ -338,7 +318,7 @@ def test_it_is_compared_with_the_packages_filters():
 
 
 def test_one_run_is_judged(own):
-    again = montecarlo.replay(with_filter(SIM.textbook), 1)
+    again = montecarlo.replay(with_filter(own_filter.textbook), 1)
     truth = again.record.truth
     judged = consistency.judge(again.estimate, truth)
     assert {one.of for one in judged.findings} == {"state", "attitude", "bias"}
@@ -350,7 +330,7 @@ def test_one_run_is_judged(own):
 
 @pytest.mark.slow
 def test_the_example_tells_the_right_filter_from_the_faulty_one():
-    found = SIM.main(runs=100, duration=60.0, seed=1)
+    found = own_filter.main(runs=100, duration=60.0, seed=1)
     assert found.verdicts["textbook"].startswith("consistent")
     assert found.verdicts["turned reference"].startswith("not consistent")
 
@@ -460,7 +440,7 @@ def test_it_is_tuned_against_a_truth_too():
     found = tuning.fit_own(make, [case], {"factor": 5.0}, measure="errors")
     plain = make({"factor": 1.0})(case.record, case.initial)
     truth = case.record.truth
-    error = consistency.errors(plain.attitude, plain.bias, truth.attitude, truth.bias)[1:]
+    error = errors(plain, truth)[1:]
     assert found.values["factor"] == pytest.approx(consistency.nees(error, plain.covariance[1:]).mean() / 6.0, rel=1e-3)
     rms = tuning.fit_own(tuned_like_the_package, [case], {"star 1.sigma": two_stars.SIGMAS[0]}, measure="rmse")
     assert rms.value <= np.sqrt(np.mean(error[:, :3] ** 2)) * (1.0 + 1e-9)
@@ -565,10 +545,9 @@ def test_a_comparison_gives_errors_over_the_bound():
         one.record, base.process_noise, one.initial, filters=["mekf", mine], every=2, bound=bound[::2]
     )
     error = found.estimates["mine"]
-    turn = quaternion.log(
-        quaternion.multiply(quaternion.conjugate(error.attitude), one.record.truth.attitude[::2])
-    ) / np.sqrt(np.diagonal(bound[::2], axis1=1, axis2=2)[:, :3])
-    expected = np.sqrt(np.mean(turn[error.time >= 30.0] ** 2))
+    turn = turn_to(error.attitude, one.record.truth.attitude[::2])
+    ratio = turn / np.sqrt(np.diagonal(bound[::2], axis1=1, axis2=2)[:, :3])
+    expected = np.sqrt(np.mean(ratio[error.time >= 30.0] ** 2))
     assert found.summary()["mine"]["attitude_over_bound"] == pytest.approx(expected, rel=1e-12)
     assert f"{expected:.3f}" in str(found)
     for bad, message in ((bound, r"bound has shape"), (bound[::2], "no truth")):

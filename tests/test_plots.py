@@ -1,7 +1,5 @@
 """Figures: what is drawn is what was given, with units, in both themes, and no extreme is lost."""
 
-from __future__ import annotations
-
 import dataclasses
 import xml.etree.ElementTree
 

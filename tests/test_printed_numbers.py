@@ -1,7 +1,5 @@
 """What commands print, computed again from the files they wrote by h5py, NumPy and SciPy alone, in the words of the literature."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

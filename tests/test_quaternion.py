@@ -1,7 +1,5 @@
 """Quaternion algebra: its axioms over batch shapes, and values against mpmath, SciPy and 2×2 complex matrices."""
 
-from __future__ import annotations
-
 import mpmath
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """The one layer that every file passes: what it lets through, and what it refuses in time and by name."""
 
-from __future__ import annotations
-
 import dataclasses
 import faulthandler
 import gc
@@ -49,18 +47,8 @@ def known(tmp_path_factory):
 # --------------------------------------------------------------------------------------------------------- no regular files
 
 
-KINDS = (
-    "record.h5",
-    "estimate.h5",
-    "campaign.h5",
-    "broad.hdf5",
-    "alone.csv",
-    "walk.csv",
-    "gyro.npy",
-    "scenario.toml",
-    "filter.toml",
-)
-KINDS += ("gyro.toml", "dispersions.toml", "vibration.csv", "tuning.json")
+KINDS = ("record.h5", "estimate.h5", "campaign.h5", "broad.hdf5", "alone.csv", "walk.csv", "gyro.npy", "scenario.toml")
+KINDS += ("filter.toml", "gyro.toml", "dispersions.toml", "vibration.csv", "tuning.json")
 
 
 @pytest.mark.parametrize("name", KINDS)

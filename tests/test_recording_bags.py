@@ -1,14 +1,14 @@
 """ROS bags: written by the library's own serialiser and read here, written here and read by the library, truncated, of several units."""
 
-from __future__ import annotations
-
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from measured import walk
 from typer.testing import CliRunner
 
-from strapdown import quaternion, recordings
+from strapdown import recordings
 from strapdown.checks import InputError
 from strapdown.cli import app
 from strapdown.recordings import Recording, read
@@ -251,27 +251,15 @@ def test_a_message_of_another_layout_is_named(bag):
         ros._joined("x.bag", topic)
 
 
-def walk(n: int = 60, epoch: int = START) -> Recording:
-    random = np.random.default_rng(2)
-    field = random.standard_normal((n, 3)) * 1e-5
-    field[1::2] = np.nan
-    return Recording(
-        source="walk",
-        time=np.cumsum(random.integers(4_000_000, 6_000_000, n)) / 1e9,
-        rate=random.standard_normal((n, 3)),
-        specific_force=random.standard_normal((n, 3)),
-        magnetic_field=field,
-        magnetic_unit="T",
-        temperature=random.standard_normal(n),
-        true_attitude=quaternion.normalize(random.standard_normal((n, 4))),
-        epoch_ns=epoch,
-    )
+def tesla(*size, **options) -> Recording:
+    """Return a recording with its field in the unit of a bag."""
+    return replace(walk(*size, **options), magnetic_unit="T", movement=None)
 
 
 @pytest.mark.parametrize("suffix", ["bag", "mcap", "db3"])
 @pytest.mark.parametrize("epoch", [0, START])
 def test_what_is_written_comes_back_to_the_bit(tmp_path, suffix, epoch):
-    whole = walk(epoch=epoch)
+    whole = tesla(epoch=epoch)
     recordings.write(whole, tmp_path / f"x.{suffix}")
     back = read(tmp_path / f"x.{suffix}")
     assert back.clock_ns.tolist() == whole.clock_ns.tolist()
@@ -284,7 +272,7 @@ def test_what_is_written_comes_back_to_the_bit(tmp_path, suffix, epoch):
 def test_the_library_reads_what_is_written(tmp_path, suffix):
     from rosbags.highlevel import AnyReader
 
-    whole = walk()
+    whole = tesla()
     recordings.write(whole, tmp_path / f"x.{suffix}")
     with AnyReader([tmp_path / f"x.{suffix}"]) as reader:
         found = [reader.deserialize(raw, c.msgtype) for c, _, raw in reader.messages() if c.topic == "/imu/data_raw"]
@@ -318,18 +306,16 @@ def test_an_estimate_fills_in_orientation_and_covariance_and_keeps_other_topics(
     assert (units[10].orientation.w, units[10].orientation.z) == (0.5, 0.5)
     assert units[10].angular_velocity.x == recording.rate[10, 0]
     with pytest.raises(InputError, match="have no stamp in common"):
-        recordings.write(estimate, tmp_path / f"no.{suffix}", recording=walk(10))
+        recordings.write(estimate, tmp_path / f"no.{suffix}", recording=tesla(10))
     with pytest.raises(InputError, match="give the recording that the estimate was made from"):
         recordings.write(estimate, tmp_path / f"no.{suffix}")
 
 
 def test_what_a_bag_cannot_hold_is_refused(tmp_path):
-    from dataclasses import replace
-
     with pytest.raises(InputError, match="does not declare the unit of its magnetometer, which is needed in T"):
-        recordings.write(replace(walk(), magnetic_unit=""), tmp_path / "x.bag")
+        recordings.write(replace(tesla(), magnetic_unit=""), tmp_path / "x.bag")
     with pytest.raises(InputError, match="no negative times"):
-        recordings.write(replace(walk(epoch=0), time=np.arange(60.0) - 5.0), tmp_path / "x.bag")
+        recordings.write(replace(tesla(epoch=0), time=np.arange(60.0) - 5.0), tmp_path / "x.bag")
     assert not list(tmp_path.iterdir())
 
 

@@ -1,11 +1,11 @@
 """Which column of a table is what: mapped, guessed and said, or refused."""
 
-from __future__ import annotations
-
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from measured import walk
 from typer.testing import CliRunner
 
 from strapdown import recordings
@@ -211,22 +211,7 @@ def test_temperature_goes_along(table):
 
 
 def test_what_is_written_is_read_back_to_the_bit(tmp_path):
-    random = np.random.default_rng(3)
-    n = 50
-    field = random.standard_normal((n, 3))
-    field[::3] = np.nan
-    whole = recordings.Recording(
-        source="x.csv",
-        time=np.cumsum(random.integers(1_000_000, 9_000_000, n)) / 1e9,
-        rate=random.standard_normal((n, 3)),
-        specific_force=random.standard_normal((n, 3)),
-        magnetic_field=field,
-        magnetic_unit="mG",
-        temperature=random.standard_normal(n),
-        true_attitude=random.standard_normal((n, 4)),
-        movement=random.random(n) > 0.5,
-        epoch_ns=1_700_000_000_123_456_789,
-    )
+    whole = replace(walk(), magnetic_unit="mG")
     for ending in ("csv", "tsv"):
         recordings.write(whole, tmp_path / f"x.{ending}")
         back = read(tmp_path / f"x.{ending}")

@@ -1,7 +1,5 @@
 """Formats beside bags and text: Parquet, data frames, flight logs, EuRoC folders, trajectories; conversion between all of them."""
 
-from __future__ import annotations
-
 import sys
 import types
 from dataclasses import replace
@@ -9,6 +7,7 @@ from dataclasses import replace
 import h5py
 import numpy as np
 import pytest
+from measured import walk
 from scipy.spatial.transform import Rotation, Slerp
 from typer.testing import CliRunner
 
@@ -21,29 +20,6 @@ from strapdown.records import outputs
 
 START = 1_700_000_000_123_456_789
 MISSING = "is not installed: pip install 'strapdown[formats]'"
-
-
-def walk(n: int = 60, epoch: int = START, single: bool = False) -> Recording:
-    """Return a recording of all there is, its numbers of single precision and stamps of whole µs if wanted."""
-    random = np.random.default_rng(2)
-    to = (lambda x: x.astype(np.float32).astype(np.float64)) if single else (lambda x: x)
-    field = to(random.standard_normal((n, 3)))
-    field[1::2] = np.nan
-    force = to(random.standard_normal((n, 3)))
-    force[5] = np.nan
-    q = Rotation.from_rotvec(np.cumsum(0.02 * random.standard_normal((n, 3)), axis=0)).as_quat()[:, [3, 0, 1, 2]]
-    return Recording(
-        source="walk",
-        time=np.cumsum(random.integers(4_000, 6_000, n)) * 1000 / 1e9,
-        rate=to(random.standard_normal((n, 3))),
-        specific_force=force,
-        magnetic_field=field,
-        magnetic_unit="G",
-        temperature=random.standard_normal(n),
-        true_attitude=q,
-        movement=random.random(n) > 0.5,
-        epoch_ns=epoch // 1000 * 1000 if single else epoch,
-    )
 
 
 def same(a: Recording, b: Recording, *names: str, rtol: float = 0.0) -> None:

@@ -1,10 +1,9 @@
 """Reading recordings: CSV and BROAD HDF5, their units, and clear words where a file is not what it should be."""
 
-from __future__ import annotations
-
 import h5py
 import numpy as np
 import pytest
+from measured import series_of
 from typer.testing import CliRunner
 
 from strapdown import estimation, recordings
@@ -12,7 +11,6 @@ from strapdown.checks import InputError
 from strapdown.cli import app
 from strapdown.recordings import Recording, read, recordfiles, samples
 from strapdown.records import ImuRecord
-from strapdown.vectors import VectorMeasurements
 
 HEADER = "time,gx [rad/s],gy,gz,ax [m/s2],ay,az"
 ROWS = ("0.00,0.1,0.2,0.3,1,2,9", "0.01,0.4,0.5,0.6,3,4,8", "0.02,0.7,0.8,0.9,5,6,7")
@@ -66,16 +64,19 @@ def test_a_byte_order_mark_and_windows_line_ends_are_read(tmp_path):
     assert len(read(path).time) == 3
 
 
-@pytest.mark.parametrize(("unit", "factor"), [("rad/s", 1.0), ("deg/s", np.pi / 180.0), ("°/s", np.pi / 180.0)])
-def test_gyro_unit_of_the_header(csv, unit, factor):
-    recording = read(csv(f"time,gx [{unit}],gy,gz,ax [m/s2],ay,az"))
-    np.testing.assert_allclose(recording.rate[1], np.array([0.4, 0.5, 0.6]) * factor, rtol=1e-15)
-
-
-@pytest.mark.parametrize(("unit", "factor"), [("m/s2", 1.0), ("m/s²", 1.0), ("m/s^2", 1.0), ("g", 9.80665)])
-def test_accelerometer_unit_of_the_header(csv, unit, factor):
-    recording = read(csv(f"time,gx [rad/s],gy,gz,ax [{unit}],ay [{unit}],az"))
-    np.testing.assert_allclose(recording.specific_force[1], np.array([3, 4, 8]) * factor, rtol=1e-15)
+@pytest.mark.parametrize(
+    ("gyro", "rate", "accelerometer", "force"),
+    [
+        ("rad/s", 1.0, "m/s2", 1.0),
+        ("deg/s", np.pi / 180.0, "m/s²", 1.0),
+        ("°/s", np.pi / 180.0, "m/s^2", 1.0),
+        ("rad/s", 1.0, "g", 9.80665),
+    ],
+)
+def test_units_of_the_header(csv, gyro, rate, accelerometer, force):
+    recording = read(csv(f"time,gx [{gyro}],gy,gz,ax [{accelerometer}],ay [{accelerometer}],az"))
+    np.testing.assert_allclose(recording.rate[1], np.array([0.4, 0.5, 0.6]) * rate, rtol=1e-15)
+    np.testing.assert_allclose(recording.specific_force[1], np.array([3, 4, 8]) * force, rtol=1e-15)
 
 
 @pytest.mark.parametrize(("unit", "factor"), [("s", 1.0), ("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9)])
@@ -109,14 +110,69 @@ def test_a_sensor_without_any_sample_is_left_out_and_reported(csv):
     assert recording.remarks[-1] == "The accelerometer has no sample from 0 s on."
 
 
-def test_undeclared_units_are_refused_not_guessed(csv):
-    refused(
-        csv("time,gx,gy,gz,ax [m/s2],ay,az"),
-        "does not declare the unit of its gyro",
-        "gx [rad/s]",
-        "rad/s, deg/s, mrad/s, mdeg/s",
-    )
-    refused(csv("time,gx [rad/s],gy,gz,ax,ay,az"), "unit of its accelerometer", "ax [m/s2]", "(m/s2, g, mg;")
+BARE = "time,gx,gy,gz,ax [m/s2],ay,az"
+SECOND = "0.01,0.4,0.5,0.6,3,4,8"
+REFUSED = {
+    "undeclared gyro": (BARE, ROWS, "does not declare the unit of its gyro", "gx [rad/s]", "rad/s, deg/s, mrad/s, mdeg/s"),
+    "undeclared force": ("time,gx [rad/s],gy,gz,ax,ay,az", ROWS, "unit of its accelerometer", "ax [m/s2]", "(m/s2, g, mg;"),
+    "unknown gyro unit": (HEADER.replace("rad/s", "deg/sec"), ROWS, "unit of the gyro 'deg/sec'", "did you mean 'deg/s'"),
+    "unknown force unit": (HEADER.replace("m/s2", "ft/s2"), ROWS, "unit of the accelerometer 'ft/s2' is not known"),
+    "two units": ("time,gx [rad/s],gy [deg/s],gz,ax [g],ay,az", ROWS, "column gy is in deg/s", "rad/s", "same unit"),
+    "missing axis": ("time,gx [rad/s],gy,ax [g],ay,az", ["0,1,2,3,4,5"], "lacks gz", "it has: time, gx, gy, ax, ay, az"),
+    "missing time": ("gx [rad/s],gy,gz,ax [g],ay,az", ["0,1,2,3,4,5"], "lacks time"),
+    "semicolons": ("time;gx;gy;ax;ay;az", ["0;1;2;3;4;5"], "lacks gz", "--columns gz="),
+    "doubled column": ("time,gx [rad/s],gy,gz,ax [g],ay,az,GX", ROWS, "column 'gx' twice"),
+    # A slip of the pen, and a heading that nobody measures is a quiet way to fail.
+    "half a magnetometer": (HEADER + ",mx,my", [row + ",1,2" for row in ROWS], "lacks mz"),
+    "decimal commas": (
+        HEADER,
+        ["0,00,0,1,0,2,0,3,1,0,2,0,9,8"],
+        "data row 1 has 14 fields, the header 7",
+        "seems to have decimal commas: write points",
+    ),
+    "one field more": (HEADER, [ROWS[0] + ",1.5"], "data row 1 has 8 fields", "truncated or damaged"),
+    "truncated row": (HEADER, [ROWS[0], "0.01,0.4,0.5,0.6,3"], "data row 2 has 5 fields, the header 7", "truncated"),
+    **{
+        f"no number: {bad}": (HEADER, [ROWS[0], f'0.01,0.4,"{bad}",0.6,3,4,8'], "data row 2, column gy", repr(bad), "not a number")
+        for bad in ("fast", "0x1f", "1,5", "1.2.3", "--1")
+    },
+    **{
+        f"rate {bad}": (HEADER, [ROWS[0], SECOND.replace("0.5", bad)], "rate[1, 1] is", "remove or interpolate")
+        for bad in ("inf", "-Infinity")
+    },
+    "infinite force": (HEADER, [ROWS[0], SECOND.replace("4,8", "inf,8")], "specific_force[1, 1] is inf"),
+    "hardly a sample": (HEADER, [ROWS[0], SECOND.replace("0.5", "")], "1 of 2 rows have a gyro sample about each axis", "at least 2"),
+    "gap and back": (HEADER, [ROWS[0], "0.02,,0,0,0,0,9", "0.01,1,0,0,0,0,9", ROWS[2]], "time[2] goes back to 0.01 s"),
+    "back": (HEADER, [ROWS[0], ROWS[2], ROWS[1]], "time[2] goes back to 0.01 s", "sort"),
+    "repeated": (HEADER, [*ROWS[:2], "0.01" + 6 * ",0.5"], "time[2] repeats 0.01 s", "drop repeated"),
+    "no stamp": (HEADER, [ROWS[0], ",0,0,0,0,0,9"], "time[1] is nan"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_bad_tables_are_refused_by_their_place(csv, case):
+    header, rows, *words = REFUSED[case]
+    refused(csv(header, rows), *words)
+
+
+@pytest.mark.parametrize(
+    ("header", "options", "words"),
+    [
+        (BARE, {"units": {"gyro": "mrad"}}, ("unit of the gyro 'mrad'",)),
+        (HEADER, {"units": {"time": "min"}}, ("unit of the time 'min'",)),
+        (HEADER, {"units": {"gyro": "deg/s"}}, ("the header declares rad/s", "the option is deg/s", "drop one")),
+        (HEADER, {"units": "deg/s"}, ("units is 'deg/s'", "{'gyro': 'deg/s'}")),
+        (HEADER, {"columns": "gx"}, ("columns is 'gx'",)),
+        (HEADER, {"columns": {"gyro": "gx"}}, ("role 'gyro' is not known", "did you mean 'gy'")),
+    ],
+)
+def test_bad_options_are_refused(csv, header, options, words):
+    refused(csv(header), *words, **options)
+
+
+def test_units_of_an_unknown_sensor_are_refused(csv):
+    with pytest.raises(InputError, match=r"'gyros' is not known.*'gyro'"):
+        read(csv(), units={"gyros": "deg/s"})
 
 
 def test_units_of_other_sensors_need_not_be_reported_where_the_gyro_alone_is_used(csv, tmp_path):
@@ -134,37 +190,6 @@ def test_units_of_other_sensors_need_not_be_reported_where_the_gyro_alone_is_use
     assert status.exit_code == 0, status.output
 
 
-def test_unknown_units_are_refused(csv):
-    refused(csv(HEADER.replace("rad/s", "deg/sec")), "unit of the gyro 'deg/sec'", "did you mean 'deg/s'")
-    refused(csv(HEADER.replace("m/s2", "ft/s2")), "unit of the accelerometer 'ft/s2' is not known")
-    refused(csv("time,gx,gy,gz,ax [m/s2],ay,az"), "unit of the gyro 'mrad'", units={"gyro": "mrad"})
-    refused(csv(), "unit of the time 'min'", units={"time": "min"})
-
-
-def test_contradicting_units_are_refused(csv):
-    refused(csv("time,gx [rad/s],gy [deg/s],gz,ax [g],ay,az"), "column gy is in deg/s", "rad/s", "same unit")
-    refused(csv(), "the header declares rad/s", "the option is deg/s", "drop one", units={"gyro": "deg/s"})
-
-
-def test_units_and_columns_are_mappings_of_what_is_known(csv):
-    refused(csv(), "units is 'deg/s'", "{'gyro': 'deg/s'}", units="deg/s")
-    refused(csv(), "columns is 'gx'", columns="gx")
-    refused(csv(), "role 'gyro' is not known", "did you mean 'gy'", columns={"gyro": "gx"})
-
-
-def test_units_of_an_unknown_sensor_are_refused(csv):
-    refused_here = csv("time,gx,gy,gz,ax [g],ay,az")
-    with pytest.raises(InputError, match=r"'gyros' is not known.*'gyro'"):
-        read(refused_here, units={"gyros": "deg/s"})
-
-
-def test_missing_and_doubled_columns_are_refused(csv):
-    refused(csv("time,gx [rad/s],gy,ax [g],ay,az", ["0,1,2,3,4,5"]), "lacks gz", "it has: time, gx, gy, ax, ay, az")
-    refused(csv("gx [rad/s],gy,gz,ax [g],ay,az", ["0,1,2,3,4,5"]), "lacks time")
-    refused(csv("time;gx;gy;ax;ay;az", ["0;1;2;3;4;5"]), "lacks gz", "--columns gz=")
-    refused(csv("time,gx [rad/s],gy,gz,ax [g],ay,az,GX"), "column 'gx' twice")
-
-
 @pytest.mark.parametrize("mark", [";", "\t", "|"])
 def test_other_separators_are_read_and_their_decimals_may_have_commas(csv, mark):
     plain = read(csv())
@@ -174,12 +199,6 @@ def test_other_separators_are_read_and_their_decimals_may_have_commas(csv, mark)
         np.testing.assert_array_equal(recording.time, plain.time)
         np.testing.assert_array_equal(recording.rate, plain.rate)
         np.testing.assert_array_equal(recording.specific_force, plain.specific_force)
-
-
-def test_decimal_commas_between_commas_are_reported(csv):
-    commas = "0,00,0,1,0,2,0,3,1,0,2,0,9,8"
-    refused(csv(rows=[commas]), "data row 1 has 14 fields, the header 7", "seems to have decimal commas: write points")
-    refused(csv(rows=[ROWS[0] + ",1.5"]), "8 fields", "truncated or damaged")
 
 
 @pytest.mark.parametrize(("columns", "name"), [("ax [m/s2],ay,az", "specific_force"), ("mx,my,mz", "magnetic_field")])
@@ -202,26 +221,6 @@ def test_a_result_is_no_recording(tmp_path):
 def test_a_simulated_record_in_csv_is_no_recording(tmp_path):
     recordfiles.export_csv(tmp_path / "x.csv", ImuRecord(time=[0.0, 1.0], increments=[[0.0, 0.1, 0.2]]))
     refused(tmp_path / "x.csv", "is a simulated record, not a recording; integrate it")
-
-
-def test_half_a_magnetometer_is_refused(csv):
-    """Two of three columns are a slip of the pen, and a heading that nobody measures is a quiet way to fail."""
-    refused(csv(HEADER + ",mx,my", [row + ",1,2" for row in ROWS]), "lacks mz")
-
-
-def test_truncated_rows_are_refused(csv):
-    refused(csv(rows=[ROWS[0], "0.01,0.4,0.5,0.6,3"]), "data row 2 has 5 fields, the header 7", "truncated")
-    refused(csv(rows=[ROWS[0] + ",8"]), "data row 1 has 8 fields")
-
-
-@pytest.mark.parametrize("bad", ["fast", "0x1f", "1,5", "1.2.3", "--1"])
-def test_what_is_no_number_is_refused(csv, bad):
-    refused(csv(rows=[ROWS[0], f'0.01,0.4,"{bad}",0.6,3,4,8']), "data row 2, column gy", repr(bad), "not a number")
-
-
-@pytest.mark.parametrize("bad", ["inf", "-Infinity"])
-def test_an_infinite_rate_is_refused(csv, bad):
-    refused(csv(rows=[ROWS[0], f"0.01,0.4,{bad},0.6,3,4,8"]), "rate[1, 1] is", "remove or interpolate")
 
 
 @pytest.mark.parametrize("bad", ["nan", "", " "])
@@ -267,11 +266,6 @@ def test_rows_that_repeat_the_row_before_are_left_out_and_reported(csv):
         read(csv(rows=[*rows[:3], rows[2].replace("0.2,0,0", "0.3,0,0"), *rows[3:]]))
 
 
-def test_a_file_of_hardly_a_gyro_sample_is_refused(csv):
-    refused(csv(rows=[ROWS[0], "0.01,0.4,,0.6,3,4,8"]), "1 of 2 rows have a gyro sample about each axis", "at least 2")
-    refused(csv(rows=[ROWS[0], "0.02,,0,0,0,0,9", "0.01,1,0,0,0,0,9", ROWS[2]]), "time[2] goes back to 0.01 s")
-
-
 def test_what_is_missing_is_reported_where_a_recording_is_used(csv, tmp_path):
     rows = [f"{0.01 * k:.2f},{'' if k in (150, 151) else 0.0},0,0,0,0,9.8" for k in range(300)]
     path = csv(rows=rows)
@@ -284,17 +278,6 @@ def test_what_is_missing_is_reported_where_a_recording_is_used(csv, tmp_path):
         assert "2 rows without a gyro sample, the first at 1.500 s, were left out" in " ".join(result.output.split())
     with pytest.raises(InputError, match=r"the interval after 1.49 s is 0.03 s"):
         recordings.read_samples(path, "gyro")
-
-
-def test_infinite_accelerations_are_refused(csv):
-    refused(csv(rows=[ROWS[0], "0.01,0.4,0.5,0.6,3,inf,8"]), "specific_force[1, 1] is inf")
-
-
-def test_stamps_out_of_order_are_refused(csv):
-    refused(csv(rows=[ROWS[0], ROWS[2], ROWS[1]]), "time[2] goes back to 0.01 s", "sort")
-    other = ",".join([ROWS[1].partition(",")[0], *["0.5"] * 6])
-    refused(csv(rows=[ROWS[0], ROWS[1], other]), "time[2] repeats 0.01 s", "drop repeated")
-    refused(csv(rows=[ROWS[0], ",0,0,0,0,0,9"]), "time[1] is nan")
 
 
 def test_stamps_with_too_few_digits_are_reported_as_they_stand(csv):
@@ -438,12 +421,6 @@ def test_since():
     assert later.magnetic_field is None
 
 
-def test_every_unit_has_a_factor():
-    assert recordings.RATE_UNITS["deg/s"] == np.pi / 180.0
-    assert recordings.FORCE_UNITS["g"] == 9.80665
-    assert recordings.TIME_UNITS == {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-
-
 @pytest.mark.parametrize(("unit", "factor"), [("us", 1_000_000), ("ms", 1000)])
 def test_a_clock_that_counts_from_1970_keeps_its_digits(tmp_path, unit, factor):
     """In seconds a double has 0.24 µs left of such a stamp."""
@@ -500,14 +477,7 @@ def test_stamps_that_stray_by_more_than_a_quarter_of_the_interval_are_assumed_ev
 
 def test_samples_of_a_simulated_record_are_its_increments_and_what_its_sensors_measured(tmp_path):
     random, time = np.random.default_rng(4), 0.01 * np.arange(201)
-    force = VectorMeasurements(
-        sensor="accelerometer",
-        kind="vector",
-        time=time[4::4],
-        reference_f=[0.0, 0.0, 9.8],
-        vector_b=random.standard_normal((50, 3)),
-        sigma=0.1,
-    )
+    force = series_of("accelerometer", "vector", time[4::4], random.standard_normal((50, 3)), [0.0, 0.0, 9.8], 0.1)
     record = ImuRecord(time=time, increments=1e-3 * random.standard_normal((200, 3)), vectors=(force,))
     recordfiles.write_record(tmp_path / "record.h5", record)
     gyro = recordings.read_samples(tmp_path / "record.h5", "gyro")

@@ -1,7 +1,5 @@
 """The IMU record and the estimate: checks, compressing, cutting, and the estimate's file."""
 
-from __future__ import annotations
-
 import dataclasses
 import re
 
@@ -11,22 +9,10 @@ import pytest
 from hdf5 import changed
 
 import strapdown
-from strapdown import coning, quaternion
+from strapdown import coning, quaternion, records
 from strapdown.checks import InputError
 from strapdown.files import reading
-from strapdown.records import (
-    CONVENTIONS,
-    Estimate,
-    Event,
-    ImuRecord,
-    Innovations,
-    Truth,
-    compress,
-    cut,
-    read_estimate,
-    read_truth,
-    write_estimate,
-)
+from strapdown.records import Estimate, ImuRecord, Truth, compress, cut, read_estimate, read_truth, write_estimate
 from strapdown.vectors import VectorMeasurements
 
 
@@ -171,10 +157,12 @@ def estimate(full: bool = False) -> Estimate:
         variance=np.diagonal(P, axis1=1, axis2=2).copy(),
         covariance=P if full else None,
         innovations={
-            "star tracker": Innovations(
+            "star tracker": records.Innovations(
                 time=np.arange(4.0), innovation=random.standard_normal((4, 2)), variance=1.0 + random.random((4, 2))
             ),
-            "magnetometer": Innovations(time=np.empty(0), innovation=np.empty((0, 1)), variance=np.empty((0, 1))),
+            "magnetometer": records.Innovations(
+                time=np.empty(0), innovation=np.empty((0, 1)), variance=np.empty((0, 1))
+            ),
         },
         skipped={"star tracker": 3, "magnetometer": 0},
     )
@@ -203,7 +191,7 @@ def test_estimate_file_holds_units_conventions_and_attributes(tmp_path):
     write_estimate(tmp_path / "estimate.h5", estimate(full=True), {"source": "test", "parameter.sigma": 0.5})
     with reading.hdf5(tmp_path / "estimate.h5") as file:
         attributes = reading.attributes(file)
-        assert attributes["conventions"] == CONVENTIONS
+        assert attributes["conventions"] == records.CONVENTIONS
         assert attributes["version"] == strapdown.__version__
         assert (attributes["source"], attributes["parameter.sigma"]) == ("test", 0.5)
         units = {
@@ -217,7 +205,7 @@ def test_estimate_file_holds_units_conventions_and_attributes(tmp_path):
 
 def test_sensor_names_with_a_slash_survive(tmp_path):
     """In HDF5 a slash parts group names."""
-    sensor = Innovations(time=np.arange(2.0), innovation=np.ones((2, 1)), variance=np.ones((2, 1)))
+    sensor = records.Innovations(time=np.arange(2.0), innovation=np.ones((2, 1)), variance=np.ones((2, 1)))
     written = dataclasses.replace(estimate(), innovations={"GPS/heading": sensor}, skipped={"GPS/heading": 1})
     write_estimate(tmp_path / "estimate.h5", written)
     read = read_estimate(tmp_path / "estimate.h5")
@@ -325,8 +313,8 @@ def test_what_no_filter_estimates_is_refused(tmp_path, name, damage, words):
     ],
 )
 def test_an_event_is_described_by_its_kind(kind, words):
-    assert re.match(words, str(Event(kind=kind, start=1.0, end=3.5, sensor="compass", value=7.0)))
-    one = str(Event(kind="hypotheses", start=1.0, end=3.5, sensor="compass"))
+    assert re.match(words, str(records.Event(kind=kind, start=1.0, end=3.5, sensor="compass", value=7.0)))
+    one = str(records.Event(kind="hypotheses", start=1.0, end=3.5, sensor="compass"))
     assert one.endswith("ambiguous: then one was chosen.")
 
 

@@ -4,8 +4,6 @@ The oracle is one rotating body, evaluated to 50 digits by three Euler angles th
 complex matrices, its rates from the derivative of its rotation matrix. Derivatives are mpmath's. The package under test enters none of it.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import mpmath as mp

@@ -1,7 +1,5 @@
 """Errors against a reference, as the BROAD benchmark defines them, against formulas of their own on SciPy rotations."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

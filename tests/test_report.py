@@ -1,7 +1,5 @@
 """Reports: self-contained pages whose words, numbers and figures are those of the result."""
 
-from __future__ import annotations
-
 import dataclasses
 import html.parser
 import json
@@ -165,18 +163,10 @@ def test_the_campaign_page_says_what_the_filter_has_no_state_for(folder, scenari
 
 def test_a_tuning_is_reported_from_its_json(folder, scenario, tmp_path):
     (tmp_path / "scenario.toml").write_text(scenarios.scenario_to_toml(scenario), encoding="utf-8")
+    tune = ["tune", str(tmp_path / "record.h5"), "--free", "star 1.sigma", "-o", str(tmp_path / "filter.toml")]
     for command in (
         ["simulate", str(tmp_path / "scenario.toml"), "--out", str(tmp_path / "record.h5")],
-        [
-            "tune",
-            str(tmp_path / "record.h5"),
-            "--free",
-            "star 1.sigma",
-            "--holdout",
-            "0.3",
-            "-o",
-            str(tmp_path / "filter.toml"),
-        ],
+        [*tune, "--holdout", "0.3"],
         ["report", str(tmp_path / "filter.json")],
     ):
         result = CliRunner().invoke(cli.app, command)
@@ -196,8 +186,7 @@ def test_a_tuning_is_reported_from_its_json(folder, scenario, tmp_path):
         report.write(folder / "right.report.json", tmp_path / "page.html")
     # A tuning without data held out, of the same name, leaves nothing of what was said of held-out data before.
     figure = (tmp_path / "filter-heldout.png").read_bytes()
-    command = ["tune", str(tmp_path / "record.h5"), "--free", "star 1.sigma", "-o", str(tmp_path / "filter.toml")]
-    assert CliRunner().invoke(cli.app, [*command, "--starts", "1"]).exit_code == 0
+    assert CliRunner().invoke(cli.app, [*tune, "--starts", "1"]).exit_code == 0
     assert not (tmp_path / "filter-heldout.png").exists()
     (tmp_path / "filter-heldout.png").write_bytes(figure)
     content = body(report.write(tmp_path / "filter.json").page)
@@ -326,23 +315,12 @@ window.onerror = (message) => { document.body.dataset.error = message; };</scrip
 def test_a_browser_shows_figures_and_charts(folder, tmp_path, name, width):
     probe = tmp_path / "probe.html"
     probe.write_text(body(folder / f"{name}.html").replace("</head>", PROBE, 1), encoding="utf-8")
-    options = [
-        "--headless",
-        "--no-sandbox",
-        "--disable-gpu",
-        "--disable-background-networking",
-        "--disable-component-update",
-    ]
-    options += [
-        "--disable-sync",
-        "--no-first-run",
-        f"--user-data-dir={tmp_path / 'profile'}",
-        "--enable-logging=stderr",
-    ]
+    options = ["--headless", "--no-sandbox", "--no-first-run", f"--user-data-dir={tmp_path / 'profile'}"]
+    options += ["--disable-gpu", "--disable-background-networking", "--disable-component-update", "--disable-sync"]
+    options += ["--enable-logging=stderr", f"--window-size={width},900", "--virtual-time-budget=4000", "--dump-dom"]
     shown = subprocess.run(
-        [str(CHROMIUM), *options, f"--window-size={width},900", "--virtual-time-budget=4000", "--dump-dom", probe.as_uri()],
-        capture_output=True, text=True, timeout=120, check=True,
-    )  # fmt: skip
+        [str(CHROMIUM), *options, probe.as_uri()], capture_output=True, text=True, timeout=120, check=True
+    )
     assert "data-error" not in shown.stdout[: shown.stdout.index("<style>") + 10] + shown.stdout[-3000:]
     assert ":CONSOLE" not in shown.stderr, shown.stderr
     found = json.loads(re.search(r"<title>(\{.*?\})</title>", shown.stdout).group(1).replace("&quot;", '"'))

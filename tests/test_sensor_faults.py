@@ -1,7 +1,5 @@
 """Clipped samples and gaps: recognised, restored as far as can be, and uncertain by as much as they are off."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,19 +1,17 @@
 """Filter setups: the model of a right filter for a scenario, and their files."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np
 import pytest
+from measured import assert_inside, errors_at, series_of
 
-from strapdown import coning, consistency, estimation, quaternion, records, scenarios, units, workflows
+from strapdown import coning, consistency, estimation, montecarlo, quaternion, records, scenarios, units, workflows
 from strapdown.checks import InputError
 from strapdown.estimation import setup
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.setup import FilterSetup
 from strapdown.gyro import GyroSpec
-from strapdown.randomness import generator
 from strapdown.records import ImuRecord
 from strapdown.vectors import VectorMeasurements
 
@@ -112,13 +110,11 @@ def test_a_file_without_the_table_says_what_writes_one(tmp_path):
 
 
 def test_matched_takes_the_gyro_at_its_word():
+    """A Gauss–Markov bias starts from its stationary spread."""
     spec = GyroSpec(angle_random_walk=2e-5, rate_random_walk=1e-8, turn_on_bias_sigma=3e-5)
     chosen = setup.FilterSetup.for_scenario(scenario(gyro=spec))
     assert chosen.process_noise == estimation.ProcessNoise(angle_random_walk=2e-5, rate_random_walk=1e-8)
     assert chosen.bias_sigma == pytest.approx(3e-5)
-
-
-def test_a_gauss_markov_bias_starts_from_its_stationary_spread():
     spec = GyroSpec(angle_random_walk=2e-5, markov_noise=1e-6, markov_correlation_time=800.0)
     assert setup.FilterSetup.for_scenario(scenario(gyro=spec)).bias_sigma == pytest.approx(1e-6 * np.sqrt(400.0))
 
@@ -154,16 +150,11 @@ def test_measurement_density_counts_what_each_kind_measures():
     expected = (record.time[-1] - record.time[0]) * sigma**2 / (number * 2.0 / 3.0)
     assert setup.measurement_density(record) == pytest.approx(expected)
     assert setup.measurement_density(dataclasses.replace(record, vectors=())) == np.inf
-    x, common = np.array([1.0, 0.0, 0.0]), {"time": np.arange(1.0, 5.0)}
-    compass = VectorMeasurements(
-        sensor="a", kind="heading", vector_b=np.tile(x, (4, 1)), reference_f=x, sigma=0.1, **common
-    )
-    field = VectorMeasurements(
-        sensor="b", kind="vector", vector_b=np.tile(2.0 * x, (4, 1)), reference_f=2.0 * x, sigma=0.2, **common
-    )
-    tracker = VectorMeasurements(
-        sensor="c", kind="attitude", attitude=np.tile(quaternion.IDENTITY, (4, 1)), sigma_axes=[0.1, 0.2, 0.4], **common
-    )
+    x, time = np.array([1.0, 0.0, 0.0]), np.arange(1.0, 5.0)
+    compass = series_of("a", "heading", time, np.tile(x, (4, 1)), x, 0.1)
+    field = series_of("b", "vector", time, np.tile(2.0 * x, (4, 1)), 2.0 * x, 0.2)
+    whole = np.tile(quaternion.IDENTITY, (4, 1))
+    tracker = VectorMeasurements(sensor="c", kind="attitude", time=time, attitude=whole, sigma_axes=[0.1, 0.2, 0.4])
     for series, information in ((compass, 100.0), (field, 200.0), (tracker, 100.0 + 25.0 + 6.25)):
         one = ImuRecord(time=np.array([0.0, 8.0]), increments=np.zeros((1, 3)), vectors=(series,))
         assert setup.measurement_density(one) == pytest.approx(8.0 / (4.0 * information / 3.0))
@@ -192,19 +183,10 @@ def test_the_matched_filter_of_a_scenario_is_consistent():
     runs, last = 60, []
     for run in range(runs):
         record = scenarios.simulate(chosen, 11, run)
-        draw = generator(11, run, "initial error").standard_normal(6)
-        start = setup.initial_state(
-            filter_setup,
-            quaternion.multiply(record.truth.attitude[0], quaternion.exp(-filter_setup.attitude_sigma * draw[:3])),
-            record.truth.bias[0] - filter_setup.bias_sigma * draw[3:],
-        )
+        start = montecarlo.start(record, filter_setup, 11, run)
         estimate = setup.run(record, filter_setup, start, full_covariance=True)
-        error = consistency.errors(
-            estimate.attitude[-1], estimate.bias[-1], record.truth.attitude[-1], record.truth.bias[-1]
-        )
-        last.append(consistency.nees(error, estimate.covariance[-1]))
-    low, high = consistency.mean_bounds(6, runs, 0.99)
-    assert low <= np.mean(last) / 6.0 <= high
+        last.append(consistency.nees(errors_at(estimate, record.truth, -1), estimate.covariance[-1]))
+    assert_inside(np.mean(last) / 6.0, 6, runs)
 
 
 def test_truth_travels_in_the_estimate_file(tmp_path):
@@ -265,24 +247,18 @@ def test_an_estimate_of_a_setup_with_states_holds_them():
     assert np.all(estimate.variance[-1, 5] > 2.0 * plain.variance[-1, 5])
 
 
-# ---------------------------------------------------------------------------------------------------- smoothing
-
-
 @pytest.mark.parametrize("states", [False, True])
 def test_smoothing_by_a_setup_is_that_of_the_smoother(states):
-    chosen = scenarios.load_scenario("spin") if states else scenario(duration=10.0)
-    chosen = dataclasses.replace(chosen, duration=10.0)
+    chosen = dataclasses.replace(scenarios.load_scenario("spin" if states else "coning"), duration=10.0)
     record = scenarios.simulate(chosen, 3)
     filter_setup = setup.FilterSetup.for_scenario(chosen, states=states)
     start = setup.initial_state(filter_setup, record.truth.attitude[0])
     found = setup.smooth(record, filter_setup, start, full_covariance=True)
     modelled = setup.modelled_record(record, filter_setup)
-    if states:
-        blocks = filter_setup.states.blocks({series.sensor: series.kind for series in modelled.vectors})
-        same = estimation.smooth(modelled, filter_setup.process_noise, start, blocks, full_covariance=True)
-        assert list(found.error_states) == [block.name for block in blocks]
-    else:
-        same = estimation.smooth(modelled, filter_setup.process_noise, start, full_covariance=True)
+    kinds = {series.sensor: series.kind for series in modelled.vectors}
+    blocks = filter_setup.states.blocks(kinds) if states else ()
+    same = estimation.smooth(modelled, filter_setup.process_noise, start, blocks, full_covariance=True)
+    assert list(found.error_states or ()) == [block.name for block in blocks]
     np.testing.assert_array_equal(found.attitude, same.attitude)
     np.testing.assert_array_equal(found.covariance, same.covariance)
     plain = setup.run(record, filter_setup, start)

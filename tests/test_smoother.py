@@ -1,7 +1,5 @@
 """Smoother: equal to its fixed-side twin; consistent; never worse than the filter. Least squares: test_error_states_smoother.py."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 
@@ -11,6 +9,7 @@ import mpmath
 import numpy as np
 import pytest
 from in_steps import transition_and_noise
+from measured import assert_inside, drawn_start, errors, recoveries, seen, series_of, unit, waves
 
 from strapdown import coning, consistency, estimation, kinematics, motion, quaternion, records
 from strapdown.checks import InputError
@@ -47,16 +46,14 @@ class Case:
 
 def exact(name, kind, time, reference, sigma, attitude=quaternion.IDENTITY) -> VectorMeasurements:
     """A sensor without errors that is modelled with some."""
-    z = np.broadcast_to(quaternion.rotate(quaternion.conjugate(attitude), reference), (len(time), 3))
-    return VectorMeasurements(sensor=name, kind=kind, time=time, vector_b=z, reference_f=reference, sigma=sigma)
+    z = np.broadcast_to(seen(attitude, reference), (len(time), 3))
+    return series_of(name, kind, time, z, reference, sigma)
 
 
 def measure(name, kind, reference, sigma, time, attitude, rng) -> VectorMeasurements:
     one = exact(name, kind, time, reference, sigma, attitude)
     z = one.vector_b + sigma * rng.standard_normal((len(time), 3))
-    if kind != "vector":
-        z /= np.linalg.norm(z, axis=1, keepdims=True)
-    return dataclasses.replace(one, vector_b=z)
+    return dataclasses.replace(one, vector_b=z if kind == "vector" else unit(z))
 
 
 def simulate(case: Case, rng: np.random.Generator, edges: np.ndarray | None = None) -> ImuRecord:
@@ -83,24 +80,13 @@ def simulate(case: Case, rng: np.random.Generator, edges: np.ndarray | None = No
 
 def simulated(case: Case, rng: np.random.Generator) -> tuple[ImuRecord, estimation.State]:
     record = simulate(case, rng)
-    error = rng.standard_normal(6) * np.repeat([case.attitude_sigma, case.bias_sigma], 3)
-    initial = estimation.initial_state(
-        quaternion.multiply(record.truth.attitude[0], quaternion.exp(-error[:3])),
-        attitude_sigma=case.attitude_sigma,
-        bias_sigma=case.bias_sigma,
-        bias=record.truth.bias[0] - error[3:],
-    )
+    initial = drawn_start(record.truth, rng.standard_normal(6), case.attitude_sigma, case.bias_sigma)
     if case.integration:
         record = records.compress(record, coning.ALGORITHMS[case.integration])
     return record, initial
 
 
-SWAY = motion.HarmonicRates(
-    harmonics=(
-        motion.Harmonic(amplitude=(0.5, 0.2, -0.3), frequency=0.21),
-        motion.Harmonic(amplitude=(-0.2, 0.4, 0.3), frequency=0.37),
-    )
-)
+SWAY = waves(((0.5, 0.2, -0.3), 0.21), ((-0.2, 0.4, 0.3), 0.37))
 TURN = motion.ConstantRate(rate=(0.3, -0.5, 0.8))
 CASES = {
     "directions": Case(
@@ -131,10 +117,6 @@ CASES = {
 }
 
 
-def errors(estimate: Estimate, record: ImuRecord) -> np.ndarray:
-    return consistency.errors(estimate.attitude, estimate.bias, record.truth.attitude, record.truth.bias)
-
-
 def check_consistent(nees: np.ndarray, probability: float, degrees: int = 6) -> None:
     """The mean over runs (runs, epochs) lies inside the two-sided bounds of all epochs together."""
     mean = nees.mean(axis=0) / degrees
@@ -151,10 +133,6 @@ def transition(w: np.ndarray, dt: float, noise: ProcessNoise) -> tuple[np.ndarra
     F[:3, :3], F[:3, 3:] = -kinematics.skew(w), -np.eye(3)
     G = np.diag(np.repeat([noise.angle_random_walk, noise.rate_random_walk], 3))
     return filterpy.common.van_loan_discretization(F, G, dt)
-
-
-def left_jacobian(phi: np.ndarray) -> np.ndarray:
-    return kinematics.right_jacobian(-phi)
 
 
 def side(q: np.ndarray) -> np.ndarray:
@@ -216,7 +194,7 @@ def fixed_side_smoother(record: ImuRecord, noise: ProcessNoise, initial: estimat
             x = K @ y
             P = (np.eye(6) - K @ H) @ P @ (np.eye(6) - K @ H).T + sigma**2 * K @ K.T
             q, b = quaternion.multiply(quaternion.exp(x[:3]), q), b + x[3:]
-            G = on_attitude(left_jacobian(x[:3]))
+            G = on_attitude(kinematics.right_jacobian(-x[:3]))
             P = G @ P @ G.T
         filtered.append((q, b, P))
         at_edge.append(now in record.time)
@@ -224,11 +202,11 @@ def fixed_side_smoother(record: ImuRecord, noise: ProcessNoise, initial: estimat
     for (q, b, P), (q_pred, b_pred, P_pred, F) in zip(filtered[-2::-1], steps[::-1], strict=True):
         q_next, b_next, P_next = rows[-1]
         a = quaternion.log(quaternion.multiply(q_next, quaternion.conjugate(q_pred)))
-        G = np.linalg.inv(on_attitude(left_jacobian(a)))
+        G = np.linalg.inv(on_attitude(kinematics.right_jacobian(-a)))
         C = np.linalg.solve(P_pred, F @ P).T
         x = C @ np.concatenate([a, b_next - b_pred])
         after = P + C @ (G @ P_next @ G.T - P_pred) @ C.T
-        G = on_attitude(left_jacobian(x[:3]))
+        G = on_attitude(kinematics.right_jacobian(-x[:3]))
         rows.append((quaternion.multiply(quaternion.exp(x[:3]), q), b + x[3:], G @ after @ G.T))
     kept = [row for row, edge in zip(rows[::-1], at_edge, strict=True) if edge]
     covariance = np.array([side(q).T @ P @ side(q) for q, _, P in kept])
@@ -270,10 +248,10 @@ def test_consistent_and_better_than_the_filter(name: str) -> None:
         smoothed = estimation.smooth(record, case.noise, initial, full_covariance=True)
         filtered = estimation.run(record, case.noise, initial)
         epochs = np.linspace(0, len(record.time) - 1, 6).astype(int)
-        e, P = errors(smoothed, record), smoothed.covariance
+        e, P = errors(smoothed, record.truth), smoothed.covariance
         parts = (slice(0, 6), slice(0, 3), slice(3, 6))
         nees.append([consistency.nees(e[:, s], P[:, s, s])[epochs] for s in parts])
-        squares.append([e**2 / filtered.variance, errors(filtered, record) ** 2 / filtered.variance])
+        squares.append([e**2 / filtered.variance, errors(filtered, record.truth) ** 2 / filtered.variance])
     for of_part, degrees in zip(np.swapaxes(nees, 0, 1), (6, 3, 3), strict=True):
         check_consistent(of_part, 0.999, degrees)
     smoothed_square, filtered_square = np.mean(squares, axis=(0, 2, 3))
@@ -289,7 +267,7 @@ def test_consistent_over_many_runs(name: str) -> None:
         record, initial = simulated(case, rng)
         smoothed = estimation.smooth(record, case.noise, initial, full_covariance=True)
         epochs = np.linspace(0, len(record.time) - 1, 6).astype(int)
-        nees.append(consistency.nees(errors(smoothed, record)[epochs], smoothed.covariance[epochs]))
+        nees.append(consistency.nees(errors(smoothed, record.truth)[epochs], smoothed.covariance[epochs]))
     check_consistent(np.array(nees), 0.99)
 
 
@@ -304,7 +282,7 @@ def test_a_wrong_gyro_model_is_outside(wrong: float, above: bool) -> None:
         record, initial = simulated(case, rng)
         middle = len(record.time) // 2
         estimate = estimation.smooth(record, noise, initial, full_covariance=True)
-        nees.append(consistency.nees(errors(estimate, record)[middle], estimate.covariance[middle]))
+        nees.append(consistency.nees(errors(estimate, record.truth)[middle], estimate.covariance[middle]))
     low, high = consistency.mean_bounds(6, 60)
     mean = np.mean(nees) / 6.0
     assert mean > high if above else mean < low
@@ -365,7 +343,7 @@ def test_a_start_half_way_round_is_survived() -> None:
         )
         if angle < 2.0:
             late = record.time > 10.0
-            assert np.all(np.abs(errors(estimate, record)[late]) < 8.0 * estimate.sigma[late])
+            assert np.all(np.abs(errors(estimate, record.truth)[late]) < 8.0 * estimate.sigma[late])
 
 
 def filtered_segments(record, noise, initial):
@@ -415,12 +393,6 @@ def far_off(seed: int, sensors: tuple = WELL_SEEN.sensors) -> tuple[ImuRecord, e
     return record, dataclasses.replace(initial, attitude=quaternion.multiply(record.truth.attitude[0], turn))
 
 
-def recovery_of(estimate: Estimate) -> records.Event:
-    found = [event for event in estimate.events if event.kind == "recovery"]
-    assert len(found) == 1
-    return found[0]
-
-
 def with_a_turn(record: ImuRecord, edge: int, turn: np.ndarray) -> ImuRecord:
     """The record with a turn that the gyro did not see at an edge: after it the body's axes are others, q ⊗ turn."""
     back, when = quaternion.conjugate(turn), record.time[edge]
@@ -446,12 +418,12 @@ def test_a_lost_stretch_is_reported_by_what_was_measured_from_its_beginning_on()
     record, initial = far_off(1)
     filtered = estimation.run(record, NOISE, initial, gate=GATE, full_covariance=True)
     smoothed = estimation.smooth(record, NOISE, initial, gate=GATE, full_covariance=True)
-    event = recovery_of(filtered)
+    (event,) = recoveries(filtered)
     assert smoothed.events == filtered.events
     first, last = np.searchsorted(record.time, [event.start, event.end])
     assert last - first > 10
-    assert np.min(np.max(np.abs(errors(filtered, record) / filtered.sigma)[first:last], axis=1)) > 10.0
-    assert np.max(np.abs(errors(smoothed, record) / smoothed.sigma)[first:]) < 5.0
+    assert np.min(np.max(np.abs(errors(filtered, record.truth) / filtered.sigma)[first:last], axis=1)) > 10.0
+    assert np.max(np.abs(errors(smoothed, record.truth) / smoothed.sigma)[first:]) < 5.0
     # The end state is the filter's, and what came before the first refusal has not heard of what came after.
     for name in ("attitude", "bias", "covariance"):
         np.testing.assert_array_equal(getattr(smoothed, name)[-1], getattr(filtered, name)[-1])
@@ -465,10 +437,10 @@ def test_of_a_filter_that_is_lost_on_its_way_the_part_before_is_smoothed_too() -
     middle = 120
     record = with_a_turn(record, middle, quaternion.exp([0.0, 1.2, 0.7]))
     both = estimation.smooth(record, NOISE, initial, gate=GATE, full_covariance=True)
-    event = recovery_of(both)
+    (event,) = recoveries(both)
     first = int(np.searchsorted(record.time, event.start))
     assert middle <= first < middle + 8
-    off = np.abs(errors(both, record) / both.sigma)
+    off = np.abs(errors(both, record.truth) / both.sigma)
     assert np.max(off[:middle]) < 5.0
     assert np.max(off[first:]) < 5.0
     # Before it: the smoother of the record that ends with the first refusal, whose measurement was not processed.
@@ -491,14 +463,14 @@ def test_what_lies_between_the_first_refusal_and_the_last_candidate_is_the_filte
     record = dataclasses.replace(record, vectors=tuple(vectors))
     filtered = estimation.run(record, NOISE, initial, gate=GATE, full_covariance=True)
     smoothed = estimation.smooth(record, NOISE, initial, gate=GATE, full_covariance=True)
-    event = recovery_of(smoothed)
+    (event,) = recoveries(smoothed)
     assert event.start < 0.1
     between = (record.time > event.start) & (record.time < 0.6)
     for name in ("attitude", "bias", "covariance"):
         np.testing.assert_array_equal(getattr(smoothed, name)[between], getattr(filtered, name)[between])
     after = record.time > 0.7
     assert event.end > 0.8
-    assert np.max(np.abs(errors(smoothed, record) / smoothed.sigma)[after]) < 5.0
+    assert np.max(np.abs(errors(smoothed, record.truth) / smoothed.sigma)[after]) < 5.0
 
 
 def test_several_recoveries_and_a_record_in_parts() -> None:
@@ -508,14 +480,14 @@ def test_several_recoveries_and_a_record_in_parts() -> None:
     whole = estimation.smooth(twice, NOISE, initial, gate=GATE, full_covariance=True)
     assert [event.kind for event in whole.events] == ["recovery", "recovery"]
     first, second = np.searchsorted(record.time, [event.start for event in whole.events])
-    off = np.max(np.abs(errors(whole, twice) / whole.sigma), axis=1)
+    off = np.max(np.abs(errors(whole, twice.truth) / whole.sigma), axis=1)
     assert np.max(off[first:120]) < 5.0
     assert np.max(off[second:]) < 5.0
     middle = int(np.searchsorted(record.time, whole.events[0].end)) - 8
     _, state = estimation.run_part(records.cut(twice, 0, middle), NOISE, initial, gate=GATE)
     rest = records.cut(twice, middle, len(twice.time) - 1)
     part = estimation.smooth(rest, NOISE, state, gate=GATE, full_covariance=True)
-    off = np.max(np.abs(errors(part, rest) / part.sigma), axis=1)
+    off = np.max(np.abs(errors(part, rest.truth) / part.sigma), axis=1)
     assert np.max(off[: 120 - middle]) < 5.0
     assert part.events == whole.events
 
@@ -526,17 +498,16 @@ def nees_of_recoveries(runs: int) -> np.ndarray:
     for run in range(runs):
         record, initial = far_off(100 + run)
         both = estimation.smooth(record, NOISE, initial, gate=GATE, full_covariance=True)
-        event = recovery_of(both)
+        (event,) = recoveries(both)
         first, last = np.searchsorted(record.time, [event.start, event.end])
         rows = [(first + last) // 2, last, 200]
-        nees.append(consistency.nees(errors(both, record)[rows], both.covariance[rows]))
+        nees.append(consistency.nees(errors(both, record.truth)[rows], both.covariance[rows]))
     return np.array(nees)
 
 
 def test_lost_stretches_are_consistent() -> None:
     mean = nees_of_recoveries(40).mean(axis=0) / 6.0
-    low, high = consistency.mean_bounds(6, 40, 0.999)
-    assert np.all((low < mean) & (mean < high)), (mean, low, high)
+    assert_inside(mean, 6, 40, 0.999)
 
 
 @pytest.mark.slow
@@ -721,21 +692,6 @@ def test_edges_are_found_exactly() -> None:
         found = np.empty(len(edges), np.int64)
         smoother_loop.locate_edges(edges, events, np.diff(at)[:, None], len(at) - 1, found)
         np.testing.assert_array_equal(found, np.searchsorted(at, edges))
-
-
-@pytest.mark.parametrize("name", ["record", "process_noise", "initial", "gate"])
-def test_what_is_no_argument_is_refused_by_name(name):
-    given = {"record": None, "process_noise": None, "initial": None, "gate": 0.999}
-    time = np.arange(3.0)
-    right = {
-        "record": ImuRecord(time=time, increments=np.zeros((2, 3))),
-        "process_noise": estimation.ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-6),
-        "initial": estimation.initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=0.1, bias_sigma=1e-3),
-    }
-    wrong = {**right, name: given[name]}
-    record, noise, initial = (wrong.pop(one) for one in ("record", "process_noise", "initial"))
-    with pytest.raises(InputError, match=name):
-        estimation.smooth(record, noise, initial, **wrong)
 
 
 # ----------------------------------------------------------------------------------------------------------- sigmas of any magnitude

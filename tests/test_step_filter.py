@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from filterpy.common import Saver
 from gated_steps import GatedStepFilter
+from measured import resting, series_of
 
 from strapdown import estimation, motion, quaternion, records
 from strapdown.checks import InputError
@@ -18,7 +19,6 @@ from strapdown.estimation.states import ProcessNoise, initial_state
 from strapdown.estimation.step_filter import StepFilter
 from strapdown.gyro import GyroSpec
 from strapdown.randomness import generator
-from strapdown.records import ImuRecord
 from strapdown.scenarios import Scenario, simulate
 from strapdown.vectors import AttitudeSensor, Faults, VectorMeasurements, VectorSensor
 
@@ -66,19 +66,8 @@ def handed_over(record, initial, states=(), **options):
     """Run the filter over a record."""
     names = {"sensors": [s.sensor for s in record.vectors]} if states else {}
     face = GatedStepFilter if options.keys() & {"gate", "robust"} else StepFilter
-    f = face(NOISE, initial, states, time=record.time[0], **{**names, **options})
-    queue = sorted((t, i, k) for i, s in enumerate(record.vectors) for k, t in enumerate(s.time))
-    for n, delta in enumerate(record.increments):
-        now, end = record.time[n], record.time[n + 1]
-        whole = end - now
-        while queue and queue[0][0] <= end:
-            time, i, k = queue.pop(0)
-            if time > now:
-                f.predict(delta * ((time - now) / whole), time=time)
-                now = time
-            in_steps.update(f, record.vectors[i], k)
-        if end > now:
-            f.predict(delta * ((end - now) / whole), time=end)
+    f = face(NOISE, initial, states, time=record.time[0], **names, **options)
+    in_steps.fed(f, record)
     return f
 
 
@@ -95,13 +84,12 @@ def begun(record, option):
     return initial_state(attitude, attitude_sigma=1e-2 if option == "lost" else 0.1, bias_sigma=3e-3)
 
 
-@pytest.mark.parametrize(
-    ("states", "option"), [(states, option) for states in ("none", "bias, drift and sway") for option in OPTIONS]
-)
+@pytest.mark.parametrize("states", STATES)
+@pytest.mark.parametrize("option", OPTIONS)
 def test_measurements_at_common_stamps_are_processed_as_the_record_s(states, option):
     record, given, blocks = record_of(1.2 if states != "none" else 2.0), OPTIONS[option], STATES[states]
     initial = begun(record, option)
-    face = handed_over(record, initial, blocks, sensors=[s.sensor for s in record.vectors], **given)
+    face = handed_over(record, initial, blocks, **given)
     estimate = estimation.run(record, NOISE, initial, blocks, **given)
     assert quaternion.angle_between(estimate.attitude[-1], face.attitude) < (1e-9 if blocks else 1e-10)
     if blocks:
@@ -109,11 +97,6 @@ def test_measurements_at_common_stamps_are_processed_as_the_record_s(states, opt
 
 
 IRON, DRIFT, SWAY = STATES["bias, drift and sway"]
-
-
-def test_names_of_sensors_are_a_sequence():
-    with pytest.raises(InputError, match=r"sensors is 'first'; it must be a sequence"):
-        StepFilter(NOISE, start(), sensors="first")
 
 
 # ------------------------------------------------------------------------------------------------------------------ the clock
@@ -192,10 +175,8 @@ def test_a_whole_vector_updates_in_its_own_unit_as_the_record_s(unit):
     reference, value = unit * np.array([0.0, 0.6, -0.8]), unit * np.array([0.05, 0.58, -0.83])
     f = StepFilter(NOISE, start())
     assert f.update_vector(value, reference, 0.01 * unit, "mag")
-    series = VectorMeasurements(
-        sensor="mag", kind="vector", time=[0.0], vector_b=[value], reference_f=reference, sigma=0.01 * unit
-    )
-    record = ImuRecord(time=[0.0, 1.0], increments=np.zeros((1, 3)), vectors=(series,))
+    series = series_of("mag", "vector", [0.0], [value], reference, 0.01 * unit)
+    record = resting(series)
     found = estimation.run(record, NOISE, start(), full_covariance=True)
     assert quaternion.angle_between(f.attitude, found.attitude[0]) < 1e-12
     np.testing.assert_allclose(f.bias, found.bias[0], rtol=1e-9, atol=1e-15)
@@ -237,8 +218,9 @@ def test_the_sensors_of_a_filter_with_error_states_can_be_named():
         face.update_direction(UP, UP, 0.1, "up")
     with pytest.raises(InputError, match=r"mag bias: sensor 'mag' is not known; did you mean 'Mag'"):
         StepFilter(NOISE, start(), (block,), sensors=("acc", "Mag"))
-    with pytest.raises(InputError, match="sensors is 'mag'; it must be a sequence"):
-        StepFilter(NOISE, start(), (block,), sensors="mag")
+    for blocks in ((block,), ()):
+        with pytest.raises(InputError, match="sensors is 'mag'; it must be a sequence"):
+            StepFilter(NOISE, start(), blocks, sensors="mag")
     # Blocks that are about no sensor leave the names free.
     free = StepFilter(NOISE, start(), (error_states.GyroScale(scale_sigma=0.01, misalignment_sigma=0.01),))
     assert free.update_direction(UP, UP, 0.1)
@@ -285,9 +267,7 @@ VERTICAL_OPTIONS = [{}, {"gate": Gate(recovery=2)}, {"robust": Robust()}]
 
 
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize(
-    "options", [{}, {"gate": Gate(recovery=2)}, {"robust": Robust()}], ids=["plain", "gate", "robust"]
-)
+@pytest.mark.parametrize("options", VERTICAL_OPTIONS, ids=["plain", "gate", "robust"])
 def test_a_vertical_measured_heading_is_skipped_and_counted(options):
     f = GatedStepFilter(NOISE, start(), **options)
     for k in range(1, 6):
@@ -299,39 +279,44 @@ def test_a_vertical_measured_heading_is_skipped_and_counted(options):
     assert f.update_heading(X, X, 0.1, sensor="north")
 
 
+UNBIASED = (error_states.VectorBias(sensor="up", bias_sigma=1e-3),)
+
+
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("options", VERTICAL_OPTIONS, ids=["plain", "gate", "robust"])
-def test_both_faces_skip_a_vertical_heading_alike(options):
+@pytest.mark.parametrize("blocks", [(), UNBIASED], ids=["no states", "states"])
+def test_both_faces_skip_a_vertical_heading_and_a_missing_sample_alike(blocks, options):
     """One heading in two is measured of a vertical vector; the run is that of the record without them, and says how many."""
     time = 0.1 * np.arange(1.0, 9.0)
-    vertical = np.arange(8) % 2 == 0
-    seen = np.where(vertical[:, None], UP, X)
-    north = VectorMeasurements(sensor="north", kind="heading", time=time, vector_b=seen, reference_f=X, sigma=0.1)
-    up = VectorMeasurements(sensor="up", kind="direction", time=time, vector_b=[UP] * 8, reference_f=UP, sigma=0.1)
-    edges = ImuRecord(time=np.linspace(0.0, 1.0, 11), increments=np.zeros((10, 3)), vectors=(north, up))
-    rest = replace(edges, vectors=(north.taken(~vertical), up))
-    both, without = (estimation.run(r, NOISE, start(), full_covariance=True, **options) for r in (edges, rest))
-    assert both.skipped == {"north": 4, "up": 0}
+    vertical, lost = np.arange(8) % 2 == 0, np.arange(8) == 3
+    seen, up = np.where(vertical[:, None], UP, X), np.where(lost[:, None], np.nan, UP)
+    north, level = series_of("north", "heading", time, seen, X, 0.1), series_of("up", "direction", time, up, UP, 0.1)
+    edges = resting(north, level, time=np.linspace(0.0, 1.0, 11))
+    rest = replace(edges, vectors=(north.taken(~vertical), level.taken(~lost)))
+    both, without = (estimation.run(r, NOISE, start(), blocks, full_covariance=True, **options) for r in (edges, rest))
+    assert both.skipped == {"north": 4, "up": 1}
     assert both.refused == {"north": 0, "up": 0}
     assert both.events == without.events
     assert np.array_equal(both.innovations["north"].time, time[~vertical])
     assert np.array_equal(both.innovations["north"].nis, without.innovations["north"].nis)
     assert np.array_equal(both.covariance, without.covariance)
-    f = GatedStepFilter(NOISE, start(), **options)
+    assert estimation.smooth(edges, NOISE, start(), blocks, **options).skipped == both.skipped
+    f = GatedStepFilter(NOISE, start(), blocks, sensors=("north", "up"), **options)
     for k, t in enumerate(time):
         f.predict(np.zeros(3), time=t)
         f.update_heading(seen[k], X, 0.1, sensor="north")
-        f.update_direction(UP, UP, 0.1, sensor="up")
-    assert f.skipped == {"north": 4}
-    assert np.allclose(f.P, both.covariance[8], rtol=1e-10, atol=1e-18)
+        f.update_direction(up[k], UP, 0.1, sensor="up")
+    assert f.skipped == both.skipped
+    assert np.allclose(f.P[:6, :6], both.covariance[8], rtol=1e-10, atol=1e-18)
 
 
 NAN = np.full(3, np.nan)
 
 
+@pytest.mark.parametrize("blocks", [(), UNBIASED], ids=["no states", "states"])
 @pytest.mark.parametrize("kind", ["direction", "vector", "heading", "attitude"])
-def test_a_missing_sample_is_skipped_and_counted(kind):
-    f = StepFilter(NOISE, start())
+def test_a_missing_sample_is_skipped_and_counted(kind, blocks):
+    f = StepFilter(NOISE, start(), blocks, sensors=("up", "s"))
     f.predict(np.zeros(3), time=0.5)
     P, noise = f.P.copy(), np.nan
     for value in (NAN, [0.0, np.nan, 1.0]):
@@ -342,8 +327,8 @@ def test_a_missing_sample_is_skipped_and_counted(kind):
         assert taken is False
     assert f.skipped == {"s": 2}
     assert np.array_equal(f.P, P)
-    for bad in (lambda: f.update_direction([np.inf, 0.0, 0.0], X, 0.1), lambda: f.update_direction(X, X, np.nan)):
-        refusal(bad)
+    for value, sigma in (([np.inf, 0.0, 0.0], 0.1), (X, np.nan)):
+        refusal(lambda value=value, sigma=sigma: f.update_direction(value, X, sigma, "s"))
 
 
 def test_missing_attitudes_are_counted_and_leave_the_others_as_they_are():
@@ -435,20 +420,10 @@ def test_saver_and_pickle(states):
 
 # ------------------------------------------------------------------------------------------------------------ what is no argument
 
-SERIES = VectorMeasurements(sensor="s", kind="direction", time=[0.5], vector_b=[X], reference_f=X, sigma=0.1)
-RECORD = ImuRecord(time=[0.0, 1.0], increments=np.zeros((1, 3)), vectors=(SERIES,))
+SERIES = series_of("s", "direction", [0.5], [X], X, 0.1)
+RECORD = resting(SERIES)
 
 WRONG = {
-    "gate by its probability": (lambda: estimation.run(RECORD, NOISE, start(), gate=0.999), "gate is 0.999, .*Gate"),
-    "robust by its name": (
-        lambda: estimation.run(RECORD, NOISE, start(), robust="huber"),
-        "robust is 'huber', .*Robust",
-    ),
-    "no start": (lambda: estimation.run(RECORD, NOISE, None), "initial is None, .*initial_state"),
-    "noise as a number": (lambda: estimation.run(RECORD, 1e-4, start()), "process_noise is 0.0001, .*ProcessNoise"),
-    "gate, stepping": (lambda: GatedStepFilter(NOISE, start(), gate=0.999), "gate is 0.999"),
-    "robust, stepping": (lambda: GatedStepFilter(NOISE, start(), robust="huber"), "robust is 'huber'"),
-    "no start, stepping": (lambda: StepFilter(NOISE, None), "initial is None"),
     "two sigmas": (
         lambda: initial_state(IDENTITY, attitude_sigma=[1.0, 2.0], bias_sigma=1.0),
         r"attitude_sigma has shape \(2,\); give one number, or three",
@@ -458,10 +433,15 @@ WRONG = {
         r"bias_sigma has shape \(2,\)",
     ),
     "sigma in words": (lambda: initial_state(IDENTITY, attitude_sigma="1°", bias_sigma=1.0), "attitude_sigma is not"),
+    "a bare block": (lambda: StepFilter(NOISE, start(), UNBIASED[0]), "single declaration .*; give a tuple"),
+    "a bare block of a start": (
+        lambda: estimation.with_error_states(start(), UNBIASED[0]),
+        "single declaration .*; give a tuple",
+    ),
     "sigma (2,)": (lambda: StepFilter(NOISE, start()).update_direction(X, X, [0.1, 0.1]), r"sigma has shape \(2,\)"),
     "sigma (3, 3)": (lambda: StepFilter(NOISE, start()).update_direction(X, X, np.eye(3)), "as covariance"),
-    "a bare series": (lambda: ImuRecord(time=[0.0, 1.0], increments=np.zeros((1, 3)), vectors=SERIES), r"\(series,\)"),
-    "no series": (lambda: ImuRecord(time=[0.0, 1.0], increments=np.zeros((1, 3)), vectors=(X,)), r"vectors\[0\] is"),
+    "a bare series": (lambda: replace(RECORD, vectors=SERIES), r"\(series,\)"),
+    "no series": (lambda: resting(X), r"vectors\[0\] is"),
     "an unknown algorithm": (lambda: records.compress(RECORD, "two-samples"), "did you mean 'two-sample'"),
 }
 
@@ -476,13 +456,7 @@ FACES = {
     "filters.run": lambda *given: filters.run("usque", *given),
     "filters.compare": filters.compare,
 }
-WRONG_ARGUMENTS = {
-    "record": None,
-    "process_noise": None,
-    "initial": None,
-    "gate": 0.999,
-    "robust": "huber",
-}
+WRONG_ARGUMENTS = {"record": None, "process_noise": 1e-4, "initial": None, "gate": 0.999, "robust": "huber"}
 
 
 def wants(face, name):
@@ -498,7 +472,9 @@ def wants(face, name):
 def test_every_face_refuses_what_is_no_argument(face, name):
     given = {"record": RECORD, "process_noise": NOISE, "initial": start(), name: WRONG_ARGUMENTS[name]}
     three = [given.pop(one) for one in ("record", "process_noise", "initial")]
-    with pytest.raises(InputError, match=f"^{name} is {WRONG_ARGUMENTS[name]!r}, not of class"):
+    of_class = {"record": "ImuRecord", "process_noise": "ProcessNoise", "initial": "State", "gate": "Gate"}
+    message = f"^{name} is {WRONG_ARGUMENTS[name]!r}, not of class {of_class.get(name, 'Robust')}; "
+    with pytest.raises(InputError, match=message):
         FACES[face](*three, **given)
 
 

@@ -1,7 +1,5 @@
 """Tables of studies: CSV that reads back to the bit, LaTeX that compiles, and the commands that write both, and figures in every format."""
 
-from __future__ import annotations
-
 import csv
 import json
 import math
@@ -20,6 +18,7 @@ from strapdown import cli
 from strapdown.checks import InputError
 from strapdown.report.tables import Table, to_csv, to_latex, write
 
+FEW = ("--free", "star 1.sigma", "--starts", 1)
 LATEX = next((path for name in ("pdflatex", "lualatex", "tectonic") if (path := shutil.which(name))), None)
 CELLS = st.one_of(
     st.none(),
@@ -108,19 +107,7 @@ def written(tmp_path_factory):
         "allan": [rest, "--rate", 100, "--gyro-unit", "rad/s", "--format", "svg", "--out", where / "allan"],
         "montecarlo": [where / "short.toml", "--runs", 8, "--out", where / "mc.h5"],
         "simulate": [where / "short.toml", "--out", where / "record.h5"],
-        "tune": [
-            where / "record.h5",
-            "--free",
-            "star 1.sigma",
-            "--holdout",
-            0.3,
-            "--starts",
-            1,
-            "--format",
-            "svg",
-            "--out",
-            where / "filter.toml",
-        ],
+        "tune": [where / "record.h5", *FEW, "--holdout", 0.3, "--format", "svg", "--out", where / "filter.toml"],
         "estimate": [where / "record.h5", "--format", "pdf", "--out", where / "estimate"],
     }
     for name, options in commands.items():

@@ -1,7 +1,5 @@
 """Tuning: the likelihood and its derivatives against independent filters, the search, what is identified, what is held out."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import math
@@ -12,8 +10,9 @@ import mpmath
 import numpy as np
 import pytest
 import two_stars
+from measured import series_of
 from scipy.optimize import brentq
-from two_stars import ARW, BELIEVED, FREE, RRW, case, scenario
+from two_stars import ANGLES, ARW, BELIEVED, FREE, KINDS, RRW, angle_case, case, differences, every_kind, scenario
 
 from strapdown import consistency, gyro, motion, quaternion, scenarios, tuning, units, vectors
 from strapdown.checks import InputError
@@ -25,48 +24,13 @@ from strapdown.estimation.states import ProcessNoise
 from strapdown.kernels import likelihood
 from strapdown.kernels.lane_values import WIDTH
 from strapdown.kernels.series import LARGEST_ANGLE
-from strapdown.records import ImuRecord, Truth
+from strapdown.records import ImuRecord
 from strapdown.tuning import fitting, innovations, parameters, planning
 from strapdown.tuning.parameters import own_sigma
 from strapdown.vectors import VectorMeasurements
 
-
-def every_kind(seed: int = 0) -> ImuRecord:
-    """A record that turns fast enough for sub-steps, with one series of each kind, samples missing and at odd times."""
-    body = motion.ConstantRate(rate=np.array([0.4, -0.7, 1.1]))
-    random = np.random.default_rng(seed)
-    edges = np.cumsum(np.concatenate([[0.0], random.uniform(0.2, 0.6, 120)]))
-    output = gyro.simulate(
-        gyro.GyroSpec(angle_random_walk=1e-3, rate_random_walk=1e-4), body.increments(edges), edges, random
-    )
-    span = (float(edges[0]), float(edges[-1]))
-    sensors = (
-        vectors.VectorSensor(name="sun", reference_f=np.array([0.0, 0.6, 0.8]), sigma=1e-2, rate=1.3),
-        vectors.Accelerometer(name="up", sigma=0.2, rate=1.0, kind="vector"),
-        vectors.Magnetometer(name="north", field_f=np.array([2e-5, 1e-5, -3e-5]), sigma=1e-6, rate=0.7, kind="heading"),
-        vectors.AttitudeSensor(name="tracker", sigma_across=5e-3, sigma_about=2e-2, rate=0.5),
-    )
-    series = [sensor.observe(body, *span, random) for sensor in sensors]
-    gaps = series[0].vector_b.copy()
-    gaps[3:5] = np.nan
-    series[0] = dataclasses.replace(series[0], vector_b=gaps)
-    truth = Truth(attitude=body.attitude(edges), bias=output.bias)
-    return ImuRecord(time=edges, increments=output.increments, vectors=tuple(series), truth=truth)
-
-
-KINDS = FilterSetup(
-    process_noise=ProcessNoise(angle_random_walk=1e-3, rate_random_walk=1e-4), attitude_sigma=0.3, bias_sigma=1e-2
-)
-ALL = (
-    "gyro.arw",
-    "gyro.rrw",
-    "sun.sigma",
-    "up.sigma",
-    "north.sigma",
-    "tracker.sigma",
-    "initial.attitude",
-    "initial.bias",
-)
+SENSORS = ("sun.sigma", "up.sigma", "north.sigma", "tracker.sigma")
+ALL = ("gyro.arw", "gyro.rrw", *SENSORS, "initial.attitude", "initial.bias")
 
 
 def plain(record: ImuRecord, chosen: FilterSetup, attitude: np.ndarray, bias: np.ndarray) -> float:
@@ -175,22 +139,6 @@ def test_several_records_add_up_on_any_number_of_threads():
     np.testing.assert_allclose(found.information, sum(one.information for one in sums), rtol=1e-5, atol=1e-5)
 
 
-def axis_records(n: int = 40, sigma: float = 1e-6) -> tuple[ImuRecord, np.ndarray, np.ndarray]:
-    """A body at rest to within microradians, its whole attitude measured: three axes apart, linear to 1e-6. Gyro and measured angles."""
-    random = np.random.default_rng(4)
-    dt = 0.5
-    increments = 3e-7 * random.standard_normal((n, 3))
-    angles = np.cumsum(increments, axis=0) + sigma * random.standard_normal((n, 3))
-    series = VectorMeasurements(
-        sensor="tracker",
-        kind="attitude",
-        time=dt * np.arange(1, n + 1),
-        attitude=quaternion.exp(angles),
-        sigma_axes=np.full(3, sigma),
-    )
-    return ImuRecord(time=dt * np.arange(n + 1), increments=increments, vectors=(series,)), increments, angles
-
-
 def linear_likelihood(white, walk, sigma, first, drift, increments, angles, dt=0.5):
     """Minus the log likelihood of a plain Kalman filter of (angle, bias), one axis after the other, in any arithmetic."""
     total = 0
@@ -213,13 +161,9 @@ def linear_likelihood(white, walk, sigma, first, drift, increments, angles, dt=0
 
 
 def test_in_the_linear_case_it_is_the_kalman_filter_with_its_derivatives_to_many_digits():
-    record, increments, angles = axis_records()
-    chosen = FilterSetup(
-        process_noise=ProcessNoise(angle_random_walk=8e-7, rate_random_walk=2e-7), attitude_sigma=2e-6, bias_sigma=1e-6
-    )
+    one, increments, angles = angle_case(40)
     names = ("gyro.arw", "gyro.rrw", "tracker.sigma", "initial.attitude", "initial.bias")
-    start = tuning.Case(record=record, initial=setup.initial_state(chosen, np.array([1.0, 0.0, 0.0, 0.0])))
-    objective = tuning.likelihood([start], chosen, names)
+    objective = tuning.likelihood([one], ANGLES, names)
     found = objective.derivatives(objective.start)
     with mpmath.workdps(40):
         values = [mpmath.mpf(float(x)) for x in objective.start]
@@ -235,16 +179,6 @@ def test_in_the_linear_case_it_is_the_kalman_filter_with_its_derivatives_to_many
             assert found.score.sum(axis=0)[j] == pytest.approx(
                 expected, abs=2.0 * innovations.STEP * max(found.information[j, j], abs(expected), 1.0)
             )
-
-
-def differences(value, point, step=1e-3):
-    """Gradient by central differences of fourth order."""
-    rows = []
-    for j in range(len(point)):
-        unit = step * np.eye(len(point))[j]
-        f = [value(point + k * unit) for k in (-2, -1, 1, 2)]
-        rows.append((f[0] - 8.0 * f[1] + 8.0 * f[2] - f[3]) / (12.0 * step))
-    return np.array(rows)
 
 
 @pytest.mark.parametrize("free", [ALL, ALL[:3], ("filter.scale",)], ids=["eight", "three", "scale"])
@@ -297,15 +231,6 @@ def test_a_common_scale_leaves_the_estimates_and_multiplies_the_variances():
     two = setup.run(start.record, chosen, setup.initial_state(chosen, start.initial.attitude, start.initial.bias))
     np.testing.assert_allclose(two.attitude, one.attitude, atol=1e-9)
     np.testing.assert_allclose(two.variance, 4.0 * one.variance, rtol=1e-6)
-    # Correlations between attitude and bias at the start are scaled along.
-    size = np.array([0.3, 0.3, 0.3, 1e-2, 1e-2, 1e-2])
-    P = np.outer(size, size) * (np.eye(6) + 0.8 * np.eye(6, k=3) + 0.8 * np.eye(6, k=-3))
-    tied = dataclasses.replace(start, initial=dataclasses.replace(start.initial, covariance=P))
-    wide = dataclasses.replace(start.initial, covariance=4.0 * P)
-    whole = setup.run(start.record, chosen, wide)
-    expected = sum(0.5 * np.sum(np.log(i.variance) + i.innovation**2 / i.variance) for i in whole.innovations.values())
-    found = tuning.likelihood([tied], KINDS, ["filter.scale"]).minus_log(np.log([[2.0]]))[0]
-    assert found == pytest.approx(expected, rel=1e-10)
     squares = sum(float(innovation.nis.sum()) for innovation in one.innovations.values())
     number = sum(innovation.innovation.size for innovation in one.innovations.values())
     # Closed form of the best scale: the root of the mean of e²/s.
@@ -323,14 +248,7 @@ def test_thinned_measurements_weigh_as_much_as_all():
     assert tuning.thinned(thin, 0.1) is thin
     # The likelihood of a record is that of its thinned series, at less than a second too.
     time = 0.1 * np.arange(1, 100)
-    star = VectorMeasurements(
-        sensor="star",
-        kind="direction",
-        time=time,
-        vector_b=np.tile([1.0, 0.0, 0.0], (99, 1)),
-        reference_f=[1.0, 0, 0],
-        sigma=1e-3,
-    )
+    star = series_of("star", "direction", time, np.tile([1.0, 0.0, 0.0], (99, 1)), [1.0, 0, 0], 1e-3)
     record = ImuRecord(time=0.1 * np.arange(101), increments=np.zeros((100, 3)), vectors=(star,))
     sparse = dataclasses.replace(record, vectors=(tuning.thinned(star, 0.5),))
     assert len(sparse.vectors[0].time) == 20
@@ -354,13 +272,8 @@ def test_thinning_finds_the_sigma_that_disturbances_which_last_ask_for():
         error = np.repeat(1e-3 * random.standard_normal((120, 3)), 10, axis=0)[: len(time)]
         seen = quaternion.rotate(quaternion.conjugate(body), np.array(reference)) + error
         series.append(
-            VectorMeasurements(
-                sensor=name,
-                kind="direction",
-                time=time,
-                vector_b=seen / np.linalg.norm(seen, axis=1, keepdims=True),
-                reference_f=np.array(reference),
-                sigma=np.full(len(time), 1e-3),
+            series_of(
+                name, "direction", time, seen / np.linalg.norm(seen, axis=1, keepdims=True), np.array(reference), 1e-3
             )
         )
     record = dataclasses.replace(record, vectors=tuple(series))
@@ -396,14 +309,7 @@ def white_noise(n: int, seed: int = 3) -> tuple[tuning.Case, np.ndarray]:
     random = np.random.default_rng(seed)
     noise = 1e-3 * random.standard_normal((n, 2))
     seen = np.column_stack([noise, np.sqrt(1.0 - np.sum(noise**2, axis=1))])
-    series = VectorMeasurements(
-        sensor="star",
-        kind="direction",
-        time=np.arange(1.0, n + 1.0),
-        vector_b=seen,
-        reference_f=np.array([0.0, 0.0, 1.0]),
-        sigma=np.full(n, 2e-3),
-    )
+    series = series_of("star", "direction", np.arange(1.0, n + 1.0), seen, [0.0, 0.0, 1.0], 2e-3)
     record = ImuRecord(time=np.arange(n + 1.0), increments=np.zeros((n, 3)), vectors=(series,))
     return tuning.Case(record=record, initial=setup.initial_state(SURE, np.array([1.0, 0.0, 0.0, 0.0]))), noise
 
@@ -491,10 +397,7 @@ def test_priors_from_a_specification_match_its_noise():
     spec = gyro.GyroSpec(angle_random_walk=2e-5, rate_random_walk=1e-8)
     record = scenarios.simulate(scenario())
     found = tuning.priors_from_gyro(spec, record, factor=2.0)
-    assert found == {
-        "gyro.arw": tuning.Prior(value=2e-5, factor=2.0),
-        "gyro.rrw": tuning.Prior(value=1e-8, factor=2.0),
-    }
+    assert found == {"gyro.arw": tuning.Prior(value=2e-5, factor=2.0), "gyro.rrw": tuning.Prior(value=1e-8, factor=2.0)}
     assert set(tuning.priors_from_gyro(gyro.GyroSpec(angle_random_walk=2e-5), record)) == {"gyro.arw"}
     flicker = dataclasses.replace(spec, bias_instability=2e-5)
     assert tuning.priors_from_gyro(flicker, record)["gyro.rrw"].value > 1e-8

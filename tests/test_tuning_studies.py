@@ -1,11 +1,10 @@
 """Tuning over many records: the errors against the Cramér–Rao bound, the coverage of the intervals, held-out verdicts, real recordings."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np
 import pytest
+from measured import errors
 from two_stars import BELIEVED, FREE, scenario
 
 from strapdown import coning, consistency, covariance, gyro, montecarlo, scenarios, tuning, vectors
@@ -92,9 +91,6 @@ def test_a_noise_that_records_hardly_show_gets_a_bound_over_200_records():
     assert np.all(found.rms[rest] <= 1.15 * found.bound[rest])
 
 
-# --------------------------------------------------------------------------------------------- built-in scenarios
-
-
 SCENARIOS = ("coning", "hand-held", "low-orbit", "magnetometer-only", "slew-vibration", "spin", "tumbling-satellite")
 
 
@@ -121,23 +117,29 @@ def without_unmodelled(chosen: scenarios.Scenario) -> scenarios.Scenario:
     return dataclasses.replace(chosen, gyro=plain, gyro_preset="", sensors=tuple(sensors))
 
 
-def tuned_and_judged(chosen: scenarios.Scenario, records: int, held: int) -> tuple[float, tuple, np.ndarray, tuple]:
-    """Tune on some records from a filter wrong by 3 and 1/3; return NIS and ANEES over others, with their bounds."""
+def tuned_from_wrong(chosen: scenarios.Scenario, records: int, factor: float) -> tuple[FilterSetup, FilterSetup]:
+    """Return the filter wrong by a factor, one parameter up and the next down, and what tuning on some records makes of it."""
     filter_setup = setup.FilterSetup.for_scenario(chosen)
     if chosen.name in INTEGRATION:
         filter_setup = dataclasses.replace(filter_setup, integration=coning.ALGORITHMS[INTEGRATION[chosen.name]])
     train = [tuning.record_case(scenarios.simulate(chosen, 5, k), filter_setup, seed=k) for k in range(records)]
     free = tuning.default_names([one.record for one in train])
     values = tuning.values_of(filter_setup, free, [one.record for one in train])
-    wrong = {name: value * (3.0 if k % 2 else 1.0 / 3.0) for k, (name, value) in enumerate(values.items())}
-    found = tuning.fit(tuning.likelihood(train, tuning.with_values(filter_setup, wrong), free), starts=2).setup
+    off = {name: value * (factor if k % 2 else 1.0 / factor) for k, (name, value) in enumerate(values.items())}
+    wrong = tuning.with_values(filter_setup, off)
+    return wrong, tuning.fit(tuning.likelihood(train, wrong, free), starts=2).setup
+
+
+def tuned_and_judged(chosen: scenarios.Scenario, records: int, held: int) -> tuple[float, tuple, np.ndarray, tuple]:
+    """Tune on some records from a filter wrong by 3 and 1/3; return NIS and ANEES over others, with their bounds."""
+    _, found = tuned_from_wrong(chosen, records, 3.0)
     squares, number, nees = 0.0, 0, []
     for k in range(held):
         one = tuning.record_case(scenarios.simulate(chosen, 6, k), found, seed=1000 + k)
         every = max(1, (len(one.record.increments) // found.integration.samples) // 10)
         estimate = setup.run(one.record, found, one.initial, every=every, full_covariance=True)
         truth = setup.modelled_record(one.record, found).truth
-        error = consistency.errors(estimate.attitude, estimate.bias, truth.attitude[::every], truth.bias[::every])
+        error = errors(estimate, truth, every)
         nees.append(consistency.nees(error, estimate.covariance))
         squares += sum(float(part.nis.sum()) for part in estimate.innovations.values())
         number += sum(part.innovation.size for part in estimate.innovations.values())
@@ -165,9 +167,6 @@ def test_after_tuning_held_out_innovations_of_the_scenarios_as_they_are_pass(nam
     assert nis_bounds[0] < nis < nis_bounds[1]
 
 
-# --------------------------------------------------------------------------------------------- against the Cramér–Rao bound
-
-
 def efficiencies(chosen: scenarios.Scenario, tuned: FilterSetup) -> tuple[np.ndarray, np.ndarray]:
     """Return RMSE/√PCRB of a filter's attitude and bias at the epochs after the start, both predicted.
 
@@ -183,23 +182,10 @@ def efficiencies(chosen: scenarios.Scenario, tuned: FilterSetup) -> tuple[np.nda
     return found[0], found[1]
 
 
-def tuned_from_thirty_times_wrong(chosen: scenarios.Scenario, records: int) -> tuple[FilterSetup, FilterSetup]:
-    """Return the filter wrong by 30, one parameter up and the next down, and what tuning makes of it."""
-    filter_setup = setup.FilterSetup.for_scenario(chosen)
-    if chosen.name in INTEGRATION:
-        filter_setup = dataclasses.replace(filter_setup, integration=coning.ALGORITHMS[INTEGRATION[chosen.name]])
-    train = [tuning.record_case(scenarios.simulate(chosen, 5, k), filter_setup, seed=k) for k in range(records)]
-    free = tuning.default_names([one.record for one in train])
-    values = tuning.values_of(filter_setup, free, [one.record for one in train])
-    off = {name: value * (30.0 if k % 2 else 1.0 / 30.0) for k, (name, value) in enumerate(values.items())}
-    wrong = tuning.with_values(filter_setup, off)
-    return wrong, tuning.fit(tuning.likelihood(train, wrong, free), starts=2).setup
-
-
 def test_tuned_from_thirty_times_wrong_the_errors_reach_their_bound():
     """Issue G: RMSE/√PCRB ≤ 1.03, predicted; and what 150 runs have agrees with the prediction."""
     chosen = scenario(600.0)
-    wrong, tuned = tuned_from_thirty_times_wrong(chosen, 1)
+    wrong, tuned = tuned_from_wrong(chosen, 1, 30.0)
     assert np.min(efficiencies(chosen, wrong)) > 1.2
     predicted = efficiencies(chosen, tuned)
     assert np.max(predicted) <= 1.03
@@ -217,14 +203,11 @@ def test_tuned_from_thirty_times_wrong_the_errors_reach_their_bound():
 def test_tuned_from_thirty_times_wrong_the_errors_reach_their_bound_in_every_scenario(name):
     """Four records, errors without a state taken out. The bias of ``slew-vibration`` hardly walks, and is known to 1.014 over time."""
     chosen = without_unmodelled(scenarios.load_scenario(name))
-    wrong, tuned = tuned_from_thirty_times_wrong(chosen, 4)
+    wrong, tuned = tuned_from_wrong(chosen, 4, 30.0)
     before, after = efficiencies(chosen, wrong), efficiencies(chosen, tuned)
     assert max(np.sqrt(np.mean(ratio**2)) for ratio in before) > 1.5
     assert np.max(after[0]) <= 1.03, after[0]
     assert np.sqrt(np.mean(after[1] ** 2)) <= 1.03, after[1]
-
-
-# --------------------------------------------------------------------------------------------- real recordings
 
 
 def recorded(broad, files: slice) -> list[tuning.Case]:

@@ -1,7 +1,5 @@
 """A unit's calibration, carried from one recording to the next."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

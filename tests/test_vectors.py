@@ -1,28 +1,19 @@
-"""Vector sensors against the definition of what each measures, their faults, and the series they give."""
+"""Vector sensors against the definition of what each measures, their noise and faults, and the series they give."""
 
 import dataclasses
 import math
 
 import numpy as np
 import pytest
+from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
 
-from strapdown import motion, quaternion, vectors
+from strapdown import estimation, motion, quaternion, scenarios, vectors
 from strapdown.checks import InputError
+from strapdown.gyro import GyroSpec
 from strapdown.motion import orbit
 from strapdown.randomness import generator
-from strapdown.vectors import (
-    Accelerometer,
-    AttitudeSensor,
-    Faults,
-    HeadingPair,
-    HorizonSensor,
-    Magnetometer,
-    VectorMeasurements,
-    VectorSensor,
-    specific_force,
-    triad,
-)
+from strapdown.vectors import Accelerometer, AttitudeSensor, Faults, HeadingPair, Magnetometer, VectorSensor, triad
 from strapdown.vectors.sensors import sample_times
 
 CONE = motion.Coning(angle=0.3, frequency=0.7)
@@ -49,7 +40,7 @@ EVERY = [
     Accelerometer(name="vertical", sigma=0.01, rate=4.0),
     Accelerometer(name="whole force", sigma=0.01, rate=4.0, kind="vector"),
     HeadingPair(name="antennas", baseline_b=[2.0, 0.0, 0.0], sigma=0.01, rate=4.0),
-    HorizonSensor(name="horizon", orbit=orbit.CircularOrbit(), sigma=1e-3, rate=4.0),
+    vectors.HorizonSensor(name="horizon", orbit=orbit.CircularOrbit(), sigma=1e-3, rate=4.0),
 ]
 
 
@@ -173,7 +164,7 @@ def test_specific_force_at_a_lever_arm_is_the_second_derivative_of_the_position(
     weights = np.array([-1.0, 16.0, -30.0, 16.0, -1.0]) / 12.0
     moved = sum(w * place(time + k * step) for w, k in zip(weights, range(-2, 3), strict=True)) / step**2
     wanted = rotation(body, time).inv().apply(moved + pushed(time) - np.array(vectors.GRAVITY_F))
-    got = specific_force(body, time, lever_arm_b=arm, acceleration_f=pushed)
+    got = vectors.specific_force(body, time, lever_arm_b=arm, acceleration_f=pushed)
     np.testing.assert_allclose(got, wanted, atol=2e-8)
 
 
@@ -249,6 +240,11 @@ ATTITUDES = {
         ({"sigma": "0.1"}, "s: sigma is not an array of numbers"),
         ({"sigma": 0.0, "sigma_axes": [0.1, 0.1]}, r"s: sigma_axes has shape \(2,\) .* one number per body axis"),
         ({"sigma": 0.0, "covariance": np.eye(2)}, r"s: covariance has shape \(2, 2\)"),
+        ({"sigma": 0.0, "covariance": np.eye(3) + 0.5 * np.eye(3, k=1)}, "not symmetric"),
+        ({"sigma": 0.0, "covariance": np.diag([1.0, 1.0, -1.0])}, "eigenvalue"),
+        ({"sigma": 0.0, "covariance": np.eye(3), "sigma_axes": [1.0, 1.0, 2.0]}, "contradict"),
+        ({"sigma": 3.0, "covariance": np.eye(3)}, "contradicts"),
+        ({"sigma": 0.0, "covariance": np.eye(3), "kind": "heading"}, "one sigma"),
         ({"time": 0.5}, r"s: time has shape \(\)"),
         ({"time": None}, "s: time"),
         ({**ATTITUDES, "sigma": 0.0}, r"needs its noise: sigma \(m,\), sigma_axes \(m, 3\) or covariance \(m, 3, 3\)"),
@@ -264,21 +260,21 @@ ATTITUDES = {
     ],
 )
 def test_what_does_not_fit_the_samples_is_named(change, message):
-    VectorMeasurements(**GOOD)
+    vectors.VectorMeasurements(**GOOD)
     with pytest.raises(InputError, match=message):
-        VectorMeasurements(**{**GOOD, **change})
+        vectors.VectorMeasurements(**{**GOOD, **change})
 
 
 def test_one_sigma_of_an_attitude_is_that_about_each_axis():
-    one = VectorMeasurements(**{**ATTITUDES, "sigma": 0.01})
+    one = vectors.VectorMeasurements(**{**ATTITUDES, "sigma": 0.01})
     np.testing.assert_array_equal(one.sigma_axes, np.full((5, 3), 0.01))
     np.testing.assert_array_equal(one.sigma, np.full(5, 0.01))
     each = 0.01 * np.arange(1.0, 6.0)
-    varying = VectorMeasurements(**{**ATTITUDES, "sigma": each})
+    varying = vectors.VectorMeasurements(**{**ATTITUDES, "sigma": each})
     np.testing.assert_array_equal(varying.covariances, each[:, None, None] ** 2 * np.eye(3))
     np.testing.assert_allclose(varying.noise_scaled(3.0).sigma_axes[:, 1], 3.0 * each, rtol=1e-15)
     empty = {"time": [], "attitude": np.empty((0, 4))}
-    assert VectorMeasurements(**{**ATTITUDES, **empty}).sigma_axes.shape == (0, 3)
+    assert vectors.VectorMeasurements(**{**ATTITUDES, **empty}).sigma_axes.shape == (0, 3)
 
 
 def missing(kind, *, also):
@@ -310,7 +306,7 @@ def missing(kind, *, also):
 @pytest.mark.parametrize("kind", vectors.KINDS)
 def test_what_belongs_to_a_missing_sample_may_be_missing_too(kind, also):
     gone, given = missing(kind, also=also)
-    series = VectorMeasurements(**given)
+    series = vectors.VectorMeasurements(**given)
     content = series.attitude if kind == "attitude" else series.vector_b
     np.testing.assert_array_equal(np.isnan(content).any(axis=1), gone)
     known = series.taken(~gone)
@@ -332,7 +328,7 @@ def test_what_belongs_to_a_missing_sample_may_be_missing_too(kind, also):
 
 def test_the_reference_of_a_missing_sample_is_that_of_the_only_one_there_is():
     reference, vector = np.array([[np.nan] * 3, [0.6, 0.8, 0.0]]), np.array([[np.nan] * 3, [0.0, 0.0, 1.0]])
-    series = VectorMeasurements(**{**GOOD, "time": [0.0, 1.0], "reference_f": reference, "vector_b": vector})
+    series = vectors.VectorMeasurements(**{**GOOD, "time": [0.0, 1.0], "reference_f": reference, "vector_b": vector})
     np.testing.assert_array_equal(series.references_f, [[0.6, 0.8, 0.0]] * 2)
 
 
@@ -342,7 +338,7 @@ def test_a_series_may_be_missing_altogether(kind):
     given = {**GOOD, "vector_b": missing, "kind": kind, "sigma": missing[:, 0], "reference_f": missing}
     if kind == "attitude":
         given = {**given, "vector_b": np.empty((0, 3)), "attitude": np.full((5, 4), np.nan)}
-    series = VectorMeasurements(**given)
+    series = vectors.VectorMeasurements(**given)
     assert np.isfinite(series.sigma).all()
     assert np.isfinite(series.references_f).all()
 
@@ -415,7 +411,7 @@ def test_a_field_without_a_direction_is_reported(field, kind):
 def test_masked_measurements_are_missing_ones():
     vector = np.ma.masked_array(np.eye(3), mask=[[0, 0, 0], [1, 1, 1], [0, 0, 0]])
     sigma = np.ma.masked_array([1e-3, 7.0, 1e-3], mask=[0, 1, 0])
-    found = VectorMeasurements(**{**GOOD, "time": [0.0, 1.0, 2.0], "vector_b": vector, "sigma": sigma})
+    found = vectors.VectorMeasurements(**{**GOOD, "time": [0.0, 1.0, 2.0], "vector_b": vector, "sigma": sigma})
     np.testing.assert_array_equal(np.isnan(found.vector_b).all(axis=1), [False, True, False])
     np.testing.assert_allclose(found.sigma, 1e-3)
 
@@ -456,3 +452,34 @@ def test_a_boresight_along_a_body_axis_is_that_axis(boresight, axis):
 def test_what_is_no_boresight_is_refused(boresight):
     with pytest.raises(InputError, match="boresight"):
         AttitudeSensor(name="t", sigma_across=1e-4, sigma_about=1e-3, rate=1.0, boresight=boresight)
+
+
+def variance_across(sigma):
+    """Variance of a component across the direction, by the mixture of χ² that the squares are: ∫ t² exp(−(1 − t²)/(2σ²)) dt over [0, 1]."""
+    return quad(lambda t: t * t * math.exp(-(1.0 - t * t) / (2.0 * sigma**2)), 0.0, 1.0, epsabs=0.0, epsrel=1e-12)[0]
+
+
+def observed(kind, sigma, samples):
+    """A body at rest, its attitude known but for 1e-6 rad, sees the field: mean NIS per degree of freedom."""
+    field = vectors.Magnetometer(
+        name="field", field_f=np.array([3.0, 0.0, 4.0]), sigma=5.0 * sigma, rate=10.0, kind=kind
+    )
+    made = scenarios.Scenario(
+        motion=motion.ConstantRate(rate=(0.0, 0.0, 0.0)),
+        gyro=GyroSpec(),
+        sensors=(field,),
+        rate=10.0,
+        duration=samples / 10.0,
+    )
+    record = scenarios.simulate(made, seed=11)
+    start = estimation.initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=1e-6, bias_sigma=1e-12)
+    noise = estimation.ProcessNoise(angle_random_walk=1e-9, rate_random_walk=0.0)
+    found = estimation.run(record, noise, start, every=samples).innovations["field"]
+    return float(np.mean(found.nis)) / found.innovation.shape[1], found.innovation.size
+
+
+@pytest.mark.parametrize("sigma", [0.05, 0.2])
+def test_the_nis_of_directions_is_too_small_by_that_share_and_that_of_whole_vectors_right(sigma):
+    for kind, expected in (("direction", variance_across(sigma) / sigma**2), ("vector", 1.0)):
+        mean, degrees = observed(kind, sigma, 40_000)
+        assert mean == pytest.approx(expected, abs=4.0 * math.sqrt(2.0 / degrees))

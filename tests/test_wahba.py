@@ -1,7 +1,5 @@
 """Attitude from vector observations: exact data, oracles at any weights, covariance by Monte Carlo, and what is refused."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 
