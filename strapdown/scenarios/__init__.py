@@ -9,7 +9,6 @@ import dataclasses
 import functools
 import os
 import re
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -425,7 +424,7 @@ def _from_table(table: dict[str, Any], place: str) -> Scenario:
     for key in ("name", "description"):
         if not isinstance(table.get(key, ""), str):
             raise InputError(f"{place}: {key} is {table[key]!r}; it must be a string")
-    preset, spec = _read_gyro(_table(table.get("gyro", {}), f"{place}: gyro"), f"{place}: gyro")
+    preset, spec = _read_gyro(tables.subtable(table.get("gyro", {}), f"{place}: gyro"), f"{place}: gyro")
     sensors = table.get("sensors", [])
     if not isinstance(sensors, list):
         raise InputError(f"{place}: sensors is one table; write [[sensors]] with two brackets")
@@ -436,21 +435,17 @@ def _from_table(table: dict[str, Any], place: str) -> Scenario:
         "rate": table["rate_hz"],
         "duration": table["duration_s"],
         "gravity_f": table.get("gravity_f_m_per_s2", vectors.GRAVITY_F),
-        "motion": _read_motion(_table(table["motion"], f"{place}: motion"), f"{place}: motion"),
+        "motion": _read_motion(tables.subtable(table["motion"], f"{place}: motion"), f"{place}: motion"),
         "gyro": spec,
         "gyro_preset": preset,
         "sensors": tuple(_read_sensor(entry, f"{place}: sensors[{i}]") for i, entry in enumerate(sensors)),
     }
     if "temperature" in table:
         where = f"{place}: temperature"
-        values["temperature"] = tables.build(Temperature, _table(table["temperature"], where), _TEMPERATURE, where)
+        values["temperature"] = tables.build(
+            Temperature, tables.subtable(table["temperature"], where), _TEMPERATURE, where
+        )
     return tables.made(Scenario, values, table, _TOP_FORM, place)  # type: ignore[no-any-return]
-
-
-def _table(content: Any, place: str) -> dict[str, Any]:
-    if not isinstance(content, Mapping):
-        raise InputError(f"{place} is {content!r}; it must be a table")
-    return dict(content)
 
 
 def _word(table: dict[str, Any], place: str, choices: Any) -> str:
@@ -467,7 +462,7 @@ def _read_motion(table: dict[str, Any], place: str) -> Motion:
     if word == "composed":
         known_keys(place, table, ("base", "vibration"))
         parts = {
-            key: _read_motion(_table(table.get(key), f"{place}: {key}"), f"{place}: {key}")
+            key: _read_motion(tables.subtable(table.get(key), f"{place}: {key}"), f"{place}: {key}")
             for key in ("base", "vibration")
         }
         return motion.Composed(**parts)
@@ -478,7 +473,9 @@ def _read_motion(table: dict[str, Any], place: str) -> Motion:
         if not isinstance(entries, list):
             raise InputError(f"{place}: harmonics is one table; write [[motion.harmonics]] with two brackets")
         more["harmonics"] = tuple(
-            tables.build(motion.Harmonic, _table(h, f"{place}: harmonics[{i}]"), _HARMONIC, f"{place}: harmonics[{i}]")
+            tables.build(
+                motion.Harmonic, tables.subtable(h, f"{place}: harmonics[{i}]"), _HARMONIC, f"{place}: harmonics[{i}]"
+            )
             for i, h in enumerate(entries)
         )
     return tables.build(kind, table, form, place, **more)  # type: ignore[no-any-return]
@@ -507,7 +504,7 @@ def _read_gyro(table: dict[str, Any], place: str) -> tuple[str, GyroSpec]:
 
 
 def _read_sensor(entry: Any, place: str) -> Sensor:
-    table = _table(entry, place)
+    table = tables.subtable(entry, place)
     word = _word(table, place, _SENSORS)
     kind, form, faults = _SENSORS[word]
     orbit = table.pop("orbit", None) if word in ("magnetometer", "horizon") else None
@@ -516,7 +513,7 @@ def _read_sensor(entry: Any, place: str) -> Sensor:
     more: dict[str, Any] = {"faults": tables.build(vectors.Faults, amiss, faults, place)}
     if orbit is not None:
         orbit_place = f"{place}: orbit"
-        found = tables.build(CircularOrbit, _table(orbit, orbit_place), _ORBIT, orbit_place)
+        found = tables.build(CircularOrbit, tables.subtable(orbit, orbit_place), _ORBIT, orbit_place)
         more.update({"orbit": found} if word == "horizon" else {"field_f": found.magnetic_field})
     elif word == "horizon":
         raise InputError(f"{place}: orbit is missing; add the table [sensors.orbit]")
