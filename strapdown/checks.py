@@ -120,6 +120,14 @@ def positive(name: str, value: float, *, unit: str = "") -> float:
     return number
 
 
+def fraction(name: str, value: float) -> float:
+    """Return ``value`` as a float between 0 and 1, both excluded."""
+    number = finite(name, value)
+    if not 0.0 < number < 1.0:
+        raise InputError(f"{name} is {number:g}; it must lie between 0 and 1")
+    return number
+
+
 def non_negative(name: str, value: float, *, unit: str = "") -> float:
     """Return ``value`` as a float of zero or more."""
     number = finite(name, value, unit=unit)

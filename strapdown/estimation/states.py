@@ -202,9 +202,9 @@ def restart_bias_variance(gate: Gate | None, initial: State) -> Array:
     """Return the increase of the bias variance of a gate's first candidate (3,), (rad/s)², in a filter that continues from ``initial``."""
     if gate is None:
         return np.zeros(3)
-    if gate.restart_bias_sigma is None and initial.gate is not None:
-        return initial.gate.restart_bias_variance
-    return gate.restart_bias_variance(initial.covariance)
+    if gate.restart_bias_sigma is None:
+        return first_bias_variance(initial)
+    return np.full(3, gate.restart_bias_sigma**2)
 
 
 NEEDED = {

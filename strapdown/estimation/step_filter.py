@@ -97,8 +97,9 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         check_arguments(process_noise=process_noise)
         self.error_states = modelling.as_blocks(error_states)
         state = modelling.begin(initial, self.error_states)
-        names = _sensor_names(sensors)
-        self.sensors = self._sensors_of_states(names)
+        if isinstance(sensors, str):
+            raise InputError(f"sensors is {sensors!r}; it must be a sequence of names, ({sensors!r},)")
+        self.sensors = self._sensors_of_states(tuple(sensors))
         n = 6 + len(state.values)
         super().__init__(dim_x=n, dim_z=2)
         self.x, self.x_prior, self.x_post = np.zeros((3, n))
@@ -243,11 +244,6 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         ----------
         *arguments, **options
             Ignored.
-
-        Raises
-        ------
-        InputError
-            Always; use :meth:`update_direction`, :meth:`update_vector`, :meth:`update_heading` or :meth:`update_attitude`.
         """
         raise InputError(
             "an update by HJacobian and Hx would leave its correction in x, not in the attitude; use update_direction, update_vector, "
@@ -284,6 +280,11 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         -------
         bool
             Whether the measurement was used; false if it is missing.
+
+        Raises
+        ------
+        InputError
+            If a shape is wrong, or the noise is missing or not positive.
         """
         return self._update_by_vector("direction", vector_b, reference_f, (sigma, covariance), sensor)
 
@@ -304,22 +305,13 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
             Measured vector in body axes, in the unit of ``reference_f``.
         reference_f : array_like (3,)
             The same vector in the fixed frame.
-        sigma : float or array_like (3,), optional
-            σ of each component, in that unit; one, or one per body axis.
-        sensor : str, optional
-            Name of the sensor.
-        covariance : array_like (3, 3), optional
-            Covariance of the noise, instead of ``sigma``.
+        sigma, sensor, covariance : optional
+            As for :meth:`update_direction`, but of each component, in that unit.
 
         Returns
         -------
         bool
-            Whether the measurement was used; false if it is missing.
-
-        Raises
-        ------
-        InputError
-            If a shape is wrong, the noise is missing or not positive.
+            As for :meth:`update_direction`.
         """
         return self._update_by_vector("vector", vector_b, reference_f, (sigma, covariance), sensor)
 
@@ -347,11 +339,6 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         -------
         bool
             Whether the measurement was used; false if it is missing or vertical.
-
-        Raises
-        ------
-        InputError
-            If a shape is wrong, σ is not positive.
         """
         return self._update_by_vector("heading", vector_b, reference_f, (sigma, None), sensor)
 
@@ -369,22 +356,13 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         ----------
         attitude : array_like (4,)
             Measured q_fb.
-        sigma : float or array_like (3,), optional
-            σ about the body axes, rad.
-        sensor : str, optional
-            Name of the sensor.
-        covariance : array_like (3, 3), optional
-            Covariance of the noise, rad², body axes, instead of ``sigma``.
+        sigma, sensor, covariance : optional
+            As for :meth:`update_direction`, but about all body axes.
 
         Returns
         -------
         bool
-            Whether the measurement was used; false if it is missing.
-
-        Raises
-        ------
-        InputError
-            If a shape is wrong, the noise is missing or not positive.
+            As for :meth:`update_direction`.
         """
         name = _label(sensor, "attitude")
         given = array(name, attitude, (4,), allow_nan=True)
@@ -506,13 +484,6 @@ class _Measurement:
         if self.kind != "heading":
             return True
         return bool(has_heading(rotation_matrix(tuple(attitude.tolist())), self.z))
-
-
-def _sensor_names(sensors: Sequence[str]) -> tuple[str, ...]:
-    """Return names of sensors as a tuple; a single string is refused."""
-    if isinstance(sensors, str):
-        raise InputError(f"sensors is {sensors!r}; it must be a sequence of names, ({sensors!r},)")
-    return tuple(sensors)
 
 
 def _label(sensor: str, name: str) -> str:

@@ -15,9 +15,9 @@ from numpy.typing import ArrayLike
 
 from strapdown import checks, quaternion
 from strapdown.checks import Array
-from strapdown.motion.constant_rate import ConstantRate
+from strapdown.motion.closed_forms import ConstantRate
 from strapdown.motion.exact_phase import DIGITS, Pair, cosine_sine, halved, product_error, to_decimal, to_pair
-from strapdown.motion.parameters import IDENTITY, edge_stamps, stacked, store_attitude, store_vector, times
+from strapdown.motion.protocol import IDENTITY, edge_stamps, stacked, store_attitude, store_vector, times
 from strapdown.motion.quadrature import interval_integrals
 
 _SMALLEST_SINE = 1e-140

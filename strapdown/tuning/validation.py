@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from strapdown import consistency
-from strapdown.checks import Array, InputError, one_of
+from strapdown.checks import Array, InputError, fraction, one_of
 from strapdown.consistency import Judgement, mean_bounds
 from strapdown.estimation import setup
 from strapdown.estimation.setup import FilterSetup
@@ -43,8 +43,7 @@ def split(cases: Sequence[Case], share: float, by: By = "time") -> tuple[tuple[C
     tuned, held : tuple of Case
         Cases to tune on, and cases held out. By time both have the same records, with different ``first`` and ``last``.
     """
-    if not 0.0 < share < 1.0:
-        raise InputError(f"holdout is {share:g}; it must lie between 0 and 1")
+    fraction("holdout", share)
     one_of("holdout by", by, ("time", "record"))
     if by == "record":
         held = max(1, round(share * len(cases)))

@@ -503,15 +503,12 @@ class Faults:
             if b < a:
                 raise InputError(f"outages has a window from {a:g} s to {b:g} s; give (from, to) with from ≤ to")
         object.__setattr__(self, "outages", windows)
-        non_negative("outlier_probability", self.outlier_probability)
-        if self.outlier_probability > 1.0:
-            raise InputError(f"outlier_probability is {self.outlier_probability:g}; it must not be above 1")
+        for name in ("outlier_probability", "drop_probability", "duty_share"):
+            if non_negative(name, getattr(self, name)) > 1.0:
+                raise InputError(f"{name} is {getattr(self, name):g}; it must not be above 1")
         positive("outlier_scale", self.outlier_scale)
         non_negative("correlated_sigma", self.correlated_sigma)
         positive("correlation_time", self.correlation_time, unit="s")
-        for name in ("drop_probability", "duty_share"):
-            if non_negative(name, getattr(self, name)) > 1.0:
-                raise InputError(f"{name} is {getattr(self, name):g}; it must not be above 1")
         non_negative("duty_period", self.duty_period, unit="s")
 
     def noise(self, time: Array, generator: np.random.Generator) -> tuple[Array, Array]:
