@@ -75,16 +75,6 @@ class TorqueFree:
     def _fixed_side(self) -> Array:
         return quaternion.multiply(np.array(self.initial_attitude), quaternion.conjugate(self._relative(np.zeros(()))))
 
-    @property
-    def energy(self) -> float:
-        """Kinetic energy T, J; constant."""
-        return 0.5 * math.fsum(i * w * w for i, w in zip(self.inertia, self.initial_rate, strict=True))
-
-    @property
-    def angular_momentum(self) -> Array:
-        """Angular momentum h_f in fixed axes (3,), kg m²/s; constant."""
-        return quaternion.rotate(np.array(self.initial_attitude), np.array(self.inertia) * np.array(self.initial_rate))
-
     def attitude(self, time: ArrayLike) -> Array:
         """Return q_fb (..., 4)."""
         t = times(time)

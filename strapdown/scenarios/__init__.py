@@ -377,8 +377,7 @@ _TOP_FORM: Form = {
     "duration": tables.SECONDS,
     "gravity_f": tables.METRES_PER_SECOND_SQUARED,
 }
-_TABLES = ("motion", "gyro", "temperature", "sensors")
-_TOP = ("name", "description", "seed", "rate_hz", "duration_s", "gravity_f_m_per_s2", *_TABLES)
+_TOP = ("name", "description", *tables.keys(_TOP_FORM), "motion", "gyro", "temperature", "sensors")
 _TEMPERATURE: Form = {"start": tables.DEGREES_CELSIUS, "end": tables.DEGREES_CELSIUS, "time_constant": tables.SECONDS}
 
 
@@ -525,22 +524,17 @@ def _write_sensor(sensor: Any) -> dict[str, Any]:
     if word is None:
         raise InputError(f"a sensor of class {type(sensor).__name__} cannot be written to a file; keep it in Python")
     _, form, faults = _SENSORS[word]
-    if getattr(sensor, "acceleration_f", None) is not None:
-        raise InputError(
-            f"{sensor.name}: acceleration_f is a function, which cannot be written to a file; keep it in Python"
-        )
-    if isinstance(sensor, vectors.HorizonSensor):
-        own = {**tables.encode(sensor, form), **tables.encode(sensor.faults, faults)}
-        return {"type": word, **own, "orbit": tables.encode(sensor.orbit, _ORBIT)}
-    field = getattr(sensor, "field_f", None)
-    if not callable(field):
-        return {"type": word, **tables.encode(sensor, form), **tables.encode(sensor.faults, faults)}
-    orbit = getattr(field, "__self__", None)
-    if not isinstance(orbit, CircularOrbit):
-        raise InputError(f"{sensor.name}: field_f is a function, which cannot be written to a file; keep it in Python")
-    rest = {name: choice for name, choice in form.items() if name != "field_f"}
-    table = {"type": word, **tables.encode(sensor, rest), **tables.encode(sensor.faults, faults)}
-    return {**table, "orbit": tables.encode(orbit, _ORBIT)}
+    field, orbit = getattr(sensor, "field_f", None), getattr(sensor, "orbit", None)
+    if callable(field):
+        orbit = getattr(field, "__self__", None)
+        form = {name: choice for name, choice in form.items() if name != "field_f"}
+    for name in ("acceleration_f", "field_f"):
+        if callable(getattr(sensor, name, None)) and not isinstance(orbit, CircularOrbit):
+            raise InputError(
+                f"{sensor.name}: {name} is a function, which cannot be written to a file; keep it in Python"
+            )
+    table = {"type": word, **tables.encode(sensor, form), **tables.encode(sensor.faults, faults)}
+    return table if orbit is None else {**table, "orbit": tables.encode(orbit, _ORBIT)}
 
 
 def scenario_to_table(scenario: Scenario) -> dict[str, Any]:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from strapdown import quaternion
-from strapdown.checks import Array, InputError, array
+from strapdown.checks import Array, InputError, array, place
 from strapdown.kinematics import skew
 from strapdown.units import DEGREE
 
@@ -64,7 +64,7 @@ def from_vertical_and_heading(up_b: ArrayLike, magnetic_b: ArrayLike) -> Array:
     if np.any(bad):
         index = np.argwhere(bad)[0]
         raise InputError(
-            f"{_place('up_b', *index)} and {_place('magnetic_b', *index)} are {angle[tuple(index)] / DEGREE:.6g}° apart, less than "
+            f"{place('up_b', index)} and {place('magnetic_b', index)} are {angle[tuple(index)] / DEGREE:.6g}° apart, less than "
             f"{MIN_HORIZONTAL_ANGLE / DEGREE:.2g}° from one line: such a field gives no heading; check both"
         )
     north_up = _frame(np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0]))
@@ -238,17 +238,13 @@ _GAUSS_NEWTON_STEPS = 10
 # Checks of the input
 
 
-def _place(name: str, *index: int | np.intp) -> str:
-    return f"{name}[{', '.join(str(int(i)) for i in index)}]" if index else name
-
-
 def _directions(name: str, value: ArrayLike) -> Array:
     """Return vectors (..., 3) divided by their lengths."""
     vector = array(name, value, (..., 3))
     largest = np.max(np.abs(vector), axis=-1, keepdims=True, initial=0.0)
     if np.any(largest == 0.0):
         index = np.argwhere(largest[..., 0] == 0.0)[0]
-        raise InputError(f"{_place(name, *index)} is the zero vector, which has no direction; leave it out")
+        raise InputError(f"{place(name, index)} is the zero vector, which has no direction; leave it out")
     # Scaled by the largest component first, so that no square overflows or underflows.
     scaled = vector / largest
     return np.asarray(scaled / np.linalg.norm(scaled, axis=-1, keepdims=True))
@@ -265,7 +261,7 @@ def _sigmas(value: ArrayLike, shape: tuple[int, ...]) -> Array:
     if np.any(sigma <= 0.0):
         index = np.argwhere(sigma <= 0.0)[0]
         raise InputError(
-            f"{_place('sigmas', *index)} is {sigma[tuple(index)]:g} rad; every direction needs a σ greater than zero"
+            f"{place('sigmas', index)} is {sigma[tuple(index)]:g} rad; every direction needs a σ greater than zero"
         )
     return sigma
 
@@ -306,7 +302,7 @@ def _refuse_undetermined(name: str, vectors: Array, sigma: Array) -> None:
         widest = int(np.argmax(np.minimum(angle, np.pi - angle)))
         uncertainty = "without bound" if least[index] == 0.0 else f"{1.0 / least[index]:.3g} rad"
         raise InputError(
-            f"{_place(name, *index)}: the attitude is not determined, the 1σ of its least determined rotation is "
+            f"{place(name, index)}: the attitude is not determined, the 1σ of its least determined rotation is "
             f"{uncertainty}; of all pairs, directions {i[widest]} and {j[widest]} are furthest from one line, "
             f"{angle[widest] / DEGREE:.6g}° "
             "apart; add a direction away from that line, or give smaller sigmas (rad) if the noise is smaller"
