@@ -52,12 +52,8 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
 
     Parameters
     ----------
-    process_noise : ProcessNoise
-        Noise of the gyro.
-    initial : State
-        Initial state. The end state of :func:`strapdown.estimation.run_part` continues that run; give its ``time``.
-    error_states : sequence of ErrorStates, optional
-        Error states of the gyro and the sensors in addition to attitude and bias.
+    process_noise, initial, error_states : ProcessNoise, State, sequence of ErrorStates
+        As for :class:`LiveFilter`.
     sensors : sequence of str, optional
         Names of the sensors; with error states no other name is accepted. Default: with error states, the sensors that they affect, if
         any; otherwise any name.

@@ -139,17 +139,13 @@ def compare(
     ----------
     record : ImuRecord
         Record; if it has a truth, errors are compared, otherwise the differences from the first filter.
-    process_noise : ProcessNoise
-        Angle random walk and rate random walk of the gyro, as the filters model them.
-    initial : State
-        State at the first edge, from which all filters start.
+    process_noise, initial : ProcessNoise, State
+        As for :func:`run`, for all filters.
     filters : iterable of str or filter, default all of :data:`FILTERS`
         Names, and filters of your own (:mod:`strapdown.estimation.filters.own`). The unscented filter needs some tenths of a
         millisecond per step, the others a microsecond.
-    every : int, default 1
-        Store every n-th edge, the first included.
-    full_covariance : bool, default False
-        Store whole covariance matrices too.
+    every, full_covariance : int, bool
+        As for :func:`run`.
     bound : array_like (n, 6, 6), optional
         Cramér–Rao bound at the stored edges (:attr:`strapdown.covariance.Analysis.cramer_rao`): errors are compared with its root.
 
