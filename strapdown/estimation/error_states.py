@@ -92,11 +92,6 @@ class ErrorStates(ByValue):
         for name, value in values.items():
             object.__setattr__(self, name, value)
 
-    def _set_sigma(self, field_name: str, unit: str) -> None:
-        """Set σ of three states from a field with one number, or one by axis."""
-        sigma = _spread(f"{self.name}: {field_name}", getattr(self, field_name), unit)
-        self._set(**{field_name: sigma, "sigma": sigma})
-
     @property
     def size(self) -> int:
         """Number of states."""
@@ -240,28 +235,19 @@ def _matrix(name: str, diagonal: float | Array, off_diagonal: float | Array, uni
     return whole
 
 
-class _GyroMatrix(ErrorStates):
-    """Entries of a matrix (3, 3) that acts on the gyro's rate or on the specific force; those with a σ of 0 are no states."""
+def _entries(sigmas: Array) -> tuple[tuple[str, ...], Array]:
+    """Return names and σ of those entries of a matrix that are states."""
+    chosen = np.flatnonzero(sigmas.ravel())
+    return tuple(ENTRIES[k] for k in chosen), np.asarray(sigmas.ravel()[chosen])
 
-    def _set_entries(self, diagonal: str, off_diagonal: str, units: tuple[str, str]) -> None:
-        """Set the states from the fields with σ of the diagonal and of the other entries, and their units."""
-        sigmas = _matrix(self.name, getattr(self, diagonal), getattr(self, off_diagonal), (diagonal, off_diagonal))
-        chosen = np.flatnonzero(sigmas)
-        components = tuple(ENTRIES[k] for k in chosen)
-        self._set(
-            components=components,
-            units=tuple(units[one not in AXES] for one in components),
-            sigma=sigmas.ravel()[chosen],
-        )
 
-    @property
-    def _matrices(self) -> Array:
-        """For each state the matrix (3, 3) that is 1 at its entry and 0 elsewhere."""
-        return np.asarray(np.eye(9)[[ENTRIES.index(name) for name in self.components]].reshape(-1, 3, 3))
+def _units_of_entries(names: tuple[str, ...]) -> Array:
+    """Return for each named entry the matrix (3, 3) that is 1 there and 0 elsewhere."""
+    return np.asarray(np.eye(9)[[ENTRIES.index(name) for name in names]].reshape(-1, 3, 3))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class GyroScale(_GyroMatrix):
+class GyroScale(ErrorStates):
     """Scale factors and misalignments of the gyro: the entries of M in ``w_meas = (I + M) w_b + b + n``, constant.
 
     Entries whose σ is 0 are treated as exact and are no states.
@@ -282,16 +268,18 @@ class GyroScale(_GyroMatrix):
 
     def __post_init__(self) -> None:
         """Check both; the states are the entries of M, row by row; xy is the sensitivity of axis x to the rate about y."""
-        self._set_entries("scale_sigma", "misalignment_sigma", ("1", "rad"))
+        sigmas = _matrix(self.name, self.scale_sigma, self.misalignment_sigma, ("scale_sigma", "misalignment_sigma"))
+        components, sigma = _entries(sigmas)
+        self._set(components=components, units=tuple("1" if one in AXES else "rad" for one in components), sigma=sigma)
 
     @property
     def gyro_scale(self) -> Array:
         """One entry of M per state."""
-        return self._matrices
+        return _units_of_entries(self.components)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class GyroForce(_GyroMatrix):
+class GyroForce(ErrorStates):
     """Sensitivity of the gyro to specific force: the entries of G in ``w_meas = w_b + b + G f_b + n``, constant.
 
     The specific force is that of a body without acceleration, ``f_b = −R_fbᵀ g_f``. Entries whose σ is 0 are no states.
@@ -315,8 +303,10 @@ class GyroForce(_GyroMatrix):
 
     def __post_init__(self) -> None:
         """Check all; the states are the entries of G, row by row; xy is the bias about x per force along y."""
-        self._set_entries("along_sigma", "across_sigma", ("rad s/m", "rad s/m"))
-        self._set(gravity_f=array(f"{self.name}: gravity_f", self.gravity_f, (3,)))
+        sigmas = _matrix(self.name, self.along_sigma, self.across_sigma, ("along_sigma", "across_sigma"))
+        components, sigma = _entries(sigmas)
+        gravity = array(f"{self.name}: gravity_f", self.gravity_f, (3,))
+        self._set(components=components, units=("rad s/m",) * len(components), sigma=sigma, gravity_f=gravity)
         if not np.any(self.gravity_f):
             raise InputError(
                 f"{self.name}: gravity_f is zero, and the specific force in free fall is zero; leave these error states out"
@@ -325,7 +315,7 @@ class GyroForce(_GyroMatrix):
     @property
     def gyro_force(self) -> Array:
         """One entry of G per state."""
-        return self._matrices
+        return _units_of_entries(self.components)
 
     @property
     def force_f(self) -> Array:
@@ -349,12 +339,11 @@ class GyroTemperature(ErrorStates):
 
     slope_sigma: float | Array
     name: str = "gyro temperature"
-    components = AXES
-    units = ("rad/s/K",) * 3
 
     def __post_init__(self) -> None:
         """Check the standard deviation."""
-        self._set_sigma("slope_sigma", "rad/s/K")
+        sigma = _spread(f"{self.name}: slope_sigma", self.slope_sigma, "rad/s/K")
+        self._set(components=AXES, units=("rad/s/K",) * 3, sigma=sigma)
 
 
 class _FirstOrder(ErrorStates):
@@ -395,7 +384,8 @@ class GyroGaussMarkov(_FirstOrder):
 
     def __post_init__(self) -> None:
         """Check both."""
-        self._set_sigma("bias_sigma", "rad/s")
+        sigma = _spread(f"{self.name}: bias_sigma", self.bias_sigma, "rad/s")
+        self._set(bias_sigma=sigma, sigma=sigma)
         positive(f"{self.name}: correlation_time", self.correlation_time, unit="s")
 
     @property
@@ -435,7 +425,8 @@ class VectorBias(ErrorStates):
     def __post_init__(self) -> None:
         """Check all."""
         self._set(name=self.name or f"{self.sensor} bias", units=(self.unit,) * 3)
-        self._set_sigma("bias_sigma", self.unit)
+        sigma = _spread(f"{self.name}: bias_sigma", self.bias_sigma, self.unit)
+        self._set(bias_sigma=sigma, sigma=sigma)
         non_negative(f"{self.name}: rate_random_walk", self.rate_random_walk)
 
     @property
@@ -556,7 +547,8 @@ class SensorMounting(ErrorStates):
     def __post_init__(self) -> None:
         """Check the deviation."""
         self._set(name=self.name or f"{self.sensor} mounting")
-        self._set_sigma("mounting_sigma", "rad")
+        sigma = _spread(f"{self.name}: mounting_sigma", self.mounting_sigma, "rad")
+        self._set(mounting_sigma=sigma, sigma=sigma)
 
     @property
     def effects(self) -> Mapping[str, Effect]:
@@ -600,7 +592,8 @@ class GaussMarkov(_FirstOrder):
     def __post_init__(self) -> None:
         """Check all."""
         self._set(name=self.name or f"{self.sensor} disturbance", units=(self.unit,) * 3)
-        self._set_sigma("noise_sigma", self.unit)
+        sigma = _spread(f"{self.name}: noise_sigma", self.noise_sigma, self.unit)
+        self._set(noise_sigma=sigma, sigma=sigma)
         positive(f"{self.name}: correlation_time", self.correlation_time, unit="s")
         one_of(f"{self.name}: frame", self.frame, ("body", "fixed"))
         if self.frame == "fixed" and len(set(self.sigma)) > 1:
