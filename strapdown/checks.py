@@ -122,6 +122,14 @@ def positive(name: str, value: float, *, unit: str = "") -> float:
     return number
 
 
+def by_axis(name: str, value: ArrayLike, remedy: str = "") -> Array:
+    """Return one number for all axes, or one for each, as three (3,) above zero; ``remedy`` ends the message about a wrong shape."""
+    given = numbers(name, value)
+    if given.shape not in ((), (1,), (3,)):
+        raise InputError(f"{name} has shape {given.shape}; give one number, or three, one per axis{remedy}")
+    return np.array([positive(f"{name}[{k}]", float(one)) for k, one in enumerate(np.broadcast_to(given, 3))])
+
+
 def fraction(name: str, value: float) -> float:
     """Return ``value`` as a float between 0 and 1, both excluded."""
     number = finite(name, value)

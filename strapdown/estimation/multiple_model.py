@@ -234,7 +234,12 @@ def _until_one(record: ImuRecord, process_noise: ProcessNoise, options: _Options
     recovery = 0 if options.gate is None else options.gate.recovery or 0
     own_events = gaps(record.time)
     failed = 0
-    first = _first_direction(events)
+    directions = _directions(events, 0)
+    if len(directions) == 0:
+        raise InputError(
+            "the record has no direction, vector or attitude within its time to start from; add one: a heading is not enough"
+        )
+    first = int(directions[0])
     while True:
         wide = gate_rules.WIDENING ** (failed % (gate_rules.WIDEST + 1)) * options.bias_sigma
         found = _walked(record, process_noise, events, first, options._replace(bias_sigma=wide), recovery)
@@ -373,16 +378,6 @@ def start(
     P[:3, :3] = events.variance[first] * (np.eye(3) - np.outer(z, z)) + (np.pi / hypotheses) ** 2 * np.outer(z, z)
     circle = quaternion.multiply(q, quaternion.exp(angles[:, None] * z))
     return np.array([pack(attitude, bias, P) for attitude in circle]), angles
-
-
-def _first_direction(events: Schedule) -> int:
-    """Return the first event that is not a heading."""
-    more = _directions(events, 0)
-    if len(more) == 0:
-        raise InputError(
-            "the record has no direction, vector or attitude within its time to start from; add one: a heading is not enough"
-        )
-    return int(more[0])
 
 
 def _directions(events: Schedule, first: int) -> np.ndarray:

@@ -19,10 +19,10 @@ from strapdown.checks import (
     Array,
     InputError,
     array,
+    by_axis,
     covariance,
     finite,
     non_negative,
-    numbers,
     one_of,
     positive,
     unit_quaternions,
@@ -493,11 +493,4 @@ def _noise_covariance(sensor: str, sigma: ArrayLike | None, covariance_b: ArrayL
         raise InputError("give either sigma or covariance: the noise of the measurement")
     if sigma is None:
         return covariance(_label(sensor, "covariance"), np.asarray(covariance_b), 3)
-    name = _label(sensor, "sigma")
-    given = numbers(name, sigma)
-    if given.shape not in ((), (1,), (3,)):
-        raise InputError(
-            f"{name} has shape {given.shape}; give one number, one per body axis, or a matrix as covariance"
-        )
-    spread = np.array([positive(name, float(value)) for value in np.broadcast_to(given, 3)])
-    return np.diag(spread**2)
+    return np.diag(by_axis(_label(sensor, "sigma"), sigma, ", or a matrix as covariance") ** 2)

@@ -13,6 +13,7 @@ from strapdown import consistency
 from strapdown.checks import Array, InputError, fraction, one_of
 from strapdown.consistency import Judgement, mean_bounds
 from strapdown.estimation import setup
+from strapdown.estimation.schedule import selected
 from strapdown.estimation.setup import FilterSetup
 from strapdown.records import Estimate, Innovations, Truth
 from strapdown.results import Listed, Listing, figure
@@ -223,18 +224,14 @@ def _judged(case: Case, chosen: FilterSetup) -> tuple[Estimate, Truth | None]:
     initial = setup.initial_state(used, case.initial.attitude, case.initial.bias)
     estimate = setup.run(case.record, used, initial, every=every, full_covariance=truth is not None)
 
-    def within(of: Any, *names: str) -> dict[str, Any]:
-        inside = (of.time >= case.first) & (of.time <= case.last)
-        values = {name: getattr(of, name) for name in names}
-        return {name: None if value is None else value[inside] for name, value in values.items()}
+    def judged(time: Array) -> np.ndarray:
+        return (time >= case.first) & (time <= case.last)
 
-    innovations = {
-        name: Innovations(**within(one, "time", "innovation", "variance", "weight"))
-        for name, one in estimate.innovations.items()
-    }
-    part = within(estimate, "time", "attitude", "bias", "variance", "covariance")
+    innovations = {name: selected(one, judged(one.time)) for name, one in estimate.innovations.items()}
+    inside = judged(estimate.time)
+    values = {name: getattr(estimate, name) for name in ("time", "attitude", "bias", "variance", "covariance")}
+    part: dict[str, Any] = {name: value[inside] for name, value in values.items() if value is not None}
     if truth is not None:
-        inside = (estimate.time >= case.first) & (estimate.time <= case.last)
         truth = Truth(attitude=truth.attitude[::every][inside], bias=truth.bias[::every][inside])
     return replace(estimate, innovations=innovations, **part), truth
 
