@@ -20,21 +20,13 @@ GATED = ("gate.probability", *OUTLIERS)
 
 
 class Tuned(NamedTuple):
-    """The outcome of :func:`tune`.
-
-    Parameters
-    ----------
-    tuning : Tuning
-        Parameters with their intervals, and the tuned filter.
-    objective : Objective
-        Function that was minimised, for :func:`fit` again or slices of it.
-    gate : TunedGate or None
-        The gate, if outliers were modelled.
-    """
+    """The outcome of :func:`tune`."""
 
     tuning: Tuning
     objective: Objective
+    """Function that was minimised, for :func:`fit` again or slices of it."""
     gate: TunedGate | None
+    """The gate, if outliers were modelled."""
 
 
 def objective_for(
