@@ -69,19 +69,8 @@ class Temperature:
         if self.time_constant != np.inf:
             positive("time_constant", self.time_constant, unit="s")
 
-    def at(self, time: Array) -> Array:
-        """Return the temperature over a record.
-
-        Parameters
-        ----------
-        time : ndarray (n + 1,)
-            Edges of the record, s.
-
-        Returns
-        -------
-        ndarray (n + 1,)
-            Temperature at the edges, °C.
-        """
+    def _at(self, time: Array) -> Array:
+        """Return the temperature at the edges of a record (n + 1,), °C."""
         elapsed = time - time[0]
         share = elapsed / elapsed[-1] if self.time_constant == np.inf else -np.expm1(-elapsed / self.time_constant)
         return np.asarray(self.start + (self.end - self.start) * share)
@@ -217,7 +206,7 @@ def simulate(scenario: Scenario | str | os.PathLike[str], seed: int | None = Non
     if np.any(spec.g_sensitivity != 0.0):
         middle = 0.5 * (edges[1:] + edges[:-1])
         force = vectors.specific_force(scenario.motion, middle, gravity_f=scenario.gravity_f)
-    temperature = None if scenario.temperature is None else scenario.temperature.at(edges)
+    temperature = None if scenario.temperature is None else scenario.temperature._at(edges)
     output = gyro.simulate(
         spec,
         scenario.motion.increments(edges),
@@ -297,23 +286,13 @@ def _form(kind: Any, units: Form) -> Form:
     return {one.name: units.get(one.name, tables.PLAIN) for one in dataclasses.fields(kind) if one.name not in _OWN}
 
 
-_OF_MOTIONS: dict[str, tables.Choice] = {
-    "angle": tables.DEGREES,
-    "frequency": tables.HERTZ,
-    "precession_rate": tables.DEGREES_PER_SECOND,
-    "spin_rate": tables.DEGREES_PER_SECOND,
-    "rate": tables.DEGREES_PER_SECOND,
-    "rock_angle": tables.DEGREES,
-    "rock_frequency": tables.HERTZ,
-    "rock_phase": tables.DEGREES,
-    "rotation_vector": tables.DEGREES,
-    "duration": tables.SECONDS,
-    "start": tables.SECONDS,
+_OF_MOTIONS: Form = {
+    **dict.fromkeys(("angle", "rock_angle", "rock_phase", "rotation_vector"), tables.DEGREES),
+    **dict.fromkeys(("rate", "spin_rate", "precession_rate", "initial_rate", "mean"), tables.DEGREES_PER_SECOND),
+    **dict.fromkeys(("frequency", "rock_frequency"), tables.HERTZ),
+    **dict.fromkeys(("duration", "start", "time"), tables.SECONDS),
     "inertia": (("kg_m2", 1.0),),
-    "initial_rate": tables.DEGREES_PER_SECOND,
-    "time": tables.SECONDS,
     "ends": tables.TEXT,
-    "mean": tables.DEGREES_PER_SECOND,
 }
 _MOTIONS: dict[str, tuple[type, Form]] = {
     word: (kind, _form(kind, _OF_MOTIONS))
@@ -338,20 +317,12 @@ _ORBIT: Form = {
 }
 
 _OF_SENSORS: dict[str, tables.Choice] = {
-    "name": tables.TEXT,
-    "kind": tables.TEXT,
+    **dict.fromkeys(("name", "kind"), tables.TEXT),
     "rate": tables.HERTZ,
-    "phase": tables.SECONDS,
-    "field_f": tables.NANOTESLAS,
-    "hard_iron": tables.NANOTESLAS,
-    "bias": tables.METRES_PER_SECOND_SQUARED,
-    "gravity_f": tables.METRES_PER_SECOND_SQUARED,
-    "lever_arm_b": tables.METRES,
-    "baseline_b": tables.METRES,
-    "latency": tables.SECONDS,
-    "outages": tables.SECONDS,
-    "correlation_time": tables.SECONDS,
-    "duty_period": tables.SECONDS,
+    **dict.fromkeys(("phase", "latency", "outages", "correlation_time", "duty_period"), tables.SECONDS),
+    **dict.fromkeys(("field_f", "hard_iron"), tables.NANOTESLAS),
+    **dict.fromkeys(("bias", "gravity_f"), tables.METRES_PER_SECOND_SQUARED),
+    **dict.fromkeys(("lever_arm_b", "baseline_b"), tables.METRES),
 }
 _SENSORS: dict[str, tuple[type, Form, Form]] = {
     word: (

@@ -108,9 +108,11 @@ class SensorStates:
 
     def __post_init__(self) -> None:
         """Check every field."""
-        object.__setattr__(self, "mounting_sigma", _entries("mounting_sigma", self.mounting_sigma, (3,), "rad"))
-        object.__setattr__(self, "bias_sigma", _entries("bias_sigma", self.bias_sigma, (3,), ""))
-        object.__setattr__(self, "lever_arm_sigma", _entries("lever_arm_sigma", self.lever_arm_sigma, (3,), "m"))
+        for name, unit in (("mounting_sigma", "rad"), ("bias_sigma", ""), ("lever_arm_sigma", "m")):
+            value = _entries(name, getattr(self, name), (3,), unit)
+            if name != "lever_arm_sigma" and _any(value) and not np.all(value):
+                raise InputError(f"{name} is {value}; give a value above zero for every axis, or leave it out")
+            object.__setattr__(self, name, value)
         non_negative("correlated_sigma", self.correlated_sigma)
         non_negative("correlation_time", self.correlation_time, unit="s")
         if (self.correlated_sigma > 0.0) != (self.correlation_time > 0.0):
@@ -119,10 +121,6 @@ class SensorStates:
                 "give both above zero, or neither"
             )
         one_of("frame", self.frame, ("body", "fixed"))
-        for name in ("mounting_sigma", "bias_sigma"):
-            value = getattr(self, name)
-            if np.ndim(value) and _any(value) and 0.0 in np.asarray(value):
-                raise InputError(f"{name} is {value}; give a value above zero for every axis, or leave it out")
         if not isinstance(self.varying, bool):
             raise InputError(f"varying is {self.varying!r}; it must be true or false")
         for name, unit in VELOCITY.items():
