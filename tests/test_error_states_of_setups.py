@@ -562,7 +562,7 @@ def test_what_a_specification_gives_is_matched_entry_by_entry():
 def test_a_motion_that_commutes_badly_gets_a_better_integration():
     assert (
         setup.FilterSetup.for_scenario(scenarios.load_scenario("coning"), states=True).integration.name
-        == setup.ACCURATE_ALGORITHM
+        == setup.matching.ACCURATE_ALGORITHM
     )
     assert setup.FilterSetup.for_scenario(scenarios.load_scenario("spin"), states=True).integration.name == "one-sample"
 
