@@ -19,11 +19,7 @@ from typing import Literal
 import numpy as np
 
 from strapdown.checks import Array, count, fraction, one_of, positive
-from strapdown.kernels import gate_rules
-
-UNIFORM_SIGMA = gate_rules.UNIFORM_SIGMA
-"""Standard deviation of an angle that is uniform over a full rotation, rad."""
-
+from strapdown.kernels.gate_rules import UNIFORM_SIGMA
 
 LOCK_OUT = 10
 """Default limit, without recovery: a lock-out is reported if the refusals of a sensor exceed its acceptances by more than this."""

@@ -194,14 +194,9 @@ def _to_body(attitude: Array, vectors_f: Array) -> Array:
     return quaternion.rotate(quaternion.conjugate(attitude)[..., None, :], vectors_f)
 
 
-def _profile(b: Array, r: Array, weight: Array) -> Array:
-    """Return the attitude profile matrix B = Σ a r bᵀ: the best R maximises tr(R Bᵀ)."""
-    return np.asarray(np.swapaxes(weight[..., None] * r, -1, -2) @ b)
-
-
 def _svd(b: Array, r: Array, weight: Array) -> Array:
-    """R = U diag(1, 1, det U det V) Vᵀ for B = U S Vᵀ (Markley 1988, J. Astronautical Sciences 36)."""
-    U, _, Vt = np.linalg.svd(_profile(b, r, weight))
+    """Return the R of largest tr(R Bᵀ), B = Σ a r bᵀ = U S Vᵀ: U diag(1, 1, det U det V) Vᵀ (Markley 1988, J. Astronaut. Sci. 36)."""
+    U, _, Vt = np.linalg.svd(np.swapaxes(weight[..., None] * r, -1, -2) @ b)
     handed = np.linalg.det(U) * np.linalg.det(Vt)
     U = U * np.stack([np.ones_like(handed), np.ones_like(handed), np.sign(handed)], axis=-1)[..., None, :]
     return quaternion.from_matrix(U @ Vt)

@@ -32,7 +32,6 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -56,22 +55,7 @@ __all__ = [
 ]
 
 
-class Filter(Protocol):
-    """Function that runs a filter over a record."""
-
-    def __call__(
-        self,
-        record: ImuRecord,
-        process_noise: ProcessNoise,
-        initial: State,
-        *,
-        every: int = 1,
-        full_covariance: bool = False,
-    ) -> Estimate:
-        """Return the estimate at every ``every``-th edge."""
-
-
-FILTERS: dict[str, Filter] = {
+FILTERS: dict[str, Callable[..., Estimate]] = {
     "mekf": forward.run,
     "fixed-side": partial(extended.run, fixed_side),
     "right-invariant": partial(extended.run, right_invariant),
@@ -82,7 +66,7 @@ FILTERS: dict[str, Filter] = {
     "usque": unscented.run,
     "mahony": complementary.run,
 }
-"""Filters by name."""
+"""Filters by name: functions with the arguments of :func:`run` after the name."""
 
 
 def run(
