@@ -31,7 +31,9 @@ OF_YOUR_OWN = "a filter of your own"
 """Part of the note added to exceptions raised by a user's filter."""
 
 
-def _place(name: str, index: tuple[np.intp, ...]) -> str:
+def place(name: str, index: Iterable[int | np.intp]) -> str:
+    """Return the name of an entry of an array for messages."""
+    index = tuple(index)
     return f"{name}[{', '.join(str(int(i)) for i in index)}]" if index else name
 
 
@@ -60,7 +62,7 @@ def _unmasked(name: str, value: ArrayLike, allow_nan: bool) -> ArrayLike:
     if not mask.any():
         return np.asarray(value)
     if not allow_nan:
-        raise InputError(f"{_place(name, _first(mask))} is masked; remove or interpolate such samples first")
+        raise InputError(f"{place(name, _first(mask))} is masked; remove or interpolate such samples first")
     return np.asarray(np.ma.filled(value.astype(np.float64), np.nan))
 
 
@@ -108,7 +110,7 @@ def array(name: str, value: ArrayLike, shape: Sequence[int | str | EllipsisType]
     bad = np.isinf(result) if allow_nan else ~np.isfinite(result)
     if bad.any():
         index = _first(bad)
-        raise InputError(f"{_place(name, index)} is {result[index]}; remove or interpolate such samples first")
+        raise InputError(f"{place(name, index)} is {result[index]}; remove or interpolate such samples first")
     return result
 
 
@@ -117,6 +119,22 @@ def positive(name: str, value: float, *, unit: str = "") -> float:
     number = finite(name, value, unit=unit)
     if number <= 0.0:
         raise InputError(f"{name} is {number:g}{_unit(unit)}; it must be greater than zero")
+    return number
+
+
+def by_axis(name: str, value: ArrayLike, remedy: str = "") -> Array:
+    """Return one number for all axes, or one for each, as three (3,) above zero; ``remedy`` ends the message about a wrong shape."""
+    given = numbers(name, value)
+    if given.shape not in ((), (1,), (3,)):
+        raise InputError(f"{name} has shape {given.shape}; give one number, or three, one per axis{remedy}")
+    return np.array([positive(f"{name}[{k}]", float(one)) for k, one in enumerate(np.broadcast_to(given, 3))])
+
+
+def fraction(name: str, value: float) -> float:
+    """Return ``value`` as a float between 0 and 1, both excluded."""
+    number = finite(name, value)
+    if not 0.0 < number < 1.0:
+        raise InputError(f"{name} is {number:g}; it must lie between 0 and 1")
     return number
 
 
@@ -148,15 +166,11 @@ MAX_COUNTED = 2.0**63
 
 def count(name: str, value: int, *, minimum: int = 1) -> int:
     """Return ``value`` as a whole number of at least ``minimum``."""
-    whole = (
-        isinstance(value, (int, float, np.integer, np.floating))
-        and not isinstance(value, bool)
-        and abs(value) < MAX_COUNTED  # NaN and infinity are not
-    )
-    if whole is False and isinstance(value, int) and not isinstance(value, bool):
-        raise InputError(f"{name} is {value}; it must be a whole number of {minimum} or more, and below 2^63")
-    if not whole or int(value) != value or value < minimum:
-        raise InputError(f"{name} is {value!r}; it must be a whole number of {minimum} or more")
+    number = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
+    # NaN and infinity are not below the bound.
+    if not number or not abs(value) < MAX_COUNTED or int(value) != value or value < minimum:
+        bound = ", and below 2^63" if number and isinstance(value, int) and abs(value) >= MAX_COUNTED else ""
+        raise InputError(f"{name} is {value!r}; it must be a whole number of {minimum} or more{bound}")
     return int(value)
 
 
@@ -175,7 +189,7 @@ def unit_quaternions(name: str, value: ArrayLike) -> Array:
     if np.any(bad):
         index = _first(bad)
         raise InputError(
-            f"{_place(name, index)} has norm {norm[index]:.9g}, not 1; normalise it (quaternion.normalize) "
+            f"{place(name, index)} has norm {norm[index]:.9g}, not 1; normalise it (quaternion.normalize) "
             "and check that it is a quaternion, scalar first"
         )
     return np.asarray(np.where(off[..., None] > ROUNDING, q / norm[..., None], q))

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from strapdown.checks import Array, InputError, array, lengths, unit_quaternions
+from strapdown.checks import Array, InputError, array, lengths, place, unit_quaternions
 from strapdown.checks import covariance as checked
 
 if TYPE_CHECKING:
@@ -154,8 +154,9 @@ def _scale(value: Array) -> Array:
     largest = functools.reduce(np.maximum, np.moveaxis(np.abs(value), -1, 0))[..., None]
     zero = largest[..., 0] == 0.0
     if np.any(zero):
-        place = [int(i) for i in np.argwhere(zero)[0]] if zero.ndim else []
-        raise InputError(f"q{place or ''} is the zero quaternion, which has no direction; remove it")
+        raise InputError(
+            f"{place('q', np.argwhere(zero)[0])} is the zero quaternion, which has no direction; remove it"
+        )
     return np.asarray(np.ldexp(1.0, np.frexp(largest)[1] - 1))
 
 

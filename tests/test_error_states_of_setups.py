@@ -502,13 +502,11 @@ def test_the_drifts_that_measurements_follow_are_states_and_the_rest_is_white():
     instability, follows = 1e-4, 12.0
     spec = GyroSpec(angle_random_walk=1e-12, bias_instability=instability)
     record = ImuRecord(time=5e-4 * np.arange(20001), increments=np.zeros((20000, 3)))
-    found = matching.matched(spec, record, (), np.zeros(3), 0.5 * instability**2 / follows**3)
-    assert found.states.gyro_drift_time == pytest.approx(
-        (10.0, 1.0, 0.1)
-    )  # the next would be 0.01 s, and 0.3/12 is 0.025
+    states, white = matching.matched(spec, record, (), np.zeros(3), 0.5 * instability**2 / follows**3)
+    assert states.gyro_drift_time == pytest.approx((10.0, 1.0, 0.1))  # the next would be 0.01 s, and 0.3/12 is 0.025
     each = instability * np.sqrt(np.log(10.0) / np.pi)
-    assert found.states.gyro_drift_sigma == pytest.approx((each,) * 3)
-    assert found.white == pytest.approx(sum(2.0 * each**2 * 10.0**-k for k in range(2, 40)))
+    assert states.gyro_drift_sigma == pytest.approx((each,) * 3)
+    assert white == pytest.approx(sum(2.0 * each**2 * 10.0**-k for k in range(2, 40)))
 
 
 def test_what_a_specification_gives_is_matched_entry_by_entry():
@@ -533,7 +531,7 @@ def test_what_a_specification_gives_is_matched_entry_by_entry():
 def test_a_motion_that_commutes_badly_gets_a_better_integration():
     assert (
         setup.FilterSetup.for_scenario(scenarios.load_scenario("coning"), states=True).integration.name
-        == setup.ACCURATE_ALGORITHM
+        == setup.matching.ACCURATE_ALGORITHM
     )
     assert setup.FilterSetup.for_scenario(scenarios.load_scenario("spin"), states=True).integration.name == "one-sample"
 

@@ -370,7 +370,7 @@ def test_low_pass_frequency_response(frequency):
 def test_low_pass_noise_by_an_independent_integral(x):
     damping, dt = 0.7, 0.5
     natural = x / dt
-    _, factor = gyro.low_pass_step(natural, damping, dt)
+    _, factor = gyro.model.low_pass_step(natural, damping, dt)
     A = np.array([[0.0, 1.0, 0.0], [-(natural**2), -2.0 * damping * natural, 0.0], [1.0, 0.0, 0.0]])
     nodes, weights = np.polynomial.legendre.leggauss(120)
     responses = [linalg.expm(A * (0.5 * dt * (1.0 + node))) @ [0.0, natural**2, 0.0] for node in nodes]
@@ -571,7 +571,7 @@ def test_flicker_share_by_quadrature(damping):
     with mp.workdps(30):
         z = mp.mpf(damping)
         integral = mp.quad(lambda v: 1 / ((1 - v) ** 2 + 4 * z * z * v), [0, 0.5, 0.9, 1, 1.1, 2, 10, 1e3, 1e6, mp.inf])
-        assert gyro.flicker_share(damping) == pytest.approx(float(integral / (2 * mp.pi) * 4 * z), rel=1e-8)
+        assert gyro.model.flicker_share(damping) == pytest.approx(float(integral / (2 * mp.pi) * 4 * z), rel=1e-8)
 
 
 @pytest.mark.parametrize("white", [1e-3, 0.3, 10.0])

@@ -255,7 +255,7 @@ def test_the_matched_filter_has_the_slope_and_a_plain_one_is_named_for_lacking_i
     assert "gyro.temperature" in states.names
     assert states.chosen(("gyro.temperature",)).gyro_temperature_sigma == states.gyro_temperature_sigma
     assert states.chosen(()).names == ()
-    (block,) = states.gyro_blocks()
+    (block,) = states.blocks({})
     np.testing.assert_allclose(block.sigma, [1e-5, 2e-5, 2e-11], rtol=1e-12)  # an axis without one is none, in effect
     missing = "the gyro's bias over temperature"
     assert missing in setup.unmodelled_errors(linear.gyro)

@@ -11,7 +11,7 @@ from strapdown import consistency, estimation, motion, quaternion, records
 from strapdown.checks import InputError
 from strapdown.estimation import gating
 from strapdown.estimation.gating import Gate, Robust
-from strapdown.estimation.states import ProcessNoise
+from strapdown.estimation.states import ProcessNoise, restart_bias_variance
 from strapdown.gyro import GyroSpec
 from strapdown.kernels import covariance_form, gate_rules
 from strapdown.kernels.iterated_update import ACCEPTED, PASSED_OVER, REFUSED
@@ -256,9 +256,9 @@ def test_a_long_run_after_a_step_is_right_to_its_end():
 
 
 def test_the_restart_is_as_wide_as_the_start_by_default():
-    P = np.diag([1.0, 1.0, 1.0, 4.0, 9.0, 16.0])
-    assert np.array_equal(Gate().restart_bias_variance(P), [4.0, 9.0, 16.0])
-    assert np.array_equal(Gate(restart_bias_sigma=3.0).restart_bias_variance(P), [9.0, 9.0, 9.0])
+    first = estimation.initial_state([1.0, 0.0, 0.0, 0.0], attitude_sigma=1.0, bias_sigma=[2.0, 3.0, 4.0])
+    assert np.array_equal(restart_bias_variance(Gate(), first), [4.0, 9.0, 16.0])
+    assert np.array_equal(restart_bias_variance(Gate(restart_bias_sigma=3.0), first), [9.0, 9.0, 9.0])
     record = simulate(scenario(duration=1.0), 3)
     start = started(record, 0, bias_sigma=0.02)
     _, end = estimation.run_part(records.cut(record, 0, 20), NOISE, turned(start), gate=Gate())

@@ -148,8 +148,8 @@ def test_measurement_density_counts_what_each_kind_measures():
     sigma = record.vectors[0].sigma[0]
     number = sum(len(series.time) for series in record.vectors)
     expected = (record.time[-1] - record.time[0]) * sigma**2 / (number * 2.0 / 3.0)
-    assert setup.measurement_density(record) == pytest.approx(expected)
-    assert setup.measurement_density(dataclasses.replace(record, vectors=())) == np.inf
+    assert setup.matching.measurement_density(record) == pytest.approx(expected)
+    assert setup.matching.measurement_density(dataclasses.replace(record, vectors=())) == np.inf
     x, time = np.array([1.0, 0.0, 0.0]), np.arange(1.0, 5.0)
     compass = series_of("a", "heading", time, np.tile(x, (4, 1)), x, 0.1)
     field = series_of("b", "vector", time, np.tile(2.0 * x, (4, 1)), 2.0 * x, 0.2)
@@ -157,7 +157,7 @@ def test_measurement_density_counts_what_each_kind_measures():
     tracker = VectorMeasurements(sensor="c", kind="attitude", time=time, attitude=whole, sigma_axes=[0.1, 0.2, 0.4])
     for series, information in ((compass, 100.0), (field, 200.0), (tracker, 100.0 + 25.0 + 6.25)):
         one = ImuRecord(time=np.array([0.0, 8.0]), increments=np.zeros((1, 3)), vectors=(series,))
-        assert setup.measurement_density(one) == pytest.approx(8.0 / (4.0 * information / 3.0))
+        assert setup.matching.measurement_density(one) == pytest.approx(8.0 / (4.0 * information / 3.0))
 
 
 def test_modelled_record_replaces_sigmas_by_name_and_keeps_ratios():

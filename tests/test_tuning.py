@@ -240,17 +240,17 @@ def test_a_common_scale_leaves_the_estimates_and_multiplies_the_variances():
 
 def test_thinned_measurements_weigh_as_much_as_all():
     series = every_kind().vectors[0]
-    thin = tuning.thinned(series, 3.0)
+    thin = tuning.objective.thinned(series, 3.0)
     assert np.all(np.diff(thin.time) >= 3.0 - 1e-5)
     usable = np.isfinite(series.vector_b).all(axis=1)
     assert np.sum(thin.sigma**-2.0) == pytest.approx(np.sum(series.sigma[usable] ** -2.0))
     assert np.isfinite(thin.vector_b).all()
-    assert tuning.thinned(thin, 0.1) is thin
+    assert tuning.objective.thinned(thin, 0.1) is thin
     # The likelihood of a record is that of its thinned series, at less than a second too.
     time = 0.1 * np.arange(1, 100)
     star = series_of("star", "direction", time, np.tile([1.0, 0.0, 0.0], (99, 1)), [1.0, 0, 0], 1e-3)
     record = ImuRecord(time=0.1 * np.arange(101), increments=np.zeros((100, 3)), vectors=(star,))
-    sparse = dataclasses.replace(record, vectors=(tuning.thinned(star, 0.5),))
+    sparse = dataclasses.replace(record, vectors=(tuning.objective.thinned(star, 0.5),))
     assert len(sparse.vectors[0].time) == 20
     initial = setup.initial_state(BELIEVED, np.array([1.0, 0.0, 0.0, 0.0]))
     of = lambda one, spacing: tuning.likelihood(  # noqa: E731

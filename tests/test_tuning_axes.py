@@ -96,7 +96,7 @@ def test_a_heading_has_one():
     case = case_of(scenario, chosen, 1)
     with pytest.raises(InputError, match=r"mag\.sigma\.x: a heading has one degree of freedom; give mag\.sigma"):
         tuning.likelihood([case], chosen, ["mag.sigma.x"])
-    assert not any(name.startswith("mag") for name in tuning.axis_names([record]))
+    assert not any(name.startswith("mag") for name in tuning.parameters.axis_names([record]))
 
 
 def test_the_monte_carlo_takes_three_of_an_attitude_in_lanes_and_others_on_the_scalar_machine():
@@ -114,7 +114,7 @@ def test_the_monte_carlo_takes_three_of_an_attitude_in_lanes_and_others_on_the_s
 def test_names_start_from_the_present_sigma():
     record = scenarios.simulate(tracked(5.0), 1)
     chosen = setup.FilterSetup.for_scenario(tracked(5.0))
-    assert tuning.axis_names([record]) == AXES
+    assert tuning.parameters.axis_names([record]) == AXES
     assert tuning.default_names([record]) == ("gyro.arw", "gyro.rrw", "star.sigma")
     values = tuning.values_of(chosen, AXES, [record])
     np.testing.assert_allclose([values[name] for name in AXES], STAR)
@@ -132,7 +132,7 @@ def test_names_start_from_the_present_sigma():
     with pytest.raises(InputError, match="no three sigmas for star"):
         tuning.with_values(chosen, {"star.sigma.y": 3e-5})
     assert tuning.unit_of("star.sigma.x", [record]).name == "arcsec"
-    assert tuning.axis_of("star.sigma") is None
+    assert tuning.parameters.axis_of("star.sigma") is None
     filled = parameters.by_axis(chosen, ["star.sigma.z"], [record])
     assert setup.from_toml(setup.to_toml(filled)) == filled
 

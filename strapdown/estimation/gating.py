@@ -18,20 +18,11 @@ from typing import Literal
 
 import numpy as np
 
-from strapdown.checks import Array, InputError, count, finite, one_of, positive
-from strapdown.kernels import gate_rules
-
-UNIFORM_SIGMA = gate_rules.UNIFORM_SIGMA
-"""Standard deviation of an angle that is uniform over a full rotation, rad."""
-
+from strapdown.checks import Array, count, fraction, one_of, positive
+from strapdown.kernels.gate_rules import UNIFORM_SIGMA
 
 LOCK_OUT = 10
 """Default limit, without recovery: a lock-out is reported if the refusals of a sensor exceed its acceptances by more than this."""
-
-
-def _probability(name: str, value: float) -> None:
-    if not 0.0 < finite(name, value) < 1.0:
-        raise InputError(f"{name} is {value:g}; it must lie between 0 and 1")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,7 +69,7 @@ class Gate:
 
     def __post_init__(self) -> None:
         """Check every field."""
-        _probability("gate: probability", self.probability)
+        fraction("gate: probability", self.probability)
         if self.recovery is not None:
             count("gate: recovery", self.recovery, minimum=2)
         positive("gate: restart_attitude_sigma", self.restart_attitude_sigma, unit="rad")
@@ -96,23 +87,6 @@ class Gate:
     def lock_out_limit(self) -> int:
         """Difference of refusals and acceptances of a sensor above which a lock-out is reported."""
         return self.recovery or LOCK_OUT
-
-    def restart_bias_variance(self, initial: Array) -> Array:
-        """Return the increase of the bias variance of the first restart candidate.
-
-        Parameters
-        ----------
-        initial : ndarray (n, n)
-            Initial covariance of the filter.
-
-        Returns
-        -------
-        ndarray (3,)
-            Increase per axis, (rad/s)².
-        """
-        if self.restart_bias_sigma is None:
-            return np.diag(initial)[3:6].copy()
-        return np.full(3, self.restart_bias_sigma**2)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -150,7 +124,7 @@ class Robust:
     def __post_init__(self) -> None:
         """Check every field."""
         one_of("robust: kind", self.kind, ("huber", "student"))
-        _probability("robust: probability", self.probability)
+        fraction("robust: probability", self.probability)
         positive("robust: degrees_of_freedom", self.degrees_of_freedom)
         count("robust: iterations", self.iterations)
 

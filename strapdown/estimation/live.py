@@ -295,7 +295,7 @@ class LiveFilter:
         if len(here.events) + len(events) > MOST:
             past.extend([here, *reversed(later)])
             raise InputError(f"there are more than {MOST} measurements in one gyro interval; give gyro samples between")
-        self._state[:], self._closed, self._time = here.before
+        (self._state[:], self._closed), self._time = here.before, here.start
         self._process(here.end, here.increment, sorted([*here.events, *events], key=_order))
         for one in reversed(later):
             self._process(one.end, one.increment, one.events)
@@ -309,7 +309,7 @@ class LiveFilter:
             past, oldest = self._intervals, end - self.look_back - 4.0 * math.ulp(end)
             while past and past[0].end < oldest:
                 past.popleft()
-            past.append(_Interval(end, increment, events, (self._state.copy(), self._closed, self._time)))
+            past.append(_Interval(self._time, end, increment, events, (self._state.copy(), self._closed)))
         edges, turn = self._gyro_stores
         edges[0], edges[1] = self._time, end
         if increment is not None:
@@ -525,16 +525,12 @@ def _template(sensor: VectorSensor | VectorMeasurements, time: float) -> VectorM
     return replace(sensor.taken(slice(0, 1)), time=np.array([time]), arrival=None)
 
 
-def _frame(reference_f: Array) -> tuple[float, ...]:
-    return tuple(triad(reference_f).ravel().tolist())
-
-
 def _row(kind: str, reference_f: Array, covariance: Array, isotropic: bool, sigma: float) -> _Row:
     """Return the row of a measurement with this noise."""
     length = float(np.linalg.norm(reference_f)) if kind == "vector" else 1.0
     x, y, z = np.diag(covariance).tolist()
     return _Row(
-        frame=(0.0,) * 9 if kind == "attitude" else _frame(reference_f),
+        frame=(0.0,) * 9 if kind == "attitude" else tuple(triad(reference_f).ravel().tolist()),
         length=length,
         sigma=sigma / length,
         noise=tuple((covariance / np.square(length))[UPPER].tolist()),
@@ -567,16 +563,12 @@ def _unit(vector: _Three) -> _Three:
 class _Interval(NamedTuple):
     """A gyro sample and the measurements in it; with a look-back, the first has no duration."""
 
+    start: float
     end: float
     increment: _Three | None
     events: Sequence[_Measured]
-    before: tuple[Array, tuple[Event, ...], float]
-    """State, closed events and time before it."""
-
-    @property
-    def start(self) -> float:
-        """Start time, s."""
-        return self.before[2]
+    before: tuple[Array, tuple[Event, ...]]
+    """State and closed events before it."""
 
 
 class _Slots:

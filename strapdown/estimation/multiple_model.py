@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from strapdown import estimation, quaternion, records, vectors
-from strapdown.checks import Array, InputError, array, count, finite, positive
+from strapdown.checks import Array, InputError, array, count, fraction
 from strapdown.estimation.forward import after, gaps, gate_options, in_order
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.schedule import Schedule, innovations_by_sensor, joined, schedule
@@ -92,11 +92,6 @@ class BankEstimate:
         """Whether the hypotheses were merged into one Gaussian."""
         return bool(np.isfinite(self.became_one))
 
-    @property
-    def left(self) -> int:
-        """Number of hypotheses at the end of the bank's part."""
-        return int(np.sum(self.weights[-1] > 0.0))
-
 
 def run(
     record: ImuRecord,
@@ -164,8 +159,7 @@ def run(
     count("hypotheses", hypotheses, minimum=8)
     count("every", every)
     for name, value in (("least_weight", least_weight), ("largest_share", largest_share)):
-        if not 0.0 < finite(name, value) < 1.0:
-            raise InputError(f"{name} is {value:g}; it must lie between 0 and 1")
+        fraction(name, value)
     options = _Options(
         hypotheses,
         array("bias", bias, (3,)),
@@ -240,7 +234,12 @@ def _until_one(record: ImuRecord, process_noise: ProcessNoise, options: _Options
     recovery = 0 if options.gate is None else options.gate.recovery or 0
     own_events = gaps(record.time)
     failed = 0
-    first = _first_direction(events)
+    directions = _directions(events, 0)
+    if len(directions) == 0:
+        raise InputError(
+            "the record has no direction, vector or attitude within its time to start from; add one: a heading is not enough"
+        )
+    first = int(directions[0])
     while True:
         wide = gate_rules.WIDENING ** (failed % (gate_rules.WIDEST + 1)) * options.bias_sigma
         found = _walked(record, process_noise, events, first, options._replace(bias_sigma=wide), recovery)
@@ -358,41 +357,27 @@ def start(
     first: int,
     hypotheses: int,
     *,
-    bias: ArrayLike = (0.0, 0.0, 0.0),
-    bias_sigma: ArrayLike,
+    bias: Array,
+    bias_sigma: Array,
 ) -> tuple[Array, Array]:
     """Return the hypotheses (h, 28), packed, for event ``first``, a direction, and their angles on the circle (h,), rad.
 
     Across the direction each has the measurement's covariance; about it, a standard deviation of half the spacing, for which the sum of the
     Gaussians is uniform over the circle to 1.5 %. A measured attitude gives a single hypothesis.
     """
-    spread = np.broadcast_to(bias_sigma, 3).astype(np.float64)
-    for k, value in enumerate(spread):
-        positive(f"bias_sigma[{k}]", value, unit="rad/s")
     P = np.zeros((6, 6))
-    P[3:, 3:] = np.diag(spread**2)
-    given = array("bias", bias, (3,))
+    P[3:, 3:] = np.diag(bias_sigma**2)
     frame = events.triads[events.reference[first]]
     if events.kind[first] == measurement.ATTITUDE:
         P[:3, :3] = np.diag(events.vector_b[first])
-        return pack(frame[:4], given, P)[None, :].copy(), np.zeros(1)
+        return pack(frame[:4], bias, P)[None, :].copy(), np.zeros(1)
     z = events.vector_b[first] / np.linalg.norm(events.vector_b[first])
     # Any attitude that maps z onto the reference: the one that maps a triad about it to a triad about the reference.
     q = quaternion.from_matrix(frame.reshape(3, 3).T @ vectors.triad(z))
     angles = 2.0 * np.pi * np.arange(hypotheses) / hypotheses
     P[:3, :3] = events.variance[first] * (np.eye(3) - np.outer(z, z)) + (np.pi / hypotheses) ** 2 * np.outer(z, z)
     circle = quaternion.multiply(q, quaternion.exp(angles[:, None] * z))
-    return np.array([pack(attitude, given, P) for attitude in circle]), angles
-
-
-def _first_direction(events: Schedule) -> int:
-    """Return the first event that is not a heading."""
-    more = _directions(events, 0)
-    if len(more) == 0:
-        raise InputError(
-            "the record has no direction, vector or attitude within its time to start from; add one: a heading is not enough"
-        )
-    return int(more[0])
+    return np.array([pack(attitude, bias, P) for attitude in circle]), angles
 
 
 def _directions(events: Schedule, first: int) -> np.ndarray:

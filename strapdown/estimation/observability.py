@@ -16,13 +16,14 @@ from strapdown.estimation.error_states import AXES, ErrorStates
 from strapdown.estimation.smoothing import smooth
 from strapdown.estimation.states import ProcessNoise, State
 from strapdown.records import ImuRecord
+from strapdown.results import Listed, Listing
 
 NAMED = 0.25
 """Minimum component of a direction, relative to its largest, for a state to be named."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Observability:
+class Observability(Listed):
     """Information of a record's measurements about the initial state, relative to the prior.
 
     With the prior covariance ``P₀ = S Sᵀ`` and the covariance P of the same state after the whole record, the information of the
@@ -95,23 +96,18 @@ class Observability:
         ]
         return " ".join(parts).removeprefix("+")
 
-    def __str__(self) -> str:
-        """Return the table as text."""
-        n = len(self.states)
-        width = max(len(f"{state}, {unit}") for state, unit in zip(self.states, self.units, strict=True))
-        lines = [f"{self.rank} of {n} directions are observed (singular value {self.threshold:g} or more)", ""]
-        lines.append(
-            f"{'state':{width}s} {'prior σ':>11s} {'start/prior':>11s} {'final/prior':>11s} {'unobserved':>10s}"
-        )
-        for i in range(n):
-            lines.append(
-                f"{f'{self.states[i]}, {self.units[i]}':{width}s} {self.prior_sigma[i]:11.3g} "
-                f"{self.start_sigma[i] / self.prior_sigma[i]:11.3g} {self.final_sigma[i] / self.prior_sigma[i]:11.3g} "
-                f"{self.unobserved[i]:10.2f}"
-            )
-        lines += ["", "singular value: direction, each state relative to its prior σ (and the remaining σ)"]
-        lines += [f"{self.singular_values[k]:14.3g}: {self.words(k)}" for k in range(n - 1, -1, -1)]
-        return "\n".join(lines)
+    def listing(self) -> Listing:
+        """Return the σ of each state, and each direction with its singular value, as a table."""
+        prior = self.prior_sigma
+        columns = (prior, self.start_sigma / prior, self.final_sigma / prior)
+        rows = [
+            (f"{state}, {unit}", *(f"{value:.3g}" for value in sigmas), f"{part:.2f}")
+            for state, unit, *sigmas, part in zip(self.states, self.units, *columns, self.unobserved, strict=True)
+        ]
+        notes = ["singular value: direction, each state relative to its prior σ (and the remaining σ)"]
+        notes += [f"{self.singular_values[k]:14.3g}: {self.words(k)}" for k in reversed(range(len(self.states)))]
+        title = f"{self.rank} of {len(self.states)} directions are observed (singular value {self.threshold:g} or more)"
+        return Listing(title, ("state", "prior σ", "start/prior", "final/prior", "unobserved"), rows, notes)
 
     def summary(self) -> dict[str, Any]:
         """Return everything as plain values for JSON, in SI units.
@@ -126,15 +122,12 @@ class Observability:
             "threshold": self.threshold,
             "singular_value_unit": "prior sigma over sigma of the measurements",
             "states": [
-                {
-                    "state": self.states[i],
-                    "unit": self.units[i],
-                    "prior_sigma": float(self.prior_sigma[i]),
-                    "start_sigma": float(self.start_sigma[i]),
-                    "final_sigma": float(self.final_sigma[i]),
-                    "unobserved": float(self.unobserved[i]),
+                {"state": state, "unit": unit}
+                | {
+                    name: float(getattr(self, name)[i])
+                    for name in ("prior_sigma", "start_sigma", "final_sigma", "unobserved")
                 }
-                for i in range(len(self.states))
+                for i, (state, unit) in enumerate(zip(self.states, self.units, strict=True))
             ],
             "directions": [
                 {

@@ -14,10 +14,10 @@ from strapdown.checks import (
     Array,
     InputError,
     array,
+    by_axis,
     covariance,
     instance,
     non_negative,
-    numbers,
     positive,
     unit_quaternions,
 )
@@ -174,23 +174,10 @@ def initial_state(
     >>> start.covariance.diagonal().round(10).tolist()
     [0.01, 0.01, 0.01, 1e-08, 1e-08, 1e-08]
     """
-    sigma = np.concatenate([_by_axis("attitude_sigma", attitude_sigma), _by_axis("bias_sigma", bias_sigma)])
-    if not np.all(sigma > 0.0):
-        k = int(np.argmin(sigma > 0.0))
-        raise InputError(
-            f"{'attitude' if k < 3 else 'bias'}_sigma[{k % 3}] is {sigma[k]:g}; it must be greater than zero"
-        )
+    sigma = np.concatenate([by_axis("attitude_sigma", attitude_sigma), by_axis("bias_sigma", bias_sigma)])
     return State(
         attitude=array("attitude", attitude, (4,)), bias=array("bias", bias, (3,)), covariance=np.diag(sigma**2)
     )
-
-
-def _by_axis(name: str, value: ArrayLike) -> Array:
-    """Return three numbers, one per axis."""
-    given = numbers(name, value)
-    if given.shape not in ((), (1,), (3,)):
-        raise InputError(f"{name} has shape {given.shape}; give one number, or three, one per axis")
-    return np.broadcast_to(given, 3)
 
 
 def first_bias_variance(initial: State) -> Array:
@@ -202,31 +189,26 @@ def restart_bias_variance(gate: Gate | None, initial: State) -> Array:
     """Return the increase of the bias variance of a gate's first candidate (3,), (rad/s)², in a filter that continues from ``initial``."""
     if gate is None:
         return np.zeros(3)
-    if gate.restart_bias_sigma is None and initial.gate is not None:
-        return initial.gate.restart_bias_variance
-    return gate.restart_bias_variance(initial.covariance)
+    if gate.restart_bias_sigma is None:
+        return first_bias_variance(initial)
+    return np.full(3, gate.restart_bias_sigma**2)
 
 
-NEEDED = {
+ARGUMENTS: dict[str, tuple[type, str]] = {
     "record": (ImuRecord, "make it with records.ImuRecord, or read one by recordfiles.read_record"),
     "process_noise": (ProcessNoise, "give estimation.ProcessNoise(angle_random_walk=…, …)"),
     "initial": (State, "make it with estimation.initial_state, or from a record by estimation.first_state"),
-}
-"""Arguments of filters by name: class, and how to obtain one."""
-OPTIONAL = {
     "gate": (Gate, "give estimation.Gate(probability=0.999), or None"),
     "robust": (Robust, "give estimation.Robust(kind='huber'), or None"),
 }
-"""Optional arguments."""
+"""Arguments of filters by name: class, and how to obtain one."""
 
 
 def check_arguments(**given: object) -> None:
-    """Raise an error for arguments, given by name, of a wrong class."""
+    """Raise an error for arguments, given by name, of a wrong class; only a gate and robust updates may be None."""
     for name, value in given.items():
-        if name in NEEDED:
-            instance(name, value, *NEEDED[name])
-        elif value is not None:
-            instance(name, value, *OPTIONAL[name])
+        if value is not None or name not in ("gate", "robust"):
+            instance(name, value, *ARGUMENTS[name])
 
 
 FIRST_SETS = 10

@@ -19,10 +19,10 @@ from strapdown.checks import (
     Array,
     InputError,
     array,
+    by_axis,
     covariance,
     finite,
     non_negative,
-    numbers,
     one_of,
     positive,
     unit_quaternions,
@@ -52,12 +52,8 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
 
     Parameters
     ----------
-    process_noise : ProcessNoise
-        Noise of the gyro.
-    initial : State
-        Initial state. The end state of :func:`strapdown.estimation.run_part` continues that run; give its ``time``.
-    error_states : sequence of ErrorStates, optional
-        Error states of the gyro and the sensors in addition to attitude and bias.
+    process_noise, initial, error_states : ProcessNoise, State, sequence of ErrorStates
+        As for :class:`LiveFilter`.
     sensors : sequence of str, optional
         Names of the sensors; with error states no other name is accepted. Default: with error states, the sensors that they affect, if
         any; otherwise any name.
@@ -97,8 +93,9 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         check_arguments(process_noise=process_noise)
         self.error_states = modelling.as_blocks(error_states)
         state = modelling.begin(initial, self.error_states)
-        names = _sensor_names(sensors)
-        self.sensors = self._sensors_of_states(names)
+        if isinstance(sensors, str):
+            raise InputError(f"sensors is {sensors!r}; it must be a sequence of names, ({sensors!r},)")
+        self.sensors = self._sensors_of_states(tuple(sensors))
         n = 6 + len(state.values)
         super().__init__(dim_x=n, dim_z=2)
         self.x, self.x_prior, self.x_post = np.zeros((3, n))
@@ -243,11 +240,6 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         ----------
         *arguments, **options
             Ignored.
-
-        Raises
-        ------
-        InputError
-            Always; use :meth:`update_direction`, :meth:`update_vector`, :meth:`update_heading` or :meth:`update_attitude`.
         """
         raise InputError(
             "an update by HJacobian and Hx would leave its correction in x, not in the attitude; use update_direction, update_vector, "
@@ -284,6 +276,11 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         -------
         bool
             Whether the measurement was used; false if it is missing.
+
+        Raises
+        ------
+        InputError
+            If a shape is wrong, or the noise is missing or not positive.
         """
         return self._update_by_vector("direction", vector_b, reference_f, (sigma, covariance), sensor)
 
@@ -304,22 +301,13 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
             Measured vector in body axes, in the unit of ``reference_f``.
         reference_f : array_like (3,)
             The same vector in the fixed frame.
-        sigma : float or array_like (3,), optional
-            σ of each component, in that unit; one, or one per body axis.
-        sensor : str, optional
-            Name of the sensor.
-        covariance : array_like (3, 3), optional
-            Covariance of the noise, instead of ``sigma``.
+        sigma, sensor, covariance : optional
+            As for :meth:`update_direction`, but of each component, in that unit.
 
         Returns
         -------
         bool
-            Whether the measurement was used; false if it is missing.
-
-        Raises
-        ------
-        InputError
-            If a shape is wrong, the noise is missing or not positive.
+            As for :meth:`update_direction`.
         """
         return self._update_by_vector("vector", vector_b, reference_f, (sigma, covariance), sensor)
 
@@ -347,11 +335,6 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         -------
         bool
             Whether the measurement was used; false if it is missing or vertical.
-
-        Raises
-        ------
-        InputError
-            If a shape is wrong, σ is not positive.
         """
         return self._update_by_vector("heading", vector_b, reference_f, (sigma, None), sensor)
 
@@ -369,22 +352,13 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         ----------
         attitude : array_like (4,)
             Measured q_fb.
-        sigma : float or array_like (3,), optional
-            σ about the body axes, rad.
-        sensor : str, optional
-            Name of the sensor.
-        covariance : array_like (3, 3), optional
-            Covariance of the noise, rad², body axes, instead of ``sigma``.
+        sigma, sensor, covariance : optional
+            As for :meth:`update_direction`, but about all body axes.
 
         Returns
         -------
         bool
-            Whether the measurement was used; false if it is missing.
-
-        Raises
-        ------
-        InputError
-            If a shape is wrong, the noise is missing or not positive.
+            As for :meth:`update_direction`.
         """
         name = _label(sensor, "attitude")
         given = array(name, attitude, (4,), allow_nan=True)
@@ -508,13 +482,6 @@ class _Measurement:
         return bool(has_heading(rotation_matrix(tuple(attitude.tolist())), self.z))
 
 
-def _sensor_names(sensors: Sequence[str]) -> tuple[str, ...]:
-    """Return names of sensors as a tuple; a single string is refused."""
-    if isinstance(sensors, str):
-        raise InputError(f"sensors is {sensors!r}; it must be a sequence of names, ({sensors!r},)")
-    return tuple(sensors)
-
-
 def _label(sensor: str, name: str) -> str:
     """Return the name of a value for messages."""
     return f"{sensor}: {name}" if sensor else name
@@ -526,11 +493,4 @@ def _noise_covariance(sensor: str, sigma: ArrayLike | None, covariance_b: ArrayL
         raise InputError("give either sigma or covariance: the noise of the measurement")
     if sigma is None:
         return covariance(_label(sensor, "covariance"), np.asarray(covariance_b), 3)
-    name = _label(sensor, "sigma")
-    given = numbers(name, sigma)
-    if given.shape not in ((), (1,), (3,)):
-        raise InputError(
-            f"{name} has shape {given.shape}; give one number, one per body axis, or a matrix as covariance"
-        )
-    spread = np.array([positive(name, float(value)) for value in np.broadcast_to(given, 3)])
-    return np.diag(spread**2)
+    return np.diag(by_axis(_label(sensor, "sigma"), sigma, ", or a matrix as covariance") ** 2)

@@ -38,11 +38,8 @@ PATTERN = (0.0,) * WIDTH
 def supports(problem: Problem) -> bool:
     """Return whether a record can be filtered with others: its model has no chains, no offset in fixed axes and no temperature."""
     model = problem.model
-    return (
-        temperature.slopes(problem.error_states) is None
-        and not len(model.chains)
-        and not (model.sensor_use & FIXED).any()
-    )
+    driven = temperature.slopes(problem.error_states) is not None
+    return not (driven or len(model.chains) or (model.sensor_use & FIXED).any())
 
 
 def run(problems: Sequence[Problem], every: int, alone: Callable[[Problem], Estimate]) -> list[Estimate]:
@@ -75,8 +72,7 @@ def run(problems: Sequence[Problem], every: int, alone: Callable[[Problem], Esti
         for first in range(0, len(group), WIDTH):
             together = group[first : first + WIDTH]
             found.update(zip(together, _filtered([problems[i] for i in together], every), strict=True))
-    found_or_none = [found.get(i) for i in range(len(problems))]
-    return [alone(problem) if one is None else one for problem, one in zip(problems, found_or_none, strict=True)]
+    return [found.get(i) or alone(problem) for i, problem in enumerate(problems)]
 
 
 def _alike(one: Problem, other: Problem) -> bool:

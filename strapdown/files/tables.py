@@ -162,6 +162,13 @@ def _with_typed(text: str, table: Mapping[str, Any], form: Form, place: str) -> 
     return text if text.startswith(place.split(":", 1)[0]) else f"{place}: {text}"
 
 
+def subtable(content: Any, place: str, remedy: str = "") -> dict[str, Any]:
+    """Return a value of a file that must be a table; ``remedy`` ends the error if it is none."""
+    if not isinstance(content, Mapping):
+        raise InputError(f"{place} is {content!r}; it must be a table{remedy}")
+    return dict(content)
+
+
 Kind = TypeVar("Kind")
 
 

@@ -15,9 +15,7 @@ from strapdown.gyro.model import GyroSpec as GyroSpec
 from strapdown.gyro.model import best_bandwidth as best_bandwidth
 from strapdown.gyro.model import bridge_dropped as bridge_dropped
 from strapdown.gyro.model import dropped as dropped
-from strapdown.gyro.model import flicker_share as flicker_share
 from strapdown.gyro.model import from_table as from_table
-from strapdown.gyro.model import low_pass_step as low_pass_step
 from strapdown.gyro.model import matched_process_noise as matched_process_noise
 from strapdown.gyro.model import process_noise as process_noise
 from strapdown.gyro.model import read_spec as read_spec

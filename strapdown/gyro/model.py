@@ -29,7 +29,7 @@ import functools
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -150,10 +150,9 @@ class GyroSpec(ByValue):
         """Check every field."""
         for name, unit in _BY_AXIS.items():
             object.__setattr__(self, name, _by_axis(name, getattr(self, name), unit))
-        if np.ndim(self.rate_ramp) == 0:
-            object.__setattr__(self, "rate_ramp", finite("rate_ramp", cast(float, self.rate_ramp), unit="rad/s²"))
-        else:
-            object.__setattr__(self, "rate_ramp", array("rate_ramp", self.rate_ramp, (3,)))
+        ramp: Any = self.rate_ramp
+        ramp = array("rate_ramp", ramp, (3,)) if np.ndim(ramp) else finite("rate_ramp", ramp, unit="rad/s²")
+        object.__setattr__(self, "rate_ramp", ramp)
         for name in ("turn_on_bias", "scale_factor", "asymmetry"):
             value = getattr(self, name)
             if not isinstance(value, (bool, str)) and np.ndim(value) == 0:

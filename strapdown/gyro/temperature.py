@@ -79,8 +79,7 @@ def to_table(warm: BiasOverTemperature, stem: str = STEM) -> dict[str, Any]:
 
 def from_table(table: Any, place: str = "temperature") -> BiasOverTemperature:
     """Return the polynomial of a table made by :func:`to_table`."""
-    if not isinstance(table, Mapping):
-        raise InputError(f"{place} is {table!r}; it must be a table, as written by `strapdown allan --temperature`")
+    table = tables.subtable(table, place, ", as written by `strapdown allan --temperature`")
     keys = [key for key in _keys(STEM, len(table)) if key == STEM or f"bias_{key}" in table]
     limits = ("reference_degc", "lowest_degc", "highest_degc")
     needed = [*limits, *(f"bias_{key}" for key in keys), *(f"sigma_{key}" for key in keys[1:])]

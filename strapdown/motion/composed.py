@@ -9,8 +9,7 @@ from numpy.typing import ArrayLike
 
 from strapdown import checks, quaternion
 from strapdown.checks import Array
-from strapdown.motion.parameters import edge_stamps, times
-from strapdown.motion.protocol import Motion, break_times
+from strapdown.motion.protocol import Motion, break_times, edge_stamps, times
 from strapdown.motion.quadrature import interval_integrals
 
 

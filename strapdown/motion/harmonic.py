@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from strapdown import checks, quaternion
 from strapdown.checks import Array
 from strapdown.motion.exact_phase import cosine_sine, harmonic_integrals
-from strapdown.motion.parameters import IDENTITY, edge_stamps, store_attitude, store_number, store_vector, times
+from strapdown.motion.protocol import IDENTITY, edge_stamps, store_attitude, store_number, store_vector, times
 
 _TERMS = 26
 _TRUNCATION = 1e-21

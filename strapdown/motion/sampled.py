@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from strapdown import checks, quaternion
 from strapdown.checks import Array
-from strapdown.motion.parameters import edge_stamps, times
+from strapdown.motion.protocol import edge_stamps, times
 from strapdown.motion.quadrature import interval_integrals
 
 _WIDEST_DEGREES = 170.0
@@ -94,18 +94,15 @@ class SampledAttitude:
         t = self._inside(time)
         return tuple(np.asarray(spline(t)) for spline in self._splines[: derivatives + 1])
 
-    def _smooth_rate(self, time: Array) -> Array:
-        s, velocity = self._smooth(time, 1)
-        product = quaternion.multiply(quaternion.conjugate(s), velocity)[..., 1:]
-        return np.asarray(2.0 * product / np.sum(s * s, axis=-1, keepdims=True))
-
     def attitude(self, time: ArrayLike) -> Array:
         """Return q_fb (..., 4)."""
         return quaternion.normalize(self._smooth(times(time), 0)[0])
 
     def body_rate(self, time: ArrayLike) -> Array:
         """Return ``w_b = 2 vec(s* ⊗ ṡ)/|s|²``, rad/s."""
-        return self._smooth_rate(times(time))
+        s, velocity = self._smooth(times(time), 1)
+        product = quaternion.multiply(quaternion.conjugate(s), velocity)[..., 1:]
+        return np.asarray(2.0 * product / np.sum(s * s, axis=-1, keepdims=True))
 
     def body_angular_acceleration(self, time: ArrayLike) -> Array:
         """Return ``dw_b/dt = 2 vec(s* ⊗ s̈)/|s|² − 2 w_b (s · ṡ)/|s|²``, rad/s²."""
@@ -118,7 +115,7 @@ class SampledAttitude:
     def increments(self, edges: ArrayLike) -> Array:
         """Return ∫ w_b dt over each interval, rad, by converged quadrature between the samples."""
         stamps = self._inside(edge_stamps(edges))
-        return interval_integrals(self._smooth_rate, stamps, self.time)
+        return interval_integrals(self.body_rate, stamps, self.time)
 
 
 def waypoints(time: ArrayLike, attitudes: ArrayLike, *, degree: int = 5) -> SampledAttitude:

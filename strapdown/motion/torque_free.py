@@ -15,9 +15,9 @@ from numpy.typing import ArrayLike
 
 from strapdown import checks, quaternion
 from strapdown.checks import Array
-from strapdown.motion.constant_rate import ConstantRate
+from strapdown.motion.closed_forms import ConstantRate
 from strapdown.motion.exact_phase import DIGITS, Pair, cosine_sine, halved, product_error, to_decimal, to_pair
-from strapdown.motion.parameters import IDENTITY, edge_stamps, stacked, store_attitude, store_vector, times
+from strapdown.motion.protocol import IDENTITY, edge_stamps, stacked, store_attitude, store_vector, times
 from strapdown.motion.quadrature import interval_integrals
 
 _SMALLEST_SINE = 1e-140
@@ -74,16 +74,6 @@ class TorqueFree:
     @functools.cached_property
     def _fixed_side(self) -> Array:
         return quaternion.multiply(np.array(self.initial_attitude), quaternion.conjugate(self._relative(np.zeros(()))))
-
-    @property
-    def energy(self) -> float:
-        """Kinetic energy T, J; constant."""
-        return 0.5 * math.fsum(i * w * w for i, w in zip(self.inertia, self.initial_rate, strict=True))
-
-    @property
-    def angular_momentum(self) -> Array:
-        """Angular momentum h_f in fixed axes (3,), kg m²/s; constant."""
-        return quaternion.rotate(np.array(self.initial_attitude), np.array(self.inertia) * np.array(self.initial_rate))
 
     def attitude(self, time: ArrayLike) -> Array:
         """Return q_fb (..., 4)."""

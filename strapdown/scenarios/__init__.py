@@ -9,7 +9,6 @@ import dataclasses
 import functools
 import os
 import re
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -70,19 +69,8 @@ class Temperature:
         if self.time_constant != np.inf:
             positive("time_constant", self.time_constant, unit="s")
 
-    def at(self, time: Array) -> Array:
-        """Return the temperature over a record.
-
-        Parameters
-        ----------
-        time : ndarray (n + 1,)
-            Edges of the record, s.
-
-        Returns
-        -------
-        ndarray (n + 1,)
-            Temperature at the edges, °C.
-        """
+    def _at(self, time: Array) -> Array:
+        """Return the temperature at the edges of a record (n + 1,), °C."""
         elapsed = time - time[0]
         share = elapsed / elapsed[-1] if self.time_constant == np.inf else -np.expm1(-elapsed / self.time_constant)
         return np.asarray(self.start + (self.end - self.start) * share)
@@ -218,7 +206,7 @@ def simulate(scenario: Scenario | str | os.PathLike[str], seed: int | None = Non
     if np.any(spec.g_sensitivity != 0.0):
         middle = 0.5 * (edges[1:] + edges[:-1])
         force = vectors.specific_force(scenario.motion, middle, gravity_f=scenario.gravity_f)
-    temperature = None if scenario.temperature is None else scenario.temperature.at(edges)
+    temperature = None if scenario.temperature is None else scenario.temperature._at(edges)
     output = gyro.simulate(
         spec,
         scenario.motion.increments(edges),
@@ -298,23 +286,13 @@ def _form(kind: Any, units: Form) -> Form:
     return {one.name: units.get(one.name, tables.PLAIN) for one in dataclasses.fields(kind) if one.name not in _OWN}
 
 
-_OF_MOTIONS: dict[str, tables.Choice] = {
-    "angle": tables.DEGREES,
-    "frequency": tables.HERTZ,
-    "precession_rate": tables.DEGREES_PER_SECOND,
-    "spin_rate": tables.DEGREES_PER_SECOND,
-    "rate": tables.DEGREES_PER_SECOND,
-    "rock_angle": tables.DEGREES,
-    "rock_frequency": tables.HERTZ,
-    "rock_phase": tables.DEGREES,
-    "rotation_vector": tables.DEGREES,
-    "duration": tables.SECONDS,
-    "start": tables.SECONDS,
+_OF_MOTIONS: Form = {
+    **dict.fromkeys(("angle", "rock_angle", "rock_phase", "rotation_vector"), tables.DEGREES),
+    **dict.fromkeys(("rate", "spin_rate", "precession_rate", "initial_rate", "mean"), tables.DEGREES_PER_SECOND),
+    **dict.fromkeys(("frequency", "rock_frequency"), tables.HERTZ),
+    **dict.fromkeys(("duration", "start", "time"), tables.SECONDS),
     "inertia": (("kg_m2", 1.0),),
-    "initial_rate": tables.DEGREES_PER_SECOND,
-    "time": tables.SECONDS,
     "ends": tables.TEXT,
-    "mean": tables.DEGREES_PER_SECOND,
 }
 _MOTIONS: dict[str, tuple[type, Form]] = {
     word: (kind, _form(kind, _OF_MOTIONS))
@@ -339,20 +317,12 @@ _ORBIT: Form = {
 }
 
 _OF_SENSORS: dict[str, tables.Choice] = {
-    "name": tables.TEXT,
-    "kind": tables.TEXT,
+    **dict.fromkeys(("name", "kind"), tables.TEXT),
     "rate": tables.HERTZ,
-    "phase": tables.SECONDS,
-    "field_f": tables.NANOTESLAS,
-    "hard_iron": tables.NANOTESLAS,
-    "bias": tables.METRES_PER_SECOND_SQUARED,
-    "gravity_f": tables.METRES_PER_SECOND_SQUARED,
-    "lever_arm_b": tables.METRES,
-    "baseline_b": tables.METRES,
-    "latency": tables.SECONDS,
-    "outages": tables.SECONDS,
-    "correlation_time": tables.SECONDS,
-    "duty_period": tables.SECONDS,
+    **dict.fromkeys(("phase", "latency", "outages", "correlation_time", "duty_period"), tables.SECONDS),
+    **dict.fromkeys(("field_f", "hard_iron"), tables.NANOTESLAS),
+    **dict.fromkeys(("bias", "gravity_f"), tables.METRES_PER_SECOND_SQUARED),
+    **dict.fromkeys(("lever_arm_b", "baseline_b"), tables.METRES),
 }
 _SENSORS: dict[str, tuple[type, Form, Form]] = {
     word: (
@@ -378,8 +348,7 @@ _TOP_FORM: Form = {
     "duration": tables.SECONDS,
     "gravity_f": tables.METRES_PER_SECOND_SQUARED,
 }
-_TABLES = ("motion", "gyro", "temperature", "sensors")
-_TOP = ("name", "description", "seed", "rate_hz", "duration_s", "gravity_f_m_per_s2", *_TABLES)
+_TOP = ("name", "description", *tables.keys(_TOP_FORM), "motion", "gyro", "temperature", "sensors")
 _TEMPERATURE: Form = {"start": tables.DEGREES_CELSIUS, "end": tables.DEGREES_CELSIUS, "time_constant": tables.SECONDS}
 
 
@@ -425,7 +394,7 @@ def _from_table(table: dict[str, Any], place: str) -> Scenario:
     for key in ("name", "description"):
         if not isinstance(table.get(key, ""), str):
             raise InputError(f"{place}: {key} is {table[key]!r}; it must be a string")
-    preset, spec = _read_gyro(_table(table.get("gyro", {}), f"{place}: gyro"), f"{place}: gyro")
+    preset, spec = _read_gyro(tables.subtable(table.get("gyro", {}), f"{place}: gyro"), f"{place}: gyro")
     sensors = table.get("sensors", [])
     if not isinstance(sensors, list):
         raise InputError(f"{place}: sensors is one table; write [[sensors]] with two brackets")
@@ -436,21 +405,17 @@ def _from_table(table: dict[str, Any], place: str) -> Scenario:
         "rate": table["rate_hz"],
         "duration": table["duration_s"],
         "gravity_f": table.get("gravity_f_m_per_s2", vectors.GRAVITY_F),
-        "motion": _read_motion(_table(table["motion"], f"{place}: motion"), f"{place}: motion"),
+        "motion": _read_motion(tables.subtable(table["motion"], f"{place}: motion"), f"{place}: motion"),
         "gyro": spec,
         "gyro_preset": preset,
         "sensors": tuple(_read_sensor(entry, f"{place}: sensors[{i}]") for i, entry in enumerate(sensors)),
     }
     if "temperature" in table:
         where = f"{place}: temperature"
-        values["temperature"] = tables.build(Temperature, _table(table["temperature"], where), _TEMPERATURE, where)
+        values["temperature"] = tables.build(
+            Temperature, tables.subtable(table["temperature"], where), _TEMPERATURE, where
+        )
     return tables.made(Scenario, values, table, _TOP_FORM, place)  # type: ignore[no-any-return]
-
-
-def _table(content: Any, place: str) -> dict[str, Any]:
-    if not isinstance(content, Mapping):
-        raise InputError(f"{place} is {content!r}; it must be a table")
-    return dict(content)
 
 
 def _word(table: dict[str, Any], place: str, choices: Any) -> str:
@@ -467,7 +432,7 @@ def _read_motion(table: dict[str, Any], place: str) -> Motion:
     if word == "composed":
         known_keys(place, table, ("base", "vibration"))
         parts = {
-            key: _read_motion(_table(table.get(key), f"{place}: {key}"), f"{place}: {key}")
+            key: _read_motion(tables.subtable(table.get(key), f"{place}: {key}"), f"{place}: {key}")
             for key in ("base", "vibration")
         }
         return motion.Composed(**parts)
@@ -478,7 +443,9 @@ def _read_motion(table: dict[str, Any], place: str) -> Motion:
         if not isinstance(entries, list):
             raise InputError(f"{place}: harmonics is one table; write [[motion.harmonics]] with two brackets")
         more["harmonics"] = tuple(
-            tables.build(motion.Harmonic, _table(h, f"{place}: harmonics[{i}]"), _HARMONIC, f"{place}: harmonics[{i}]")
+            tables.build(
+                motion.Harmonic, tables.subtable(h, f"{place}: harmonics[{i}]"), _HARMONIC, f"{place}: harmonics[{i}]"
+            )
             for i, h in enumerate(entries)
         )
     return tables.build(kind, table, form, place, **more)  # type: ignore[no-any-return]
@@ -507,7 +474,7 @@ def _read_gyro(table: dict[str, Any], place: str) -> tuple[str, GyroSpec]:
 
 
 def _read_sensor(entry: Any, place: str) -> Sensor:
-    table = _table(entry, place)
+    table = tables.subtable(entry, place)
     word = _word(table, place, _SENSORS)
     kind, form, faults = _SENSORS[word]
     orbit = table.pop("orbit", None) if word in ("magnetometer", "horizon") else None
@@ -516,7 +483,7 @@ def _read_sensor(entry: Any, place: str) -> Sensor:
     more: dict[str, Any] = {"faults": tables.build(vectors.Faults, amiss, faults, place)}
     if orbit is not None:
         orbit_place = f"{place}: orbit"
-        found = tables.build(CircularOrbit, _table(orbit, orbit_place), _ORBIT, orbit_place)
+        found = tables.build(CircularOrbit, tables.subtable(orbit, orbit_place), _ORBIT, orbit_place)
         more.update({"orbit": found} if word == "horizon" else {"field_f": found.magnetic_field})
     elif word == "horizon":
         raise InputError(f"{place}: orbit is missing; add the table [sensors.orbit]")
@@ -528,22 +495,17 @@ def _write_sensor(sensor: Any) -> dict[str, Any]:
     if word is None:
         raise InputError(f"a sensor of class {type(sensor).__name__} cannot be written to a file; keep it in Python")
     _, form, faults = _SENSORS[word]
-    if getattr(sensor, "acceleration_f", None) is not None:
-        raise InputError(
-            f"{sensor.name}: acceleration_f is a function, which cannot be written to a file; keep it in Python"
-        )
-    if isinstance(sensor, vectors.HorizonSensor):
-        own = {**tables.encode(sensor, form), **tables.encode(sensor.faults, faults)}
-        return {"type": word, **own, "orbit": tables.encode(sensor.orbit, _ORBIT)}
-    field = getattr(sensor, "field_f", None)
-    if not callable(field):
-        return {"type": word, **tables.encode(sensor, form), **tables.encode(sensor.faults, faults)}
-    orbit = getattr(field, "__self__", None)
-    if not isinstance(orbit, CircularOrbit):
-        raise InputError(f"{sensor.name}: field_f is a function, which cannot be written to a file; keep it in Python")
-    rest = {name: choice for name, choice in form.items() if name != "field_f"}
-    table = {"type": word, **tables.encode(sensor, rest), **tables.encode(sensor.faults, faults)}
-    return {**table, "orbit": tables.encode(orbit, _ORBIT)}
+    field, orbit = getattr(sensor, "field_f", None), getattr(sensor, "orbit", None)
+    if callable(field):
+        orbit = getattr(field, "__self__", None)
+        form = {name: choice for name, choice in form.items() if name != "field_f"}
+    for name in ("acceleration_f", "field_f"):
+        if callable(getattr(sensor, name, None)) and not isinstance(orbit, CircularOrbit):
+            raise InputError(
+                f"{sensor.name}: {name} is a function, which cannot be written to a file; keep it in Python"
+            )
+    table = {"type": word, **tables.encode(sensor, form), **tables.encode(sensor.faults, faults)}
+    return table if orbit is None else {**table, "orbit": tables.encode(orbit, _ORBIT)}
 
 
 def scenario_to_table(scenario: Scenario) -> dict[str, Any]:

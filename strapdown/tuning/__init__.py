@@ -36,17 +36,13 @@ from strapdown.tuning.initialization import record_case, recording_case
 from strapdown.tuning.initialization import recording_setup as recording_setup
 from strapdown.tuning.innovations import likelihood
 from strapdown.tuning.objective import Case
-from strapdown.tuning.objective import thinned as thinned
 from strapdown.tuning.outliers import TunedGate as TunedGate
 from strapdown.tuning.outliers import contaminated_likelihood as contaminated_likelihood
 from strapdown.tuning.outliers import log_likelihood as log_likelihood
 from strapdown.tuning.outliers import tuned_gate as tuned_gate
 from strapdown.tuning.own import OwnTuning, fit_own
 from strapdown.tuning.parameters import Prior, priors_from_gyro
-from strapdown.tuning.parameters import axis_names as axis_names
-from strapdown.tuning.parameters import axis_of as axis_of
 from strapdown.tuning.parameters import default_names as default_names
-from strapdown.tuning.parameters import known_names as known_names
 from strapdown.tuning.parameters import unit_of as unit_of
 from strapdown.tuning.parameters import values_of as values_of
 from strapdown.tuning.parameters import with_values as with_values
@@ -58,7 +54,6 @@ from strapdown.tuning.residual_checks import Unmodelled as Unmodelled
 from strapdown.tuning.residual_checks import doubted as doubted
 from strapdown.tuning.residual_checks import unmodelled as unmodelled
 from strapdown.tuning.validation import Comparison as Comparison
-from strapdown.tuning.validation import Performance as Performance
 from strapdown.tuning.validation import compare, split
 
 __all__ = [

@@ -188,8 +188,6 @@ class Tuning(Listed):
         Points at which the searches started.
     optima : ndarray (k, p)
         Points at which the searches ended.
-    optima_values : ndarray (k,)
-        Negative log likelihood at these points.
     misfit : bool
         Whether the gradient varies over the record by more than the information allows: the innovations are not white, or their variance
         is not that of any such filter, and the maximum-likelihood filter need not be the best one.
@@ -209,7 +207,6 @@ class Tuning(Listed):
     covariance: Array
     starts: Array
     optima: Array
-    optima_values: Array
     misfit: bool
     agreeing: int
     composite: bool = False
@@ -360,7 +357,6 @@ def fit(
         composite=objective.composite,
         starts=points,
         optima=np.array([optimum.point for optimum in optima]),
-        optima_values=np.array([optimum.local.value for optimum in optima]),
         agreeing=sum(1 for optimum in optima if optimum.local.value < best.local.value + NEGLIGIBLE),
     )
 

@@ -371,11 +371,7 @@ def priors_from_gyro(spec: GyroSpec, record: ImuRecord, *, factor: float = 3.0) 
     dict of str to Prior
         Priors of ``"gyro.arw"`` (rad/√s) and ``"gyro.rrw"`` (rad/s/√s).
     """
-    noise = setup.FilterSetup.for_record(record, spec).process_noise if _flickers(spec) else None
-    found = gyro.process_noise(spec) if noise is None else vars(noise)
+    flickers = np.any(np.asarray(spec.bias_instability) > 0.0)
+    found = vars(setup.FilterSetup.for_record(record, spec).process_noise) if flickers else gyro.process_noise(spec)
     pairs = {ARW: found["angle_random_walk"], RRW: found["rate_random_walk"]}
     return {name: Prior(value=value, factor=factor) for name, value in pairs.items() if value > 0.0}
-
-
-def _flickers(spec: GyroSpec) -> bool:
-    return bool(np.any(np.asarray(spec.bias_instability) > 0.0))

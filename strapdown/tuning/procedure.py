@@ -20,21 +20,13 @@ GATED = ("gate.probability", *OUTLIERS)
 
 
 class Tuned(NamedTuple):
-    """The outcome of :func:`tune`.
-
-    Parameters
-    ----------
-    tuning : Tuning
-        Parameters with their intervals, and the tuned filter.
-    objective : Objective
-        Function that was minimised, for :func:`fit` again or slices of it.
-    gate : TunedGate or None
-        The gate, if outliers were modelled.
-    """
+    """The outcome of :func:`tune`."""
 
     tuning: Tuning
     objective: Objective
+    """Function that was minimised, for :func:`fit` again or slices of it."""
     gate: TunedGate | None
+    """The gate, if outliers were modelled."""
 
 
 def objective_for(
@@ -98,18 +90,8 @@ def tune(
         The filter to start from.
     names : sequence of str, optional
         Parameters to tune; those of :data:`GATED` imply ``gate``. Default: :func:`default_names`.
-    priors : mapping of str to Prior, optional
-        Prior knowledge by parameter; the result is then the maximum of the posterior density.
-    starts : int, default 4
-        Number of searches: the first from the setup's values, the others from random starts.
-    factor : float, default 30
-        Maximum factor, up or down, between random starts and the setup's values.
-    seed : int, default 0
-        Seed of the random starts.
-    threads : int, default 1
-        Number of searches, or records, computed in parallel.
-    progress : callable, optional
-        As of :func:`fit`.
+    priors, starts, factor, seed, threads, progress : optional
+        As for :func:`fit`; the threads process records if there is one search at a time.
     gate : bool, default False
         Model outliers, and set the gate where an outlier is more likely.
     **objective

@@ -10,9 +10,10 @@ from typing import Any, Literal
 import numpy as np
 
 from strapdown import consistency
-from strapdown.checks import Array, InputError, one_of
+from strapdown.checks import Array, InputError, fraction, one_of
 from strapdown.consistency import Judgement, mean_bounds
 from strapdown.estimation import setup
+from strapdown.estimation.schedule import selected
 from strapdown.estimation.setup import FilterSetup
 from strapdown.records import Estimate, Innovations, Truth
 from strapdown.results import Listed, Listing, figure
@@ -43,8 +44,7 @@ def split(cases: Sequence[Case], share: float, by: By = "time") -> tuple[tuple[C
     tuned, held : tuple of Case
         Cases to tune on, and cases held out. By time both have the same records, with different ``first`` and ``last``.
     """
-    if not 0.0 < share < 1.0:
-        raise InputError(f"holdout is {share:g}; it must lie between 0 and 1")
+    fraction("holdout", share)
     one_of("holdout by", by, ("time", "record"))
     if by == "record":
         held = max(1, round(share * len(cases)))
@@ -224,18 +224,14 @@ def _judged(case: Case, chosen: FilterSetup) -> tuple[Estimate, Truth | None]:
     initial = setup.initial_state(used, case.initial.attitude, case.initial.bias)
     estimate = setup.run_modelled(record, used, initial, every=every, full_covariance=truth is not None)
 
-    def within(of: Any, *names: str) -> dict[str, Any]:
-        inside = (of.time >= case.first) & (of.time <= case.last)
-        values = {name: getattr(of, name) for name in names}
-        return {name: None if value is None else value[inside] for name, value in values.items()}
+    def judged(time: Array) -> np.ndarray:
+        return (time >= case.first) & (time <= case.last)
 
-    innovations = {
-        name: Innovations(**within(one, "time", "innovation", "variance", "weight"))
-        for name, one in estimate.innovations.items()
-    }
-    part = within(estimate, "time", "attitude", "bias", "variance", "covariance")
+    innovations = {name: selected(one, judged(one.time)) for name, one in estimate.innovations.items()}
+    inside = judged(estimate.time)
+    values = {name: getattr(estimate, name) for name in ("time", "attitude", "bias", "variance", "covariance")}
+    part: dict[str, Any] = {name: value[inside] for name, value in values.items() if value is not None}
     if truth is not None:
-        inside = (estimate.time >= case.first) & (estimate.time <= case.last)
         truth = Truth(attitude=truth.attitude[::every][inside], bias=truth.bias[::every][inside])
     return replace(estimate, innovations=innovations, **part), truth
 

@@ -62,13 +62,7 @@ VectorField = Callable[[Array], Array]
 
 
 class Sensor(Protocol):
-    """A sensor of a scenario.
-
-    Attributes
-    ----------
-    name : str
-        Name of the sensor and of its stream of random numbers.
-    """
+    """A sensor of a scenario."""
 
     @property
     def name(self) -> str:
@@ -187,7 +181,8 @@ class VectorMeasurements:
         if self.kind == "heading" and not (self.sigma_axes is None and self.covariance is None):
             raise InputError(f"{self.sensor}: a heading has one sigma; sigma_axes and covariance belong to other kinds")
         if self.sigma_axes is not None:
-            axes = _of_known(f"{self.sensor}: sigma_axes", self._given_axes(m), missing, _root_mean_square)
+            given = self._repeated("sigma_axes", (m, 3), "one number per body axis (3,), or (m, 3)")
+            axes = _of_known(f"{self.sensor}: sigma_axes", given, missing, _root_mean_square)
             if np.any(axes < 0.0):
                 raise InputError(f"{self.sensor}: sigma_axes has a negative entry; give standard deviations")
             found["sigma_axes"] = axes
@@ -200,7 +195,8 @@ class VectorMeasurements:
             axes = diagonal
             if self.kind == "attitude":
                 found["sigma_axes"] = axes
-        given = self._given_sigma(m)
+        by_axis = "" if self.kind == "heading" else ", and one per body axis as sigma_axes"
+        given = self._repeated("sigma", (m,), f"one number, or one per sample{by_axis}")
         given_sigma = np.any(numbers("sigma", self.sigma, allow_nan=True) != 0.0)  # for an empty series too
         if axes is None and self.kind == "attitude" and not given_sigma:
             raise InputError(
@@ -230,24 +226,13 @@ class VectorMeasurements:
         found["sigma"] = sigma
         return found
 
-    def _given_sigma(self, m: int) -> Array:
-        """Return the given σ of each sample (m,); a single one is repeated."""
-        given = numbers(f"{self.sensor}: sigma", self.sigma, allow_nan=True)
-        if given.shape not in ((), (1,), (m,)):
-            by_axis = "" if self.kind == "heading" else ", and one per body axis as sigma_axes"
-            raise InputError(
-                f"{self.sensor}: sigma has shape {given.shape} for {m} samples; give one number, or one per sample{by_axis}"
-            )
-        return array(f"{self.sensor}: sigma", np.broadcast_to(given, (m,)), (m,), allow_nan=True)
-
-    def _given_axes(self, m: int) -> Array:
-        """Return the given σ of each body axis (m, 3); a single set is repeated."""
-        given = numbers(f"{self.sensor}: sigma_axes", self.sigma_axes, allow_nan=True)  # type: ignore[arg-type]
-        if given.shape not in ((), (3,), (1, 3), (m, 3)):
-            raise InputError(
-                f"{self.sensor}: sigma_axes has shape {given.shape} for {m} samples; give one number per body axis (3,), or (m, 3)"
-            )
-        return array(f"{self.sensor}: sigma_axes", np.broadcast_to(given, (m, 3)), (m, 3), allow_nan=True)
+    def _repeated(self, field: str, shape: tuple[int, ...], remedy: str) -> Array:
+        """Return the numbers of a field for each sample, of this shape; those for one sample are repeated."""
+        name = f"{self.sensor}: {field}"
+        given = numbers(name, getattr(self, field), allow_nan=True)
+        if given.shape not in ((), shape[1:], (1, *shape[1:]), shape):
+            raise InputError(f"{name} has shape {given.shape} for {shape[0]} samples; give {remedy}")
+        return array(name, np.broadcast_to(given, shape), shape, allow_nan=True)
 
     def _reference(self, m: int, missing: np.ndarray) -> Array:
         name = f"{self.sensor}: reference_f"
@@ -503,41 +488,21 @@ class Faults:
             if b < a:
                 raise InputError(f"outages has a window from {a:g} s to {b:g} s; give (from, to) with from ≤ to")
         object.__setattr__(self, "outages", windows)
-        non_negative("outlier_probability", self.outlier_probability)
-        if self.outlier_probability > 1.0:
-            raise InputError(f"outlier_probability is {self.outlier_probability:g}; it must not be above 1")
+        for name in ("outlier_probability", "drop_probability", "duty_share"):
+            if non_negative(name, getattr(self, name)) > 1.0:
+                raise InputError(f"{name} is {getattr(self, name):g}; it must not be above 1")
         positive("outlier_scale", self.outlier_scale)
         non_negative("correlated_sigma", self.correlated_sigma)
         positive("correlation_time", self.correlation_time, unit="s")
-        for name in ("drop_probability", "duty_share"):
-            if non_negative(name, getattr(self, name)) > 1.0:
-                raise InputError(f"{name} is {getattr(self, name):g}; it must not be above 1")
         non_negative("duty_period", self.duty_period, unit="s")
 
-    def noise(self, time: Array, generator: np.random.Generator) -> tuple[Array, Array]:
-        """Return white noise of unit σ including outliers, and the correlated noise.
-
-        Parameters
-        ----------
-        time : ndarray (m,)
-            Times of the measurements, s, increasing.
-        generator : numpy.random.Generator
-            Random stream of the sensor.
-
-        Returns
-        -------
-        white : ndarray (m, 3)
-            White noise of unit σ. It is drawn first, so that it is the same with and without correlated noise or outliers.
-        correlated : ndarray (m, 3)
-            Gauss–Markov noise, in the unit of ``correlated_sigma``.
-        """
+    def _noise(self, time: Array, generator: np.random.Generator) -> tuple[Array, Array]:
+        """Return white noise (m, 3) of unit σ including outliers, and the correlated noise (m, 3), in the unit of ``correlated_sigma``."""
+        # Drawn first, so that it is the same with and without correlated noise or outliers.
         white = generator.standard_normal((len(time), 3))
-        struck = (
-            generator.random(len(time)) < self.outlier_probability
-            if self.outlier_probability > 0.0
-            else np.zeros(len(time), bool)
-        )
-        white = np.where(struck[:, None], self.outlier_scale * white, white)
+        if self.outlier_probability > 0.0:
+            struck = generator.random(len(time)) < self.outlier_probability
+            white[struck] *= self.outlier_scale
         correlated = np.zeros_like(white)
         if self.correlated_sigma > 0.0 and len(time):
             drive = self.correlated_sigma * generator.standard_normal(white.shape)
@@ -546,22 +511,10 @@ class Faults:
             compiled(gyro_errors.gauss_markov)(decay, np.sqrt(1.0 - decay**2)[:, None] * drive[1:], correlated)
         return white, correlated
 
-    def heard(self, series: VectorMeasurements, generator: np.random.Generator) -> VectorMeasurements:
+    def _heard(self, series: VectorMeasurements, generator: np.random.Generator) -> VectorMeasurements:
         """Return the series without the samples in outages, off duty or lost, with arrival times if there is a latency.
 
         Lost samples are drawn from a child of the generator, so they do not depend on the noise.
-
-        Parameters
-        ----------
-        series : VectorMeasurements
-            Measurements without timing faults.
-        generator : numpy.random.Generator
-            Random stream of the sensor; a child of it draws the lost samples.
-
-        Returns
-        -------
-        VectorMeasurements
-            The series as received.
         """
         arrival = series.time + self.latency if self.latency > 0.0 else None
         series = dataclasses.replace(series, arrival=arrival)
@@ -592,10 +545,14 @@ def _check_sampling(name: str, sigma: float, unit: str, rate: float, phase: floa
     non_negative(f"{name}: phase", phase, unit="s")
 
 
+def _attitude(motion: Any, time: Array) -> Array:
+    """Return q_fb of a motion, which may be given as a function of time."""
+    return np.asarray(motion(time) if callable(motion) else motion.attitude(time))
+
+
 def _body(motion: Any, time: Array, vector_f: Array) -> Array:
-    """Return R_fbᵀ v_f; ``motion`` is a motion or its attitude function."""
-    attitude = motion if callable(motion) else motion.attitude
-    return quaternion.rotate(quaternion.conjugate(attitude(time)), vector_f)
+    """Return R_fbᵀ v_f."""
+    return quaternion.rotate(quaternion.conjugate(_attitude(motion, time)), vector_f)
 
 
 class _Sampled:
@@ -609,9 +566,9 @@ class _Sampled:
     def observe(self, motion: Any, start: float, end: float, generator: np.random.Generator) -> VectorMeasurements:
         """Return noisy measurements over (start, end] of a motion, or of an attitude q_fb given as a function of time."""
         time = sample_times(self.rate, self.phase, start, end)
-        white, correlated = self.faults.noise(time, generator)
+        white, correlated = self.faults._noise(time, generator)
         measured = self._measured(motion, time, white, correlated)
-        return self.faults.heard(VectorMeasurements(sensor=self.name, time=time, **measured), generator)
+        return self.faults._heard(VectorMeasurements(sensor=self.name, time=time, **measured), generator)
 
     def _measured(self, motion: Any, time: Array, white: Array, correlated: Array) -> dict[str, Any]:
         """Return the fields of the series of measurements, from white noise of unit σ and correlated noise (m, 3)."""
@@ -673,17 +630,13 @@ class HorizonSensor(_Sampled, ByValue):
     Parameters
     ----------
     name : str
-        Name of the sensor and of its stream of random numbers.
+        As for :class:`VectorSensor`.
     orbit : CircularOrbit
         Orbit of the body, in the fixed frame.
     sigma : float
         Noise of each component of the unit direction, rad.
-    rate : float
-        Measurements per second, Hz.
-    phase : float, default 0.0
-        Time of the first measurement after the start, s; 0: one interval after it.
-    faults : Faults, default no faults
-        Errors beyond the white noise.
+    rate, phase, faults : float, float, Faults
+        As for :class:`VectorSensor`.
     """
 
     name: str
@@ -746,7 +699,7 @@ class AttitudeSensor(_Sampled):
     Parameters
     ----------
     name : str
-        Name of the sensor and of its stream of random numbers.
+        As for :class:`VectorSensor`.
     sigma_across : float
         Noise about the two axes across the boresight, rad.
     sigma_about : float
@@ -756,10 +709,8 @@ class AttitudeSensor(_Sampled):
     boresight : {"x", "y", "z"} or array_like (3,), (4,) or (3, 3), default "z"
         Boresight: a body axis, a direction in body axes (3,), or the mounting, sensor to body, as a quaternion (4,), scalar first,
         or a rotation matrix (3, 3), whose z axis is the boresight. Stored as an axis or a unit vector.
-    phase : float, default 0.0
-        Time of the first measurement after the start, s; 0: one interval after it.
-    faults : Faults, default no faults
-        Errors beyond the white noise.
+    phase, faults : float, Faults
+        As for :class:`VectorSensor`.
     """
 
     name: str
@@ -795,7 +746,6 @@ class AttitudeSensor(_Sampled):
         return np.sqrt(np.diag(self.covariance))
 
     def _measured(self, motion: Any, time: Array, white: Array, correlated: Array) -> dict[str, Any]:
-        attitude = motion if callable(motion) else motion.attitude
         noise = self.sigma_axes * white
         if not isinstance(self.boresight, str):
             b = np.asarray(self.boresight)
@@ -804,7 +754,7 @@ class AttitudeSensor(_Sampled):
         whole = self.covariance
         return {
             "kind": "attitude",
-            "attitude": quaternion.multiply(attitude(time), error).reshape(-1, 4),
+            "attitude": quaternion.multiply(_attitude(motion, time), error).reshape(-1, 4),
             "sigma_axes": self.sigma_axes if whole is None else None,
             "covariance": whole,
         }
@@ -817,7 +767,7 @@ class Magnetometer(_Sampled, ByValue):
     Parameters
     ----------
     name : str
-        Name of the sensor and of its stream of random numbers.
+        As for :class:`VectorSensor`.
     field_f : ndarray (3,) or callable
         Magnetic field, T, fixed frame; or a function of time (m,), s, that returns it (m, 3).
     sigma : float
@@ -830,10 +780,8 @@ class Magnetometer(_Sampled, ByValue):
         Soft iron S: effect of parts magnetised by the external field, dimensionless.
     kind : {"direction", "heading", "vector"}, default "direction"
         ``"direction"``, ``"heading"`` (about the fixed z axis) or ``"vector"`` (the whole field, T).
-    phase : float, default 0.0
-        Time of the first measurement after the start, s; 0: one interval after it.
-    faults : Faults, default no faults
-        Errors beyond the white noise.
+    phase, faults : float, Faults
+        As for :class:`VectorSensor`.
     """
 
     name: str
@@ -862,12 +810,9 @@ class Magnetometer(_Sampled, ByValue):
         object.__setattr__(self, "soft_iron", array(f"{self.name}: soft_iron", self.soft_iron, (3, 3)))
 
     def _measured(self, motion: Any, time: Array, white: Array, correlated: Array) -> dict[str, Any]:
-        varies = callable(self.field_f)
-        true_f = (
-            array(f"{self.name}: field_f", self.field_f(time), (len(time), 3))
-            if callable(self.field_f)
-            else self.field_f
-        )
+        true_f = self.field_f
+        if callable(true_f):
+            true_f = array(f"{self.name}: field_f", true_f(time), (len(time), 3))
         exact = _body(motion, time, true_f) @ (np.eye(3) + self.soft_iron).T + self.hard_iron
         measured = exact + self.sigma * white + correlated
         strength = np.broadcast_to(np.linalg.norm(true_f, axis=-1), time.shape)
@@ -876,7 +821,7 @@ class Magnetometer(_Sampled, ByValue):
         return {
             "kind": self.kind,
             "vector_b": measured if self.kind == "vector" else _unit(measured),
-            "reference_f": true_f if varies else np.asarray(self.field_f),
+            "reference_f": true_f,
             "sigma": self.sigma / scale,
         }
 
@@ -932,7 +877,7 @@ class Accelerometer(_Sampled, ByValue):
     Parameters
     ----------
     name : str
-        Name of the sensor and of its stream of random numbers.
+        As for :class:`VectorSensor`.
     sigma : float
         Noise of each component, m/s².
     rate : float
@@ -947,10 +892,8 @@ class Accelerometer(_Sampled, ByValue):
         Acceleration of gravity, m/s², fixed frame.
     kind : {"direction", "vector"}, default "direction"
         ``"direction"`` (of the vertical) or ``"vector"`` (the specific force, m/s²).
-    phase : float, default 0.0
-        Time of the first measurement after the start, s; 0: one interval after it.
-    faults : Faults, default no faults
-        Errors beyond the white noise.
+    phase, faults : float, Faults
+        As for :class:`VectorSensor`.
     """
 
     name: str
@@ -995,17 +938,13 @@ class HeadingPair(_Sampled, ByValue):
     Parameters
     ----------
     name : str
-        Name of the sensor and of its stream of random numbers.
+        As for :class:`VectorSensor`.
     baseline_b : ndarray (3,)
         Vector from the first antenna to the second, m, body axes.
     sigma : float
         Noise of each component of the relative position, m; that of the heading is this divided by the baseline's horizontal length.
-    rate : float
-        Measurements per second, Hz.
-    phase : float, default 0.0
-        Time of the first measurement after the start, s; 0: one interval after it.
-    faults : Faults, default no faults
-        Errors beyond the white noise.
+    rate, phase, faults : float, float, Faults
+        As for :class:`VectorSensor`.
     """
 
     name: str
@@ -1022,8 +961,7 @@ class HeadingPair(_Sampled, ByValue):
         _direction(f"{self.name}: baseline_b", self.baseline_b)
 
     def _measured(self, motion: Any, time: Array, white: Array, correlated: Array) -> dict[str, Any]:
-        attitude = motion if callable(motion) else motion.attitude
-        line_f = quaternion.rotate(attitude(time), self.baseline_b).reshape(-1, 3)
+        line_f = quaternion.rotate(_attitude(motion, time), self.baseline_b).reshape(-1, 3)
         level = np.hypot(line_f[:, 0], line_f[:, 1])
         measured = (line_f + self.sigma * white + correlated) * np.array([1.0, 1.0, 0.0])
         return {

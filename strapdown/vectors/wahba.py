@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from strapdown import quaternion
-from strapdown.checks import Array, InputError, array
+from strapdown.checks import Array, InputError, array, place
 from strapdown.kinematics import skew
 from strapdown.units import DEGREE
 
@@ -64,7 +64,7 @@ def from_vertical_and_heading(up_b: ArrayLike, magnetic_b: ArrayLike) -> Array:
     if np.any(bad):
         index = np.argwhere(bad)[0]
         raise InputError(
-            f"{_place('up_b', *index)} and {_place('magnetic_b', *index)} are {angle[tuple(index)] / DEGREE:.6g}° apart, less than "
+            f"{place('up_b', index)} and {place('magnetic_b', index)} are {angle[tuple(index)] / DEGREE:.6g}° apart, less than "
             f"{MIN_HORIZONTAL_ANGLE / DEGREE:.2g}° from one line: such a field gives no heading; check both"
         )
     north_up = _frame(np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0]))
@@ -194,14 +194,9 @@ def _to_body(attitude: Array, vectors_f: Array) -> Array:
     return quaternion.rotate(quaternion.conjugate(attitude)[..., None, :], vectors_f)
 
 
-def _profile(b: Array, r: Array, weight: Array) -> Array:
-    """Return the attitude profile matrix B = Σ a r bᵀ: the best R maximises tr(R Bᵀ)."""
-    return np.asarray(np.swapaxes(weight[..., None] * r, -1, -2) @ b)
-
-
 def _svd(b: Array, r: Array, weight: Array) -> Array:
-    """R = U diag(1, 1, det U det V) Vᵀ for B = U S Vᵀ (Markley 1988, J. Astronautical Sciences 36)."""
-    U, _, Vt = np.linalg.svd(_profile(b, r, weight))
+    """Return the R of largest tr(R Bᵀ), B = Σ a r bᵀ = U S Vᵀ: U diag(1, 1, det U det V) Vᵀ (Markley 1988, J. Astronaut. Sci. 36)."""
+    U, _, Vt = np.linalg.svd(np.swapaxes(weight[..., None] * r, -1, -2) @ b)
     handed = np.linalg.det(U) * np.linalg.det(Vt)
     U = U * np.stack([np.ones_like(handed), np.ones_like(handed), np.sign(handed)], axis=-1)[..., None, :]
     return quaternion.from_matrix(U @ Vt)
@@ -238,17 +233,13 @@ _GAUSS_NEWTON_STEPS = 10
 # Checks of the input
 
 
-def _place(name: str, *index: int | np.intp) -> str:
-    return f"{name}[{', '.join(str(int(i)) for i in index)}]" if index else name
-
-
 def _directions(name: str, value: ArrayLike) -> Array:
     """Return vectors (..., 3) divided by their lengths."""
     vector = array(name, value, (..., 3))
     largest = np.max(np.abs(vector), axis=-1, keepdims=True, initial=0.0)
     if np.any(largest == 0.0):
         index = np.argwhere(largest[..., 0] == 0.0)[0]
-        raise InputError(f"{_place(name, *index)} is the zero vector, which has no direction; leave it out")
+        raise InputError(f"{place(name, index)} is the zero vector, which has no direction; leave it out")
     # Scaled by the largest component first, so that no square overflows or underflows.
     scaled = vector / largest
     return np.asarray(scaled / np.linalg.norm(scaled, axis=-1, keepdims=True))
@@ -265,7 +256,7 @@ def _sigmas(value: ArrayLike, shape: tuple[int, ...]) -> Array:
     if np.any(sigma <= 0.0):
         index = np.argwhere(sigma <= 0.0)[0]
         raise InputError(
-            f"{_place('sigmas', *index)} is {sigma[tuple(index)]:g} rad; every direction needs a σ greater than zero"
+            f"{place('sigmas', index)} is {sigma[tuple(index)]:g} rad; every direction needs a σ greater than zero"
         )
     return sigma
 
@@ -306,7 +297,7 @@ def _refuse_undetermined(name: str, vectors: Array, sigma: Array) -> None:
         widest = int(np.argmax(np.minimum(angle, np.pi - angle)))
         uncertainty = "without bound" if least[index] == 0.0 else f"{1.0 / least[index]:.3g} rad"
         raise InputError(
-            f"{_place(name, *index)}: the attitude is not determined, the 1σ of its least determined rotation is "
+            f"{place(name, index)}: the attitude is not determined, the 1σ of its least determined rotation is "
             f"{uncertainty}; of all pairs, directions {i[widest]} and {j[widest]} are furthest from one line, "
             f"{angle[widest] / DEGREE:.6g}° "
             "apart; add a direction away from that line, or give smaller sigmas (rad) if the noise is smaller"

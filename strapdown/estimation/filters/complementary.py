@@ -7,26 +7,16 @@ its gains, so that its consistency can be tested like that of the others.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from strapdown.checks import Array, array, instance
+from strapdown.checks import Array, array
 from strapdown.estimation.filters import extended
 from strapdown.estimation.schedule import Schedule
 from strapdown.estimation.states import ProcessNoise, State
 from strapdown.kernels.filters import complementary as kernel
 from strapdown.records import Estimate, ImuRecord
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Gains:
-    """Gains of each sensor, in the order of the record, for ``ω_mes = z × R̂ᵀ r``."""
-
-    attitude: Array
-    """Rotation of the attitude per angle, rad/rad (sensors,): k_P times the weight of the sensor times its sample interval."""
-    bias: Array
-    """Change of the bias per angle, rad/s/rad (sensors,), not positive: −k_I times the same."""
 
 
 def farrenkopf_gains(
@@ -45,11 +35,12 @@ def farrenkopf_gains(
     return (zeta - 1.0) * (zeta + 1.0) / (zeta * zeta), -su / (interval * zeta)
 
 
-def _steady_gains(record: ImuRecord, events: Schedule, process_noise: ProcessNoise, initial: State) -> Gains:
+def _steady_gains(record: ImuRecord, events: Schedule, process_noise: ProcessNoise, initial: State) -> Array:
+    """Return Farrenkopf's gains (2, sensors) for all sensors together, divided among them by information."""
     duration = float(record.time[-1] - record.time[0])
     number = np.bincount(events.sensor, minlength=len(events.sensors))
     if not number.any():
-        return Gains(attitude=np.zeros(len(number)), bias=np.zeros(len(number)))
+        return np.zeros((2, len(number)))
     information = np.bincount(events.sensor, weights=1.0 / events.variance, minlength=len(number)) / duration
     interval = duration / np.maximum(number, 1)
     longest = float(interval[number > 0].max())
@@ -61,7 +52,7 @@ def _steady_gains(record: ImuRecord, events: Schedule, process_noise: ProcessNoi
         longest,
     )
     share = information / information.sum() * interval / longest
-    return Gains(attitude=attitude * share, bias=bias * share)
+    return np.stack([attitude * share, bias * share])
 
 
 def run(
@@ -71,19 +62,16 @@ def run(
     *,
     every: int = 1,
     full_covariance: bool = False,
-    gains: Gains | None = None,
+    gains: ArrayLike | None = None,
 ) -> Estimate:
     """Run the filter over a whole record, compiled; options as for :func:`strapdown.estimation.filters.run`.
 
-    Default gains: Farrenkopf's for all sensors together, divided among them by information, with random walks increased by the initial
+    ``gains`` (2, sensors) are of each sensor, in the order of the record, for ``ω_mes = z × R̂ᵀ r``: the rotation of the attitude per angle,
+    k_P times the sensor's weight times its sample interval, and the change of the bias per angle, rad/s/rad, −k_I times the same.
+    Default: Farrenkopf's for all sensors together, divided among them by information, with random walks increased by the initial
     standard deviations of attitude and bias over the record: a fixed gain must be suitable for the start as well as the end.
     """
     events = extended.checked_schedule(record, process_noise, initial, every)
-    if gains is not None:
-        instance("gains", gains, Gains, "give complementary.Gains(attitude=…, bias=…), or None")
     chosen = _steady_gains(record, events, process_noise, initial) if gains is None else gains
-    sensors = len(events.sensors)
-    rows = np.stack(
-        [array("gains.attitude", chosen.attitude, (sensors,)), array("gains.bias", chosen.bias, (sensors,))]
-    )
+    rows = array("gains", chosen, (2, len(events.sensors)))
     return extended.run_scheduled(kernel, record, events, process_noise, initial, rows, every, full_covariance)

@@ -240,7 +240,6 @@ def _copied(given: Any, name: str) -> Any:
 
 def _checked(name: str, estimate: Any, record: ImuRecord, times: Array | None) -> Estimate:
     """Return an estimate at the wanted times only; raise an error if it cannot be compared with the record's truth."""
-    own: Estimate = estimate
     instance(f"result of {name}", estimate, Estimate, "return Estimate.from_arrays(record.time, attitude, covariance)")
     time = increasing(f"{name}: time", estimate.time)
     place = np.minimum(np.searchsorted(record.time, time), len(record.time) - 1)
@@ -252,16 +251,14 @@ def _checked(name: str, estimate: Any, record: ImuRecord, times: Array | None) -
     for what, width in (("attitude", 4), ("bias", 3), ("variance", 6)):
         array(f"{name}: {what}", np.nan_to_num(getattr(estimate, what)), (len(time), width))
     if times is None:
-        return own
+        return estimate  # type: ignore[no-any-return]
     rows = np.minimum(np.searchsorted(time, times), len(time) - 1)
     if not np.array_equal(time[rows], times):
         k = int(np.argmax(time[rows] != times))
         raise InputError(f"{name} gives no value at {times[k]:.9g} s; return one at each of record.time")
-    of_rows: dict[str, Any] = {
-        what: None if (value := getattr(estimate, what)) is None else value[rows]
-        for what in ("attitude", "bias", "variance", "covariance")
-    }
-    return replace(own, time=time[rows], **of_rows)
+    values = {what: getattr(estimate, what) for what in ("attitude", "bias", "variance", "covariance")}
+    part = {what: value[rows] for what, value in values.items() if value is not None}
+    return replace(estimate, time=time[rows], **part)  # type: ignore[no-any-return]
 
 
 def _plain(value: Any) -> Any:

@@ -10,8 +10,7 @@ linear in the state, so that sigma points with a large spread cause no discontin
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -88,8 +87,7 @@ def run(
     return extended.estimate(record, events, every, states, innovation, full_covariance)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Steps:
+class Steps(NamedTuple):
     """Steps: each predicts over ``dt`` if ``dt > 0``, then updates with an event if there is one, then stores the state if requested."""
 
     dt: Array
@@ -124,14 +122,13 @@ def in_steps(record: ImuRecord, events: Schedule, every: int) -> Steps:
     parts = (np.linalg.norm(increment, axis=1) / LARGEST_ANGLE).astype(np.int64) + 1
     whole = np.repeat(np.arange(len(dt)), parts)
     last = np.append(whole[1:] != whole[:-1], True)
-    steps = Steps(
+    return Steps(
         dt=dt[whole] / parts[whole],
         increment=np.ascontiguousarray(increment[whole] / parts[whole, None]),
         event=np.where(last, event[whole], -1),
         row=np.where(last, row[whole], -1),
         time=edges[::every],
     )
-    return steps
 
 
 def _product(p: Array, q: Array) -> Array:
@@ -149,20 +146,14 @@ def _predict(
     points: Any, q: Array, b: Array, P: Array, increment: Array, dt: float, process_noise: ProcessNoise
 ) -> tuple[Array, Array, Array]:
     """Propagate each sigma point by equation (17) with its bias."""
+    from filterpy.kalman import unscented_transform
+
     sigma, attitudes = _spread(points, q, b, P)
     attitudes = _product(attitudes, quaternion.exp(increment - dt * sigma[:, 3:]))
     sigma[:, :3] = quaternion_to_rodrigues(_product(attitudes[0] * _CONJUGATE, attitudes))
     noise = _process_noise(increment - dt * b, dt, process_noise)
-    mean, covariance = _transformed(sigma, points, noise)
-    return _moved(attitudes[0], mean), mean[3:], 0.5 * (covariance + covariance.T)
-
-
-def _transformed(sigma: Array, points: Any, noise: Array) -> tuple[Array, Array]:
-    """Return mean and covariance of sigma points with noise added."""
-    from filterpy.kalman import unscented_transform
-
     mean, covariance = unscented_transform(sigma, points.Wm, points.Wc, noise)
-    return mean, covariance
+    return _moved(attitudes[0], mean), mean[3:], 0.5 * (covariance + covariance.T)
 
 
 def _process_noise(phi: Array, dt: float, process_noise: ProcessNoise) -> Array:
@@ -184,6 +175,8 @@ def _update(
 
     A heading whose vector is vertical at the central quaternion is skipped, and its innovation is NaN.
     """
+    from filterpy.kalman import unscented_transform
+
     kind, z = events.kind[event], events.vector_b[event]
     frame = events.triads[events.reference[event]]
     triad = frame.reshape(3, 3)
@@ -210,7 +203,7 @@ def _update(
             degrees = 2
             noise[2, :2] = noise[:2, 2] = 0.0
             noise[2, 2] = 0.5 * (noise[0, 0] + noise[1, 1])
-    mean, S = _transformed(residuals, points, noise)
+    mean, S = unscented_transform(residuals, points.Wm, points.Wc, noise)
     prior = np.concatenate([np.zeros(3), b])
     cross = -(points.Wc[:, None] * (sigma - prior)).T @ (residuals - mean)
     gain = np.linalg.solve(S, cross.T).T

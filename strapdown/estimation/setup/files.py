@@ -61,45 +61,35 @@ def to_table(setup: FilterSetup) -> dict[str, Any]:
 def from_table(table: Mapping[str, Any], place: str = "filter") -> FilterSetup:
     """Return the setup in a table; an unknown key is an error that names the nearest known one."""
     known_keys(place, table, {*tables.keys(_NOISE_FORM), *tables.keys(_FORM), *_PARTS})
-    own = tables.keys(_NOISE_FORM)
+    given = {name: table[name] for name in _PARTS if name in table}
+    for name in ("sigma", "gate", "robust", "states"):
+        if name in given:
+            given[name] = tables.subtable(given[name], f"{place}: {name}", f", [{place}.{name}]")
+    noise = {key: table[key] for key in tables.keys(_NOISE_FORM) if key in table}
     parts: dict[str, Any] = {}
-    if "integration" in table:
-        algorithm = table["integration"]
+    if "integration" in given:
+        algorithm = given["integration"]
         if isinstance(algorithm, Mapping):
             parts["integration"] = coning.Algorithm.from_table(algorithm, f"{place}: integration")
         else:
             parts["integration"] = coning.ALGORITHMS[one_of(f"{place}: integration", algorithm, coning.ALGORITHMS)]
-    if "sigma" in table:
-        sigma = _part(table, "sigma", place)
-        parts["sigma"] = {name: sensor_sigma(f"{place}: sigma: {name}", value) for name, value in sigma.items()}
-    if "gate" in table:
-        content = _part(table, "gate", place)
-        never = {name: None for name in ("recovery",) if content.get(name) == NEVER}
-        given = {key: value for key, value in content.items() if key not in never}
-        parts["gate"] = tables.build(Gate, given, _GATE_FORM, f"{place}: gate", **never)
-    if "robust" in table:
-        parts["robust"] = tables.build(Robust, _part(table, "robust", place), _ROBUST_FORM, f"{place}: robust")
-    if "states" in table:
-        parts["states"] = optional.from_table(_part(table, "states", place), f"{place}: states")
-    if "estimator" in table:
-        estimator = table["estimator"]  # a table describes a user's filter, whose code is in no file
-        parts["estimator"] = (
-            Own(estimator) if isinstance(estimator, Mapping) and "name" in estimator else str(estimator)
-        )
-    return tables.build(  # type: ignore[no-any-return]
-        FilterSetup,
-        {key: value for key, value in table.items() if key not in own and key not in _PARTS},
-        _FORM,
-        place,
-        process_noise=tables.build(ProcessNoise, {k: v for k, v in table.items() if k in own}, _NOISE_FORM, place),
-        **parts,
-    )
-
-
-def _part(table: Mapping[str, Any], name: str, place: str) -> Mapping[str, Any]:
-    if not isinstance(table[name], Mapping):
-        raise InputError(f"{place}: {name} is {table[name]!r}; it must be a table, [{place}.{name}]")
-    return table[name]  # type: ignore[no-any-return]
+    if "sigma" in given:
+        parts["sigma"] = {name: sensor_sigma(f"{place}: sigma: {name}", s) for name, s in given["sigma"].items()}
+    if "gate" in given:
+        never = {"recovery": None} if given["gate"].get("recovery") == NEVER else {}
+        gate = {key: value for key, value in given["gate"].items() if key not in never}
+        parts["gate"] = tables.build(Gate, gate, _GATE_FORM, f"{place}: gate", **never)
+    if "robust" in given:
+        parts["robust"] = tables.build(Robust, given["robust"], _ROBUST_FORM, f"{place}: robust")
+    if "states" in given:
+        parts["states"] = optional.from_table(given["states"], f"{place}: states")
+    if "estimator" in given:
+        estimator = given["estimator"]  # a table describes a user's filter, whose code is in no file
+        own = isinstance(estimator, Mapping) and "name" in estimator
+        parts["estimator"] = Own(estimator) if own else str(estimator)
+    parts["process_noise"] = tables.build(ProcessNoise, noise, _NOISE_FORM, place)
+    rest = {key: value for key, value in table.items() if key not in {*noise, *given}}
+    return tables.build(FilterSetup, rest, _FORM, place, **parts)  # type: ignore[no-any-return]
 
 
 def to_toml(setup: FilterSetup) -> str:

@@ -93,9 +93,6 @@ class FilterSetup(ByValue):
         positive("measurement_sigma_factor", self.measurement_sigma_factor)
         sigma = {str(name): sensor_sigma(f"sigma[{name!r}]", s) for name, s in self.sigma.items()}
         object.__setattr__(self, "sigma", sigma)
-        self._check_estimator()
-
-    def _check_estimator(self) -> None:
         if isinstance(self.estimator, str):
             one_of("estimator", self.estimator, filters.FILTERS)
         else:
@@ -206,20 +203,18 @@ class FilterSetup(ByValue):
             and not (origin.gyro and matching.unmodelled_errors(origin.gyro, sensors, gravity_f=gravity_f))
         ):
             return plain
-        found = matching.matched(spec, record, sensors, np.asarray(gravity_f), matching.measurement_density(record))
-        noise = ProcessNoise(**matching.noise_beside_states(spec, found.white))
-        algorithm = (
-            matching.ACCURATE_ALGORITHM if matching.commutes_badly(record, noise.angle_random_walk) else "one-sample"
+        kept, white = matching.matched(
+            spec, record, sensors, np.asarray(gravity_f), matching.measurement_density(record)
         )
-        kept = found.states
+        noise = ProcessNoise(**matching.noise_beside_states(spec, white))
+        accurate = matching.commutes_badly(record, noise.angle_random_walk)
         if not isinstance(states, bool) and states is not None:
-            kept = found.states.chosen(tuple(states)) if states else States()
+            kept = kept.chosen(tuple(states)) if states else States()
         return replace(
             plain,
-            process_noise=noise
-            if "gyro.drift" in kept.names
-            else plain.process_noise,  # flicker is a state or in the noise
-            integration=coning.ALGORITHMS[algorithm],
+            # Flicker is a state, or in the noise.
+            process_noise=noise if "gyro.drift" in kept.names else plain.process_noise,
+            integration=coning.ALGORITHMS[matching.ACCURATE_ALGORITHM if accurate else "one-sample"],
             states=kept if kept.names else None,
         )
 

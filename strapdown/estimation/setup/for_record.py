@@ -31,21 +31,13 @@ def unmodelled_errors(record: ImuRecord, chosen: FilterSetup) -> tuple[str, ...]
 
 
 class Start(NamedTuple):
-    """Initial state of a filter for a record.
-
-    Parameters
-    ----------
-    state : State
-        Initial attitude, bias and covariance.
-    words : str
-        Description of how the state was found, in one sentence.
-    edge : int, default 0
-        Edge of the filter's steps at which the filter starts.
-    """
+    """Initial state of a filter for a record."""
 
     state: State
     words: str
+    """Description of how the state was found, in one sentence."""
     edge: int = 0
+    """Edge of the filter's steps at which the filter starts."""
 
 
 def start(record: ImuRecord, chosen: FilterSetup) -> Start:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -36,17 +35,10 @@ MIN_STEPS = 10.0
 """Minimum time constant of a drift, in gyro intervals."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Matched:
-    """States for a record, and the noise to be added for errors without a state."""
-
-    states: States
-    white: float
-    """PSD to be added to the gyro's white noise for the flicker above the bandwidth of the states, rad²/s."""
-
-
-def matched(spec: GyroSpec, record: ImuRecord, sensors: Sequence[Any], gravity_f: Array, density: float) -> Matched:
-    """Return the states for the specified errors of a gyro and of sensors on a record.
+def matched(
+    spec: GyroSpec, record: ImuRecord, sensors: Sequence[Any], gravity_f: Array, density: float
+) -> tuple[States, float]:
+    """Return the states for the specified errors of a gyro and of sensors on a record, and the PSD of the flicker without a state, rad²/s.
 
     Each error is modelled as one draw from a normal distribution whose σ is its size, entry by entry; an error of zero is no state. Flicker
     is modelled by states with time constants a decade apart, from the record's duration down to the shortest that the measurements can
@@ -59,24 +51,22 @@ def matched(spec: GyroSpec, record: ImuRecord, sensors: Sequence[Any], gravity_f
     found = {}
     for sensor in sensors:
         if sensor.name in series and len(series[sensor.name].time):
-            states = _of_sensor(sensor, series[sensor.name])
-            if states != SensorStates():
-                found[sensor.name] = states
-    return Matched(
-        states=States(
-            gyro_scale_sigma=_entries(np.abs(spec.scale_factor)),
-            gyro_misalignment_sigma=_entries(np.abs(spec.misalignment)),
-            gyro_force_sigma=_entries(np.diag(force)),
-            gyro_cross_force_sigma=_entries(force - np.diag(np.diag(force))),
-            gyro_temperature_sigma=_slope(spec, record),
-            gyro_drift_sigma=drift_sigma,
-            gyro_drift_time=drift_time,
-            gyro_fast_bias_sigma=fast,
-            gravity_f=tuple(gravity_f) if np.any(gravity_f) else States().gravity_f,
-            sensors=found,
-        ),
-        white=white,
+            own = _of_sensor(sensor, series[sensor.name])
+            if own != SensorStates():
+                found[sensor.name] = own
+    states = States(
+        gyro_scale_sigma=_entries(np.abs(spec.scale_factor)),
+        gyro_misalignment_sigma=_entries(np.abs(spec.misalignment)),
+        gyro_force_sigma=_entries(np.diag(force)),
+        gyro_cross_force_sigma=_entries(force - np.diag(np.diag(force))),
+        gyro_temperature_sigma=_slope(spec, record),
+        gyro_drift_sigma=drift_sigma,
+        gyro_drift_time=drift_time,
+        gyro_fast_bias_sigma=fast,
+        gravity_f=tuple(gravity_f) if np.any(gravity_f) else vectors.GRAVITY_F,
+        sensors=found,
     )
+    return states, white
 
 
 def _slope(spec: GyroSpec, record: ImuRecord) -> Entries:
@@ -93,11 +83,8 @@ def _slope(spec: GyroSpec, record: ImuRecord) -> Entries:
 
 def _entries(values: Array) -> Entries:
     """Return entries as specified; 0 if all are zero."""
-    return (
-        tuple(map(tuple, values.tolist()))
-        if values.ndim == 2 and values.any()
-        else (tuple(values.tolist()) if values.any() else 0.0)
-    )
+    entries: Any = values.tolist() if values.any() else 0.0
+    return entries  # type: ignore[no-any-return]
 
 
 def _drifts(
@@ -162,19 +149,13 @@ def _of_sensor(sensor: Any, series: VectorMeasurements) -> SensorStates:
     if series.kind == "attitude":
         arm = np.zeros(3)
     return SensorStates(
-        bias_sigma=_all_axes(size),
+        # Negligible on an axis without error.
+        bias_sigma=_entries(np.where(size > 0.0, size, 1e-6 * float(size.max()))),
         correlated_sigma=coloured,
         correlation_time=float(faults.correlation_time) if faults is not None and coloured > 0.0 else 0.0,
         varying=varying and (coloured > 0.0 or bool(size.any())),
         lever_arm_sigma=_entries(arm),
     )
-
-
-def _all_axes(size: Array) -> Entries:
-    """Return σ of each axis; where the error is zero, a σ that is negligible beside the others."""
-    if not size.any():
-        return 0.0
-    return tuple(np.where(size > 0.0, size, 1e-6 * float(size.max())).tolist())
 
 
 def specified(origin: Origin) -> tuple[Sequence[Any], Sequence[float]]:

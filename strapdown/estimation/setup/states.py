@@ -108,9 +108,11 @@ class SensorStates:
 
     def __post_init__(self) -> None:
         """Check every field."""
-        object.__setattr__(self, "mounting_sigma", _entries("mounting_sigma", self.mounting_sigma, (3,), "rad"))
-        object.__setattr__(self, "bias_sigma", _entries("bias_sigma", self.bias_sigma, (3,), ""))
-        object.__setattr__(self, "lever_arm_sigma", _entries("lever_arm_sigma", self.lever_arm_sigma, (3,), "m"))
+        for name, unit in (("mounting_sigma", "rad"), ("bias_sigma", ""), ("lever_arm_sigma", "m")):
+            value = _entries(name, getattr(self, name), (3,), unit)
+            if name != "lever_arm_sigma" and _any(value) and not np.all(value):
+                raise InputError(f"{name} is {value}; give a value above zero for every axis, or leave it out")
+            object.__setattr__(self, name, value)
         non_negative("correlated_sigma", self.correlated_sigma)
         non_negative("correlation_time", self.correlation_time, unit="s")
         if (self.correlated_sigma > 0.0) != (self.correlation_time > 0.0):
@@ -119,10 +121,6 @@ class SensorStates:
                 "give both above zero, or neither"
             )
         one_of("frame", self.frame, ("body", "fixed"))
-        for name in ("mounting_sigma", "bias_sigma"):
-            value = getattr(self, name)
-            if np.ndim(value) and _any(value) and 0.0 in np.asarray(value):
-                raise InputError(f"{name} is {value}; give a value above zero for every axis, or leave it out")
         if not isinstance(self.varying, bool):
             raise InputError(f"varying is {self.varying!r}; it must be true or false")
         for name, unit in VELOCITY.items():
@@ -134,31 +132,16 @@ class SensorStates:
         given = {name: getattr(self, name) for name in VELOCITY}
         return BoundedVelocity(sensor=sensor, strength=strength, **given)
 
-    def blocks(self, sensor: str, kind: str, gravity: float) -> tuple[ErrorStates, ...]:
-        """Return the error states of one sensor.
-
-        Parameters
-        ----------
-        sensor : str
-            Name of the sensor.
-        kind : {"direction", "vector", "heading", "attitude"}
-            Kind of its measurements.
-        gravity : float
-            Magnitude of gravity, m/s², by which the specific force of a direction is divided.
-
-        Returns
-        -------
-        tuple of ErrorStates
-            Declarations for each error of the sensor with a σ above zero.
-        """
+    def _blocks(self, sensor: str, kind: str, gravity: float) -> list[ErrorStates]:
+        """Return the error states of a sensor whose measurements are of this kind; a direction's specific force is divided by gravity."""
         one_of(f"{sensor}: kind", kind, KINDS)
+        strength = 1.0 if kind == "vector" else gravity
         found: list[ErrorStates] = []
         if _any(self.mounting_sigma):
             found.append(SensorMounting(sensor=sensor, mounting_sigma=np.asarray(self.mounting_sigma)))
         if _any(self.bias_sigma):
             found.append(VectorBias(sensor=sensor, bias_sigma=np.asarray(self.bias_sigma), varying=self.varying))
         if _any(self.lever_arm_sigma):
-            strength = 1.0 if kind == "vector" else gravity
             found.append(LeverArm(sensor=sensor, arm_sigma=np.asarray(self.lever_arm_sigma), strength=strength))
         if self.correlated_sigma > 0.0:
             found.append(
@@ -172,8 +155,8 @@ class SensorStates:
             )
         if self.velocity_time > 0.0:
             one_of(f"{sensor}: velocity_time needs an accelerometer; kind", kind, ("direction", "vector"))
-            found.append(self._velocity(sensor, 1.0 if kind == "vector" else gravity))
-        return tuple(found)
+            found.append(self._velocity(sensor, strength))
+        return found
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -242,22 +225,10 @@ class States(ByValue):
         for name, one in self.sensors.items():
             if not isinstance(one, SensorStates):
                 raise InputError(f"sensors[{name!r}] is {one!r}; it must be SensorStates")
-        self.gyro_blocks()
+        self._gyro_blocks()
 
-    @property
-    def gravity(self) -> float:
-        """Length of ``gravity_f``, m/s²."""
-        return float(np.linalg.norm(self.gravity_f))
-
-    def gyro_blocks(self) -> tuple[ErrorStates, ...]:
-        """Return the error states of the gyro.
-
-        Returns
-        -------
-        tuple of ErrorStates
-            Declarations for scale and misalignment, sensitivity to specific force, slope over temperature, and each drift,
-            if its σ is above zero.
-        """
+    def _gyro_blocks(self) -> list[ErrorStates]:
+        """Return the error states of the gyro whose σ is above zero."""
         found: list[ErrorStates] = []
         if _any(self.gyro_scale_sigma) or _any(self.gyro_misalignment_sigma):
             scale, misalignment = _spread(self.gyro_scale_sigma, self.gyro_misalignment_sigma)
@@ -270,7 +241,7 @@ class States(ByValue):
             found.append(GyroTemperature(slope_sigma=np.maximum(slope, 1e-6 * slope.max())))
         for sigma, time in zip(self.gyro_drift_sigma, self.gyro_drift_time, strict=True):
             found.append(GyroGaussMarkov(bias_sigma=sigma, correlation_time=time, name=f"gyro drift {time:g} s"))
-        return tuple(found)
+        return found
 
     def blocks(self, kinds: Mapping[str, str]) -> tuple[ErrorStates, ...]:
         """Return all error states of a filter.
@@ -285,10 +256,10 @@ class States(ByValue):
         tuple of ErrorStates
             Declarations of the gyro, then those of the sensors in the order of ``sensors``.
         """
-        found = list(self.gyro_blocks())
+        found, gravity = self._gyro_blocks(), float(np.linalg.norm(self.gravity_f))
         for name, one in self.sensors.items():
             known = one_of("states: sensor", name, kinds)
-            found += one.blocks(known, kinds[known], self.gravity)
+            found += one._blocks(known, kinds[known], gravity)
         return tuple(found)
 
     @property
@@ -317,7 +288,7 @@ class States(ByValue):
                 raise InputError(f"states: {name!r} is requested, but no states are declared; leave it out")
             one_of("states: name", name, self.names)
         sensors = {sensor: _kept(one, sensor, _SENSOR_PARTS, names) for sensor, one in self.sensors.items()}
-        used = {sensor: one for sensor, one in sensors.items() if one.blocks(sensor, "direction", 1.0)}
+        used = {sensor: one for sensor, one in sensors.items() if one._blocks(sensor, "direction", 1.0)}
         return replace(_kept(self, "gyro", _GYRO_PARTS, names), sensors=used)
 
 
@@ -413,14 +384,12 @@ def to_table(states: States) -> dict[str, Any]:
 def from_table(table: Mapping[str, Any], place: str = "states") -> States:
     """Return the states in a table; an unknown key is an error that names the nearest known one."""
     known_keys(place, table, {*tables.keys(FORM), "sensors"})
-    sensors = table.get("sensors", {})
-    if not isinstance(sensors, Mapping):
-        raise InputError(f"{place}: sensors is {sensors!r}; it must be a table of tables, [{place}.sensors.NAME]")
+    where = f"{place}: sensors"
     by_sensor = {}
-    for name, content in sensors.items():
-        where = f"{place}: sensors: {name}"
-        if not isinstance(content, Mapping):
-            raise InputError(f"{where} is {content!r}; it must be a table, [{place}.sensors.{name}]")
-        by_sensor[name] = tables.build(SensorStates, content, SENSOR_FORM, where)
+    for name, content in tables.subtable(
+        table.get("sensors", {}), where, f" of tables, [{place}.sensors.NAME]"
+    ).items():
+        own = tables.subtable(content, f"{where}: {name}", f", [{place}.sensors.{name}]")
+        by_sensor[name] = tables.build(SensorStates, own, SENSOR_FORM, f"{where}: {name}")
     own = {key: value for key, value in table.items() if key != "sensors"}
     return tables.build(States, own, FORM, place, sensors=by_sensor)  # type: ignore[no-any-return]
