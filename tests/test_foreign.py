@@ -318,12 +318,12 @@ def test_frames_and_clock_are_found_and_removed(run):
     assert abs(a.offset + 1e6) < 4.5 * a.sigma[6] < 0.2
     assert found.judgement.verdict == "consistent"
     assert len([words for words in found.remarks if "removed" in words]) == 3
-    # The uncertainty of what was removed is part of the covariance.
-    before, after = (
-        np.trace(e.covariance[:, :3, :3], axis1=1, axis2=2),
-        np.trace(found.estimate.covariance[:, :3, :3], axis1=1, axis2=2),
-    )
-    assert after.mean() > before.mean() + 3.0 * float(np.mean(a.sigma[:6] ** 2))
+    # In the truth's body axes again, but for the uncertainty of what was removed, which is part of the covariance.
+    rows = np.searchsorted(e.time, found.estimate.time - 0.05)
+    np.testing.assert_allclose(found.estimate.bias, e.bias[rows], atol=0.03 * np.abs(e.bias).max())
+    added = found.estimate.covariance[:, :3, :3] - e.covariance[rows, :3, :3]
+    assert np.linalg.eigvalsh(added).min() > 0.0
+    assert np.trace(added.mean(axis=0)) > 3.0 * float(np.mean(a.sigma[:6] ** 2))
 
 
 @pytest.mark.parametrize("convention", ["conjugate", "last", "last, conjugate"])
@@ -365,6 +365,10 @@ def test_a_sparser_truth_is_taken_at_its_own_times(run):
     found = checked(run, true_time=run.estimate.time[every], true_attitude=t.attitude[every], true_bias=t.bias[every])
     assert len(found.estimate.time) == len(run.estimate.time[every])
     np.testing.assert_allclose(found.estimate.attitude, run.estimate.attitude[every], atol=1e-12)
+    for before in (0.03, -0.03):  # between the estimate's times: its covariance is that of the nearest
+        off = {"true_time": run.estimate.time[every] + before, "align": "none", "error_frame": "body"}
+        off |= {"true_attitude": FLIGHT.motion.attitude(off["true_time"]), "true_bias": t.bias[every]}
+        np.testing.assert_array_equal(checked(run, **off).estimate.covariance, run.estimate.covariance[every])
 
 
 def test_what_is_asked_for_is_removed(run):

@@ -273,6 +273,21 @@ def test_summary_bounds_are_those_that_decide():
     assert np.allclose(summary["nees"]["bias"]["bounds"], [low, high], rtol=1e-12)
     low, high = scipy.stats.chi2.ppf([0.5 * single, 1.0 - 0.5 * single], 6) / 6.0
     assert np.allclose(summary["nis"][1]["bounds"], [low, high], rtol=1e-12)
+    assert np.allclose(sums.nis_bounds(1.0 - single, "star"), [low, high], rtol=1e-12)
+
+
+def test_the_mean_error_is_students_t_of_the_worst_epoch_and_state():
+    """And ln NEES that of the worst epoch; both times the number of tests."""
+    sums, epochs = scalar.run_chunk(PLAN, 0, 8), np.array([2, 4])
+    error = sums.example_error + 3.0 * sums.rms_error * (np.arange(6) == 5)
+    moved = {"error_sum": error.sum(axis=0), "error_product_sum": np.einsum("rmi,rmj->mij", error, error)}
+    logs = sums.log_nees_sum + 2.4 * np.arange(7)[:, None]
+    found = {one.name: one for one in replace(sums, **moved, log_nees_sum=logs).judge(epochs=epochs).findings}
+    student = scipy.stats.ttest_1samp(error[:, epochs], 0.0)
+    assert (found["mean error"].of, found["mean error"].value) == ("bias z", pytest.approx(student.statistic.max()))
+    assert found["mean error"].p_value == pytest.approx(12.0 * student.pvalue.min())
+    p = consistency.log_mean_p_value(float(logs[4, 2]) / 8.0, 3, 8)
+    assert found["log-NEES"].p_value == pytest.approx(2.0 * p)  # the last subset is the bias
 
 
 def test_summary_and_verdict_agree_where_holm_is_sharper_than_bonferroni():

@@ -9,8 +9,10 @@ import hypothesis
 import matplotlib
 import numpy as np
 import pytest
+import scipy.stats
 from hypothesis import strategies as st
 from matplotlib.colors import to_rgb
+from scipy.spatial.transform import Rotation
 
 from strapdown import coning, consistency, covariance, gyro, montecarlo, plots, quaternion, records, scenarios, units
 from strapdown.checks import InputError
@@ -172,28 +174,42 @@ def test_the_histogram_counts_what_lies_beyond():
 
 @pytest.mark.parametrize("epoch", [0, -1])
 def test_coverage_is_drawn_at_its_epoch(statistics, epoch):
-    drawn = [
-        line.get_ydata() for line in plots.coverage_by_state(statistics, epoch).lines if len(line.get_xdata()) == 6
-    ]
+    ax = plots.coverage_by_state(statistics, epoch)
+    drawn = [line.get_ydata() for line in ax.lines if len(line.get_xdata()) == 6]
     np.testing.assert_allclose(np.transpose(drawn), 100.0 * statistics.coverage[epoch] / statistics.finite[epoch])
+    for k, span in enumerate(ax.patches, start=1):
+        ends = scipy.stats.binom.ppf([0.005, 0.995], 24, 2.0 * scipy.stats.norm.cdf(k) - 1.0) / 24
+        np.testing.assert_allclose([span.get_y(), span.get_y() + span.get_height()], 100.0 * ends, rtol=1e-9)
+
+
+def test_a_fan_has_the_normal_quantiles_of_the_filters_sigma(statistics):
+    ax = plots.fan(statistics, 4)
+    assert ax.get_ylabel().endswith(" °/h")
+    for line, band, share in zip(ax.lines, ax.collections, (0.99, 0.9, 0.5), strict=True):
+        predicted = scipy.stats.norm.ppf(0.5 + 0.5 * share) * statistics.sigma[:, 4] / units.DEGREE_PER_HOUR
+        np.testing.assert_allclose(line.get_ydata(), predicted, rtol=1e-4)
+        top = statistics.error_quantile(share)[:, 4].max() / units.DEGREE_PER_HOUR
+        assert band.get_paths()[0].vertices[:, 1].max() == pytest.approx(top)
 
 
 def test_errors_are_drawn_in_the_unit_of_their_label(run):
     estimate, truth = run
     figure = plots.error_overview(estimate, truth)
     error = consistency.errors(estimate.attitude, estimate.bias, truth.attitude, truth.bias)
-    for column, unit, size in ((0, "arcsec", units.ARCSECOND), (1, "°/h", units.DEGREE_PER_HOUR)):
-        ax = figure.axes[column]
-        assert unit in ax.get_ylabel()
+    for state, ax in enumerate(np.reshape(figure.axes, (3, 2)).T.ravel()):
+        unit, size = (("arcsec", units.ARCSECOND), ("°/h", units.DEGREE_PER_HOUR))[state // 3]
+        assert ax.get_ylabel() == f"{('attitude', 'bias')[state // 3]} {'xyz'[state % 3]}, {unit}"
         drawn = ax.lines[-1].get_ydata()
-        assert np.abs(drawn).max() == pytest.approx(np.abs(error[:, 3 * column]).max() / size)
+        assert np.abs(drawn).max() == pytest.approx(np.abs(error[:, state]).max() / size)
+        top = max(part.get_paths()[0].vertices[:, 1].max() for part in ax.collections)
+        assert top == pytest.approx(3.0 * estimate.sigma[:, state].max() / size, rel=0.02)  # or no lighter part
 
 
 @pytest.mark.filterwarnings("error")
 def test_a_budget_that_starts_without_error_shows_what_comes_after(scenario, tmp_path):
-    found = covariance.analyse(
-        dataclasses.replace(scenario, duration=2.0), initial_attitude_sigma=0.0, initial_bias_sigma=0.0, epochs=4
-    )
+    opposite = dataclasses.replace(scenario.gyro, scale_factor=np.full(3, 1e-4), asymmetry=np.full(3, -1e-4))
+    brief = dataclasses.replace(scenario, gyro=opposite, duration=2.0)
+    found = covariance.analyse(brief, initial_attitude_sigma=0.0, initial_bias_sigma=0.0, epochs=4)
     assert not found.rms[0].any()
     figure = plots.error_budget(found)
     plots.save(figure, tmp_path / "budget.png")
@@ -205,6 +221,12 @@ def test_a_budget_that_starts_without_error_shows_what_comes_after(scenario, tmp
     line = figure.axes[0].lines[0].get_ydata()
     assert np.isnan(line[0])
     assert np.all(line[1:] > 0.0)
+    for ax, part, size in (
+        (figure.axes[0], slice(3), units.ARCSECOND),
+        (figure.axes[1], slice(3, 6), units.DEGREE_PER_HOUR),
+    ):
+        for line, six in zip(ax.lines, (found.rms, found.filter_sigma), strict=True):
+            np.testing.assert_allclose(line.get_ydata()[1:] * size, np.sqrt(np.mean(six[1:, part] ** 2, axis=1)))
 
 
 @pytest.mark.filterwarnings("error")
@@ -313,12 +335,33 @@ def figures(run, statistics, outcomes):
     }
 
 
-def test_the_bias_is_drawn_in_the_unit_of_its_axis(run):
+def test_the_estimate_is_drawn_in_the_unit_of_its_axis(run):
     estimate, _ = run
-    (ax,) = (ax for ax in plots.estimate_overview(estimate).axes if ax.get_ylabel().startswith("gyro bias"))
-    size = {"gyro bias, °/h": np.pi / 180.0 / 3600.0, "gyro bias, °/s": np.pi / 180.0}[ax.get_ylabel()]
-    for k, line in enumerate(ax.get_lines()[:3]):
+    axes = plots.estimate_overview(estimate).axes
+    yaw, pitch, roll = Rotation.from_quat(estimate.attitude, scalar_first=True).as_euler("ZYX", degrees=True).T
+    for ax, name, angle in zip(axes, ("roll, °", "pitch, °", "yaw, °"), (roll, pitch, yaw), strict=False):
+        assert ax.get_ylabel() == name
+        assert ax.lines[0].get_ydata()[-1] == pytest.approx(angle[-1])
+    size = {"gyro bias, °/h": np.pi / 180.0 / 3600.0, "gyro bias, °/s": np.pi / 180.0}[axes[3].get_ylabel()]
+    for k, (line, band) in enumerate(zip(axes[3].lines, axes[3].collections, strict=True)):
         assert line.get_ydata()[-1] * size == pytest.approx(estimate.bias[-1, k], rel=1e-12)
+        top = np.max(estimate.bias[:, k] + 3.0 * estimate.sigma[:, 3 + k])
+        assert band.get_paths()[0].vertices[:, 1].max() * size == pytest.approx(top)
+
+
+def test_error_states_are_drawn_with_three_sigma(run):
+    estimate, _ = run
+    every = np.ones((len(estimate.time), 1))
+    block = ErrorStateEstimate(
+        components=("x", "y"),
+        units=("1", "1"),
+        values=every * [1e-4, -2e-4],
+        variance=every * [1e-10, 4e-10],
+    )
+    (ax,) = plots.states_over_time(dataclasses.replace(estimate, error_states={"gyro scale": block})).axes
+    assert ax.get_ylabel() == "ppm"
+    for line, level in zip(ax.lines, (70.0, 130.0, 100.0, -260.0, -140.0, -200.0), strict=True):
+        np.testing.assert_allclose(line.get_ydata(), level)
 
 
 @pytest.fixture(scope="module")
