@@ -100,6 +100,10 @@ def test_a_factor_on_sigma_is_as_likely_as_its_likelihood_ratio(m, factor):
     known = foreign.explanations(1e-3 * error, {"body": P}, "body", {"body": 1.0}, truth, time, attitude)
     (found,) = (one for one in known if one.name == foreign.SCALE)
     assert float(found.value) == pytest.approx(factor, rel=1e-3)
+    if m == 10:  # a mean removed: 2 Δℓ = 3 m ln of the ratio of the mean squares, χ² of three degrees
+        (mounting,) = (one for one in known if "mounting" in one.name)
+        ratio = 3.0 * np.log(np.mean(error**2) / np.mean((error - error.mean(axis=0)) ** 2))
+        assert mounting.p_value == pytest.approx(scipy.stats.chi2.sf(ratio, 3))
     ratio = 3.0 * (m if m > 10 else 1) * (factor**2 - 1.0 - 2.0 * np.log(factor))
     if factor == 1.0:
         assert found.p_value == pytest.approx(1.0, abs=1e-6)
