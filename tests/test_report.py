@@ -18,7 +18,7 @@ from strapdown import cli, coning, gyro, montecarlo, plots, records, report, sce
 from strapdown.checks import InputError
 from strapdown.estimation import setup
 from strapdown.montecarlo import campaign
-from strapdown.report import page
+from strapdown.report import campaigns, estimates, page
 
 CHROMIUM = next(
     (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
@@ -377,14 +377,38 @@ def test_each_column_of_the_estimates_table_is_what_its_head_says(folder):
         assert abs(wanted[1] / wanted[0] - 1.0) > 0.2
 
 
+def test_the_estimates_table_of_sensors_leaves_out_what_the_gate_rejected(folder):
+    estimate = records.read_estimate(folder / "right.h5")
+    one = estimate.innovations["star 1"]
+    outlier = np.arange(len(one.time)) % 5 == 0
+    wild = np.where(outlier[:, None], 100.0 * one.innovation, one.innovation)
+    gated = dataclasses.replace(one, innovation=wild, weight=np.where(outlier, 0.0, 1.0))
+    given = dataclasses.replace(estimate, innovations={"star 1": gated}, skipped={"star 1": 3})
+    nis = np.mean(one.innovation[~outlier] ** 2 / one.variance[~outlier])
+    wanted = [len(one.time), 3, outlier.sum(), nis]
+    np.testing.assert_allclose(rows_of(estimates._numbers(given, None), "star 1"), wanted, rtol=6e-4)
+
+
 def test_what_a_campaign_page_says_of_the_end_is_of_the_last_epoch(folder, monkeypatch):
     held = campaign.read(folder / "campaign.h5").statistics
     inside = 100.0 * held.coverage / held.finite[:, None, None]
     assert not np.array_equal(inside[-1], inside[0])
     content = body(folder / "campaign.html")
+    bound = (1e-6 * np.arange(1.0, 27.0))[:, None, None] ** 2 * np.eye(6)
+    bounded = campaigns._numbers(held, bound, held.judge())
     for state, name in enumerate([f"{what} {axis}" for what in ("attitude", "bias") for axis in "xyz"]):
+        unit = re.search(rf"{name}, ([^<]+)<", content)[1]
+        size = {"arcsec": np.pi / 648000.0, "°/h": np.pi / 648000.0}[
+            unit
+        ]  # an hour has as many seconds as a degree has arcseconds
         shown = rows_of(content, f"(?:gyro )?{name}")
+        wanted = [one[-1, state] / size for one in (held.sigma, held.rms_error, held.mean_error)]
+        np.testing.assert_allclose(shown[:3], wanted, rtol=6e-3)
+        np.testing.assert_allclose(
+            shown[3:5], [held.error_quantile(q)[-1, state] / size for q in (0.5, 0.95)], rtol=6e-3
+        )
         np.testing.assert_allclose(shown[-3:], inside[-1, state], atol=0.051)
+        np.testing.assert_allclose(rows_of(bounded, name)[-1], held.rms_error[-1, state] / (26.0 * 1e-6), rtol=6e-3)
     drawn, ellipses = [], []
     monkeypatch.setattr(plots, "coverage_by_state", lambda statistics, epoch, ax: drawn.append(epoch))
     monkeypatch.setattr(plots, "covariance_ellipses", lambda *given: ellipses.append(given[:3]))
