@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import xml.etree.ElementTree
+from types import SimpleNamespace
 
 import hypothesis
 import matplotlib
@@ -14,12 +15,24 @@ from hypothesis import strategies as st
 from matplotlib.colors import to_rgb
 from scipy.spatial.transform import Rotation
 
-from strapdown import coning, consistency, covariance, gyro, montecarlo, plots, quaternion, records, scenarios, units
+from strapdown import (
+    allan,
+    coning,
+    consistency,
+    covariance,
+    gyro,
+    montecarlo,
+    plots,
+    quaternion,
+    records,
+    scenarios,
+    units,
+)
 from strapdown.checks import InputError
 from strapdown.estimation import setup
 from strapdown.montecarlo.coning_study import Drift, FilterOutcome
 from strapdown.montecarlo.statistics import BINS_PER_OCTAVE
-from strapdown.plots import decimation, estimates, style
+from strapdown.plots import decimation, estimates, style, tuning
 from strapdown.records.estimate import ErrorStateEstimate
 
 pytestmark = pytest.mark.draws
@@ -164,6 +177,71 @@ def test_every_function_draws_into_the_axes_it_is_given(run, statistics):
         assert ax.get_ylabel()
         ax.figure.canvas.draw()
         assert draw(None) is not ax
+
+
+def test_nis_and_autocorrelation_are_drawn_with_their_bounds(run, statistics):
+    degrees = np.median(statistics.sensor_degrees.sum(axis=0))
+    span = plots.nis_over_time([("filter", statistics)]).patches[0]
+    bounds = scipy.stats.chi2.ppf([0.005, 0.995], degrees) / degrees
+    np.testing.assert_allclose([span.get_y(), span.get_y() + span.get_height()], bounds)
+    innovations = next(iter(run[0].innovations.values()))
+    nis = np.sum(innovations.whitened**2, axis=1) / 2.0
+    each, mean, _ = plots.nis_over_record(innovations, (0.1, 4.0), window=7).lines
+    np.testing.assert_allclose(each.get_ydata(), np.maximum(nis, 1e-4))
+    for k in (0, 5):  # each mean at the middle of its window
+        assert mean.get_xdata()[k] == pytest.approx(innovations.time[k : k + 7].mean())
+        assert mean.get_ydata()[k] == pytest.approx(nis[k : k + 7].mean())
+    n, lags = len(nis), 3
+    lines = plots.innovation_autocorrelation(consistency.autocorrelation(innovations.whitened, lags)).lines[:4]
+    spread = np.sqrt((n - np.arange(1, lags + 1)) / (n * (n + 2.0)))
+    for line, sign, outside in zip(lines, (1.0, -1.0) * 2, (0.005, 0.005, 0.005 / 6, 0.005 / 6), strict=True):
+        np.testing.assert_allclose(line.get_ydata(), sign * scipy.stats.norm.isf(outside) * spread)
+
+
+@pytest.mark.parametrize("start", [2e-4, 1e-9])
+def test_a_slice_of_the_likelihood_is_drawn_in_the_unit_of_its_axis(start):
+    unit = SimpleNamespace(name="°/h", factor=units.DEGREE_PER_HOUR)
+    one = SimpleNamespace(name="b", unit=unit, start=start, value=1e-4, lower=6e-5, upper=1.5e-4, identified=True)
+    slices = SimpleNamespace(values=np.geomspace(4e-5, 3e-4, 9)[None], fallen=np.arange(9.0)[None])
+    ax = tuning.likelihood_slice(slices, SimpleNamespace(parameters=(one,), composite=False), 0)
+    levels = {line.get_label(): line for line in ax.lines}
+    np.testing.assert_allclose(ax.lines[0].get_xdata() * units.DEGREE_PER_HOUR, slices.values[0])
+    assert levels["3.84: 95 % of χ², one parameter"].get_ydata()[0] == pytest.approx(
+        scipy.stats.chi2.ppf(0.95, 1), rel=1e-3
+    )
+    assert levels["tuned"].get_xdata()[0] * units.DEGREE_PER_HOUR == pytest.approx(1e-4)
+    assert ax.patches[0].get_x() * units.DEGREE_PER_HOUR == pytest.approx(6e-5)
+    if start == 2e-4:
+        assert levels["before"].get_xdata()[0] * units.DEGREE_PER_HOUR == pytest.approx(2e-4)
+    else:
+        assert ax.texts[0].get_text() == f"before: {start / units.DEGREE_PER_HOUR:.3g}"
+
+
+def test_an_allan_deviation_is_drawn_with_the_terms_of_its_axis():
+    random = np.random.default_rng(2)
+    white = 1e-3 * random.standard_normal((3000, 2))
+    rate = white + np.cumsum(1e-4 * random.standard_normal((3000, 2)), axis=0) * [0.0, 1.0]
+    deviation, fit = allan.allan_deviation(rate, 0.1), allan.fit_noise(rate, 0.1)
+    assert fit.supported[:, fit.terms.index("rate_random_walk")].tolist() == [False, True]
+    size = units.DEGREE_PER_HOUR
+    for axis, ax in enumerate(plots.allan_overview(deviation, fit).axes):
+        drawn = [line.get_label() for line in ax.lines[2:]]
+        assert drawn == [
+            term.replace("_", " ") for term, held in zip(fit.terms, fit.supported[axis], strict=True) if held
+        ]
+        np.testing.assert_allclose(ax.lines[0].get_ydata() * size, deviation.deviation[axis])
+        ends = ax.collections[0].get_paths()[0].vertices[:, 1] * size
+        finite = deviation.upper[axis][np.isfinite(deviation.upper[axis])]
+        np.testing.assert_allclose([ends.min(), ends.max()], [deviation.lower[axis].min(), finite.max()])
+
+
+def test_coning_errors_are_those_about_the_cones_axis(outcomes):
+    held = outcomes[0].statistics
+    axes = plots.coning_errors(outcomes).axes
+    for ax, state, size in ((axes[0], 2, units.ARCSECOND), (axes[2], 5, units.DEGREE_PER_HOUR)):
+        np.testing.assert_allclose(ax.lines[1].get_ydata() * size, held.example_error[0, :, state])
+        top = ax.collections[0].get_paths()[0].vertices[:, 1].max()
+        assert top * size == pytest.approx(3.0 * held.sigma[:, state].max())
 
 
 def test_the_histogram_counts_what_lies_beyond():
