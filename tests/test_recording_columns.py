@@ -156,7 +156,10 @@ def test_two_sensors_that_fit_are_refused_not_chosen(table):
     np.testing.assert_allclose(chosen.rate, VALUES[:, 4:7] * DEGREE, rtol=1e-15)
 
 
-@pytest.mark.parametrize("name", ["Linear Acceleration {} (m/s^2)", "userAcceleration{}", "gyro_bias_{}", "acc_{}_std"])
+@pytest.mark.parametrize(
+    "name",
+    ["Linear Acceleration {} (m/s^2)", "userAcceleration{}", "gyro_bias_{}", "acc_{}_std", "angular_acceleration_{}"],
+)
 def test_what_is_no_plain_sample_is_not_taken_for_one(table, name):
     """An acceleration without gravity shows no vertical."""
     other = ",".join(name.format(axis) for axis in "xyz")
@@ -190,6 +193,9 @@ def test_milliseconds_since_1970_keep_every_nanosecond(table):
     recording = read(path)
     assert recording.epoch_ns == 1_763_850_000_009_000_000
     np.testing.assert_allclose(recording.time, [0.0, 0.01, 0.021], rtol=1e-15)
+    fraction = f"{path.read_text(encoding='utf-8').splitlines()[0]}\n1763850000009.25,1,2,3\n1763850000019.5,1,2,3\n"
+    path.write_text(fraction, encoding="utf-8")
+    assert read(path).epoch_ns == 1_763_850_000_009_250_000
 
 
 def test_columns_that_nobody_asks_for_may_hold_anything(table, tmp_path):

@@ -168,6 +168,21 @@ def test_a_flight_log_is_read(ulog):
     assert "vehicle_attitude, the vehicle's estimate" in " ".join(back.remarks)
 
 
+def test_a_flight_log_uses_the_time_of_the_samples(ulog, monkeypatch):
+    """A magnetometer logged 20 ms late with its sample's time, and an accelerometer 30 ms before the gyro, which is said."""
+    import pyulog
+
+    path, whole = ulog
+    log = pyulog.ULog(str(path))
+    data = {one.name: one.data for one in log.data_list}
+    data["vehicle_magnetometer"]["timestamp"] += 20_000
+    data["sensor_combined"]["accelerometer_timestamp_relative"][:] = -30_000
+    monkeypatch.setattr(pyulog, "ULog", lambda *given: log)
+    found = read(path)
+    same(found, whole, "magnetic_field")
+    assert "offset by -30 ms from the gyro's stamps" in " ".join(found.remarks)
+
+
 def test_the_library_reads_the_attitude_as_px4_has_it(ulog):
     """From forward-right-down body axes to North-East-Down: a body whose axes are those has the identity."""
     import pyulog

@@ -357,6 +357,15 @@ def hdf5(tmp_path):
     return write
 
 
+def test_broad_has_microtesla(tmp_path):
+    one = Recording(
+        source="a", time=np.arange(3.0), rate=np.ones((3, 3)), magnetic_field=np.full((3, 3), 0.5), magnetic_unit="G"
+    )
+    recordings.write(one, tmp_path / "a.hdf5")
+    np.testing.assert_allclose(read(tmp_path / "a.hdf5").magnetic_field, 50.0)
+    assert read(tmp_path / "a.hdf5").magnetic_unit == "uT"
+
+
 def test_broad_layout_is_read(hdf5):
     path = hdf5()
     recording = read(path)
