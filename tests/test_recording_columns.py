@@ -93,6 +93,8 @@ def test_euroc_names_its_columns_in_a_comment_and_keeps_its_nanoseconds(table, t
     assert recording.epoch_ns == stamps[0]
     np.testing.assert_allclose(recording.time, 5_000_001e-9 * np.arange(4), rtol=1e-15)
     assert recording.clock_ns.tolist() == stamps
+    path.write_text(f"{header}\n2000000000000000,1,2,3,4,5,6\n2000000005000000,1,2,3,4,5,6\n")
+    np.testing.assert_allclose(read(path).time, [2e6, 2e6 + 5e-3])  # of a machine that has run for 23 days
     np.testing.assert_array_equal(recording.rate[0], [1, 2, 3])
     np.testing.assert_array_equal(recording.specific_force[3], [4, 5, 9])
 

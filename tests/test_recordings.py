@@ -12,6 +12,7 @@ from strapdown.checks import InputError
 from strapdown.cli import app
 from strapdown.recordings import Recording, read, recordfiles, samples
 from strapdown.records import ImuRecord
+from strapdown.records.recording import at_nearest
 from strapdown.vectors import VectorMeasurements
 
 HEADER = "time,gx [rad/s],gy,gz,ax [m/s2],ay,az"
@@ -355,6 +356,21 @@ def hdf5(tmp_path):
         return path
 
     return write
+
+
+def test_samples_go_to_the_nearest_stamp_the_closest_of_several():
+    """Sample by sample, within a median interval; some before the first stamp, after the last, and in a gap."""
+    random = np.random.default_rng(6)
+    time = np.cumsum(random.uniform(0.8, 1.2, 60)) + 40.0 * (np.arange(60) >= 30)
+    other = np.sort(random.uniform(-10.0, 110.0, 150))
+    wanted = np.full(60, np.nan)
+    for j in np.argsort(-np.abs(other[:, None] - time).min(axis=1)):
+        distance = np.abs(other[j] - time)
+        if distance.min() <= np.median(np.diff(time)):
+            wanted[distance.argmin()] = other[j]
+    placed, lost = at_nearest(time, other, other[:, None])
+    np.testing.assert_array_equal(placed[:, 0], wanted)
+    assert lost == 150 - np.isfinite(wanted).sum()
 
 
 def test_broad_has_microtesla(tmp_path):
