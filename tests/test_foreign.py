@@ -565,6 +565,22 @@ def test_tables_of_sigma_and_of_other_units_are_read(tmp_path):
     np.testing.assert_array_equal(read.attitude[0], [1.0, 0.0, 0.0, 0.0])
 
 
+def test_tables_of_covariances_in_degrees_are_read(tmp_path):
+    path = tmp_path / "estimate.csv"
+    names = [f"cov_body_{a}{b}_deg2" for a, b in ("xx", "xy", "xz", "yy", "yz", "zz")]
+    path.write_text(f"time_s,qw,qx,qy,qz,{','.join(names)}\n1,1,0,0,0,9,1,2,8,3,7\n2,1,0,0,0,9,1,2,8,3,7\n")
+    expected = np.array([[9.0, 1.0, 2.0], [1.0, 8.0, 3.0], [2.0, 3.0, 7.0]]) * (np.pi / 180.0) ** 2
+    np.testing.assert_allclose(read_attitudes(path).covariance[1], expected)
+
+
+def test_a_repeated_innovation_of_a_flight_log_is_no_measurement():
+    stamps = np.array([5, 6, 7, 8]) * 100_000
+    values = {"timestamp": stamps, "heading": np.array([0.1, 0.1, 0.2, 0.2])}
+    found = attitudes._ulog_innovations(values, {"timestamp": stamps, "heading": np.full(4, 4.0)}, 500_000)["heading"]
+    np.testing.assert_allclose(found.time, [0.0, 0.2])
+    np.testing.assert_array_equal(found.innovation[:, 0], [0.1, 0.2])
+
+
 def test_the_command_refuses(files, monkeypatch, capsys):
     for arguments, message in (
         (["check", files / "estimate.tum"], "has no innovations, so it cannot be judged without a truth"),

@@ -382,6 +382,8 @@ def test_a_trajectory_is_a_reference(tmp_path):
         read(path)
     with pytest.raises(InputError, match=r"truth.txt goes from .* both must have the same clock"):
         recordings.with_reference(replace(whole, epoch_ns=0), path)
+    path.write_text("-1.25 0 0 0 0 0 0 1\n-0.5 0 0 0 0 0 0 1\n2 0 0 0 0 0 0 1\n")
+    assert recordings.read_tum(path)[0].tolist() == [-1_250_000_000, -500_000_000, 2_000_000_000]
     path.write_text("1 2 3\n")
     with pytest.raises(InputError, match=r"data row 1 has 3 numbers; a TUM trajectory has time tx"):
         recordings.read_tum(path)

@@ -18,7 +18,7 @@ from strapdown import cli, coning, gyro, montecarlo, plots, records, report, sce
 from strapdown.checks import InputError
 from strapdown.estimation import setup
 from strapdown.montecarlo import campaign
-from strapdown.report import campaigns, estimates, page
+from strapdown.report import campaigns, estimates, page, tunings
 
 CHROMIUM = next(
     (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
@@ -128,7 +128,9 @@ def test_charts_hold_every_extreme(folder):
     estimate, truth = records.read_estimate(folder / "right.h5"), records.read_truth(folder / "right.h5")
     error = (truth.bias - estimate.bias) * 180.0 / np.pi * 3600.0
     for axis in range(3):
-        drawn = np.array(charts[3 + axis]["data"][3])
+        high, low, drawn = (np.array(values) for values in charts[3 + axis]["data"][1:])
+        sigma = np.sqrt(estimate.variance[:, 3 + axis]).max() * 180.0 / np.pi * 3600.0
+        np.testing.assert_allclose([high.max(), low.min()], [3.0 * sigma, -3.0 * sigma], rtol=1e-6)
         assert drawn.max() == pytest.approx(error[:, axis].max(), rel=1e-6)
         assert drawn.min() == pytest.approx(error[:, axis].min(), rel=1e-6)
 
@@ -203,6 +205,21 @@ def test_a_tuning_is_reported_from_its_json(folder, scenario, tmp_path):
     content = body(report.write(tmp_path / "filter.json").page)
     assert content.count("data:image/png") == 1
     assert "<strong>Consistent.</strong> The tuned filter agrees with the data used for tuning" in content
+
+
+def test_the_verdict_of_a_tuning_is_the_worst_on_held_out_data():
+    verdicts = [{"verdict": one, "reason": one, "findings": []} for one in ("consistent", "cannot tell")]
+    verdicts[0]["findings"] = [{"rejected": True, "means": "odd"}, {"rejected": False, "means": "even"}]
+    held = {"before": {"log_likelihood_per_innovation": 2.0}}
+    held["after"] = {"log_likelihood_per_innovation": 1.0, "judgements": verdicts}
+    answer, reason, details = tunings.verdict({"held_out": held})
+    assert (answer, reason) == ("cannot tell", "cannot tell, on held-out data")
+    assert details == ["odd", "on the held-out data the likelihood has decreased: keep the previous filter"]
+    held["before"]["log_likelihood_per_innovation"] = 0.5
+    assert tunings.verdict({"held_out": held})[2] == ["odd"]
+    objective = {"name": "a", "before": 2.0, "after": 0.5, "attitude_rms_rad": [np.pi / 180.0, np.pi / 360.0]}
+    words = " ".join(tunings._parameters({"parameters": [], "objective": objective}))
+    assert "RMS attitude error: 1° before, 0.5° after." in words
 
 
 def test_gaps_become_null_not_nan():
@@ -387,6 +404,7 @@ def test_the_estimates_table_of_sensors_leaves_out_what_the_gate_rejected(folder
     nis = np.mean(one.innovation[~outlier] ** 2 / one.variance[~outlier])
     wanted = [len(one.time), 3, outlier.sum(), nis]
     np.testing.assert_allclose(rows_of(estimates._numbers(given, None), "star 1"), wanted, rtol=6e-4)
+    assert f"mean NIS per degree of freedom {nis:.3g}" in str(given)
 
 
 def test_what_a_campaign_page_says_of_the_end_is_of_the_last_epoch(folder, monkeypatch):
