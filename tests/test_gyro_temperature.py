@@ -14,7 +14,7 @@ from strapdown.estimation import temperature as driven
 from strapdown.estimation.gating import Gate
 from strapdown.estimation.setup.for_record import drawn_start
 from strapdown.estimation.states import Candidate, GateMemory
-from strapdown.gyro.temperature import BiasOverTemperature, from_table, to_table
+from strapdown.gyro.temperature import from_table, to_table
 from strapdown.montecarlo import lanes
 from strapdown.recordings import formats, recordfiles
 from strapdown.units import DEGREE_PER_HOUR, DEGREE_PER_ROOT_HOUR
@@ -56,18 +56,6 @@ rate_hz = 1.0
 sigma_across_arcsec = 60.0
 sigma_about_arcsec = 60.0
 """
-
-
-def test_slope_and_walk_bound_the_error_of_the_polynomial():
-    """Of independent errors of c_1 and c_2: the largest σ of the slope in the span, and of the change since the start over √t."""
-    sigma = np.array([[0.0, 0.0, 0.0], [1e-5, 2e-5, 0.0], [3e-6, 1e-6, 0.0]])
-    warm = BiasOverTemperature(reference=30.0, span=(10.0, 45.0), coefficients=np.zeros((3, 3)), sigma=sigma)
-    t = np.linspace(10.0, 45.0, 36)[:, None] - 30.0
-    np.testing.assert_allclose(warm.slope_sigma, np.sqrt(sigma[1] ** 2 + (2.0 * t * sigma[2]) ** 2).max(axis=0))
-    T, time = np.array([12.0, 20.0, 50.0]), np.array([5.0, 15.0, 105.0])
-    t = np.array([-18.0, -10.0, 15.0])  # the last one beyond the span
-    variance = (t - t[0])[1:, None] ** 2 * sigma[1] ** 2 + (t**2 - t[0] ** 2)[1:, None] ** 2 * sigma[2] ** 2
-    assert warm.walk(T, time) == pytest.approx(np.sqrt(np.max(variance / (time - 5.0)[1:, None])))
 
 
 def test_the_simulated_bias_is_the_polynomial_of_the_course(tmp_path):

@@ -309,6 +309,21 @@ def test_summary_and_verdict_agree_where_holm_is_sharper_than_bonferroni():
         assert part["epochs_outside"] == int(found[subset].rejected)
 
 
+def test_the_summary_has_the_last_epoch_each_sensor_and_the_bound():
+    sums = scalar.run_chunk(PLAN, 0, 8)
+    refused = np.arange(10).reshape(2, 5)
+    bound = np.tile(np.diag([4.0, 1.0, 1.0, 1.0, 1.0, 1.0]), (7, 1, 1))
+    summary = montecarlo.summary(replace(sums, sensor_refused=refused), bound=bound, epochs=np.array([2, 4]))
+    assert [one["refused"] for one in summary["nis"]] == [10, 35]
+    median = sums.error_quantile(0.5)[-1] * 648000.0 / np.pi
+    np.testing.assert_allclose(summary["last_epoch"]["attitude_error_quantile_0.5_arcsec"], median[:3])
+    over = summary["rms_over_root_cramer_rao_bound"]
+    rms = np.sqrt(np.mean(sums.rms_error[[2, 4]] ** 2, axis=0))
+    np.testing.assert_allclose([*over["attitude"], *over["bias"]], rms / [2.0, 1.0, 1.0, 1.0, 1.0, 1.0])
+    ends = np.sqrt(scipy.stats.chi2.ppf([0.005, 0.995], 8) / 8.0)
+    np.testing.assert_allclose(over["bounds_of_an_efficient_filter"], ends)
+
+
 def test_summary_takes_coverage_over_the_judged_epochs():
     counts = np.zeros((PLAN.epochs + 1, 6, 3), int)
     counts[4], counts[2, :3, 1] = 3, 3
@@ -417,6 +432,8 @@ def test_a_dispersed_gyro_is_the_one_that_is_simulated():
     spec = scalar.dispersed(SCENARIO.gyro, only, PLAN.seed, 5)
     turned = (record.increments - plain.increments).sum(axis=0) / np.deg2rad(60.0 * 2.4)
     assert turned[2] == pytest.approx(spec.scale_factor[2] - SCENARIO.gyro.scale_factor[2], rel=1e-6)
+    origin = montecarlo.replay(planned(dispersions=only), 5, machine="scalar").record.origin
+    assert origin.gyro == origin.scenario.gyro == spec
 
 
 def test_initial_errors_are_as_dispersed():
