@@ -101,6 +101,7 @@ def test_a_data_frame_is_a_recording():
     recording = recordings.from_table(frame, source="frame")
     np.testing.assert_allclose(recording.rate[:, 0], np.radians([1, 2, 3]), rtol=1e-15)
     assert recording.epoch_ns == 1_709_294_400 * 10**9
+    assert recordings.from_table(frame.reset_index(names="time")).epoch_ns == 1_709_294_400 * 10**9
     assert recording.magnetic_field[:, 0].tolist()[::2] == [1.0, 3.0]
     assert np.isnan(recording.magnetic_field[1, 0])
     np.testing.assert_array_equal(sd.read(frame, units={"magnetometer": "uT"}).rate, recording.rate)

@@ -523,6 +523,21 @@ def test_stamps_that_stray_by_more_than_a_quarter_of_the_interval_are_assumed_ev
     assert not even or f"deviate by up to {10.0 * shift:.3g} ms" in words[0]
 
 
+def test_stamps_in_whole_milliseconds_have_the_mean_interval():
+    """300 Hz and a lost sample: intervals of 3 and 4 ms. The temperature is interpolated over the loss; a burst is no grid."""
+    kept = np.delete(np.arange(900), 600)
+    one = Recording(
+        source="log", time=np.rint(1e3 * kept / 300.0) / 1e3, rate=np.ones((899, 3)), temperature=kept * 0.01
+    )
+    found = samples.samples_of(one, gaps=True)
+    assert found.sample_interval == pytest.approx(1.0 / 300.0, rel=1e-3)
+    assert np.flatnonzero(np.isnan(found.values[:, 0])).tolist() == [600]
+    np.testing.assert_allclose(found.temperature, 0.01 * np.arange(900))
+    time = 0.01 * np.arange(100.0)
+    time[41:] -= 0.009
+    assert samples._grid("log", time)[1].tolist() == list(range(100))
+
+
 def test_samples_of_a_simulated_record_are_its_increments_and_what_its_sensors_measured(tmp_path):
     random, time = np.random.default_rng(4), 0.01 * np.arange(201)
     force = VectorMeasurements(
