@@ -17,6 +17,7 @@ from strapdown import consistency, estimation, montecarlo, quaternion, scenarios
 from strapdown.checks import InputError
 from strapdown.estimation import setup as setups
 from strapdown.montecarlo import campaign, engine, plan, scalar, statistics
+from strapdown.montecarlo.coning_study import FilterOutcome
 from strapdown.montecarlo.statistics import BINS, ERROR_EXPONENT, NEES_EXPONENT, bin_edges, bin_of
 
 SCENARIO = replace(scenarios.load_scenario("spin"), duration=2.4)
@@ -322,6 +323,24 @@ def test_the_summary_has_the_last_epoch_each_sensor_and_the_bound():
     np.testing.assert_allclose([*over["attitude"], *over["bias"]], rms / [2.0, 1.0, 1.0, 1.0, 1.0, 1.0])
     ends = np.sqrt(scipy.stats.chi2.ppf([0.005, 0.995], 8) / 8.0)
     np.testing.assert_allclose(over["bounds_of_an_efficient_filter"], ends)
+
+
+def test_the_numbers_of_the_coning_study_are_means_over_the_judged_epochs():
+    sums, epochs = scalar.run_chunk(PLAN, 0, 8), np.array([2, 4, 6])
+    found = FilterOutcome(integration="a", statistics=sums, probability=0.95, epochs=epochs).summary()
+    error, P = sums.example_error[:, epochs], sums.covariance_sum[epochs] / 8.0
+    turn = np.pi / 648000.0  # an arcsecond, and a degree per hour
+    for name, part in (("attitude_{}_arcsec", slice(3)), ("bias_{}_deg_per_hour", slice(3, 6))):
+        assert found[name.format("rms")] * turn == pytest.approx(np.sqrt(np.mean(error[:, :, part] ** 2)))
+        sigma = np.sqrt(np.mean(np.diagonal(P, axis1=1, axis2=2)[:, part]))
+        assert found[name.format("sigma")] * turn == pytest.approx(sigma)
+    np.testing.assert_allclose(np.multiply(found["bias_mean_deg_per_hour"], turn), error[:, :, 3:].mean(axis=(0, 1)))
+    totals = {"anees": (6 * 8, sums.nees_sum[epochs, 0]), "anees_bias": (3 * 8, sums.nees_sum[epochs, 2])}
+    totals |= {"nis": (sums.sensor_degrees.sum(), sums.sensor_nis_sum.sum())}
+    for name, (degrees, total) in totals.items():
+        assert found[name] == pytest.approx(np.mean(total) / degrees)
+        ends = scipy.stats.chi2.ppf([0.025, 0.975], degrees) / degrees
+        np.testing.assert_allclose(found[f"{name}_bounds"], ends)
 
 
 def test_summary_takes_coverage_over_the_judged_epochs():
