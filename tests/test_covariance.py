@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 
 import numpy as np
 import pytest
@@ -209,6 +210,22 @@ def test_correlated_noise_runs_from_white_to_a_constant():
         white_noise = found.contributions[:, found.sources.index("sun")] * (size / scenario.sensors[0].sigma) ** 2
         constant = np.einsum("mci,mcj->mij", found.considered_errors, found.considered_errors)
         assert np.allclose(coloured, white_noise if tau < 1.0 else constant, rtol=1e-6, atol=1e-24)
+
+
+@pytest.mark.parametrize("tau", [0.5, 5.0])
+def test_correlated_noise_of_two_measurements_lies_between_white_and_constant(tau):
+    """Errors w₁ n₁ + w₂ n₂ a second apart: with ρ = exp(−1/τ) a share ρ of the difference of both extremes."""
+    scenario, size = dataclasses.replace(still_scenario(), duration=2.0), 3e-4
+
+    def covariance_of(time):
+        faults = Faults(correlated_sigma=size, correlation_time=time)
+        sensors = (dataclasses.replace(scenario.sensors[0], faults=faults), *scenario.sensors[1:])
+        found = covariance.analyse(dataclasses.replace(scenario, sensors=sensors), BELIEF, epochs=5)
+        return found.contributions[-1, found.sources.index("sun, correlated")]
+
+    white_noise, constant = covariance_of(1e-6), covariance_of(1e18)
+    expected = white_noise + math.exp(-1.0 / tau) * (constant - white_noise)
+    np.testing.assert_allclose(covariance_of(tau), expected, rtol=1e-9, atol=1e-12 * np.abs(expected).max())
 
 
 def test_correlated_noise_of_a_heading_pair_is_that_of_its_line_in_fixed_axes():

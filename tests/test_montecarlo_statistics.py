@@ -287,6 +287,9 @@ def test_the_mean_error_is_students_t_of_the_worst_epoch_and_state():
     student = scipy.stats.ttest_1samp(error[:, epochs], 0.0)
     assert (found["mean error"].of, found["mean error"].value) == ("bias z", pytest.approx(student.statistic.max()))
     assert found["mean error"].p_value == pytest.approx(12.0 * student.pvalue.min())
+    anees = sums.nees_sum[epochs, 2]
+    each = [2.0 * min(scipy.stats.chi2.cdf(one, 24), scipy.stats.chi2.sf(one, 24)) for one in anees]
+    assert found["ANEES"].p_value == pytest.approx(min(1.0, 2.0 * min(each)))
     p = consistency.log_mean_p_value(float(logs[4, 2]) / 8.0, 3, 8)
     assert found["log-NEES"].p_value == pytest.approx(2.0 * p)  # the last subset is the bias
 
@@ -365,10 +368,12 @@ DISPERSED = montecarlo.Dispersions(
 
 
 def test_a_plan_goes_through_its_table_and_back():
-    for one in (PLAN, planned(dispersions=DISPERSED, seed=9), planned(setup=replace(SETUP, sigma={"star": 1e-3}))):
+    plans = (PLAN, planned(dispersions=DISPERSED, seed=9), planned(setup=replace(SETUP, sigma={"star": 1e-3})))
+    for one in (*plans, planned(individuals=True)):
         again = plan.from_table(one.to_table())
         assert again.to_table() == one.to_table()
         assert again.digest == one.digest
+        assert again.individuals == one.individuals
         assert not same(scalar.run_chunk(one, 0, 2), scalar.run_chunk(again, 0, 2))
 
 
