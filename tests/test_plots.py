@@ -184,6 +184,8 @@ def test_nis_and_autocorrelation_are_drawn_with_their_bounds(run, statistics):
     span = plots.nis_over_time([("filter", statistics)]).patches[0]
     bounds = scipy.stats.chi2.ppf([0.005, 0.995], degrees) / degrees
     np.testing.assert_allclose([span.get_y(), span.get_y() + span.get_height()], bounds)
+    nees = plots.nees_over_time([("filter", statistics)], (0.8, 1.2), "bias").lines[0].get_ydata()
+    np.testing.assert_allclose(nees, statistics.nees_sum[:, 2] / (3.0 * 24.0))
     innovations = next(iter(run[0].innovations.values()))
     nis = np.sum(innovations.whitened**2, axis=1) / 2.0
     each, mean, _ = plots.nis_over_record(innovations, (0.1, 4.0), window=7).lines
@@ -425,6 +427,19 @@ def test_the_estimate_is_drawn_in_the_unit_of_its_axis(run):
         assert line.get_ydata()[-1] * size == pytest.approx(estimate.bias[-1, k], rel=1e-12)
         top = np.max(estimate.bias[:, k] + 3.0 * estimate.sigma[:, 3 + k])
         assert band.get_paths()[0].vertices[:, 1].max() * size == pytest.approx(top)
+    assert axes[4].get_ylabel() == "attitude σ, arcsec"
+    top = axes[4].collections[0].get_paths()[0].vertices[:, 1].max() * units.ARCSECOND
+    assert top == pytest.approx(np.linalg.norm(estimate.sigma[:, :3], axis=1).max())
+
+
+def test_errors_of_a_recording_and_their_distribution_are_drawn():
+    half, q = units.DEGREE / 2.0, np.tile([1.0, 0.0, 0.0, 0.0], (4, 1))
+    turned = quaternion.multiply(quaternion.exp([0.0, 0.0, half]), quaternion.exp([3.0 * half, 0.0, 0.0]))
+    (ax,) = plots.recording_errors(np.arange(4.0), consistency.reference_errors(q, np.tile(turned, (4, 1)))).axes
+    drawn = {line.get_label().split(",")[0]: line.get_ydata()[0] for line in ax.lines}
+    assert drawn == pytest.approx({"total": np.hypot(0.5, 1.5), "heading": 0.5, "inclination": 1.5}, rel=1e-3)
+    ax = plots.error_distribution(consistency.distribution(units.DEGREE * np.arange(1.0, 101.0)))
+    assert [line.get_xdata()[0] for line in ax.lines[1:]] == pytest.approx([50.0, 95.0])
 
 
 def test_error_states_are_drawn_with_three_sigma(run):
