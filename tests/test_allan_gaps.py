@@ -144,6 +144,13 @@ def test_a_stretch_that_moves_is_seen():
     fit = allan.fit_noise(x, 0.01)
     assert fit.misfit_probability[0] < 1e-6
     assert fit.misfit[0].startswith("in the segment from 21 s ")
+    y = noise("white", (1, 4000), 3)[0]
+    y[1000] = 5.5
+    once, twice = (
+        allan.fit_noise(one, 0.01, terms=allan.TERMS[1:2]).misfit_probability[0] for one in (y, [*y, np.nan, *y])
+    )
+    assert 1e-6 < once < 0.1
+    assert twice == pytest.approx(2.0 * once, rel=1e-6)
 
 
 @pytest.mark.parametrize(
