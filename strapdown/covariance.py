@@ -457,7 +457,6 @@ def _integration_rate(scenario: Scenario, setup: FilterSetup, stamps: Array, att
     share = (stamps[1:] - begins[step]) / length
     true = quaternion.multiply(quaternion.conjugate(attitude[first]), attitude[1:])
     error = quaternion.log(quaternion.multiply(quaternion.exp(-share[:, None] * turns[step]), true))
-    error[stamps[1:] > begins[-1]] = 0.0
     before = np.concatenate([np.zeros((1, 3)), error[:-1]])
     before[stamps[:-1] <= begins[step]] = 0.0
     carried = quaternion.rotate(quaternion.exp(-phi), before)
@@ -531,14 +530,14 @@ class _Path(NamedTuple):
 
 
 def _path(scenario: Scenario, setup: FilterSetup, epochs: int) -> _Path:
-    edges = scenario.edges
-    steps = (len(edges) - 1) // setup.integration.samples
+    steps = (len(scenario.edges) - 1) // setup.integration.samples
     if steps < count("epochs", epochs):
         raise InputError(f"{steps} filter steps are fewer than {epochs} epochs; use fewer epochs, or a longer scenario")
+    edges = scenario.edges[: steps * setup.integration.samples + 1]  # like the filter, without an incomplete last step
     parts = _all_rows(scenario, setup)
     none = _Rows(np.empty(0), *np.empty((2, 0, 3)), *np.empty((4, 0)))
     joined = [np.concatenate(part) for part in zip(none, *parts, strict=True)]
-    order = np.argsort(joined[0], kind="stable")
+    order = np.argsort(joined[0], kind="stable")[: np.sum(joined[0] <= edges[-1])]
     rows = _Rows(*(np.ascontiguousarray(part[order]) for part in joined))
     stamps = np.union1d(edges, rows.time)
     attitude = scenario.motion.attitude(stamps)

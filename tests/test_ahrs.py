@@ -483,6 +483,8 @@ def test_how_late_the_magnetometer_is_shows_beside_the_gyro(behind):
     delay, sigma = sensor_delays.magnetometer_delay(late(field=behind))
     assert sigma < 3e-4
     assert delay == pytest.approx(behind, abs=5e-4)
+    used = delay if behind else 0.0  # not within 3 σ of zero
+    assert np.all(sensor_delays.find(late(field=behind)).field == used)
 
 
 @pytest.mark.parametrize("behind", [-0.008, 0.0, 0.011])

@@ -807,3 +807,16 @@ def test_the_covariance_of_a_coefficient_is_that_of_the_coefficient_not_of_its_s
     fit = allan.fit_noise(np.random.default_rng(5).standard_normal((n, 1)), 1.0, terms=("angle_random_walk",))
     assert fit.covariance.shape == (1, 1, 1)
     assert np.sqrt(fit.covariance[0, 0, 0]) == pytest.approx(1.0 / np.sqrt(2.0 * n), rel=0.02)
+
+
+def test_the_units_of_the_coefficients_are_what_their_names_say():
+    hour, g = 3600.0, 9.80665e-6  # s, and a microgravity in m/s²
+    degree = np.pi / 180.0
+    for terms in allan.noise_fit.UNITS.values():
+        names, factors = zip(*(terms[term] for term in allan.TERMS), strict=True)
+        wanted = {
+            "arcsec": (degree / hour, degree / hour**0.5, degree / hour, degree / hour**1.5, degree / hour**2),
+            "mm/s": (1e-3, g, g, g / hour**0.5, g / hour),
+            "nT s": (1e-9, 1e-9, 1e-9, 1e-9 / hour**0.5, 1e-9 / hour),
+        }[names[0]]
+        assert_allclose(factors, wanted, rtol=1e-12)

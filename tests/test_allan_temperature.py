@@ -43,6 +43,8 @@ def test_its_intervals_cover_where_plain_least_squares_would_not():
     found = allan_temperature.fit_temperature(x, T, DT, order=1)
     inside = np.abs(found.polynomial.coefficients[1] - 1e-3) <= found.reach[1]
     assert 64 <= inside.sum() <= 75
+    assert 0.7 < np.std(found.polynomial.coefficients[1]) / found.polynomial.sigma[1].mean() < 1.3  # of 75: ±8 %
+    np.testing.assert_allclose(found.reach[1], 1.959964 * found.polynomial.sigma[1], rtol=1e-6)
     A = np.stack([np.ones(samples), T - T.mean()], axis=1)
     plain, rest, *_ = np.linalg.lstsq(A, x, rcond=None)
     sigma = np.sqrt(rest / (samples - 2) / np.sum((T - T.mean()) ** 2))

@@ -295,3 +295,13 @@ def test_misfits_have_their_closed_forms(angle):
     assert misfit((1.0, 0.0, 0.0)) == pytest.approx([0.0, 1.0 - math.cos(angle), 0.0], abs=1e-9)
     assert misfit((0.0, 0.0, 1.0)) == pytest.approx([0.0, 0.0, declined], abs=1e-9)
     assert misfit((0.0, 0.0, 0.0), 1.0 + angle) == pytest.approx([scale, 0.0, 0.0], rel=1e-3, abs=1e-6)
+
+
+def test_the_misfit_of_unrelated_directions_is_one():
+    """cos of the angle between two random directions is uniform: its variance is a third."""
+    u = np.random.default_rng(3).standard_normal((2, 5000, 3))
+    u /= np.linalg.norm(u, axis=-1, keepdims=True)
+    means = dict(zip(("accelerometer", "magnetometer"), np.einsum("ab,swc->swabc", np.eye(3), u), strict=True))
+    found = check_conventions._fixed_misfits(means, dict.fromkeys(means, np.eye(3)))
+    assert found["gyro and magnetometer"] == pytest.approx(0.0, abs=1e-12)
+    assert found["accelerometer and magnetometer"] == pytest.approx(1.0, rel=0.05)

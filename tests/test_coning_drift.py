@@ -47,6 +47,14 @@ def test_double_precision_agrees_with_thirty_digits(name):
 
 
 @pytest.mark.parametrize("name", list(ALGORITHMS))
+def test_the_predicted_drift_is_the_leading_term_of_the_series(name):
+    ratio, frequency, beta = 0.02, 5.0, 1e-6
+    predicted = coning.predicted_coning_drift(name, beta, frequency, ratio / (2.0 * math.pi * frequency))
+    series = beta**2 * 2.0 * math.pi * frequency * coning.small_angle_drift(name, ratio)
+    assert predicted == pytest.approx(series, rel=0.01, abs=0.0)
+
+
+@pytest.mark.parametrize("name", list(ALGORITHMS))
 def test_drift_order_and_constant_of_every_table(name):
     """With digits enough β can be so small that no second-order floor shows; a wrong order is a factor of 2,500."""
     table, ratio = ALGORITHMS[name], 0.02
@@ -151,4 +159,4 @@ def test_small_angle_drift_refuses_ratios_beyond_its_series():
 def test_comments_and_empty_lines_of_a_vibration_file_are_no_lines(tmp_path):
     path = tmp_path / "v.csv"
     path.write_text("# measured on the bench\n\nfrequency_hz,angle_deg\n  \n10,0.1\n # 20,0.1\n\n")
-    assert [line.frequency for line in coning.read_vibration(path)] == [10.0]
+    assert coning.read_vibration(path) == (VibrationLine(frequency=10.0, angle=math.radians(0.1), phase=0.5 * math.pi),)

@@ -226,8 +226,9 @@ def test_quantile_pairs_are_order_statistics_in_their_band():
     inside = np.mean((found.observed >= found.low) & (found.observed <= found.high))
     assert inside > 0.9
     small = consistency.quantile_pairs(x[:20, 0])
-    expected = scipy.stats.norm.ppf(scipy.stats.beta.ppf(0.005, 1, 20))
-    assert small.low[0] == pytest.approx(expected)
+    for ends, share in ((small.low, 0.005), (small.high, 0.995)):
+        order = scipy.stats.beta.ppf(share, np.arange(1, 21), np.arange(20, 0, -1))
+        assert ends == pytest.approx(scipy.stats.norm.ppf(order))
     assert small.theoretical[0] == pytest.approx(scipy.stats.norm.ppf(0.5 / 20))
 
 

@@ -128,7 +128,11 @@ def test_variances_alone_judge_the_end_by_axes():
     assert good.verdict == "consistent"
     assert any("variances only" in limit for limit in good.limits)
     bad = consistency.judge(*estimate(covariance=False, bias_error=10.0))
-    assert [(f.name, f.of) for f in bad.findings if f.rejected] == [("error at the end", "bias z")]
+    (found,) = (f for f in bad.findings if f.rejected)
+    assert (found.name, found.of) == ("error at the end", "bias z")
+    assert found.p_value == pytest.approx(
+        6.0 * 2.0 * scipy.stats.chi2.sf(found.value**2, 1), rel=1e-6, abs=0.0
+    )  # of six
 
 
 def test_too_little_cannot_tell():

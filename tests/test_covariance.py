@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 
 import numpy as np
 import pytest
@@ -173,6 +174,25 @@ def test_a_coloured_bias_that_never_changes_is_nothing_but_initial_bias():
     assert np.abs(block / np.outer(reach, reach)).max() < 1e-12
 
 
+def test_markov_noise_without_a_correlation_time_is_a_rate_random_walk():
+    scenarios_ = (still_scenario(rate_random_walk=3e-7, markov_noise=4e-7), still_scenario(rate_random_walk=5e-7))
+    one, other = (covariance.analyse(scenario, BELIEF, epochs=5).contributions for scenario in scenarios_)
+    np.testing.assert_allclose(one, other, rtol=1e-12)
+
+
+def test_measurements_in_an_incomplete_last_step_are_not_processed():
+    """20 steps of four samples, two more samples with a measurement: as with 80 samples alone."""
+    scenario = dataclasses.replace(still_scenario(angle_random_walk=1e-5), duration=8.0)
+    star = dataclasses.replace(scenario.sensors[0], rate=5.0, phase=0.0)
+    belief = dataclasses.replace(BELIEF, integration=coning.ALGORITHMS["four-sample"])
+    whole, longer = (
+        covariance.analyse(dataclasses.replace(scenario, sensors=(star,), duration=duration), belief, epochs=5)
+        for duration in (8.0, 8.2)
+    )
+    assert longer.expected_nis == whole.expected_nis
+    np.testing.assert_array_equal(longer.rms, whole.rms)
+
+
 def test_correlated_noise_runs_from_white_to_a_constant():
     scenario, size = still_scenario(), 3e-4
     for tau in (1e-6, 1e18):
@@ -188,6 +208,22 @@ def test_correlated_noise_runs_from_white_to_a_constant():
         white_noise = found.contributions[:, found.sources.index("sun")] * (size / scenario.sensors[0].sigma) ** 2
         constant = np.einsum("mci,mcj->mij", found.considered_errors, found.considered_errors)
         assert np.allclose(coloured, white_noise if tau < 1.0 else constant, rtol=1e-6, atol=1e-24)
+
+
+@pytest.mark.parametrize("tau", [0.5, 5.0])
+def test_correlated_noise_of_two_measurements_lies_between_white_and_constant(tau):
+    """Errors w₁ n₁ + w₂ n₂ a second apart: with ρ = exp(−1/τ) a share ρ of the difference of both extremes."""
+    scenario, size = dataclasses.replace(still_scenario(), duration=2.0), 3e-4
+
+    def covariance_of(time):
+        faults = Faults(correlated_sigma=size, correlation_time=time)
+        sensors = (dataclasses.replace(scenario.sensors[0], faults=faults), *scenario.sensors[1:])
+        found = covariance.analyse(dataclasses.replace(scenario, sensors=sensors), BELIEF, epochs=5)
+        return found.contributions[-1, found.sources.index("sun, correlated")]
+
+    white_noise, constant = covariance_of(1e-6), covariance_of(1e18)
+    expected = white_noise + math.exp(-1.0 / tau) * (constant - white_noise)
+    np.testing.assert_allclose(covariance_of(tau), expected, rtol=1e-9, atol=1e-12 * np.abs(expected).max())
 
 
 def test_correlated_noise_of_a_heading_pair_is_that_of_its_line_in_fixed_axes():
@@ -610,7 +646,6 @@ def test_the_command_prints_a_budget_and_writes_it(succeeds, tmp_path):
     said = succeeds("covariance", "spin", "--epochs", 10, "--misalignment", 0.1, "--time-offset", "star=2")
     for word in ("angle random walk", "gyro scale factor", "misalignment", "star time offset", "the filter's own σ"):
         assert word in said
-    assert "optimistic in bias" in " ".join(said.split())
     found = json.loads((tmp_path / "covariance-results" / "covariance.json").read_text(encoding="utf-8"))
     assert len(found["time_s"]) == 11
     direct = covariance.analyse(
@@ -618,6 +653,8 @@ def test_the_command_prints_a_budget_and_writes_it(succeeds, tmp_path):
     )
     assert np.allclose(np.array(found["rms"]["attitude_arcsec"]) * ARCSECOND, direct.rms[:, :3])
     assert np.allclose(found["expected_nees_per_state"]["bias"], direct.expected_nees[:, 2])
+    times = f"{np.sqrt(direct.expected_nees[-1, 2]):.3g} times its σ"
+    assert f"optimistic in bias: its errors will be {times}" in " ".join(said.split())
     assert (tmp_path / "covariance-results" / "budget.png").read_bytes().startswith(b"\x89PNG")
 
 

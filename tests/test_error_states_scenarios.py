@@ -5,6 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from scipy.special import sici
 
 from strapdown import consistency, scenarios
 from strapdown.estimation import setup
@@ -146,9 +147,9 @@ def test_the_quicker_part_of_flicker_is_reported_of_the_bias():
     np.testing.assert_allclose(one.variance[1:, 3:] - other.variance[1:, 3:], fast, rtol=1e-9)
     np.testing.assert_allclose(one.variance[0, 3:], np.diag(initial.covariance)[3:], rtol=1e-9)
     np.testing.assert_allclose(np.einsum("kii->ki", one.covariance), one.variance, rtol=1e-12)
-    # What the drifts and it hold together is the flicker of the simulator but for what does not change within the record.
-    from strapdown.gyro import flicker
-
-    whole = scenario.gyro.bias_instability**2 * flicker.shaping(len(record.increments)).variance
-    held = fast + sum(sigma**2 for sigma in chosen.states.gyro_drift_sigma)
-    assert 0.6 * whole < held < 1.0 * whole
+    # Closed form: B²/(2πf) cos²(πf), the mean of neighbouring intervals, minus the drifts, from the shortest drift's time constant up.
+    step, times = 1.0 / scenario.rate, np.array(chosen.states.gyro_drift_time)
+    turns = np.array([step / (times[-1] * np.sqrt(10.0)), np.pi])  # 2πf of the two ends
+    flicker = 0.5 * np.max(scenario.gyro.bias_instability) ** 2 / np.pi * np.diff(np.log(turns) + sici(turns)[1])
+    drifts = 2.0 / np.pi * np.square(chosen.states.gyro_drift_sigma) @ np.diff(np.arctan(np.outer(times / step, turns)))
+    np.testing.assert_allclose(fast, flicker - drifts, rtol=1e-3)

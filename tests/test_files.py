@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from strapdown.files import write_json, written_beside
+from strapdown.files import tables, write_json, written_beside
 
 
 def names(folder) -> list[str]:
@@ -130,3 +130,11 @@ def test_a_full_disk_is_an_ordinary_error_of_hdf5_too(tmp_path):
     assert done.stdout.startswith("error: [Errno 27]")
     assert (tmp_path / "record.h5").read_text() == "old"
     assert names(tmp_path) == ["record.h5"]
+
+
+@pytest.mark.parametrize(("suffix", "factor"), [unit for unit in tables.ARCSECONDS if unit[0] != "rad"])
+def test_numbers_of_few_digits_are_written_with_them(suffix, factor):
+    """Of a thousand decimal numbers some quotients by the factor have 17 digits; those of few digits give the same number."""
+    for number in (k / 1000.0 for k in range(1, 1001)):
+        (found,) = tables._entry("angle", number * factor, ((suffix, factor),)).items()
+        assert found == (f"angle_{suffix}", number)

@@ -91,6 +91,10 @@ def test_a_factor_on_sigma_is_as_likely_as_its_likelihood_ratio(m, factor):
     known = foreign.explanations(1e-3 * error, {"body": P}, "body", {"body": 1.0}, truth, time, attitude)
     (found,) = (one for one in known if one.name == foreign.SCALE)
     assert float(found.value) == pytest.approx(factor, rel=1e-3)
+    if m == 10:  # a mean removed: 2 Δℓ = 3 m ln of the ratio of the mean squares, χ² of three degrees
+        (mounting,) = (one for one in known if "mounting" in one.name)
+        ratio = 3.0 * np.log(np.mean(error**2) / np.mean((error - error.mean(axis=0)) ** 2))
+        assert mounting.p_value == pytest.approx(scipy.stats.chi2.sf(ratio, 3))
     ratio = 3.0 * (m if m > 10 else 1) * (factor**2 - 1.0 - 2.0 * np.log(factor))
     if factor == 1.0:
         assert found.p_value == pytest.approx(1.0, abs=1e-6)
@@ -309,12 +313,12 @@ def test_frames_and_clock_are_found_and_removed(run):
     assert abs(a.offset + 1e6) < 4.5 * a.sigma[6] < 0.2
     assert found.judgement.verdict == "consistent"
     assert len([words for words in found.remarks if "removed" in words]) == 3
-    # The uncertainty of what was removed is part of the covariance.
-    before, after = (
-        np.trace(e.covariance[:, :3, :3], axis1=1, axis2=2),
-        np.trace(found.estimate.covariance[:, :3, :3], axis1=1, axis2=2),
-    )
-    assert after.mean() > before.mean() + 3.0 * float(np.mean(a.sigma[:6] ** 2))
+    # In the truth's body axes again, but for the uncertainty of what was removed, which is part of the covariance.
+    rows = np.searchsorted(e.time, found.estimate.time - 0.05)
+    np.testing.assert_allclose(found.estimate.bias, e.bias[rows], atol=0.03 * np.abs(e.bias).max())
+    added = found.estimate.covariance[:, :3, :3] - e.covariance[rows, :3, :3]
+    assert np.linalg.eigvalsh(added).min() > 0.0
+    assert np.trace(added.mean(axis=0)) > 3.0 * float(np.mean(a.sigma[:6] ** 2))
 
 
 @pytest.mark.parametrize("convention", ["conjugate", "last", "last, conjugate"])
@@ -356,6 +360,10 @@ def test_a_sparser_truth_is_taken_at_its_own_times(run):
     found = checked(run, true_time=run.estimate.time[every], true_attitude=t.attitude[every], true_bias=t.bias[every])
     assert len(found.estimate.time) == len(run.estimate.time[every])
     np.testing.assert_allclose(found.estimate.attitude, run.estimate.attitude[every], atol=1e-12)
+    for before in (0.03, -0.03):  # between the estimate's times: its covariance is that of the nearest
+        off = {"true_time": run.estimate.time[every] + before, "align": "none", "error_frame": "body"}
+        off |= {"true_attitude": FLIGHT.motion.attitude(off["true_time"]), "true_bias": t.bias[every]}
+        np.testing.assert_array_equal(checked(run, **off).estimate.covariance, run.estimate.covariance[every])
 
 
 def test_what_is_asked_for_is_removed(run):
@@ -546,6 +554,22 @@ def test_tables_of_sigma_and_of_other_units_are_read(tmp_path):
     assert read.error_frame == "euler"
     np.testing.assert_allclose(read.covariance[0], np.diag([1.0, 4.0, 9.0]) * DEGREE**2)
     np.testing.assert_array_equal(read.attitude[0], [1.0, 0.0, 0.0, 0.0])
+
+
+def test_tables_of_covariances_in_degrees_are_read(tmp_path):
+    path = tmp_path / "estimate.csv"
+    names = [f"cov_body_{a}{b}_deg2" for a, b in ("xx", "xy", "xz", "yy", "yz", "zz")]
+    path.write_text(f"time_s,qw,qx,qy,qz,{','.join(names)}\n1,1,0,0,0,9,1,2,8,3,7\n2,1,0,0,0,9,1,2,8,3,7\n")
+    expected = np.array([[9.0, 1.0, 2.0], [1.0, 8.0, 3.0], [2.0, 3.0, 7.0]]) * (np.pi / 180.0) ** 2
+    np.testing.assert_allclose(read_attitudes(path).covariance[1], expected)
+
+
+def test_a_repeated_innovation_of_a_flight_log_is_no_measurement():
+    stamps = np.array([5, 6, 7, 8]) * 100_000
+    values = {"timestamp": stamps, "heading": np.array([0.1, 0.1, 0.2, 0.2])}
+    found = attitudes._ulog_innovations(values, {"timestamp": stamps, "heading": np.full(4, 4.0)}, 500_000)["heading"]
+    np.testing.assert_allclose(found.time, [0.0, 0.2])
+    np.testing.assert_array_equal(found.innovation[:, 0], [0.1, 0.2])
 
 
 def test_the_command_refuses(files, monkeypatch, capsys):

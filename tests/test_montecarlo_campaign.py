@@ -276,6 +276,10 @@ def test_a_file_of_another_version_or_format_is_refused(tmp_path):
     _forged(path, "version", "0.0.1")
     with pytest.raises(InputError, match=r"version is 0\.0\.1 there"):
         go(path, 16, resume=True)
+    go(path, 8, overwrite=True)
+    _forged(path, "arithmetic", "another processor")  # which rounds differently
+    with pytest.raises(InputError, match="arithmetic is another processor there"):
+        go(path, 16, resume=True)
     _forged(path, "format", 99)
     with pytest.raises(InputError, match="format 99, newer"):
         campaign.read(path)

@@ -13,10 +13,11 @@ import scipy.stats
 from measured import errors_at, turn_to
 from spin_plan import PLAN, SCENARIO, SETUP, different
 
-from strapdown import coning, estimation, montecarlo, scenarios
+from strapdown import coning, consistency, estimation, montecarlo, scenarios
 from strapdown.checks import InputError
 from strapdown.estimation import setup as setups
 from strapdown.montecarlo import campaign, engine, plan, scalar, statistics
+from strapdown.montecarlo.coning_study import FilterOutcome
 from strapdown.montecarlo.statistics import BINS, ERROR_EXPONENT, NEES_EXPONENT, bin_edges, bin_of
 
 
@@ -260,6 +261,24 @@ def test_summary_bounds_are_those_that_decide():
     assert np.allclose(summary["nees"]["bias"]["bounds"], [low, high], rtol=1e-12)
     low, high = scipy.stats.chi2.ppf([0.5 * single, 1.0 - 0.5 * single], 6) / 6.0
     assert np.allclose(summary["nis"][1]["bounds"], [low, high], rtol=1e-12)
+    assert np.allclose(sums.nis_bounds(1.0 - single, "star"), [low, high], rtol=1e-12)
+
+
+def test_the_mean_error_is_students_t_of_the_worst_epoch_and_state():
+    """And ln NEES that of the worst epoch; both times the number of tests."""
+    sums, epochs = scalar.run_chunk(PLAN, 0, 8), np.array([2, 4])
+    error = sums.example_error + 3.0 * sums.rms_error * (np.arange(6) == 5)
+    moved = {"error_sum": error.sum(axis=0), "error_product_sum": np.einsum("rmi,rmj->mij", error, error)}
+    logs = sums.log_nees_sum + 2.4 * np.arange(7)[:, None]
+    found = {one.name: one for one in replace(sums, **moved, log_nees_sum=logs).judge(epochs=epochs).findings}
+    student = scipy.stats.ttest_1samp(error[:, epochs], 0.0)
+    assert (found["mean error"].of, found["mean error"].value) == ("bias z", pytest.approx(student.statistic.max()))
+    assert found["mean error"].p_value == pytest.approx(12.0 * student.pvalue.min())
+    anees = sums.nees_sum[epochs, 2]
+    each = [2.0 * min(scipy.stats.chi2.cdf(one, 24), scipy.stats.chi2.sf(one, 24)) for one in anees]
+    assert found["ANEES"].p_value == pytest.approx(min(1.0, 2.0 * min(each)))
+    p = consistency.log_mean_p_value(float(logs[4, 2]) / 8.0, 3, 8)
+    assert found["log-NEES"].p_value == pytest.approx(2.0 * p)  # the last subset is the bias
 
 
 def test_summary_and_verdict_agree_where_holm_is_sharper_than_bonferroni():
@@ -279,6 +298,39 @@ def test_summary_and_verdict_agree_where_holm_is_sharper_than_bonferroni():
         assert part["consistent"] == (not found[subset].rejected)
         assert part["bounds"] == [found[subset].low, found[subset].high]
         assert part["epochs_outside"] == int(found[subset].rejected)
+
+
+def test_the_summary_has_the_last_epoch_each_sensor_and_the_bound():
+    sums = scalar.run_chunk(PLAN, 0, 8)
+    refused = np.arange(10).reshape(2, 5)
+    bound = np.tile(np.diag([4.0, 1.0, 1.0, 1.0, 1.0, 1.0]), (7, 1, 1))
+    summary = montecarlo.summary(replace(sums, sensor_refused=refused), bound=bound, epochs=np.array([2, 4]))
+    assert [one["refused"] for one in summary["nis"]] == [10, 35]
+    median = sums.error_quantile(0.5)[-1] * 648000.0 / np.pi
+    np.testing.assert_allclose(summary["last_epoch"]["attitude_error_quantile_0.5_arcsec"], median[:3])
+    over = summary["rms_over_root_cramer_rao_bound"]
+    rms = np.sqrt(np.mean(sums.rms_error[[2, 4]] ** 2, axis=0))
+    np.testing.assert_allclose([*over["attitude"], *over["bias"]], rms / [2.0, 1.0, 1.0, 1.0, 1.0, 1.0])
+    ends = np.sqrt(scipy.stats.chi2.ppf([0.005, 0.995], 8) / 8.0)
+    np.testing.assert_allclose(over["bounds_of_an_efficient_filter"], ends)
+
+
+def test_the_numbers_of_the_coning_study_are_means_over_the_judged_epochs():
+    sums, epochs = scalar.run_chunk(PLAN, 0, 8), np.array([2, 4, 6])
+    found = FilterOutcome(integration="a", statistics=sums, probability=0.95, epochs=epochs).summary()
+    error, P = sums.example_error[:, epochs], sums.covariance_sum[epochs] / 8.0
+    turn = np.pi / 648000.0  # an arcsecond, and a degree per hour
+    for name, part in (("attitude_{}_arcsec", slice(3)), ("bias_{}_deg_per_hour", slice(3, 6))):
+        assert found[name.format("rms")] * turn == pytest.approx(np.sqrt(np.mean(error[:, :, part] ** 2)))
+        sigma = np.sqrt(np.mean(np.diagonal(P, axis1=1, axis2=2)[:, part]))
+        assert found[name.format("sigma")] * turn == pytest.approx(sigma)
+    np.testing.assert_allclose(np.multiply(found["bias_mean_deg_per_hour"], turn), error[:, :, 3:].mean(axis=(0, 1)))
+    totals = {"anees": (6 * 8, sums.nees_sum[epochs, 0]), "anees_bias": (3 * 8, sums.nees_sum[epochs, 2])}
+    totals |= {"nis": (sums.sensor_degrees.sum(), sums.sensor_nis_sum.sum())}
+    for name, (degrees, total) in totals.items():
+        assert found[name] == pytest.approx(np.mean(total) / degrees)
+        ends = scipy.stats.chi2.ppf([0.025, 0.975], degrees) / degrees
+        np.testing.assert_allclose(found[f"{name}_bounds"], ends)
 
 
 def test_summary_takes_coverage_over_the_judged_epochs():
@@ -303,10 +355,12 @@ DISPERSED = montecarlo.Dispersions(
 
 
 def test_a_plan_goes_through_its_table_and_back():
-    for one in (PLAN, planned(dispersions=DISPERSED, seed=9), planned(setup=replace(SETUP, sigma={"star": 1e-3}))):
+    plans = (PLAN, planned(dispersions=DISPERSED, seed=9), planned(setup=replace(SETUP, sigma={"star": 1e-3})))
+    for one in (*plans, planned(individuals=True)):
         again = plan.from_table(one.to_table())
         assert again.to_table() == one.to_table()
         assert again.digest == one.digest
+        assert again.individuals == one.individuals
         assert not different(scalar.run_chunk(one, 0, 2), scalar.run_chunk(again, 0, 2))
 
 
@@ -389,6 +443,8 @@ def test_a_dispersed_gyro_is_the_one_that_is_simulated():
     spec = scalar.dispersed(SCENARIO.gyro, only, PLAN.seed, 5)
     turned = (record.increments - plain.increments).sum(axis=0) / np.deg2rad(60.0 * 2.4)
     assert turned[2] == pytest.approx(spec.scale_factor[2] - SCENARIO.gyro.scale_factor[2], rel=1e-6)
+    origin = montecarlo.replay(planned(dispersions=only), 5, machine="scalar").record.origin
+    assert origin.gyro == origin.scenario.gyro == spec
 
 
 def test_initial_errors_are_as_dispersed():

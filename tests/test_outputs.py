@@ -116,7 +116,8 @@ def case():
         epoch_ns=1_700_000_000_000_000_001,
     )
     P = np.zeros((20, 6, 6))
-    P[:, :3, :3], P[:, 3:, 3:] = covariances(), covariances()
+    P[:, :3, :3], P[:, 3:, 3:] = covariances(), 0.25 * covariances()
+    P[:, :3, 3:] = P[:, 3:, :3] = 0.1 * covariances()
     estimate = Estimate(
         time=recording.time[10:],
         attitude=attitudes(),
@@ -139,6 +140,8 @@ def test_a_table_says_all_in_its_names(case):
     np.testing.assert_allclose(
         found["bias_x_sigma_deg_per_h"], np.degrees(np.sqrt(estimate.variance[:, 3])) * 3600.0, rtol=1e-12
     )
+    for name, place in (("xy_rad2", (0, 1)), ("xby_rad2_per_s", (0, 4)), ("bxby_rad2_per_s2", (3, 4))):
+        np.testing.assert_array_equal(found[f"cov_body_{name}"], estimate.covariance[:, *place])
     ned = estimate.table(recording=recording, frame="NED", sequence="ZXZ")
     np.testing.assert_allclose(ned["free_acceleration_x_m_per_s2"], found["free_acceleration_y_m_per_s2"], rtol=1e-15)
     np.testing.assert_allclose(ned["free_acceleration_z_m_per_s2"], -found["free_acceleration_z_m_per_s2"], rtol=1e-15)

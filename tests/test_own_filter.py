@@ -513,7 +513,8 @@ def test_a_filter_that_leaves_measurements_out_stays_above_the_bound_by_just_tha
     for given, sigma in ((montecarlo.Dispersions(), 1e-3), (montecarlo.Dispersions(attitude_sigma=3e-3), 3e-3)):
         least = cramer_rao(scene, attitude_sigma=sigma, bias_sigma=1e-5, epochs=6)
         np.testing.assert_array_equal(verdicts.bound_of(replace(plan, dispersions=given)), least)
-    assert verdicts.bound_of(replace(plan, dispersions=montecarlo.Dispersions(attitude_error=(1e-3, 0, 0)))) is None
+    for error in ({"attitude_error": (1e-3, 0, 0)}, {"bias_error": (1e-6, 0, 0)}):
+        assert verdicts.bound_of(replace(plan, dispersions=montecarlo.Dispersions(**error))) is None
     runs = 300
     statistics = campaign.run(plan, tmp_path / "half.h5", runs=runs).statistics
     ratio = verdicts.efficiency(statistics, bound)

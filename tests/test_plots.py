@@ -2,20 +2,35 @@
 
 import dataclasses
 import xml.etree.ElementTree
+from types import SimpleNamespace
 
 import hypothesis
 import matplotlib
 import numpy as np
 import pytest
+import scipy.stats
 from hypothesis import strategies as st
 from matplotlib.colors import to_rgb
+from scipy.spatial.transform import Rotation
 
-from strapdown import coning, consistency, covariance, gyro, montecarlo, plots, quaternion, records, scenarios, units
+from strapdown import (
+    allan,
+    coning,
+    consistency,
+    covariance,
+    gyro,
+    montecarlo,
+    plots,
+    quaternion,
+    records,
+    scenarios,
+    units,
+)
 from strapdown.checks import InputError
 from strapdown.estimation import setup
 from strapdown.montecarlo.coning_study import Drift, FilterOutcome
 from strapdown.montecarlo.statistics import BINS_PER_OCTAVE
-from strapdown.plots import decimation, estimates, style
+from strapdown.plots import decimation, estimates, style, tuning
 from strapdown.records.estimate import ErrorStateEstimate
 
 pytestmark = pytest.mark.draws
@@ -168,6 +183,73 @@ def test_a_distribution_has_its_quantiles_and_leaves_out_what_is_missing():
     assert [text.get_text() for text in ax.texts] == ["50 %: 2 °", "95 %: 4 °"]
 
 
+def test_nis_and_autocorrelation_are_drawn_with_their_bounds(run, statistics):
+    degrees = np.median(statistics.sensor_degrees.sum(axis=0))
+    span = plots.nis_over_time([("filter", statistics)]).patches[0]
+    bounds = scipy.stats.chi2.ppf([0.005, 0.995], degrees) / degrees
+    np.testing.assert_allclose([span.get_y(), span.get_y() + span.get_height()], bounds)
+    nees = plots.nees_over_time([("filter", statistics)], (0.8, 1.2), "bias").lines[0].get_ydata()
+    np.testing.assert_allclose(nees, statistics.nees_sum[:, 2] / (3.0 * 24.0))
+    innovations = next(iter(run[0].innovations.values()))
+    nis = np.sum(innovations.whitened**2, axis=1) / 2.0
+    each, mean, _ = plots.nis_over_record(innovations, (0.1, 4.0), window=7).lines
+    np.testing.assert_allclose(each.get_ydata(), np.maximum(nis, 1e-4))
+    for k in (0, 5):  # each mean at the middle of its window
+        assert mean.get_xdata()[k] == pytest.approx(innovations.time[k : k + 7].mean())
+        assert mean.get_ydata()[k] == pytest.approx(nis[k : k + 7].mean())
+    n, lags = len(nis), 3
+    lines = plots.innovation_autocorrelation(consistency.autocorrelation(innovations.whitened, lags)).lines[:4]
+    spread = np.sqrt((n - np.arange(1, lags + 1)) / (n * (n + 2.0)))
+    for line, sign, outside in zip(lines, (1.0, -1.0) * 2, (0.005, 0.005, 0.005 / 6, 0.005 / 6), strict=True):
+        np.testing.assert_allclose(line.get_ydata(), sign * scipy.stats.norm.isf(outside) * spread)
+
+
+@pytest.mark.parametrize("start", [2e-4, 1e-9])
+def test_a_slice_of_the_likelihood_is_drawn_in_the_unit_of_its_axis(start):
+    unit = SimpleNamespace(name="°/h", factor=units.DEGREE_PER_HOUR)
+    one = SimpleNamespace(name="b", unit=unit, start=start, value=1e-4, lower=6e-5, upper=1.5e-4, identified=True)
+    slices = SimpleNamespace(values=np.geomspace(4e-5, 3e-4, 9)[None], fallen=np.arange(9.0)[None])
+    ax = tuning.likelihood_slice(slices, SimpleNamespace(parameters=(one,), composite=False), 0)
+    levels = {line.get_label(): line for line in ax.lines}
+    np.testing.assert_allclose(ax.lines[0].get_xdata() * units.DEGREE_PER_HOUR, slices.values[0])
+    assert levels["3.84: 95 % of χ², one parameter"].get_ydata()[0] == pytest.approx(
+        scipy.stats.chi2.ppf(0.95, 1), rel=1e-3
+    )
+    assert levels["tuned"].get_xdata()[0] * units.DEGREE_PER_HOUR == pytest.approx(1e-4)
+    assert ax.patches[0].get_x() * units.DEGREE_PER_HOUR == pytest.approx(6e-5)
+    if start == 2e-4:
+        assert levels["before"].get_xdata()[0] * units.DEGREE_PER_HOUR == pytest.approx(2e-4)
+    else:
+        assert ax.texts[0].get_text() == f"before: {start / units.DEGREE_PER_HOUR:.3g}"
+
+
+def test_an_allan_deviation_is_drawn_with_the_terms_of_its_axis():
+    random = np.random.default_rng(2)
+    white = 1e-3 * random.standard_normal((3000, 2))
+    rate = white + np.cumsum(1e-4 * random.standard_normal((3000, 2)), axis=0) * [0.0, 1.0]
+    deviation, fit = allan.allan_deviation(rate, 0.1), allan.fit_noise(rate, 0.1)
+    assert fit.supported[:, fit.terms.index("rate_random_walk")].tolist() == [False, True]
+    size = units.DEGREE_PER_HOUR
+    for axis, ax in enumerate(plots.allan_overview(deviation, fit).axes):
+        drawn = [line.get_label() for line in ax.lines[2:]]
+        assert drawn == [
+            term.replace("_", " ") for term, held in zip(fit.terms, fit.supported[axis], strict=True) if held
+        ]
+        np.testing.assert_allclose(ax.lines[0].get_ydata() * size, deviation.deviation[axis])
+        ends = ax.collections[0].get_paths()[0].vertices[:, 1] * size
+        finite = deviation.upper[axis][np.isfinite(deviation.upper[axis])]
+        np.testing.assert_allclose([ends.min(), ends.max()], [deviation.lower[axis].min(), finite.max()])
+
+
+def test_coning_errors_are_those_about_the_cones_axis(outcomes):
+    held = outcomes[0].statistics
+    axes = plots.coning_errors(outcomes).axes
+    for ax, state, size in ((axes[0], 2, units.ARCSECOND), (axes[2], 5, units.DEGREE_PER_HOUR)):
+        np.testing.assert_allclose(ax.lines[1].get_ydata() * size, held.example_error[0, :, state])
+        top = ax.collections[0].get_paths()[0].vertices[:, 1].max()
+        assert top * size == pytest.approx(3.0 * held.sigma[:, state].max())
+
+
 def test_the_histogram_counts_what_lies_beyond():
     white = np.concatenate([np.zeros(100), [9.0, -7.0]])[:, None]
     ax = plots.innovation_histogram(white)
@@ -176,28 +258,42 @@ def test_the_histogram_counts_what_lies_beyond():
 
 @pytest.mark.parametrize("epoch", [0, -1])
 def test_coverage_is_drawn_at_its_epoch(statistics, epoch):
-    drawn = [
-        line.get_ydata() for line in plots.coverage_by_state(statistics, epoch).lines if len(line.get_xdata()) == 6
-    ]
+    ax = plots.coverage_by_state(statistics, epoch)
+    drawn = [line.get_ydata() for line in ax.lines if len(line.get_xdata()) == 6]
     np.testing.assert_allclose(np.transpose(drawn), 100.0 * statistics.coverage[epoch] / statistics.finite[epoch])
+    for k, span in enumerate(ax.patches, start=1):
+        ends = scipy.stats.binom.ppf([0.005, 0.995], 24, 2.0 * scipy.stats.norm.cdf(k) - 1.0) / 24
+        np.testing.assert_allclose([span.get_y(), span.get_y() + span.get_height()], 100.0 * ends, rtol=1e-9)
+
+
+def test_a_fan_has_the_normal_quantiles_of_the_filters_sigma(statistics):
+    ax = plots.fan(statistics, 4)
+    assert ax.get_ylabel().endswith(" °/h")
+    for line, band, share in zip(ax.lines, ax.collections, (0.99, 0.9, 0.5), strict=True):
+        predicted = scipy.stats.norm.ppf(0.5 + 0.5 * share) * statistics.sigma[:, 4] / units.DEGREE_PER_HOUR
+        np.testing.assert_allclose(line.get_ydata(), predicted, rtol=1e-4)
+        top = statistics.error_quantile(share)[:, 4].max() / units.DEGREE_PER_HOUR
+        assert band.get_paths()[0].vertices[:, 1].max() == pytest.approx(top)
 
 
 def test_errors_are_drawn_in_the_unit_of_their_label(run):
     estimate, truth = run
     figure = plots.error_overview(estimate, truth)
     error = consistency.errors(estimate.attitude, estimate.bias, truth.attitude, truth.bias)
-    for column, unit, size in ((0, "arcsec", units.ARCSECOND), (1, "°/h", units.DEGREE_PER_HOUR)):
-        ax = figure.axes[column]
-        assert unit in ax.get_ylabel()
+    for state, ax in enumerate(np.reshape(figure.axes, (3, 2)).T.ravel()):
+        unit, size = (("arcsec", units.ARCSECOND), ("°/h", units.DEGREE_PER_HOUR))[state // 3]
+        assert ax.get_ylabel() == f"{('attitude', 'bias')[state // 3]} {'xyz'[state % 3]}, {unit}"
         drawn = ax.lines[-1].get_ydata()
-        assert np.abs(drawn).max() == pytest.approx(np.abs(error[:, 3 * column]).max() / size)
+        assert np.abs(drawn).max() == pytest.approx(np.abs(error[:, state]).max() / size)
+        top = max(part.get_paths()[0].vertices[:, 1].max() for part in ax.collections)
+        assert top == pytest.approx(3.0 * estimate.sigma[:, state].max() / size, rel=0.02)  # or no lighter part
 
 
 @pytest.mark.filterwarnings("error")
 def test_a_budget_that_starts_without_error_shows_what_comes_after(scenario, tmp_path):
-    found = covariance.analyse(
-        dataclasses.replace(scenario, duration=2.0), initial_attitude_sigma=0.0, initial_bias_sigma=0.0, epochs=4
-    )
+    opposite = dataclasses.replace(scenario.gyro, scale_factor=np.full(3, 1e-4), asymmetry=np.full(3, -1e-4))
+    brief = dataclasses.replace(scenario, gyro=opposite, duration=2.0)
+    found = covariance.analyse(brief, initial_attitude_sigma=0.0, initial_bias_sigma=0.0, epochs=4)
     assert not found.rms[0].any()
     figure = plots.error_budget(found)
     plots.save(figure, tmp_path / "budget.png")
@@ -209,6 +305,12 @@ def test_a_budget_that_starts_without_error_shows_what_comes_after(scenario, tmp
     line = figure.axes[0].lines[0].get_ydata()
     assert np.isnan(line[0])
     assert np.all(line[1:] > 0.0)
+    for ax, part, size in (
+        (figure.axes[0], slice(3), units.ARCSECOND),
+        (figure.axes[1], slice(3, 6), units.DEGREE_PER_HOUR),
+    ):
+        for line, six in zip(ax.lines, (found.rms, found.filter_sigma), strict=True):
+            np.testing.assert_allclose(line.get_ydata()[1:] * size, np.sqrt(np.mean(six[1:, part] ** 2, axis=1)))
 
 
 @pytest.mark.filterwarnings("error")
@@ -317,12 +419,46 @@ def figures(run, statistics, outcomes):
     }
 
 
-def test_the_bias_is_drawn_in_the_unit_of_its_axis(run):
+def test_the_estimate_is_drawn_in_the_unit_of_its_axis(run):
     estimate, _ = run
-    (ax,) = (ax for ax in plots.estimate_overview(estimate).axes if ax.get_ylabel().startswith("gyro bias"))
-    size = {"gyro bias, °/h": np.pi / 180.0 / 3600.0, "gyro bias, °/s": np.pi / 180.0}[ax.get_ylabel()]
-    for k, line in enumerate(ax.get_lines()[:3]):
+    axes = plots.estimate_overview(estimate).axes
+    yaw, pitch, roll = Rotation.from_quat(estimate.attitude, scalar_first=True).as_euler("ZYX", degrees=True).T
+    for ax, name, angle in zip(axes, ("roll, °", "pitch, °", "yaw, °"), (roll, pitch, yaw), strict=False):
+        assert ax.get_ylabel() == name
+        assert ax.lines[0].get_ydata()[-1] == pytest.approx(angle[-1])
+    size = {"gyro bias, °/h": np.pi / 180.0 / 3600.0, "gyro bias, °/s": np.pi / 180.0}[axes[3].get_ylabel()]
+    for k, (line, band) in enumerate(zip(axes[3].lines, axes[3].collections, strict=True)):
         assert line.get_ydata()[-1] * size == pytest.approx(estimate.bias[-1, k], rel=1e-12)
+        top = np.max(estimate.bias[:, k] + 3.0 * estimate.sigma[:, 3 + k])
+        assert band.get_paths()[0].vertices[:, 1].max() * size == pytest.approx(top)
+    assert axes[4].get_ylabel() == "attitude σ, arcsec"
+    top = axes[4].collections[0].get_paths()[0].vertices[:, 1].max() * units.ARCSECOND
+    assert top == pytest.approx(np.linalg.norm(estimate.sigma[:, :3], axis=1).max())
+
+
+def test_errors_of_a_recording_and_their_distribution_are_drawn():
+    half, q = units.DEGREE / 2.0, np.tile([1.0, 0.0, 0.0, 0.0], (4, 1))
+    turned = quaternion.multiply(quaternion.exp([0.0, 0.0, half]), quaternion.exp([3.0 * half, 0.0, 0.0]))
+    (ax,) = plots.recording_errors(np.arange(4.0), consistency.reference_errors(q, np.tile(turned, (4, 1)))).axes
+    drawn = {line.get_label().split(",")[0]: line.get_ydata()[0] for line in ax.lines}
+    assert drawn == pytest.approx({"total": np.hypot(0.5, 1.5), "heading": 0.5, "inclination": 1.5}, rel=1e-3)
+    ax = plots.error_distribution(consistency.distribution(units.DEGREE * np.arange(1.0, 101.0)))
+    assert [line.get_xdata()[0] for line in ax.lines[1:]] == pytest.approx([50.0, 95.0])
+
+
+def test_error_states_are_drawn_with_three_sigma(run):
+    estimate, _ = run
+    every = np.ones((len(estimate.time), 1))
+    block = ErrorStateEstimate(
+        components=("x", "y"),
+        units=("1", "1"),
+        values=every * [1e-4, -2e-4],
+        variance=every * [1e-10, 4e-10],
+    )
+    (ax,) = plots.states_over_time(dataclasses.replace(estimate, error_states={"gyro scale": block})).axes
+    assert ax.get_ylabel() == "ppm"
+    for line, level in zip(ax.lines, (70.0, 130.0, 100.0, -260.0, -140.0, -200.0), strict=True):
+        np.testing.assert_allclose(line.get_ydata(), level)
 
 
 @pytest.fixture(scope="module")

@@ -305,6 +305,10 @@ def test_an_estimate_fills_in_orientation_and_covariance_and_keeps_other_topics(
     np.testing.assert_allclose(units[10].orientation_covariance.reshape(3, 3), np.diag([9.0, 1.0, 4.0]), atol=1e-12)
     assert (units[10].orientation.w, units[10].orientation.z) == (0.5, 0.5)
     assert units[10].angular_velocity.x == recording.rate[10, 0]
+    other = tmp_path / f"other.{'mcap' if suffix == 'bag' else 'bag'}"  # messages of the other ROS cannot be copied
+    recordings.write(estimate, other, recording=recording, source=source)
+    with AnyReader([other]) as reader:
+        assert {c.topic for c in reader.connections} == {"/imu/data"}
     with pytest.raises(InputError, match="have no stamp in common"):
         recordings.write(estimate, tmp_path / f"no.{suffix}", recording=tesla(10))
     with pytest.raises(InputError, match="give the recording that the estimate was made from"):

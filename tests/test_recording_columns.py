@@ -93,6 +93,8 @@ def test_euroc_names_its_columns_in_a_comment_and_keeps_its_nanoseconds(table, t
     assert recording.epoch_ns == stamps[0]
     np.testing.assert_allclose(recording.time, 5_000_001e-9 * np.arange(4), rtol=1e-15)
     assert recording.clock_ns.tolist() == stamps
+    path.write_text(f"{header}\n2000000000000000,1,2,3,4,5,6\n2000000005000000,1,2,3,4,5,6\n")
+    np.testing.assert_allclose(read(path).time, [2e6, 2e6 + 5e-3])  # of a machine that has run for 23 days
     np.testing.assert_array_equal(recording.rate[0], [1, 2, 3])
     np.testing.assert_array_equal(recording.specific_force[3], [4, 5, 9])
 
@@ -156,7 +158,10 @@ def test_two_sensors_that_fit_are_refused_not_chosen(table):
     np.testing.assert_allclose(chosen.rate, VALUES[:, 4:7] * DEGREE, rtol=1e-15)
 
 
-@pytest.mark.parametrize("name", ["Linear Acceleration {} (m/s^2)", "userAcceleration{}", "gyro_bias_{}", "acc_{}_std"])
+@pytest.mark.parametrize(
+    "name",
+    ["Linear Acceleration {} (m/s^2)", "userAcceleration{}", "gyro_bias_{}", "acc_{}_std", "angular_acceleration_{}"],
+)
 def test_what_is_no_plain_sample_is_not_taken_for_one(table, name):
     """An acceleration without gravity shows no vertical."""
     other = ",".join(name.format(axis) for axis in "xyz")
@@ -190,6 +195,9 @@ def test_milliseconds_since_1970_keep_every_nanosecond(table):
     recording = read(path)
     assert recording.epoch_ns == 1_763_850_000_009_000_000
     np.testing.assert_allclose(recording.time, [0.0, 0.01, 0.021], rtol=1e-15)
+    fraction = f"{path.read_text(encoding='utf-8').splitlines()[0]}\n1763850000009.25,1,2,3\n1763850000019.5,1,2,3\n"
+    path.write_text(fraction, encoding="utf-8")
+    assert read(path).epoch_ns == 1_763_850_000_009_250_000
 
 
 def test_columns_that_nobody_asks_for_may_hold_anything(table, tmp_path):

@@ -77,6 +77,7 @@ def test_a_data_frame_is_a_recording():
     recording = recordings.from_table(frame, source="frame")
     np.testing.assert_allclose(recording.rate[:, 0], np.radians([1, 2, 3]), rtol=1e-15)
     assert recording.epoch_ns == 1_709_294_400 * 10**9
+    assert recordings.from_table(frame.reset_index(names="time")).epoch_ns == 1_709_294_400 * 10**9
     assert recording.magnetic_field[:, 0].tolist()[::2] == [1.0, 3.0]
     assert np.isnan(recording.magnetic_field[1, 0])
     np.testing.assert_array_equal(sd.read(frame, units={"magnetometer": "uT"}).rate, recording.rate)
@@ -142,6 +143,21 @@ def test_a_flight_log_is_read(ulog):
     assert quaternion.angle_between(quaternion.normalize(back.true_attitude), whole.true_attitude).max() < 1e-6
     assert back.remarks[0] == "Topic sensor_combined: 60 messages."
     assert "vehicle_attitude, the vehicle's estimate" in " ".join(back.remarks)
+
+
+def test_a_flight_log_uses_the_time_of_the_samples(ulog, monkeypatch):
+    """A magnetometer logged 20 ms late with its sample's time, and an accelerometer 30 ms before the gyro, which is said."""
+    import pyulog
+
+    path, whole = ulog
+    log = pyulog.ULog(str(path))
+    data = {one.name: one.data for one in log.data_list}
+    data["vehicle_magnetometer"]["timestamp"] += 20_000
+    data["sensor_combined"]["accelerometer_timestamp_relative"][:] = -30_000
+    monkeypatch.setattr(pyulog, "ULog", lambda *given: log)
+    found = read(path)
+    same(found, whole, "magnetic_field")
+    assert "offset by -30 ms from the gyro's stamps" in " ".join(found.remarks)
 
 
 def test_the_library_reads_the_attitude_as_px4_has_it(ulog):
@@ -343,6 +359,8 @@ def test_a_trajectory_is_a_reference(tmp_path):
         read(path)
     with pytest.raises(InputError, match=r"truth.txt goes from .* both must have the same clock"):
         recordings.with_reference(replace(whole, epoch_ns=0), path)
+    path.write_text("-1.25 0 0 0 0 0 0 1\n-0.5 0 0 0 0 0 0 1\n2 0 0 0 0 0 0 1\n")
+    assert recordings.read_tum(path)[0].tolist() == [-1_250_000_000, -500_000_000, 2_000_000_000]
     path.write_text("1 2 3\n")
     with pytest.raises(InputError, match=r"data row 1 has 3 numbers; a TUM trajectory has time tx"):
         recordings.read_tum(path)

@@ -11,6 +11,7 @@ from strapdown.checks import InputError
 from strapdown.cli import app
 from strapdown.recordings import Recording, read, recordfiles, samples
 from strapdown.records import ImuRecord
+from strapdown.records.recording import at_nearest
 
 HEADER = "time,gx [rad/s],gy,gz,ax [m/s2],ay,az"
 ROWS = ("0.00,0.1,0.2,0.3,1,2,9", "0.01,0.4,0.5,0.6,3,4,8", "0.02,0.7,0.8,0.9,5,6,7")
@@ -340,6 +341,30 @@ def hdf5(tmp_path):
     return write
 
 
+def test_samples_go_to_the_nearest_stamp_the_closest_of_several():
+    """Sample by sample, within a median interval; some before the first stamp, after the last, and in a gap."""
+    random = np.random.default_rng(6)
+    time = np.cumsum(random.uniform(0.8, 1.2, 60)) + 40.0 * (np.arange(60) >= 30)
+    other = np.sort(random.uniform(-10.0, 110.0, 150))
+    wanted = np.full(60, np.nan)
+    for j in np.argsort(-np.abs(other[:, None] - time).min(axis=1)):
+        distance = np.abs(other[j] - time)
+        if distance.min() <= np.median(np.diff(time)):
+            wanted[distance.argmin()] = other[j]
+    placed, lost = at_nearest(time, other, other[:, None])
+    np.testing.assert_array_equal(placed[:, 0], wanted)
+    assert lost == 150 - np.isfinite(wanted).sum()
+
+
+def test_broad_has_microtesla(tmp_path):
+    one = Recording(
+        source="a", time=np.arange(3.0), rate=np.ones((3, 3)), magnetic_field=np.full((3, 3), 0.5), magnetic_unit="G"
+    )
+    recordings.write(one, tmp_path / "a.hdf5")
+    np.testing.assert_allclose(read(tmp_path / "a.hdf5").magnetic_field, 50.0)
+    assert read(tmp_path / "a.hdf5").magnetic_unit == "uT"
+
+
 def test_broad_layout_is_read(hdf5):
     path = hdf5()
     recording = read(path)
@@ -473,6 +498,21 @@ def test_stamps_that_stray_by_more_than_a_quarter_of_the_interval_are_assumed_ev
     np.testing.assert_array_equal(place, np.delete(np.arange(200), np.s_[150:160]))
     assert [word.split()[0] for word in words] == (["Intervals", "10"] if even else ["10"])
     assert not even or f"deviate by up to {10.0 * shift:.3g} ms" in words[0]
+
+
+def test_stamps_in_whole_milliseconds_have_the_mean_interval():
+    """300 Hz and a lost sample: intervals of 3 and 4 ms. The temperature is interpolated over the loss; a burst is no grid."""
+    kept = np.delete(np.arange(900), 600)
+    one = Recording(
+        source="log", time=np.rint(1e3 * kept / 300.0) / 1e3, rate=np.ones((899, 3)), temperature=kept * 0.01
+    )
+    found = samples.samples_of(one, gaps=True)
+    assert found.sample_interval == pytest.approx(1.0 / 300.0, rel=1e-3)
+    assert np.flatnonzero(np.isnan(found.values[:, 0])).tolist() == [600]
+    np.testing.assert_allclose(found.temperature, 0.01 * np.arange(900))
+    time = 0.01 * np.arange(100.0)
+    time[41:] -= 0.009
+    assert samples._grid("log", time)[1].tolist() == list(range(100))
 
 
 def test_samples_of_a_simulated_record_are_its_increments_and_what_its_sensors_measured(tmp_path):

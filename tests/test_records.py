@@ -221,6 +221,16 @@ def test_sigma_and_nis():
     assert e.innovations["magnetometer"].nis.shape == (0,)
 
 
+def test_a_truth_without_a_bias_is_kept_without_one(tmp_path):
+    given = estimate()
+    write_estimate(
+        tmp_path / "e.h5", given, truth=Truth(attitude=given.attitude, bias=np.full_like(given.bias, np.nan))
+    )
+    found = read_truth(tmp_path / "e.h5")
+    np.testing.assert_array_equal(found.attitude, given.attitude)
+    assert np.isnan(found.bias).all()
+
+
 def test_a_write_that_fails_leaves_the_old_file(tmp_path):
     path = tmp_path / "estimate.h5"
     write_estimate(path, estimate())

@@ -16,7 +16,7 @@ from strapdown import cli, coning, gyro, montecarlo, plots, records, report, sce
 from strapdown.checks import InputError
 from strapdown.estimation import setup
 from strapdown.montecarlo import campaign
-from strapdown.report import page
+from strapdown.report import campaigns, estimates, page, tunings
 
 CHROMIUM = next(
     (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
@@ -126,7 +126,9 @@ def test_charts_hold_every_extreme(folder):
     estimate, truth = records.read_estimate(folder / "right.h5"), records.read_truth(folder / "right.h5")
     error = (truth.bias - estimate.bias) * 180.0 / np.pi * 3600.0
     for axis in range(3):
-        drawn = np.array(charts[3 + axis]["data"][3])
+        high, low, drawn = (np.array(values) for values in charts[3 + axis]["data"][1:])
+        sigma = np.sqrt(estimate.variance[:, 3 + axis]).max() * 180.0 / np.pi * 3600.0
+        np.testing.assert_allclose([high.max(), low.min()], [3.0 * sigma, -3.0 * sigma], rtol=1e-6)
         assert drawn.max() == pytest.approx(error[:, axis].max(), rel=1e-6)
         assert drawn.min() == pytest.approx(error[:, axis].min(), rel=1e-6)
 
@@ -192,6 +194,21 @@ def test_a_tuning_is_reported_from_its_json(folder, scenario, tmp_path):
     content = body(report.write(tmp_path / "filter.json").page)
     assert content.count("data:image/png") == 1
     assert "<strong>Consistent.</strong> The tuned filter agrees with the data used for tuning" in content
+
+
+def test_the_verdict_of_a_tuning_is_the_worst_on_held_out_data():
+    verdicts = [{"verdict": one, "reason": one, "findings": []} for one in ("consistent", "cannot tell")]
+    verdicts[0]["findings"] = [{"rejected": True, "means": "odd"}, {"rejected": False, "means": "even"}]
+    held = {"before": {"log_likelihood_per_innovation": 2.0}}
+    held["after"] = {"log_likelihood_per_innovation": 1.0, "judgements": verdicts}
+    answer, reason, details = tunings.verdict({"held_out": held})
+    assert (answer, reason) == ("cannot tell", "cannot tell, on held-out data")
+    assert details == ["odd", "on the held-out data the likelihood has decreased: keep the previous filter"]
+    held["before"]["log_likelihood_per_innovation"] = 0.5
+    assert tunings.verdict({"held_out": held})[2] == ["odd"]
+    objective = {"name": "a", "before": 2.0, "after": 0.5, "attitude_rms_rad": [np.pi / 180.0, np.pi / 360.0]}
+    words = " ".join(tunings._parameters({"parameters": [], "objective": objective}))
+    assert "RMS attitude error: 1° before, 0.5° after." in words
 
 
 def test_gaps_become_null_not_nan():
@@ -355,14 +372,39 @@ def test_each_column_of_the_estimates_table_is_what_its_head_says(folder):
         assert abs(wanted[1] / wanted[0] - 1.0) > 0.2
 
 
+def test_the_estimates_table_of_sensors_leaves_out_what_the_gate_rejected(folder):
+    estimate = records.read_estimate(folder / "right.h5")
+    one = estimate.innovations["star 1"]
+    outlier = np.arange(len(one.time)) % 5 == 0
+    wild = np.where(outlier[:, None], 100.0 * one.innovation, one.innovation)
+    gated = dataclasses.replace(one, innovation=wild, weight=np.where(outlier, 0.0, 1.0))
+    given = dataclasses.replace(estimate, innovations={"star 1": gated}, skipped={"star 1": 3})
+    nis = np.mean(one.innovation[~outlier] ** 2 / one.variance[~outlier])
+    wanted = [len(one.time), 3, outlier.sum(), nis]
+    np.testing.assert_allclose(rows_of(estimates._numbers(given, None), "star 1"), wanted, rtol=6e-4)
+    assert f"mean NIS per degree of freedom {nis:.3g}" in str(given)
+
+
 def test_what_a_campaign_page_says_of_the_end_is_of_the_last_epoch(folder, monkeypatch):
     held = campaign.read(folder / "campaign.h5").statistics
     inside = 100.0 * held.coverage / held.finite[:, None, None]
     assert not np.array_equal(inside[-1], inside[0])
     content = body(folder / "campaign.html")
+    bound = (1e-6 * np.arange(1.0, 27.0))[:, None, None] ** 2 * np.eye(6)
+    bounded = campaigns._numbers(held, bound, held.judge())
     for state, name in enumerate([f"{what} {axis}" for what in ("attitude", "bias") for axis in "xyz"]):
+        unit = re.search(rf"{name}, ([^<]+)<", content)[1]
+        size = {"arcsec": np.pi / 648000.0, "°/h": np.pi / 648000.0}[
+            unit
+        ]  # an hour has as many seconds as a degree has arcseconds
         shown = rows_of(content, f"(?:gyro )?{name}")
+        wanted = [one[-1, state] / size for one in (held.sigma, held.rms_error, held.mean_error)]
+        np.testing.assert_allclose(shown[:3], wanted, rtol=6e-3)
+        np.testing.assert_allclose(
+            shown[3:5], [held.error_quantile(q)[-1, state] / size for q in (0.5, 0.95)], rtol=6e-3
+        )
         np.testing.assert_allclose(shown[-3:], inside[-1, state], atol=0.051)
+        np.testing.assert_allclose(rows_of(bounded, name)[-1], held.rms_error[-1, state] / (26.0 * 1e-6), rtol=6e-3)
     drawn, ellipses = [], []
     monkeypatch.setattr(plots, "coverage_by_state", lambda statistics, epoch, ax: drawn.append(epoch))
     monkeypatch.setattr(plots, "covariance_ellipses", lambda *given: ellipses.append(given[:3]))

@@ -11,13 +11,13 @@ from strapdown import consistency, estimation, motion, quaternion, records
 from strapdown.checks import InputError
 from strapdown.estimation import gating
 from strapdown.estimation.gating import Gate, Robust
-from strapdown.estimation.states import ProcessNoise, restart_bias_variance
+from strapdown.estimation.states import GateMemory, ProcessNoise, initial_state, restart_bias_variance
 from strapdown.gyro import GyroSpec
 from strapdown.kernels import covariance_form, gate_rules
 from strapdown.kernels.iterated_update import ACCEPTED, PASSED_OVER, REFUSED
 from strapdown.randomness import generator
 from strapdown.scenarios import Scenario, simulate
-from strapdown.vectors import AttitudeSensor, Faults, VectorSensor
+from strapdown.vectors import AttitudeSensor, Faults, VectorMeasurements, VectorSensor
 
 NOISE = ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-5)
 STARS = (np.array([1.0, 0.2, 0.0]), np.array([0.0, 1.0, 1.0]))
@@ -406,6 +406,28 @@ def test_the_rules_of_a_gate():
     assert (memory[gate_rules.LEVEL], memory[gate_rules.NIS], memory[gate_rules.DEGREES]) == (1.0, 0.0, 0.0)
     assert gate_rules.restart_attitude(0.1, memory) == pytest.approx(0.3)
     assert gate_rules.restart_attitude(1.0, memory) == gating.UNIFORM_SIGMA
+
+
+@pytest.mark.parametrize(("kind", "attitude_sigma"), [("heading", 0.3), ("vector", 1.0)])
+def test_a_refused_update_that_does_not_converge_is_reported_at_the_prior(kind, attitude_sigma):
+    """Innovation and variance of each row in closed form, after a recovery; from one start and, where little is known, from three."""
+    counts = np.zeros(gate_rules.MEMORY)
+    counts[gate_rules.PASSES] = gate_rules.WIDE_PASSES
+    memory = GateMemory(restart_bias_variance=np.full(3, 1e-6), counts=counts, counters={})
+    start = initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=attitude_sigma, bias_sigma=1e-3)
+    turn, wide = np.deg2rad(150.0), attitude_sigma**2
+    if kind == "heading":  # of a vector at 45°: a rotation about either horizontal axis changes it
+        r, z = [1.0, 0.0, 0.0], np.sqrt(0.5) * np.array([np.cos(turn), np.sin(turn), 1.0])
+        expected, variance = [turn**2 / (2.0 * wide + 0.01)], [2.0 * wide + 0.01]
+    else:  # half its length
+        r, z = [0.0, 0.0, 1.0], [0.5 * np.sin(turn), 0.0, 0.5 * np.cos(turn)]
+        expected, variance = [z[0] ** 2 / (wide + 0.01), (z[2] - 1.0) ** 2 / 0.01], [0.01, wide + 0.01, wide + 0.01]
+    series = VectorMeasurements(sensor="s", kind=kind, time=[0.0], vector_b=[z], reference_f=r, sigma=0.1)
+    record = records.ImuRecord(time=np.array([0.0, 1.0]), increments=np.zeros((1, 3)), vectors=(series,))
+    found = estimation.run(record, NOISE, replace(start, gate=memory), gate=Gate()).innovations["s"]
+    assert found.weight[0] == 0.0
+    np.testing.assert_allclose(np.sort(found.variance[0]), variance, rtol=1e-12)
+    np.testing.assert_allclose(found.nis[0], sum(expected), rtol=1e-12)
 
 
 def test_a_widened_candidate_is_one_that_started_wider():

@@ -173,11 +173,15 @@ def test_tables_hold_the_numbers_of_the_json(written):
     (row,) = of(written, "tune", "parameters")
     assert float(row["after"]) == parameter["value"] / parameter["si_per_unit"]
     assert row["unit"] == "arcsec"
+    held = json.loads((written / "filter.json").read_text())["held_out"]
+    for row in of(written, "tune", "held-out"):
+        assert [float(row[f"nis_{end}"]) for end in ("lower", "upper")] == held[row["filter"]]["nis_bounds"]
     covariance = json.loads((written / "covariance" / "covariance.json").read_text())
     for row in of(written, "covariance", "budget"):
         if row["kind"] == "random":
-            axes = covariance["random"][row["source"]]["attitude_arcsec"][-1]
-            assert float(row["attitude_arcsec"]) == pytest.approx(np.sqrt(np.mean(np.square(axes))), rel=1e-12)
+            for column in ("attitude_arcsec", "bias_deg_per_hour"):
+                axes = covariance["random"][row["source"]][column][-1]
+                assert float(row[column]) == pytest.approx(np.sqrt(np.mean(np.square(axes))), rel=1e-12)
 
 
 def test_figures_are_written_in_the_format_asked_for(written):

@@ -771,6 +771,8 @@ def test_before_and_after_are_drawn_for_nis_and_for_nees_where_there_is_a_truth(
         "NEES of the attitude",
         "NEES of the bias",
     ]
+    for line, filter_ in zip(figure.axes[0].lines, (compared.before, compared.after), strict=False):
+        np.testing.assert_array_equal(line.get_ydata(), filter_.nis_course[filter_.nis_degrees > 0])
     bare = dataclasses.replace(one, record=dataclasses.replace(one.record, truth=None))
     assert len(drawing.before_and_after(tuning.compare([bare], off, BELIEVED)).axes) == 1
     beside = dataclasses.replace(bare, true_attitude=one.record.truth.attitude)

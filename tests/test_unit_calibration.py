@@ -47,13 +47,13 @@ def test_rates_are_corrected_and_corrections_follow_one_another():
         components=("x", "xy", "xz", "yx", "y", "yz", "zx", "zy", "z"),
         units=("1",) * 9,
         values=values,
-        variance=np.full((2, 9), 4e-8),
+        variance=1e-8 * np.arange(18.0).reshape(2, 9),
     )
     after = unit_calibration.combined(known, block, 0.011, "next")
     further = np.array([[1e-3, 2e-3, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, -1e-3]])
     # what the filter sees after the correction by MATRIX is off by `further`: the gyro itself by both
     np.testing.assert_allclose(np.eye(3) + after.matrix, (np.eye(3) + MATRIX) @ (np.eye(3) + further), atol=1e-15)
-    assert (after.sigma, after.magnetometer_delay, after.source) == (pytest.approx(2e-4), 0.011, "next")
+    assert (after.sigma, after.magnetometer_delay, after.source) == (pytest.approx(np.sqrt(13e-8)), 0.011, "next")
 
 
 def test_a_file_gives_it_back(tmp_path):

@@ -109,7 +109,7 @@ def _numbers(estimate: Estimate, error: Array | None) -> str:
             len(one.time),
             estimate.skipped.get(name, 0),
             one.refused,
-            page.number(float(one.nis.sum() / one.innovation.size)),
+            page.number(float(np.mean(one.nis[one.used])) / one.innovation.shape[1] if one.used.any() else np.nan),
         )
         for name, one in estimate.innovations.items()
         if len(one.time)
