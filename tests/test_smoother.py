@@ -14,6 +14,7 @@ from measured import assert_inside, drawn_start, errors, recoveries, seen, serie
 from strapdown import coning, consistency, estimation, kinematics, motion, quaternion, records
 from strapdown.checks import InputError
 from strapdown.estimation import forward, recovery_segments
+from strapdown.estimation.error_states import GyroScale
 from strapdown.estimation.gating import Gate
 from strapdown.estimation.states import ProcessNoise, covariance_matrices
 from strapdown.kernels import rotation, smoother_loop, smoother_step
@@ -750,16 +751,21 @@ def test_sigmas_of_any_magnitude_are_smoothed_right() -> None:
 
 
 def test_a_filter_that_diverges_is_an_error() -> None:
-    """From a start that is off by a radian, measurements to 1e-12 rad: rates without end."""
-    time, rate = np.arange(41) * 1e-3, np.array([0.1, -0.2, 0.3])
-    at = time[3::4]
-    attitude = quaternion.exp(at[:, None] * rate)
-    series = exact("field", "vector", at, DOWN, 1e-12, attitude)
-    record = ImuRecord(time=time, increments=np.tile(1e-3 * rate, (40, 1)), vectors=(series,))
-    start = quaternion.exp(0.6 * np.random.default_rng(21).standard_normal(3))
-    initial = estimation.initial_state(start, attitude_sigma=1.7, bias_sigma=0.04)
+    """From starts off by a radian or two: rates without end, and with a scale factor of σ 1 an attitude that is not a number."""
+
+    def diverging(dt: float, sigma: float, every: int, off: list[float]):
+        time, rate = np.arange(41) * dt, np.array([0.1, -0.2, 0.3])
+        at = time[3::every]
+        series = exact("field", "vector", at, DOWN, sigma, quaternion.exp(at[:, None] * rate))
+        record = ImuRecord(time=time, increments=np.tile(dt * rate, (40, 1)), vectors=(series,))
+        return record, estimation.initial_state(quaternion.exp(off), attitude_sigma=1.7, bias_sigma=0.04)
+
+    record, initial = diverging(1e-3, 1e-12, 4, 0.6 * np.random.default_rng(21).standard_normal(3))
     noise = ProcessNoise(angle_random_walk=1e-16, rate_random_walk=1e-15)
-    with pytest.raises(InputError, match=r"diverged before 0\.011 s"):
-        estimation.run(record, noise, initial)
     with pytest.raises(InputError, match="diverged: with its estimate"):
         estimation.smooth(record, noise, initial)
+    record, initial = diverging(1.0, 1e-3, 1, [1.5, -1.0, 0.8])
+    noise = ProcessNoise(angle_random_walk=1e-6, rate_random_walk=1e-6)
+    scale = GyroScale(scale_sigma=1.0, misalignment_sigma=1e-3)
+    with pytest.raises(InputError, match=r"diverged before 6 s"):
+        estimation.run(record, noise, initial, (scale,))
