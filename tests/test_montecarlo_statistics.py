@@ -497,11 +497,11 @@ def test_memory_does_not_grow_with_the_runs():
         tracemalloc.stop()
         return most
 
-    def least(runs):  # how two threads fall together moves one peak by a tenth
-        return min(peak(runs) for _ in range(2))
+    def usual(runs):  # how two threads fall together moves one peak by a tenth
+        return np.median([peak(runs) for _ in range(3)])
 
     peak(4)
-    assert least(36) < 1.2 * least(12)
+    assert usual(108) < 1.2 * usual(36)
 
 
 def test_chunks_are_not_listed():

@@ -183,7 +183,8 @@ def test_a_distribution_has_its_quantiles_and_leaves_out_what_is_missing():
     assert [text.get_text() for text in ax.texts] == ["50 %: 2 °", "95 %: 4 °"]
 
 
-def test_nis_and_autocorrelation_are_drawn_with_their_bounds(run, statistics):
+def test_nis_and_autocorrelation_are_drawn_with_their_bounds(run, statistics, monkeypatch):
+    monkeypatch.setattr(plots.innovations, "WINDOW", 7)
     degrees = np.median(statistics.sensor_degrees.sum(axis=0))
     span = plots.nis_over_time([("filter", statistics)]).patches[0]
     bounds = scipy.stats.chi2.ppf([0.005, 0.995], degrees) / degrees
@@ -192,7 +193,7 @@ def test_nis_and_autocorrelation_are_drawn_with_their_bounds(run, statistics):
     np.testing.assert_allclose(nees, statistics.nees_sum[:, 2] / (3.0 * 24.0))
     innovations = next(iter(run[0].innovations.values()))
     nis = np.sum(innovations.whitened**2, axis=1) / 2.0
-    each, mean, _ = plots.nis_over_record(innovations, (0.1, 4.0), window=7).lines
+    each, mean, _ = plots.nis_over_record(innovations, (0.1, 4.0)).lines
     np.testing.assert_allclose(each.get_ydata(), np.maximum(nis, 1e-4))
     for k in (0, 5):  # each mean at the middle of its window
         assert mean.get_xdata()[k] == pytest.approx(innovations.time[k : k + 7].mean())
@@ -442,7 +443,7 @@ def test_errors_of_a_recording_and_their_distribution_are_drawn():
     (ax,) = plots.recording_errors(np.arange(4.0), consistency.reference_errors(q, np.tile(turned, (4, 1)))).axes
     drawn = {line.get_label().split(",")[0]: line.get_ydata()[0] for line in ax.lines}
     assert drawn == pytest.approx({"total": np.hypot(0.5, 1.5), "heading": 0.5, "inclination": 1.5}, rel=1e-3)
-    ax = plots.error_distribution(consistency.distribution(units.DEGREE * np.arange(1.0, 101.0)))
+    ax = plots.error_distribution(units.DEGREE * np.arange(1.0, 101.0))
     assert [line.get_xdata()[0] for line in ax.lines[1:]] == pytest.approx([50.0, 95.0])
 
 
