@@ -106,7 +106,7 @@ class Campaign(Listed):
     version : str, optional
         Version of this package that computed it. Default: the running one.
     arithmetic : str, default ""
-        Processor features that the rounding depends on (:func:`strapdown.montecarlo.engine.arithmetic`).
+        Processor features that the rounding depends on (:func:`strapdown.montecarlo.engine.arithmetic`); empty for earlier versions.
     seconds : float, default 0.0
         Time spent computing, s, over all resumptions.
     """
@@ -455,7 +455,7 @@ def _stored(path: Path) -> tuple[Campaign, _Progress]:
             runs=count("runs", attributes["runs"]),
             statistics=_statistics_of(file["statistics"], plan) if "statistics" in file else None,
             version=str(attributes["version"]),
-            arithmetic=str(attributes["arithmetic"]),
+            arithmetic=str(attributes.get("arithmetic", "")),
             seconds=finite("seconds", attributes["seconds"], unit="s"),
         )
         early = file.get("resume", {})
