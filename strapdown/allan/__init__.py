@@ -9,9 +9,9 @@
 
 from __future__ import annotations
 
-from strapdown.allan import gaps as gaps
-from strapdown.allan import parameters as parameters
-from strapdown.allan import temperature as temperature
+from importlib import import_module
+from typing import Any
+
 from strapdown.allan.deviation import NOISE_TYPES as NOISE_TYPES
 from strapdown.allan.deviation import TERMS as TERMS
 from strapdown.allan.deviation import AllanDeviation as AllanDeviation
@@ -35,3 +35,10 @@ __all__ = [
     "fit_noise",
     "to_gyro_parameters",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """Load a submodule on first use (PEP 562)."""
+    if name in ("gaps", "parameters", "temperature"):
+        return import_module(f"{__name__}.{name}")
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -197,12 +197,13 @@ def estimate(
     need_own(out / FILES[0], "estimate", lambda path: bool(read_attributes(path)["kind"] == "strapdown estimate"))
     reading_options = layout.options(recording)
     simulated = is_record(recording)
-    for name in given(recorded if simulated else specified):
-        what = "contains its specification, as those of `strapdown simulate`"
+    if simulated and (options := given(recorded)):
         raise InputError(
-            f"{name} goes with a recording without a specification; {recording} contains one, of `strapdown simulate`"
-            if simulated
-            else f"{name} goes with a recording that {what}; {recording} does not"
+            f"{options[0]} goes with a recording without a specification; {recording} contains one, of `strapdown simulate`"
+        )
+    if not simulated and (options := given(specified)):
+        raise InputError(
+            f"{options[0]} goes with a recording that contains its specification, as those of `strapdown simulate`; {recording} does not"
         )
     exports = _exports(output, recording, changed=bool(layout.axes or layout.invert))
     if simulated:

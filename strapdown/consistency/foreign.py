@@ -21,9 +21,10 @@ from strapdown.checks import Array, InputError, array, increasing, one_of, unit_
 from strapdown.consistency.judgement import WITHOUT_TRUTH, Judgement, judge
 from strapdown.consistency.manifold import whitened
 from strapdown.consistency.timeaverage import effective_samples
-from strapdown.recordings import trajectories
 from strapdown.records import Estimate, Innovations, Truth
 from strapdown.records.outputs import euler_axes
+from strapdown.records.recording import BRIDGED
+from strapdown.records.recording import interpolated as between_stamps
 from strapdown.units import DEGREE
 
 ERROR_FRAMES = ("body", "fixed", "euler")
@@ -375,7 +376,7 @@ def _turns(one: Array, other: Array) -> Array:
 
 def interpolated(time: Array, stamps: Array, attitude: Array, bridged: float) -> Array:
     """Return attitudes (n, 4) at ``time``, interpolated; at the truth's own times they are copied exactly, next to gaps too."""
-    result = trajectories.interpolated(time, stamps, attitude, bridged)
+    result = between_stamps(time, stamps, attitude, bridged)
     k = np.clip(np.searchsorted(stamps, time), 0, len(stamps) - 1)
     exact = time == stamps[k]
     result[exact] = attitude[k[exact]]
@@ -384,7 +385,7 @@ def interpolated(time: Array, stamps: Array, attitude: Array, bridged: float) ->
 
 def _bridged(series: _Series) -> float:
     """Return the maximum interval to interpolate over, s: 1.5 times the median one if the series is slow."""
-    return max(trajectories.BRIDGED, 1.5 * float(np.median(np.diff(series.time))))
+    return max(BRIDGED, 1.5 * float(np.median(np.diff(series.time))))
 
 
 def _at_common_times(own: _Series, theirs: _Series, offset: float) -> tuple[_Series, Truth]:

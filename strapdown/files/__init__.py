@@ -3,6 +3,7 @@
 - ``reading``: Limits of size, errors that name the file, digests.
 - ``writing``: Atomic writing, locks, digests.
 - ``tables``: Frozen dataclasses as TOML and JSON tables with the unit in each key.
+- ``extras``: Optional libraries.
 """
 
 from __future__ import annotations

@@ -19,8 +19,8 @@ from typing import Any
 
 import strapdown
 from strapdown.checks import InputError, count
+from strapdown.files.extras import library
 from strapdown.montecarlo.engine import Chunks, Parts, Window, Work, Workers, arithmetic
-from strapdown.recordings.extras import library
 
 __all__ = [
     "dask_client",

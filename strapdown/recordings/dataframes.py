@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from strapdown.checks import Array, InputError
 from strapdown.files import written_beside
+from strapdown.files.extras import library
 from strapdown.recordings import columns as naming
 from strapdown.recordings.delimited import recording_columns
-from strapdown.recordings.extras import library
 from strapdown.records.recording import CLOCK_OFFSET, Recording, relative_time
 
 

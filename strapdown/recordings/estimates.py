@@ -10,9 +10,9 @@ import numpy as np
 
 from strapdown.checks import Array
 from strapdown.files import written_beside
+from strapdown.files.extras import library
 from strapdown.recordings.dataframes import write_parquet_columns
 from strapdown.recordings.delimited import write_columns
-from strapdown.recordings.extras import library
 from strapdown.records import Estimate
 from strapdown.records import write_estimate as write_result
 from strapdown.records.recording import Recording

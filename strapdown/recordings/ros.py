@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 from strapdown import quaternion
 from strapdown.checks import Array, InputError, one_of
 from strapdown.files import reading
-from strapdown.recordings.extras import library, with_ending
+from strapdown.files.extras import library, with_ending
 from strapdown.records import Estimate
 from strapdown.records.recording import Recording, at_nearest, field_in, relative_time, with_gyro
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from strapdown.checks import Array, InputError
 from strapdown.files import reading
-from strapdown.recordings.extras import library, with_ending
+from strapdown.files.extras import library, with_ending
 from strapdown.records.recording import Recording, with_gyro
 from strapdown.units import DEGREE
 

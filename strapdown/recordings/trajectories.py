@@ -9,7 +9,7 @@ A TUM trajectory is text with rows ``time tx ty tz qx qy qz qw``: s, m, quaterni
 up. It has no inertial samples: it is read as the reference of a recording, or written from an estimate.
 
 References have their own stamps. They are interpolated along the shortest rotation to the stamps of the recording if the reference's
-stamps on both sides are at most :data:`BRIDGED` apart; otherwise they are missing.
+stamps on both sides are at most :data:`strapdown.records.recording.BRIDGED` apart; otherwise they are missing.
 """
 
 from __future__ import annotations
@@ -25,11 +25,9 @@ from strapdown import quaternion
 from strapdown.checks import Array, InputError
 from strapdown.files import reading
 from strapdown.recordings.delimited import is_number, read_csv
-from strapdown.records.recording import Recording
+from strapdown.records.recording import Recording, interpolated
 
 TRUTHS = ("state_groundtruth_estimate0", "mocap0")
-BRIDGED = 0.1
-"""Maximum interval between two stamps of a reference for interpolation, s."""
 
 
 def _root(path: Path) -> Path | None:
@@ -143,21 +141,3 @@ def _with_reference(recording: Recording, stamps: NDArray[np.int64], attitude: A
         )
     words = f"Reference of {name}: at {known} of {len(found)} stamps."
     return replace(recording, true_attitude=found, remarks=(*recording.remarks, words))
-
-
-def interpolated(time: Array, stamps: Array, q: Array, bridged: float = BRIDGED) -> Array:
-    """Return attitudes (n, 4) at ``time`` (n,) between unit quaternions at ``stamps`` along the shortest rotation.
-
-    NaN outside, and between stamps that are further than ``bridged`` apart, s.
-    """
-    result = np.full((len(time), 4), np.nan)
-    if len(stamps) < 2:
-        return result
-    k = np.clip(np.searchsorted(stamps, time, side="right") - 1, 0, len(stamps) - 2)
-    width = stamps[k + 1] - stamps[k]
-    share = (time - stamps[k]) / width
-    usable = (share >= -1e-9 / width) & (share <= 1.0 + 1e-9 / width) & (width <= bridged)
-    k, share = k[usable], share[usable]
-    turn = quaternion.log(quaternion.multiply(quaternion.conjugate(q[k]), q[k + 1]))
-    result[usable] = quaternion.multiply(q[k], quaternion.exp(share[:, None] * turn))
-    return result

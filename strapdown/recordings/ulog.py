@@ -24,10 +24,9 @@ from numpy.typing import NDArray
 from strapdown import quaternion
 from strapdown.checks import Array, InputError, one_of
 from strapdown.files import reading, written_beside
-from strapdown.recordings.extras import library
-from strapdown.recordings.trajectories import interpolated
+from strapdown.files.extras import library
 from strapdown.records import outputs
-from strapdown.records.recording import Recording, at_nearest, field_in, relative_time, with_gyro
+from strapdown.records.recording import Recording, at_nearest, field_in, interpolated, relative_time, with_gyro
 
 UNIT, FIELD, ATTITUDE = "sensor_combined", "vehicle_magnetometer", "vehicle_attitude"
 NO_SAMPLE = 0x7FFFFFFF

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from strapdown import quaternion
 from strapdown.checks import Array, InputError, array, increasing, one_of
 from strapdown.results import Listed, Listing, figure
 from strapdown.units import DEGREE, STANDARD_GRAVITY
@@ -23,6 +24,9 @@ TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 
 CLOCK_OFFSET = 1e8
 """Stamps above this, s, count from 1970 or from the start of a machine; the time of a recording then begins at its first stamp."""
+
+BRIDGED = 0.1
+"""Maximum interval between two stamps of a reference for interpolation, s."""
 
 GAP = 5.0
 """Minimum interval between stamps that counts as a gap, in median intervals."""
@@ -263,6 +267,24 @@ def at_nearest(time: Array, other: Array, values: Array) -> tuple[Array, int]:
     order = np.flatnonzero(usable)[np.argsort(-distance[usable], kind="stable")]  # the nearest comes last and stays
     placed[nearest[order]] = values[order]
     return placed, int(len(other) - len(np.unique(nearest[usable])))
+
+
+def interpolated(time: Array, stamps: Array, q: Array, bridged: float = BRIDGED) -> Array:
+    """Return attitudes (n, 4) at ``time`` (n,) between unit quaternions at ``stamps`` along the shortest rotation.
+
+    NaN outside, and between stamps that are further than ``bridged`` apart, s.
+    """
+    result = np.full((len(time), 4), np.nan)
+    if len(stamps) < 2:
+        return result
+    k = np.clip(np.searchsorted(stamps, time, side="right") - 1, 0, len(stamps) - 2)
+    width = stamps[k + 1] - stamps[k]
+    share = (time - stamps[k]) / width
+    usable = (share >= -1e-9 / width) & (share <= 1.0 + 1e-9 / width) & (width <= bridged)
+    k, share = k[usable], share[usable]
+    turn = quaternion.log(quaternion.multiply(quaternion.conjugate(q[k]), q[k + 1]))
+    result[usable] = quaternion.multiply(q[k], quaternion.exp(share[:, None] * turn))
+    return result
 
 
 def field_in(unit: str, recording: Recording) -> Array:

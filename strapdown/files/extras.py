@@ -1,4 +1,4 @@
-"""Optional libraries of some formats, with an error that names a missing one."""
+"""Optional libraries, with an error that names a missing one."""
 
 from __future__ import annotations
 
