@@ -34,7 +34,7 @@ from strapdown.kernels.algebra import (
 from strapdown.kernels.lane_values import anywhere, chosen, everywhere
 from strapdown.kernels.measurement import direction_rows
 from strapdown.kernels.rotation import far_turn, logarithm, quaternion_multiply, right_jacobian, turned, unit
-from strapdown.kernels.series import LARGEST_ANGLE, fifth, fourth, second, sinc, third
+from strapdown.kernels.series import SQUARED_RANGE, fifth, fourth, second, sinc, third
 
 SHORT_FORM = 1000.0
 """Maximum ratio of innovation variance to measurement variance for the short form, which then loses at most three digits."""
@@ -140,7 +140,7 @@ def reset(q, A, B, correction):
     """
     G = right_jacobian(correction)
     moved = turned(q, correction)
-    large = dot(correction, correction) > LARGEST_ANGLE * LARGEST_ANGLE
+    large = dot(correction, correction) > SQUARED_RANGE
     if anywhere(large):
         far, J = far_turn(correction)
         moved = chosen_parts(large, unit(quaternion_multiply(q, far)), moved)

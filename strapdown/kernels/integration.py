@@ -24,7 +24,7 @@ from strapdown.kernels.lane_values import (
 )
 from strapdown.kernels.measurement import vector_at
 from strapdown.kernels.rotation import exponential, quaternion_multiply, renormalized
-from strapdown.kernels.series import LARGEST_ANGLE
+from strapdown.kernels.series import SQUARED_RANGE
 from strapdown.kernels.state import load_quaternion, store_several
 
 SEGMENT = 48
@@ -39,15 +39,13 @@ FEWEST = 4 * WIDTH
 WORK = 4 * (BLOCK + WIDTH) + WIDTH
 """Length of the work space: products and starts of the lanes, and alignment to a cache line."""
 
-_LARGEST_SQUARE = LARGEST_ANGLE * LARGEST_ANGLE
-
 
 def large_exponential(phi):
     """Return exp(φ) of any rotation vector, by repeated halving, series and squaring; NaN if |φ|² is not finite."""
     halvings = 0
     s = 1.0
     x = dot(phi, phi)
-    while _LARGEST_SQUARE < x < math.inf:
+    while SQUARED_RANGE < x < math.inf:
         x *= 0.25
         s *= 0.5
         halvings += 1
@@ -112,7 +110,7 @@ def multiply_exponentials(vectors, start, length, work):
         largest = chosen(x > largest, x, largest)
         p = quaternion_multiply(p, exponential(phi))
         store_several(work, 4 * WIDTH * k, p)
-    if anywhere(largest > _LARGEST_SQUARE):
+    if anywhere(largest > SQUARED_RANGE):
         multiply_large_exponentials(vectors, start, length, work)
 
 

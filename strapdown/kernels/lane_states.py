@@ -50,7 +50,7 @@ from strapdown.kernels.measurement import ATTITUDE, HEADING, frame_at, six_at
 from strapdown.kernels.montecarlo_run import four, store_several, triple
 from strapdown.kernels.rotation import right_jacobian, rotation_matrix, turned
 from strapdown.kernels.sensor_rows import arm_noise, decorrelate, fill_rows, identity
-from strapdown.kernels.walk import SQUARED_RANGE
+from strapdown.kernels.series import SQUARED_RANGE
 
 CALLED = (
     "step",

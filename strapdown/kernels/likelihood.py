@@ -30,9 +30,9 @@ from strapdown.kernels.measurement import (
     value_of,
 )
 from strapdown.kernels.rotation import quaternion_multiply, rotation_matrix
-from strapdown.kernels.series import LARGEST_ANGLE
+from strapdown.kernels.series import LARGEST_ANGLE, SQUARED_RANGE
 from strapdown.kernels.state import load_lanes, load_quaternion, store_lanes, store_several
-from strapdown.kernels.walk import MAX_TURN, SQUARED_RANGE
+from strapdown.kernels.walk import MAX_TURN
 
 REPLACEABLE = ("counted",)
 

@@ -18,7 +18,7 @@ from strapdown.kernels.algebra import (
     square_root,
     transpose,
 )
-from strapdown.kernels.series import LARGEST_ANGLE, cosine, polynomial, second, sinc, third
+from strapdown.kernels.series import LARGEST_ANGLE, SQUARED_RANGE, cosine, polynomial, second, sinc, third
 
 _ARCSINE = tuple(math.comb(2 * k, k) / (4.0**k * (2 * k + 1)) for k in range(12))
 # |B_2k| / (2k)! for k = 1 … 6, with the Bernoulli numbers 1/6, 1/30, 1/42, 1/30, 5/66, 691/2730.
@@ -150,7 +150,7 @@ def near_inverse_right_jacobian(phi):
 def inverse_right_jacobian(phi):
     """Return ``J_r(φ)⁻¹ = I + ½ [φ] + (1 − (θ/2) cot(θ/2))/θ² [φ]²``, θ = |φ| ≤ π."""
     x = dot(phi, phi)
-    if x <= LARGEST_ANGLE * LARGEST_ANGLE:
+    if x <= SQUARED_RANGE:
         return near_inverse_right_jacobian(phi)
     half = 0.5 * math.sqrt(x)
     return skew_polynomial(1.0, 0.5, (1.0 - half / math.tan(half)) / x, phi)
@@ -159,7 +159,7 @@ def inverse_right_jacobian(phi):
 def moved(q, phi):
     """Return q ⊗ exp(φ) and J_r(φ) for any angle: a correction of an attitude and of its tangent space."""
     x = dot(phi, phi)
-    if x <= LARGEST_ANGLE * LARGEST_ANGLE:
+    if x <= SQUARED_RANGE:
         return turned(q, phi), right_jacobian(phi)
     theta = math.sqrt(x)
     s = math.sin(0.5 * theta)
@@ -169,7 +169,7 @@ def moved(q, phi):
 
 def sine_and_versine(x):
     """Return sin θ/θ and (1 − cos θ)/θ² at θ = √x of any size."""
-    if x <= LARGEST_ANGLE * LARGEST_ANGLE:
+    if x <= SQUARED_RANGE:
         return sinc(x), second(x)
     angle = math.sqrt(x)
     half = math.sin(0.5 * angle)
@@ -184,7 +184,7 @@ def composed(r, phi):
         r[0] * phi[2] + (r[1] * phi[1] - r[2] * phi[0]),
     )
     x = dot(phi, phi)
-    if x <= LARGEST_ANGLE * LARGEST_ANGLE:
+    if x <= SQUARED_RANGE:
         c = cosine(0.25 * x)
         h = 0.5 * sinc(0.25 * x)
     else:

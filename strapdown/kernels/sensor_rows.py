@@ -27,7 +27,7 @@ from strapdown.kernels.error_state_step import CARRIED, FIXED, LEVER, OFFSET, SC
 from strapdown.kernels.lane_values import chosen, everywhere
 from strapdown.kernels.measurement import ATTITUDE, DIRECTION, HEADING, VERTICAL
 from strapdown.kernels.rotation import logarithm, moved, quaternion_multiply, rotation_matrix
-from strapdown.kernels.walk import SQUARED_RANGE
+from strapdown.kernels.series import SQUARED_RANGE
 
 REPLACEABLE = ("state_at", "row_entry", "set_row_entry", "turned_by", "turn_vector", "angle_of")
 CALLED = ("fill_rows", "decorrelate", "arm_noise")

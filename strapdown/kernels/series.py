@@ -11,6 +11,8 @@ import math
 LARGEST_ANGLE = 1.0 / 3.0
 """Maximum angle, rad, at which the polynomials below are accurate to rounding; larger increments are divided into sub-steps. Beyond it
 their accuracy decreases gradually: 1e-10 at 1 rad, 1e-6 at 2 rad."""
+SQUARED_RANGE = LARGEST_ANGLE * LARGEST_ANGLE
+"""The same limit for the squared angle, rad²."""
 
 _COSINE = tuple((-1.0) ** k / math.factorial(2 * k) for k in range(6))
 _SINC = tuple((-1.0) ** k / math.factorial(2 * k + 1) for k in range(6))

@@ -36,7 +36,7 @@ from strapdown.kernels.rotation import (
     right_jacobian,
     turned,
 )
-from strapdown.kernels.series import LARGEST_ANGLE
+from strapdown.kernels.series import SQUARED_RANGE
 from strapdown.kernels.smoother_step import gain, kept_share, left_noise, step_noise
 from strapdown.kernels.state import (
     SIZE,
@@ -100,7 +100,6 @@ FEWEST_ROWS = WIDTH + 1
 """Minimum number of rows of the array of segments; rows after the end state are not read."""
 
 _NOTHING = 1e-30
-_LARGEST_SQUARE = LARGEST_ANGLE * LARGEST_ANGLE
 SIX = (0, 1, 2, 3, 4, 5)
 
 
@@ -279,7 +278,7 @@ def fold_jacobians(work, group, errors):
         a0, a1, a2 = scale(load(work, FACTOR), (a0, a1, a2))
         e = (e0, e1, e2)
         a = (chosen(seen, a0, e0), chosen(seen, a1, e1), chosen(seen, a2, e2))
-        if anywhere(dot(e, e) > _LARGEST_SQUARE) or anywhere(dot(a, a) > _LARGEST_SQUARE):
+        if anywhere(dot(e, e) > SQUARED_RANGE) or anywhere(dot(a, a) > SQUARED_RANGE):
             for i in range(WIDTH):
                 s = errors + w + w * i
                 e = (work[s], work[s + 1], work[s + 2])
@@ -343,7 +342,7 @@ def move_states(work, group, errors, whole):
     t = SMOOTHED
     store_several(work, t + 4 * w, (b0 + beta0, b1 + beta1, b2 + beta2))
     e = (e0, e1, e2)
-    if anywhere(dot(e, e) > _LARGEST_SQUARE):
+    if anywhere(dot(e, e) > SQUARED_RANGE):
         for i in range(WIDTH):
             u = group + ATTITUDE + i
             s = errors + w * i

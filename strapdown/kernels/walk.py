@@ -10,7 +10,7 @@ import math
 
 from strapdown.kernels.algebra import combine, dot, scale
 from strapdown.kernels.measurement import vector_at
-from strapdown.kernels.series import LARGEST_ANGLE
+from strapdown.kernels.series import LARGEST_ANGLE, SQUARED_RANGE
 
 OPEN = ("begin", "keep", "longest_step", "predict", "update", "finish")
 REPLACEABLE = ("stopped",)
@@ -18,8 +18,6 @@ REPLACEABLE = ("stopped",)
 
 MAX_TURN = 1e6
 """Maximum rotation by the bias in a step, rad; a larger one belongs to a diverged filter and is not divided into sub-steps."""
-SQUARED_RANGE = LARGEST_ANGLE * LARGEST_ANGLE
-"""Limit of the polynomials, rad²."""
 
 
 def turn_squared(part, dt, b):
