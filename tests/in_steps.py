@@ -98,7 +98,7 @@ def run(record, process_noise, initial, error_states=(), **options):
         whitened={sensor: np.array([whitened(*one[2:]) for one in found]) for sensor, found in seen.items()},
         refused={sensor: f.refused.get(sensor, 0) for sensor in sensors},
         skipped={sensor: f.skipped.get(sensor, 0) for sensor in sensors},
-        events=tuple(sorted([*estimation.gaps(record.time), *f.events], key=lambda event: event.start)),
+        events=tuple(sorted([*estimation.gaps(record), *f.events], key=lambda event: event.start)),
         state=f.state(),
     )
 

@@ -638,7 +638,7 @@ def test_gaps_of_the_gyro_are_reported_whether_hypotheses_were_many_or_one(durat
     gaps = dataclasses.replace(record, time=record.time + later)
     found = multiple_model.run(gaps, belief, every=5)
     assert found.converged == (duration > 60.0)
-    assert found.estimate.events == tuple(estimation.gaps(gaps.time))
+    assert found.estimate.events == tuple(estimation.gaps(gaps))
     assert [(one.start, one.end) for one in found.estimate.events] == [
         (gaps.time[k], gaps.time[k + 1]) for k in (early, late)
     ]

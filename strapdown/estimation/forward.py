@@ -43,10 +43,9 @@ from strapdown.kernels.series import LARGEST_ANGLE
 from strapdown.kernels.triangle import padded
 from strapdown.kernels.walk import walk
 from strapdown.records import ErrorStateEstimate, Estimate, Event, ImuRecord, cut
+from strapdown.records.recording import GAP
 from strapdown.vectors import KINDS, VectorMeasurements
 
-GAP_FACTOR = 5.0
-"""A gyro interval longer than this many times the median one is reported as a gap."""
 CHECK_INTERVALS = 1024
 """Number of intervals between checks of the covariance for lost digits."""
 SHARPNESS = 1e9
@@ -298,15 +297,15 @@ def _over_temperature(problem: Problem, options: Options, slopes: slice) -> Pass
     return Passed(estimate=replace(estimate, skipped=skipped), make_end=lambda: end, segments=np.empty((0, 0)))
 
 
-def gaps(time: Array, factor: float = GAP_FACTOR) -> list[Event]:
-    """Return the gyro intervals that are more than ``factor`` times as long as the median interval, as events."""
-    steps = np.diff(time)
-    if np.max(steps, initial=0.0) <= factor * np.min(steps, initial=np.inf):
+def gaps(record: ImuRecord) -> list[Event]:
+    """Return the gyro intervals that are more than :data:`GAP` times as long as the median interval, as events."""
+    time, steps = record.time, record.intervals
+    if steps.max() <= GAP * steps.min():
         return []  # skips the sort for the median
     usual = float(np.median(steps))
     return [
         Event(kind="gap", start=float(time[k]), end=float(time[k + 1]), value=float(steps[k] / usual))
-        for k in np.flatnonzero(steps > factor * usual)
+        for k in np.flatnonzero(steps > GAP * usual)
     ]
 
 
@@ -426,7 +425,7 @@ def _block_result(
         covariance=covariance_matrices(out.covariance) if options.full_covariance else None,
         innovations=innovations,
         skipped=skipped_too(problem.events, innovations),
-        events=in_order([*gaps(problem.record.time), *events]),
+        events=in_order([*gaps(problem.record), *events]),
     )
     return Passed(
         estimate=estimate,
@@ -678,7 +677,7 @@ def _in_factor(problem: Problem, options: Options) -> Passed:
         ),
         innovations=innovations,
         skipped=skipped_too(events, innovations),
-        events=in_order([*gaps(record.time), *happened]),
+        events=in_order([*gaps(record), *happened]),
     )
     if options.whole_bias:
         estimate = replace(
@@ -912,9 +911,7 @@ def most_segments(problem: Problem) -> int:
     """Return an upper bound of the number of predictions: one per interval and per measurement, and the sub-steps of both limits."""
     record = problem.record
     most = len(record.increments) + int(problem.events.bounds[-1])
-    if np.isinf(problem.model.limit) and (
-        3.0 * max(record.increments.max(), -record.increments.min()) ** 2 <= LARGEST_ANGLE**2
-    ):
+    if np.isinf(problem.model.limit) and 3.0 * record.largest_increment**2 <= LARGEST_ANGLE**2:
         return most
     dt = record.intervals
     steps = np.maximum(np.linalg.norm(record.increments, axis=1) / LARGEST_ANGLE, dt / problem.model.limit)

@@ -232,7 +232,7 @@ def _until_one(record: ImuRecord, process_noise: ProcessNoise, options: _Options
     coarse = tuple(_isotropic(series) for series in record.vectors)
     events = schedule(coarse, record.time[0], record.time[-1])
     recovery = 0 if options.gate is None else options.gate.recovery or 0
-    own_events = gaps(record.time)
+    own_events = gaps(record)
     failed = 0
     directions = _directions(events, 0)
     if len(directions) == 0:

@@ -301,10 +301,9 @@ def selected(innovations: Innovations, which: np.ndarray) -> Innovations:
 
 def skipped_too(events: Schedule, innovations: Mapping[str, Innovations]) -> dict[str, int]:
     """Return the number of skipped measurements by sensor: those that were not scheduled, and headings of a vertical vector."""
-    numbers = np.diff(events.bounds)
     return {
-        sensor: events.skipped[sensor] + int(number) - len(innovations[sensor].time)
-        for sensor, number in zip(events.sensors, numbers, strict=True)
+        sensor: events.skipped[sensor] + len(time) - len(innovations[sensor].time)
+        for sensor, time in zip(events.sensors, events.series_time, strict=True)
     }
 
 

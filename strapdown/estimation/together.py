@@ -181,7 +181,7 @@ def _estimate(problem: Problem, every: int, kept: Array, innovation: Array) -> E
         estimate,
         innovations=innovations,
         skipped=skipped_too(problem.events, innovations),
-        events=tuple(gaps(problem.record.time)),
+        events=tuple(gaps(problem.record)),
         bias=whole_bias(model, x),
         variance=np.diagonal(covariance, axis1=1, axis2=2).copy(),
         covariance=covariance,

@@ -99,15 +99,14 @@ class ImuRecord(Listed):
         if self.temperature is not None:
             object.__setattr__(self, "temperature", array("temperature", self.temperature, (len(time),)))
         increments = array("increments", self.increments, (len(time) - 1, 3))
-        for index in (np.argmax(increments), np.argmin(increments)):
-            row, axis = (int(i) for i in np.unravel_index(index, increments.shape))
-            if abs(increments[row, axis]) > LARGEST_TURN:
-                raise InputError(
-                    f"increments[{row}, {axis}] is {increments[row, axis]:g} rad in {time[row + 1] - time[row]:g} s, more than "
-                    f"{LARGEST_TURN:g} rad between two samples; check the unit, or remove it"
-                )
         object.__setattr__(self, "time", time)
         object.__setattr__(self, "increments", increments)
+        if self.largest_increment > LARGEST_TURN:
+            row, axis = (int(i) for i in np.unravel_index(np.argmax(np.abs(increments)), increments.shape))
+            raise InputError(
+                f"increments[{row}, {axis}] is {increments[row, axis]:g} rad in {time[row + 1] - time[row]:g} s, more than "
+                f"{LARGEST_TURN:g} rad between two samples; check the unit, or remove it"
+            )
         if isinstance(self.vectors, VectorMeasurements):
             raise InputError(f"vectors is the single series {self.vectors.sensor}; give a tuple of series, (series,)")
         instance("vectors", self.vectors, Iterable, "give a tuple of series, empty for none")
@@ -143,6 +142,11 @@ class ImuRecord(Listed):
         intervals = np.diff(self.time)
         intervals.flags.writeable = False
         return intervals
+
+    @functools.cached_property
+    def largest_increment(self) -> float:
+        """Largest magnitude of a component of the increments, rad."""
+        return float(max(self.increments.max(), -self.increments.min()))
 
     @property
     def rates(self) -> Array:

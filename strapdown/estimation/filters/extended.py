@@ -104,5 +104,5 @@ def estimate(
         covariance=covariance if full_covariance else None,
         innovations=innovations,
         skipped=skipped_too(events, innovations),
-        events=tuple(gaps(record.time)),
+        events=tuple(gaps(record)),
     )
