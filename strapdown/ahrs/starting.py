@@ -73,7 +73,7 @@ def quiet_span(recording: Recording) -> slice:
             "interval; if its stamps are in ms or us, say so (--time-unit, or units={'time': 'ms'})"
         )
     blocks = len(recording.time) // length
-    axes = recording.rate[: blocks * length].T.reshape(3, blocks, length)
+    axes = recording.rate[: blocks * length].T.copy().reshape(3, blocks, length)
     mean = axes.mean(axis=2)
     varying = axes - mean[:, :, None]
     # The mean is added to the spread so that a constant rate is not mistaken for rest; half weight, because it may be bias.

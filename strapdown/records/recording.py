@@ -159,6 +159,8 @@ class Recording(Listed):
         Recording
             The rest of the recording.
         """
+        if first == 0:
+            return self
         rows = slice(first, None)
         parts: dict[str, Any] = {n: None if getattr(self, n) is None else getattr(self, n)[rows] for n in _ROWS}
         begin = parts["time"][0]
