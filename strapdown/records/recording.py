@@ -311,8 +311,8 @@ def increments(recording: Recording) -> Array:
 
 def sampled(samples: Array) -> np.ndarray:
     """Return a mask (n,) of the rows (n, 3) of a sensor that are samples: neither NaN nor all 0."""
-    x, y, z = samples.T
-    return np.asarray(~np.isnan(x + y + z) & ((x != 0.0) | (y != 0.0) | (z != 0.0)))
+    x, y, z = np.abs(samples).T
+    return np.asarray(x + y + z > 0.0)
 
 
 def gaps(time: ArrayLike) -> list[tuple[float, float]]:
