@@ -19,7 +19,7 @@ from __future__ import annotations
 import functools
 import itertools
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple
 
@@ -75,6 +75,7 @@ FORCE_UNITS: dict[str, float] = {
     _unit("specific force is 9.81 times too large", "m/s² read as g", "accelerometer", "m/s2"): 1.0 / STANDARD_GRAVITY,
 }
 
+NO_CHANGE = "no change"
 PENALTY = 5.0
 FLOORS = {"reference": 0.003, "vectors": 0.04}
 """m₀ of relations to a reference, and of those between sensors only, which accelerations and the gyro's bias disturb."""
@@ -124,7 +125,7 @@ class Candidate:
     @property
     def words(self) -> str:
         """The changes in one line."""
-        return "; ".join(self.changes) or "no change"
+        return "; ".join(self.changes) or NO_CHANGE
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -207,13 +208,18 @@ def examine(recording: Recording) -> Examination:
         raise InputError(
             f"{recording.source} has only a gyro; a reference attitude, an accelerometer or a magnetometer is needed too"
         )
-    unit_changes, doubts = _force_unit(recording)
+    sensors = {
+        name: (vectors, float(np.nanmedian(lengths(vectors))))
+        for name, vectors in (("accelerometer", recording.specific_force), ("magnetometer", recording.magnetic_field))
+        if vectors is not None
+    }
+    unit_changes, doubts = _force_unit(sensors["accelerometer"][1]) if "accelerometer" in sensors else ((), [])
     doubts += _too_fast(recording)
     unsaid = [f"as it seems, {words}" for words in unit_changes]  # gravity alone shows it, whatever the turns do
     upright = at_rest(recording)
-    found = list(_with_reference(recording) if recording.true_attitude is not None else _without_reference(recording))
+    found = (_without_reference if recording.true_attitude is None else _with_reference)(recording, sensors)
     notes = _unseen(recording)
-    if not found:
+    if found is None:
         return Examination(
             source=recording.source,
             verdict="cannot tell",
@@ -222,16 +228,7 @@ def examine(recording: Recording) -> Examination:
             notes=tuple(notes),
             doubts=tuple(upright + unsaid + doubts),
         )
-    candidates = [
-        Candidate(
-            changes=(*one.changes, *unit_changes),
-            score=one.score - PENALTY * len(unit_changes),
-            misfit=one.misfit,
-        )
-        for one in found
-    ]
-    candidates.sort(key=lambda one: -one.score)
-    result = _concluded(recording.source, candidates, unit_changes, notes)
+    result = _concluded(recording.source, found, unit_changes, notes)
     if upright and result.verdict == "as declared":
         result = replace(
             result, verdict="cannot tell", reason="the sensors agree with each other; see the warning on their sign"
@@ -239,31 +236,50 @@ def examine(recording: Recording) -> Examination:
     return replace(result, doubts=tuple(upright + (unsaid if result.verdict == "cannot tell" else []) + doubts))
 
 
-def _concluded(source: str, candidates: list[Candidate], sure: tuple[str, ...], notes: list[str]) -> Examination:
-    best = candidates[0]
-    plain = next(one for one in candidates if len(one.changes) == len(sure))
-    named = best if best.score - plain.score >= MARGIN else plain
-    fit = {id(one): one.score + PENALTY * len(one.changes) for one in candidates}
-    equal = [one for one in candidates if one is not named and fit[id(one)] > fit[id(named)] - MARGIN]
+class _Explanations(NamedTuple):
+    """Explanations of a recording; the first one changes nothing."""
+
+    misfit: dict[str, Array]
+    """Misfits (m,) of each relation."""
+    number: Array
+    """Number of changes (m,)."""
+    changes: Callable[[int], tuple[str, ...]]
+    """Changes of one of them."""
+    floor: float
+    """m₀ of the relations."""
+
+
+def _concluded(source: str, found: _Explanations, sure: tuple[str, ...], notes: list[str]) -> Examination:
+    fit = np.sum([_score(values, found.floor) for values in found.misfit.values()], axis=0)
+    score = fit - PENALTY * found.number
+    order = np.argsort(-score, kind="stable")
+    named = order[0] if score[order[0]] - score[0] >= MARGIN else 0
+    equal = [k for k in order[fit[order] > fit[named] - MARGIN] if k != named]
+    best = [
+        Candidate(
+            changes=(*found.changes(k), *sure),
+            score=float(score[k]) - PENALTY * len(sure),
+            misfit={name: float(values[k]) for name, values in found.misfit.items()},
+        )
+        for k in order[:12]
+    ]
+    words = "; ".join((*found.changes(named), *sure))
     verdict: Literal["as declared", "wrong convention", "cannot tell"]
-    if min(best.misfit.values()) > POOR:
+    if min(best[0].misfit.values()) > POOR:
         verdict = "cannot tell"
         reason = "no explanation tried fits; misfits of the best one: " + ", ".join(
-            f"{name} {value:.2f}" for name, value in best.misfit.items()
+            f"{name} {value:.2f}" for name, value in best[0].misfit.items()
         )
     elif len(equal) > MAX_EQUAL:
         verdict = "cannot tell"
-        reason = f"{len(equal)} other explanations fit as well as “{named.words}”: the rotation is too small, or about one axis only"
-    elif named is plain:
-        verdict = "wrong convention" if sure else "as declared"
-        reason = "; ".join(sure) if sure else "no change explains the recording better than its declared conventions"
+        reason = f"{len(equal)} other explanations fit as well as “{words or NO_CHANGE}”: the rotation is too small, or about one axis only"
     else:
-        verdict, reason = "wrong convention", named.words
+        verdict = "wrong convention" if words else "as declared"
+        reason = words or "no change explains the recording better than its declared conventions"
     if equal and verdict != "cannot tell":
-        notes = [*notes, "fits as well: " + " / ".join(one.words for one in equal)]
-    return Examination(
-        source=source, verdict=verdict, reason=reason, candidates=tuple(candidates[:12]), notes=tuple(notes)
-    )
+        others = ("; ".join((*found.changes(k), *sure)) or NO_CHANGE for k in equal)
+        notes = [*notes, "fits as well: " + " / ".join(others)]
+    return Examination(source=source, verdict=verdict, reason=reason, candidates=tuple(best), notes=tuple(notes))
 
 
 REST_SPREAD = 0.05
@@ -337,10 +353,8 @@ def _dip(recording: Recording, quiet: slice, up: Array) -> float | None:
     return -math.asin(float(np.clip(mean @ up / np.linalg.norm(mean), -1.0, 1.0)))
 
 
-def _force_unit(recording: Recording) -> tuple[tuple[str, ...], list[str]]:
-    if recording.specific_force is None:
-        return (), []
-    strength = float(np.nanmedian(lengths(recording.specific_force)))
+def _force_unit(strength: float) -> tuple[tuple[str, ...], list[str]]:
+    """Return the change of unit by which the median specific force is gravity, and the doubt if there is none."""
     if not strength > 0.0:
         return (), ["the accelerometer reads zero throughout"]
     distances = {words: abs(math.log(strength * factor / STANDARD_GRAVITY)) for words, factor in FORCE_UNITS.items()}
@@ -377,8 +391,8 @@ def _unseen(recording: Recording) -> list[str]:
     return notes
 
 
-def _score(misfit: float, kind: str = "reference") -> float:
-    return -1.5 * INDEPENDENT * math.log(max(misfit, 0.0) + FLOORS[kind])
+def _score(misfit: Array, floor: float) -> Array:
+    return np.asarray(-1.5 * INDEPENDENT * np.log(np.maximum(misfit, 0.0) + floor))
 
 
 SPAN = 4.0
@@ -387,50 +401,66 @@ MIN_INTERVAL = 0.02
 """Minimum interval of the samples of a vector used, s."""
 
 
+_Sensors = Mapping[str, tuple[Array, float]]
+"""Samples of the vectors by sensor, and their median magnitude."""
+
+
 class _Windows(NamedTuple):
-    """Windows with the fastest rotation, and the samples of a vector there."""
+    """Windows with the fastest rotation, and the samples of the vectors there."""
 
     rows: np.ndarray
     """Rows of the samples in the recording (m,)."""
+    edges: list[int]
+    """First sample of each window, and m."""
     vectors: Array
-    """Vectors relative to their median magnitude (m, 3)."""
-    begin: np.ndarray
-    """First sample of each window but the first."""
-    counts: np.ndarray
-    """Number of samples of each window."""
+    """Vectors of all sensors side by side, relative to their median magnitude (m, 3 sensors); 0 if not used."""
+    counts: dict[str, np.ndarray]
+    """Number of samples used of each sensor in each window."""
 
-    def means(self, attitude: Array) -> Array:
-        """Return the means over each window of R_ab v_c (windows, 3, 3, 3), R of attitudes at the rows (m, 4)."""
-        turned = quaternion.to_matrix(attitude).reshape(-1, 9)
-        parts = zip(np.split(turned, self.begin), np.split(self.vectors, self.begin), strict=True)
-        sums = np.reshape([R.T @ w for R, w in parts], (-1, 3, 3, 3))
-        return np.asarray(sums / self.counts[:, None, None, None])
+    def means(self, attitudes: Iterable[Array]) -> dict[str, Array]:
+        """Return for each sensor the means over each window of R_ab v_c (attitudes, windows, 3, 3, 3), R of attitudes at the rows."""
+        sums = []
+        for attitude in attitudes:
+            turned = quaternion.to_matrix(attitude).reshape(-1, 9)
+            sums.append([turned[a:b].T @ self.vectors[a:b] for a, b in itertools.pairwise(self.edges)])
+        parts = np.split(np.reshape(sums, (len(sums), len(self.edges) - 1, 3, 3, -1)), len(self.counts), axis=-1)
+        return {
+            name: part[:, n > 0] / n[n > 0, None, None, None]
+            for part, (name, n) in zip(parts, self.counts.items(), strict=True)
+        }
 
 
 def _turned(means: Array, axes: Array) -> Array:
     """Return the mean of R A v over each window (..., windows, 3) for axes A (..., 3, 3)."""
-    flat = means.reshape(len(means), 3, 9)
-    return np.asarray(np.moveaxis(flat @ axes.reshape(*axes.shape[:-2], 9).T, (0, 1), (-2, -1)))
+    flat = (one.reshape(*one.shape[:-2], 9) for one in (means, axes))
+    return np.asarray(np.einsum("...wik,...k->...wi", *flat))
 
 
-def _windows(recording: Recording, vectors: Array | None, known: np.ndarray | bool = True) -> _Windows | None:
-    """Return the windows with samples of a vector, where the attitude is ``known``; None if there are none."""
-    strength = 0.0 if vectors is None else float(np.nanmedian(lengths(vectors)))
-    if vectors is None or not strength > 0.0:
-        return None
+def _windows(recording: Recording, sensors: _Sensors, known: np.ndarray | bool = True) -> _Windows | None:
+    """Return the windows with samples of each vector, where the attitude is ``known``; None if there are none."""
     step = max(1, round(MIN_INTERVAL / float(np.median(np.diff(recording.time)))))
     rows = slice(None, None, step)
-    time, v = recording.time[rows], vectors[rows] / strength
-    seen = np.isfinite(lengths(v)) & np.broadcast_to(known, recording.time.shape)[rows]
+    time = recording.time[rows]
     window = np.floor((time - time[0]) / SPAN).astype(int)
-    number = int(window[-1]) + 1
-    turning = np.bincount(window, lengths(recording.rate[rows]), number) / np.bincount(window, minlength=number).clip(1)
-    counts = np.bincount(window[seen], minlength=number)
-    full = np.flatnonzero(counts >= 0.5 * max(1.0, SPAN / float(np.median(np.diff(time)))))
-    chosen = np.sort(full[np.argsort(-turning[full])][:WINDOWS])
-    used = np.flatnonzero(seen & np.isin(window, chosen))
-    begin = np.flatnonzero(np.diff(window[used], prepend=-1))[1:]
-    return _Windows(step * used, v[used], begin, counts[chosen]) if len(chosen) else None
+    turning = np.bincount(window, lengths(recording.rate[rows])) / np.bincount(window).clip(1)
+    least = 0.5 * max(1.0, SPAN / float(np.median(np.diff(time))))
+    vectors, used = [], {}
+    for name, (samples, strength) in sensors.items():
+        seen = (
+            np.isfinite(lengths(samples[rows])) & np.broadcast_to(known, recording.time.shape)[rows] & (strength > 0.0)
+        )
+        full = np.flatnonzero(np.bincount(window[seen], minlength=len(turning)) >= least)
+        chosen = np.zeros(len(turning), bool)
+        chosen[full[np.argsort(-turning[full])][:WINDOWS]] = True
+        if chosen.any():
+            used[name] = seen & chosen[window]
+            vectors.append(np.where(used[name][:, None], samples[rows] / strength, 0.0))
+    if not used:
+        return None
+    kept = np.flatnonzero(np.any([*used.values()], axis=0))
+    begin = np.flatnonzero(np.diff(window[kept], prepend=-1))
+    counts = {name: np.add.reduceat(one[kept], begin, dtype=int) for name, one in used.items()}
+    return _Windows(step * kept, [*begin.tolist(), len(kept)], np.hstack(vectors)[kept], counts)
 
 
 # ------------------------------------------------------------------------------------------------------------------ with a reference
@@ -439,41 +469,29 @@ REFERENCE_SPAN = 0.1
 """Duration of the windows over which the rotations of gyro and reference are compared, s."""
 
 
-def _with_reference(recording: Recording) -> Iterator[Candidate]:
-    assert recording.true_attitude is not None
-    known = np.isfinite(recording.true_attitude).all(axis=1)
-    known &= lengths(np.nan_to_num(recording.true_attitude)) > 0.0
-    first, last, turn = _turns(recording, known)
+def _with_reference(recording: Recording, sensors: _Sensors) -> _Explanations | None:
+    true = recording.true_attitude
+    assert true is not None
+    size = lengths(true)
+    first, last, turn = _turns(recording, known := np.isfinite(size) & (size > 0.0))
     if len(first) < 10:
-        return
-    force = _windows(recording, recording.specific_force, known)
-    magnetic = _windows(recording, recording.magnetic_field, known)
-    for reading, read in {"": lambda q: q, **ATTITUDE_READINGS}.items():
+        return None
 
-        def at(rows: np.ndarray, read: Callable[[Array], Array] = read) -> Array:
-            return quaternion.normalize(read(recording.true_attitude[rows]))  # type: ignore[index]
+    def at(rows: np.ndarray) -> Array:
+        """Return the reference (readings, m, 4)."""
+        q = quaternion.normalize(true[rows])
+        return np.stack([q, *(read(q) for read in ATTITUDE_READINGS.values())])
 
-        reference = quaternion.log(quaternion.multiply(quaternion.conjugate(at(first)), at(last)))
-        if np.sum(np.linalg.norm(reference, axis=1)) < MIN_TURN:
-            return
-        gyro = _gyro_fits(turn, reference)
-        up = None if force is None else _turned(force.means(at(force.rows)), _ALL)
-        north = None if magnetic is None else _turned(magnetic.means(at(magnetic.rows)), _ALL)
-        for frame, to_enu in FRAMES.items():
-            parts = {"gyro": gyro}
-            if up is not None:
-                parts["accelerometer"] = _force_fits(up @ to_enu.T)
-            if north is not None:
-                parts["magnetometer"] = _field_fits(north @ to_enu.T)
-            common = tuple(
-                words
-                for words in (
-                    f"reference quaternions are {reading}" if reading else "",
-                    f"the reference's fixed frame is {frame}" if frame != "East-North-Up" else "",
-                )
-                if words
-            )
-            yield from _combined(common, parts)
+    reference = quaternion.log(quaternion.multiply(quaternion.conjugate(at(first)), at(last)))
+    if np.sum(lengths(reference[0])) < MIN_TURN:
+        return None
+    parts = {"gyro": np.repeat(_gyro_fits(turn, reference), len(FRAMES), axis=0)}
+    to_enu = np.stack([one.T for one in FRAMES.values()])[:, None]
+    windows = _windows(recording, sensors, known)
+    for name, means in ({} if windows is None else windows.means(at(windows.rows))).items():
+        v = np.stack([_turned(one, _ALL) for one in means])[:, None] @ to_enu  # (readings, frames, 48, windows, 3)
+        parts[name] = (_force_fits if name == "accelerometer" else _field_fits)(v).reshape(-1, len(AXES))
+    return _combined(parts)
 
 
 def _turns(recording: Recording, known: np.ndarray) -> tuple[np.ndarray, np.ndarray, Array]:
@@ -490,57 +508,70 @@ def _turns(recording: Recording, known: np.ndarray) -> tuple[np.ndarray, np.ndar
     return first[chosen], first[chosen] + step, turn[chosen]
 
 
-_Fits = dict[tuple[int, str], float]
-"""Misfit by index of the axes in AXES and description of the unit."""
+def _gyro_fits(turn: Array, reference: Array) -> Array:
+    """Return misfits (readings, 48 · 3) of ``reference = unit · axes · turn``, by axes and unit."""
+    cross = np.swapaxes(reference, -1, -2) @ turn
+    own, other = np.sum(turn**2), np.sum(reference**2, axis=(1, 2))
+    factor = np.array(list(GYRO_UNITS.values()))
+    along = cross.reshape(-1, 9) @ _ALL.reshape(-1, 9).T
+    misfit = 1.0 - 2.0 * factor * along[..., None] / (factor**2 * own + other[:, None, None])
+    return np.asarray(misfit.reshape(len(reference), -1))
 
 
-def _gyro_fits(turn: Array, reference: Array) -> _Fits:
-    """Return misfits of ``reference = unit · axes · turn``."""
-    cross = reference.T @ turn
-    own, other = float(np.sum(turn**2)), float(np.sum(reference**2))
-    return {
-        (k, words): 1.0 - 2.0 * factor * float(np.sum(matrix * cross)) / (factor**2 * own + other)
-        for k, matrix in enumerate(AXES)
-        for words, factor in GYRO_UNITS.items()
-    }
+def _force_fits(v: Array) -> Array:
+    """Return misfits (...,) of the mean specific force in each window (..., windows, 3), East-North-Up, with the vertical."""
+    return np.asarray(1.0 - 2.0 * v[..., 2].sum(axis=-1) / (np.sum(v**2, axis=(-2, -1)) + v.shape[-2]))
 
 
-def _force_fits(v: Array) -> _Fits:
-    """Return misfits of the mean specific force, by axes and window (48, windows, 3), East-North-Up, with the vertical."""
-    misfit = 1.0 - 2.0 * v[..., 2].sum(axis=1) / (np.sum(v**2, axis=(1, 2)) + v.shape[1])
-    return {(k, ""): float(value) for k, value in enumerate(misfit)}
-
-
-def _field_fits(v: Array) -> _Fits:
-    """Return misfits of the mean field with the best-fitting field that points North, of any dip."""
-    _, north, up = v.mean(axis=1).T
+def _field_fits(v: Array) -> Array:
+    """Return misfits (...,) of the mean field (..., windows, 3) with the best-fitting field that points North, of any dip."""
+    _, north, up = np.moveaxis(v.mean(axis=-2), -1, 0)
     along = np.where(north > 0.0, np.hypot(north, up), np.abs(up))
-    misfit = 1.0 - 2.0 * along / (np.mean(np.sum(v**2, axis=2), axis=1) + 1.0)
-    return {(k, ""): float(value) for k, value in enumerate(misfit)}
+    return np.asarray(1.0 - 2.0 * along / (np.sum(v**2, axis=(-2, -1)) / v.shape[-2] + 1.0))
 
 
-def _combined(common: tuple[str, ...], parts: dict[str, _Fits]) -> Iterator[Candidate]:
-    """Yield combinations of the best settings of each sensor, and those that change the axes of all sensors alike."""
+def _combined(parts: dict[str, Array]) -> _Explanations:
+    """Return combinations of the best settings of each sensor, and those that change the axes of all sensors alike.
 
-    def penalised(item: tuple[tuple[int, str], float]) -> float:
-        (k, unit), misfit = item
-        return _score(misfit) - PENALTY * ((k > 0) + bool(unit))
-
-    best = [
-        dict([((0, ""), fits[0, ""]), *sorted(fits.items(), key=penalised, reverse=True)[:3]]).items()
-        for fits in parts.values()
+    ``parts``: misfits of each sensor by reading and frame of the reference, and by setting of the sensor.
+    """
+    commons = [
+        (f"reference quaternions are {reading}",) * (reading != "")
+        + (f"the reference's fixed frame is {frame}",) * (frame != "East-North-Up")
+        for reading in ("", *ATTITUDE_READINGS)
+        for frame in FRAMES
     ]
-    for chosen in itertools.product(*best):
-        changes = list(common)
-        for name, ((k, unit), _) in zip(parts, chosen, strict=True):
-            changes += [_axes_change(name, k)] if k else []
-            changes += [unit] if unit else []
-        yield _candidate(tuple(changes), dict(zip(parts, (m for _, m in chosen), strict=True)))
-    if len(parts) > 1:
-        for k in range(1, len(AXES)):
-            yield _candidate(
-                (*common, _axes_change("whole unit", k)), {name: fits[k, ""] for name, fits in parts.items()}
-            )
+    alike = range(1, len(AXES) if len(parts) > 1 else 1)
+    cells = np.indices((4,) * len(parts)).reshape(len(parts), -1)
+    number = np.add.outer([len(common) for common in commons], [0] * len(cells.T) + [1] * len(alike))
+    settings, misfit = {}, {}
+    for (name, values), cell in zip(parts.items(), cells, strict=True):
+        changed = np.array([len(one) for one in _settings(name)])
+        best = np.argsort(PENALTY * changed - _score(values, FLOORS["reference"]), axis=1, kind="stable")[:, :3]
+        best = np.insert(np.where(best, best, -1), 0, 0, axis=1)[:, cell]  # no change comes first, and once
+        number[:, : len(cell)] += changed[best]
+        whole = np.array(alike, int) * (len(changed) // len(AXES))
+        settings[name] = np.hstack([best, np.tile(whole, (len(commons), 1))])
+        misfit[name] = np.take_along_axis(values, settings[name], axis=1)
+    kept = np.flatnonzero(np.all([one >= 0 for one in settings.values()], axis=0))
+
+    def changes(k: int) -> tuple[str, ...]:
+        common, column = divmod(int(kept[k]), number.shape[1])
+        if column >= len(cells.T):
+            return (*commons[common], _axes_change("whole unit", alike[column - len(cells.T)]))
+        return sum((_settings(name)[which[common, column]] for name, which in settings.items()), commons[common])
+
+    misfit = {name: values.ravel()[kept] for name, values in misfit.items()}
+    return _Explanations(misfit, number.ravel()[kept], changes, FLOORS["reference"])
+
+
+@functools.cache
+def _settings(name: str) -> tuple[tuple[str, ...], ...]:
+    """Return the changes of each setting of a sensor: axes and, for the gyro, units."""
+    units = GYRO_UNITS if name == "gyro" else ("",)
+    return tuple(
+        (_axes_change(name, k),) * (k > 0) + (unit,) * (unit != "") for k in range(len(AXES)) for unit in units
+    )
 
 
 @functools.cache
@@ -554,57 +585,54 @@ def _axes_change(name: str, k: int) -> str:
     return f"axes of the {name} should be read as ({words}) (--axes {'' if name == 'whole unit' else f'{name}='}{option}; axes= in Python)"
 
 
-def _candidate(changes: tuple[str, ...], misfit: dict[str, float], kind: str = "reference") -> Candidate:
-    score = sum(_score(value, kind) for value in misfit.values()) - PENALTY * len(changes)
-    return Candidate(changes=changes, score=score, misfit=misfit)
-
-
 # --------------------------------------------------------------------------------------------------------------- without a reference
 
 
-def _without_reference(recording: Recording) -> Iterator[Candidate]:
-    """Yield explanations with one wrong sensor: two wrong sensors could not be distinguished from the third one being wrong.
+def _without_reference(recording: Recording, sensors: _Sensors) -> _Explanations | None:
+    """Return explanations with one wrong sensor: two wrong sensors could not be distinguished from the third one being wrong.
 
     For a proper rotation P of the gyro's axes, increments P Δθ integrate to P R Pᵀ. P therefore has the same effect on a vector's mean as
     axes Pᵀ of the vector's sensor. An improper P is a proper one of the inverted gyro, which is integrated separately.
     """
-    windows = {
-        name: found
-        for name, vectors in (
-            ("accelerometer", recording.specific_force),
-            ("magnetometer", recording.magnetic_field),
-        )
-        if (found := _windows(recording, vectors)) is not None
-    }
-    if not windows:
-        return
+    windows = _windows(recording, sensors)
+    if windows is None:
+        return None
     turns = increments(recording)
-    for unit, factor in GYRO_UNITS.items():
-        changes = (unit,) if unit else ()
-        for sign in (1.0, -1.0):
-            attitude = coning.integrate(sign * factor * turns)
-            means = {name: one.means(attitude[one.rows]) for name, one in windows.items()}
-            for k, matrix in enumerate(AXES):
-                if np.linalg.det(matrix) * sign > 0.0:
-                    axes = dict.fromkeys(means, sign * matrix.T)
-                    yield _candidate(
-                        (*([_axes_change("gyro", k)] if k else []), *changes), _fixed_misfits(means, axes), "vectors"
-                    )
-                if k and sign > 0.0 and not unit:
-                    for name in means:
-                        axes = {other: matrix if other == name else np.eye(3) for other in means}
-                        yield _candidate((_axes_change(name, k),), _fixed_misfits(means, axes), "vectors")
+    attitudes = (
+        coning.integrate(sign * factor * turns)[windows.rows] for factor in GYRO_UNITS.values() for sign in (1.0, -1.0)
+    )
+    which, axes, changes = _one_wrong(tuple(windows.counts))
+    means = {name: one[which] for name, one in windows.means(attitudes).items()}
+    number = np.array([len(one) for one in changes])
+    return _Explanations(_fixed_misfits(means, axes), number, changes.__getitem__, FLOORS["vectors"])
 
 
-def _fixed_misfits(means: dict[str, Array], axes: dict[str, Array]) -> dict[str, float]:
+@functools.cache
+def _one_wrong(names: tuple[str, ...]) -> tuple[np.ndarray, dict[str, Array], list[tuple[str, ...]]]:
+    """Return explanations with one wrong sensor: which attitude by the gyro, the axes of each vector, and the changes."""
+    found = []
+    for which, sign in enumerate((1.0, -1.0) * len(GYRO_UNITS)):
+        for k, matrix in enumerate(AXES):
+            if np.linalg.det(matrix) * sign > 0.0:
+                changes = _settings("gyro")[k * len(GYRO_UNITS) + which // 2]
+                found.append((which, [sign * matrix.T for _ in names], changes))
+            if k and which == 0:
+                for name in names:
+                    own = [matrix if other == name else AXES[0] for other in names]
+                    found.append((which, own, _settings(name)[k]))
+    attitudes, axes, words = zip(*found, strict=True)
+    return np.array(attitudes), dict(zip(names, np.stack(axes, axis=1), strict=True)), list(words)
+
+
+def _fixed_misfits(means: dict[str, Array], axes: dict[str, Array]) -> dict[str, Array]:
     """Return the relative loss of magnitude of the means, and the spread of the angle between two of them."""
     vectors = {name: _turned(mean, axes[name]) for name, mean in means.items()}
-    length = {name: np.linalg.norm(v, axis=1) for name, v in vectors.items()}
-    misfit = {f"gyro and {name}": max(0.0, 1.0 - float(np.mean(size))) for name, size in length.items()}
+    length = {name: lengths(v) for name, v in vectors.items()}
+    misfit = {f"gyro and {name}": np.maximum(0.0, 1.0 - np.mean(size, axis=-1)) for name, size in length.items()}
     if len(vectors) == 2:
         one, other = vectors
-        rows = min(len(vectors[one]), len(vectors[other]))
-        product = np.sum(vectors[one][:rows] * vectors[other][:rows], axis=1)
-        cosine = product / np.maximum(length[one][:rows] * length[other][:rows], 1e-12)
-        misfit[f"{one} and {other}"] = float(3.0 * np.var(cosine))  # two unrelated directions: 1/3
+        rows = min(length[one].shape[-1], length[other].shape[-1])
+        product = np.sum(vectors[one][..., :rows, :] * vectors[other][..., :rows, :], axis=-1)
+        cosine = product / np.maximum(length[one][..., :rows] * length[other][..., :rows], 1e-12)
+        misfit[f"{one} and {other}"] = 3.0 * np.var(cosine, axis=-1)  # two unrelated directions: 1/3
     return misfit

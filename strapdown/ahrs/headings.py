@@ -12,7 +12,7 @@ import numpy as np
 
 from strapdown import quaternion
 from strapdown.ahrs.parameters import AhrsParameters
-from strapdown.checks import Array
+from strapdown.checks import Array, lengths
 from strapdown.recordings import hard_iron
 from strapdown.recordings.hard_iron import low_pass
 from strapdown.vectors import VectorMeasurements
@@ -61,7 +61,7 @@ def measured(steps: FieldSteps, parameters: AhrsParameters, *, causal: bool) -> 
         )
         odds = np.clip((as_measured - without) / (2.0 * parameters.field_deviation**2), -50.0, 0.0)
         iron *= (2.0 / (1.0 + np.exp(-odds)))[:, None]
-        iron[np.linalg.norm(iron, axis=1) < hard_iron.NEGLIGIBLE * reference[0]] = 0.0
+        iron[lengths(iron) < hard_iron.NEGLIGIBLE * reference[0]] = 0.0
         field = field - quaternion.rotate(steps.frame, iron)
         level = _strength_and_dip(field, vertical)
         reference = level[first].mean(axis=0)
@@ -80,12 +80,12 @@ def _gathered(steps: FieldSteps, direction: Array, information: Array, heading_i
     total = np.add.reduceat(direction * information[:, None], begin, axis=0)
     information = np.add.reduceat(information, begin)
     seen = information > 0.0
-    total[seen] /= np.linalg.norm(total[seen], axis=1, keepdims=True)
+    total = total[seen] / lengths(total[seen])[:, None]
     return VectorMeasurements(
         sensor="magnetometer",
         kind="heading",
         time=time[1:][edge][seen],
-        vector_b=quaternion.rotate(quaternion.conjugate(steps.at_edge[1:][edge][seen]), total[seen]),
+        vector_b=quaternion.rotate(quaternion.conjugate(steps.at_edge[1:][edge][seen]), total),
         reference_f=NORTH,
         sigma=1.0 / np.sqrt(information[seen]),
     )
@@ -95,12 +95,12 @@ def _vertical(force: Array, interval: float) -> Array:
     """Return the vertical (k, 3) from specific force passed twice through a low-pass filter."""
     share = interval / VERTICAL_TIME
     vertical = low_pass(low_pass(_held(force, np.asarray(force.any(axis=1))), share), share)
-    return np.asarray(vertical / np.linalg.norm(vertical, axis=1, keepdims=True))
+    return np.asarray(vertical / lengths(vertical)[:, None])
 
 
 def _strength_and_dip(field: Array, vertical: Array) -> Array:
     """Return the magnitude of a field, and its angle below the horizontal, rad (k, 2)."""
-    strength = np.linalg.norm(field, axis=1)
+    strength = lengths(field)
     strength[strength == 0.0] = 1.0
     return np.column_stack(
         [strength, np.arcsin(np.clip(-np.einsum("ki,ki->k", field, vertical) / strength, -1.0, 1.0))]

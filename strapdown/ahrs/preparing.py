@@ -57,7 +57,7 @@ def prepare(
     hard iron is found only from the samples up to each step; otherwise from all samples, for the initial state too. ``turned`` (n, 4):
     attitude from the gyro only, if already computed.
     """
-    initial = starting.start(recording, quiet, parameters)  # first, because it rejects a sensor without samples
+    at_rest = starting.means_at_first(recording, quiet)  # first, because it rejects a sensor without samples
     if turned is None:
         turned = sensor_delays.gyro_attitude(recording)
     edge = edges(recording.time, parameters.step)
@@ -67,18 +67,17 @@ def prepare(
     assert recording.specific_force is not None
     force, number = averages(recording.specific_force, turned, edge)
     shown = number > 0
-    gravity = starting.norm(starting.mean_at_first(recording, recording.specific_force, quiet, "accelerometer")[0])
     vectors = [
         VectorMeasurements(
             sensor="accelerometer",
             kind="vector",
             time=time[1:][shown],
             vector_b=quaternion.rotate(quaternion.conjugate(at_edge[1:]), force)[shown],
-            reference_f=gravity * UP,
+            reference_f=starting.norm(at_rest[0]) * UP,
             sigma=parameters.specific_force_noise / np.sqrt(number[shown] * interval),
         )
     ]
-    dip, iron = None, np.zeros(3)
+    dip, irons = None, np.zeros((1, 3))
     if recording.magnetic_field is not None:
         frame = turned
         if np.any(field_delay):
@@ -97,14 +96,12 @@ def prepare(
         )
         heading, dip, irons = headings.measured(samples, parameters, causal=causal)
         vectors.append(heading)
-        iron = irons[-1]
-        if irons[0].any():
-            initial = starting.start(recording, quiet, parameters, irons[0])
     turn = quaternion.log(quaternion.multiply(quaternion.conjugate(at_edge[:-1]), at_edge[1:]))
     known = recording.temperature is not None and bool(np.isfinite(recording.temperature).all())
     temperature = recording.temperature[edge] if known and recording.temperature is not None else None
     record = ImuRecord(time=time, increments=turn, vectors=tuple(vectors), temperature=temperature)
-    return Prepared(record, initial, edge, turned, dip, iron, liveliest(force, shown, parameters.step))
+    initial = starting.start(recording, quiet, parameters, irons[0], at_rest)
+    return Prepared(record, initial, edge, turned, dip, irons[-1], liveliest(force, shown, parameters.step))
 
 
 def without_temperature(

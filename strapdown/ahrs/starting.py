@@ -73,7 +73,7 @@ def quiet_span(recording: Recording) -> slice:
             "interval; if its stamps are in ms or us, say so (--time-unit, or units={'time': 'ms'})"
         )
     blocks = len(recording.time) // length
-    axes = recording.rate[: blocks * length].T.reshape(3, blocks, length)
+    axes = recording.rate[: blocks * length].T.copy().reshape(3, blocks, length)
     mean = axes.mean(axis=2)
     varying = axes - mean[:, :, None]
     # The mean is added to the spread so that a constant rate is not mistaken for rest; half weight, because it may be bias.
@@ -83,20 +83,21 @@ def quiet_span(recording: Recording) -> slice:
 
 
 def start(
-    recording: Recording, quiet: slice, parameters: AhrsParameters, iron: Array | float = 0.0
+    recording: Recording,
+    quiet: slice,
+    parameters: AhrsParameters,
+    iron: Array | float = 0.0,
+    means: tuple[Array, float, Array | None] | None = None,
 ) -> estimation.State:
     """Return the state at the first of the quiet samples: attitude by TRIAD from the mean vertical and field, any heading without a field.
 
-    The means are formed in the frame fixed by the integrated gyro, and the acceleration remaining there is added to σ. ``iron`` (3,) is the
-    hard iron to be subtracted from the field, body axes. If ``rest_bias_sigma`` is positive, the bias is that of :func:`resting_bias`.
+    The acceleration that remains in the frame fixed by the integrated gyro is added to σ. ``iron`` (3,) is the hard iron to be subtracted
+    from the field, body axes. If ``rest_bias_sigma`` is positive, the bias is that of :func:`resting_bias`. ``means``: those of
+    :func:`means_at_first`, if already computed.
     """
-    assert recording.specific_force is not None
-    force, spread = mean_at_first(recording, recording.specific_force, quiet, "accelerometer")
-    if recording.magnetic_field is None:
-        # Without a magnetometer the heading is arbitrary: any horizontal direction will do.
-        across = np.eye(3)[np.argmin(np.abs(force))]
-    else:
-        across = mean_at_first(recording, recording.magnetic_field, quiet, "magnetometer")[0] - iron
+    force, spread, field = means_at_first(recording, quiet) if means is None else means
+    # Without a magnetometer the heading is arbitrary: any horizontal direction will do.
+    across = np.eye(3)[np.argmin(np.abs(force))] if field is None else field - iron
     bias, bias_sigma = np.zeros(3), parameters.bias_sigma
     if parameters.rest_bias_sigma > 0.0:
         bias, bias_sigma = resting_bias(recording, quiet, parameters)
@@ -108,14 +109,24 @@ def start(
     )
 
 
-def mean_at_first(recording: Recording, samples: Array, quiet: slice, sensor: str) -> tuple[Array, float]:
-    """Return the mean of the quiet samples in the body axes of the first (3,), and the norm of their standard deviation."""
+def means_at_first(recording: Recording, quiet: slice) -> tuple[Array, float, Array | None]:
+    """Return means of the quiet samples in the body axes of the first, and reject a sensor without samples there.
+
+    They are the specific force (3,), the norm of its standard deviation, and the field (3,), None without a magnetometer. The means are
+    formed in the frame fixed by the integrated gyro.
+    """
     turn = 0.5 * (recording.rate[quiet][1:] + recording.rate[quiet][:-1]) * np.diff(recording.time[quiet])[:, None]
-    own = samples[quiet]
-    known = np.isfinite(own).all(axis=1)
-    still = quaternion.rotate(coning.integrate(turn)[known], own[known])
-    mean = _mean(still, recording.source, sensor)
-    return mean, norm(still.std(axis=0))
+    turned = coning.integrate(turn)
+
+    def still(samples: Array) -> Array:
+        known = np.isfinite(samples[quiet]).all(axis=1)
+        return quaternion.rotate(turned[known], samples[quiet][known])
+
+    assert recording.specific_force is not None
+    force, field = still(recording.specific_force), recording.magnetic_field
+    mean = _mean(force, recording.source, "accelerometer")
+    across = None if field is None else _mean(still(field), recording.source, "magnetometer")
+    return mean, norm(force.std(axis=0)), across
 
 
 def resting_bias(recording: Recording, quiet: slice, parameters: AhrsParameters) -> tuple[Array, float]:

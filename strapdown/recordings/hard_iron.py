@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from strapdown import quaternion
-from strapdown.checks import Array
+from strapdown.checks import Array, lengths
 from strapdown.kernels import recording_steps
 from strapdown.kernels.machine import compiled
 
@@ -43,7 +43,7 @@ def find(field: Array, frame: Array, time: Array, known: np.ndarray, strength: f
     now, then = quaternion.conjugate(frame[lag:]), quaternion.conjugate(frame[:-lag])
     change = (field[lag:] - field[:-lag]) / strength
     # With A = R − R' and v the vector part of the quaternion of the rotation between them, AᵀA = 4 (|v|² I − v vᵀ).
-    x, y, z = quaternion.multiply(now, quaternion.conjugate(then))[:, 1:].T
+    x, y, z = quaternion.multiply(now, frame[:-lag])[:, 1:].T
     normal = 4.0 * np.stack([y * y + z * z, x * x + z * z, x * x + y * y, -x * y, -x * z, -y * z], axis=1)
     right = quaternion.rotate(now, change) - quaternion.rotate(then, change)
     # Over a gap the gyro does not measure the rotation.
@@ -55,11 +55,10 @@ def find(field: Array, frame: Array, time: Array, known: np.ndarray, strength: f
         sums = sums + _integral(np.concatenate([before, own[::-1]]), interval)[::-1]
     matrix = sums[:, [0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(-1, 3, 3)
     iron = np.linalg.solve(matrix + (CHANGE_NOISE / SIGMA) ** 2 * np.eye(3), sums[:, 6:, None])[..., 0]
-    size = np.sum(iron**2, axis=1)
-    iron *= strength * np.maximum(1.0 - FEIGNED**2 / np.maximum(size, 1e-30), 0.0)[:, None]
+    iron *= strength * np.maximum(1.0 - FEIGNED**2 / np.maximum(np.sum(iron**2, axis=1), 1e-30), 0.0)[:, None]
     if causal:
         iron = low_pass(iron, interval / RISE)
-        iron[np.linalg.norm(iron, axis=1) < NEGLIGIBLE * strength] = 0.0
+        iron[lengths(iron) < NEGLIGIBLE * strength] = 0.0
     return np.asarray(iron)
 
 

@@ -126,9 +126,8 @@ def truncation_step(rate: Array) -> float | None:
 def _quantisation(rate: Array) -> float | None:
     """Return the step of which nearly all small rates among (n, 3) are multiples, including zero; None if there is none."""
     sizes = np.abs(rate)
-    counted = np.bincount(np.rint(1e7 * sizes[sizes < SLOW_RATE]).astype(np.intp))
-    values = np.flatnonzero(counted)
-    slow, number = values / 1e7, counted[values]
+    slow, number = np.unique(np.rint(1e7 * sizes[sizes < SLOW_RATE]), return_counts=True)
+    slow /= 1e7
     frequent = slow[number >= 3]
     if len(frequent) < BINS or frequent[0] != 0.0:
         return None

@@ -159,6 +159,8 @@ class Recording(Listed):
         Recording
             The rest of the recording.
         """
+        if first == 0:
+            return self
         rows = slice(first, None)
         parts: dict[str, Any] = {n: None if getattr(self, n) is None else getattr(self, n)[rows] for n in _ROWS}
         begin = parts["time"][0]
@@ -309,8 +311,8 @@ def increments(recording: Recording) -> Array:
 
 def sampled(samples: Array) -> np.ndarray:
     """Return a mask (n,) of the rows (n, 3) of a sensor that are samples: neither NaN nor all 0."""
-    x, y, z = samples.T
-    return np.asarray(~np.isnan(x + y + z) & ((x != 0.0) | (y != 0.0) | (z != 0.0)))
+    x, y, z = np.abs(samples).T
+    return np.asarray(x + y + z > 0.0)
 
 
 def gaps(time: ArrayLike) -> list[tuple[float, float]]:
