@@ -26,7 +26,7 @@ INTERVAL = 0.01
 SPACING = {"two vectors a sample": 1, "two vectors every 10 samples": 10, "no measurements": 0}
 UP, FIELD = np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.5, -math.sqrt(0.75)])
 GYRO_SIGMA, SIGMA = 5e-3, 0.02
-WANTED = {"filter": 6.0, "vqf": 5.0}
+WANTED = {"filter": 6.0, "vqf": 3.0}
 
 
 def least_times(functions: dict[str, Callable[[], object]], seconds: float) -> dict[str, float]:

@@ -159,7 +159,7 @@ class Recording(Listed):
         Recording
             The rest of the recording.
         """
-        if first == 0:
+        if first == 0 and not len(self.missing_gyro) and not len(self.repeated):
             return self
         rows = slice(first, None)
         parts: dict[str, Any] = {n: None if getattr(self, n) is None else getattr(self, n)[rows] for n in _ROWS}
