@@ -167,6 +167,27 @@ def test_a_recording_that_does_not_turn_cannot_tell():
             assert any(words in doubt for doubt in found.doubts)
 
 
+def test_the_fastest_windows_decide_after_a_long_rest():
+    moving = broken(simulated(3, reference=False), 3)["force axes"][0]
+    rest = round(4.0 * check_conventions.SPAN * check_conventions.WINDOWS * 100.0)
+
+    def after_rest(samples: np.ndarray | None) -> np.ndarray:
+        assert samples is not None
+        return np.concatenate([np.tile(samples[0], (rest, 1)), samples])
+
+    found = check_conventions.examine(
+        Recording(
+            source="rest, then motion",
+            time=np.arange(rest + len(moving.time)) / 100.0,
+            rate=np.concatenate([np.zeros((rest, 3)), moving.rate]),
+            specific_force=after_rest(moving.specific_force),
+            magnetic_field=after_rest(moving.magnetic_field),
+        )
+    )
+    assert found.verdict == "wrong convention"
+    assert "axes of the accelerometer" in found.reason
+
+
 def test_noise_is_no_convention():
     recording = simulated(7)
     random = np.random.default_rng(0)
