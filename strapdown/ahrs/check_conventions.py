@@ -473,7 +473,8 @@ def _with_reference(recording: Recording, sensors: _Sensors) -> _Explanations | 
     true = recording.true_attitude
     assert true is not None
     size = lengths(true)
-    first, last, turn = _turns(recording, known := np.isfinite(size) & (size > 0.0))
+    known = np.isfinite(size) & (size > 0.0)
+    first, last, turn = _turns(recording, known)
     if len(first) < 10:
         return None
 
@@ -541,15 +542,18 @@ def _combined(parts: dict[str, Array]) -> _Explanations:
         for reading in ("", *ATTITUDE_READINGS)
         for frame in FRAMES
     ]
+    # A row for each reading and frame. A column for each combination of the sensors' settings: of each as declared and the three best;
+    # then one for each change of the axes of all sensors alike.
+    combinations = np.indices((4,) * len(parts)).reshape(len(parts), -1)
     alike = range(1, len(AXES) if len(parts) > 1 else 1)
-    cells = np.indices((4,) * len(parts)).reshape(len(parts), -1)
-    number = np.add.outer([len(common) for common in commons], [0] * len(cells.T) + [1] * len(alike))
+    columns = combinations.shape[1]
+    number = np.add.outer([len(common) for common in commons], [0] * columns + [1] * len(alike))
     settings, misfit = {}, {}
-    for (name, values), cell in zip(parts.items(), cells, strict=True):
+    for (name, values), choice in zip(parts.items(), combinations, strict=True):
         changed = np.array([len(one) for one in _settings(name)])
         best = np.argsort(PENALTY * changed - _score(values, FLOORS["reference"]), axis=1, kind="stable")[:, :3]
-        best = np.insert(np.where(best, best, -1), 0, 0, axis=1)[:, cell]  # no change comes first, and once
-        number[:, : len(cell)] += changed[best]
+        best = np.insert(np.where(best, best, -1), 0, 0, axis=1)[:, choice]  # as declared comes first, and once
+        number[:, :columns] += changed[best]
         whole = np.array(alike, int) * (len(changed) // len(AXES))
         settings[name] = np.hstack([best, np.tile(whole, (len(commons), 1))])
         misfit[name] = np.take_along_axis(values, settings[name], axis=1)
@@ -557,8 +561,8 @@ def _combined(parts: dict[str, Array]) -> _Explanations:
 
     def changes(k: int) -> tuple[str, ...]:
         common, column = divmod(int(kept[k]), number.shape[1])
-        if column >= len(cells.T):
-            return (*commons[common], _axes_change("whole unit", alike[column - len(cells.T)]))
+        if column >= columns:
+            return (*commons[common], _axes_change("whole unit", alike[column - columns]))
         return sum((_settings(name)[which[common, column]] for name, which in settings.items()), commons[common])
 
     misfit = {name: values.ravel()[kept] for name, values in misfit.items()}
