@@ -138,9 +138,10 @@ def _unmasked(values: Any) -> NDArray[np.generic]:
     """Return an array with NaN, or NaT, in place of masked values."""
     if not np.ma.is_masked(values):
         return np.asarray(values)
-    if values.dtype.kind in "mM":
-        return np.asarray(np.ma.filled(values, np.array("NaT", values.dtype)))
-    return np.asarray(np.ma.filled(values.astype(np.float64) if values.dtype.kind in "biu" else values, np.nan))
+    dates = values.dtype.kind in "mM"
+    result = np.array(values.data if dates or values.dtype.kind == "c" else values.data.astype(np.float64))
+    result[np.ma.getmaskarray(values)] = np.array("NaT", result.dtype) if dates else np.nan
+    return result
 
 
 def _by_axis(name: str, values: NDArray[np.generic]) -> dict[str, NDArray[np.generic]]:
