@@ -12,6 +12,7 @@ import sys
 import threading
 import time
 import tracemalloc
+import warnings
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -685,3 +686,26 @@ def test_a_tuning_without_a_unit_is_shown_in_si(known, tmp_path):
     content = tunings.report(tmp_path / "tuning.json", 0.99)[0]
     assert ">0.0123<" in content
     assert ">0.0456<" in content
+
+
+def test_a_fault_in_compiling_is_not_blamed_on_the_file(tmp_path):
+    """A reader's handler of exceptions may be around a first call of a kernel."""
+    import numba
+
+    broken = numba.njit(lambda x: x.nothing)
+    with pytest.raises(numba.TypingError), reading.from_file(tmp_path / "record.h5"):
+        broken(1.0)
+
+
+def test_a_damaged_cache_of_kernels_is_one_line_of_warning_in_the_program(known, tmp_path, run, monkeypatch):
+    from strapdown.kernels.cache import CacheWarning
+
+    (tmp_path / "walk.csv").write_bytes(known["walk.csv"].content)
+    read = recordings.read
+
+    def warned(*arguments, **options):
+        warnings.warn(CacheWarning("a kernel was damaged"), stacklevel=1)
+        return read(*arguments, **options)
+
+    monkeypatch.setattr(recordings, "read", warned)
+    assert run("integrate", "walk.csv")[::2] == (0, "warning: a kernel was damaged\n")
