@@ -17,6 +17,7 @@ import functools
 import hashlib
 import io
 import json
+import mmap
 import multiprocessing
 import os
 import re
@@ -105,6 +106,41 @@ def limit() -> int:
     if not value.isdecimal() or int(value) == 0:
         raise InputError(f"the environment variable {LIMIT} is {value!r}; it must be a whole number of megabytes")
     return int(value) * 1_000_000
+
+
+FREELY_UNPACKED = 64_000_000
+"""Number of bytes that any file may unpack to."""
+USUAL_PACKING = 100
+"""Maximum compression ratio of a larger file, unless the user sets a limit: samples of sensors have noise, which hardly compresses."""
+
+
+class Unpacked:
+    """The number of bytes that a packed file of another program may still unpack to, counted before memory is spent."""
+
+    def __init__(self, path: Name, packed: int) -> None:
+        """``packed`` is the size of the file, bytes."""
+        self.path = path
+        self.left = limit() if LIMIT in os.environ else min(limit(), max(FREELY_UNPACKED, USUAL_PACKING * packed))
+
+    def take(self, size: int) -> None:
+        """Count bytes that will be unpacked; raise an error if they are too many."""
+        if size > self.left:
+            raise InputError(
+                f"{self.path} unpacks to more than its limit, {self.left / 1e6:.4g} MB left and {size / 1e6:.4g} MB to come; if that is "
+                f"intended, set the limit with the environment variable {LIMIT}"
+            )
+        self.left -= size
+
+
+@contextlib.contextmanager
+def mapped(path: Name) -> Iterator[memoryview]:
+    """Yield the content of a regular file, of which only the parts used are brought into memory if it is large."""
+    with opened(path) as handle:
+        size = os.fstat(handle.fileno()).st_size
+        if size < FREELY_UNPACKED:
+            yield memoryview(handle.read(size))
+        else:
+            yield memoryview(mmap.mmap(handle.fileno(), 0, access=mmap.ACCESS_READ))
 
 
 def existing_file(path: Name) -> None:
