@@ -21,6 +21,7 @@ import mmap
 import multiprocessing
 import os
 import re
+import signal
 import stat
 import subprocess
 import sys
@@ -63,10 +64,17 @@ class NoDigestWarning(UserWarning):
 
 
 @contextlib.contextmanager
-def from_file(path: Name) -> Iterator[None]:
-    """Raise any exception within as an InputError that blames the file, except for a missing library or a fault in compiling."""
+def from_file(path: Name, kind: str = "") -> Iterator[None]:
+    """Raise any exception within as an InputError that blames the file, except for a missing library or a fault in compiling.
+
+    This is the guard around every reader: libraries for foreign formats raise any exception of their parsers. An interruption (Ctrl-C) that
+    a library turned into another exception remains one. ``kind`` is the format as which the file is read, for the message.
+    """
+    handled = sys.exception()
     try:
         yield
+    except (KeyboardInterrupt, SystemExit, GeneratorExit):
+        raise
     except InputError as error:
         said = _short(str(error))
         if said == str(error) and Path(path).name in said:
@@ -79,13 +87,40 @@ def from_file(path: Name) -> Iterator[None]:
             f"{path} is not read: a library that strapdown needs is missing or broken ({error}); install strapdown again with pip, which "
             "brings its libraries"
         ) from error
-    except Exception as error:
-        if _in_compiler(error):
+    except BaseException as error:  # a fault inside a library written in Rust is not a subclass of Exception
+        if _interrupted(error, handled):
+            raise KeyboardInterrupt from error
+        if _in_compiler(error) or not (isinstance(error, Exception) or type(error).__module__ == "pyo3_runtime"):
             raise
-        what = _short(f"{type(error).__name__}: {error}" if isinstance(error, LookupError) else str(error))
-        raise InputError(
-            f"{path} cannot be read ({what or type(error).__name__}); the file is truncated, damaged or of another kind"
-        ) from error
+        text = " ".join(str(error).split())
+        what = _short(f"{type(error).__name__}: {text}" if isinstance(error, LookupError) else text)
+        said = f"{path} cannot be read {f'as {kind} ' if kind else ''}({what or type(error).__name__})"
+        raise InputError(f"{said}; the file is truncated, damaged or of another kind") from error
+
+
+def _interrupted(error: BaseException | None, handled: BaseException | None) -> bool:
+    """Return whether an exception came from an interruption, unless that was ``handled`` already before the file was read."""
+    while error is not None and error is not handled:
+        if isinstance(error, KeyboardInterrupt):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
+
+
+@contextlib.contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Defer Ctrl-C to the end: interrupted within the HDF5 library, finalizers may free memory twice."""
+    if threading.current_thread() is not threading.main_thread() or not callable(signal.getsignal(signal.SIGINT)):
+        yield
+        return
+    signals: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, frame: signals.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+        if signals:
+            signal.raise_signal(signal.SIGINT)
 
 
 def _in_compiler(error: BaseException) -> bool:
@@ -191,9 +226,13 @@ def content(path: Name, *, link: bool = True, maximum: int | None = None) -> byt
     """Return the bytes of a regular file."""
     with from_file(path), opened(path, link=link, maximum=maximum) as handle:
         maximum = limit() if maximum is None else maximum
-        found = handle.read(maximum + 1)
-        _need_size(path, len(found), maximum)  # again, for a file without a stated size (/proc) or a growing one
-        return found
+        parts, size = [], 0
+        # In parts: a buffer of the size asked for is allocated at once. A file may have no stated size (/proc), or grow.
+        while part := handle.read(min(maximum + 1, max(os.fstat(handle.fileno()).st_size, 1 << 20))):
+            parts.append(part)
+            size += len(part)
+            _need_size(path, size, maximum)
+        return b"".join(parts)
 
 
 def text(path: Name, *, link: bool = True, maximum: int | None = None) -> str:
@@ -281,7 +320,7 @@ def hdf5(path: Name) -> Iterator[Any]:
             )
         if not sealed:
             _need_readable(path)
-        with h5py.File(path, "r") as file:
+        with uninterrupted(), h5py.File(path, "r") as file:
             if not sealed and str(attributes(file).get("kind", "")).startswith("strapdown "):
                 if file.userblock_size:  # which files of earlier versions do not have
                     raise InputError(f"{path} is damaged: its digest is missing; make it again, or restore a copy")

@@ -58,7 +58,11 @@ class Attitudes:
 
 def read_attitudes(path: str | os.PathLike[str], *, topic: str = "") -> Attitudes:
     """Read the attitudes of a file, or of the folder of a ROS 2 bag; ``topic`` selects one if several have attitudes."""
-    file = Path(path)
+    with reading.from_file(path):
+        return _read(Path(path), topic)
+
+
+def _read(file: Path, topic: str) -> Attitudes:
     if bag_files.is_folder(file):
         return _bag(file, topic)
     reading.existing_file(file)
@@ -146,44 +150,48 @@ _PATTERNS = {name: re.compile(pattern) for name, pattern in COLUMNS.items()}
 
 def _table(path: Path) -> Attitudes:
     """Read a table of text."""
-    with reading.from_file(path):
-        table = delimited.Table(path.name, io.StringIO(reading.text(path), newline=""))
-        found: dict[str, dict[str, tuple[int, str]]] = {name: {} for name in COLUMNS}
-        frames: set[str] = set()
-        for place, cell in enumerate(table.header):
-            for name, pattern in _PATTERNS.items():
-                match = pattern.fullmatch(cell.strip().lower())
-                if match is None:
-                    continue
-                parts = match.groupdict()
-                key = f"{parts['one']} {parts['two']}" if name == "cov" else str(parts.get("axis", ""))
-                if parts.get("frame"):
-                    frames.add(parts["frame"])
-                if key in found[name]:
-                    raise InputError(
-                        f"{path.name}: column {cell} has the same meaning as column {table.header[found[name][key][0]]}"
-                    )
-                found[name][key] = (place, parts.get("unit") or "")
-        if len(frames) > 1:
-            raise InputError(
-                f"{path.name}: its covariance is of {' and '.join(sorted(frames))} axes; name all its columns alike"
-            )
-        if set(found["q"]) != set("wxyz") or not found["time"]:
-            raise InputError(
-                f"{path.name} lacks {'time' if not found['time'] else 'the four columns of a quaternion'}; wanted time_s (or _ns), "
-                f"qw, qx, qy, qz[, cov_xx_rad2, …], and it has: {', '.join(table.header[:12])}"
-            )
-        time_place, time_unit = found["time"][""]
-        places = sorted({place for group in found.values() for place, _ in group.values()})
-        numbers = table.load(places, time_place)
-        whole = table.clock_ns(time_place)
+    table = delimited.Table(path.name, io.StringIO(reading.text(path), newline=""))
+    found: dict[str, dict[str, tuple[int, str]]] = {name: {} for name in COLUMNS}
+    frames: set[str] = set()
+    for place, cell in enumerate(table.header):
+        for name, pattern in _PATTERNS.items():
+            match = pattern.fullmatch(cell.strip().lower())
+            if match is None:
+                continue
+            parts = match.groupdict()
+            key = f"{parts['one']} {parts['two']}" if name == "cov" else str(parts.get("axis", ""))
+            if parts.get("frame"):
+                frames.add(parts["frame"])
+            if key in found[name]:
+                raise InputError(
+                    f"{path.name}: column {cell} has the same meaning as column {table.header[found[name][key][0]]}"
+                )
+            found[name][key] = (place, parts.get("unit") or "")
+    if len(frames) > 1:
+        raise InputError(
+            f"{path.name}: its covariance is of {' and '.join(sorted(frames))} axes; name all its columns alike"
+        )
+    if set(found["q"]) != set("wxyz") or not found["time"]:
+        raise InputError(
+            f"{path.name} lacks {'time' if not found['time'] else 'the four columns of a quaternion'}; wanted time_s (or _ns), "
+            f"qw, qx, qy, qz[, cov_xx_rad2, …], and it has: {', '.join(table.header[:12])}"
+        )
+    time_place, time_unit = found["time"][""]
+    places = sorted({place for group in found.values() for place, _ in group.values()})
+    numbers = table.load(places, time_place)
+    whole = table.clock_ns(time_place)
     columns = {
         name: {key: (numbers[place], unit) for key, (place, unit) in group.items()} for name, group in found.items()
     }
     if whole is not None:
         stamps = np.rint(whole[0] * 1e9).astype(np.int64) + whole[1]
     else:
-        stamps = np.rint(numbers[time_place] * _TIME[time_unit or "s"]).astype(np.int64)
+        counts = array(f"{path.name}: time", np.rint(numbers[time_place] * _TIME[time_unit or "s"]), ("m",))
+        if np.any(np.abs(counts) >= 2.0**63):
+            raise InputError(
+                f"{path.name}: a time is {numbers[time_place][np.argmax(np.abs(counts))]:g}, which no clock counts"
+            )
+        stamps = counts.astype(np.int64)
     q = np.stack([columns["q"][axis][0] for axis in "wxyz"], axis=1)
     known = np.isfinite(q).all(axis=1)
     covariance, frame, remarks = _covariance(path.name, columns, len(stamps))

@@ -108,6 +108,8 @@ class _Scan:
         self.schemas: dict[int, str] = {}
         self.number = self.lost = 0
         """Number of messages, and of those of no topic."""
+        self.checked = False
+        """Whether the chunks of an MCAP file have checksums."""
 
     @contextlib.contextmanager
     def guarded(self, place: int) -> Iterator[None]:
@@ -208,17 +210,16 @@ class _Scan:
     # ----------------------------------------------------------------------------------------------------------- MCAP
 
     def mcap(self, data: memoryview) -> None:
-        checked = finished = False
-        declared = 0
+        finished, declared = False, 0
         for place, kind, content in _mcap_records(data, len(MCAP)):
             if kind == 0x06:
                 with self.guarded(place):
-                    checked = self.mcap_chunk(content)
+                    self.mcap_chunk(content)
             elif kind == 0x0F:
                 (checksum,) = _U32.unpack_from(content)
                 if checksum and checksum != zlib.crc32(data[:place]):
                     self.fault(place, "the content does not match its checksum")
-                    if not checked:  # else each chunk was checked separately
+                    if not self.checked:  # else each chunk was checked separately
                         raise InputError(
                             f"{self.path.name} cannot be read: its content does not match its checksum, so it is damaged; restore a copy"
                         )
@@ -232,9 +233,10 @@ class _Scan:
             self.fault(len(data), "it ends without a footer")
         self.summary(len(data), declared)
 
-    def mcap_chunk(self, content: memoryview) -> bool:
-        """Read a chunk; return whether it has a checksum. One that does not match it is left out."""
+    def mcap_chunk(self, content: memoryview) -> None:
+        """Read a chunk; one that does not match its checksum is left out."""
         _, _, size, checksum = _CHUNK.unpack_from(content)
+        self.checked = bool(checksum)
         compression, at = _mcap_text(content, _CHUNK.size)
         (held,) = _U64.unpack_from(content, at)
         records = self.unpack(compression, content[at + 8 : at + 8 + held], size)
@@ -242,7 +244,6 @@ class _Scan:
             raise ValueError("a chunk does not match its checksum and is left out")
         for _, kind, part in _mcap_records(records, 0):
             self.mcap_record(kind, part)
-        return bool(checksum)
 
     def mcap_record(self, kind: int, content: memoryview) -> None:
         if kind == 0x05:
@@ -283,11 +284,12 @@ class _Scan:
         work = iter(range(100 + size // 1000))
         database.set_progress_handler(lambda: next(work, None) is None, 100_000)  # an endless query is interrupted
         database.text_factory = lambda text: text.decode(errors="replace")
+        database.set_authorizer(_only_reads)
+        database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, size)  # of a value, which a generated column may make up
         kinds = dict(database.execute("SELECT name, sql FROM sqlite_master WHERE type = 'table'"))
         for name in ("topics", "messages"):
             if not str(kinds.get(name, "")).upper().startswith("CREATE TABLE"):
                 raise ValueError(f"it has no table {name}, so it is no bag")
-        database.set_authorizer(_only_reads)
         if "message_definitions" in kinds:
             columns = "topic_type, encoding, encoded_message_definition"
             for name, encoding, text in database.execute(f"SELECT {columns} FROM message_definitions"):
@@ -368,3 +370,26 @@ def _mcap_records(data: memoryview, place: int) -> Iterator[tuple[int, int, memo
 def _mcap_text(data: memoryview, place: int) -> tuple[str, int]:
     (size,) = _U32.unpack_from(data, place)
     return bytes(data[place + 4 : place + 4 + size]).decode(), place + 4 + size
+
+
+# ------------------------------------------------------------------------------------------------------------ checksums
+
+
+def write_checksums(path: Path) -> None:
+    """Write the checksums of an MCAP file of uncompressed chunks, which the library leaves at zero: of chunks, data and summary."""
+    with open(path, "r+b") as file:
+        content = bytearray(file.read())
+        view = memoryview(content)
+        summary = len(content)
+        for place, kind, record in _mcap_records(view, len(MCAP)):
+            at = place + _RECORD.size
+            if kind == 0x06:
+                inner = _mcap_text(record, _CHUNK.size)[1] + 8
+                _U32.pack_into(content, at + 24, zlib.crc32(record[inner:]))
+            elif kind == 0x0F:
+                _U32.pack_into(content, at, zlib.crc32(view[:place]))
+                summary = at + len(record)
+            elif kind == 0x02:
+                _U32.pack_into(content, at + 16, zlib.crc32(view[summary : at + 16]))
+        file.seek(0)
+        file.write(content)

@@ -237,7 +237,8 @@ def read(
     options: dict[str, Any] = {name: value for name, value in given.items() if name in found.options}
     if "gyro_alone" in found.options:
         options["gyro_alone"] = gyro_alone
-    recording: Recording = _function(found.read)(file, **options)
+    with reading.from_file(file, found.name):
+        recording: Recording = _function(found.read)(file, **options)
     return with_axes(recording, axes, invert) if axes or invert else recording
 
 

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from strapdown import quaternion
 from strapdown.checks import Array, InputError, one_of
 from strapdown.files.extras import library
-from strapdown.recordings.bag_files import Add, Bag, Data
+from strapdown.recordings.bag_files import Add, Bag, Data, write_checksums
 from strapdown.records import Estimate
 from strapdown.records.recording import Recording, at_nearest, field_in, relative_time, with_gyro
 
@@ -385,6 +385,8 @@ def _write(target: Path, series: list[_Series], others: Sequence[Topic] = (), ba
             for stamp, connection, data in queue:
                 writer.write(connection, stamp, data)
         made = place if not ros2 else next(one for one in place.iterdir() if one.suffix == target.suffix.lower())
+        if made.suffix == ".mcap":
+            write_checksums(made)
         if target.is_dir():
             raise InputError(f"{target} is a folder; choose another name")
         shutil.move(made, target)
