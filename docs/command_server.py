@@ -52,9 +52,13 @@ def _warm() -> None:
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
         for words in ("simulate two-stars", "estimate two-stars.h5 --figures", "check estimate-results/estimate.h5"):
             sys.argv = ["strapdown", *words.split()]
-            with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
-                with contextlib.suppress(SystemExit):
-                    cli.main()
+            nowhere = io.StringIO()
+            with (
+                contextlib.redirect_stdout(nowhere),
+                contextlib.redirect_stderr(nowhere),
+                contextlib.suppress(SystemExit),
+            ):
+                cli.main()
 
 
 def _serve(address: str) -> None:
@@ -82,7 +86,7 @@ def _answer(call: socket.socket) -> None:
     if child == 0:
         for number, stream in enumerate(streams):
             os.dup2(stream, number)
-        sys.stdout, sys.stderr = (open(number, "w", encoding="utf-8", closefd=False) for number in (1, 2))
+        sys.stdout, sys.stderr = (io.TextIOWrapper(io.FileIO(number, "w", closefd=False)) for number in (1, 2))
         request = json.loads(words)
         os.chdir(request["folder"])
         os.environ.clear()

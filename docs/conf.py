@@ -132,9 +132,9 @@ def _spaced(markup: str) -> str:
 
 def _plain_marks(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
     """Let docstrings be read as they are meant: |q| is an absolute value and no substitution, a literal may touch a sign, as in ``x``²."""
+    role = re.compile(r":(?:func|class|meth|mod|data|attr|exc):`~?([\w.]+)`")
     for k, line in enumerate(lines):
-        line = re.sub(r":(?:func|class|meth|mod|data|attr|exc):`~?([\w.]+)`", functools.partial(_linked, name), line)
-        parts = re.split(r"(``.+?``)", line)
+        parts = re.split(r"(``.+?``)", role.sub(functools.partial(_linked, name), line))
         for i in range(0, len(parts), 2):  # the texts between literals
             parts[i] = parts[i].replace("|", r"\|")
             if i and re.match(r"[^\s.,;:!?'\")\]}>/-]", parts[i]):
