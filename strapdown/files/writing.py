@@ -111,9 +111,8 @@ def locked(path: str | os.PathLike[str]) -> Iterator[None]:
 
 def _own_file(lock: Path) -> TextIO:
     """Open a lock file, which is created if necessary; a link or a pipe that another user may have put there is rejected."""
-    flags = os.O_RDWR | os.O_CREAT | os.O_NONBLOCK | os.O_NOFOLLOW
     try:
-        handle = os.open(lock, flags, 0o666)
+        handle = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK | os.O_NOFOLLOW, 0o666)
     except OSError as error:
         if error.errno == errno.ELOOP:
             raise InputError(f"{lock} is a link, which is not followed; remove it") from None
