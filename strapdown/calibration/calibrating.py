@@ -10,7 +10,7 @@ import numpy as np
 from strapdown.calibration import fitting
 from strapdown.calibration.fitting import Fit, Prior, Problem, Unknowns
 from strapdown.calibration.intervals import Intervals, gathered, predicted
-from strapdown.calibration.unit import AXES, SCALE, WORDS, SensorErrors, UnitCalibration
+from strapdown.calibration.unit import SensorErrors, UnitCalibration, printed
 from strapdown.checks import Array, InputError, instance, positive
 from strapdown.recordings import Recording
 from strapdown.units import DEGREE, STANDARD_GRAVITY
@@ -28,7 +28,7 @@ DIP_SIGMA = 1.0
 AVERAGED = 2.0
 """Duration before and after a node over which vertical and field are averaged for its initial attitude, s."""
 MOVED_RATE = 0.1
-"""Spread of the rate, rad/s, above which no second of a part is taken for a rest."""
+"""Spread of the rate, rad/s, above which no second of a part is treated as a rest."""
 WANTED = {
     "gyro_bias": 0.05 * DEGREE,
     "gyro_matrix": 2e-3,
@@ -46,7 +46,6 @@ def calibrate(
     recordings: Recording | Sequence[Recording],
     *,
     gravity: float = STANDARD_GRAVITY,
-    advance: Callable[[int], None] = lambda _: None,
 ) -> UnitCalibration:
     """Estimate the errors of a unit's sensors, each with its σ, from recordings of motion by hand.
 
@@ -60,8 +59,6 @@ def calibrate(
         Recordings of one unit, each with an accelerometer. The magnetometer is calibrated if all have one.
     gravity : float, default 9.80665
         Gravity at the place, m/s².
-    advance : callable, optional
-        Called with the number of each step.
 
     Returns
     -------
@@ -92,17 +89,21 @@ def calibrate(
         instance("recordings", one, Recording, "give recordings, as read returns them")
     units = {one.magnetic_unit for one in used}
     if len(units) > 1:
-        raise InputError(f"the units of the recordings' fields are {', '.join(map(repr, units))}; declare one unit for all")
+        raise InputError(
+            f"the units of the recordings' fields are {', '.join(map(repr, units))}; declare one unit for all"
+        )
     intervals = gathered(used)
     if len(intervals.node) < 4 * 10:
-        raise InputError(f"the recordings last {np.sum(intervals.length):.3g} s; a calibration needs at least 10 s, better a minute")
+        raise InputError(
+            f"the recordings last {np.sum(intervals.length):.3g} s; a calibration needs at least 10 s, better a minute"
+        )
     bias = _resting_bias(intervals)
     strength, intervals, prior = _priors(intervals, bias)
     attitude = _initial_attitude(intervals, prior.mean, bias)
     nodes = np.zeros((len(intervals.time), 12 if intervals.field is not None else 9))
     nodes[:, fitting.GYRO_BIAS - 3 : fitting.GYRO_BIAS] = bias
     problem = Problem(intervals, prior, positive("gravity", gravity, unit="m/s²"))
-    fit = fitting.solve(problem, Unknowns(prior.mean.copy(), attitude, nodes), advance)
+    fit = fitting.solve(problem, Unknowns(prior.mean.copy(), attitude, nodes))
     return _result(fit, prior, strength, used)
 
 
@@ -144,7 +145,9 @@ def _priors(intervals: Intervals, bias: Array) -> tuple[float, Intervals, Prior]
     assert p.field is not None
     value, by_iron = np.einsum("kij,kj->ki", frame, p.field.value), frame @ p.field.by_own[:, :, :3]
     lag = round(1.0 / float(np.median(intervals.length)))
-    pair = (intervals.node[lag:] - intervals.node[:-lag] == lag) & (intervals.field.number[lag:] * intervals.field.number[:-lag] > 0.0)
+    pair = (intervals.node[lag:] - intervals.node[:-lag] == lag) & (
+        intervals.field.number[lag:] * intervals.field.number[:-lag] > 0.0
+    )
     A, b = ((x[lag:] - x[:-lag])[pair] for x in (by_iron, value))
     A, b = A.reshape(-1, 3), -b.ravel()
     iron = np.linalg.solve(A.T @ A + 0.03 * np.eye(3), A.T @ b)
@@ -207,9 +210,18 @@ def _sensor_errors(x: Array, bias: Array, strength: float, matrix: Callable[[Arr
 
 def _result(fit: Fit, prior: Prior, strength: float, recordings: Sequence[Recording]) -> UnitCalibration:
     """Return the calibration of a fit, with its remarks."""
-    sigma = np.sqrt(np.diag(fit.covariance))
+    x, covariance = fit.unknowns.errors.copy(), fit.covariance.copy()
+    if len(x) > fitting.IRON.start:
+        # The strength of the field is unknown, so the mean scale factor of the magnetometer is set to 1.
+        A = np.eye(3).ravel() + x[fitting.FIELD]
+        mean = (A[0] + A[4] + A[8]) / 3.0
+        x[fitting.FIELD] = A / mean - np.eye(3).ravel()
+        J = np.eye(len(covariance))
+        J[fitting.FIELD, fitting.FIELD] = (np.eye(9) - np.outer(A / mean, np.eye(3).ravel()) / 3.0) / mean
+        covariance = J @ covariance @ J.T
+    sigma = np.sqrt(np.diag(covariance))
     symmetric: Callable[[Array], Array] = lambda entries: fitting.SYMMETRIC @ entries  # noqa: E731
-    values = _sensor_errors(fit.unknowns.errors, fit.unknowns.bias[-1], strength, symmetric)
+    values = _sensor_errors(x, fit.unknowns.bias[-1], strength, symmetric)
     found = UnitCalibration(
         **vars(values),
         sigma=_sensor_errors(sigma[:-3], sigma[-3:], strength, symmetric),
@@ -220,16 +232,21 @@ def _result(fit: Fit, prior: Prior, strength: float, recordings: Sequence[Record
 
 
 def missing(calibration: UnitCalibration, strength: float = 1.0) -> tuple[str, ...]:
-    """Return the motion that is missing for the errors whose σ exceeds :data:`WANTED`; ``strength`` is that of the field."""
-    lacking: dict[str, list[str]] = {}
+    """Return the motion that is missing for errors whose σ exceeds :data:`WANTED`, each with the worst of them.
+
+    ``strength`` is that of the field, in the unit of the hard iron.
+    """
+    lacking: dict[str, tuple[float, str]] = {}
     for name, axes, sigma in calibration.sigma.entries():
         wanted = WANTED[name] * (strength if name == "hard_iron" else 1.0)
-        if sigma > wanted:
-            words, unit = WORDS[name]
-            factor = SCALE.get(unit, 1.0)
-            own = f"{words} {axes}".strip() + f": σ {sigma / factor:.2g} {unit}, good: {wanted / factor:.2g}"
-            lacking.setdefault(_motion(name, axes), []).append(own)
-    return tuple(f"{motion} ({'; '.join(errors)})." for motion, errors in lacking.items())
+        motion = _motion(name, axes)
+        if sigma > wanted and sigma / wanted > lacking.get(motion, (0.0, ""))[0]:
+            words, unit, factor = printed(name, axes, calibration.magnetic_unit)
+            lacking[motion] = (
+                sigma / wanted,
+                f"σ of {words} is {sigma / factor:.2g} {unit}, good is {wanted / factor:.2g}",
+            )
+    return tuple(f"{motion}: {worst}." for motion, (_, worst) in lacking.items())
 
 
 def _motion(name: str, axes: str) -> str:
@@ -239,11 +256,5 @@ def _motion(name: str, axes: str) -> str:
     if name == "gyro_matrix":
         return f"Turn about {axes[-1]} by half a turn or more, back and forth, with a rest before and after"
     if name in ("accelerometer_bias", "accelerometer_matrix"):
-        return (
-            f"Rest with {axes} up and with {axes} down"
-            if len(axes) == 1
-            else f"Rest with the bisector of {' and '.join(axes)} up, and down"
-        )
-    if name.endswith("delay"):
-        return "Turn faster"
-    return f"Turn so that {' and '.join(axes)} point along the field and against it, away from iron"
+        return f"Rest with {axes} up and with {axes} down" if len(axes) == 1 else "Rest on edges and corners too"
+    return "Turn faster" if name.endswith("delay") else "Turn into all attitudes, away from iron"

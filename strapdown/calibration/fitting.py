@@ -15,7 +15,7 @@ equation are estimated by restricted maximum likelihood. Rows of the normal equa
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -28,11 +28,11 @@ from strapdown.calibration.intervals import Errors, Intervals, predicted, right_
 from strapdown.checks import Array
 from strapdown.units import DEGREE
 
-VELOCITY_TIME = 0.5
+VELOCITY_TIME = 0.3
 """Correlation time of the velocity, s."""
 REACTION_TIME = 0.3
 """σ of the velocity over that of the acceleration, s, before its factor is estimated."""
-REST_VELOCITY = 2e-3
+REST_VELOCITY = 5e-4
 """σ of the velocity at rest, m/s, added to the former."""
 LEVER_SIGMA = 0.3
 """σ of the lever arm, each component, m."""
@@ -70,8 +70,8 @@ GYRO, BIAS, FORCE, FORCE_DELAY, IRON, FIELD, FIELD_DELAY, DIP = (
     slice(31, 32),
     slice(32, 33),
 )
-"""Places of the sensor errors in the vector of unknowns: gyro matrix; accelerometer bias, matrix, delay; hard iron, magnetometer matrix, delay;
-dip of the field."""
+"""Places of the sensor errors in the vector of unknowns: gyro matrix; accelerometer bias, matrix, delay; hard iron, magnetometer matrix,
+delay; dip of the field."""
 ATTITUDE, VELOCITY, LEVER, GYRO_BIAS, DISTURBANCE = (3 * k for k in range(5))
 """Places of the unknowns of a node."""
 
@@ -138,7 +138,9 @@ class _Equations:
     kinds: dict[str, slice] = field(default_factory=dict)
     rows: int = 0
 
-    def add(self, kind: str, residual: Array, sigma: Array | float, *parts: tuple[np.ndarray | int, Array]) -> None:
+    def add(
+        self, kind: str, residual: Array, sigma: Array | float, *parts: tuple[np.ndarray | int, np.ndarray]
+    ) -> None:
         """Add residuals (k, m) with their σ (k,), and their derivatives (k, m, c) by the unknowns from a place (k,) on."""
         count, size = residual.shape
         weight = np.broadcast_to(1.0 / np.asarray(sigma, np.float64), (count,))
@@ -161,7 +163,10 @@ class _Equations:
     @property
     def jacobian(self) -> scipy.sparse.csr_matrix:
         row, column, value = (np.concatenate(each) for each in zip(*self.triplets, strict=True))
-        return scipy.sparse.csr_matrix((value, (row, column)), shape=(self.rows, self.columns))
+        result: scipy.sparse.csr_matrix = scipy.sparse.csr_matrix(
+            (value, (row, column)), shape=(self.rows, self.columns)
+        )
+        return result
 
 
 class Problem:
@@ -173,9 +178,8 @@ class Problem:
         nodes = len(intervals.time)
         self.errors_at = self.size * nodes
         self.activity = np.full(nodes, 1.0)
-        force_noise = max(FORCE_FLOOR, intervals.force.noise * np.sqrt(np.median(intervals.length / intervals.force.number.clip(1))))
-        self.floor = {"rotation": intervals.gyro_noise, "bias": 1e-6, "force": force_noise, "velocity": 0.02}
-        self.noise = {"rotation": 10.0 * intervals.gyro_noise, "bias": 2e-4, "force": 5.0 * force_noise, "velocity": 1.0}
+        self.floor = {"rotation": intervals.gyro_noise, "bias": 1e-6, "force": FORCE_FLOOR, "velocity": 0.02}
+        self.noise = {"rotation": 10.0 * intervals.gyro_noise, "bias": 2e-4, "force": 0.05, "velocity": 1.0}
         if intervals.field is not None:
             self.floor |= {"field": intervals.field.noise, "disturbance": 1e-4}
             self.noise |= {"field": max(0.02, intervals.field.noise), "disturbance": 0.02}
@@ -184,7 +188,8 @@ class Problem:
         """Set σ of the velocity at the nodes from the RMS acceleration over the second around each."""
         mean = predicted(self.intervals, unpacked(x.errors), self._bias(x)).force.value
         acceleration = np.einsum("kij,kj->ki", x.attitude[self.intervals.node], mean) - self.gravity * np.eye(3)[2]
-        square = np.mean(acceleration**2, axis=1)
+        noise = self.noise["force"] ** 2 / self.intervals.length
+        square = np.maximum(np.mean(acceleration**2, axis=1) - noise, 0.0)
         width = 1 + 2 * round(1.0 / float(np.median(self.intervals.length)))
         square = np.convolve(np.pad(square, width // 2, mode="edge"), np.full(width, 1.0 / width), mode="valid")
         activity = np.full(len(self.activity), np.nan)
@@ -194,7 +199,7 @@ class Problem:
 
     def _bias(self, x: Unknowns) -> Array:
         node = self.intervals.node
-        return 0.5 * (x.bias[node] + x.bias[node + 1])
+        return np.asarray(0.5 * (x.bias[node] + x.bias[node + 1]))
 
     def equations(self, x: Unknowns) -> _Equations:
         """Return the equations linearised at some unknowns."""
@@ -218,7 +223,9 @@ class Problem:
         self._process(found, x, "bias", GYRO_BIAS, np.inf, BIAS_SIGMA, noise["bias"] * np.sqrt(length))
         self._process(found, x, "lever", LEVER, np.inf, LEVER_SIGMA, LEVER_WALK * np.sqrt(length))
         velocity = noise["velocity"] * self.activity
-        self._process(found, x, "velocity", VELOCITY, VELOCITY_TIME, velocity, np.sqrt(velocity[node] * velocity[node + 1]))
+        self._process(
+            found, x, "velocity", VELOCITY, VELOCITY_TIME, velocity, np.sqrt(velocity[node] * velocity[node + 1])
+        )
 
         rate = (iv.node_rate - x.bias) @ np.linalg.inv(unit + errors.gyro_matrix).T
         u, r = x.nodes[:, VELOCITY - 3 : VELOCITY], x.nodes[:, LEVER - 3 : LEVER]
@@ -259,7 +266,9 @@ class Problem:
         )  # fmt: skip
         return found
 
-    def _by_errors(self, by_turn: Array, by_own: Array, here: np.ndarray, there: np.ndarray, place: int) -> Sequence[tuple[np.ndarray | int, Array]]:
+    def _by_errors(
+        self, by_turn: Array, by_own: Array, here: np.ndarray, there: np.ndarray, place: int
+    ) -> Sequence[tuple[np.ndarray | int, np.ndarray]]:
         """Return the derivatives of a mean (k, 3) by gyro bias and matrix, and by the errors of its own sensor from ``place`` on."""
         half = 0.5 * by_turn[:, :, :3]
         return (
@@ -269,20 +278,29 @@ class Problem:
             (self.errors_at + place, by_own),
         )
 
-    def _process(self, found: _Equations, x: Unknowns, kind: str, place: int, time: float, first: Array | float, sigma: Array | float) -> None:
+    def _process(
+        self,
+        found: _Equations,
+        x: Unknowns,
+        kind: str,
+        place: int,
+        time: float,
+        first: Array | float,
+        sigma: Array | float,
+    ) -> None:
         """Add a random walk of σ an interval, or for a finite correlation time a Gauss–Markov process of σ; ``first`` is σ at the start."""
         node, values = self.intervals.node, x.nodes[:, place - 3 : place]
         decay = np.exp(-self.intervals.length / time)
         drive = np.sqrt(1.0 - decay**2) if np.isfinite(time) else 1.0
         begin = self.intervals.first
-        first = first if np.isscalar(first) else np.asarray(first)[begin]
         found.add(
             kind, values[node + 1] - decay[:, None] * values[node], sigma * drive,
             (self.size * (node + 1) + place, np.eye(3)), (self.size * node + place, -decay[:, None, None] * np.eye(3)),
         )  # fmt: skip
+        kind = kind if kind != "bias" else "start"  # the factor of the random walk's noise is not that of its start
         found.add(
-            kind if kind != "bias" else "start", values[begin], first, (self.size * begin + place, np.eye(3))
-        )  # fmt: skip
+            kind, values[begin], np.broadcast_to(first, len(values))[begin], (self.size * begin + place, np.eye(3))
+        )
 
 
 def _factor(matrix: scipy.sparse.csc_matrix) -> SuperLU:
@@ -290,17 +308,17 @@ def _factor(matrix: scipy.sparse.csc_matrix) -> SuperLU:
     return splu(matrix, permc_spec="NATURAL", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
 
 
-def solve(problem: Problem, x: Unknowns, advance: Callable[[int], None] = lambda _: None) -> Fit:
+def solve(problem: Problem, x: Unknowns) -> Fit:
     """Return the least squares from initial unknowns, with the noise estimated from the residuals.
 
-    A motion that swings with one period is no broadband noise: over a swing, its acceleration and the field along its path may depend on the
-    attitude as a scale factor does. Therefore the noise of velocity and disturbance is finally increased to the level at the frequencies
-    where they are (:func:`_coherence`).
+    A motion that swings with one period is no broadband noise: over a swing, its acceleration and the field along its path may depend on
+    the attitude as a scale factor does. Therefore the noise of velocity and disturbance is finally increased to the level at the
+    frequencies where they are (:func:`_coherence`).
     """
     # The heading of each part is arbitrary without a magnetometer.
     weak = np.zeros(problem.errors_at + len(x.errors))
     weak[(problem.size * problem.intervals.first[:, None] + np.arange(3)).ravel()] = 1e-2
-    x = _iterated(problem, x, weak, advance, noise=True)
+    x = _iterated(problem, x, weak, noise=True)
     noise = problem.noise
     factors = {"velocity": _coherence(problem, x, VELOCITY, VELOCITY_TIME, noise["velocity"] * problem.activity)}
     if "disturbance" in noise:
@@ -308,7 +326,7 @@ def solve(problem: Problem, x: Unknowns, advance: Callable[[int], None] = lambda
         factors["disturbance"] = _coherence(problem, x, DISTURBANCE, DISTURBANCE_TIME, sigma)
     for kind, factor in factors.items():
         noise[kind] *= max(1.0, factor) ** 0.5
-    x = _iterated(problem, x, weak, advance, noise=False)
+    x = _iterated(problem, x, weak, noise=False)
     found = problem.equations(x)
     factor = _factor((found.jacobian.T @ found.jacobian).tocsc() + scipy.sparse.diags(weak, format="csc"))
     bias = problem.size * (len(x.nodes) - 1) + GYRO_BIAS + np.arange(3)
@@ -318,7 +336,7 @@ def solve(problem: Problem, x: Unknowns, advance: Callable[[int], None] = lambda
     return Fit(x, factor.solve(unit)[wanted], noise)
 
 
-def _iterated(problem: Problem, x: Unknowns, weak: Array, advance: Callable[[int], None], *, noise: bool) -> Unknowns:
+def _iterated(problem: Problem, x: Unknowns, weak: Array, *, noise: bool) -> Unknowns:
     """Return the unknowns after damped Gauss–Newton steps, between which the noise is estimated; ``weak``: added to the diagonal."""
     random = np.random.default_rng(0)
     prior = scipy.sparse.diags(weak, format="csc")
@@ -334,7 +352,6 @@ def _iterated(problem: Problem, x: Unknowns, weak: Array, advance: Callable[[int
             J = found.jacobian
         r = found.residual
         x, damping, gain = _descended(problem, x, (J.T @ J).tocsc() + prior, J.T @ r, float(r @ r), damping)
-        advance(step)
         if (not noise or step > 2 * FREE_STEPS) and changed < SETTLED and gain < 1e-4:
             break
     return x
@@ -363,7 +380,9 @@ def _coherence(problem: Problem, x: Unknowns, place: int, time: float, sigma: Ar
     return products / power / (4.0 / 3.0) if power > 0.0 else 1.0
 
 
-def _descended(problem: Problem, x: Unknowns, normal: scipy.sparse.csc_matrix, gradient: Array, cost: float, damping: float) -> tuple[Unknowns, float, float]:
+def _descended(
+    problem: Problem, x: Unknowns, normal: scipy.sparse.csc_matrix, gradient: Array, cost: float, damping: float
+) -> tuple[Unknowns, float, float]:
     """Return the unknowns after a step that reduces the cost, the next damping, and the relative reduction."""
     scale = scipy.sparse.diags(normal.diagonal(), format="csc")
     while damping < 1e8:
@@ -375,7 +394,9 @@ def _descended(problem: Problem, x: Unknowns, normal: scipy.sparse.csc_matrix, g
     return x, 1e-3, 0.0
 
 
-def _estimate_noise(problem: Problem, found: _Equations, J: scipy.sparse.csr_matrix, factor: SuperLU, random: np.random.Generator) -> float:
+def _estimate_noise(
+    problem: Problem, found: _Equations, J: scipy.sparse.csr_matrix, factor: SuperLU, random: np.random.Generator
+) -> float:
     """Scale the noise of each kind of equation to its residuals; return the largest relative change.
 
     The expected square sum of m residuals is m less the trace of their part of J (JᵀJ)⁻¹ Jᵀ, which is estimated with random signs.

@@ -185,7 +185,7 @@ class Prediction(NamedTuple):
 def predicted(intervals: Intervals, errors: Errors, bias: Array) -> Prediction:
     """Return rotations and means with the errors removed; ``bias`` (k, 3) is that of the gyro in each interval, rad/s."""
     count, width = intervals.step.shape
-    inverse = np.linalg.inv(np.eye(3) + errors.gyro_matrix)
+    inverse: Array = np.linalg.inv(np.eye(3) + errors.gyro_matrix).astype(np.float64)
     turn, by = np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3, 12))
     sums = [_Sum(intervals.force, errors.accelerometer_bias, errors.accelerometer_matrix, errors.accelerometer_delay)]
     if intervals.field is not None:
@@ -193,20 +193,20 @@ def predicted(intervals: Intervals, errors: Errors, bias: Array) -> Prediction:
     for j in range(width):
         step = intervals.step[:, j, None]
         angle = (intervals.angle[:, j] - bias * step) @ inverse.T
-        change = np.concatenate(
-            [
-                -step[:, :, None] * inverse,
-                -np.einsum("ia,kb->kiab", inverse, angle).reshape(count, 3, 9),
-            ],
-            axis=2,
-        )
+        change = _by_gyro(inverse, angle, step)
         small = Rotation.from_rotvec(angle).as_matrix()
         by = np.swapaxes(small, 1, 2) @ by + right_jacobian(angle) @ change
         turn = turn @ small
         rate = (intervals.rate[:, j] - bias) @ inverse.T
         for one in sums:
-            one.add(j, turn, by, rate)
+            one.add(j, turn, by, rate, _by_gyro(inverse, rate, np.ones((count, 1))))
     return Prediction(turn, by, sums[0].mean, sums[1].mean if len(sums) == 2 else None)
+
+
+def _by_gyro(inverse: Array, turned: Array, length: Array) -> Array:
+    """Return the derivative (k, 3, 12) of corrected rotations over a time (k, 1), ``turned`` (k, 3), by gyro bias and matrix."""
+    matrix = inverse[None, :, :, None] * turned[:, None, None, :]
+    return -np.concatenate([length[:, :, None] * inverse, matrix.reshape(-1, 3, 9)], axis=2)
 
 
 class _Sum:
@@ -218,20 +218,23 @@ class _Sum:
         count = len(sensor.samples)
         self.value, self.by_turn, self.by_own = (np.zeros((count, 3, *more)) for more in ((), (12,), (13,)))
 
-    def add(self, j: int, turn: Array, by: Array, rate: Array) -> None:
-        """Add sample ``j`` of every interval: ``turn`` (k, 3, 3) since the start, its derivative, and the rate there."""
+    def add(self, j: int, turn: Array, by: Array, rate: Array, rate_by: Array) -> None:
+        """Add sample ``j`` of every interval: rotation to it (k, 3, 3), rate there, and their derivatives by the errors of the gyro."""
         known = self.sensor.known[:, j, None]
         sample = known * ((self.sensor.samples[:, j] - self.bias) @ self.inverse.T)
         # A sample that is late by τ was taken when the unit had turned by less: C(t − τ) = C(t) exp(−w τ).
         late = Rotation.from_rotvec(-self.delay * rate).as_matrix()
         to_start = turn @ late
-        there = np.einsum("kij,kj->ki", late, sample)
         linear = known[:, :, None] * (to_start @ self.inverse)
-        self.value += np.einsum("kij,kj->ki", turn, there)
-        self.by_turn -= turn @ skew(there) @ by
+        self.value += np.einsum("kij,kj->ki", to_start, sample)
+        self.by_turn -= (
+            to_start
+            @ skew(sample)
+            @ (np.swapaxes(late, 1, 2) @ by - self.delay * right_jacobian(-self.delay * rate) @ rate_by)
+        )
         self.by_own[:, :, :3] -= linear
         self.by_own[:, :, 3:12] -= (linear[:, :, :, None] * sample[:, None, None, :]).reshape(-1, 3, 9)
-        self.by_own[:, :, 12] -= np.einsum("kij,kj->ki", turn, np.cross(rate, there))
+        self.by_own[:, :, 12] -= np.einsum("kij,kj->ki", to_start, np.cross(rate, sample))
 
     @property
     def mean(self) -> Mean:

@@ -100,6 +100,11 @@ class SensorErrors:
         """Yield field, component (``x``, ``xy``, …; empty for a number) and value of each error, in the order of the fields.
 
         Of the accelerometer's symmetric matrix each entry appears once.
+
+        Yields
+        ------
+        tuple of (str, str, float)
+            Name, component and value in SI.
         """
         for name in FORM:
             value = np.atleast_1d(getattr(self, name))
@@ -110,12 +115,26 @@ class SensorErrors:
                 yield name, axes, float(value[index])
 
 
+def printed(name: str, axes: str, magnetic_unit: str) -> tuple[str, str, float]:
+    """Return the words for an entry of a field of :class:`SensorErrors`, its printed unit, and this unit in SI."""
+    words, unit = WORDS[name]
+    if name.endswith("matrix"):
+        off = "soft iron" if name == "magnetometer_matrix" else "misalignment"
+        words = f"{words} {'scale' if len(axes) == 1 else off}"
+    unit = magnetic_unit or unit if name == "hard_iron" else unit
+    return f"{words} {axes}".strip(), unit, SCALE.get(unit, 1.0)
+
+
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class UnitCalibration(SensorErrors, Listed):
     """Calibration of one unit, from :func:`strapdown.calibrate` or a file of it.
 
     Parameters
     ----------
+    gyro_bias, gyro_matrix, accelerometer_bias, accelerometer_matrix, hard_iron, magnetometer_matrix : ndarray, default zeros
+        As for :class:`SensorErrors`.
+    accelerometer_delay, magnetometer_delay : float, default 0.0
+        As for :class:`SensorErrors`. The estimate corrects for that of the magnetometer.
     sigma : SensorErrors, optional
         Standard deviation of each error; 0: the error was not estimated.
     magnetic_unit : str, default ""
@@ -182,14 +201,8 @@ class UnitCalibration(SensorErrors, Listed):
         for (name, axes, value), (_, _, sigma) in zip(self.entries(), self.sigma.entries(), strict=True):
             if sigma == 0.0:
                 continue
-            words, unit = WORDS[name]
-            if name.endswith("matrix"):
-                kind = "scale" if len(axes) == 1 else "misalignment"
-                kind = "soft iron" if kind == "misalignment" and name == "magnetometer_matrix" else kind
-                words = f"{words} {kind}"
-            unit = self.magnetic_unit or unit if name == "hard_iron" else unit
-            factor = SCALE.get(unit, 1.0)
-            rows.append((f"{words} {axes}".strip(), unit, f"{value / factor:.4g}", f"{sigma / factor:.2g}"))
+            words, unit, factor = printed(name, axes, self.magnetic_unit)
+            rows.append((words, unit, f"{value / factor:.4g}", f"{sigma / factor:.2g}"))
         title = f"Calibration from {self.source or 'an unknown source'}"
         return Listing(title, ("error", "unit", "value", "σ"), rows, self.remarks, left=2)
 
@@ -272,7 +285,9 @@ def _from_table(table: Mapping[str, Any], place: str) -> UnitCalibration:
     form = {**FORM, "source": tables.TEXT, "magnetic_unit": tables.TEXT}
     unit = values.get("magnetic_unit", "")
     if unit and unit not in MAGNETIC_UNITS:
-        raise InputError(f"{place}: magnetic_unit is {unit!r}; give one of {', '.join(MAGNETIC_UNITS)}, or leave it out")
+        raise InputError(
+            f"{place}: magnetic_unit is {unit!r}; give one of {', '.join(MAGNETIC_UNITS)}, or leave it out"
+        )
     errors: SensorErrors = tables.build(SensorErrors, sigma, FORM, f"{place}.sigma")
     negative = [name for name, _, value in errors.entries() if value < 0.0]
     if negative:
