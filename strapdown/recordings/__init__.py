@@ -3,6 +3,9 @@
 A recording has point samples of rate, specific force and magnetic field of a device, on one time axis. :mod:`strapdown.ahrs`
 estimates attitude from it.
 
+Own HDF5 files have a digest, MCAP and Parquet checksums, which are verified: a changed bit is noticed. CSV, TUM, ULog, ROS 1 bags and
+SQLite have none: one changed bit of a sample is another sample.
+
 - ``formats``: The table of formats; :func:`read` by content, :func:`write` by file extension.
 - ``body_axes``: Axes and signs that differ from the package's: :func:`with_axes`.
 - ``columns``, ``delimited``, ``dataframes``: Tables: roles of columns; CSV and TSV; Parquet, pandas and xarray.
