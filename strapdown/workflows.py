@@ -45,10 +45,10 @@ from strapdown.scenarios import Scenario, simulate
 
 if TYPE_CHECKING:
     from strapdown.allan import AllanDeviation, NoiseFit
+    from strapdown.calibration import UnitCalibration
     from strapdown.montecarlo import Dispersions, Plan, Statistics
     from strapdown.montecarlo.campaign import Campaign
     from strapdown.recordings import GyroSamples
-    from strapdown.recordings.unit_calibration import UnitCalibration
     from strapdown.tuning import Prior, Tuning
 
 __all__ = [
@@ -262,7 +262,7 @@ def estimate(
     latency : float, optional
         For a recording: delay of the gyro's samples, s. Default: half a sample interval.
     calibration : UnitCalibration, optional
-        For a recording: calibration from an earlier recording of the same unit.
+        For a recording: calibration of the unit, from :func:`strapdown.calibrate`; the bias is then that of the corrected rates.
     full_covariance : bool, optional
         Whether to store covariance matrices rather than their diagonals. Default: True for a record, False for a recording.
     smooth : bool, default False

@@ -21,7 +21,6 @@ SQLite have none: one changed bit of a sample is another sample.
 from __future__ import annotations
 
 # Names imported "as" themselves and not listed in __all__ are for use within the package only.
-from strapdown.recordings import unit_calibration as unit_calibration
 from strapdown.recordings.body_axes import SENSORS as SENSORS
 from strapdown.recordings.body_axes import axes_matrix as axes_matrix
 from strapdown.recordings.body_axes import with_axes as with_axes
