@@ -373,7 +373,7 @@ class GatedStepFilter(StepFilter):
         if one is not None and self._supervision.has_candidate:
             bias, values = one.others[:3], one.others[3:]
             self._supervision.candidate = self._candidate(
-                State(attitude=one.attitude, bias=bias, values=values, covariance=one.covariance, factor=one.factor)
+                State(attitude=one.attitude, bias=bias, values=values, covariance=one.covariance)
             )
 
     def _predict(self, increment: Array, step: float, end: float) -> None:
