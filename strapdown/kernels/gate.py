@@ -1,7 +1,6 @@
-"""A gate and robust weights around a filter: a body of :mod:`strapdown.kernels.walk` over either form of the covariance.
+"""A gate and robust weights around the filter of :mod:`strapdown.kernels.filter`: a body of :mod:`strapdown.kernels.walk`.
 
-The consequences of refusals are in :mod:`strapdown.kernels.gate_rules`. The form (:mod:`strapdown.kernels.covariance_form` or
-:mod:`strapdown.kernels.root_form`) defines the functions in ``OPEN``. Row 0 of its states is the filter, row 1 the restart candidate, if
+The consequences of refusals are in :mod:`strapdown.kernels.gate_rules`. Row 0 of the states is the filter, row 1 the restart candidate, if
 there is one; both are processed by the same code.
 """
 
@@ -12,14 +11,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from strapdown.kernels import structure
 from strapdown.kernels.algebra import add, factored, matrix_times_vector, scale, solved
-from strapdown.kernels.covariance_form import (
+from strapdown.kernels.filter import (
     attitude_covariance,
     attitude_of,
     become,
     bias_at,
     correct,
-    digits_left,
     innovation_covariance,
     keep_row,
     linearised,
@@ -69,13 +68,12 @@ from strapdown.kernels.measurement import (
     HEADING,
     KIND,
     degrees_of_freedom,
-    frame_of,
     has_heading,
-    noise_of,
     store_innovations,
     value_of,
 )
 from strapdown.kernels.rotation import moved, quaternion_multiply, rotation_matrix
+from strapdown.kernels.structure import MAX_PRECISION
 from strapdown.kernels.walk import step_within, turn_squared
 
 OPEN = (
@@ -85,7 +83,6 @@ OPEN = (
     "attitude_of",
     "bias_at",
     "step_limit",
-    "digits_left",
     "propagate",
     "store_prediction",
     "attitude_covariance",
@@ -101,10 +98,7 @@ OPEN = (
     "widen",
     "keep_row",
 )
-"""Functions that a form defines; in this module those of :mod:`strapdown.kernels.covariance_form`."""
-
-LENIENT = 1e3
-"""Factor on the loss of digits of the covariance allowed for a candidate, which starts with a very large covariance."""
+"""Functions of the instance of the filter; in this module those of six states."""
 
 
 class Options(NamedTuple):
@@ -126,13 +120,25 @@ class Options(NamedTuple):
     """σ of the first candidate's attitude, rad."""
 
 
-class Body(NamedTuple):
-    """A filter in one form, with its gate."""
+class Restart(NamedTuple):
+    """Initial values of a restart candidate."""
 
-    form: NamedTuple
+    bias_variance: np.ndarray
+    """Increase of the variance of the bias (3,), (rad/s)²."""
+    values: np.ndarray
+    """Error states (m,) at ``time``."""
+    covariance: np.ndarray
+    """Their covariance (m, m)."""
+    time: float
+
+
+class Body(NamedTuple):
+    """A filter with its gate."""
+
+    form: structure.Body
     options: Options
-    restart: NamedTuple
-    """Initial values of a candidate of the form."""
+    restart: Restart
+    """Initial values of a candidate."""
     standing: np.ndarray
     """Counters of each sensor (sensors, ``STANDING``); at return, their final values."""
     memory: np.ndarray
@@ -142,7 +148,7 @@ class Body(NamedTuple):
 class Outputs(NamedTuple):
     """Outputs of a run in addition to those of the form."""
 
-    form: NamedTuple
+    form: structure.Outputs
     weight: np.ndarray
     """Weight of each measurement (events,), by place; 0: refused."""
     recoveries: np.ndarray
@@ -155,22 +161,13 @@ class Outputs(NamedTuple):
 
 
 def begin(body):
-    """Return the numbers of states, lock-outs, recoveries and segments, and whether digits are lost."""
+    """Return the numbers of states, lock-outs, recoveries and segments, and whether a measurement was too precise."""
     # From an array, and not literals: numba would compile the body for that type too.
     none = 0 * len(body.memory)
     running = none + 1
     if body.memory[CANDIDATE] > 0.0:
         running = none + 2
-    return running, none, none, none, lost_digits(running, body)
-
-
-def lost_digits(running, body):
-    """Return whether any covariance has lost its digits."""
-    lost = False
-    for i in range(running):
-        least = body.form.least_share if i == 0 else body.form.least_share / LENIENT
-        lost = lost or not digits_left(body.form, i) >= least
-    return lost
+    return running, none, none, none, running < 0
 
 
 def largest_turn(running, part, dt, body):
@@ -210,9 +207,8 @@ def update(state, e, now, measured, body, out):
     while i < running:
         passes = int(memory[PASSES]) if i == 0 else WIDE_PASSES
         outcome, weight, innovation, variance, share = judged_update(form, i, e, measured, passes, options)
-        least_noise = 1.0 / form.sharpness if i == 0 else 1.0 / (form.sharpness * LENIENT)
-        lost = lost or (form.sharpness < math.inf and not share >= least_noise)
         if i == 0:
+            lost = lost or not share >= 1.0 / MAX_PRECISION
             out.weight[place] = weight
             store_innovations(out.form.innovation, place, innovation, variance)
             lock_outs, start = judge_filter(
@@ -240,23 +236,20 @@ def update(state, e, now, measured, body, out):
 
 
 def keep(state, row, e, body, out):
-    """Write a row; every ``check`` rows, check that the covariances have enough digits."""
-    running, lock_outs, recoveries, segments, lost = state
+    """Write a row."""
     keep_row(body.form, load(body.form, 0), row, out.form)
-    if row % body.form.check == 0:
-        lost = lost or lost_digits(running, body)
-    return running, lock_outs, recoveries, segments, lost
+    return state
 
 
 def stopped(state):
-    """Return whether a covariance has lost its digits."""
+    """Return whether a measurement was too precise for double precision."""
     return state[4]
 
 
 def finish(state, row, e, body):
-    """Return the numbers of segments (−1: a covariance has lost its digits), recoveries and lock-outs."""
-    running, lock_outs, recoveries, segments, lost = state
-    if lost or lost_digits(running, body):
+    """Return the numbers of segments (−1: a measurement was too precise), recoveries and lock-outs."""
+    _, lock_outs, recoveries, segments, lost = state
+    if lost:
         segments = -1
     return segments, recoveries, lock_outs
 
@@ -283,8 +276,6 @@ def judged_update(form, i, e, measured, passes, options):
     sensor = measured.sensor[e]
     kind = measured.series[sensor, KIND]
     z = value_of(measured, place, sensor)
-    frame = frame_of(measured, place, sensor)
-    noise = noise_of(measured, place, sensor, kind, z)
     degrees = degrees_of_freedom(kind)
     threshold = options.thresholds[degrees - 1]
     state = load(form, i)
@@ -306,7 +297,7 @@ def judged_update(form, i, e, measured, passes, options):
     done = 1
     trials = 0
     while True:
-        rows, y, p, variance, far, along = linearised(form, i, e, now_q, q, M, z, frame, noise, kind, sensor, prior)
+        rows, y, p, variance, far, along = linearised(form, i, e, now_q, q, M, measured, kind, sensor, prior)
         S = innovation_covariance(form, i, state, rows)
         F = factored((S[0] + variance[0], S[1], S[2], S[3] + variance[1], S[4], S[5] + variance[2]))
         innovation = (y[0] - p[0], y[1] - p[1], y[2] - p[2])

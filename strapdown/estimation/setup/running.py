@@ -19,14 +19,13 @@ from strapdown.estimation.schedule import schedule
 from strapdown.estimation.setup.filter_setup import MEKF, FilterSetup, need_mekf
 from strapdown.estimation.setup.states import States
 from strapdown.estimation.states import State
-from strapdown.kernels.lane_values import WIDTH
 from strapdown.randomness import generator
 from strapdown.records import Estimate, ImuRecord, compress
 from strapdown.vectors import VectorMeasurements
 
 _BIAS = np.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])
 """1 for the bias, 0 for the attitude."""
-WHOLE_BIAS: dict[str, Any] = {"whole_bias": True, "together": True}
+WHOLE_BIAS: dict[str, Any] = {"whole_bias": True}
 """Options of the filter by which the reported bias includes the drifts."""
 
 MAX_MEMORY = 8e9
@@ -135,33 +134,6 @@ def measured_motion(record: ImuRecord, setup: FilterSetup) -> tuple[Array, Array
     if not levers or np.any(states.gyro_temperature_sigma):
         return None
     return turning(record, schedule(record.vectors, record.time[0], record.time[-1], anisotropic=True).time)
-
-
-def runs_at_once(setup: FilterSetup) -> int:
-    """Return the number of records that :func:`run_together` filters at once: 1 for a filter that it does not support."""
-    judged = setup.gate is not None or setup.robust is not None
-    return WIDTH if setup.estimator == MEKF and setup.states is not None and not judged else 1
-
-
-def run_together(
-    records: Sequence[ImuRecord], setup: FilterSetup, initials: Sequence[State], every: int
-) -> list[Estimate]:
-    """Run the filter of a setup over several records, and store every ``every``-th state with its covariance.
-
-    The filter must be one for which :func:`runs_at_once` is above 1. A record's estimate is bit for bit independent of the other records,
-    and agrees with that of :func:`run` to rounding.
-    """
-    from strapdown.estimation import together
-
-    states = setup.states
-    assert states is not None
-    problems = [
-        _prepared(modelled_record(record, setup), setup, initial)
-        for record, initial in zip(records, initials, strict=True)
-    ]
-    options = forward.Options(every=every, full_covariance=True, **WHOLE_BIAS)
-    found = together.run(problems, every, lambda problem: forward.filtered(problem, options).estimate)
-    return [_reported(one, states, initial) for one, initial in zip(found, initials, strict=True)]
 
 
 def _run_other(
@@ -300,7 +272,7 @@ def state_of_whole_bias(initial: State, error_states: tuple[ErrorStates, ...], f
     turn[3:6, 6:] = -_offsets(error_states)
     sigma = np.sqrt(np.diag(plain.covariance))
     root = (turn @ (sigma[:, None] * np.linalg.cholesky(plain.covariance / np.outer(sigma, sigma)))).T
-    return replace(plain, covariance=root.T @ root, factor=root)
+    return replace(plain, covariance=root.T @ root)
 
 
 def _offsets(error_states: tuple[ErrorStates, ...]) -> Array:
