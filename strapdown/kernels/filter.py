@@ -901,6 +901,8 @@ def turned_by(q, correction):
 def measurement_of(s, body, measured, e):
     """Return the e-th measurement, by a sensor of shape s."""
     shape, at, sensor = STRUCTURE.sensors[s], measured.place[e], measured.sensor[e]
+    if LANES > 1:
+        return measurement_in_lanes(s, body, measured, e, at, sensor)
     z = value_of(measured, at, sensor)
     if not shape.isotropic:
         noise = six_at(measured.noise, at)
@@ -912,6 +914,19 @@ def measurement_of(s, body, measured, e):
     levers = any(t.lever for t in shape.states)
     turning = tuple(body.turning[e, i] for i in NINE) if levers else (0.0,) * 9
     return Measured(z, frame_of(measured, at, sensor), noise, body.length[e] if shape.states else 1.0, turning)
+
+
+def measurement_in_lanes(s, body, measured, e, at, sensor):
+    """Return the e-th measurement of several runs: ``value`` has four numbers of each run, a vector or an attitude."""
+    shape, like = STRUCTURE.sensors[s], lanes_of((0.0,) * LANES)
+    value = tuple_at(measured.value, 4 * at, 4, like)
+    noise = six_at(measured.noise, at)
+    levers = any(t.lever for t in shape.states)
+    turning = tuple_at(body.turning, 9 * e, 9, like) if levers else (0.0,) * 9
+    length = body.length[e] if shape.states else 1.0
+    if shape.kind == ATTITUDE:
+        return Measured((noise[0], noise[3], noise[5]), value, noise, length, turning)
+    return Measured(value[:3], frame_of(measured, at, sensor), noise, length, turning)
 
 
 def gains(s, x, P, work, measured, numbers, innovation, e, like):
@@ -940,15 +955,23 @@ def gains(s, x, P, work, measured, numbers, innovation, e, like):
         else:
             S = r[i]  # the length of a vector has no information, but is part of the innovation
         store_innovation(innovation, e, i, errors[i], S)
-    if STRUCTURE.sensors[s].kind == HEADING:
-        innovation[e, 0] = chosen(valid, errors[0], math.nan)  # a vertical vector has no heading: skipped
+    if STRUCTURE.sensors[s].kind == HEADING:  # a vertical vector has no heading: skipped
+        store_value(innovation, e, 0, chosen(valid, errors[0], like + math.nan))
     return tuple(p[: len(gain)]), tuple(gain), tuple(errors[: len(gain)]), precise
 
 
 def store_innovation(innovation, e, i, value, variance):
     """Write innovation i of a measurement, and its variance."""
-    innovation[e, 2 * i] = value
-    innovation[e, 2 * i + 1] = variance
+    store_value(innovation, e, 2 * i, value)
+    store_value(innovation, e, 2 * i + 1, variance)
+
+
+def store_value(innovation, e, i, value):
+    """Write a number to a row of the innovations; of several runs, (events, 6, runs)."""
+    if LANES == 1:
+        innovation[e, i] = value
+    else:
+        put_at(innovation, 6 * e + i, value)
 
 
 def reduced(P, work, p, gain, i, c, like):
@@ -1113,6 +1136,30 @@ def take_precisely(x, P, work, rows, like):
     return anywhere(lost)
 
 
+def take_precisely_in_lanes(body, p, gain, errors, precise, rows, like):
+    """Update by both forms, Joseph's for the runs that are precise."""
+    x, P = body.x, body.P
+    copy_values(x[0], x[1], N + 1, like)
+    copy_values(P[0], P[1], SIZE_OF_P // LANES, like)
+    apply_gains(x[0], P[0], body.work, p, gain, errors, like)
+    lost = take_precisely(x[1], P[1], body.work, rows, like)
+    blend_values(x[1], x[0], precise, N + 1, like)
+    blend_values(P[1], P[0], precise, SIZE_OF_P // LANES, like)
+    return lost
+
+
+def copy_values(a, b, count, like):
+    """Copy values of an array of lanes to another."""
+    for i in range(count):
+        put_at(b, i, value_at(a, i, like))
+
+
+def blend_values(a, b, condition, count, like):
+    """Replace values of b by those of a in the runs in which the condition holds."""
+    for i in range(count):
+        put_at(b, i, chosen(condition, value_at(a, i, like), value_at(b, i, like)))
+
+
 def apply_step(x, P, work, like):
     """Correct the state by the step in the work space, and transform the covariance."""
     correct_by(x, P, work, (), (), tuple_at(work, LINE * STEP, N, like), like)
@@ -1139,7 +1186,7 @@ def take_{s}(body, measured, e, innovation, like):
     p, gain, errors, precise = gains_{s}(body, measured, e, innovation, like)
     if anywhere(precise):
         rows_{s}(body.x[0], body, measured, e, like)
-        return take_precisely(body.x[0], body.P[0], body.work, {rows}, like)
+        return {precise}
     apply_gains(body.x[0], body.P[0], body.work, p, gain, errors, like)
     return False
 
@@ -1156,7 +1203,15 @@ def _dispatch(name: str, arguments: str, otherwise: str) -> str:
     return f"\n\ndef {name}(shape, {arguments}):\n{''.join(calls)}    return {otherwise}\n"
 
 
-_SOURCE = "\n".join(_OF_A_SHAPE.format(s=s, rows=ROWS_OF_KIND[t.kind]) for s, t in enumerate(STRUCTURE.sensors))
+# In lanes a run that needs Joseph's form must not change the bits of those beside it.
+_PRECISE = {
+    True: "take_precisely(body.x[0], body.P[0], body.work, {rows}, like)",
+    False: "take_precisely_in_lanes(body, p, gain, errors, precise, {rows}, like)",
+}[LANES == 1]
+_SOURCE = "\n".join(
+    _OF_A_SHAPE.format(s=s, rows=rows, precise=_PRECISE.format(rows=rows))
+    for s, rows in enumerate(ROWS_OF_KIND[t.kind] for t in STRUCTURE.sensors)
+)
 _SOURCE += _dispatch("take", "body, measured, e, innovation, like", "False")
 _SOURCE += _dispatch("write", "x, body, measured, e, like", "0, (like, like), like < like")
 exec(compile(_SOURCE, __file__, "exec"), globals())

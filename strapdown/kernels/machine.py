@@ -17,7 +17,7 @@ import sys
 from collections.abc import Callable, Hashable
 from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -73,6 +73,9 @@ def _defined(name: str, value: FunctionType, function: FunctionType, parts: tupl
             return found
     if name in function.__globals__.get("REPLACEABLE", ()):
         return value
+    for module in parts:  # the default of another module
+        if name in vars(module).get("REPLACEABLE", ()):
+            return cast(FunctionType, getattr(module, name))
     names = ", ".join(module.__name__ for module in parts) or "nothing"
     raise TypeError(f"{function.__module__} leaves {name} open, and {names} does not define it")
 
