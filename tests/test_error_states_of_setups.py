@@ -398,7 +398,7 @@ def test_rate_and_angular_acceleration_are_those_of_the_motion(body, white):
 def test_the_noise_of_an_angular_acceleration_turns_with_the_arm():
     """``n × r`` of noise n with a variance about each axis, over the length that the sensor's vector is divided by."""
     arm, variance, length = np.array([0.2, -0.1, 0.3]), np.array([1.0, 3.0, 7.0]), 2.0
-    model = assemble((error_states.LeverArm(sensor="acc", arm_sigma=0.3),), {"acc": "vector"})
+    model = assemble((error_states.LeverArm(sensor="acc", arm_sigma=0.3, strength=1.0),), {"acc": "vector"})
     x, upper = np.concatenate([np.zeros(7), arm]), np.triu_indices(3)
     C = np.array([[2.0, 0.3, 0.1], [0.3, 1.0, -0.2], [0.1, -0.2, 3.0]])
     measured = structure.Measured((), (), (), length, (0.0,) * 6 + tuple(variance))
