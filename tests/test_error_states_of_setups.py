@@ -515,7 +515,7 @@ def test_what_a_specification_gives_is_matched_entry_by_entry():
     chosen = setup.FilterSetup.for_scenario(scenario, states=True)
     assert chosen.states == States(gyro_scale_sigma=tuple(scenario.gyro.scale_factor))
     assert chosen.states.gyro_scale_sigma[2] == pytest.approx(1e-4)
-    assert chosen.process_noise == setup.FilterSetup.for_scenario(scenario).process_noise
+    assert chosen.process_noise == setup.FilterSetup.for_scenario(scenario, states=False).process_noise
     markov = GyroSpec(angle_random_walk=1e-5, markov_noise=1e-6, markov_correlation_time=50.0)
     found = setup.FilterSetup.for_scenario(dataclasses.replace(scenario, gyro=markov), states=True)
     assert found.states.gyro_drift_time == (50.0,)

@@ -96,7 +96,7 @@ MEAN = 12
 # Lines of the work space, each of LINE values.
 LINE = W + 8
 FACTORS, GAINS, ROWS = 0, 3, 6
-"""Products P h of the rows of a measurement, given those before; the same over their innovation variance; the rows h."""
+"""Products P h of the rows of a measurement, given those before; the same over the roots of their innovation variances; the rows h."""
 PRODUCT, STEP, ROUNDING, PRIOR, NOW_X, PRIOR_ROWS = 9, 10, 11, 12, 13, 14
 """P h of one row; a correction; the rounding error of P h; prior mean relative to a point of linearisation, the state there, and the rows
 there in the tangent space of the prior."""
@@ -932,13 +932,14 @@ def measurement_in_lanes(s, body, measured, e, at, sensor):
 def gains(s, x, P, work, measured, numbers, factor, like):
     """Return the gains of a measurement whose noise variances are multiplied by a factor, as a :class:`Gains`.
 
-    For each row p = P h, given the rows before it, by parts, and its entries over the innovation's variance.
+    Of each row p = P h, given the rows before it, by parts, over the root of its innovation's variance: P decreases by the sum of the outer
+    products of these gains, which is symmetric to the last bit.
     """
     H, y, r, angle, valid = rows_of(s, x, measured, numbers, like)
     r = tuple(factor * t for t in r) if factor is not None else r
     used = tuple(i for i in STATES if any(not is_zero(h[i]) for h in H))
     p = [tuple(products(tuple(h[i] for i in used), tuple(part(P, i, c, like) for i in used)) for c in PARTS) for h in H]
-    errors, gain, inverted, variances, shares = list(y), [], [], [], []
+    errors, gain, steps, inverted, variances, shares = list(y), [], [], [], [], []
     precise = None
     for i, h in enumerate(H):
         if any_number(h):
@@ -951,7 +952,9 @@ def gains(s, x, P, work, measured, numbers, factor, like):
             p[i] = kept(p[i], work, LINE * (FACTORS + i))
             variances.append(products(row, tuple(entry(p[i], work, LINE * (FACTORS + i), k) for k in used)) + r[i])
             inverted.append(1.0 / variances[i])
-            gain.append(kept(tuple(inverted[i] * t for t in p[i]), work, LINE * (GAINS + i)))
+            root = square_root(inverted[i])
+            gain.append(kept(tuple(root * t for t in p[i]), work, LINE * (GAINS + i)))
+            steps.append(root * errors[i])
             far = variances[i] > SHORT_FORM * r[i]
             precise = far if precise is None else precise | far
         else:  # the length of a vector has no information, but is part of the innovation
@@ -962,8 +965,8 @@ def gains(s, x, P, work, measured, numbers, factor, like):
     errors, variances = tuple(errors), tuple(variances)
     skipped = STRUCTURE.sensors[s].kind == HEADING  # possibly: a vertical vector has no heading
     reported = (chosen(valid, errors[0], like + math.nan),) if skipped else errors
-    p, gain = tuple(p[: len(gain)]), tuple(gain)
-    return Gains(p, gain, errors, variances, reported, precise, tuple(shares), tuple(r), tuple(y), angle, valid, nis)
+    rest = precise, tuple(shares), tuple(r), tuple(y), angle, valid, nis
+    return Gains(tuple(gain), tuple(steps), errors, variances, reported, *rest)
 
 
 def innovation_covariance_of(shares, variances, noise, like):
@@ -1028,11 +1031,12 @@ def store_value(innovation, e, i, value):
         put_at(innovation, 6 * e + i, value)
 
 
-def reduced(P, work, p, gain, i, c, like):
-    """Return the value of row i of P from column c on after the update; p: that value of each row p, gain: its gains."""
+def reduced(P, work, gain, i, c, like):
+    """Return the value of row i of P from column c on after the update."""
     t = part(P, i, c, like)
-    for r, u in enumerate(p):
-        t = t - (work[LINE * (GAINS + r) + i] if LANES == 1 else gain[r]) * u
+    rows = at_part(gain, i)
+    for r, u in enumerate(at_part(gain, c)):
+        t = t - (work[LINE * (GAINS + r) + i] if LANES == 1 else rows[r]) * u
     return t
 
 
@@ -1041,13 +1045,12 @@ def at_part(rows, c):
     return tuple(row[PARTS.index(c)] for row in rows if c in PARTS)
 
 
-def apply_gains(x, P, work, p, gain, errors, like):
+def apply_gains(x, P, work, gain, steps, like):
     """Correct the state, update the covariance and transform it to the new tangent space, in one pass."""
-    errors = errors[: len(gain)]  # of a vector without states, the last one is its length's
     step = tuple(
-        products(errors, tuple(entry(k, work, LINE * (GAINS + r), j) for r, k in enumerate(gain))) for j in STATES
+        products(steps, tuple(entry(k, work, LINE * (GAINS + r), j) for r, k in enumerate(gain))) for j in STATES
     )
-    correct_by(x, P, work, p, gain, step, like)
+    correct_by(x, P, work, gain, step, like)
 
 
 def fixed_turn(before, after):
@@ -1055,8 +1058,8 @@ def fixed_turn(before, after):
     return rotation_matrix(quaternion_multiply(after, (before[0], -before[1], -before[2], -before[3])))
 
 
-def correct_by(x, P, work, p, gain, step, like):
-    """Correct the state by a step; subtract Σ k pᵀ from the covariance, and transform it to the new tangent space, in one pass.
+def correct_by(x, P, work, gain, step, like):
+    """Correct the state by a step; subtract Σ g gᵀ from the covariance, and transform it to the new tangent space, in one pass.
 
     A vector of carried states is defined in the axes of the *estimated* attitude: a correction that rotates the attitude by A in fixed axes
     changes it to A c, and its error likewise.
@@ -1071,17 +1074,17 @@ def correct_by(x, P, work, p, gain, step, like):
             c[k] = t
     for i, t in enumerate((*q, *(c[k] for k in OTHERS))):
         put_at(x, i, t)
-    rotate_covariance(P, work, p, gain, G, A, like)
+    rotate_covariance(P, work, gain, G, A, like)
 
 
-def rotate_covariance(P, work, p, gain, G, A, like):
-    """Subtract Σ k pᵀ from P, and transform the attitude by G and the carried vectors by A."""
+def rotate_covariance(P, work, gain, G, A, like):
+    """Subtract Σ g gᵀ from P, and transform the attitude by G and the carried vectors by A."""
     groups = ((AXES, G), *((v, A) for v in STRUCTURE.vectors))
     half = {}
     for m, (v, T) in enumerate(groups):
         for first in PARTS if LANES == 1 else STATES:
             if first in PLAIN or LANES == 1 or any(first in w for w, _ in groups[m:]):
-                t = tuple(reduced(P, work, at_part(p, first), at_part(gain, i), i, first, like) for i in v)
+                t = tuple(reduced(P, work, gain, i, first, like) for i in v)
                 for a in AXES:
                     half[v[a], first] = products(T[3 * a : 3 * a + 3], t)
                     if first in PLAIN or LANES == 1:
@@ -1090,7 +1093,7 @@ def rotate_covariance(P, work, p, gain, G, A, like):
         for i in PLAIN:
             for first in block:
                 if first >= i or LANES == 1:
-                    put_part(P, i, first, reduced(P, work, at_part(p, first), at_part(gain, i), i, first, like))
+                    put_part(P, i, first, reduced(P, work, gain, i, first, like))
     for i in ROTATED if LANES == 1 else ():
         for j in PLAIN:
             put_element(P, i, j, element_at(P, i, j, like))
@@ -1151,12 +1154,15 @@ def product_by_parts(P, work, row, line, like):
 
 
 def minus_outer_by_parts(P, work, left, right, factor, like):
-    """Subtract an outer product, eight columns at once."""
+    """Subtract an outer product, eight columns at once, and copy the upper triangle to the lower one."""
     columns = tuple(load_like(work, right + c, lanes_of(EIGHT)) for c in PARTS)
     for i in STATES:
         f = factor * work[left + i]
         for c, column in zip(PARTS, columns, strict=True):
             put_part(P, i, c, part(P, i, c, like) - f * column)
+    for i in STATES:
+        for j in STATES[i + 1 :]:
+            P[W * j + i] = P[W * i + j]
 
 
 def product_by_elements(P, work, row, line, like):
@@ -1227,12 +1233,12 @@ def take_precisely(x, P, work, rows, like):
     return anywhere(lost)
 
 
-def take_precisely_in_lanes(body, p, gain, errors, precise, rows, like):
+def take_precisely_in_lanes(body, gain, steps, precise, rows, like):
     """Update by both forms, Joseph's for the runs that are precise."""
     x, P = body.x, body.P
     copy_values(x[0], x[1], N + 1, like)
     copy_values(P[0], P[1], SIZE_OF_P // LANES, like)
-    apply_gains(x[0], P[0], body.work, p, gain, errors, like)
+    apply_gains(x[0], P[0], body.work, gain, steps, like)
     lost = take_precisely(x[1], P[1], body.work, rows, like)
     blend_values(x[1], x[0], precise, N + 1, like)
     blend_values(P[1], P[0], precise, SIZE_OF_P // LANES, like)
@@ -1253,7 +1259,7 @@ def blend_values(a, b, condition, count, like):
 
 def apply_step(x, P, work, like):
     """Correct the state by the step in the work space, and transform the covariance."""
-    correct_by(x, P, work, (), (), tuple_at(work, LINE * STEP, N, like), like)
+    correct_by(x, P, work, (), tuple_at(work, LINE * STEP, N, like), like)
 
 
 # --------------------------------------------------------------------------------------- updates by shape, which is known while compiling
@@ -1279,7 +1285,7 @@ def take_{s}(body, measured, e, innovation, like):
     if anywhere(g.precise):
         rows_{s}(body.x[0], body, measured, e, like)
         return {precise}
-    apply_gains(body.x[0], body.P[0], body.work, g.p, g.gain, g.errors, like)
+    apply_gains(body.x[0], body.P[0], body.work, g.gain, g.steps, like)
     return False
 
 
@@ -1306,7 +1312,7 @@ def judge_{s}(body, measured, e, options, like):
             divide_variances(body.work, {rows}, weight, like)
             lost = take_precisely(body.x[0], body.P[0], body.work, {rows}, like)
         else:
-            apply_gains(body.x[0], body.P[0], body.work, g.p, g.gain, g.errors, like)
+            apply_gains(body.x[0], body.P[0], body.work, g.gain, g.steps, like)
     return outcome, weight, errors, variances, lost
 
 
@@ -1337,7 +1343,7 @@ def _dispatch(name: str, arguments: str, otherwise: str) -> str:
 # In lanes a run that needs Joseph's form must not change the bits of those beside it.
 _PRECISE = {
     True: "take_precisely(body.x[0], body.P[0], body.work, {rows}, like)",
-    False: "take_precisely_in_lanes(body, g.p, g.gain, g.errors, g.precise, {rows}, like)",
+    False: "take_precisely_in_lanes(body, g.gain, g.steps, g.precise, {rows}, like)",
 }[LANES == 1]
 _SOURCE = "\n".join(
     _OF_A_SHAPE.format(s=s, rows=rows, precise=_PRECISE.format(rows=rows))

@@ -182,10 +182,10 @@ class Effects(NamedTuple):
 class Gains(NamedTuple):
     """A measurement at a state, with up to three rows h of independent noise that are processed one after the other."""
 
-    p: tuple[Any, ...]
-    """P h of each row, given those before it."""
     gain: tuple[Any, ...]
-    """The same over the variance of its innovation."""
+    """g of each row: P h, given the rows before it, over the root of its innovation's variance."""
+    steps: tuple[Any, ...]
+    """Innovation of each row over the same root."""
     errors: tuple[Any, ...]
     """Innovations, and their variances."""
     variances: tuple[Any, ...]
