@@ -561,13 +561,14 @@ def _run(problem: Problem, options: Options) -> Passed:
 
 
 class TooPreciseError(InputError):
-    """A measurement is so much more precise than the state that a covariance in double precision keeps no digits."""
+    """A measurement is so much more precise than the state that a covariance in double precision has too few digits left."""
 
     def __init__(self) -> None:
         ratio = np.sqrt(structure.MAX_PRECISION)
         super().__init__(
-            f"a measurement is more than {ratio:.0e} times as precise as the state, and the covariance in double precision keeps no "
-            "digits; give the initial state a smaller sigma, or the measurement a larger one"
+            f"a measurement is more than {ratio:.0e} times as precise as the state, and its update would leave the covariance with no "
+            "digits left in double precision; give the initial state a smaller sigma, or the measurement a larger one. If both are right, the "
+            "filter has diverged before: the errors of the start are many times their sigmas"
         )
 
 
@@ -577,9 +578,12 @@ def whole_bias(model: Model, x: Array) -> Array:
 
 
 def covariance_at(body: structure.Body, i: int) -> Array:
-    """Return the covariance (n, n) of state i."""
+    """Return the covariance (n, n) of state i; if rounding has made it indefinite, with correlations smaller by as much."""
     n = body.x.shape[1] - 1
-    return np.array(body.P[i].reshape(n, -1)[:, :n])
+    P = np.array(body.P[i].reshape(n, -1)[:, :n])
+    sigma = np.sqrt(np.diag(P))
+    least = float(np.linalg.eigvalsh(P / np.outer(sigma, sigma))[0])
+    return P if least > 0.0 else P + np.diag(np.diag(P)) * (2.0 * abs(least) + 1e-15)
 
 
 def candidate_of(body: structure.Body, model: Model) -> Candidate:
