@@ -529,7 +529,9 @@ def test_a_measurement_far_more_precise_than_the_start_keeps_its_digits_or_is_re
     initial = estimation.initial_state(quaternion.IDENTITY, attitude_sigma=first[0], bias_sigma=first[1])
     noise = ProcessNoise(angle_random_walk=1e-18, rate_random_walk=0.0)
     both = estimation.smooth(record, noise, initial, full_covariance=True)
-    finer = dataclasses.replace(record, vectors=tuple(dataclasses.replace(one, sigma=1e-3 * one.sigma) for one in series))
+    finer = dataclasses.replace(
+        record, vectors=tuple(dataclasses.replace(one, sigma=1e-3 * one.sigma) for one in series)
+    )
     with pytest.raises(InputError, match="times as precise as the state"):
         estimation.smooth(finer, noise, initial)
     with mpmath.workdps(60):

@@ -329,7 +329,9 @@ def _in_registers(problem: Problem, options: Options) -> Passed:
     )
     return Passed(
         estimate=estimate,
-        make_end=lambda: State(attitude=state[:4], bias=state[4:7], covariance=covariance_matrices(state[7:])),
+        make_end=lambda: State(
+            attitude=state[:4], bias=state[4:7], covariance=definite(covariance_matrices(state[7:]))
+        ),
         segments=segments[: number + 1],
     )
 
@@ -578,12 +580,18 @@ def whole_bias(model: Model, x: Array) -> Array:
 
 
 def covariance_at(body: structure.Body, i: int) -> Array:
-    """Return the covariance (n, n) of state i; if rounding has made it indefinite, with correlations smaller by as much."""
+    """Return the covariance (n, n) of state i."""
     n = body.x.shape[1] - 1
-    P = np.array(body.P[i].reshape(n, -1)[:, :n])
+    return definite(np.array(body.P[i].reshape(n, -1)[:, :n]))
+
+
+def definite(P: Array) -> Array:
+    """Return a covariance; if rounding has made it indefinite, with smaller correlations."""
     sigma = np.sqrt(np.diag(P))
     least = float(np.linalg.eigvalsh(P / np.outer(sigma, sigma))[0])
-    return P if least > 0.0 else P + np.diag(np.diag(P)) * (2.0 * abs(least) + 1e-15)
+    if least > 0.0:
+        return P
+    return np.where(np.eye(len(P), dtype=bool), P, (1.0 - 4.0 * abs(least) - 1e-14) * P)
 
 
 def candidate_of(body: structure.Body, model: Model) -> Candidate:
