@@ -517,7 +517,7 @@ def test_lost_stretches_are_consistent_over_many_runs() -> None:
 
 
 def test_a_measurement_far_more_precise_than_the_start_keeps_its_digits_or_is_refused() -> None:
-    """Directions to a microradian, at a start known to a radian: each σ against the information summed in 60 digits. A nanoradian is refused.
+    """Directions to a microradian, at a start known to a radian: each σ against information summed in 60 digits. A nanoradian is refused.
 
     The body rests and nothing drives it to speak of, so what is known of any edge is one constant state seen over and over.
     """

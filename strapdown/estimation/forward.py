@@ -569,8 +569,8 @@ class TooPreciseError(InputError):
         ratio = np.sqrt(structure.MAX_PRECISION)
         super().__init__(
             f"a measurement is more than {ratio:.0e} times as precise as the state, and its update would leave the covariance with no "
-            "digits left in double precision; give the initial state a smaller sigma, or the measurement a larger one. If both are right, the "
-            "filter has diverged before: the errors of the start are many times their sigmas"
+            "digits left in double precision; give the initial state a smaller sigma, or the measurement a larger one. If both are right, "
+            "the filter has diverged before: the errors of the start are many times their sigmas"
         )
 
 
