@@ -346,7 +346,6 @@ def _drawn(
     title: str,
     truth: Any = None,
     used: Any = None,
-    errors: Any = None,
     fixed_frame: str = "",
 ) -> list[Path]:
     """Draw the estimate, its optional states, and its errors relative to a truth or a reference; return the files."""
@@ -358,8 +357,8 @@ def _drawn(
         figures[out / "states"] = plots.states_over_time(result, title=title)
     if truth is not None:
         figures[out / "errors"] = plots.error_overview(result, truth, title=title)
-    if errors is not None:
-        figures[out / "errors"] = plots.recording_errors(used.time, errors, used.movement)
+    if used is not None and used.true_attitude is not None:
+        figures[out / "errors"] = plots.recording_errors(result, used.true_attitude, used.movement)
     return save_as(figures, form)
 
 
@@ -495,7 +494,7 @@ def _estimate_recording(
     paths += _export(exports, result.estimate, begun.recording)
     if output.drawn_as is not None:
         frame = _fixed_frame(used)
-        paths += _drawn(out, output.drawn_as, result.estimate, used.source, used=used, errors=errors, fixed_frame=frame)
+        paths += _drawn(out, output.drawn_as, result.estimate, used.source, used=used, fixed_frame=frame)
     written(*paths)
 
 
