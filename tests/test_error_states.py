@@ -102,7 +102,18 @@ SPUN = motion.ConstantRate(rate=(40.0, -30.0, 35.0))
 """1.2 rad a sample: sub-steps."""
 
 
-@pytest.mark.parametrize(("option", "body"), [*((option, SWAY) for option in OPTIONS), ("none", SPUN), ("all", SPUN)])
+QUICK = ("none", "gyro scale", "gyro drift", "hard iron", "two frames", "mounting of whole attitudes", "all")
+"""Options whose filters are compiled in the default run; each takes seconds."""
+
+
+@pytest.mark.parametrize(
+    ("option", "body"),
+    [
+        *(pytest.param(option, SWAY, marks=[] if option in QUICK else pytest.mark.slow) for option in OPTIONS),
+        ("none", SPUN),
+        ("all", SPUN),
+    ],
+)
 def test_both_faces_are_one_filter(option, body):
     record, blocks = record_of(body, duration=1.0, anisotropic=option == "all"), OPTIONS[option]
     initial = start(body)

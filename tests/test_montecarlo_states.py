@@ -124,7 +124,13 @@ def bits(estimate):
     return b"".join(np.ascontiguousarray(one).tobytes() for one in (*own, *innovations, *states))
 
 
-@pytest.mark.parametrize("name", MODELS)
+QUICK = ("gyro, star tracker", "heading")
+"""Models whose filters are compiled in the default run; each takes seconds."""
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[] if name in QUICK else pytest.mark.slow) for name in MODELS]
+)
 def test_each_run_is_what_the_filter_alone_makes_of_it(name, monkeypatch):
     """Errors, σ, correlations, NIS and error states, to 1e-8 of σ; none is left to the filter of one record."""
     filtered, found = in_lanes._filtered, []
