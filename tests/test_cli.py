@@ -15,8 +15,9 @@ import strapdown
 from strapdown import cli, recordings, scenarios
 from strapdown.cli import layout
 from strapdown.cli.terminal import app
+from strapdown.estimation.setup import read_estimate
 from strapdown.montecarlo.coning_study import ALGORITHMS
-from strapdown.records import read_attributes, read_estimate
+from strapdown.records import read_attributes
 
 PNG = b"\x89PNG\r\n\x1a\n"
 

@@ -15,9 +15,10 @@ from strapdown import consistency, montecarlo, motion, records, scenarios
 from strapdown.checks import InputError
 from strapdown.consistency.judgement import Finding, holm
 from strapdown.estimation import ProcessNoise, setup
+from strapdown.estimation.setup import FilterSetup, write_estimate
 from strapdown.gyro import GyroSpec
 from strapdown.montecarlo import campaign
-from strapdown.records import Estimate, Innovations, Truth
+from strapdown.records import ErrorStateEstimate, Estimate, Innovations, Origin, Truth
 
 
 def estimate(scale=1.0, samples=400, seed=0, *, bias_error=0.0, covariance=True, correlated=False):
@@ -46,6 +47,18 @@ def estimate(scale=1.0, samples=400, seed=0, *, bias_error=0.0, covariance=True,
         },
     )
     return result, truth
+
+
+def with_states(states):
+    """The same of a filter with error states."""
+    result, truth = estimate()
+    block = ErrorStateEstimate(components=("x",), units=("1",), values=np.zeros((200, 1)), variance=np.ones((200, 1)))
+    return replace(result, error_states=dict.fromkeys(states, block)), truth
+
+
+def of_a_recording(result):
+    """The same of a recording, whose σ are upper bounds."""
+    return replace(result, motion="hand")
 
 
 def test_a_right_filter_is_consistent():
@@ -110,7 +123,7 @@ def test_an_error_that_hardly_moves_is_not_averaged_over_the_run_and_that_is_rep
 )
 def test_what_error_states_reach_is_not_averaged_over_one_run(states, averaged):
     """Their part of the errors may last longer than the run, which does not show it."""
-    judgement = consistency.judge(*estimate(), error_states=states)
+    judgement = consistency.judge(*with_states(states))
     assert {finding.of for finding in judgement.findings if finding.name == "time-averaged NEES"} <= averaged
     assert ("attitude" in averaged) == any(
         f.name == "time-averaged NEES" and f.of == "attitude" for f in judgement.findings
@@ -187,11 +200,14 @@ def test_a_sigma_wrong_by_the_power_stated_is_found():
 
 
 def test_a_state_that_nothing_tests_is_named():
-    result, truth = estimate()
-    blind = consistency.judge(result, error_states=["gyro.scale"])
+    result, truth = with_states(["gyro.scale"])
+    blind = consistency.judge(result)
     assert "the σ of attitude, bias, gyro.scale are not tested: no truth for it" in blind.reason
     assert all(math.isinf(one.factor) for one in blind.power if not one.of.startswith("innovations"))
-    seen = consistency.judge(result, truth, error_states=["gyro.scale"], unmodelled=["the gyro's asymmetry of 9 ppm"])
+    spec = GyroSpec(angle_random_walk=1e-5, asymmetry=(9e-6, 0.0, 0.0))
+    noise = ProcessNoise(angle_random_walk=1e-5, rate_random_walk=0.0)
+    setup = FilterSetup(process_noise=noise, bias_sigma=1e-3)
+    seen = consistency.judge(replace(result, origin=Origin(gyro=spec), setup=setup), truth)
     assert "the σ of gyro.scale is not tested" in seen.reason
     assert seen.reason.endswith("the filter has no state for the gyro's asymmetry of 9 ppm")
     assert json.loads(json.dumps(seen.summary(), allow_nan=False))["power"][-1] == {"of": "gyro.scale", "factor": None}
@@ -200,17 +216,19 @@ def test_a_state_that_nothing_tests_is_named():
 def test_upper_bounds_are_contradicted_by_what_exceeds_them_alone():
     """The noise of a recording's filter covers disturbances that last: innovations a tenth as large, and correlated."""
     for scale, status in ((0.1, "cannot tell"), (1.0, "cannot tell"), (1.2, "not consistent")):
-        judged = consistency.judge(estimate(scale, correlated=True)[0], upper_bounds=True)
+        judged = consistency.judge(of_a_recording(estimate(scale, correlated=True)[0]))
         assert judged.verdict == status
         assert {one.name for one in judged.findings} == {"NIS"}
     assert (
         "σ of attitude and bias are not tested without a truth"
-        in consistency.judge(estimate(0.1)[0], upper_bounds=True).reason
+        in consistency.judge(of_a_recording(estimate(0.1)[0])).reason
     )
-    small = consistency.judge(*estimate(0.1), upper_bounds=True)
+    small, truth = estimate(0.1)
+    small = consistency.judge(of_a_recording(small), truth)
     assert small.verdict == "consistent"
     assert all(one.low <= one.value <= one.high for one in small.findings)  # as it passes
-    assert consistency.judge(*estimate(0.1, bias_error=10.0), upper_bounds=True).verdict == "not consistent"
+    large, truth = estimate(0.1, bias_error=10.0)
+    assert consistency.judge(of_a_recording(large), truth).verdict == "not consistent"
 
 
 @pytest.mark.parametrize("samples", [200, 20, 1])
@@ -343,7 +361,7 @@ def test_bounds_are_those_that_decide(plan):
 )
 def test_check_ends_with_the_status_of_the_verdict(run, tmp_path, made, status, verdict):
     result, _ = estimate(**made)
-    records.write_estimate("estimate.h5", result)
+    write_estimate("estimate.h5", result)
     ended, said, _ = run("check", "estimate.h5", "--json", "check.json")
     assert ended == status
     assert verdict in said
@@ -354,7 +372,7 @@ def test_check_ends_with_the_status_of_the_verdict(run, tmp_path, made, status, 
 
 def test_check_uses_the_truth_in_the_file(run):
     result, truth = estimate(bias_error=10.0)
-    records.write_estimate("estimate.h5", result, truth=truth)
+    write_estimate("estimate.h5", replace(result, truth=truth))
     status, said, _ = run("check", "estimate.h5")
     assert status == 1
     assert "with its truth" in said

@@ -19,7 +19,7 @@ from strapdown.estimation import setup
 from strapdown.gyro import GyroSpec
 from strapdown.recordings import attitudes, recordfiles, ulog
 from strapdown.recordings.attitudes import read_attitudes
-from strapdown.records import Truth, read_estimate, read_truth, write_estimate
+from strapdown.records import Truth
 from strapdown.records.outputs import euler, euler_axes, to_ned
 from strapdown.units import DEGREE, DEGREE_PER_HOUR_PER_ROOT_HOUR, DEGREE_PER_ROOT_HOUR
 
@@ -114,7 +114,7 @@ def command(monkeypatch, capsys, *arguments):
 def files(run, tmp_path_factory):
     folder = tmp_path_factory.mktemp("foreign")
     recordfiles.write_record(folder / "record.h5", run.record)
-    write_estimate(folder / "estimate.h5", run.estimate, truth=run.record.truth)
+    setup.write_estimate(folder / "estimate.h5", replace(run.estimate, truth=run.record.truth))
     recordings.write(run.estimate, folder / "estimate.csv")
     recordings.write(run.estimate, folder / "estimate.tum")
     # A bag holds stamps of a recording, which begins one sample after the record's first edge.
@@ -217,11 +217,11 @@ def test_an_estimate_without_a_bias_is_kept_and_reported(files, run, tmp_path):
     e = run.estimate
     found = checked(run, covariance=e.covariance[:, :3, :3], bias=None, innovations={})
     out = tmp_path / "attitude.h5"
-    write_estimate(out, found.estimate, truth=found.truth)
-    read = read_estimate(out)
+    setup.write_estimate(out, replace(found.estimate, truth=found.truth))
+    read = setup.read_estimate(out)
     assert not read.has_bias
     np.testing.assert_array_equal(read.covariance[:, :3, :3], e.covariance[:, :3, :3])
-    assert statistics(consistency.judge(read, read_truth(out))) == statistics(found.judgement)
+    assert statistics(consistency.judge(read)) == statistics(found.judgement)
     assert {one.of for one in found.judgement.findings} == {"attitude"}
     report.write(out, tmp_path / "attitude.html")
     page = (tmp_path / "attitude.html").read_text(encoding="utf-8")

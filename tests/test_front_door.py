@@ -274,8 +274,8 @@ def test_integrate_starts_at_the_truth():
 
 def test_files_are_recognised_by_their_content(tmp_path):
     record = sd.simulate(scenario(10.0))
-    sd.write(record, tmp_path / "record.csv")
-    assert sd.read(tmp_path / "record.csv").origin.seed == 3
+    sd.write(record, tmp_path / "record.h5")
+    assert sd.read(tmp_path / "record.h5").origin.seed == 3
     estimate = sd.estimate(record)
     sd.write(estimate, tmp_path / "estimate.h5")
     np.testing.assert_array_equal(sd.read(tmp_path / "estimate.h5").attitude, estimate.attitude)
@@ -286,7 +286,7 @@ def test_files_are_recognised_by_their_content(tmp_path):
     sd.write(sd.FilterSetup.for_scenario(scenario()), tmp_path / "filter.toml")
     assert sd.estimation.setup.read_setup(tmp_path / "filter.toml") == sd.FilterSetup.for_scenario(scenario())
     with pytest.raises(sd.InputError, match="units"):
-        sd.read(tmp_path / "record.csv", units={"gyro": "deg/s"})
+        sd.read(tmp_path / "record.h5", units={"gyro": "deg/s"})
     with pytest.raises(sd.InputError, match="toml"):
         sd.write(scenario(), tmp_path / "scenario.h5")
 

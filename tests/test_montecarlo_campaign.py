@@ -442,7 +442,7 @@ def test_a_replay_is_the_run_of_the_campaign_to_the_bit(command, machine):
     status, said, _ = command("short-montecarlo.h5", "--replay", 5)
     assert status == 0
     assert "Run 5 of seed 1" in said
-    estimate = records.read_estimate("short-montecarlo-run-5-estimate.h5")
+    estimate = setups.read_estimate("short-montecarlo-run-5-estimate.h5")
     record = recordfiles.read_record("short-montecarlo-run-5-record.h5")
     step = (len(estimate.time) - 1) // held.plan.epochs
     rows = slice(None, None, step)

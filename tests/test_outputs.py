@@ -11,8 +11,9 @@ from typer.testing import CliRunner
 from strapdown import quaternion, recordings
 from strapdown.checks import InputError
 from strapdown.cli import app
+from strapdown.estimation.setup import read_estimate
 from strapdown.recordings import Recording
-from strapdown.records import Estimate, outputs, read_estimate
+from strapdown.records import Estimate, outputs
 
 SEQUENCES = ["".join(s) for s in itertools.product("XYZ", repeat=3) if s[0] != s[1] != s[2]]
 

@@ -17,7 +17,7 @@ from strapdown.estimation import filters, setup
 from strapdown.estimation.filters import extended
 from strapdown.gyro import GyroSpec
 from strapdown.montecarlo import Plan, campaign, verdicts
-from strapdown.records import Estimate, Truth, read_estimate, read_truth
+from strapdown.records import Estimate, Truth
 from strapdown.report import campaigns
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -233,7 +233,8 @@ def test_a_run_of_a_filter_without_a_bias_and_at_times_of_its_own_is_replayed_an
     files = ["own-run-1-estimate.h5", "--truth", "own-run-1-record.h5"]
     cli.app(["check", *files], standalone_mode=False)
     assert "the one test does not contradict the filter" in capsys.readouterr().out
-    read, truth = read_estimate("own-run-1-estimate.h5"), read_truth("own-run-1-estimate.h5")
+    read = setup.read_estimate("own-run-1-estimate.h5")
+    truth = read.truth
     assert np.max(np.abs(turn_to(read.attitude, truth.attitude))) < 5.0 * np.max(
         read.sigma[:, :3]
     )  # the truth of these times

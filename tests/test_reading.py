@@ -307,15 +307,6 @@ def test_what_lies_beside_a_result_and_is_no_figure_is_not_shown(known, tmp_path
         tunings.report(tmp_path / "filter.json", 0.99)
 
 
-def test_the_series_of_a_csv_record_are_no_links(tmp_path):
-    low = dataclasses.replace(scenarios.load_scenario("low-orbit"), duration=2.0)
-    written = recordfiles.export_csv(tmp_path / "record.csv", scenarios.simulate(low, 3))
-    written[1].rename(tmp_path / "elsewhere.csv")
-    written[1].symlink_to(tmp_path / "elsewhere.csv")
-    with pytest.raises(InputError, match=r"record-vectors-0\.csv is a symbolic link"):
-        recordfiles.read_record(written[0])
-
-
 def test_a_file_that_the_user_names_may_be_a_link(tmp_path):
     (tmp_path / "link.h5").symlink_to(_written(tmp_path / "record.h5"))
     assert len(recordfiles.read_record(tmp_path / "link.h5").time) == 2001

@@ -199,7 +199,7 @@ def test_an_estimate_keeps_more_than_its_start(folder, tmp_path):
 
 
 def test_errors_are_taken_at_the_same_times(folder):
-    estimate = records.read_estimate(folder / "run" / "estimate.h5")
+    estimate = setup.read_estimate(folder / "run" / "estimate.h5")
     with pytest.raises(InputError, match="same times"):
         consistency.errors(estimate.attitude, estimate.bias, estimate.attitude[:-1], estimate.bias[:-1])
 

@@ -57,12 +57,11 @@ def folder(tmp_path_factory, scenario, filter_setup, blank, panels):
         return drawn[-1]
 
     estimate, truth = estimate_of(scenario, filter_setup)
-    records.write_estimate(
-        where / "right.h5", estimate, {"command": "a <b> & c", "scenario": "x = 1\ny = 2"}, truth=truth
-    )
-    records.write_estimate(where / "blind.h5", estimate)
+    details = {"command": "a <b> & c", "notes": "x = 1\ny = 2"}
+    setup.write_estimate(where / "right.h5", dataclasses.replace(estimate, truth=truth, details=details))
+    setup.write_estimate(where / "blind.h5", estimate)
     wrong, truth = estimate_of(scenario, dataclasses.replace(filter_setup, measurement_sigma_factor=0.3))
-    records.write_estimate(where / "wrong.h5", wrong, truth=truth)
+    setup.write_estimate(where / "wrong.h5", dataclasses.replace(wrong, truth=truth))
     plan = montecarlo.Plan(
         scenario=dataclasses.replace(scenario, duration=20.0), setup=filter_setup, epochs=25, nis_bins=20
     )
@@ -108,7 +107,8 @@ def test_the_verdict_is_the_first_word_and_in_the_json(folder, name, verdict):
 
 
 def test_numbers_are_those_of_the_estimate(folder):
-    estimate, truth = records.read_estimate(folder / "right.h5"), records.read_truth(folder / "right.h5")
+    estimate = setup.read_estimate(folder / "right.h5")
+    truth = estimate.truth
     numbers = json.loads((folder / "right.report.json").read_text())["key_numbers"]
     half = len(estimate.time) // 2
     bias_error = np.sqrt(np.mean((truth.bias[half:] - estimate.bias[half:]) ** 2, axis=0))
@@ -123,7 +123,8 @@ def test_charts_hold_every_extreme(folder):
         for text in re.findall(r'<script type="application/json">(.*?)</script>', content, re.S)
     ]
     assert [chart["unit"].split(", ")[1] for chart in charts] == ["arcsec"] * 3 + ["°/h"] * 3
-    estimate, truth = records.read_estimate(folder / "right.h5"), records.read_truth(folder / "right.h5")
+    estimate = setup.read_estimate(folder / "right.h5")
+    truth = estimate.truth
     error = (truth.bias - estimate.bias) * 180.0 / np.pi * 3600.0
     for axis in range(3):
         high, low, drawn = (np.array(values) for values in charts[3 + axis]["data"][1:])
@@ -357,7 +358,8 @@ def rows_of(content, first):
 
 def test_each_column_of_the_estimates_table_is_what_its_head_says(folder):
     """Of a filter that is three times too sure, so that no column is another's."""
-    estimate, truth = records.read_estimate(folder / "wrong.h5"), records.read_truth(folder / "wrong.h5")
+    estimate = setup.read_estimate(folder / "wrong.h5")
+    truth = estimate.truth
     half = len(estimate.time) // 2
     error = 648000.0 / np.pi * (truth.bias - estimate.bias)[half:]
     sigma = 648000.0 / np.pi * np.sqrt(estimate.variance[half:, 3:])
@@ -373,7 +375,7 @@ def test_each_column_of_the_estimates_table_is_what_its_head_says(folder):
 
 
 def test_the_estimates_table_of_sensors_leaves_out_what_the_gate_rejected(folder):
-    estimate = records.read_estimate(folder / "right.h5")
+    estimate = setup.read_estimate(folder / "right.h5")
     one = estimate.innovations["star 1"]
     outlier = np.arange(len(one.time)) % 5 == 0
     wild = np.where(outlier[:, None], 100.0 * one.innovation, one.innovation)

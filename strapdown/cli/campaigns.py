@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import signal
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -282,6 +281,7 @@ def _with_filter(held: Campaign, own: Own, source: Path) -> Campaign:
 
 def _print_result(campaign: Campaign) -> tuple[int, dict[str, Any]]:
     """Print the statistics and the verdict of `strapdown check`; return the exit status and the content of the JSON file."""
+    from strapdown import workflows
     from strapdown.cli.judgement import status_of
     from strapdown.estimation.setup import MEKF
     from strapdown.montecarlo import summary
@@ -293,7 +293,7 @@ def _print_result(campaign: Campaign) -> tuple[int, dict[str, Any]]:
         console.print(f"{campaign.statistics.runs} of {campaign.runs} runs are completed.")
     report = summary(campaign.statistics, bound=bound_of(campaign.plan))
     figure = lambda value: "-" if value is None else f"{value:.4g}" if value >= 1e3 else f"{value:.4f}"  # noqa: E731
-    judgement = campaign.statistics.judge(unmodelled=campaign.plan.unmodelled)
+    judgement = workflows.check(campaign)
     rows = table(
         f"Per degree of freedom; 1 for a consistent filter. NEES over {report['epochs_judged']} epochs",
         *("", "mean", "minimum", "maximum", "from", "to", ""),
@@ -393,45 +393,22 @@ def _replayed(target: Path, run: int) -> list[Path]:
 
 
 def _replay(plan: Plan, run: int, machine: str, target: Path) -> None:
-
-    from strapdown import consistency
+    from strapdown import consistency, workflows
     from strapdown import montecarlo as engine
-    from strapdown.estimation import setup
     from strapdown.recordings import recordfiles
-    from strapdown.records import Origin, Truth, write_estimate
-    from strapdown.scenarios import scenario_to_toml
 
-    choice = engine.choose(plan, machine)
     again = engine.replay(plan, run, machine=machine)
-    truth = again.record.truth
-    assert truth is not None
-    # If a filter step combines several samples, the record is at the samples or at the steps, depending on the machine.
-    edges = np.searchsorted(again.record.time, again.estimate.time - 1e-9)
-    true = Truth(attitude=truth.attitude[edges], bias=truth.bias[edges])
-    attributes: dict[str, Any] = {
-        "scenario": scenario_to_toml(plan.scenario),
-        "seed": plan.seed,
-        "run": run,
-        "machine": choice.machine,
-        "filter": setup.to_toml(plan.setup),
-        "dispersions": json.dumps(plan.to_table()["dispersions"]),
-    }
-    paths = _replayed(target, run)
-    origin = Origin(gyro=plan.scenario.gyro, scenario=plan.scenario, seed=plan.seed, run=run)
-    recordfiles.write_record(
-        paths[0],
-        replace(again.record, origin=origin),
-        attributes={name: attributes[name] for name in ("machine", "dispersions")},
-    )
-    write_estimate(paths[1], again.estimate, attributes, truth=true)
-    estimate = again.estimate
+    estimate, truth, paths = again.estimate, again.estimate.truth, _replayed(target, run)
+    recordfiles.write_record(paths[0], again.record, attributes=estimate.details)
+    workflows.write(estimate, paths[1])
     size, states = (6, "six") if estimate.has_bias else (3, "three")
-    error = consistency.errors(estimate.attitude, np.nan_to_num(estimate.bias), true.attitude, true.bias)[:, :size]
     assert estimate.covariance is not None
+    assert truth is not None
+    error = consistency.errors(estimate.attitude, np.nan_to_num(estimate.bias), truth.attitude, truth.bias)[:, :size]
     nees = consistency.nees(error, estimate.covariance[:, :size, :size])
     step = int(np.argmax(nees))
     console.print(
-        f"Run {run} of seed {plan.seed}, machine: {choice}. Its maximum NEES is {nees[step]:.4g} ({states} states), "
+        f"Run {run} of seed {plan.seed}, machine: {engine.choose(plan, machine)}. Its maximum NEES is {nees[step]:.4g} ({states} states), "
         f"at {estimate.time[step]:g} s."
     )
     written(*paths)

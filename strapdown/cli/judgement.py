@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -127,33 +127,28 @@ def check(
 
 def _judged_own(result: Path, probability: float, *, with_record: bool) -> tuple[Judgement, dict[str, Any]]:
     """Judge a result of this package; return the verdict and the start of the JSON content."""
-    from strapdown import records
-    from strapdown.report import findings
+    from strapdown import workflows
 
-    attributes = records.read_attributes(result)
-    kind = str(attributes["kind"])
+    held: Any = workflows.read(result)
+    kind = reading.kind(result)
     if kind == "strapdown montecarlo":
-        from strapdown.montecarlo import campaign
-
         if with_record:
             raise InputError("--record and --filter go with an estimate; for a Monte Carlo, replay a run first")
-        held = campaign.read(result)
         if held.statistics is None:
             raise InputError(f"{result} has no completed run yet; resume it with `strapdown montecarlo --resume`")
         console.print(f"{result.name}: {held.statistics.runs} of {counted(held.runs, 'run')}, machine {held.machine}.")
-        judgement = held.statistics.judge(probability=probability, unmodelled=held.plan.unmodelled)
     elif kind == "strapdown estimate":
-        estimate = records.read_estimate(result)
-        truth = records.read_truth(result)
+        truth = held.truth
         console.print(
-            f"{result.name}: {len(estimate.time)} epochs over {estimate.time[-1] - estimate.time[0]:.6g} s, "
-            f"{sum(len(one.time) for one in estimate.innovations.values())} measurements, "
-            f"{'with its truth' if truth is not None else 'with a reference attitude' if records.read_reference(result) else 'no truth'}."
+            f"{result.name}: {len(held.time)} epochs over {held.time[-1] - held.time[0]:.6g} s, "
+            f"{sum(len(one.time) for one in held.innovations.values())} measurements, "
+            f"{'no truth' if truth is None else 'with its truth' if truth.has_bias else 'with a reference attitude'}."
         )
-        judgement = findings.judged(result, attributes, estimate, truth, probability=probability)
     else:
-        raise InputError(f"{result} is a {kind}; give a result of `strapdown estimate` or `strapdown montecarlo`")
-    return judgement, {"source": result.name, "kind": kind}
+        raise InputError(
+            f"{result} is {f'a {kind}' if kind else 'a recording'}; give a result of `strapdown estimate` or `strapdown montecarlo`"
+        )
+    return workflows.check(held, probability=probability), {"source": result.name, "kind": kind}
 
 
 def status_of(judgement: Judgement) -> int:
@@ -168,14 +163,17 @@ def _is_own(path: Path) -> bool:
 
 def _judged_foreign(result: Path, options: _Foreign, probability: float) -> tuple[Judgement, dict[str, Any]]:
     """Judge an estimate of another program; return the verdict and the start of the JSON content."""
-    from strapdown import consistency
+    from strapdown import consistency, workflows
     from strapdown.consistency import foreign
+    from strapdown.estimation.setup import read_estimate
     from strapdown.recordings.attitudes import read_attitudes
-    from strapdown.records import write_estimate
+    from strapdown.records import Origin
 
     if options.aligned is not None:
         writable("aligned", options.aligned, suffixes=(".h5", ".hdf5"), sources=(result, options.truth))
     own = read_attitudes(result, topic=options.topic or "")
+    if reading.kind(result) == "strapdown estimate":
+        own = replace(own, innovations=read_estimate(result).innovations)
     length = (own.stamps_ns[-1] - own.stamps_ns[0]) / 1e9
     console.print(f"{own.source}: {len(own.stamps_ns)} attitudes over {length:.6g} s.")
     say(*own.remarks)
@@ -211,8 +209,8 @@ def _judged_foreign(result: Path, options: _Foreign, probability: float) -> tupl
         console.print(f"Note: the file declares that its covariance is of the {frame} error.")
     _show_explanations(found)
     if options.aligned is not None:
-        attributes = {"source": own.source, "truth": reference.source}
-        write_estimate(options.aligned, found.estimate, attributes, truth=found.truth)
+        aligned = replace(found.estimate, truth=found.truth, origin=Origin(source=own.source))
+        workflows.write(replace(aligned, details={"truth": reference.source}), options.aligned)
     return found.judgement, content
 
 
@@ -239,17 +237,18 @@ def _diagnosed(
     result: Path, record: Path, filter_file: Path | None, judgement: Judgement
 ) -> tuple[dict[str, Any], Diagnosis | None]:
     """Print the causes found from a record; return them for JSON, and the diagnosis with the combined verdict, or None."""
-    from strapdown import estimation, records
+    from strapdown import estimation
+    from strapdown.estimation.setup import read_estimate
     from strapdown.estimation.setup.for_record import unmodelled_errors
     from strapdown.recordings import recordfiles
     from strapdown.tuning import diagnosis
     from strapdown.tuning.residual_checks import accepted
 
-    chosen = _filter_of(result, filter_file)
-    estimate = records.read_estimate(result)
+    estimate = read_estimate(result)
+    chosen = _filter_of(result, estimate, filter_file)
     held = recordfiles.read_record(record)
     _need_same(result, estimate, record, held)
-    missing = unmodelled_errors(held, chosen)
+    missing = unmodelled_errors(held.origin, chosen)
     say(*no_state_words(missing, chosen))
     if chosen.states is not None and chosen.states.names:
         reason = f"the search supports filters of attitude and bias only, and this one has the states {', '.join(chosen.states.names)}"
@@ -272,17 +271,15 @@ def _diagnosed(
     return content, found
 
 
-def _filter_of(result: Path, filter_file: Path | None) -> FilterSetup:
+def _filter_of(result: Path, estimate: Estimate, filter_file: Path | None) -> FilterSetup:
     """Return the setup of an estimate, from a file or from the estimate itself."""
-    from strapdown import records
     from strapdown.estimation import setup
 
     if filter_file is not None:
         return setup.read_setup(filter_file)
-    text = records.read_attributes(result).get("filter")
-    if text is None:
+    if estimate.setup is None:
         raise InputError(f"{result} does not contain its filter; give --filter, a TOML file with the table [filter]")
-    return setup.from_toml(str(text), f"{result}: filter")
+    return estimate.setup  # type: ignore[no-any-return]
 
 
 def _need_same(result: Path, estimate: Estimate, path: Path, record: ImuRecord) -> None:

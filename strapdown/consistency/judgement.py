@@ -24,6 +24,7 @@ from strapdown.consistency.whiteness import (
     ljung_box,
     mean_innovation_p_value,
 )
+from strapdown.estimation.setup.for_record import unmodelled_errors
 from strapdown.files import plain
 from strapdown.records import Estimate, Truth
 from strapdown.results import Listed, Listing, figure
@@ -232,33 +233,27 @@ def judge(
     truth: Truth | None = None,
     *,
     probability: float = 0.99,
-    upper_bounds: bool = False,
-    error_states: Sequence[str] | None = None,
-    unmodelled: Sequence[str] = (),
 ) -> Judgement:
     """Return the verdict on one run.
+
+    If the estimate is that of a recording (``motion``), the filter's noise covers disturbances that last over many samples. Its
+    innovations are then neither white nor as large as their variance, and only larger ones contradict it: σ are upper bounds.
 
     Parameters
     ----------
     estimate : Estimate
-        Estimate with innovations; if a truth is given, with full covariances.
+        Estimate with innovations; if a truth is known, with full covariances.
     truth : Truth, optional
-        Attitude and bias at the estimate's times, NaN if unknown. Without it only the innovations are judged.
+        Attitude and bias at the estimate's times, NaN if unknown. Default: that of the estimate; without any only the innovations are
+        judged.
     probability : float, default 0.99
         A consistent filter is rejected with probability at most 1 − ``probability``, all tests together.
-    upper_bounds : bool, default False
-        Whether the filter's noise covers disturbances that last over many samples, as that of :mod:`strapdown.ahrs` does. Its innovations
-        are then neither white nor as large as their variance, and only larger ones contradict it.
-    error_states : sequence of str, optional
-        Names of the filter's error states. Default: those of the estimate.
-    unmodelled : sequence of str, default empty
-        Specified errors that the filter has no state for (:func:`strapdown.estimation.setup.unmodelled_errors`); named in the verdict.
 
     Returns
     -------
     Judgement
         The verdict; its ``power`` is the error of each state's σ that the tests would have detected. Error states have no truth here and
-        are not tested.
+        are not tested. Errors that the estimate's ``origin`` specifies and its filter has no state for are named in the verdict.
 
     References
     ----------
@@ -279,12 +274,14 @@ def judge(
         if innovations.refused:
             limits.append(f"{innovations.refused} measurements of {sensor} that the gate refused are left out")
     findings += _of_pairs(estimate)
-    beside = tuple(estimate.error_states if error_states is None else error_states)
+    beside = tuple(estimate.error_states)
+    unmodelled = unmodelled_errors(estimate.origin, estimate.setup)
+    truth = estimate.truth if truth is None else truth
     if truth is None:
         limits.append(WITHOUT_TRUTH)
     else:
         findings += _of_errors(estimate, truth, limits, beside)
-    if upper_bounds:
+    if estimate.motion:
         return _bounded(findings, limits, probability, unmodelled)
     return concluded(findings, limits, probability, states=(*STATES, *beside), unmodelled=unmodelled)
 

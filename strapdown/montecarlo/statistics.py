@@ -23,7 +23,7 @@ errors e = (δθ, δb) of :func:`strapdown.consistency.errors` and the filter's 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -43,8 +43,9 @@ from strapdown.consistency.judgement import (
     ratio,
     state_name,
 )
+from strapdown.montecarlo.plan import Plan
 from strapdown.records import Estimate, ImuRecord
-from strapdown.results import Listed, Listing, figure
+from strapdown.results import ByContent, Listed, Listing, figure
 
 Counts = NDArray[np.int64]
 
@@ -101,7 +102,7 @@ class Replay:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Statistics(Listed):
+class Statistics(ByContent, Listed):
     """Sums over independent runs at each epoch.
 
     Errors are e = (δθ, δb): rad in the body frame, rad/s. The sums at an epoch exclude runs that are not finite there.
@@ -149,6 +150,8 @@ class Statistics(Listed):
         Errors of these runs, finite or not, rad and rad/s.
     example_sigma : ndarray (x, m, 6)
         The filter's σ in these runs, rad and rad/s.
+    plan : Plan, optional
+        Scenario, filter, seed and dispersions of the runs.
     """
 
     _drawn_by = "runs_overview"
@@ -173,10 +176,9 @@ class Statistics(Listed):
     example_run: Counts
     example_error: Array
     example_sigma: Array
+    plan: Plan | None = None
 
-    def judge(
-        self, *, epochs: Iterable[int] | None = None, probability: float = 0.99, unmodelled: Sequence[str] = ()
-    ) -> Judgement:
+    def judge(self, *, epochs: Iterable[int] | None = None, probability: float = 0.99) -> Judgement:
         """Return the verdict on these independent runs.
 
         Parameters
@@ -185,8 +187,6 @@ class Statistics(Listed):
             Indices of the epochs at which errors are judged. Default: 20 evenly spaced ones without the first, which is the prior.
         probability : float, default 0.99
             A consistent filter is rejected with probability at most 1 − ``probability``, all tests together.
-        unmodelled : sequence of str, default empty
-            Specified errors that the filter has no state for; named in the verdict.
 
         Returns
         -------
@@ -210,6 +210,7 @@ class Statistics(Listed):
                 mean = float(np.sum(self.sensor_nis_sum[row]) / degrees)
                 findings.append(ratio("NIS", sensor, mean, 1, degrees, innovation_words(sensor, mean)))
         tested = [name for name in STATES if name in self.subsets]
+        unmodelled = () if self.plan is None else self.plan.unmodelled
         return concluded(findings, [], probability, states=tested, needed=tested, unmodelled=unmodelled)
 
     def listing(self) -> Listing:
@@ -504,7 +505,7 @@ def merge(a: Statistics, b: Statistics) -> Statistics:
     for name in _SAME:
         if not np.array_equal(getattr(a, name), getattr(b, name)):
             raise InputError(f"statistics of different {name} cannot be merged; they are of different plans")
-    merged: dict[str, Any] = {name: getattr(a, name) for name in _SAME}
+    merged: dict[str, Any] = {name: getattr(a, name) for name in (*_SAME, "plan")}
     merged.update(zip(_WORST, worst(*(np.concatenate([getattr(a, n), getattr(b, n)]) for n in _WORST)), strict=True))
     first = np.argsort(np.concatenate([a.example_run, b.example_run]), kind="stable")[:EXAMPLES]
     merged.update({name: np.concatenate([getattr(a, name), getattr(b, name)])[first] for name in _EXAMPLES})

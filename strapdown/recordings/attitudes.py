@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from strapdown import quaternion, records
+from strapdown import quaternion
 from strapdown.checks import Array, InputError, array, one_of
 from strapdown.files import reading
 from strapdown.recordings import delimited, recordfiles, ros, trajectories, ulog
@@ -87,19 +87,18 @@ def _whole_ns(time: Array) -> NDArray[np.int64]:
 def _own(path: Path, kind: str) -> Attitudes:
     """Read a result of this package, of this kind."""
     if kind == "strapdown estimate":
-        estimate = records.read_estimate(path)
-        size = 6 if estimate.has_bias else 3
-        P = estimate.covariance
-        if P is None:
-            P = np.apply_along_axis(np.diag, 1, estimate.variance)
+        with reading.hdf5(path) as file:
+            arrays = {name: reading.numbers(file, name) for name in ("time", "attitude", "variance")}
+            size = arrays["variance"].shape[1]
+            P = reading.numbers(file, "covariance") if "covariance" in file else None
+            bias = reading.numbers(file, "bias") if "bias" in file else None
         return Attitudes(
             source=path.name,
-            stamps_ns=_whole_ns(estimate.time),
-            attitude=quaternion.normalize(estimate.attitude),
-            covariance=P[:, :size, :size],
+            stamps_ns=_whole_ns(arrays["time"]),
+            attitude=quaternion.normalize(arrays["attitude"]),
+            covariance=arrays["variance"][:, :, None] * np.eye(size) if P is None else P,
             error_frame="body",
-            bias=estimate.bias if estimate.has_bias else None,
-            innovations=estimate.innovations,
+            bias=bias,
         )
     if kind == recordfiles.KIND:
         record = recordfiles.read_record(path)

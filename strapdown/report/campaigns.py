@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from strapdown import consistency, plots, records
+from strapdown import consistency, plots, records, workflows
 from strapdown.checks import Array, InputError
 from strapdown.files import plain
 from strapdown.montecarlo import campaign, verdicts
@@ -25,7 +25,7 @@ def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
     statistics = held.statistics
     if statistics is None:
         raise InputError(f"{path} has no completed run yet; continue the campaign with --resume first")
-    judgement = statistics.judge(probability=probability, unmodelled=held.plan.unmodelled)
+    judgement = workflows.check(held, probability=probability)
     bound = verdicts.bound_of(held.plan)
     name = held.plan.scenario.name or "a scenario"
     unfinished = "" if held.finished else f"; incomplete: {statistics.runs} of {held.runs} runs"

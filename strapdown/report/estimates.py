@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from strapdown import consistency, plots, quaternion, records
+from strapdown import consistency, plots, quaternion, records, workflows
 from strapdown.checks import Array
+from strapdown.estimation import setup
 from strapdown.plots.estimates import angle_labels
 from strapdown.plots.style import AXES
 from strapdown.records import Estimate, Innovations, Truth
@@ -23,19 +24,24 @@ _COLOURS = ("--a", "--b", "--c")
 def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
     """Return the page and the statistics for an estimate file."""
     attributes = records.read_attributes(path)
-    estimate = records.read_estimate(path)
-    truth = records.read_truth(path)
+    estimate = setup.read_estimate(path)
+    truth = estimate.truth
     error = None
     if truth is not None:
-        error = consistency.errors(estimate.attitude, estimate.bias, truth.attitude, truth.bias)
-    judgement = findings.judged(path, attributes, estimate, truth, probability=probability)
+        known = np.isfinite(truth.attitude).all(axis=1)
+        error = np.full((len(estimate.time), 6), np.nan)
+        error[known] = consistency.errors(
+            estimate.attitude[known], estimate.bias[known], truth.attitude[known], truth.bias[known]
+        )
+    judgement = workflows.check(estimate, probability=probability)
     span = estimate.time[-1] - estimate.time[0]
     used = sum(len(one.time) for one in estimate.innovations.values())
     content = page.page(
         f"Estimate: {path.name}",
         f"{len(estimate.time)} epochs over {span:g} s, {used} measurements of {len(estimate.innovations)} "
         f"sensor{'' if len(estimate.innovations) == 1 else 's'}, "
-        f"{'with' if truth is not None else 'without'} truth; strapdown {attributes.get('version', '')}",
+        f"{'without truth' if truth is None else 'with truth' if truth.has_bias else 'with a reference attitude'}; "
+        f"strapdown {attributes.get('version', '')}",
         findings.verdict(judgement),
         *(
             [page.section("Events", *(page.paragraph(str(event)) for event in estimate.events))]
@@ -44,7 +50,7 @@ def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
         ),
         _numbers(estimate, error),
         findings.evidence(judgement),
-        _over_time(estimate, truth, error, str(attributes.get("fixed_frame", ""))),
+        _over_time(estimate, truth, error),
         *[_sensor(name, one, probability) for name, one in estimate.innovations.items()],
         *_distribution(estimate, truth),
         page.section(
@@ -80,10 +86,14 @@ def _key_numbers(estimate: Estimate, error: Array | None) -> dict[str, Any]:
         numbers["final_bias_rad_per_s"] = estimate.bias[-1].tolist()
         numbers["final_bias_sigma_rad_per_s"] = estimate.sigma[-1, 3:].tolist()
     if error is not None:
-        rms = np.sqrt(np.mean(error[len(error) // 2 :] ** 2, axis=0))
-        numbers["rms_attitude_error_second_half_rad"] = rms[:3].tolist()
-        if estimate.has_bias:
-            numbers["rms_bias_error_second_half_rad_per_s"] = rms[3:].tolist()
+        half = error[len(error) // 2 :]
+        for name, states in (
+            ("attitude_error_second_half_rad", slice(3)),
+            ("bias_error_second_half_rad_per_s", slice(3, 6)),
+        ):
+            known = half[np.isfinite(half[:, states]).all(axis=1), states]
+            if len(known):
+                numbers[f"rms_{name}"] = np.sqrt(np.mean(known**2, axis=0)).tolist()
     return numbers
 
 
@@ -97,8 +107,9 @@ def _numbers(estimate: Estimate, error: Array | None) -> str:
             k = states.start + axis
             row = [f"{what} {name}, {unit}", page.number(float(sigma[k] / size))]
             if error is not None:
-                own = error[half:, k] / size
-                row += [page.number(float(x)) for x in (np.sqrt(np.mean(own**2)), np.mean(own), np.abs(own).max())]
+                own = error[half:, k][np.isfinite(error[half:, k])] / size
+                values = (np.sqrt(np.mean(own**2)), np.mean(own), np.abs(own).max()) if len(own) else (np.nan,) * 3
+                row += [page.number(float(x)) for x in values]
             rows.append(row)
     head = ["second half of the run", "σ of the filter"]
     head += ["RMS error", "mean error", "largest"] if error is not None else []
@@ -121,13 +132,15 @@ def _numbers(estimate: Estimate, error: Array | None) -> str:
     return page.section("Key numbers", *parts)
 
 
-def _over_time(estimate: Estimate, truth: Truth | None, error: Array | None, fixed_frame: str) -> str:
+def _over_time(estimate: Estimate, truth: Truth | None, error: Array | None) -> str:
     sigma = estimate.sigma
     charts = []
     figure = ""
     settled = slice(len(estimate.time) // 20, None)
     if truth is not None and error is not None:
         for what, (states, unit_of) in zip(("Attitude error", "Bias error"), _parts(estimate), strict=False):
+            if not np.isfinite(error[:, states]).any():
+                continue
             unit, size = unit_of(3.0 * sigma[settled, states])
             for k, axis in enumerate(AXES):
                 state = states.start + k
@@ -137,10 +150,10 @@ def _over_time(estimate: Estimate, truth: Truth | None, error: Array | None, fix
                     page.Series(label="−3σ", value=-bound, colour="--faint", band=True),
                     page.Series(label=f"{what.lower()} {axis}", value=value, colour=_COLOURS[k]),
                 )
-                reach = 1.3 * max(float(bound[settled].max()), float(np.abs(value[settled]).max()))
+                reach = 1.3 * max(float(bound[settled].max()), float(np.nanmax(np.abs(value[settled]), initial=0.0)))
                 label = f"{what.lower()} {axis}, {unit}"
                 charts.append(page.chart(f"{what} {axis}", label, estimate.time, series, reach=reach))
-        if estimate.has_bias:
+        if estimate.has_bias and truth.has_bias:
             figure = page.figure(
                 lambda: plots.error_overview(estimate, truth),
                 "Errors relative to the truth with the filter's ±3σ, body axes",
@@ -149,7 +162,7 @@ def _over_time(estimate: Estimate, truth: Truth | None, error: Array | None, fix
         euler = quaternion.to_rotation(estimate.attitude).as_euler("ZYX", degrees=True)[:, ::-1]
         series = tuple(
             page.Series(label=name, value=euler[:, k], colour=_COLOURS[k], wraps=True)
-            for k, name in enumerate(angle_labels(fixed_frame))
+            for k, name in enumerate(angle_labels(estimate.fixed_frame))
         )
         charts.append(page.chart("Attitude, Euler angles Z-Y-X", "angle, °", estimate.time, series))
         unit, size = rate_unit(3.0 * sigma[settled, 3:])
@@ -161,7 +174,7 @@ def _over_time(estimate: Estimate, truth: Truth | None, error: Array | None, fix
         series = (page.Series(label="σ, root sum square of the three axes", value=spread),)
         charts.append(page.chart("Attitude σ", "attitude σ, °", estimate.time, series))
         figure = page.figure(
-            lambda: plots.estimate_overview(estimate, fixed_frame=fixed_frame),
+            lambda: plots.estimate_overview(estimate, fixed_frame=estimate.fixed_frame),
             "Attitude, gyro bias with ±3σ, attitude σ",
         )
     return page.section("Over time", *charts, figure)
@@ -189,7 +202,8 @@ def _sensor(name: str, innovations: Innovations, probability: float) -> str:
 def _distribution(estimate: Estimate, truth: Truth | None) -> list[str]:
     if truth is None:
         return []
-    angle = quaternion.angle_between(estimate.attitude, truth.attitude)
+    known = np.isfinite(truth.attitude).all(axis=1)
+    angle = quaternion.angle_between(estimate.attitude[known], truth.attitude[known])
 
     def draw() -> Figure:
         figure, ax = plots.new_figure(size=(6.5, 4.2))
