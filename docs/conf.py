@@ -3,6 +3,7 @@
 Every page is executed when it is built, in an empty folder, and nothing is fetched from the network, neither by the build nor by the pages.
 """
 
+import html
 import os
 import re
 import shutil
@@ -16,7 +17,9 @@ from docutils.utils.math import MathError, latex2mathml
 from sphinx.errors import ExtensionError
 
 DOCS = Path(__file__).resolve().parent
-sys.path.insert(0, str(DOCS.parent))
+sys.path[:0] = [str(DOCS.parent), str(DOCS)]
+
+import formula_font  # noqa: E402
 
 import strapdown  # noqa: E402
 
@@ -87,7 +90,13 @@ def _mathml(self: Any, node: nodes.Element, *, block: bool) -> None:
         markup = latex2mathml.tex2mathml(node.astext(), as_block=block)
     except MathError as error:
         raise ExtensionError(f"{node.source}:{node.line}: {error} in {node.astext()}") from error
-    markup = _spaced(markup)
+    markup = _spaced(
+        re.sub(r">ˉ</mo>", ">¯</mo>", re.sub(r'(<mo stretchy="false">)~', r"\1˜", markup))
+    )  # accents that fonts have
+    if missing := formula_font.missing(html.unescape(re.sub(r"<[^>]*>", "", markup))):
+        raise ExtensionError(
+            f"{node.source}:{node.line}: the font of formulas lacks {missing}; add them in formula_font.py"
+        )
     if block:
         number = f'<span class="formula-number">({node["number"]})</span>' if node.get("number") else ""
         markup = f'<div class="math">{markup}{number}</div>\n'
