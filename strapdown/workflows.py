@@ -31,7 +31,10 @@ from strapdown import (
 )
 from strapdown.ahrs.remarks import fixed_frame, remarks
 from strapdown.checks import Array, InputError, count, instance
-from strapdown.consistency import Judgement
+from strapdown.consistency import Accuracy, Judgement
+from strapdown.consistency.accuracy import accuracy as accuracy_of_rows
+from strapdown.consistency.accuracy import accuracy_of
+from strapdown.consistency.alignment import Series
 from strapdown.covariance import analyse as covariance_analysis
 from strapdown.estimation import setup as setups
 from strapdown.estimation.gating import Gate, Robust
@@ -40,6 +43,7 @@ from strapdown.estimation.states import ProcessNoise, State
 from strapdown.files import reading, written_beside
 from strapdown.gyro import GyroSpec
 from strapdown.recordings import Recording, recordfiles
+from strapdown.recordings.attitudes import Attitudes, read_attitudes
 from strapdown.records import Estimate, ImuRecord, Origin, Truth
 from strapdown.scenarios import Scenario, simulate
 
@@ -55,6 +59,7 @@ if TYPE_CHECKING:
 __all__ = [
     "AttitudeHistory",
     "RecordRun",
+    "accuracy",
     "allan_deviation",
     "check",
     "covariance_analysis",
@@ -65,6 +70,7 @@ __all__ = [
     "monte_carlo",
     "plan",
     "read",
+    "read_attitudes",
     "simulate",
     "smooth",
     "tune",
@@ -525,7 +531,8 @@ def check(
     result: Estimate | Statistics | Campaign,
     truth: Truth | ImuRecord | Recording | None = None,
     *,
-    probability: float = 0.99,
+    confidence_level: float = 0.99,
+    detectable_error: float = consistency.DETECTABLE,
 ) -> Judgement:
     """Test whether a filter is consistent, that is, whether its errors and innovations agree with its covariance.
 
@@ -538,13 +545,16 @@ def check(
     truth : Truth, ImuRecord or Recording, optional
         Truth at the epochs of the estimate, or the record or recording with its truth, which is matched by time. Default: the estimate's
         own; if it has none, only the innovations are tested.
-    probability : float, default 0.99
+    confidence_level : float, default 0.99
         Minimum probability with which a consistent filter passes all tests together.
+    detectable_error : float, default 1.5
+        "consistent" needs tests that would have detected an error of σ by this factor, of attitude, bias and innovations.
 
     Returns
     -------
     Judgement
-        ``verdict`` is "consistent", "not consistent" or "cannot tell"; ``findings`` has the statistics.
+        ``headline`` has the verdict, "consistent", "not consistent" or "cannot tell", and the parts that were tested; ``findings`` has the
+        statistics.
 
     Examples
     --------
@@ -552,7 +562,8 @@ def check(
     >>> print(sd.check(sd.estimate(sd.simulate("two-stars"))))  # doctest: +SKIP
     """
     if isinstance(result, Estimate):
-        return consistency.judge(result, _truth_at(result, truth), probability=probability)
+        options = {"confidence_level": confidence_level, "detectable_error": detectable_error}
+        return consistency.judge(result, _truth_at(result, truth), **options)
     statistics: Any = getattr(result, "statistics", result)
     if statistics is None:
         raise InputError("the Monte Carlo has no finished run yet; resume it")
@@ -560,7 +571,7 @@ def check(
         raise InputError(f"result is {type(result).__name__}; give an Estimate, or what monte_carlo returned")
     if truth is not None:
         raise InputError("truth goes with an estimate; a Monte Carlo contains its own truth; leave it out")
-    judgement: Judgement = statistics.judge(probability=probability)
+    judgement: Judgement = statistics.judge(confidence_level=confidence_level, detectable_error=detectable_error)
     return judgement
 
 
@@ -587,6 +598,36 @@ def _truth_at(result: Estimate, truth: Truth | ImuRecord | Recording | None) -> 
     if np.max(np.abs(truth.time[rows] - result.time)) > SAME_STAMP:
         raise InputError("the time stamps of record and estimate differ; give the record of the estimate")
     return whole.taken(rows)
+
+
+def accuracy(result: Estimate, truth: Truth | ImuRecord | Recording | Attitudes | None = None) -> Accuracy:
+    """Return the attitude errors of an estimate: total, heading and inclination, as given, and aligned with a truth of another source.
+
+    Parameters
+    ----------
+    result : Estimate
+        Estimate of any filter.
+    truth : Truth, ImuRecord, Recording or Attitudes, optional
+        Truth at the epochs of the estimate; the record or recording with its truth; or attitudes of any source
+        (:func:`read_attitudes`), in another clock and other frames. Default: the estimate's own.
+
+    Returns
+    -------
+    Accuracy
+        Errors over all samples and over the movement; with covariances also their coverage and the ratio of RMS error and σ.
+
+    Examples
+    --------
+    >>> import strapdown as sd
+    >>> print(sd.accuracy(sd.estimate(recording)))  # doctest: +SKIP
+    """
+    instance("result", result, Estimate, "give the result of estimate or read")
+    if not isinstance(truth, Attitudes):
+        known = _truth_at(result, truth) or result.truth
+        return accuracy_of_rows(result, known, align=known is not None and not known.has_bias)
+    P = result.attitude_covariance
+    own = Series(result.time, result.attitude, P if np.isfinite(P).all() else None)
+    return accuracy_of(own, Series(truth.seconds(0), truth.attitude, movement=truth.movement))
 
 
 def plan(

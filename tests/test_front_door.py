@@ -184,7 +184,7 @@ def test_estimate_of_a_recording_is_that_of_the_command(succeeds, tmp_path):
 def test_monte_carlo_is_that_of_the_command(run, tmp_path):
     sd.write(scenario(10.0), tmp_path / "small.toml")
     options = ("--runs", 10, "--out", tmp_path / "runs.h5", "--threads", 1)
-    assert run("montecarlo", tmp_path / "small.toml", *options)[0] == 2  # ten runs cannot tell
+    assert run("montecarlo", tmp_path / "small.toml", *options)[0] == 3  # ten runs cannot tell
     campaign = sd.read(tmp_path / "runs.h5")
     call = sd.monte_carlo(tmp_path / "small.toml", runs=10, threads=1)
     np.testing.assert_array_equal(call.nees_sum, campaign.statistics.nees_sum)

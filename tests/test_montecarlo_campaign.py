@@ -83,7 +83,7 @@ def test_the_file_describes_itself(tmp_path):
         assert "quaternions Hamilton" in attributes["conventions"]
         for dataset in file["statistics"].values():
             assert reading.attributes(dataset).keys() >= {"unit", "meaning"}
-        names = {field.name for field in fields(statistics.Statistics)} - {"runs", "sensors"}
+        names = {field.name for field in fields(statistics.Statistics)} - {"runs", "sensors", "plan"}
         assert set(file["statistics"]) == names
 
 
@@ -337,7 +337,7 @@ SCALAR = ("--machine", "scalar")
 
 def test_the_command_computes_prints_and_writes(command):
     status, said, error = command("short.toml", "--runs", 30, "--seed", 4, *SCALAR)
-    assert (status, error) == (2, "")  # 30 runs cannot tell
+    assert (status, error) == (3, "")  # 30 runs cannot tell
     assert "More runs (--runs, with --resume) are needed for a decision." in said
     assert "short: 30 runs, seed 4, machine: scalar." in said
     for words in (
@@ -545,7 +545,7 @@ def test_a_signal_that_whoever_started_the_command_had_ignored_stays_ignored(com
     signal.signal(number, signal.SIG_IGN)
     monkeypatch.setattr(campaign, "_write", interrupted)
     status, _, _ = command("short.toml", "--runs", 20, "--threads", 1, *SCALAR)
-    assert status == 2  # 20 runs cannot tell
+    assert status == 3  # 20 runs cannot tell
     assert campaign.read("short-montecarlo.h5").finished
     assert signal.getsignal(number) is signal.SIG_IGN
 

@@ -13,7 +13,7 @@ from strapdown.records import Estimate
 from tests.conftest import BROAD
 
 TRIALS = sorted(BROAD.glob("*.hdf5"))
-STATUS = {"consistent": 0, "not consistent": 1, "cannot tell": 2}
+STATUS = {"consistent": 0, "not consistent": 1, "cannot tell": 3}
 
 
 def run(*arguments: object) -> int:

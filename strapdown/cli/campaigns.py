@@ -113,7 +113,7 @@ def montecarlo(
     computing: _Computing,
     output: _Output,
 ) -> None:
-    """Run many simulations of a scenario and judge the filter: exit status 0 consistent, 1 not, 2 cannot tell (or bad input)."""
+    """Run many simulations of a scenario and judge the filter: exit status 0 consistent, 1 not, 3 cannot tell."""
     source = Path(scenario)
     held, plan = _planned(source, scenario, model, computing.machine)
     machine = held.machine if held is not None and computing.machine == "auto" else computing.machine
@@ -321,7 +321,7 @@ def _print_result(campaign: Campaign) -> tuple[int, dict[str, Any]]:
         rate = f" ({rate_text(campaign.statistics.runs / campaign.seconds)} runs/s, including compilation)"
     console.print(
         f"{counted(report['runs'], 'run')}, {campaign.seconds:.3g} s{rate}. The verdict combines all {len(judgement.findings)} "
-        f"statistics of `strapdown check`: a consistent filter passes with {100.0 * report['probability']:g} %."
+        f"statistics of `strapdown check`: a consistent filter passes with {100.0 * report['confidence_level']:g} %."
     )
     console.print(judgement.words)
     if judgement.verdict == "cannot tell":

@@ -24,6 +24,7 @@ from strapdown.cli.terminal import (
     need_own,
     say,
     show,
+    show_listing,
     table,
     writable,
     written,
@@ -449,7 +450,6 @@ def _estimate_recording(
 ) -> None:
     """Run the filter over a recording: accelerometer as the vertical, magnetometer as the heading."""
     from strapdown import ahrs, recordings, workflows
-    from strapdown.consistency import reference_errors
     from strapdown.gyro import read_spec
     from strapdown.gyro import temperature as thermal
     from strapdown.recordings import unit_calibration
@@ -491,19 +491,11 @@ def _estimate_recording(
     if shared.observability:
         paths.append(_observability(out, source.source, run.record, parameters.setup, run.initial))
     if result.truth is not None:
-        errors = reference_errors(result.attitude, result.truth.attitude).rms(result.truth.movement)
-        over = "the whole recording" if result.truth.movement is None else "the movement phase"
-        paths.append(_rms(out, source.source, {name: value / DEGREE for name, value in errors.items()}, over))
+        table = workflows.accuracy(result)
+        show_listing(table.listing(), notes=True)
+        paths.append(out / "errors.json")
+        write_json(paths[-1], {"source": source.source, **table.summary()})
     paths += _export(exports, result, source)
     if output.drawn_as is not None:
         paths += _drawn(out, output.drawn_as, result, source.source)
     written(*paths)
-
-
-def _rms(out: Path, source: str, rms: dict[str, float], over: str) -> Path:
-    """Print and write the RMS errors relative to the reference, degrees; return the file."""
-    write_json(out / "errors.json", {"source": source, **{f"{name}_rmse_deg": value for name, value in rms.items()}})
-    rows = table(f"RMS error over {over}, degrees", *rms, left=0)
-    rows.add_row(*(f"{value:.2f}" for value in rms.values()))
-    show(rows)
-    return out / "errors.json"

@@ -38,8 +38,8 @@ if TYPE_CHECKING:
     from strapdown.records import Estimate, ImuRecord
     from strapdown.tuning.diagnosis import Diagnosis
 
-CONSISTENT, NOT, CANNOT_TELL = 0, 1, 2
-"""Exit status of a verdict. Bad input also ends with 2, and an error on standard error."""
+CONSISTENT, NOT, CANNOT_TELL = 0, 1, 3
+"""Exit status of a verdict; 2 is that of bad usage or input."""
 
 
 @dataclass(frozen=True)
@@ -75,8 +75,12 @@ def check(
         ),
     ],
     foreign: _Foreign,
-    probability: float = typer.Option(
+    confidence_level: float = typer.Option(
         0.99, help="Minimum probability with which a consistent filter passes all tests together."
+    ),
+    detectable_error: float = typer.Option(
+        1.5,
+        help="Factor on σ that the tests of attitude, bias and innovations must be able to detect for the verdict consistent.",
     ),
     record: Path | None = typer.Option(
         None, help="Record from which the estimate was made; likely causes are then determined."
@@ -88,7 +92,7 @@ def check(
     ),
     json: Path | None = typer.Option(None, "--json", help="File for all statistics; - for standard output."),
 ) -> None:
-    """Judge whether a filter is consistent: exit status 0 consistent, 1 not, 2 cannot tell (or bad input).
+    """Judge whether a filter is consistent: exit status 0 consistent, 1 not, 3 cannot tell, 2 bad usage or input.
 
     With --record, the verdict combines the statistics with a search for causes. With --truth, the estimate may be from any filter; clocks
     and frames are compared first. Without a truth, an estimate of another program is judged by its innovations, if it has any.
@@ -98,7 +102,8 @@ def check(
     json_target(json, result, record, filter_file, foreign.truth)
     if record is None and filter_file is not None:
         raise InputError("--filter goes with --record: the record is needed to search for causes")
-    tail(probability)
+    tail(confidence_level)
+    how: dict[str, Any] = {"confidence_level": confidence_level, "detectable_error": detectable_error}
     own = _is_own(result)
     if record is not None and (foreign.truth is not None or not own):
         raise InputError(
@@ -108,9 +113,9 @@ def check(
         if name not in ("--topic", "--truth-topic"):
             raise InputError(f"{name} goes with --truth; give a reference, or leave it out")
     if foreign.truth is not None or not own:
-        judgement, content = _judged_foreign(result, foreign, probability)
+        judgement, content = _judged_foreign(result, foreign, how)
     else:
-        judgement, content = _judged_own(result, probability, with_record=record is not None)
+        judgement, content = _judged_own(result, how, with_record=record is not None)
     words = judgement.words
     _show_statistics(judgement)
     if record is not None:
@@ -125,7 +130,7 @@ def check(
     raise typer.Exit(status_of(judgement))
 
 
-def _judged_own(result: Path, probability: float, *, with_record: bool) -> tuple[Judgement, dict[str, Any]]:
+def _judged_own(result: Path, how: dict[str, Any], *, with_record: bool) -> tuple[Judgement, dict[str, Any]]:
     """Judge a result of this package; return the verdict and the start of the JSON content."""
     from strapdown import workflows
 
@@ -148,7 +153,7 @@ def _judged_own(result: Path, probability: float, *, with_record: bool) -> tuple
         raise InputError(
             f"{result} is {f'a {kind}' if kind else 'a recording'}; give a result of `strapdown estimate` or `strapdown montecarlo`"
         )
-    return workflows.check(held, probability=probability), {"source": result.name, "kind": kind}
+    return workflows.check(held, **how), {"source": result.name, "kind": kind}
 
 
 def status_of(judgement: Judgement) -> int:
@@ -161,7 +166,7 @@ def _is_own(path: Path) -> bool:
     return not path.exists() or path.suffix.lower() in (".h5", ".hdf5") or (path.is_file() and reading.is_hdf5(path))
 
 
-def _judged_foreign(result: Path, options: _Foreign, probability: float) -> tuple[Judgement, dict[str, Any]]:
+def _judged_foreign(result: Path, options: _Foreign, how: dict[str, Any]) -> tuple[Judgement, dict[str, Any]]:
     """Judge an estimate of another program; return the verdict and the start of the JSON content."""
     from strapdown import consistency, workflows
     from strapdown.consistency import foreign
@@ -184,7 +189,7 @@ def _judged_foreign(result: Path, options: _Foreign, probability: float) -> tupl
                 f"{result} has no innovations, so it cannot be judged without a truth; give --truth, attitudes over the same time"
             )
         estimate = foreign.without_truth(own.seconds(int(own.stamps_ns[0])), own.attitude, own.innovations)
-        return consistency.judge(estimate, None, probability=probability), content
+        return consistency.judge(estimate, **how), content
     reference = read_attitudes(options.truth, topic=options.truth_topic or "")
     console.print(f"Truth: {reference.source}, {len(reference.stamps_ns)} attitudes.")
     # One clock may count from 1970 and the other from the boot of a machine: both relative to the first stamp, in integer ns.
@@ -201,12 +206,14 @@ def _judged_foreign(result: Path, options: _Foreign, probability: float) -> tupl
         innovations=own.innovations,
         error_frame=frame,
         align=options.align,
-        probability=probability,
+        true_movement=reference.movement,
+        **how,
     )
     content.update(found.summary())
     say(*(f"Note: {remark}." for remark in found.remarks))
     if frame != options.error_frame:
         console.print(f"Note: the file declares that its covariance is of the {frame} error.")
+    show_listing(found.accuracy.listing(), notes=True)
     _show_explanations(found)
     if options.aligned is not None:
         aligned = replace(found.estimate, truth=found.truth, origin=Origin(source=own.source))
@@ -227,9 +234,10 @@ def _show_explanations(found: Checked) -> None:
 def _show_statistics(judgement: Judgement) -> None:
     if judgement.findings:
         show_listing(judgement.listing(), "Statistics of the filter and their bounds for a consistent filter")
+        share = 100.0 * (1.0 - judgement.confidence_level)
         console.print(
-            "Each p-value is for one statistic; bounds, pass and FAIL are for all together "
-            f"(a consistent filter fails with at most {100.0 * (1.0 - judgement.probability):.2g} %). NIS, NEES: per degree of freedom."
+            "Each p-value is for one statistic; bounds, pass and FAIL are for all together (a consistent filter fails with at most "
+            f"{share:.2g} %). NIS, NEES: per degree of freedom."
         )
 
 
@@ -259,7 +267,7 @@ def _diagnosed(
     # The verdict is on the filter with its gate, so measurements that it rejected are left out.
     with progress_bar("searching for causes"):
         found = diagnosis.diagnose(
-            accepted(held, estimate), chosen, initial, probability=judgement.probability, judgement=judgement
+            accepted(held, estimate), chosen, initial, probability=judgement.confidence_level, judgement=judgement
         )
     show_listing(found.listing(), "Causes by their effect on the likelihood")
     content = {**found.summary(), "without_a_state": list(missing)}
@@ -307,7 +315,7 @@ def doctor(
         None, "--json", help="File for the explanations and their scores; - for standard output."
     ),
 ) -> None:
-    """Test the axes, signs, frames and units of a recording against alternatives: exit status 0 as declared, 1 wrong, 2 cannot tell."""
+    """Test the axes, signs, frames and units of a recording against alternatives: exit status 0 as declared, 1 wrong, 3 cannot tell."""
     from strapdown import recordings
     from strapdown.ahrs import check_conventions
 

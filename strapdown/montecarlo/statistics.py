@@ -35,6 +35,7 @@ from strapdown.checks import Array, InputError
 from strapdown.consistency import Finding, Judgement, Verdict
 from strapdown.consistency.bounds import coverage_p_values, log_mean_p_value, tail
 from strapdown.consistency.judgement import (
+    INNOVATIONS,
     LOG_NEES,
     STATES,
     concluded,
@@ -178,28 +179,33 @@ class Statistics(ByContent, Listed):
     example_sigma: Array
     plan: Plan | None = None
 
-    def judge(self, *, epochs: Iterable[int] | None = None, probability: float = 0.99) -> Judgement:
+    def judge(
+        self,
+        *,
+        epochs: Iterable[int] | None = None,
+        confidence_level: float = 0.99,
+        detectable_error: float = consistency.DETECTABLE,
+    ) -> Judgement:
         """Return the verdict on these independent runs.
 
         Parameters
         ----------
         epochs : iterable of int, optional
             Indices of the epochs at which errors are judged. Default: 20 evenly spaced ones without the first, which is the prior.
-        probability : float, default 0.99
-            A consistent filter is rejected with probability at most 1 − ``probability``, all tests together.
+        confidence_level, detectable_error : float
+            As for :func:`strapdown.consistency.judge`.
 
         Returns
         -------
         Judgement
-            "consistent" only if the runs would have shown a σ of attitude or bias wrong by a factor of
-            :data:`strapdown.consistency.judgement.RESOLUTION`.
+            "consistent" only if the runs would have shown an error of σ of attitude, bias and innovations by ``detectable_error``.
         """
-        tail(probability)
+        tail(confidence_level)
         chosen = judged_epochs(len(self.time) - 1) if epochs is None else np.array(list(epochs), int)
         failed = int(self.runs - np.min(self.finite[chosen]))
         findings = []
         for subset in self.subsets:
-            findings.append(_anees(self, chosen, subset, probability, failed))
+            findings.append(_anees(self, chosen, subset, confidence_level, failed))
             if failed == 0:
                 findings.append(_log_nees(self, chosen, subset))
         if failed == 0 and self.runs >= 3:
@@ -209,9 +215,17 @@ class Statistics(ByContent, Listed):
             if degrees >= 1.0:
                 mean = float(np.sum(self.sensor_nis_sum[row]) / degrees)
                 findings.append(ratio("NIS", sensor, mean, 1, degrees, innovation_words(sensor, mean)))
-        tested = [name for name in STATES if name in self.subsets]
-        unmodelled = () if self.plan is None else self.plan.unmodelled
-        return concluded(findings, [], probability, states=tested, needed=tested, unmodelled=unmodelled)
+        parts = [f"{INNOVATIONS}{one.of}" for one in findings if one.name == "NIS"]
+        parts += [name for name in STATES if name in self.subsets]
+        return concluded(
+            findings,
+            [],
+            confidence_level,
+            parts=dict.fromkeys(parts, ""),
+            required=detectable_error,
+            unmodelled=() if self.plan is None else self.plan.unmodelled,
+            runs=f"{self.runs} runs",
+        )
 
     def listing(self) -> Listing:
         """Return NEES and NIS per degree of freedom, and the errors at the end, as a table."""
@@ -240,7 +254,7 @@ class Statistics(ByContent, Listed):
         ]
         if self.failed:
             notes.append(f"{self.failed} runs failed: their errors or covariances are not finite")
-        title = f"{self.runs} runs, per degree of freedom (1 expected); {100.0 * judgement.probability:g} % bounds of all together"
+        title = f"{self.runs} runs, per degree of freedom (1 expected); {100.0 * judgement.confidence_level:g} % bounds of all together"
         return Listing(title, ("statistic", "value", "bounds", ""), rows, notes)
 
     @property

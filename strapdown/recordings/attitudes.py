@@ -50,6 +50,8 @@ class Attitudes:
     """Gyro bias (m, 3), rad/s, body axes."""
     innovations: Mapping[str, Innovations] = field(default_factory=dict)
     """Innovations by sensor; times in s since the first stamp."""
+    movement: NDArray[np.bool_] | None = None
+    """Whether the unit moved (m,), if the file states it."""
     remarks: tuple[str, ...] = ()
 
     def seconds(self, origin_ns: int) -> Array:
@@ -122,7 +124,10 @@ def _of_recording(recording: Recording) -> Attitudes:
         raise InputError(f"{recording.source} is a recording without a reference attitude; give another reference")
     known = np.isfinite(recording.true_attitude).all(axis=1)
     stamps = recording.epoch_ns + _whole_ns(recording.time[known])
-    return Attitudes(source=recording.source, stamps_ns=stamps, attitude=recording.true_attitude[known])
+    movement = None if recording.movement is None else recording.movement[known]
+    return Attitudes(
+        source=recording.source, stamps_ns=stamps, attitude=recording.true_attitude[known], movement=movement
+    )
 
 
 # ------------------------------------------------------------------------------------------------------------ tables

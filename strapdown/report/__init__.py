@@ -43,7 +43,7 @@ class Report:
 
 
 def write(
-    result: str | os.PathLike[str], out: str | os.PathLike[str] | None = None, *, probability: float = 0.99
+    result: str | os.PathLike[str], out: str | os.PathLike[str] | None = None, *, confidence_level: float = 0.99
 ) -> Report:
     """Write the report of a result file, and its statistics as JSON beside it, atomically.
 
@@ -53,8 +53,8 @@ def write(
         HDF5 file of an estimate or a Monte Carlo, or the JSON of a tuning.
     out : path, optional
         The page. Default: ``result`` with the suffix .html.
-    probability : float
-        Probability that no test rejects a consistent filter.
+    confidence_level : float, default 0.99
+        Minimum probability that no test rejects a consistent filter.
 
     Returns
     -------
@@ -71,7 +71,7 @@ def write(
         known = ", ".join(name.removeprefix("strapdown ") for name in _WRITERS)
         raise InputError(f"{source} holds: {kind.removeprefix('strapdown ')}; reports are available for: {known}")
     with from_file(source):  # errors while drawing invalid numbers name the file
-        content, statistics = _WRITERS[kind](source, probability)
+        content, statistics = _WRITERS[kind](source, confidence_level)
     beside = target.with_suffix(".report.json")  # not .json, which other commands write beside their results
     with written_beside(target) as temporary:
         temporary.write_text(content, encoding="utf-8", errors="backslashreplace")  # a name may not be UTF-8

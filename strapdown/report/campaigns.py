@@ -18,14 +18,14 @@ from strapdown.plots.style import legend_below, match_scales
 from strapdown.report import findings, page
 
 
-def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
+def report(path: Path, confidence_level: float) -> tuple[str, dict[str, Any]]:
     """Return the page and the statistics for a campaign file."""
     attributes = records.read_attributes(path)
     held = campaign.read(path)
     statistics = held.statistics
     if statistics is None:
         raise InputError(f"{path} has no completed run yet; continue the campaign with --resume first")
-    judgement = workflows.check(held, probability=probability)
+    judgement = workflows.check(held, confidence_level=confidence_level)
     bound = verdicts.bound_of(held.plan)
     name = held.plan.scenario.name or "a scenario"
     unfinished = "" if held.finished else f"; incomplete: {statistics.runs} of {held.runs} runs"
@@ -39,7 +39,7 @@ def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
         page.section(
             "Over time",
             page.figure(
-                lambda: plots.runs_overview(statistics, probability),
+                lambda: plots.runs_overview(statistics, confidence_level),
                 "ANEES of attitude and bias, and NIS, with the bounds of a consistent filter",
             ),
             page.figure(
@@ -123,7 +123,12 @@ def _numbers(statistics: Statistics, bound: Array | None, judgement: consistency
     if nis:
         parts.append(
             page.table(
-                ("sensor", "NIS per degree of freedom", "from", f"to ({100.0 * judgement.probability:g} %, all tests)"),
+                (
+                    "sensor",
+                    "NIS per degree of freedom",
+                    "from",
+                    f"to ({100.0 * judgement.confidence_level:g} %, all tests)",
+                ),
                 nis,
                 numbers=3,
             )

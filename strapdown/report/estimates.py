@@ -21,7 +21,7 @@ from strapdown.units import DEGREE, angle_unit, rate_unit
 _COLOURS = ("--a", "--b", "--c")
 
 
-def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
+def report(path: Path, confidence_level: float) -> tuple[str, dict[str, Any]]:
     """Return the page and the statistics for an estimate file."""
     attributes = records.read_attributes(path)
     estimate = setup.read_estimate(path)
@@ -33,7 +33,8 @@ def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
         error[known] = consistency.errors(
             estimate.attitude[known], estimate.bias[known], truth.attitude[known], truth.bias[known]
         )
-    judgement = workflows.check(estimate, probability=probability)
+    judgement = workflows.check(estimate, confidence_level=confidence_level)
+    table = None if truth is None else workflows.accuracy(estimate)
     span = estimate.time[-1] - estimate.time[0]
     used = sum(len(one.time) for one in estimate.innovations.values())
     content = page.page(
@@ -49,9 +50,10 @@ def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
             else []
         ),
         _numbers(estimate, error),
+        *([] if table is None else [findings.listed(table.listing(), numbers=5)]),
         findings.evidence(judgement),
         _over_time(estimate, truth, error),
-        *[_sensor(name, one, probability) for name, one in estimate.innovations.items()],
+        *[_sensor(name, one, confidence_level) for name, one in estimate.innovations.items()],
         *_distribution(estimate, truth),
         page.section(
             "Provenance",
@@ -64,6 +66,7 @@ def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
         "source": path.name,
         "judgement": judgement.summary(),
         "key_numbers": _key_numbers(estimate, error),
+        "accuracy": None if table is None else table.summary(),
     }
 
 
@@ -180,7 +183,7 @@ def _over_time(estimate: Estimate, truth: Truth | None, error: Array | None) -> 
     return page.section("Over time", *charts, figure)
 
 
-def _sensor(name: str, innovations: Innovations, probability: float) -> str:
+def _sensor(name: str, innovations: Innovations, confidence_level: float) -> str:
     if len(innovations.time) < 8:
         return page.section(
             f"Innovations of {name}", page.paragraph(f"{len(innovations.time)} measurements are too few to draw.")
@@ -190,8 +193,8 @@ def _sensor(name: str, innovations: Innovations, probability: float) -> str:
     def draw() -> Figure:
         figure, axes = plots.new_figure(2, 2, size=(10.5, 7.0))
         plots.innovation_histogram(white, axes[0, 0])
-        plots.innovation_quantiles(consistency.quantile_pairs(white, probability), axes[0, 1])
-        plots.innovation_autocorrelation(consistency.autocorrelation(white, probability=probability), axes[1, 0])
+        plots.innovation_quantiles(consistency.quantile_pairs(white, confidence_level), axes[0, 1])
+        plots.innovation_autocorrelation(consistency.autocorrelation(white, probability=confidence_level), axes[1, 0])
         plots.nis_over_record(innovations, consistency.mean_bounds(white.shape[1], 1, 0.99), axes[1, 1])
         return figure
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from strapdown.consistency import Judgement
 from strapdown.report import page
+from strapdown.results import Listing
 
 
 def verdict(judgement: Judgement) -> str:
@@ -11,6 +12,12 @@ def verdict(judgement: Judgement) -> str:
     return page.verdict(
         judgement.verdict, judgement.reason, [finding.means for finding in judgement.findings if finding.rejected]
     )
+
+
+def listed(listing: Listing, *, numbers: int) -> str:
+    """Return the section of a table of a result, its last ``numbers`` columns numbers."""
+    notes = [page.paragraph(note, faint=True) for note in listing.notes]
+    return page.section(listing.title, page.table(listing.columns, listing.rows, numbers=numbers), *notes)
 
 
 def evidence(judgement: Judgement) -> str:
@@ -30,7 +37,7 @@ def evidence(judgement: Judgement) -> str:
     ]
     head = ("", "statistic", "of", "value", "from", "to", "p-value", "samples")
     marked = ["fail" if finding.rejected else "pass" for finding in judgement.findings]
-    percent = 100.0 * judgement.probability
+    percent = 100.0 * judgement.confidence_level
     note = (
         f"Bounds, pass and fail are for all tests together: a consistent filter fails with at most {100.0 - percent:g} %. Each p-value is "
         "for one statistic. For correlated samples, the number is the effective number of independent samples."
