@@ -30,7 +30,14 @@ version = release = strapdown.__version__
 
 shutil.rmtree(DOCS / "api/generated", ignore_errors=True)  # pages of modules that are no more would be read too
 
-extensions = ["myst_nb", "numpydoc", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.viewcode"]
+extensions = [
+    "presentation",
+    "myst_nb",
+    "numpydoc",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
+    "sphinx.ext.viewcode",
+]
 exclude_patterns = ["_build", "jupyter_execute", "_data", "_templates", "**.ipynb_checkpoints"]
 templates_path = ["_templates"]
 
@@ -65,7 +72,7 @@ nb_execution_timeout = 900  # a cell may compile a filter
 nb_merge_streams = True
 nb_render_markdown_format = "myst"
 nb_output_stderr = "remove"  # progress bars; an error still stops the build
-myst_enable_extensions = ["amsmath", "dollarmath", "deflist", "attrs_inline"]
+myst_enable_extensions = ["amsmath", "dollarmath", "deflist", "attrs_inline", "colon_fence"]
 myst_heading_anchors = 3
 
 autosummary_generate = True
@@ -79,6 +86,7 @@ html_theme = "furo"
 html_title = "strapdown"
 html_static_path = ["_static"]
 html_css_files = ["strapdown.css"]
+html_js_files = ["copy.js"]
 html_copy_source = False
 html_show_sphinx = False
 html_theme_options = {"navigation_with_keys": True}
