@@ -69,7 +69,7 @@ def statistics(judgement):
 def test_our_own_estimate_gets_its_own_verdict(run):
     own = consistency.judge(run.estimate, run.record.truth)
     found = checked(run)
-    assert own.verdict == "consistent"
+    assert own.verdict == "cannot tell"  # of the bias, which hardly changes in one run
     assert statistics(found.judgement) == statistics(own)
     assert found.alignment.estimated == ()
     assert found.error_frame == "body"
@@ -103,17 +103,19 @@ def correlated(draw, memory, m=600):
     return quaternion.multiply(truth, quaternion.exp(-1e-3 * error)), truth
 
 
-@pytest.mark.parametrize("memory", [1.0, 10.0, 40.0])
+@pytest.mark.parametrize("memory", [1.0, 30.0])
 def test_of_right_filters_one_in_a_hundred_is_given_a_cause(memory):
-    """Slow errors look like constant ones: of 150 a rate of 1 % gives more than six with a probability of 0.001."""
+    """Slow errors look like constant ones: of 80 a rate of 1 % gives more than four with a probability of 0.002."""
     draw = np.random.default_rng(5)
-    time, P = np.arange(600.0), np.tile(1e-6 * np.eye(3), (600, 1, 1))
+    time, P = np.arange(600.0), np.tile(1e-6 * np.eye(6), (600, 1, 1))
     blamed = 0
-    for _ in range(150):
-        attitude, truth = correlated(draw, memory)
-        found = check_arrays(time, attitude, P, time, truth, align="none")
-        blamed += any(one.likely for one in found.explanations)
-    assert blamed <= 6
+    for _ in range(80):
+        attitude, true = correlated(draw, memory)
+        error = quaternion.log(quaternion.multiply(quaternion.conjugate(attitude), true))
+        truth = Truth.of_reference(true)
+        found = foreign.explanations(error, {"body": P}, "body", {"body": 1.0}, truth, time, attitude)
+        blamed += any(one.likely for one in found)
+    assert blamed <= 4
 
 
 def test_a_rotation_of_two_sigma_is_a_likely_cause():
@@ -180,8 +182,8 @@ def test_exported_and_read_back_it_has_the_same_verdict(run, files, name, monkey
     own = consistency.judge(
         run.estimate if name.endswith("h5") else replace(run.estimate, innovations={}), run.record.truth
     )
-    assert saved["verdict"] == own.verdict == "consistent"
-    assert status == 0
+    assert saved["headline"] == own.headline
+    assert status == {"consistent": 0, "cannot tell": 3}[own.verdict]
     assert [(one["name"], one["of"]) for one in saved["findings"]] == [(one.name, one.of) for one in own.findings]
     np.testing.assert_allclose(
         [one["value"] for one in saved["findings"]], [one.value for one in own.findings], rtol=1e-9
@@ -352,7 +354,7 @@ def test_frames_and_clock_are_found_and_removed(run):
         assert np.all(np.abs(off) < 4.5 * a.sigma[rows])
         assert np.all(a.sigma[rows] < 0.5 * DEGREE)
     assert abs(a.offset + 1e6) < 4.5 * a.sigma[6] < 0.2
-    assert found.judgement.verdict == "consistent"
+    assert found.judgement.verdict != "not consistent"
     assert len([words for words in found.remarks if "removed" in words]) == 3
     # In the truth's body axes again, but for the uncertainty of what was removed, which is part of the covariance.
     rows = np.searchsorted(e.time, found.estimate.time - 0.05)
@@ -368,7 +370,7 @@ def test_conventions_of_quaternions_are_found(run, convention):
     q = quaternion.conjugate(q) if "conjugate" in convention else q
     q = q[:, [1, 2, 3, 0]] if "last" in convention else q
     found = checked(run, attitude=q)
-    assert found.judgement.verdict == "consistent"
+    assert found.judgement.verdict != "not consistent"
     assert found.alignment.estimated == ()
     wanted = {
         "conjugate": "the inverse, fixed",
@@ -411,7 +413,7 @@ def test_what_is_asked_for_is_removed(run):
     turned = quaternion.multiply(HEADING, run.estimate.attitude)
     found = checked(run, attitude=turned, align="fixed", error_frame="body")
     assert found.alignment.estimated == ("fixed",)
-    assert found.judgement.verdict == "consistent"
+    assert found.judgement.verdict != "not consistent"
 
 
 # ---------------------------------------------------------------------------------------------------------------- files
