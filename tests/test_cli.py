@@ -93,12 +93,12 @@ def test_ctrl_c_ends_with_status_130(run, monkeypatch, tmp_path):
 
 def test_a_fault_of_the_program_is_no_verdict(run, monkeypatch):
     """Status 1 of a raw traceback would be "not consistent" of `check`."""
-    from strapdown import records
+    from strapdown import workflows
 
     def broken(*_: object) -> str:
         raise ZeroDivisionError("a fault")
 
-    monkeypatch.setattr(records, "read_attributes", broken)
+    monkeypatch.setattr(workflows, "read", broken)
     status, said, error = run("check", "estimate.h5")
     assert (status, said) == (70, "")
     assert "ZeroDivisionError: a fault" in error.splitlines()

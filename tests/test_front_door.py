@@ -22,8 +22,17 @@ from strapdown import results
 
 NAMES = {
     *("FilterSetup", "Gate", "GyroSpec", "InputError", "LiveFilter", "ProcessNoise", "Robust", "Scenario"),
-    *("StepFilter", "VectorSensor", "allan_deviation", "check", "covariance_analysis", "estimate", "fit_noise"),
-    *("initial_state", "integrate", "monte_carlo", "read", "simulate", "smooth", "tune", "write"),
+    *(
+        "StepFilter",
+        "VectorSensor",
+        "accuracy",
+        "allan_deviation",
+        "check",
+        "covariance_analysis",
+        "estimate",
+        "fit_noise",
+    ),
+    *("initial_state", "integrate", "monte_carlo", "read", "read_attitudes", "simulate", "smooth", "tune", "write"),
 }
 
 

@@ -35,7 +35,7 @@ def folder(tmp_path_factory, short):
         ["montecarlo", str(where / "short.toml"), "--runs", "8", "--out", str(where / "runs.h5")],
     ):
         result = CliRunner().invoke(cli.app, command)
-        assert result.exit_code == (2 if command[0] == "montecarlo" else 0), result.output  # 8 runs cannot tell
+        assert result.exit_code == (3 if command[0] == "montecarlo" else 0), result.output  # 8 runs cannot tell
     return where
 
 
@@ -207,7 +207,7 @@ def test_errors_are_taken_at_the_same_times(folder):
 def test_numbers_that_nothing_can_be_are_reported_before_anything_else(there, tmp_path):
     for command in (
         ["montecarlo", "short.toml", "--runs", 0, "--out", tmp_path / "x.h5"],
-        ["check", "run/estimate.h5", "--probability", 1],
+        ["check", "run/estimate.h5", "--confidence-level", 1],
     ):
         assert refused_at_once(command)
     assert not list(tmp_path.iterdir())

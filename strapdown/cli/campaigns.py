@@ -406,9 +406,11 @@ def _replay(plan: Plan, run: int, machine: str, target: Path) -> None:
     assert truth is not None
     error = consistency.errors(estimate.attitude, np.nan_to_num(estimate.bias), truth.attitude, truth.bias)[:, :size]
     nees = consistency.nees(error, estimate.covariance[:, :size, :size])
-    step = int(np.argmax(nees))
+    # At the epochs of the statistics, as in the list of worst runs.
+    rows = np.searchsorted(estimate.time, plan.time + 1e-9, side="right") - 1
+    worst = int(rows[np.argmax(nees[rows])])
     console.print(
-        f"Run {run} of seed {plan.seed}, machine: {engine.choose(plan, machine)}. Its maximum NEES is {nees[step]:.4g} ({states} states), "
-        f"at {estimate.time[step]:g} s."
+        f"Run {run} of seed {plan.seed}, machine: {engine.choose(plan, machine)}. Its maximum NEES at the campaign's {plan.epochs} epochs is "
+        f"{nees[worst]:.1f} ({states} states), at {estimate.time[worst]:g} s."
     )
     written(*paths)

@@ -318,6 +318,7 @@ def doctor(
     """Test the axes, signs, frames and units of a recording against alternatives: exit status 0 as declared, 1 wrong, 3 cannot tell."""
     from strapdown import recordings
     from strapdown.ahrs import check_conventions
+    from strapdown.recordings.sensor_faults import stuck_words
 
     json_target(json, recording)
     source = recordings.read(recording, **layout.options(recording))
@@ -326,6 +327,7 @@ def doctor(
     say(
         f"{found.source}: {found.words}",
         *(f"warning: {words}." for words in found.doubts),
+        *(f"warning: {words}" for words in stuck_words(source)),
         *(f"Note: {remark}" for remark in source.remarks),
     )
     if found.candidates:
