@@ -410,7 +410,7 @@ def _replay(plan: Plan, run: int, machine: str, target: Path) -> None:
     rows = np.searchsorted(estimate.time, plan.time + 1e-9, side="right") - 1
     worst = int(rows[np.argmax(nees[rows])])
     console.print(
-        f"Run {run} of seed {plan.seed}, machine: {engine.choose(plan, machine)}. Its maximum NEES at the campaign's {plan.epochs} epochs is "
-        f"{nees[worst]:.1f} ({states} states), at {estimate.time[worst]:g} s."
+        f"Run {run} of seed {plan.seed}, machine: {engine.choose(plan, machine)}. Its maximum NEES at the {plan.epochs} epochs of the "
+        f"campaign is {nees[worst]:.1f} ({states} states), at {estimate.time[worst]:g} s."
     )
     written(*paths)

@@ -461,11 +461,11 @@ def _estimate_recording(
     spec = None if shared.gyro is None else read_spec(shared.gyro)
     with progress_bar("reading"):
         source = recordings.read(recording, **layout)
-    if source.true_attitude is not None and source.movement is not None:
-        if not (np.isfinite(source.true_attitude).all(axis=1) & source.movement).any():
-            raise InputError(
-                f"{recording}: no sample to judge has a reference attitude; check its movement mask and its reference"
-            )
+    known = None if source.true_attitude is None else np.isfinite(source.true_attitude).all(axis=1)
+    if known is not None and source.movement is not None and not (known & source.movement).any():
+        raise InputError(
+            f"{recording}: no sample to judge has a reference attitude; check its movement mask and its reference"
+        )
     doubt(source, recording)
     with progress_bar("smoothing" if shared.smooth else "filtering"):
         run = workflows.estimate_recording(

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from strapdown.checks import InputError
-from strapdown.files.reading import BLOCK, SEAL
+from strapdown.files.reading import BLOCK, SEAL, uninterrupted
 
 
 @contextlib.contextmanager
@@ -46,7 +46,10 @@ def whole_hdf5(path: str | os.PathLike[str]) -> Iterator[Any]:
     import h5py
 
     content = io.BytesIO()
-    with h5py.File(content, "w", userblock_size=BLOCK, libver=("v110", "v110")) as file:  # v110: attributes above 64 kB
+    with (
+        uninterrupted(),
+        h5py.File(content, "w", userblock_size=BLOCK, libver=("v110", "v110")) as file,
+    ):  # v110: attributes above 64 kB
         yield file
     held = content.getbuffer()
     held[:BLOCK] = _user_block(held[BLOCK:])

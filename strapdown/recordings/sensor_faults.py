@@ -214,7 +214,7 @@ ROTATES = 0.2
 
 
 def stuck_words(recording: Recording) -> tuple[str, ...]:
-    """Return a sentence for each gyro axis that is stuck: at one value throughout, or for seconds while the unit rotates about the others."""
+    """Return a sentence for each gyro axis stuck at one value, throughout or for seconds in which the unit rotates about the others."""
     time, found = recording.time, []
     for axis, name in enumerate("xyz"):
         values = recording.rate[:, axis]
