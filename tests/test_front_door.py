@@ -32,7 +32,18 @@ NAMES = {
         "estimate",
         "fit_noise",
     ),
-    *("initial_state", "integrate", "monte_carlo", "read", "read_attitudes", "simulate", "smooth", "tune", "write"),
+    *(
+        "initial_state",
+        "integrate",
+        "calibrate",
+        "monte_carlo",
+        "read",
+        "read_attitudes",
+        "simulate",
+        "smooth",
+        "tune",
+        "write",
+    ),
 }
 
 
@@ -478,7 +489,7 @@ def test_dir_shows_the_names_and_the_public_submodules_alone():
 
 BELOW = ("ahrs.check_conventions", "allan.parameters", "allan.temperature", "estimation.error_states")
 BELOW += ("estimation.filters", "estimation.multiple_model", "gyro.datasheets", "montecarlo.campaign")
-BELOW += ("montecarlo.cluster", "motion.orbit", "recordings.unit_calibration", "records.outputs", "vectors.wahba")
+BELOW += ("montecarlo.cluster", "motion.orbit", "records.outputs", "vectors.wahba")
 """Public modules below the public submodules."""
 
 

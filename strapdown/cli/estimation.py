@@ -131,7 +131,8 @@ class _Recorded:
         help="Delay of the gyro's samples by its low-pass filter, ms; 0: point samples. Default: half a sample interval.",
     )
     calibration: Path | None = typer.Option(
-        None, help="calibration.toml of an earlier recording of the same unit; a new one is written."
+        None,
+        help="calibration.toml of the unit, from `strapdown calibrate` or an earlier estimate; a new one is written.",
     )
     temperature: Path | None = typer.Option(
         None,
@@ -449,14 +450,13 @@ def _estimate_recording(
     recording: Path, layout: dict[str, Any], shared: _Shared, options: _Recorded, output: _Output, exports: Exports
 ) -> None:
     """Run the filter over a recording: accelerometer as the vertical, magnetometer as the heading."""
-    from strapdown import ahrs, recordings, workflows
+    from strapdown import ahrs, calibration, recordings, workflows
     from strapdown.gyro import read_spec
     from strapdown.gyro import temperature as thermal
-    from strapdown.recordings import unit_calibration
 
     motion = one_of("--motion", options.motion or ahrs.motions.AUTO, (ahrs.motions.AUTO, *ahrs.MOTIONS))
     late = None if options.latency is None else 1e-3 * non_negative("--latency", options.latency, unit="ms")
-    carried = None if options.calibration is None else unit_calibration.read(options.calibration)
+    carried = None if options.calibration is None else calibration.read(options.calibration)
     warm = None if options.temperature is None else thermal.read(options.temperature)
     spec = None if shared.gyro is None else read_spec(shared.gyro)
     with progress_bar("reading"):
@@ -484,7 +484,7 @@ def _estimate_recording(
     paths = _write(out, result, run.record)
     if run.calibration is not None:
         paths.append(out / "calibration.toml")
-        paths[-1].write_text(unit_calibration.to_toml(run.calibration), encoding="utf-8")
+        calibration.write(run.calibration, paths[-1])
     say(*result.remarks)
     _print_result(replace(result, skipped={}))
     if shared.gyro is not None:
