@@ -423,7 +423,7 @@ def test_a_browser_shows_figures_and_charts(folder, tmp_path, name, width):
     assert found["pressed"] == "false"
     assert found["ink"] == "#16181d"  # dark on paper, also in the dark theme
     if name == "right":
-        assert found["samples"] == len(records.read_estimate(folder / "right.h5").time)
+        assert found["samples"] == len(setup.read_estimate(folder / "right.h5").time)
         assert found["body"] == [found["samples"] - 1]
         assert found["turned"] == [0]
 
