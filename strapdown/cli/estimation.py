@@ -342,7 +342,6 @@ def _drawn(
 ) -> list[Path]:
     """Draw the estimate, its optional states, and its errors relative to a truth or a reference; return the files."""
     from strapdown import plots
-    from strapdown.consistency import reference_errors
     from strapdown.plots.style import save_as
 
     truth = result.truth
@@ -352,8 +351,7 @@ def _drawn(
     if truth is not None and truth.has_bias:
         figures[out / "errors"] = plots.error_overview(result, truth, title=title)
     elif truth is not None:
-        errors = reference_errors(result.attitude, truth.attitude)
-        figures[out / "errors"] = plots.recording_errors(result.time, errors, truth.movement)
+        figures[out / "errors"] = plots.recording_errors(result, truth.attitude, truth.movement)
     return save_as(figures, form)
 
 
