@@ -37,7 +37,7 @@ import strapdown
 from strapdown import ahrs, consistency, covariance, montecarlo, quaternion, recordings, scenarios, vectors
 from strapdown.ahrs import HAND_HELD
 from strapdown.checks import Array
-from strapdown.consistency import foreign, reference_errors
+from strapdown.consistency import alignment, reference_errors
 from strapdown.estimation import State, filters, setup
 from strapdown.estimation.states import ProcessNoise
 from strapdown.files import write_json
@@ -236,13 +236,13 @@ def samples(record: ImuRecord) -> tuple[Array, Array, Array, float]:
     return record.rates, force.vector_b, field.vector_b, 1.0 / RATE
 
 
-def frame_of(attitude: Array, time: Array, truth: Array) -> foreign.Alignment:
+def frame_of(attitude: Array, time: Array, truth: Array) -> alignment.Alignment:
     """Return the rotations by right angles between a peer's frames and the package's, from the second half of a record."""
     half = slice(len(time) // 2, None)
-    series = foreign._Series(time[half], quaternion.normalize(attitude)[half])
-    found = foreign.fit(series, foreign._Series(time[half], truth[half]), ("fixed", "body"), 0.0)
+    series = alignment.Series(time[half], quaternion.normalize(attitude)[half])
+    found = alignment.fit(series, alignment.Series(time[half], truth[half]), ("fixed", "body"), 0.0)
     snapped = {name: _snapped(getattr(found, name)) for name in ("fixed", "body")}
-    return foreign.Alignment(**{**vars(found), **snapped})
+    return alignment.Alignment(**{**vars(found), **snapped})
 
 
 def _snapped(rotation: Array) -> Array:
@@ -310,11 +310,11 @@ def main(
         frame = frame_of(peer(*samples(trained[0]), 1.0), trained[0].time[1:], trained[0].truth.attitude[1:])
 
         def attitude(
-            record: ImuRecord, gain: float, peer: Peer = peer, frame: foreign.Alignment = frame
+            record: ImuRecord, gain: float, peer: Peer = peer, frame: alignment.Alignment = frame
         ) -> tuple[Array, float]:
             begun = clock.process_time()
             q = peer(*samples(record), gain)
-            return foreign.replace_attitude(quaternion.normalize(q), frame), clock.process_time() - begun
+            return alignment.in_truth_frames(quaternion.normalize(q), frame), clock.process_time() - begun
 
         scores = [np.mean([np.mean(errors_of(attitude(r, gain)[0], r) ** 2) for r in trained]) for gain in GAINS]
         best = GAINS[int(np.argmin(scores))]
@@ -428,7 +428,7 @@ def _until(recording: Recording, end: float) -> Recording:
 
 def _errors(
     run: Callable[[Recording, float], tuple[Array, Array]],
-    frame: foreign.Alignment | None,
+    frame: alignment.Alignment | None,
     recording: Recording,
     gain: float,
 ) -> tuple[list[float], float]:
@@ -436,7 +436,7 @@ def _errors(
     begun = clock.process_time()
     time, q = run(recording, gain)
     spent = clock.process_time() - begun
-    attitude = q if frame is None else foreign.replace_attitude(q, frame)
+    attitude = q if frame is None else alignment.in_truth_frames(q, frame)
     rows = np.searchsorted(recording.time, time)
     assert recording.true_attitude is not None
     assert recording.movement is not None

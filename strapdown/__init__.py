@@ -6,8 +6,8 @@
 >>> print(sd.check(estimate, record))  # is the filter consistent?  # doctest: +SKIP
 
 Tasks
-    ``simulate``, ``read``, ``write``, ``estimate``, ``smooth``, ``integrate``, ``check``, ``tune``, ``monte_carlo``,
-    ``covariance_analysis``, ``allan_deviation``, ``fit_noise``, ``calibrate``, ``initial_state``
+    ``simulate``, ``read``, ``read_attitudes``, ``write``, ``estimate``, ``smooth``, ``integrate``, ``check``, ``accuracy``, ``tune``,
+    ``monte_carlo``, ``covariance_analysis``, ``allan_deviation``, ``fit_noise``, ``calibrate``, ``initial_state``
 Classes
     ``Scenario``, ``GyroSpec``, ``VectorSensor``, ``FilterSetup``, ``ProcessNoise``, ``Gate``, ``Robust``; ``LiveFilter`` and
     ``StepFilter`` filter sample by sample, compiled and on filterpy. Every function raises ``InputError`` on bad input; the message names
@@ -67,6 +67,7 @@ if TYPE_CHECKING:
     from strapdown.scenarios import Scenario
     from strapdown.vectors import VectorSensor
     from strapdown.workflows import (
+        accuracy,
         allan_deviation,
         check,
         covariance_analysis,
@@ -75,6 +76,7 @@ if TYPE_CHECKING:
         integrate,
         monte_carlo,
         read,
+        read_attitudes,
         simulate,
         smooth,
         tune,
@@ -92,6 +94,7 @@ __all__ = [
     "Scenario",
     "StepFilter",
     "VectorSensor",
+    "accuracy",
     "ahrs",
     "allan",
     "allan_deviation",
@@ -115,6 +118,7 @@ __all__ = [
     "plots",
     "quaternion",
     "read",
+    "read_attitudes",
     "recordings",
     "records",
     "report",
@@ -139,6 +143,7 @@ _HOMES = {
     "Scenario": "scenarios",
     "StepFilter": "estimation",
     "VectorSensor": "vectors",
+    "accuracy": "workflows",
     "allan_deviation": "workflows",
     "calibrate": "calibration",
     "check": "workflows",
@@ -149,6 +154,7 @@ _HOMES = {
     "integrate": "workflows",
     "monte_carlo": "workflows",
     "read": "workflows",
+    "read_attitudes": "workflows",
     "simulate": "workflows",
     "smooth": "workflows",
     "tune": "workflows",

@@ -1,7 +1,8 @@
 """Base classes of frozen dataclasses of arrays: equality by value, and printing as a short table. Private.
 
 Specifications (of a gyro, a sensor, a filter) derive from :class:`ByValue`: they are written to files and read back, and are equal if their
-values are. Data and results are compared by identity; for them ``@dataclass(eq=False)`` is enough. Results derive from :class:`Listed`.
+values are. So do results that are kept in files, of large arrays: :class:`ByContent`. Other data are compared by identity; for them
+``@dataclass(eq=False)`` is enough. Results derive from :class:`Listed`.
 """
 
 from __future__ import annotations
@@ -11,13 +12,14 @@ import dataclasses
 import io
 import math
 import textwrap
+import types
 from collections.abc import Mapping, Sequence
 from html import escape
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-__all__ = ["ByValue", "Listed", "Listing", "figure"]
+__all__ = ["ByContent", "ByValue", "Listed", "Listing", "equal", "figure"]
 
 WIDTH = 88
 """Maximum number of characters in a line of a title or a note."""
@@ -154,6 +156,48 @@ class ByValue:
         return hash((type(self), _contents(self)))
 
 
+class ByContent:
+    """Base of a frozen dataclass of large arrays, declared with ``eq=False``, whose instances are equal if all their fields are.
+
+    Unlike :class:`ByValue`, missing numbers (NaN) at the same place are equal, and the hash is that of the type.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from dataclasses import dataclass
+    >>> @dataclass(frozen=True, eq=False)
+    ... class Course(ByContent):
+    ...     values: np.ndarray
+    >>> Course(np.array([1.0, np.nan])) == Course(np.array([1.0, np.nan]))
+    True
+    """
+
+    def __eq__(self, other: object) -> bool:
+        """Compare all fields, arrays element by element."""
+        if not (isinstance(other, type(self)) or isinstance(self, type(other))):
+            return NotImplemented
+        names = [field.name for field in dataclasses.fields(self)]  # type: ignore[arg-type]
+        return self is other or all(equal(getattr(self, name), getattr(other, name)) for name in names)
+
+    def __hash__(self) -> int:
+        """Return a hash that equal instances share."""
+        return hash(ByContent)
+
+
+def equal(one: Any, other: Any) -> bool:
+    """Return whether two values are equal: arrays by their elements, NaN equal to NaN, sequences and mappings by their contents."""
+    if isinstance(one, np.ndarray) or isinstance(other, np.ndarray):
+        a, b = np.asarray(one), np.asarray(other)
+        return np.array_equal(a, b, equal_nan=a.dtype.kind == "f" and b.dtype.kind == "f")
+    if isinstance(one, Mapping) and isinstance(other, Mapping):
+        return set(one) == set(other) and all(equal(one[name], other[name]) for name in one)
+    if isinstance(one, (list, tuple)) and isinstance(other, (list, tuple)):
+        return len(one) == len(other) and all(map(equal, one, other))
+    if isinstance(one, float) and isinstance(other, float) and math.isnan(one):
+        return math.isnan(other)
+    return bool(one == other)
+
+
 def _contents(instance: Any) -> tuple[Any, ...]:
     return tuple(_plain(getattr(instance, field.name)) for field in dataclasses.fields(instance))
 
@@ -166,4 +210,6 @@ def _plain(value: Any) -> Any:
         return frozenset((key, _plain(content)) for key, content in value.items())
     if isinstance(value, (list, tuple)):
         return tuple(_plain(one) for one in value)
+    if isinstance(value, types.MethodType):  # Python compares the objects of two methods by identity
+        return value.__func__, value.__self__
     return value

@@ -30,8 +30,12 @@ from strapdown import (
     scenarios,
     units,
 )
+from strapdown.ahrs.remarks import fixed_frame, remarks
 from strapdown.checks import Array, InputError, count, instance
-from strapdown.consistency import Judgement
+from strapdown.consistency import Accuracy, Judgement
+from strapdown.consistency.accuracy import accuracy as accuracy_of_rows
+from strapdown.consistency.accuracy import accuracy_of
+from strapdown.consistency.alignment import Series
 from strapdown.covariance import analyse as covariance_analysis
 from strapdown.estimation import setup as setups
 from strapdown.estimation.gating import Gate, Robust
@@ -40,12 +44,14 @@ from strapdown.estimation.states import ProcessNoise, State
 from strapdown.files import reading, written_beside
 from strapdown.gyro import GyroSpec
 from strapdown.recordings import Recording, recordfiles
-from strapdown.records import Estimate, ImuRecord, Truth
+from strapdown.recordings.attitudes import Attitudes, read_attitudes
+from strapdown.records import Estimate, ImuRecord, Origin, Truth
 from strapdown.scenarios import Scenario, simulate
 
 if TYPE_CHECKING:
     from strapdown.allan import AllanDeviation, NoiseFit
     from strapdown.calibration import UnitCalibration
+    from strapdown.gyro.temperature import BiasOverTemperature
     from strapdown.montecarlo import Dispersions, Plan, Statistics
     from strapdown.montecarlo.campaign import Campaign
     from strapdown.recordings import GyroSamples
@@ -54,6 +60,7 @@ if TYPE_CHECKING:
 __all__ = [
     "AttitudeHistory",
     "RecordRun",
+    "accuracy",
     "allan_deviation",
     "check",
     "covariance_analysis",
@@ -64,6 +71,7 @@ __all__ = [
     "monte_carlo",
     "plan",
     "read",
+    "read_attitudes",
     "simulate",
     "smooth",
     "tune",
@@ -73,6 +81,8 @@ __all__ = [
 SOURCE = "give an ImuRecord or a Recording, as simulate and read return them"
 SAME_STAMP = 1e-9
 """Maximum difference between two time stamps of the same epoch, s."""
+HDF5 = (".h5", ".hdf5")
+"""Suffixes of files that hold results completely."""
 
 
 # ------------------------------------------------------------------------------------------------------------------ read, write
@@ -126,7 +136,7 @@ def read(path: Any, **options: Any) -> ImuRecord | Recording | Estimate | Campai
     if kind == "record":
         return recordfiles.read_record(file)
     if kind == "estimate":
-        return records.read_estimate(file)
+        return setups.read_estimate(file)
     from strapdown.montecarlo import campaign
 
     return campaign.read(file)
@@ -134,7 +144,7 @@ def read(path: Any, **options: Any) -> ImuRecord | Recording | Estimate | Campai
 
 def write(
     content: ImuRecord | Recording | Estimate | Scenario | FilterSetup, path: str | os.PathLike[str], **options: Any
-) -> None:
+) -> Path:
     """Write a record, recording, estimate, scenario or filter setup to a file, atomically.
 
     Parameters
@@ -142,10 +152,15 @@ def write(
     content : ImuRecord, Recording, Estimate, Scenario or FilterSetup
         The file of a record contains its origin; a scenario that includes your own Python functions or classes is omitted.
     path : path
-        The suffix selects the format: ``.h5`` or ``.csv`` for a record, ``.toml`` for a scenario or a filter setup;
-        :func:`strapdown.recordings.writers` lists those for recordings and estimates.
+        The suffix selects the format: ``.h5`` holds a record or an estimate completely, with its filter, origin and truth, ``.toml`` a
+        scenario or a filter setup; :data:`strapdown.recordings.FORMATS` lists the others for recordings and estimates.
     **options
         Options of the format (:func:`strapdown.recordings.write`): ``sequence`` and ``frame`` for an estimate as a table.
+
+    Returns
+    -------
+    Path
+        The file.
 
     Examples
     --------
@@ -162,12 +177,12 @@ def write(
         text = setups.to_toml(content) if isinstance(content, FilterSetup) else scenarios.scenario_to_toml(content)
         with written_beside(path) as temporary:
             temporary.write_text(text, encoding="utf-8")
-    elif isinstance(content, ImuRecord) and Path(path).suffix.lower() == ".csv":
-        recordfiles.export_csv(path, content, **options)
-    elif isinstance(content, ImuRecord) and Path(path).suffix.lower() in (".h5", ".hdf5"):
-        recordfiles.write_record(path, content, **options)
+    elif isinstance(content, (ImuRecord, Estimate)) and Path(path).suffix.lower() in HDF5:
+        save: Callable[..., None] = setups.write_estimate if isinstance(content, Estimate) else recordfiles.write_record
+        save(path, content, **options)
     else:
         recordings.write(content, path, **options)
+    return Path(path)
 
 
 # ------------------------------------------------------------------------------------------------------------------- estimate
@@ -179,11 +194,7 @@ class RecordRun(NamedTuple):
     estimate: Estimate
     record: ImuRecord
     """The record from the start of the filter on, as processed by it (:func:`strapdown.estimation.setup.modelled_record`)."""
-    truth: Truth | None
-    """Truth at the epochs of the estimate."""
     initial: State
-    start: str
-    """Description of how the initial state was determined."""
 
 
 def estimate_record(
@@ -201,21 +212,83 @@ def estimate_record(
         raise InputError(
             f"every is {every}, more than the {len(modelled.increments)} filter steps of the record; only the first epoch would be kept"
         )
-    found = for_record.start(modelled, chosen) if start is None else start
-    if found.edge > 0:
-        modelled = records.cut(modelled, found.edge, len(modelled.increments))
+    begin = for_record.start(modelled, chosen) if start is None else start
+    if begin.edge > 0:
+        modelled = records.cut(modelled, begin.edge, len(modelled.increments))
         if every > len(modelled.increments):
             raise InputError(
                 f"every is {every}, more than the {len(modelled.increments)} filter steps after the start of the filter"
             )
     if smooth:
-        result = setups.smooth_modelled(modelled, chosen, found.state, full_covariance=full_covariance)
+        result = setups.smooth_modelled(modelled, chosen, begin.state, full_covariance=full_covariance)
     else:
-        result = setups.run_modelled(modelled, chosen, found.state, every=every, full_covariance=full_covariance)
-    truth = None
-    if modelled.truth is not None:
-        truth = Truth(attitude=modelled.truth.attitude[::every], bias=modelled.truth.bias[::every])
-    return RecordRun(result, modelled, truth, found.state, found.words)
+        result = setups.run_modelled(modelled, chosen, begin.state, every=every, full_covariance=full_covariance)
+    truth = None if modelled.truth is None else modelled.truth.taken(np.searchsorted(modelled.time, result.time))
+    result = dataclasses.replace(
+        result, setup=chosen, origin=record.origin, truth=truth, smoothed=smooth, remarks=(begin.words,)
+    )
+    return RecordRun(result, modelled, begin.state)
+
+
+def estimate_recording(
+    source: Recording,
+    *,
+    noise: GyroSpec | NoiseFit | ProcessNoise | None = None,
+    temperature: BiasOverTemperature | None = None,
+    motion: str = ahrs.motions.AUTO,
+    walks: bool = False,
+    full_covariance: bool | None = None,
+    gate: Gate | None = None,
+    robust: Robust | None = None,
+    smooth: bool = False,
+    **options: Any,
+) -> ahrs.AhrsEstimate:
+    """Run the filter over a recording; its estimate has the setup, the reference, and remarks on the start, the motion and the samples.
+
+    ``temperature``: the gyro's bias over temperature, which is subtracted first; ``walks``: model the error of its slope as a random walk.
+    ``options`` are those of :func:`strapdown.ahrs.estimate`.
+    """
+    begun = ahrs.begin(source)
+    kind, odds = ahrs.motions.chosen(begun, motion)
+    parameters = ahrs.MOTIONS[kind]
+    if isinstance(noise, ProcessNoise):
+        parameters = dataclasses.replace(
+            parameters, angle_random_walk=noise.angle_random_walk, rate_random_walk=noise.rate_random_walk
+        )
+    elif noise is not None:
+        spec = _specification(noise)
+        parameters, temperature = with_gyro_noise(parameters, spec), temperature or spec.temperature
+    if temperature is not None:
+        source, parameters = ahrs.without_temperature(source, parameters, temperature, walks=walks or smooth)
+        begun = ahrs.begin(source)
+    known = source.true_attitude is not None
+    result = ahrs.estimate(
+        begun,
+        parameters,
+        gate=gate,
+        robust=robust,
+        full_covariance=known if full_covariance is None else full_covariance,
+        smooth=smooth,
+        **options,
+    )
+    used = result.recording
+    truth = None if used.true_attitude is None else Truth.of_reference(used.true_attitude, used.movement)
+    estimate = dataclasses.replace(
+        result.estimate,
+        setup=dataclasses.replace(result.parameters.setup, gate=gate, robust=robust),
+        origin=Origin(source=used.source),
+        truth=truth,
+        fixed_frame=fixed_frame(used),
+        motion=kind,
+        smoothed=smooth,
+        remarks=remarks(result, kind, odds),
+        details={
+            **{f"parameter.{name}": value for name, value in vars(result.parameters).items()},
+            "latency": result.delays.last_gyro,
+            "magnetometer_latency": result.delays.last_field,
+        },
+    )
+    return dataclasses.replace(result, estimate=estimate)
 
 
 def estimate(
@@ -264,7 +337,7 @@ def estimate(
     calibration : UnitCalibration, optional
         For a recording: calibration of the unit, from :func:`strapdown.calibrate`; the bias is then that of the corrected rates.
     full_covariance : bool, optional
-        Whether to store covariance matrices rather than their diagonals. Default: True for a record, False for a recording.
+        Whether to store covariance matrices rather than their diagonals. Default: True, but for a recording without a reference attitude.
     smooth : bool, default False
         Whether to estimate each epoch from all measurements: see :func:`smooth`.
 
@@ -273,6 +346,7 @@ def estimate(
     Estimate
         At the edges of the filter's steps (record) or at the stamps of the recording: ``time`` (m,) s, ``attitude`` (m, 4) q_fb,
         ``bias`` (m, 3) rad/s, ``variance`` (m, 6) rad² and (rad/s)². The fixed frame of a recording is East-North-Up with magnetic North.
+        It has its filter (``setup``), its ``truth`` or reference if the source has one, and ``remarks``.
 
     Raises
     ------
@@ -295,22 +369,18 @@ def estimate(
     robust = Robust(kind=robust) if isinstance(robust, str) else robust  # type: ignore[arg-type]
     if isinstance(source, Recording):
         _refuse("a record", setup=setup, initial=initial, states=states or None)
-        begun: Recording | ahrs.Begun = ahrs.begin(source)
         _doubt(source)
-        parameters = _recording_parameters(begun, motion, noise)
-        if isinstance(noise, GyroSpec) and noise.temperature is not None:
-            begun, parameters = ahrs.without_temperature(source, parameters, noise.temperature, walks=smooth)
-        found = ahrs.estimate(
-            begun,
-            parameters,
+        return estimate_recording(
+            source,
+            noise=noise,
+            motion=motion or ahrs.motions.AUTO,
             latency=latency,
             calibration=calibration,
             gate=gate,
             robust=robust,
-            full_covariance=bool(full_covariance),
+            full_covariance=full_covariance,
             smooth=smooth,
-        )
-        return found.estimate
+        ).estimate
     instance("source", source, ImuRecord, SOURCE)
     _refuse("a recording", motion=motion, latency=latency, calibration=calibration)
     chosen = _record_setup(source, noise, setup, initial, states)
@@ -371,19 +441,6 @@ def _specification(noise: GyroSpec | NoiseFit) -> GyroSpec:
     if not isinstance(noise, GyroSpec):
         raise InputError(f"noise is {type(noise).__name__}; give a GyroSpec, a NoiseFit or a ProcessNoise")
     return noise
-
-
-def _recording_parameters(
-    source: Recording | ahrs.Begun, motion: str | None, noise: GyroSpec | NoiseFit | ProcessNoise | None
-) -> ahrs.AhrsParameters:
-    parameters = ahrs.MOTIONS[ahrs.motions.chosen(source, motion or "auto")[0]]
-    if noise is None:
-        return parameters
-    if isinstance(noise, ProcessNoise):
-        return dataclasses.replace(
-            parameters, angle_random_walk=noise.angle_random_walk, rate_random_walk=noise.rate_random_walk
-        )
-    return with_gyro_noise(parameters, _specification(noise))
 
 
 def with_gyro_noise(parameters: ahrs.AhrsParameters, spec: GyroSpec) -> ahrs.AhrsParameters:
@@ -482,34 +539,42 @@ def integrate(
 
 
 def check(
-    result: Estimate | Statistics | Campaign, truth: Truth | ImuRecord | None = None, *, probability: float = 0.99
+    result: Estimate | Statistics | Campaign,
+    truth: Truth | ImuRecord | Recording | None = None,
+    *,
+    confidence_level: float = 0.99,
+    detectable_error: float = consistency.DETECTABLE,
 ) -> Judgement:
     """Test whether a filter is consistent, that is, whether its errors and innovations agree with its covariance.
+
+    The verdict is that of the command ``strapdown check`` and of the report. A result has all that it depends on, in memory and in a file.
 
     Parameters
     ----------
     result : Estimate, Statistics or Campaign
         Result of :func:`estimate`, :func:`monte_carlo` or :func:`read`.
-    truth : Truth or ImuRecord, optional
-        Truth at the epochs of the estimate, or the record with its truth, which is matched by time. If not given, only the innovations
-        are tested.
-    probability : float, default 0.99
+    truth : Truth, ImuRecord or Recording, optional
+        Truth at the epochs of the estimate, or the record or recording with its truth, which is matched by time. Default: the estimate's
+        own; if it has none, only the innovations are tested.
+    confidence_level : float, default 0.99
         Minimum probability with which a consistent filter passes all tests together.
+    detectable_error : float, default 1.5
+        "consistent" needs tests that would have detected an error of σ by this factor, of attitude, bias and innovations.
 
     Returns
     -------
     Judgement
-        ``verdict`` is "consistent", "not consistent" or "cannot tell"; ``findings`` has the statistics.
+        ``headline`` has the verdict, "consistent", "not consistent" or "cannot tell", and the parts that were tested; ``findings`` has the
+        statistics.
 
     Examples
     --------
     >>> import strapdown as sd
-    >>> record = sd.simulate("two-stars")
-    >>> sd.check(sd.estimate(record), record).verdict  # doctest: +SKIP
-    'consistent'
+    >>> print(sd.check(sd.estimate(sd.simulate("two-stars"))))  # doctest: +SKIP
     """
     if isinstance(result, Estimate):
-        return consistency.judge(result, _truth_at(result, truth), probability=probability)
+        options = {"confidence_level": confidence_level, "detectable_error": detectable_error}
+        return consistency.judge(result, _truth_at(result, truth), **options)
     statistics: Any = getattr(result, "statistics", result)
     if statistics is None:
         raise InputError("the Monte Carlo has no finished run yet; resume it")
@@ -517,26 +582,63 @@ def check(
         raise InputError(f"result is {type(result).__name__}; give an Estimate, or what monte_carlo returned")
     if truth is not None:
         raise InputError("truth goes with an estimate; a Monte Carlo contains its own truth; leave it out")
-    judgement: Judgement = statistics.judge(probability=probability)
+    judgement: Judgement = statistics.judge(confidence_level=confidence_level, detectable_error=detectable_error)
     return judgement
 
 
-def _truth_at(result: Estimate, truth: Truth | ImuRecord | None) -> Truth | None:
+def _truth_at(result: Estimate, truth: Truth | ImuRecord | Recording | None) -> Truth | None:
     """Return the truth at the epochs of an estimate."""
-    if isinstance(truth, ImuRecord):
-        if truth.truth is None:
-            raise InputError("the record has no truth; leave it out to test the innovations only")
-        rows = np.minimum(np.searchsorted(truth.time, result.time - SAME_STAMP), len(truth.time) - 1)
-        if np.max(np.abs(truth.time[rows] - result.time)) > SAME_STAMP:
-            raise InputError("the time stamps of record and estimate differ; give the record of the estimate")
-        return Truth(attitude=truth.truth.attitude[rows], bias=truth.truth.bias[rows])
-    if truth is not None:
-        instance("truth", truth, Truth, "give the record, or a Truth at the epochs of the estimate")
-    if truth is not None and len(truth.attitude) != len(result.time):
-        raise InputError(
-            f"truth has {len(truth.attitude)} epochs and the estimate {len(result.time)}; give the record, which is matched by time"
-        )
-    return truth
+    if truth is None or isinstance(truth, Truth):
+        if truth is not None and len(truth.attitude) != len(result.time):
+            raise InputError(
+                f"truth has {len(truth.attitude)} epochs and the estimate {len(result.time)}; give the record, which is matched by time"
+            )
+        return truth
+    instance(
+        "truth",
+        truth,
+        (ImuRecord, Recording),
+        "give the record, the recording, or a Truth at the epochs of the estimate",
+    )
+    whole = truth.truth if isinstance(truth, ImuRecord) else None
+    if isinstance(truth, Recording) and truth.true_attitude is not None:
+        whole = Truth.of_reference(truth.true_attitude, truth.movement)
+    if whole is None:
+        raise InputError("truth is a record without a truth; leave it out to test the innovations only")
+    rows = np.minimum(np.searchsorted(truth.time, result.time - SAME_STAMP), len(truth.time) - 1)
+    if np.max(np.abs(truth.time[rows] - result.time)) > SAME_STAMP:
+        raise InputError("the time stamps of record and estimate differ; give the record of the estimate")
+    return whole.taken(rows)
+
+
+def accuracy(result: Estimate, truth: Truth | ImuRecord | Recording | Attitudes | None = None) -> Accuracy:
+    """Return the attitude errors of an estimate: total, heading and inclination, as given, and aligned with a truth of another source.
+
+    Parameters
+    ----------
+    result : Estimate
+        Estimate of any filter.
+    truth : Truth, ImuRecord, Recording or Attitudes, optional
+        Truth at the epochs of the estimate; the record or recording with its truth; or attitudes of any source
+        (:func:`read_attitudes`), in another clock and other frames. Default: the estimate's own.
+
+    Returns
+    -------
+    Accuracy
+        Errors over all samples and over the movement; with covariances also their coverage and the ratio of RMS error and σ.
+
+    Examples
+    --------
+    >>> import strapdown as sd
+    >>> print(sd.accuracy(sd.estimate(recording)))  # doctest: +SKIP
+    """
+    instance("result", result, Estimate, "give the result of estimate or read")
+    if not isinstance(truth, Attitudes):
+        known = _truth_at(result, truth) or result.truth
+        return accuracy_of_rows(result, known, align=known is not None and not known.has_bias)
+    P = result.attitude_covariance
+    own = Series(result.time, result.attitude, P if np.isfinite(P).all() else None)
+    return accuracy_of(own, Series(truth.seconds(0), truth.attitude, movement=truth.movement))
 
 
 def plan(

@@ -80,7 +80,7 @@ def test_a_verdict_has_two_sides():
 
 @pytest.mark.parametrize("bad", [0.0, 1.0, 1.5])
 def test_a_probability_lies_between_0_and_1(bad):
-    with pytest.raises(InputError, match="probability"):
+    with pytest.raises(InputError, match="confidence_level"):
         consistency.mean_bounds(6, 10, bad)
 
 

@@ -15,9 +15,10 @@ from strapdown import consistency, montecarlo, motion, records, scenarios
 from strapdown.checks import InputError
 from strapdown.consistency.judgement import Finding, holm
 from strapdown.estimation import ProcessNoise, setup
+from strapdown.estimation.setup import FilterSetup, write_estimate
 from strapdown.gyro import GyroSpec
 from strapdown.montecarlo import campaign
-from strapdown.records import Estimate, Innovations, Truth
+from strapdown.records import ErrorStateEstimate, Estimate, Innovations, Origin, Truth
 
 
 def estimate(scale=1.0, samples=400, seed=0, *, bias_error=0.0, covariance=True, correlated=False):
@@ -48,6 +49,18 @@ def estimate(scale=1.0, samples=400, seed=0, *, bias_error=0.0, covariance=True,
     return result, truth
 
 
+def with_states(states):
+    """The same of a filter with error states."""
+    result, truth = estimate()
+    block = ErrorStateEstimate(components=("x",), units=("1",), values=np.zeros((200, 1)), variance=np.ones((200, 1)))
+    return replace(result, error_states=dict.fromkeys(states, block)), truth
+
+
+def of_a_recording(result):
+    """The same of a recording, whose σ are upper bounds."""
+    return replace(result, motion="hand")
+
+
 def test_a_right_filter_is_consistent():
     judgement = consistency.judge(*estimate())
     assert judgement.verdict == "consistent"
@@ -61,7 +74,9 @@ def test_a_right_filter_is_consistent():
         "NEES at the end",
         "time-averaged NEES",
     }
-    assert "would have been seen" in judgement.words
+    assert judgement.headline.startswith(
+        "consistent: attitude, bias and innovations; detectable error of σ: innovations of star 1 ×"
+    )
 
 
 @pytest.mark.parametrize(("scale", "leaning"), [(1.3, "optimistic"), (0.75, "pessimistic")])
@@ -82,7 +97,7 @@ def test_a_bias_error_shows_in_the_errors_alone():
     assert ("NEES at the end", "attitude") not in rejected
     assert not any(name == "NIS" for name, _ in rejected)
     blind = consistency.judge(estimate(bias_error=10.0)[0])
-    assert blind.verdict == "consistent"
+    assert blind.verdict == "cannot tell"
     assert "bias error that the initial state hides" in blind.limits[0]  # and it says what it cannot show
 
 
@@ -91,9 +106,7 @@ def test_an_error_that_hardly_moves_is_not_averaged_over_the_run_and_that_is_rep
     result, truth = estimate()
     slow = 1e-5 * (0.6 + 0.1 * np.linspace(0.0, 1.0, 200))[:, None] * np.array([1.0, -1.0, 1.0])
     judgement = consistency.judge(replace(result, bias=-slow), truth)
-    assert any(
-        limit.startswith("the bias error changes too slowly for this run to average over") for limit in judgement.limits
-    )
+    assert "bias not testable from this run: its error changes too slowly for this run" in judgement.reason
     averaged = {finding.of for finding in judgement.findings if finding.name == "time-averaged NEES"}
     assert "bias" not in averaged
     assert "attitude" in averaged
@@ -110,12 +123,12 @@ def test_an_error_that_hardly_moves_is_not_averaged_over_the_run_and_that_is_rep
 )
 def test_what_error_states_reach_is_not_averaged_over_one_run(states, averaged):
     """Their part of the errors may last longer than the run, which does not show it."""
-    judgement = consistency.judge(*estimate(), error_states=states)
+    judgement = consistency.judge(*with_states(states))
     assert {finding.of for finding in judgement.findings if finding.name == "time-averaged NEES"} <= averaged
     assert ("attitude" in averaged) == any(
         f.name == "time-averaged NEES" and f.of == "attitude" for f in judgement.findings
     )
-    assert any("further error states" in limit for limit in judgement.limits) == bool(states)
+    assert ("with further error states is not known" in judgement.reason) == bool(states)
 
 
 def test_sensors_that_share_an_error_are_reported():
@@ -125,7 +138,9 @@ def test_sensors_that_share_an_error_are_reported():
 
 def test_variances_alone_judge_the_end_by_axes():
     good = consistency.judge(*estimate(covariance=False))
-    assert good.verdict == "consistent"
+    assert good.headline.startswith(
+        "cannot tell: innovations consistent; attitude and bias not testable from this run: no full"
+    )
     assert any("variances only" in limit for limit in good.limits)
     bad = consistency.judge(*estimate(covariance=False, bias_error=10.0))
     (found,) = (f for f in bad.findings if f.rejected)
@@ -140,7 +155,7 @@ def test_too_little_cannot_tell():
     assert consistency.judge(nothing).verdict == "cannot tell"
     few = consistency.judge(estimate(samples=8)[0])
     assert few.verdict == "cannot tell"
-    assert "too few samples" in few.reason
+    assert "innovations not testable from this run: only an error of σ of ×" in few.reason
     assert consistency.judge(estimate(scale=20.0, samples=8)[0]).verdict == "not consistent"  # gross needs few
 
 
@@ -151,7 +166,7 @@ def test_refused_measurements_are_left_out():
     struck = replace(result.innovations["star 1"], weight=weight)
     struck.innovation[::20] *= 30.0
     judgement = consistency.judge(replace(result, innovations={"star 1": struck}))
-    assert judgement.verdict == "consistent"
+    assert not any(finding.rejected for finding in judgement.findings)
     assert any("20 measurements of star 1" in limit for limit in judgement.limits)
 
 
@@ -175,9 +190,8 @@ def test_a_sigma_wrong_by_the_power_stated_is_found():
     """At the stated factor, too small or too large, the verdict is "not consistent" in 97 % of runs or more, and mostly not at a third of
     its logarithm."""
     right = consistency.judge(*estimate())
-    power = {one.of: one.factor for one in right.power}
+    power = {one.of: one.detectable_error for one in right.parts}
     assert set(power) == {"innovations of star 1", "innovations of star 2", "attitude", "bias"}
-    assert right.states == ("attitude", "bias")
     factor = power["innovations of star 1"]
     for scale in (factor, 1.0 / factor):
         found = [consistency.judge(estimate(scale, seed=seed)[0]).verdict for seed in range(40)]
@@ -187,43 +201,50 @@ def test_a_sigma_wrong_by_the_power_stated_is_found():
 
 
 def test_a_state_that_nothing_tests_is_named():
-    result, truth = estimate()
-    blind = consistency.judge(result, error_states=["gyro.scale"])
-    assert "the σ of attitude, bias, gyro.scale are not tested: no truth for it" in blind.reason
-    assert all(math.isinf(one.factor) for one in blind.power if not one.of.startswith("innovations"))
-    seen = consistency.judge(result, truth, error_states=["gyro.scale"], unmodelled=["the gyro's asymmetry of 9 ppm"])
-    assert "the σ of gyro.scale is not tested" in seen.reason
+    result, truth = with_states(["gyro.scale"])
+    blind = consistency.judge(result)
+    assert blind.headline.startswith(
+        "cannot tell: innovations consistent; attitude and bias not testable from this run: no truth for it; detectable error of σ: "
+    )
+    assert all(math.isinf(one.detectable_error) for one in blind.parts if not one.of.startswith("innovations"))
+    assert any("the σ of gyro.scale is not tested: no truth for it" in limit for limit in blind.limits)
+    spec = GyroSpec(angle_random_walk=1e-5, asymmetry=(9e-6, 0.0, 0.0))
+    noise = ProcessNoise(angle_random_walk=1e-5, rate_random_walk=0.0)
+    setup = FilterSetup(process_noise=noise, bias_sigma=1e-3)
+    seen = consistency.judge(replace(result, origin=Origin(gyro=spec), setup=setup), truth)
     assert seen.reason.endswith("the filter has no state for the gyro's asymmetry of 9 ppm")
-    assert json.loads(json.dumps(seen.summary(), allow_nan=False))["power"][-1] == {"of": "gyro.scale", "factor": None}
+    plain = json.loads(json.dumps(blind.summary(), allow_nan=False))["parts"]
+    assert plain[-1] == {"of": "bias", "detectable_error": None, "why": "no truth for it"}
 
 
 def test_upper_bounds_are_contradicted_by_what_exceeds_them_alone():
     """The noise of a recording's filter covers disturbances that last: innovations a tenth as large, and correlated."""
     for scale, status in ((0.1, "cannot tell"), (1.0, "cannot tell"), (1.2, "not consistent")):
-        judged = consistency.judge(estimate(scale, correlated=True)[0], upper_bounds=True)
+        judged = consistency.judge(of_a_recording(estimate(scale, correlated=True)[0]))
         assert judged.verdict == status
         assert {one.name for one in judged.findings} == {"NIS"}
-    assert (
-        "σ of attitude and bias are not tested without a truth"
-        in consistency.judge(estimate(0.1)[0], upper_bounds=True).reason
-    )
-    small = consistency.judge(*estimate(0.1), upper_bounds=True)
+    judged = consistency.judge(of_a_recording(estimate(0.1)[0]))
+    assert "innovations within σ; attitude and bias not testable from this run: no truth for it" in judged.reason
+    assert "RMS over σ: innovations of star 1 0.1" in judged.reason
+    small, truth = estimate(0.1)
+    small = consistency.judge(of_a_recording(small), truth)
     assert small.verdict == "consistent"
     assert all(one.low <= one.value <= one.high for one in small.findings)  # as it passes
-    assert consistency.judge(*estimate(0.1, bias_error=10.0), upper_bounds=True).verdict == "not consistent"
+    large, truth = estimate(0.1, bias_error=10.0)
+    assert consistency.judge(of_a_recording(large), truth).verdict == "not consistent"
 
 
 @pytest.mark.parametrize("samples", [200, 20, 1])
 def test_resolution_is_the_factor_that_bounds_leave(samples):
     finding = Finding(name="NIS", of="star", value=1.0, p_value=0.5, samples=samples, degrees=2)
     low, high = consistency.mean_bounds(2, samples, 0.99)
-    judged = consistency.concluded([finding], [], 0.99, states=())
-    assert judged.power[0].factor == pytest.approx(math.sqrt(high / low))
+    judged = consistency.concluded([finding], [], 0.99, parts={"innovations of star": ""})
+    assert judged.parts[0].detectable_error == pytest.approx(math.sqrt(high / low))
     assert judged.verdict == ("consistent" if samples == 200 else "cannot tell")
-    # One sample distinguishes nothing.
-    unseen = {200: "", 20: f"a factor of {math.sqrt(high / low):.2g} would not be seen", 1: "by any factor would not"}
-    assert unseen[samples] in judged.reason
-    assert judged.reason.startswith("the one test does not contradict the filter")
+    unseen = f"innovations not testable from this run: only an error of σ of ×{math.sqrt(high / low):.2g}"
+    assert judged.reason.startswith("innovations; detectable error" if samples == 200 else unseen)
+    asked = consistency.concluded([finding], [], 0.99, parts={"innovations of star": ""}, required=1.1)
+    assert asked.verdict == "cannot tell"
 
 
 def test_the_summary_is_plain():
@@ -339,11 +360,15 @@ def test_bounds_are_those_that_decide(plan):
 
 @pytest.mark.parametrize(
     ("made", "status", "verdict"),
-    [({}, 0, "consistent: none"), ({"scale": 1.3}, 1, "not consistent: "), ({"samples": 8}, 2, "cannot tell: ")],
+    [
+        ({}, 3, "cannot tell: innovations consistent; attitude and bias not testable from this run"),
+        ({"scale": 1.3}, 1, "not consistent: "),
+        ({"samples": 8}, 3, "cannot tell: "),
+    ],
 )
 def test_check_ends_with_the_status_of_the_verdict(run, tmp_path, made, status, verdict):
     result, _ = estimate(**made)
-    records.write_estimate("estimate.h5", result)
+    write_estimate("estimate.h5", result)
     ended, said, _ = run("check", "estimate.h5", "--json", "check.json")
     assert ended == status
     assert verdict in said
@@ -354,7 +379,7 @@ def test_check_ends_with_the_status_of_the_verdict(run, tmp_path, made, status, 
 
 def test_check_uses_the_truth_in_the_file(run):
     result, truth = estimate(bias_error=10.0)
-    records.write_estimate("estimate.h5", result, truth=truth)
+    write_estimate("estimate.h5", replace(result, truth=truth))
     status, said, _ = run("check", "estimate.h5")
     assert status == 1
     assert "with its truth" in said
@@ -363,8 +388,8 @@ def test_check_uses_the_truth_in_the_file(run):
 def test_check_judges_a_campaign(run, succeeds, plan, tmp_path):
     campaign.run(plan, tmp_path / "few.h5", runs=20)
     status, said, _ = run("check", "few.h5")
-    assert status == 2  # nor attitude nor bias would have been seen to be wrong by 1.5
-    assert "this cannot show the σ of the attitude (only one wrong by a factor of 2" in said
+    assert status == 3  # nor attitude nor bias would have been seen to be wrong by 1.5
+    assert "innovations consistent; attitude and bias not testable from 20 runs: only an error of σ of ×2" in said
     campaign.run(plan, tmp_path / "runs.h5", runs=200)
     said = succeeds("check", "runs.h5", "--json", "check.json")
     assert "200 of 200 runs" in said

@@ -113,7 +113,7 @@ def refused(seeds, probability):
     """How many right runs are called not consistent, and how often each finding alone is below 1 %."""
     wrong, alone = 0, {}
     for seed in seeds:
-        judgement = consistency.judge(*right_run(seed), probability=probability)
+        judgement = consistency.judge(*right_run(seed), confidence_level=probability)
         wrong += judgement.verdict == "not consistent"
         for finding in judgement.findings:
             alone.setdefault((finding.name, finding.of), []).append(finding.p_value)

@@ -252,8 +252,8 @@ def test_summary_of_a_right_filter_and_of_a_wrong_one():
 def test_summary_bounds_are_those_that_decide():
     """The level is shared by the ten tests of the verdict, none of which rejects, and within each by its two epochs."""
     sums, epochs = scalar.run_chunk(PLAN, 0, 3), np.array([2, 4])
-    summary = montecarlo.summary(sums, epochs=epochs, probability=0.95)
-    judgement = sums.judge(epochs=epochs, probability=0.95)
+    summary = montecarlo.summary(sums, epochs=epochs, confidence_level=0.95)
+    judgement = sums.judge(epochs=epochs, confidence_level=0.95)
     assert len(judgement.findings) == 10
     assert not any(one.rejected for one in judgement.findings)
     single = 0.05 / 10.0
@@ -291,8 +291,8 @@ def test_summary_and_verdict_agree_where_holm_is_sharper_than_bonferroni():
     nees = sums.nees_sum.copy()
     nees[4] = 18.0 * 50.0, 9.0 * 0.9 * low, 9.0 * 50.0
     odd = replace(sums, nees_sum=nees, sensor_nis_sum=50.0 * sums.sensor_nis_sum, log_nees_sum=sums.log_nees_sum + 30.0)
-    summary = montecarlo.summary(odd, epochs=epochs, probability=0.95)
-    found = {one.of: one for one in odd.judge(epochs=epochs, probability=0.95).findings if one.name == "ANEES"}
+    summary = montecarlo.summary(odd, epochs=epochs, confidence_level=0.95)
+    found = {one.of: one for one in odd.judge(epochs=epochs, confidence_level=0.95).findings if one.name == "ANEES"}
     assert found["attitude"].rejected
     for subset, part in summary["nees"].items():
         assert part["consistent"] == (not found[subset].rejected)

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 import strapdown as sd
-from strapdown import ahrs, allan, gyro, recordings, records, scenarios, units, workflows
+from strapdown import ahrs, allan, gyro, recordings, scenarios, units, workflows
 from strapdown.allan import noise_fit
 from strapdown.allan import parameters as noise_parameters
 from strapdown.checks import InputError
+from strapdown.estimation import setup
 from strapdown.gyro.temperature import from_table
 from strapdown.recordings import Recording, gyro_temperature
 from strapdown.units import DEGREE_PER_HOUR, DEGREE_PER_ROOT_HOUR, STANDARD_GRAVITY
@@ -269,14 +270,14 @@ def test_a_simulated_unit_goes_through_allan_and_its_table_into_the_filter(succe
     assert gyro.from_table(both).temperature.span == (found["lowest_degc"], found["highest_degc"])
     succeeds("convert", "use.h5", "use.db3")
     succeeds("estimate", "use.db3", "--temperature", path)
-    estimate = records.read_estimate(tmp_path / "estimate-results" / "estimate.h5")
-    slope = records.read_states(tmp_path / "estimate-results" / "estimate.h5")["gyro temperature"]
+    estimate = setup.read_estimate(tmp_path / "estimate-results" / "estimate.h5")
+    slope = estimate.error_states["gyro temperature"]
     assert (slope.sigma[0] < 1e-4).all()
     # The two files in one, as the gyro's noise, do the same.
     (tmp_path / "whole.toml").write_text(text + path.read_text())
     again = sd.estimate(recordings.read(tmp_path / "use.db3"), noise=gyro.read_spec(tmp_path / "whole.toml"))
     succeeds("estimate", "use.db3", "--gyro", "whole.toml")
-    by_command = records.read_estimate(tmp_path / "estimate-results" / "estimate.h5")
+    by_command = setup.read_estimate(tmp_path / "estimate-results" / "estimate.h5")
     np.testing.assert_array_equal(again.bias, by_command.bias)
     np.testing.assert_allclose(again.bias[-1], estimate.bias[-1], atol=3.0 * estimate.sigma[-1, 3])
     # About the two level axes, which the accelerometer shows: the bias at turn-on all the time, and c_0 has no interval.

@@ -11,8 +11,9 @@ from typer.testing import CliRunner
 from strapdown import quaternion, recordings
 from strapdown.checks import InputError
 from strapdown.cli import app
+from strapdown.estimation.setup import read_estimate, write_estimate
 from strapdown.recordings import Recording
-from strapdown.records import Estimate, outputs, read_estimate
+from strapdown.records import Estimate, outputs
 from strapdown.units import STANDARD_GRAVITY
 
 SEQUENCES = ["".join(s) for s in itertools.product("XYZ", repeat=3) if s[0] != s[1] != s[2]]
@@ -194,7 +195,7 @@ def test_a_tum_trajectory_and_the_packages_own_file(case, tmp_path):
     assert lines[4].split()[0] == "1700000000.130000001"
     table = np.loadtxt(tmp_path / "x.tum")
     np.testing.assert_array_equal(table[:, 4:], estimate.attitude[:, [1, 2, 3, 0]])
-    recordings.write(estimate, tmp_path / "x.h5")
+    write_estimate(tmp_path / "x.h5", estimate)
     np.testing.assert_array_equal(read_estimate(tmp_path / "x.h5").covariance, estimate.covariance)
 
 

@@ -446,7 +446,8 @@ def test_a_simulated_record_and_an_estimate_are_converted(tmp_path):
     np.testing.assert_allclose(back.rate * np.diff(record.time)[:, None], record.increments, rtol=1e-14)
     np.testing.assert_array_equal(back.time, record.time[1:])
     np.testing.assert_array_equal(back.true_attitude, record.truth.attitude[1:])
-    from strapdown.records import Estimate, write_estimate
+    from strapdown.estimation.setup import write_estimate
+    from strapdown.records import Estimate
 
     q = quaternion.normalize(np.random.default_rng(1).standard_normal((5, 4)))
     estimate = Estimate(time=np.arange(5.0), attitude=q, bias=np.zeros((5, 3)), variance=np.ones((5, 6)))

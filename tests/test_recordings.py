@@ -219,11 +219,6 @@ def test_a_result_is_no_recording(tmp_path):
     )
 
 
-def test_a_simulated_record_in_csv_is_no_recording(tmp_path):
-    recordfiles.export_csv(tmp_path / "x.csv", ImuRecord(time=[0.0, 1.0], increments=[[0.0, 0.1, 0.2]]))
-    refused(tmp_path / "x.csv", "is a simulated record, not a recording; integrate it")
-
-
 @pytest.mark.parametrize("bad", ["nan", "", " "])
 def test_rows_without_a_gyro_sample_are_left_out_and_reported(csv, bad):
     """What the turn across them is nobody knows: the intervals beside one are joined, and a filter's covariance grows over all of it."""

@@ -11,8 +11,9 @@ from hdf5 import changed
 import strapdown
 from strapdown import coning, quaternion, records
 from strapdown.checks import InputError
+from strapdown.estimation.setup import read_estimate, write_estimate
 from strapdown.files import reading
-from strapdown.records import Estimate, ImuRecord, Truth, compress, cut, read_estimate, read_truth, write_estimate
+from strapdown.records import Estimate, ImuRecord, Truth, compress, cut
 from strapdown.vectors import VectorMeasurements
 
 
@@ -171,7 +172,7 @@ def estimate(full: bool = False) -> Estimate:
 @pytest.mark.parametrize("full", [False, True])
 def test_estimate_round_trip_is_exact(tmp_path, full):
     written = estimate(full)
-    write_estimate(tmp_path / "new folder" / "estimate.h5", written, {"source": "test"})
+    write_estimate(tmp_path / "new folder" / "estimate.h5", written)
     read = read_estimate(tmp_path / "new folder" / "estimate.h5")
     for name in ("time", "attitude", "bias", "variance"):
         np.testing.assert_array_equal(getattr(read, name), getattr(written, name))
@@ -188,7 +189,9 @@ def test_estimate_round_trip_is_exact(tmp_path, full):
 
 
 def test_estimate_file_holds_units_conventions_and_attributes(tmp_path):
-    write_estimate(tmp_path / "estimate.h5", estimate(full=True), {"source": "test", "parameter.sigma": 0.5})
+    details = {"parameter.sigma": 0.5}
+    given = dataclasses.replace(estimate(full=True), origin=records.Origin(source="test"), details=details)
+    write_estimate(tmp_path / "estimate.h5", given)
     with reading.hdf5(tmp_path / "estimate.h5") as file:
         attributes = reading.attributes(file)
         assert attributes["conventions"] == records.CONVENTIONS
@@ -223,10 +226,10 @@ def test_sigma_and_nis():
 
 def test_a_truth_without_a_bias_is_kept_without_one(tmp_path):
     given = estimate()
-    write_estimate(
-        tmp_path / "e.h5", given, truth=Truth(attitude=given.attitude, bias=np.full_like(given.bias, np.nan))
-    )
-    found = read_truth(tmp_path / "e.h5")
+    truth = Truth.of_reference(given.attitude, np.arange(7) > 3)
+    write_estimate(tmp_path / "e.h5", dataclasses.replace(given, truth=truth))
+    found = read_estimate(tmp_path / "e.h5").truth
+    assert found == truth
     np.testing.assert_array_equal(found.attitude, given.attitude)
     assert np.isnan(found.bias).all()
 
@@ -236,7 +239,7 @@ def test_a_write_that_fails_leaves_the_old_file(tmp_path):
     write_estimate(path, estimate())
     before = path.read_bytes()
     with pytest.raises(TypeError):
-        write_estimate(path, estimate(full=True), {"source": object()})
+        write_estimate(path, dataclasses.replace(estimate(full=True), details={"place": object()}))
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["estimate.h5"]
 
@@ -282,9 +285,13 @@ def test_foreign_files_are_refused(tmp_path):
         ),
         ("variance", lambda x: -x, r"variance\[0, 0\] is -.*repeat the estimate"),
         ("covariance", lambda x: -x, r"covariance, diagonal\[0, 0\] is -"),
-        ("innovations/0/variance", lambda x: x - 1e3, r"innovations/0/variance\[0, 0\] is -.*give each a sigma"),
-        ("innovations/0/variance", lambda x: x[:, :1], r"innovations/0/variance has shape"),
-        ("innovations/0/time", lambda x: x[1:], r"innovations/0/innovation has shape"),
+        (
+            "innovations/000000/variance",
+            lambda x: x - 1e3,
+            r"innovations/000000/variance\[0, 0\] is -.*give each a sigma",
+        ),
+        ("innovations/000000/variance", lambda x: x[:, :1], r"innovations/000000/variance has shape"),
+        ("innovations/000000/time", lambda x: x[1:], r"innovations/000000/innovation has shape"),
         ("bias", lambda x: x + 1e200, r"bias\[0, 0\] is 1e\+200 rad/s, more than any gyro has.*unit"),
         ("bias", lambda x: x[:, 0], r"bias has shape"),
         ("bias", lambda x: np.array(["1.0"] * 7, dtype="S3"), r"bias "),
@@ -292,7 +299,7 @@ def test_foreign_files_are_refused(tmp_path):
         ("attitude", lambda x: None, r"attitude is a group and not an array; .*make it again"),
         ("time", lambda x: None, r"time is a group and not an array"),
         ("time", lambda x: 1.0, r"time has shape \(\)"),
-        ("innovations/0/innovation", lambda x: None, r"innovations/0/innovation is a group"),
+        ("innovations/000000/innovation", lambda x: None, r"innovations/000000/innovation is a group"),
         ("truth/bias", lambda x: -1e200 + x, r"truth/bias\[0, 0\] is -1e\+200 rad/s"),
         ("truth/attitude", lambda x: x[1:], r"truth/attitude has shape"),
         ("truth/attitude", lambda x: None, r"truth/attitude is a group"),
@@ -301,7 +308,8 @@ def test_foreign_files_are_refused(tmp_path):
 def test_what_no_filter_estimates_is_refused(tmp_path, name, damage, words):
     path = tmp_path / "estimate.h5"
     written = estimate(full=True)
-    write_estimate(path, written, truth=Truth(attitude=random_attitudes(7), bias=np.zeros((7, 3))))
+    truth = Truth(attitude=random_attitudes(7), bias=np.zeros((7, 3)))
+    write_estimate(path, dataclasses.replace(written, truth=truth))
     with changed(path) as file:
         value = damage(file[name][:])
         del file[name]
@@ -310,7 +318,7 @@ def test_what_no_filter_estimates_is_refused(tmp_path, name, damage, words):
         else:
             file[name] = value
     with pytest.raises(InputError, match=f"^{path}.*{words}"):
-        (read_truth if name.startswith("truth") else read_estimate)(path)
+        read_estimate(path)
 
 
 @pytest.mark.parametrize(

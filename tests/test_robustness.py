@@ -10,7 +10,7 @@ from scipy.stats import binom, chi2
 
 from strapdown import consistency, estimation, motion, quaternion, records
 from strapdown.checks import InputError
-from strapdown.estimation import gating
+from strapdown.estimation import gating, setup
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.states import GateMemory, ProcessNoise, initial_state, restart_bias_variance
 from strapdown.gyro import GyroSpec
@@ -565,8 +565,8 @@ def test_a_recovery_is_reported_in_the_file(tmp_path):
     record = simulate(scenario(duration=3.0), 3)
     lost = replace(started(record, 0), attitude=quaternion.multiply(record.truth.attitude[0], [0.0, 0.6, 0.8, 0.0]))
     estimate = estimation.run(record, NOISE, lost, gate=Gate(), robust=Robust())
-    records.write_estimate(tmp_path / "e.h5", estimate)
-    back = records.read_estimate(tmp_path / "e.h5")
+    setup.write_estimate(tmp_path / "e.h5", estimate)
+    back = setup.read_estimate(tmp_path / "e.h5")
     assert back.events == estimate.events
     assert {event.kind for event in back.events} == {"recovery"}
     for sensor, innovations in estimate.innovations.items():

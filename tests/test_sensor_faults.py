@@ -213,3 +213,24 @@ def test_an_ordinary_recording_has_no_faults():
     found = sensor_faults.find(swing(10.0))
     assert found.words == ()
     assert not found.turn_variance.any()
+
+
+@pytest.mark.parametrize(
+    ("rows", "value", "words"),
+    [
+        (slice(None), 0.0, "stuck about y: 0 °/s throughout"),
+        (slice(300, 700), 0.1, "stuck about y: 5.73 °/s from 3 to 6.99 s"),
+        (slice(300, 400), 0.1, ""),
+    ],
+)
+def test_a_stuck_gyro_is_reported(rows, value, words):
+    rate = np.random.default_rng(1).normal(0.0, 0.5, (1000, 3))
+    rate[rows, 1] = value
+    said = sensor_faults.stuck_words(Recording(source="a", time=0.01 * np.arange(1000), rate=rate))
+    assert (words in said[0]) if words else not said
+
+
+def test_a_coarse_gyro_at_rest_is_not_stuck():
+    rate = np.random.default_rng(1).normal(0.0, 1e-3, (1000, 3))
+    rate[100:900, 2] = 0.0  # below its resolution
+    assert not sensor_faults.stuck_words(Recording(source="a", time=0.01 * np.arange(1000), rate=rate))

@@ -195,16 +195,15 @@ def test_truth_travels_in_the_estimate_file(tmp_path):
     record = scenarios.simulate(scenario(duration=5.0))
     filter_setup = setup.FilterSetup.for_scenario(scenario(), states=False)
     estimate = setup.run(record, filter_setup, setup.initial_state(filter_setup, record.truth.attitude[0]))
-    records.write_estimate(tmp_path / "with.h5", estimate, truth=record.truth)
-    records.write_estimate(tmp_path / "without.h5", estimate)
-    truth = records.read_truth(tmp_path / "with.h5")
+    setup.write_estimate(tmp_path / "with.h5", dataclasses.replace(estimate, truth=record.truth))
+    setup.write_estimate(tmp_path / "without.h5", estimate)
+    truth = setup.read_estimate(tmp_path / "with.h5").truth
     np.testing.assert_array_equal(truth.attitude, record.truth.attitude)
     np.testing.assert_array_equal(truth.bias, record.truth.bias)
-    assert records.read_truth(tmp_path / "without.h5") is None
-    np.testing.assert_array_equal(records.read_estimate(tmp_path / "with.h5").attitude, estimate.attitude)
-    short = records.Truth(attitude=record.truth.attitude[:-1], bias=record.truth.bias[:-1])
+    assert setup.read_estimate(tmp_path / "without.h5").truth is None
+    np.testing.assert_array_equal(setup.read_estimate(tmp_path / "with.h5").attitude, estimate.attitude)
     with pytest.raises(InputError, match="rows"):
-        records.write_estimate(tmp_path / "bad.h5", estimate, truth=short)
+        setup.write_estimate(tmp_path / "bad.h5", dataclasses.replace(estimate, truth=record.truth.taken(slice(-1))))
     assert not (tmp_path / "bad.h5").exists()
 
 

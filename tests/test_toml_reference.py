@@ -1,37 +1,36 @@
-"""The reference of the scenario file on the documentation site: each key in it is accepted, and each accepted key is in it."""
+"""The reference of the scenario file, in the terminal and on the site: each key in it is accepted, and each accepted key is in it."""
 
 import copy
 import importlib.util
 import re
-import sys
 from pathlib import Path
 
 import pytest
 import tomli_w
+from typer.testing import CliRunner
 
 from strapdown import scenarios
 from strapdown.checks import InputError
-
-pytest.importorskip("numpydoc", reason="the documentation's tools are not installed")
+from strapdown.cli import app
+from strapdown.scenarios import keys
 
 DOCS = Path(__file__).parents[1] / "docs"
 
 
-def _load():
+def documented():
+    """Return the module of the documentation."""
+    if not (DOCS / "toml_reference.py").exists():
+        pytest.skip("the documentation is not in this distribution")
     spec = importlib.util.spec_from_file_location("toml_reference", DOCS / "toml_reference.py")
     module = importlib.util.module_from_spec(spec)
-    sys.modules["toml_reference"] = module  # dataclasses look their module up there
     spec.loader.exec_module(module)
     return module
 
 
-if not (DOCS / "toml_reference.py").exists():
-    pytest.skip("the documentation is not in this distribution", allow_module_level=True)
-reference = _load()
-SECTIONS = reference.sections()
+SECTIONS = keys.sections()
 NAMES = [f"{section.header} {section.type}".strip() for section in SECTIONS]
 TABLES = {"motion", "gyro", "temperature", "sensors", "base", "vibration"}
-"""Keys that hold tables: headers of the reference."""
+"""Keys that hold tables: headers of the keys."""
 
 
 def _required(section):
@@ -97,7 +96,7 @@ def test_every_accepted_key_is_in_the_reference(section):
 
 
 def test_every_section_and_key_is_printed():
-    page = "\n".join(reference.markdown(group) for group in ("top", "motion", "gyro", "sensors"))
+    page = "\n".join(documented().markdown(group) for group in ("top", "motion", "gyro", "sensors"))
     printed = set(re.findall(r"<code class=\"key\">([a-z0-9_]+)</code>", page.replace("<wbr>", "")))
     for section in SECTIONS:
         assert f"`{section.header}`" in page or section.group == "top"
@@ -117,7 +116,7 @@ def test_every_type_of_motion_and_sensor_of_the_parser_is_in_the_reference():
 
 def test_every_printed_key_has_a_meaning():
     for group in ("top", "motion", "gyro", "sensors"):
-        rows = [row.split(" | ") for row in reference.markdown(group).splitlines() if row.startswith("| <code")]
+        rows = [row.split(" | ") for row in documented().markdown(group).splitlines() if row.startswith("| <code")]
         assert rows
         for key, *_, meaning in rows:
             assert len(meaning.strip(" |").split()) >= 2, f"{group}: {key} has no docstring"
@@ -130,3 +129,14 @@ def test_every_kind_of_measurement_that_a_meaning_names_is_accepted():
                 words = re.findall(r'`"([a-z]+)"`', key.meaning)
                 assert len(words) >= 2
                 assert all(_refusal(section, key.name, word) == "" for word in words)
+
+
+def test_the_keys_are_printed_by_section():
+    for name, words in (("coning", "frequency_hz = 1.0"), ("gyro", "# angle_random_walk_deg_per_sqrt_hour = 0.0")):
+        result = CliRunner().invoke(app, ["keys", name])
+        assert result.exit_code == 0, result.output
+        assert words in result.output
+    every = CliRunner().invoke(app, ["keys"]).output
+    assert all(section.header in every for section in SECTIONS)
+    with pytest.raises(InputError, match=r"no section 'gyros' .* name one of top, motion, gyro, sensors"):
+        keys.named("gyros")

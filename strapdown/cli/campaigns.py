@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import signal
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -114,7 +113,7 @@ def montecarlo(
     computing: _Computing,
     output: _Output,
 ) -> None:
-    """Run many simulations of a scenario and judge the filter: exit status 0 consistent, 1 not, 2 cannot tell (or bad input)."""
+    """Run many simulations of a scenario and judge the filter: exit status 0 consistent, 1 not, 3 cannot tell."""
     source = Path(scenario)
     held, plan = _planned(source, scenario, model, computing.machine)
     machine = held.machine if held is not None and computing.machine == "auto" else computing.machine
@@ -282,6 +281,7 @@ def _with_filter(held: Campaign, own: Own, source: Path) -> Campaign:
 
 def _print_result(campaign: Campaign) -> tuple[int, dict[str, Any]]:
     """Print the statistics and the verdict of `strapdown check`; return the exit status and the content of the JSON file."""
+    from strapdown import workflows
     from strapdown.cli.judgement import status_of
     from strapdown.estimation.setup import MEKF
     from strapdown.montecarlo import summary
@@ -293,7 +293,7 @@ def _print_result(campaign: Campaign) -> tuple[int, dict[str, Any]]:
         console.print(f"{campaign.statistics.runs} of {campaign.runs} runs are completed.")
     report = summary(campaign.statistics, bound=bound_of(campaign.plan))
     figure = lambda value: "-" if value is None else f"{value:.4g}" if value >= 1e3 else f"{value:.4f}"  # noqa: E731
-    judgement = campaign.statistics.judge(unmodelled=campaign.plan.unmodelled)
+    judgement = workflows.check(campaign)
     rows = table(
         f"Per degree of freedom; 1 for a consistent filter. NEES over {report['epochs_judged']} epochs",
         *("", "mean", "minimum", "maximum", "from", "to", ""),
@@ -321,7 +321,7 @@ def _print_result(campaign: Campaign) -> tuple[int, dict[str, Any]]:
         rate = f" ({rate_text(campaign.statistics.runs / campaign.seconds)} runs/s, including compilation)"
     console.print(
         f"{counted(report['runs'], 'run')}, {campaign.seconds:.3g} s{rate}. The verdict combines all {len(judgement.findings)} "
-        f"statistics of `strapdown check`: a consistent filter passes with {100.0 * report['probability']:g} %."
+        f"statistics of `strapdown check`: a consistent filter passes with {100.0 * report['confidence_level']:g} %."
     )
     console.print(judgement.words)
     if judgement.verdict == "cannot tell":
@@ -393,45 +393,24 @@ def _replayed(target: Path, run: int) -> list[Path]:
 
 
 def _replay(plan: Plan, run: int, machine: str, target: Path) -> None:
-
-    from strapdown import consistency
+    from strapdown import consistency, workflows
     from strapdown import montecarlo as engine
-    from strapdown.estimation import setup
     from strapdown.recordings import recordfiles
-    from strapdown.records import Origin, Truth, write_estimate
-    from strapdown.scenarios import scenario_to_toml
 
-    choice = engine.choose(plan, machine)
     again = engine.replay(plan, run, machine=machine)
-    truth = again.record.truth
-    assert truth is not None
-    # If a filter step combines several samples, the record is at the samples or at the steps, depending on the machine.
-    edges = np.searchsorted(again.record.time, again.estimate.time - 1e-9)
-    true = Truth(attitude=truth.attitude[edges], bias=truth.bias[edges])
-    attributes: dict[str, Any] = {
-        "scenario": scenario_to_toml(plan.scenario),
-        "seed": plan.seed,
-        "run": run,
-        "machine": choice.machine,
-        "filter": setup.to_toml(plan.setup),
-        "dispersions": json.dumps(plan.to_table()["dispersions"]),
-    }
-    paths = _replayed(target, run)
-    origin = Origin(gyro=plan.scenario.gyro, scenario=plan.scenario, seed=plan.seed, run=run)
-    recordfiles.write_record(
-        paths[0],
-        replace(again.record, origin=origin),
-        attributes={name: attributes[name] for name in ("machine", "dispersions")},
-    )
-    write_estimate(paths[1], again.estimate, attributes, truth=true)
-    estimate = again.estimate
+    estimate, truth, paths = again.estimate, again.estimate.truth, _replayed(target, run)
+    recordfiles.write_record(paths[0], again.record, attributes=estimate.details)
+    workflows.write(estimate, paths[1])
     size, states = (6, "six") if estimate.has_bias else (3, "three")
-    error = consistency.errors(estimate.attitude, np.nan_to_num(estimate.bias), true.attitude, true.bias)[:, :size]
     assert estimate.covariance is not None
+    assert truth is not None
+    error = consistency.errors(estimate.attitude, np.nan_to_num(estimate.bias), truth.attitude, truth.bias)[:, :size]
     nees = consistency.nees(error, estimate.covariance[:, :size, :size])
-    step = int(np.argmax(nees))
+    # At the epochs of the statistics, as in the list of worst runs.
+    rows = np.searchsorted(estimate.time, plan.time + 1e-9, side="right") - 1
+    worst = int(rows[np.argmax(nees[rows])])
     console.print(
-        f"Run {run} of seed {plan.seed}, machine: {choice}. Its maximum NEES is {nees[step]:.4g} ({states} states), "
-        f"at {estimate.time[step]:g} s."
+        f"Run {run} of seed {plan.seed}, machine: {engine.choose(plan, machine)}. Its maximum NEES at the {plan.epochs} epochs of the "
+        f"campaign is {nees[worst]:.1f} ({states} states), at {estimate.time[worst]:g} s."
     )
     written(*paths)

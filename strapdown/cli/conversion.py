@@ -40,7 +40,7 @@ def convert(
 ) -> None:
     """Convert a recording, a simulated record or an estimate; the format of IN is detected, that of OUT is given by its suffix."""
     from strapdown import recordings
-    from strapdown.records import read_estimate
+    from strapdown.estimation.setup import read_estimate
 
     options = layout.options(source)
     estimate = recordings.is_estimate(source)

@@ -20,11 +20,11 @@ from strapdown.cli.terminal import (
     command,
     console,
     doubt,
-    gap_words,
     given,
     need_own,
     say,
     show,
+    show_listing,
     table,
     writable,
     written,
@@ -33,13 +33,11 @@ from strapdown.files import usable_folder, write_json
 from strapdown.units import DEGREE, DEGREE_PER_HOUR, DEGREE_PER_HOUR_PER_ROOT_HOUR, DEGREE_PER_ROOT_HOUR
 
 if TYPE_CHECKING:
-    from strapdown.ahrs import AhrsEstimate, AhrsParameters, Begun
     from strapdown.estimation.setup import FilterSetup
     from strapdown.estimation.setup.for_record import Start
     from strapdown.estimation.states import State
     from strapdown.recordings import Recording
-    from strapdown.records import Estimate, ImuRecord, Origin
-    from strapdown.workflows import RecordRun
+    from strapdown.records import Estimate, ImuRecord
 
     Exports = Sequence[tuple[Path, dict[str, Any]]]
     """Additional files of an estimate, with the options of their writers."""
@@ -187,15 +185,15 @@ def estimate(
     The accelerometer gives the vertical and the magnetometer the heading. If the recording contains its specification, like those of
     `strapdown simulate`, the filter matches it.
     """
+    from strapdown.files import reading
     from strapdown.recordings import is_record
-    from strapdown.records import read_attributes
 
     out = output.out
     usable_folder("out", out)
     names = (*FILES, *(f"{name}.{output.drawn_as or FigureFormat.png}" for name in FIGURES))
     sources = (recording, shared.gyro, specified.filter_file, recorded.calibration, recorded.temperature)
     writable("out", *(out / name for name in names), sources=sources)
-    need_own(out / FILES[0], "estimate", lambda path: bool(read_attributes(path)["kind"] == "strapdown estimate"))
+    need_own(out / FILES[0], "estimate", lambda path: reading.kind(path) == "strapdown estimate")
     reading_options = layout.options(recording)
     simulated = is_record(recording)
     if simulated and (options := given(recorded)):
@@ -215,7 +213,7 @@ def estimate(
 
 def _exports(output: _Output, recording: Path, *, changed: bool) -> Exports:
     """Return the additional files of an estimate; raise an error for those that cannot be written."""
-    from strapdown import recordings
+    from strapdown import recordings, workflows
     from strapdown.records import outputs
 
     frame = None if output.frame is None else one_of("--frame", output.frame.upper(), outputs.FRAMES)
@@ -226,8 +224,12 @@ def _exports(output: _Output, recording: Path, *, changed: bool) -> Exports:
         raise InputError("--euler and --frame go with --to FILE; give the file")
     found = []
     for target in output.to or ():
-        writable("to", target, suffixes=recordings.writers("write_estimate"), sources=(recording,))
+        suffixes = tuple(dict.fromkeys((*workflows.HDF5, *recordings.writers("write_estimate"))))
+        writable("to", target, suffixes=suffixes, sources=(recording,))
         options: dict[str, Any] = dict(wanted)
+        if target.suffix.lower() in workflows.HDF5 and not wanted:
+            found.append((target, options))
+            continue
         chosen = recordings.estimate_format(target, wanted, recording=not recordings.is_record(recording))
         # If the axes were changed, the samples in a copy of the file would not be in those of the orientation.
         if "source" in chosen.estimate_options and recordings.format_of(recording) is chosen and not changed:
@@ -238,10 +240,11 @@ def _exports(output: _Output, recording: Path, *, changed: bool) -> Exports:
 
 def _export(exports: Exports, estimate: Estimate, recording: Recording | None) -> list[Path]:
     """Write an estimate to its additional files and return them."""
-    from strapdown import recordings
+    from strapdown import workflows
 
     for target, options in exports:
-        recordings.write(estimate, target, recording=recording, **options)
+        samples = {} if target.suffix.lower() in workflows.HDF5 else {"recording": recording}
+        workflows.write(estimate, target, **options, **samples)
     return [target for target, _ in exports]
 
 
@@ -268,46 +271,38 @@ def _estimate_specified(path: Path, shared: _Shared, options: _Specified, output
             full_covariance=shared.full_covariance is not False,
             smooth=shared.smooth,
         )
-    length = record.time[-1] - record.time[0]
+    length, result = record.time[-1] - record.time[0], run.estimate
     console.print(
         f"{path.name}: {len(record.increments)} gyro samples over {length:.6g} s, "
-        f"{', '.join(f'{len(s.time)} of {s.sensor}' for s in record.vectors) or 'no measurements'}. {run.start}"
+        f"{', '.join(f'{len(s.time)} of {s.sensor}' for s in record.vectors) or 'no measurements'}. {' '.join(result.remarks)}"
     )
     say(*remarks)
-    _print_result(run.estimate)
-    paths = _write_specified(path, record.origin, chosen, run, shared, output.out)
-    paths += _export(exports, run.estimate, None)
-    _say_nis(run.estimate, paths[0])
+    _print_result(result)
+    paths = _write(output.out, result, record)
+    if shared.observability:
+        paths.append(_observability(output.out, str(path), run.record, chosen, run.initial))
+    if result.truth is not None:
+        paths.append(output.out / "errors.json")
+        found = _errors(result, result.truth)
+        write_json(paths[-1], {"source": str(path), **found})
+        console.print(_errors_words(found))
+    paths += _export(exports, result, None)
+    _say_nis(result, paths[0])
     if output.drawn_as is not None:
-        paths += _drawn(output.out, output.drawn_as, run.estimate, path.name, truth=run.truth)
+        paths += _drawn(output.out, output.drawn_as, result, path.name)
     written(*paths)
 
 
-def _write_specified(
-    path: Path, origin: Origin | None, chosen: FilterSetup, run: RecordRun, shared: _Shared, out: Path
-) -> list[Path]:
-    """Write the estimate with its attributes, and print its errors; return the files."""
-    from strapdown.estimation import setup
-    from strapdown.recordings.recordfiles import origin_attributes
-    from strapdown.records import write_estimate
+def _write(out: Path, result: Estimate, record: ImuRecord) -> list[Path]:
+    """Write the estimate and its error states, which are printed too; return the files."""
+    from strapdown import workflows
 
-    result, truth = run.estimate, run.truth
-    paths = [out / "estimate.h5"]
-    attributes: dict[str, Any] = {"source": str(path), "filter": setup.to_toml(chosen), "start": run.start}
-    attributes["smoothed"] = shared.smooth
-    attributes |= {name: value for name, value in origin_attributes(origin).items() if name != "gyro"}
     _clear(out)
-    write_estimate(paths[0], result, attributes, truth=truth)
+    paths = [workflows.write(result, out / "estimate.h5")]
     if result.error_states:
         paths.append(out / "states.json")
-        write_json(paths[-1], {"source": str(path), **_print_states(result, run.record)})
-    if shared.observability:
-        paths.append(_observability(out, str(path), run.record, chosen, run.initial))
-    if truth is not None:
-        paths.append(out / "errors.json")
-        found = _errors(result, truth)
-        write_json(paths[-1], {"source": str(path), **found})
-        console.print(_errors_words(found))
+        states = _states(result) if result.motion else _print_states(result, record)
+        write_json(paths[-1], {"source": "" if result.origin is None else result.origin.source, **states})
     return paths
 
 
@@ -344,21 +339,19 @@ def _drawn(
     form: FigureFormat,
     result: Estimate,
     title: str,
-    truth: Any = None,
-    used: Any = None,
-    fixed_frame: str = "",
 ) -> list[Path]:
     """Draw the estimate, its optional states, and its errors relative to a truth or a reference; return the files."""
     from strapdown import plots
     from strapdown.plots.style import save_as
 
-    figures = {out / "estimate": plots.estimate_overview(result, title=title, fixed_frame=fixed_frame)}
+    truth = result.truth
+    figures = {out / "estimate": plots.estimate_overview(result, title=title, fixed_frame=result.fixed_frame)}
     if result.error_states:
         figures[out / "states"] = plots.states_over_time(result, title=title)
-    if truth is not None:
+    if truth is not None and truth.has_bias:
         figures[out / "errors"] = plots.error_overview(result, truth, title=title)
-    if used is not None and used.true_attitude is not None:
-        figures[out / "errors"] = plots.recording_errors(result, used.true_attitude, used.movement)
+    elif truth is not None:
+        figures[out / "errors"] = plots.recording_errors(result, truth.attitude, truth.movement)
     return save_as(figures, form)
 
 
@@ -455,31 +448,43 @@ def _estimate_recording(
     recording: Path, layout: dict[str, Any], shared: _Shared, options: _Recorded, output: _Output, exports: Exports
 ) -> None:
     """Run the filter over a recording: accelerometer as the vertical, magnetometer as the heading."""
-    from strapdown import ahrs, calibration
-    from strapdown.consistency import reference_errors
+    from strapdown import ahrs, calibration, recordings, workflows
+    from strapdown.gyro import read_spec
+    from strapdown.gyro import temperature as thermal
 
-    motion = one_of("--motion", options.motion or "auto", ("auto", *ahrs.MOTIONS))
+    motion = one_of("--motion", options.motion or ahrs.motions.AUTO, (ahrs.motions.AUTO, *ahrs.MOTIONS))
     late = None if options.latency is None else 1e-3 * non_negative("--latency", options.latency, unit="ms")
-    robustness = shared.robustness
     carried = None if options.calibration is None else calibration.read(options.calibration)
-    begun, parameters, motion, odds = _read_recording(recording, layout, motion, shared, options.temperature)
+    warm = None if options.temperature is None else thermal.read(options.temperature)
+    spec = None if shared.gyro is None else read_spec(shared.gyro)
+    with progress_bar("reading"):
+        source = recordings.read(recording, **layout)
+    known = None if source.true_attitude is None else np.isfinite(source.true_attitude).all(axis=1)
+    if known is not None and source.movement is not None and not (known & source.movement).any():
+        raise InputError(
+            f"{recording}: no sample to judge has a reference attitude; check its movement mask and its reference"
+        )
+    doubt(source, recording)
     with progress_bar("smoothing" if shared.smooth else "filtering"):
-        result = ahrs.estimate(
-            begun,
-            parameters,
+        run = workflows.estimate_recording(
+            source,
+            noise=spec,
+            temperature=warm,
+            motion=motion,
+            walks=shared.observability,
             latency=late,
             calibration=carried,
-            full_covariance=begun.recording.true_attitude is not None
-            if shared.full_covariance is None
-            else shared.full_covariance,
+            full_covariance=shared.full_covariance,
             smooth=shared.smooth,
-            **robustness,
+            **shared.robustness,
         )
-    used, parameters, out = result.recording, result.parameters, output.out
-    errors = None if used.true_attitude is None else reference_errors(result.estimate.attitude, used.true_attitude)
-    rms = None if errors is None else {name: value / DEGREE for name, value in errors.rms(used.movement).items()}
-    paths = _write_recording(result, replace(parameters.setup, **robustness), motion, shared.smooth, out)
-    _say_recording(result, motion, odds)
+    result, parameters, out = run.estimate, run.parameters, output.out
+    paths = _write(out, result, run.record)
+    if run.calibration is not None:
+        paths.append(out / "calibration.toml")
+        calibration.write(run.calibration, paths[-1])
+    say(*result.remarks)
+    _print_result(replace(result, skipped={}))
     if shared.gyro is not None:
         arw, rrw = parameters.angle_random_walk, parameters.rate_random_walk
         console.print(
@@ -487,145 +492,13 @@ def _estimate_recording(
             f"{rrw / DEGREE_PER_HOUR_PER_ROOT_HOUR:.3g} °/h/√h."
         )
     if shared.observability:
-        paths.append(_observability(out, used.source, result.record, parameters.setup, result.initial))
-    if rms is not None:
-        over = "the whole recording" if used.movement is None else "the movement phase"
-        paths.append(_rms(out, used.source, rms, over))
-    paths += _export(exports, result.estimate, begun.recording)
+        paths.append(_observability(out, source.source, run.record, parameters.setup, run.initial))
+    if result.truth is not None:
+        table = workflows.accuracy(result)
+        show_listing(table.listing(), notes=True)
+        paths.append(out / "errors.json")
+        write_json(paths[-1], {"source": source.source, **table.summary()})
+    paths += _export(exports, result, source)
     if output.drawn_as is not None:
-        frame = _fixed_frame(used)
-        paths += _drawn(out, output.drawn_as, result.estimate, used.source, used=used, fixed_frame=frame)
+        paths += _drawn(out, output.drawn_as, result, source.source)
     written(*paths)
-
-
-def _read_recording(
-    recording: Path, layout: dict[str, Any], motion: str, shared: _Shared, temperature: Path | None
-) -> tuple[Begun, AhrsParameters, str, float]:
-    """Return the recording less its bias over temperature, the parameters of the filter, the motion, and the margin of its log-likelihood.
-
-    The margin over the other motion is infinite if the motion was given.
-    """
-    from strapdown import ahrs, recordings
-    from strapdown.gyro import read_spec
-    from strapdown.gyro import temperature as thermal
-
-    warm = None if temperature is None else thermal.read(temperature)
-    with progress_bar("reading"):
-        source = recordings.read(recording, **layout)
-    begun = ahrs.begin(source)
-    doubt(source, recording)
-    motion, odds = ahrs.motions.chosen(begun, motion, name="--motion")
-    parameters = ahrs.MOTIONS[motion]
-    if shared.gyro is not None:
-        from strapdown import workflows  # slow to import
-
-        spec = read_spec(shared.gyro)
-        parameters, warm = workflows.with_gyro_noise(parameters, spec), warm or spec.temperature
-    if warm is not None:
-        walks = shared.smooth or shared.observability
-        source, parameters = ahrs.without_temperature(source, parameters, warm, walks=walks)
-        begun = ahrs.begin(source)
-    return begun, parameters, motion, odds
-
-
-def _fixed_frame(used: Recording) -> str:
-    return (
-        "East-North-Up, magnetic North"
-        if used.magnetic_field is not None
-        else "z up, heading arbitrary (no magnetometer)"
-    )
-
-
-def _write_recording(result: AhrsEstimate, chosen: FilterSetup, motion: str, smoothed: bool, out: Path) -> list[Path]:
-    """Write the estimate, its states and the calibration; return the files."""
-    from strapdown import calibration
-    from strapdown.estimation import setup
-    from strapdown.records import write_estimate
-
-    used, found = result.recording, result.estimate
-    paths = [out / "estimate.h5"]
-    _clear(out)
-    write_estimate(
-        paths[0],
-        found,
-        {
-            "source": used.source,
-            "fixed_frame": _fixed_frame(used),
-            "motion": motion,
-            "smoothed": smoothed,
-            "filter": setup.to_toml(chosen),
-            **{f"parameter.{name}": value for name, value in vars(result.parameters).items()},
-            "latency": result.delays.last_gyro,
-            "magnetometer_latency": result.delays.last_field,
-        },
-        reference=used.true_attitude,
-    )
-    if found.error_states:
-        paths.append(out / "states.json")
-        write_json(paths[-1], {"source": used.source, **_states(found)})
-    if result.calibration is not None:
-        paths.append(out / "calibration.toml")
-        calibration.write(result.calibration, paths[-1])
-    return paths
-
-
-def _say_recording(result: AhrsEstimate, motion: str, odds: float) -> None:
-    """Print what was read, the initial state, the motion model, and faults of the samples."""
-    from strapdown import recordings
-
-    used, found = result.recording, result.estimate
-    console.print(
-        f"{used.source}: {len(used.time)} samples over {used.time[-1] - used.time[0]:.1f} s, initialised in "
-        f"{'the quiet second' if _rested(result) else 'its quietest second, which is not at rest,'} from {used.time[0]:.2f} s."
-    )
-    say(*used.remarks, f"Fixed frame: {_fixed_frame(used)}.", _model(motion, odds, result))
-    say(*result.delays.words, *(f"{one}." for one in result.faults.words))
-    if result.hard_iron.any():
-        iron = ", ".join(f"{value:.3g}" for value in result.hard_iron)
-        console.print(
-            f"Hard iron of ({iron}) {used.magnetic_unit or '(unit of the magnetometer)'}, body axes, at the end, is subtracted."
-        )
-    if words := gap_words(recordings.gaps(used.time)):
-        console.print(f"{words}.")
-    say(used.left_out_words)
-    for sensor, number in found.skipped.items():
-        if number:
-            console.print(f"{number} of the gyro's samples have no sample of the {sensor} at the same time.")
-    _print_result(replace(found, skipped={}))
-
-
-def _rms(out: Path, source: str, rms: dict[str, float], over: str) -> Path:
-    """Print and write the RMS errors relative to the reference, degrees; return the file."""
-    write_json(out / "errors.json", {"source": source, **{f"{name}_rmse_deg": value for name, value in rms.items()}})
-    rows = table(f"RMS error over {over}, degrees", *rms, left=0)
-    rows.add_row(*(f"{value:.2f}" for value in rms.values()))
-    show(rows)
-    return out / "errors.json"
-
-
-def _rested(result: AhrsEstimate) -> bool:
-    """Return whether the gyro bias was estimated at the start, if the filter is initialised with it."""
-    p = result.parameters
-    return p.rest_bias_sigma == 0.0 or bool(result.initial.covariance[3, 3] <= (0.5 * p.bias_sigma) ** 2)
-
-
-def _model(moved_by: str, odds: float, result: AhrsEstimate) -> str:
-    """Return a description of the motion model and of the initial gyro bias."""
-    if moved_by == "any":
-        return "Motion: any, its acceleration modelled as white noise."
-    bias, sigma = result.initial.bias / DEGREE, np.sqrt(result.initial.covariance[3, 3]) / DEGREE
-    parameters = result.parameters
-    shown = " (from the recording)" if parameters.velocity_from_record else ""
-    likelier = (
-        f" (log-likelihood larger by {odds:.0f} than for a {'hand' if moved_by == 'vehicle' else 'vehicle'})"
-        if odds < np.inf
-        else ""
-    )
-    words = (
-        f"Motion: of a {moved_by}{likelier}, velocity σ {parameters.velocity_sigma:.2g} m/s{shown}, correlation time "
-        f"{parameters.velocity_time:g} s. "
-        f"Initial gyro bias: {', '.join(f'{value:.3g}' for value in bias)} °/s, σ {sigma:.2g} °/s"
-    )
-    if not _rested(result):
-        return f"{words}: no second is quiet enough to estimate it, so the heading may drift at first."
-    return f"{words}, from that second."

@@ -41,12 +41,12 @@ def filter_for(
             )
         chosen = setup.read_setup(filter_file)
         need_angles(filter_file, chosen, record)
-        return chosen, no_state_words(unmodelled_errors(record, chosen), chosen)
+        return chosen, no_state_words(unmodelled_errors(record.origin, chosen), chosen)
     spec = None if gyro is None else read_spec(gyro)
     if spec is None and (record.origin is None or record.origin.gyro is None):
         raise InputError(f"{path} does not contain the gyro's specification; give --gyro or --filter, a TOML file")
     chosen = setup.FilterSetup.for_record(record, spec, states=True if states == () else states)
-    missing = unmodelled_errors(record, chosen)
+    missing = unmodelled_errors(record.origin, chosen)
     if states is False or (states is None and chosen.states is None):
         return chosen, no_state_words(missing, chosen)
     remarks = []

@@ -16,7 +16,6 @@ from strapdown.cli.terminal import (
     TABLES,
     command,
     console,
-    gap_words,
     json_target,
     need_own,
     put_json,
@@ -120,6 +119,8 @@ def integrate(
         error = np.degrees(quaternion.angle_between(quaternion.normalize(reference[known]), attitude[known]))
         console.print(f"Error relative to the file's attitude: final {error[-1]:.4g}°, maximum {error.max():.4g}°.")
     if gaps:
+        from strapdown.ahrs.remarks import gap_words
+
         console.print(f"{gap_words(gaps)}: the rotation during a gap is interpolated.")
     say(words)
     written(out)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -38,8 +38,8 @@ if TYPE_CHECKING:
     from strapdown.records import Estimate, ImuRecord
     from strapdown.tuning.diagnosis import Diagnosis
 
-CONSISTENT, NOT, CANNOT_TELL = 0, 1, 2
-"""Exit status of a verdict. Bad input also ends with 2, and an error on standard error."""
+CONSISTENT, NOT, CANNOT_TELL = 0, 1, 3
+"""Exit status of a verdict; 2 is that of bad usage or input."""
 
 
 @dataclass(frozen=True)
@@ -75,8 +75,12 @@ def check(
         ),
     ],
     foreign: _Foreign,
-    probability: float = typer.Option(
+    confidence_level: float = typer.Option(
         0.99, help="Minimum probability with which a consistent filter passes all tests together."
+    ),
+    detectable_error: float = typer.Option(
+        1.5,
+        help="Factor on σ that the tests of attitude, bias and innovations must be able to detect for the verdict consistent.",
     ),
     record: Path | None = typer.Option(
         None, help="Record from which the estimate was made; likely causes are then determined."
@@ -88,7 +92,7 @@ def check(
     ),
     json: Path | None = typer.Option(None, "--json", help="File for all statistics; - for standard output."),
 ) -> None:
-    """Judge whether a filter is consistent: exit status 0 consistent, 1 not, 2 cannot tell (or bad input).
+    """Judge whether a filter is consistent: exit status 0 consistent, 1 not, 3 cannot tell, 2 bad usage or input.
 
     With --record, the verdict combines the statistics with a search for causes. With --truth, the estimate may be from any filter; clocks
     and frames are compared first. Without a truth, an estimate of another program is judged by its innovations, if it has any.
@@ -98,7 +102,8 @@ def check(
     json_target(json, result, record, filter_file, foreign.truth)
     if record is None and filter_file is not None:
         raise InputError("--filter goes with --record: the record is needed to search for causes")
-    tail(probability)
+    tail(confidence_level)
+    how: dict[str, Any] = {"confidence_level": confidence_level, "detectable_error": detectable_error}
     own = _is_own(result)
     if record is not None and (foreign.truth is not None or not own):
         raise InputError(
@@ -108,9 +113,9 @@ def check(
         if name not in ("--topic", "--truth-topic"):
             raise InputError(f"{name} goes with --truth; give a reference, or leave it out")
     if foreign.truth is not None or not own:
-        judgement, content = _judged_foreign(result, foreign, probability)
+        judgement, content = _judged_foreign(result, foreign, how)
     else:
-        judgement, content = _judged_own(result, probability, with_record=record is not None)
+        judgement, content = _judged_own(result, how, with_record=record is not None)
     words = judgement.words
     _show_statistics(judgement)
     if record is not None:
@@ -125,35 +130,30 @@ def check(
     raise typer.Exit(status_of(judgement))
 
 
-def _judged_own(result: Path, probability: float, *, with_record: bool) -> tuple[Judgement, dict[str, Any]]:
+def _judged_own(result: Path, how: dict[str, Any], *, with_record: bool) -> tuple[Judgement, dict[str, Any]]:
     """Judge a result of this package; return the verdict and the start of the JSON content."""
-    from strapdown import records
-    from strapdown.report import findings
+    from strapdown import workflows
 
-    attributes = records.read_attributes(result)
-    kind = str(attributes["kind"])
+    held: Any = workflows.read(result)
+    kind = reading.kind(result)
     if kind == "strapdown montecarlo":
-        from strapdown.montecarlo import campaign
-
         if with_record:
             raise InputError("--record and --filter go with an estimate; for a Monte Carlo, replay a run first")
-        held = campaign.read(result)
         if held.statistics is None:
             raise InputError(f"{result} has no completed run yet; resume it with `strapdown montecarlo --resume`")
         console.print(f"{result.name}: {held.statistics.runs} of {counted(held.runs, 'run')}, machine {held.machine}.")
-        judgement = held.statistics.judge(probability=probability, unmodelled=held.plan.unmodelled)
     elif kind == "strapdown estimate":
-        estimate = records.read_estimate(result)
-        truth = records.read_truth(result)
+        truth = held.truth
         console.print(
-            f"{result.name}: {len(estimate.time)} epochs over {estimate.time[-1] - estimate.time[0]:.6g} s, "
-            f"{sum(len(one.time) for one in estimate.innovations.values())} measurements, "
-            f"{'with its truth' if truth is not None else 'with a reference attitude' if records.read_reference(result) else 'no truth'}."
+            f"{result.name}: {len(held.time)} epochs over {held.time[-1] - held.time[0]:.6g} s, "
+            f"{sum(len(one.time) for one in held.innovations.values())} measurements, "
+            f"{'no truth' if truth is None else 'with its truth' if truth.has_bias else 'with a reference attitude'}."
         )
-        judgement = findings.judged(result, attributes, estimate, truth, probability=probability)
     else:
-        raise InputError(f"{result} is a {kind}; give a result of `strapdown estimate` or `strapdown montecarlo`")
-    return judgement, {"source": result.name, "kind": kind}
+        raise InputError(
+            f"{result} is {f'a {kind}' if kind else 'a recording'}; give a result of `strapdown estimate` or `strapdown montecarlo`"
+        )
+    return workflows.check(held, **how), {"source": result.name, "kind": kind}
 
 
 def status_of(judgement: Judgement) -> int:
@@ -166,16 +166,19 @@ def _is_own(path: Path) -> bool:
     return not path.exists() or path.suffix.lower() in (".h5", ".hdf5") or (path.is_file() and reading.is_hdf5(path))
 
 
-def _judged_foreign(result: Path, options: _Foreign, probability: float) -> tuple[Judgement, dict[str, Any]]:
+def _judged_foreign(result: Path, options: _Foreign, how: dict[str, Any]) -> tuple[Judgement, dict[str, Any]]:
     """Judge an estimate of another program; return the verdict and the start of the JSON content."""
-    from strapdown import consistency
+    from strapdown import consistency, workflows
     from strapdown.consistency import foreign
+    from strapdown.estimation.setup import read_estimate
     from strapdown.recordings.attitudes import read_attitudes
-    from strapdown.records import write_estimate
+    from strapdown.records import Origin
 
     if options.aligned is not None:
         writable("aligned", options.aligned, suffixes=(".h5", ".hdf5"), sources=(result, options.truth))
     own = read_attitudes(result, topic=options.topic or "")
+    if reading.kind(result) == "strapdown estimate":
+        own = replace(own, innovations=read_estimate(result).innovations)
     length = (own.stamps_ns[-1] - own.stamps_ns[0]) / 1e9
     console.print(f"{own.source}: {len(own.stamps_ns)} attitudes over {length:.6g} s.")
     say(*own.remarks)
@@ -186,7 +189,7 @@ def _judged_foreign(result: Path, options: _Foreign, probability: float) -> tupl
                 f"{result} has no innovations, so it cannot be judged without a truth; give --truth, attitudes over the same time"
             )
         estimate = foreign.without_truth(own.seconds(int(own.stamps_ns[0])), own.attitude, own.innovations)
-        return consistency.judge(estimate, None, probability=probability), content
+        return consistency.judge(estimate, **how), content
     reference = read_attitudes(options.truth, topic=options.truth_topic or "")
     console.print(f"Truth: {reference.source}, {len(reference.stamps_ns)} attitudes.")
     # One clock may count from 1970 and the other from the boot of a machine: both relative to the first stamp, in integer ns.
@@ -203,16 +206,18 @@ def _judged_foreign(result: Path, options: _Foreign, probability: float) -> tupl
         innovations=own.innovations,
         error_frame=frame,
         align=options.align,
-        probability=probability,
+        true_movement=reference.movement,
+        **how,
     )
     content.update(found.summary())
     say(*(f"Note: {remark}." for remark in found.remarks))
     if frame != options.error_frame:
         console.print(f"Note: the file declares that its covariance is of the {frame} error.")
+    show_listing(found.accuracy.listing(), notes=True)
     _show_explanations(found)
     if options.aligned is not None:
-        attributes = {"source": own.source, "truth": reference.source}
-        write_estimate(options.aligned, found.estimate, attributes, truth=found.truth)
+        aligned = replace(found.estimate, truth=found.truth, origin=Origin(source=own.source))
+        workflows.write(replace(aligned, details={"truth": reference.source}), options.aligned)
     return found.judgement, content
 
 
@@ -229,9 +234,10 @@ def _show_explanations(found: Checked) -> None:
 def _show_statistics(judgement: Judgement) -> None:
     if judgement.findings:
         show_listing(judgement.listing(), "Statistics of the filter and their bounds for a consistent filter")
+        share = 100.0 * (1.0 - judgement.confidence_level)
         console.print(
-            "Each p-value is for one statistic; bounds, pass and FAIL are for all together "
-            f"(a consistent filter fails with at most {100.0 * (1.0 - judgement.probability):.2g} %). NIS, NEES: per degree of freedom."
+            "Each p-value is for one statistic; bounds, pass and FAIL are for all together (a consistent filter fails with at most "
+            f"{share:.2g} %). NIS, NEES: per degree of freedom."
         )
 
 
@@ -239,17 +245,18 @@ def _diagnosed(
     result: Path, record: Path, filter_file: Path | None, judgement: Judgement
 ) -> tuple[dict[str, Any], Diagnosis | None]:
     """Print the causes found from a record; return them for JSON, and the diagnosis with the combined verdict, or None."""
-    from strapdown import estimation, records
+    from strapdown import estimation
+    from strapdown.estimation.setup import read_estimate
     from strapdown.estimation.setup.for_record import unmodelled_errors
     from strapdown.recordings import recordfiles
     from strapdown.tuning import diagnosis
     from strapdown.tuning.residual_checks import accepted
 
-    chosen = _filter_of(result, filter_file)
-    estimate = records.read_estimate(result)
+    estimate = read_estimate(result)
+    chosen = _filter_of(result, estimate, filter_file)
     held = recordfiles.read_record(record)
     _need_same(result, estimate, record, held)
-    missing = unmodelled_errors(held, chosen)
+    missing = unmodelled_errors(held.origin, chosen)
     say(*no_state_words(missing, chosen))
     if chosen.states is not None and chosen.states.names:
         reason = f"the search supports filters of attitude and bias only, and this one has the states {', '.join(chosen.states.names)}"
@@ -260,7 +267,7 @@ def _diagnosed(
     # The verdict is on the filter with its gate, so measurements that it rejected are left out.
     with progress_bar("searching for causes"):
         found = diagnosis.diagnose(
-            accepted(held, estimate), chosen, initial, probability=judgement.probability, judgement=judgement
+            accepted(held, estimate), chosen, initial, probability=judgement.confidence_level, judgement=judgement
         )
     show_listing(found.listing(), "Causes by their effect on the likelihood")
     content = {**found.summary(), "without_a_state": list(missing)}
@@ -272,17 +279,15 @@ def _diagnosed(
     return content, found
 
 
-def _filter_of(result: Path, filter_file: Path | None) -> FilterSetup:
+def _filter_of(result: Path, estimate: Estimate, filter_file: Path | None) -> FilterSetup:
     """Return the setup of an estimate, from a file or from the estimate itself."""
-    from strapdown import records
     from strapdown.estimation import setup
 
     if filter_file is not None:
         return setup.read_setup(filter_file)
-    text = records.read_attributes(result).get("filter")
-    if text is None:
+    if estimate.setup is None:
         raise InputError(f"{result} does not contain its filter; give --filter, a TOML file with the table [filter]")
-    return setup.from_toml(str(text), f"{result}: filter")
+    return estimate.setup  # type: ignore[no-any-return]
 
 
 def _need_same(result: Path, estimate: Estimate, path: Path, record: ImuRecord) -> None:
@@ -310,9 +315,10 @@ def doctor(
         None, "--json", help="File for the explanations and their scores; - for standard output."
     ),
 ) -> None:
-    """Test the axes, signs, frames and units of a recording against alternatives: exit status 0 as declared, 1 wrong, 2 cannot tell."""
+    """Test the axes, signs, frames and units of a recording against alternatives: exit status 0 as declared, 1 wrong, 3 cannot tell."""
     from strapdown import recordings
     from strapdown.ahrs import check_conventions
+    from strapdown.recordings.sensor_faults import stuck_words
 
     json_target(json, recording)
     source = recordings.read(recording, **layout.options(recording))
@@ -321,6 +327,7 @@ def doctor(
     say(
         f"{found.source}: {found.words}",
         *(f"warning: {words}." for words in found.doubts),
+        *(f"warning: {words}" for words in stuck_words(source)),
         *(f"Note: {remark}" for remark in source.remarks),
     )
     if found.candidates:

@@ -9,6 +9,7 @@ from strapdown.cli.terminal import app
 COMMANDS: dict[str, dict[str, tuple[str, ...]]] = {
     "Simulate, estimate, judge": {
         "scenarios": ("sensors",),
+        "keys": ("keys", "strapdown keys sensors", "strapdown keys coning"),
         "simulate": (
             "sensors",
             "strapdown simulate two-stars",

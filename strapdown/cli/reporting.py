@@ -27,7 +27,7 @@ def report(
     out: Path | None = typer.Option(
         None, "--out", "-o", help="The page, .html. Default: the file name of the result with this suffix."
     ),
-    probability: float = typer.Option(
+    confidence_level: float = typer.Option(
         0.99, help="Probability that a consistent filter passes all tests, between 0 and 1."
     ),
 ) -> None:
@@ -38,6 +38,6 @@ def report(
     page = result.with_suffix(".html") if out is None else out
     writable("out", page, page.with_suffix(".report.json"), sources=(result, other))
     with progress_bar("judging, drawing"):
-        done = reports.write(result, out, other=other, probability=probability)
+        done = reports.write(result, out, other=other, confidence_level=confidence_level)
     console.print(f"{result.name}: {done.verdict}.", highlight=False)
     written(done.page, done.statistics)

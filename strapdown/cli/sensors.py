@@ -71,18 +71,12 @@ def simulate(
         return
     used = chosen.seed if seed is None else seed
     target = out or Path(f"{Path(scenario).stem}.h5")
-    writable("out", target, suffixes=(".h5", ".hdf5", ".csv"), sources=(scenario,))
-    beside = [target.with_name(f"{target.stem}-vectors-{number}.csv") for number in range(len(chosen.sensors))]
-    writable("out", *(beside if target.suffix.lower() == ".csv" else ()))
+    writable("out", target, suffixes=(".h5", ".hdf5"), sources=(scenario,))
     need_own(target, "simulate", recordfiles.is_record)
     with progress_bar("simulating, writing", 2) as advance:
         record = catalogue.simulate(chosen, used, run)
         advance(1)
-        if target.suffix.lower() == ".csv":
-            paths = recordfiles.export_csv(target, record)
-        else:
-            recordfiles.write_record(target, record)
-            paths = (target,)
+        recordfiles.write_record(target, record)
         advance(1)
     console.print(
         f"{chosen.name or target.stem}: {len(record.increments)} gyro samples over {record.time[-1] - record.time[0]:g} s, seed {used}, "
@@ -97,7 +91,7 @@ def simulate(
                 f"warning: {series.sensor}: its sigma is zero, which a filter cannot use; add noise in the scenario, or give the filter "
                 "another sigma in [filter.sigma]"
             )
-    written(*paths)
+    written(target)
 
 
 @dataclass(frozen=True)

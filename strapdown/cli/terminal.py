@@ -8,7 +8,7 @@ import enum
 import functools
 import inspect
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_type_hints
 
@@ -226,14 +226,6 @@ def doubt(source: Recording, path: Path) -> None:
     with progress_bar("testing conventions"):
         found = check_conventions.examine(source)
     say(*(f"warning: {words}. See `strapdown doctor {path}`." for words in found.warnings))
-
-
-def gap_words(gaps: Sequence[tuple[float, float]]) -> str:
-    """Return how many gaps between stamps there are, begin and length of each given, and the longest; empty without any."""
-    if not gaps:
-        return ""
-    begin, length = max(gaps, key=lambda gap: gap[1])
-    return f"Gaps between stamps: {len(gaps)}, the longest {length:.3g} s after {begin:.3f} s"
 
 
 STANDARD_OUTPUT = Path("-")

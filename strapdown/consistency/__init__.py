@@ -4,15 +4,16 @@
 - ``bounds``: Exact two-sided bounds of averages over independent runs: ANEES and NIS, log-NEES, coverage.
 - ``whiteness``: Tests of the innovations: white, normal, of mean zero, independent of those of other sensors.
 - ``timeaverage``: Averages over the time of one run, whose errors are correlated, and their effective sample size.
-- ``accuracy``: Errors against a reference, and their convergence time.
+- ``accuracy``: Errors against a truth or a reference, in one table; their convergence time.
+- ``alignment``: Clocks and frames of an estimate and a truth.
 - ``foreign``: The verdict on the estimate of another program: alignment of clocks and frames, definition of its covariance.
 - ``judgement``: The verdict in words, with its evidence, at a stated probability of a false alarm. For independent runs see
   :meth:`strapdown.montecarlo.Statistics.judge`.
 """
 
+from strapdown.consistency.accuracy import Accuracy, reference_errors
 from strapdown.consistency.accuracy import ReferenceErrors as ReferenceErrors
 from strapdown.consistency.accuracy import convergence_time as convergence_time
-from strapdown.consistency.accuracy import reference_errors
 from strapdown.consistency.bounds import Verdict as Verdict
 from strapdown.consistency.bounds import log_mean_bounds as log_mean_bounds
 from strapdown.consistency.bounds import log_mean_p_value as log_mean_p_value
@@ -20,6 +21,7 @@ from strapdown.consistency.bounds import log_moments as log_moments
 from strapdown.consistency.bounds import mean_bounds
 from strapdown.consistency.bounds import mean_p_value as mean_p_value
 from strapdown.consistency.foreign import Checked, check_arrays
+from strapdown.consistency.judgement import DETECTABLE as DETECTABLE
 from strapdown.consistency.judgement import Finding, Judgement, judge
 from strapdown.consistency.judgement import concluded as concluded
 from strapdown.consistency.manifold import SUBSETS as SUBSETS
@@ -36,6 +38,7 @@ from strapdown.consistency.whiteness import mean_innovation_p_value as mean_inno
 from strapdown.consistency.whiteness import quantile_pairs as quantile_pairs
 
 __all__ = [
+    "Accuracy",
     "Checked",
     "Finding",
     "Judgement",

@@ -1,15 +1,31 @@
-"""Errors of an estimate: against a reference, convergence time."""
+"""Accuracy of an estimate against a truth or a reference: one table for all; convergence time."""
 
 from __future__ import annotations
 
+import contextlib
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from strapdown import quaternion
 from strapdown.checks import Array, InputError, array, increasing, positive
+from strapdown.consistency.alignment import ALIGNED, Alignment, Series, align_series, at_common_times, in_truth_frames
+from strapdown.files import plain
+from strapdown.records import Estimate, Truth
+from strapdown.results import Listed, Listing, figure
+from strapdown.units import DEGREE
+
+KINDS = ("total", "heading", "inclination")
+"""Parts of an attitude error: its angle, its part about the vertical, the angle between the two verticals."""
+_DEGREES = {"total": 3, "heading": 1, "inclination": 2}
+REGION = 0.95
+"""Probability of the regions of an error given its covariance, whose coverage is reported."""
+FITTED = 4000
+"""Maximum number of attitudes from which clocks and frames are aligned."""
 
 
 def convergence_time(time: ArrayLike, magnitude: ArrayLike, threshold: float) -> float:
@@ -81,3 +97,195 @@ def reference_errors(attitude: ArrayLike, reference: ArrayLike) -> ReferenceErro
     results[1, known] = 2.0 * np.arctan2(np.abs(z), np.abs(w))
     results[2, known] = 2.0 * np.arctan2(np.hypot(x, y), np.hypot(w, z))
     return ReferenceErrors(total=results[0], heading=results[1], inclination=results[2])
+
+
+class ErrorSize(NamedTuple):
+    """Size of one part of the attitude error over some samples."""
+
+    rms: float
+    """Root mean square of the angle, rad."""
+    median: float
+    """Median of the angle, rad."""
+    maximum: float
+    """Maximum of the angle, rad."""
+    coverage: float = math.nan
+    """Fraction of the errors inside the 95 % region of the covariance; NaN without a covariance."""
+    rms_over_sigma: float = math.nan
+    """Root mean square of the error divided by its σ: 1 for a consistent filter."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Accuracy(Listed):
+    """Attitude errors of an estimate against a truth or a reference.
+
+    Parameters
+    ----------
+    samples : mapping of str to int
+        Number of samples by span: "all samples", "movement" if the truth states it.
+    given : mapping of str to mapping of str to ErrorSize
+        Errors by span and by part (:data:`KINDS`), as given.
+    aligned : mapping, default empty
+        The same after clocks and frames are aligned.
+    alignment : Alignment, optional
+        The differences of clocks and frames; they are removed from ``aligned`` only.
+    """
+
+    samples: Mapping[str, int]
+    given: Mapping[str, Mapping[str, ErrorSize]]
+    aligned: Mapping[str, Mapping[str, ErrorSize]] = field(default_factory=dict)
+    alignment: Alignment | None = None
+
+    @property
+    def rms_over_sigma(self) -> dict[str, float]:
+        """RMS error over σ by part, over all samples as given; empty without a covariance."""
+        sizes = self.given.get("all samples", {})
+        return {kind: one.rms_over_sigma for kind, one in sizes.items() if math.isfinite(one.rms_over_sigma)}
+
+    def listing(self) -> Listing:
+        """Return the errors as given and aligned, by span and part, in degrees."""
+        rows = []
+        for words, table in (("as given", self.given), ("aligned", self.aligned)):
+            for span, sizes in table.items():
+                for kind, one in sizes.items():
+                    angles = (figure(x / DEGREE) for x in one[:3])
+                    share = "" if math.isnan(one.coverage) else f"{100.0 * one.coverage:.1f} %"
+                    ratio = "" if math.isnan(one.rms_over_sigma) else figure(one.rms_over_sigma, 3)
+                    rows.append((span, words, kind, *angles, share, ratio))
+        notes = [
+            "RMS, median and maximum of the angle of each part; RMS/σ per axis of the part, 1 for a consistent filter."
+        ]
+        if self.alignment is not None:
+            notes.append(self.alignment.differences)
+        columns = ("over", "frames", "error", "RMS, °", "median, °", "maximum, °", "in 95 % region", "RMS/σ")
+        spans = ", ".join(
+            f"{number} {'samples' if name == 'all samples' else f'of {name}'}" for name, number in self.samples.items()
+        )
+        return Listing(f"Attitude error over {spans}", columns, rows, notes, left=3)
+
+    def summary(self) -> dict[str, Any]:
+        """Return the errors as plain values for JSON, in degrees.
+
+        Returns
+        -------
+        dict
+            ``samples``; ``given`` and ``aligned`` by span and part; ``alignment``.
+        """
+
+        def angles(table: Mapping[str, Mapping[str, ErrorSize]]) -> dict[str, Any]:
+            return {
+                span: {
+                    kind: {
+                        **{f"{name}_deg": getattr(one, name) / DEGREE for name in ("rms", "median", "maximum")},
+                        "coverage": one.coverage,
+                        "rms_over_sigma": one.rms_over_sigma,
+                    }
+                    for kind, one in sizes.items()
+                }
+                for span, sizes in table.items()
+            }
+
+        found = {"samples": dict(self.samples), "given": angles(self.given), "aligned": angles(self.aligned)}
+        if self.alignment is not None:
+            found["alignment"] = self.alignment.summary()
+        return plain(found)  # type: ignore[no-any-return]
+
+
+def accuracy(estimate: Estimate, truth: Truth | None = None, *, align: bool = False) -> Accuracy:
+    """Return the attitude errors of an estimate against a truth at its times.
+
+    Parameters
+    ----------
+    estimate : Estimate
+        Estimate; with covariances, coverage and RMS over σ are reported too.
+    truth : Truth, optional
+        Attitudes at the estimate's times, NaN where unknown. Default: those of the estimate.
+    align : bool, default False
+        Whether to report the errors after clocks and frames are aligned too.
+
+    Returns
+    -------
+    Accuracy
+        Errors over all samples with a truth, and over the movement if the truth states it.
+    """
+    truth = estimate.truth if truth is None else truth
+    if truth is None:
+        raise InputError("the estimate has no truth; give one")
+    known = np.isfinite(truth.attitude).all(axis=1)
+    if not known.any():
+        raise InputError("the truth has no attitude at the estimate's times")
+    P = estimate.attitude_covariance
+    own = Series(estimate.time, estimate.attitude, P if np.isfinite(P).all() else None)
+    theirs = truth.taken(known)
+    given = _sizes(own.attitude[known], theirs, None if own.covariance is None else P[known])
+    found: Alignment | None = None
+    aligned: dict[str, dict[str, ErrorSize]] = {}
+    if align:
+        found, aligned, _ = _aligned_sizes(own, Series(own.time[known], theirs.attitude, movement=theirs.movement))
+    return Accuracy(samples=_numbers(theirs), given=given, aligned=aligned, alignment=found)
+
+
+def accuracy_of(own: Series, theirs: Series) -> Accuracy:
+    """Return the errors of a history of attitudes against another in its own clock and frames, as given and aligned.
+
+    The errors as given are left out if the two have no times in common.
+    """
+    found, aligned, samples = _aligned_sizes(own, theirs)
+    given: dict[str, dict[str, ErrorSize]] = {}
+    with contextlib.suppress(InputError):
+        matched, truth = at_common_times(own, theirs, 0.0)
+        P = None if matched.covariance is None else matched.covariance[:, :3, :3]
+        given, samples = _sizes(matched.attitude, truth, P), _numbers(truth)
+    return Accuracy(samples=samples, given=given, aligned=aligned, alignment=found)
+
+
+def _aligned_sizes(own: Series, theirs: Series) -> tuple[Alignment, dict[str, dict[str, ErrorSize]], dict[str, int]]:
+    """Return the alignment of two histories, the errors after it, and the number of samples by span."""
+    thin = slice(None, None, max(1, len(own.time) // FITTED))
+    _, found = align_series(Series(own.time[thin], own.attitude[thin]), theirs, ALIGNED, [])
+    matched, truth = at_common_times(own, theirs, found.offset)
+    return found, _sizes(in_truth_frames(matched.attitude, found), truth, None), _numbers(truth)
+
+
+def _numbers(truth: Truth) -> dict[str, int]:
+    """Return the number of samples by span."""
+    numbers = {"all samples": len(truth.attitude)}
+    return numbers if truth.movement is None else {**numbers, "movement": int(truth.movement.sum())}
+
+
+def _sizes(attitude: Array, truth: Truth, P: Array | None) -> dict[str, dict[str, ErrorSize]]:
+    """Return the sizes of the errors by span and part; P (m, 3, 3) is the covariance of the body-side error."""
+    found = reference_errors(attitude, truth.attitude)
+    squares = None if P is None else _normalised(attitude, truth.attitude, P)
+    spans = {"all samples": np.ones(len(attitude), bool)}
+    if truth.movement is not None and truth.movement.any():
+        spans["movement"] = truth.movement
+    return {
+        span: {
+            kind: _size(kind, getattr(found, kind)[rows], None if squares is None else squares[kind][rows])
+            for kind in KINDS
+        }
+        for span, rows in spans.items()
+    }
+
+
+def _size(kind: str, angle: Array, squares: Array | None) -> ErrorSize:
+    from scipy.special import chdtri
+
+    rms, middle, most = float(np.sqrt(np.mean(angle**2))), float(np.median(angle)), float(angle.max())
+    if squares is None:
+        return ErrorSize(rms, middle, most)
+    degrees = _DEGREES[kind]
+    inside = float(np.mean(squares <= chdtri(degrees, 1.0 - REGION)))
+    return ErrorSize(rms, middle, most, inside, float(np.sqrt(np.mean(squares) / degrees)))
+
+
+def _normalised(attitude: Array, true_attitude: Array, P: Array) -> dict[str, Array]:
+    """Return the normalised squares (m,) of each part of the error, in the fixed frame, whose z axis is vertical."""
+    R = quaternion.to_matrix(attitude)
+    C = R @ P @ np.swapaxes(R, 1, 2)
+    error = quaternion.log(quaternion.multiply(true_attitude, quaternion.conjugate(attitude)))
+    parts = {"total": slice(3), "heading": slice(2, 3), "inclination": slice(2)}
+    return {
+        kind: np.einsum("mi,mi->m", error[:, rows], np.linalg.solve(C[:, rows, rows], error[:, rows, None])[:, :, 0])
+        for kind, rows in parts.items()
+    }

@@ -15,11 +15,11 @@ SIGMAS = (1.0, 2.0, 3.0)
 """Multiples of σ at which the coverage is evaluated."""
 
 
-def tail(probability: float) -> float:
-    """Return the probability beyond each of two-sided bounds that hold with ``probability``."""
-    if not 0.0 < probability < 1.0:
-        raise InputError(f"probability is {probability}; it must lie between 0 and 1")
-    return 0.5 * (1.0 - probability)
+def tail(confidence_level: float) -> float:
+    """Return the probability beyond each of two-sided bounds that hold with ``confidence_level``."""
+    if not 0.0 < confidence_level < 1.0:
+        raise InputError(f"confidence_level is {confidence_level}; it must lie between 0 and 1")
+    return 0.5 * (1.0 - confidence_level)
 
 
 def two_sided(lower: float, upper: float) -> float:
@@ -27,10 +27,13 @@ def two_sided(lower: float, upper: float) -> float:
     return float(min(1.0, 2.0 * min(lower, upper)))
 
 
-def mean_bounds(degrees: int, samples: float, probability: float = 0.99) -> tuple[float, float]:
+def mean_bounds(
+    degrees: int, samples: float, confidence_level: float = 0.99, *, certainty: float = math.inf
+) -> tuple[float, float]:
     """Return two-sided bounds of the mean of independent χ² values, per degree of freedom.
 
-    ``samples · degrees · mean`` is χ² with ``samples · degrees`` degrees of freedom; the expected mean is 1.
+    ``samples · degrees · mean`` is χ² with ``samples · degrees`` degrees of freedom; the expected mean is 1. If the number of samples is
+    itself estimated, the normal score of that χ² is distributed as Student's t.
 
     Parameters
     ----------
@@ -38,8 +41,10 @@ def mean_bounds(degrees: int, samples: float, probability: float = 0.99) -> tupl
         Degrees of freedom of one value.
     samples : float
         Number of independent values; an effective number need not be an integer.
-    probability : float, default 0.99
+    confidence_level : float, default 0.99
         Probability that the mean lies between the bounds.
+    certainty : float, default inf
+        Degrees of freedom of the estimate of ``samples``; infinite if they are counted.
 
     Returns
     -------
@@ -56,22 +61,27 @@ def mean_bounds(degrees: int, samples: float, probability: float = 0.99) -> tupl
     >>> [round(x, 2) for x in consistency.mean_bounds(3, 50, 0.95)]  # 50 runs, 3 states
     [0.79, 1.24]
     """
+    from scipy.special import ndtr, stdtrit
     from scipy.stats import chi2
 
-    outside = tail(probability)
+    outside = tail(confidence_level)
+    if math.isfinite(certainty):
+        outside = float(ndtr(stdtrit(certainty, outside)))
     total = _total(degrees, samples)
-    low, high = chi2.ppf([outside, 1.0 - outside], total) / total
-    return float(low), float(high)
+    return float(chi2.ppf(outside, total) / total), float(chi2.isf(outside, total) / total)
 
 
-def mean_p_value(mean: float, degrees: int, samples: float) -> float:
+def mean_p_value(mean: float, degrees: int, samples: float, *, certainty: float = math.inf) -> float:
     """Return the two-sided p-value of a mean of independent χ² values per degree of freedom (see :func:`mean_bounds`)."""
-    from scipy.special import chdtr, chdtrc
+    from scipy.special import chdtr, chdtrc, ndtri, stdtr
 
     total = _total(degrees, samples)
     if not np.isfinite(mean):
         return 0.0
-    return two_sided(float(chdtr(total, total * mean)), float(chdtrc(total, total * mean)))
+    tails = np.array([chdtr(total, total * mean), chdtrc(total, total * mean)])
+    if math.isfinite(certainty):
+        tails = stdtr(certainty, ndtri(tails))
+    return two_sided(float(tails[0]), float(tails[1]))
 
 
 def _total(degrees: int, samples: float) -> float:

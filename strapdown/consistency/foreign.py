@@ -17,69 +17,34 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from strapdown import quaternion
-from strapdown.checks import Array, InputError, array, increasing, one_of, unit_quaternions
-from strapdown.consistency.judgement import WITHOUT_TRUTH, Judgement, judge
+from strapdown.checks import Array, InputError, one_of
+from strapdown.consistency.accuracy import Accuracy, accuracy_of
+from strapdown.consistency.alignment import (
+    ALIGNED,
+    Alignment,
+    Series,
+    align_series,
+    at_common_times,
+    in_truth_frames,
+    jacobian,
+    series_of,
+    turns,
+)
+from strapdown.consistency.bounds import mean_p_value
+from strapdown.consistency.judgement import DETECTABLE, WITHOUT_TRUTH, Judgement, judge
 from strapdown.consistency.manifold import whitened
-from strapdown.consistency.timeaverage import effective_samples
+from strapdown.consistency.timeaverage import MIN_ROWS, effective_samples, time_average
 from strapdown.records import Estimate, Innovations, Truth
-from strapdown.records.estimate import matrices
 from strapdown.records.outputs import euler_axes
-from strapdown.records.recording import BRIDGED
-from strapdown.records.recording import interpolated as between_stamps
-from strapdown.units import DEGREE
+from strapdown.units import DEGREE, DEGREE_PER_HOUR
 
 ERROR_FRAMES = ("body", "fixed", "euler")
 """Definitions of an attitude covariance: of δθ with ``q_true = q ⊗ exp(δθ)``; of δφ with ``q_true = exp(δφ) ⊗ q``, as ROS defines it for
 poses; of the errors of roll, pitch and yaw, in this order (ZYX)."""
 DECIDED = 0.9
 """Probability above which the errors decide the definition of the covariance; below, "body" is used, this package's own."""
-ALIGNED = ("time", "fixed", "body")
-"""Parts of an alignment: clocks, fixed frames, body frames."""
-GROSS = 5.0 * DEGREE
-"""A constant rotation above this is a difference of frames and not an error of a filter, rad."""
 SCALE = "σ wrong by one factor"
-LIKELY = 1e-3
-"""p-value below which an explanation is likely."""
-LONGEST_OFFSET = 30.0
-"""Maximum offset of the clocks to search for if the records overlap without one, s."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Alignment:
-    """Differences of clock and frames between an estimate and a truth: ``q_true(t + offset) = exp(fixed) ⊗ q(t) ⊗ exp(body)``."""
-
-    offset: float
-    """Offset, s, to be added to the estimate's times."""
-    fixed: Array
-    """Rotation vector (3,), rad, from the estimate's fixed frame to the truth's."""
-    body: Array
-    """Rotation vector (3,), rad, from the truth's body frame to the estimate's."""
-    sigma: Array
-    """Standard deviations of fixed (3), body (3), rad, and offset, s: (7,); 0 for those not estimated."""
-    covariance: Array
-    """Their covariance (7, 7)."""
-    estimated: tuple[str, ...]
-    """Which of :data:`ALIGNED` were estimated and removed."""
-    residual: float
-    """RMS of the remaining angle, rad."""
-
-    @property
-    def words(self) -> tuple[str, ...]:
-        """Differences that were removed, one sentence each."""
-        found = []
-        if "time" in self.estimated:
-            found.append(
-                f"clocks differ by {self.offset:.6g} s ± {self.sigma[6]:.2g} s (added to the estimate's times): removed"
-            )
-        for name, rotation, rows in (("fixed", self.fixed, slice(0, 3)), ("body", self.body, slice(3, 6))):
-            if name in self.estimated:
-                text = ", ".join(f"{x / DEGREE:.4g}" for x in rotation)
-                sigma = float(np.sqrt(np.mean(self.sigma[rows] ** 2))) / DEGREE
-                found.append(
-                    f"the {name} frames differ by {np.linalg.norm(rotation) / DEGREE:.4g}° (rotation vector {text}°) ± {sigma:.2g}° an "
-                    "axis: removed; a constant error of the filter would look the same"
-                )
-        return tuple(found)
+NO_BIAS = "gyro bias held at zero"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,11 +57,8 @@ class Explanation:
     """NEES of the attitude per state if it were removed."""
     p_value: float
     """Probability of as large a reduction by chance for a consistent filter; small if the explanation is likely."""
-
-    @property
-    def likely(self) -> bool:
-        """Whether so large a reduction is improbable by chance."""
-        return self.p_value < LIKELY
+    likely: bool = False
+    """Whether so large a reduction is improbable by chance, all explanations together (Holm)."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -121,6 +83,8 @@ class Checked:
         Differences that would explain the errors and were not removed, the most likely first.
     remarks : tuple of str
         Differences removed and the definition of the covariance used, one sentence each.
+    accuracy : Accuracy
+        The errors as given and aligned.
     """
 
     judgement: Judgement
@@ -131,6 +95,7 @@ class Checked:
     frame_probability: Mapping[str, float]
     explanations: tuple[Explanation, ...]
     remarks: tuple[str, ...]
+    accuracy: Accuracy
 
     def summary(self) -> dict[str, Any]:
         """Return everything as plain values for JSON.
@@ -147,18 +112,10 @@ class Checked:
             "error_frame_probability": dict(self.frame_probability),
             "explanations": [vars(one) for one in self.explanations],
             "remarks": list(self.remarks),
+            "accuracy": self.accuracy.summary(),
         }
         if self.alignment is not None:
-            a = self.alignment
-            table["alignment"] = {
-                "removed": list(a.estimated),
-                "time_offset_s": a.offset,
-                "fixed_rotation_vector_deg": (a.fixed / DEGREE).tolist(),
-                "body_rotation_vector_deg": (a.body / DEGREE).tolist(),
-                "sigma_fixed_body_deg": (a.sigma[:6] / DEGREE).tolist(),
-                "sigma_time_s": float(a.sigma[6]),
-                "residual_rms_deg": a.residual / DEGREE,
-            }
+            table["alignment"] = self.alignment.summary()
         return table
 
 
@@ -174,7 +131,9 @@ def check_arrays(
     innovations: Mapping[str, Innovations] | None = None,
     error_frame: str = "find",
     align: str | Iterable[str] = "auto",
-    probability: float = 0.99,
+    confidence_level: float = 0.99,
+    detectable_error: float = DETECTABLE,
+    true_movement: ArrayLike | None = None,
 ) -> Checked:
     """Return the verdict on an estimate of any filter against a truth.
 
@@ -197,8 +156,10 @@ def check_arrays(
         Definition of the covariance (:data:`ERROR_FRAMES`). "find" takes the one of maximum likelihood given the errors.
     align : "auto", "none", or any of "time", "fixed", "body"
         Differences to estimate and remove. "auto": a clock offset beyond three times its σ, and rotations above 5°.
-    probability : float
-        A consistent filter is rejected with probability at most 1 − ``probability``, all tests together.
+    confidence_level, detectable_error : float
+        As for :func:`strapdown.consistency.judge`.
+    true_movement : array_like (n,) of bool, optional
+        Whether the unit moved, at the truth's times; the accuracy is reported for the movement too.
 
     Returns
     -------
@@ -222,33 +183,35 @@ def check_arrays(
     if error_frame != "find":
         one_of("error_frame", error_frame, ERROR_FRAMES)
     wanted = _wanted(align)
-    own = _series("", time, attitude, covariance, bias)
-    theirs = _series("true_", true_time, true_attitude, None, true_bias)
+    own = series_of("", time, attitude, covariance, bias)
+    theirs = series_of("true_", true_time, true_attitude, None, true_bias, true_movement)
     if own.covariance is not None and (own.bias is None or theirs.bias is None):
         own = replace(own, bias=None, covariance=own.covariance[:, :3, :3])
     remarks: list[str] = []
-    own, alignment = _aligned(own, theirs, wanted, remarks)
-    own, truth = _at_common_times(own, theirs, alignment.offset)
+    own, alignment = align_series(own, theirs, wanted, remarks)
+    whole = own
+    own, truth = at_common_times(own, theirs, alignment.offset)
     remarks += alignment.words
-    aligned = replace_attitude(own.attitude, alignment)
+    aligned = in_truth_frames(own.attitude, alignment)
     if own.covariance is None:
-        size = f"RMS attitude error {alignment.residual / DEGREE:.4g}°"
-        judged = judge(estimate := without_truth(own.time, aligned, innovations or {}), probability=probability)
+        estimate = without_truth(own.time, aligned, innovations or {})
+        judged = judge(estimate, confidence_level=confidence_level, detectable_error=detectable_error)
         judgement = replace(judged, limits=tuple(limit for limit in judged.limits if limit != WITHOUT_TRUTH))
-        remarks.append(f"the estimate has no covariance, so its errors are not judged ({size})")
         chosen, found, explained = "", dict[str, float](), tuple[Explanation, ...]()
     else:
         readings = {name: read_as(name, own.covariance, own.attitude) for name in ERROR_FRAMES}
         readings = {name: _in_truth_axes(P, own, truth, alignment) for name, P in readings.items()}
-        error = _turns(aligned, truth.attitude)
+        error = turns(aligned, truth.attitude)
         found = frame_probabilities(error, {name: P[:, :3, :3] for name, P in readings.items()})
         chosen, words = _chosen_frame(error_frame, found)
         remarks += words
         body = quaternion.conjugate(quaternion.exp(alignment.body))
         turned = None if own.bias is None else quaternion.rotate(body, own.bias)
         estimate = Estimate.from_arrays(own.time, aligned, readings[chosen], bias=turned, innovations=innovations)
-        judgement = judge(estimate, truth, probability=probability)
-        explained = explanations(error, readings, chosen, found, truth, own.time, aligned)
+        judgement = judge(estimate, truth, confidence_level=confidence_level, detectable_error=detectable_error)
+        assert whole.covariance is not None
+        whole = replace(whole, covariance=read_as(chosen, whole.covariance, whole.attitude))
+        explained = explanations(error, readings, chosen, found, truth, own.time, aligned, own.bias, confidence_level)
     return Checked(
         judgement=judgement,
         estimate=estimate,
@@ -258,6 +221,7 @@ def check_arrays(
         frame_probability=found if error_frame == "find" else {},
         explanations=explained,
         remarks=tuple(remarks),
+        accuracy=accuracy_of(whole, theirs),
     )
 
 
@@ -270,30 +234,6 @@ def _chosen_frame(given: str, found: Mapping[str, float]) -> tuple[str, list[str
     if found[given] < 0.01:
         return given, [f"the covariance is read as {given}, as given; the errors fit far better read as {best}"]
     return given, []
-
-
-@dataclass(frozen=True, eq=False)
-class _Series:
-    time: Array
-    attitude: Array
-    covariance: Array | None = None
-    bias: Array | None = None
-
-    def at(self, rows: np.ndarray, time: Array, attitude: Array) -> _Series:
-        """Return the given times and attitudes with the covariances and biases of these rows."""
-        P, bias = (None if one is None else one[rows] for one in (self.covariance, self.bias))
-        return _Series(time, attitude, P, bias)
-
-
-def _series(
-    prefix: str, time: ArrayLike, attitude: ArrayLike, covariance: ArrayLike | None, bias: ArrayLike | None
-) -> _Series:
-    """Return a checked history; ``prefix`` precedes its names in messages."""
-    stamps = increasing(f"{prefix}time", time, minimum=2)
-    m = len(stamps)
-    q = unit_quaternions(f"{prefix}attitude", array(f"{prefix}attitude", attitude, (m, 4)))
-    P = None if covariance is None else matrices("covariance", covariance, m)
-    return _Series(stamps, q, P, None if bias is None else array(f"{prefix}bias", bias, (m, 3)))
 
 
 def _wanted(align: str | Iterable[str]) -> tuple[str, ...] | None:
@@ -358,233 +298,14 @@ def _frame_words(chosen: str, found: Mapping[str, float]) -> str:
     return f"the covariance is read as {chosen} ({said}, found from the errors)"
 
 
-# ----------------------------------------------------------------------------------------------------------- alignment
-
-
-def replace_attitude(attitude: Array, alignment: Alignment) -> Array:
-    """Return attitudes (m, 4) in the truth's frames."""
-    return quaternion.multiply(
-        quaternion.multiply(quaternion.exp(alignment.fixed), attitude), quaternion.exp(alignment.body)
-    )
-
-
-def _turns(one: Array, other: Array) -> Array:
-    """Return the rotation vectors (m, 3), rad, body axes, from attitudes (m, 4) to others."""
-    return quaternion.log(quaternion.multiply(quaternion.conjugate(one), other))
-
-
-def interpolated(time: Array, stamps: Array, attitude: Array, bridged: float) -> Array:
-    """Return attitudes (n, 4) at ``time``, interpolated; at the truth's own times they are copied exactly, next to gaps too."""
-    result = between_stamps(time, stamps, attitude, bridged)
-    k = np.clip(np.searchsorted(stamps, time), 0, len(stamps) - 1)
-    exact = time == stamps[k]
-    result[exact] = attitude[k[exact]]
-    return result
-
-
-def _bridged(series: _Series) -> float:
-    """Return the maximum interval to interpolate over, s: 1.5 times the median one if the series is slow."""
-    return max(BRIDGED, 1.5 * float(np.median(np.diff(series.time))))
-
-
-def _at_common_times(own: _Series, theirs: _Series, offset: float) -> tuple[_Series, Truth]:
-    """Return the estimate and the truth at common times: those of the estimate, or of the truth if it is sparser."""
-    sparser = np.median(np.diff(theirs.time)) > 1.5 * np.median(np.diff(own.time))
-    if sparser:
-        inside = (theirs.time - offset >= own.time[0]) & (theirs.time - offset <= own.time[-1])
-        at = theirs.time[inside] - offset
-        near = np.clip(np.searchsorted(own.time, at), 1, len(own.time) - 1)
-        near -= (at - own.time[near - 1]) < (own.time[near] - at)
-        own = own.at(near, at, interpolated(at, own.time, own.attitude, _bridged(own)))
-        q, bias = theirs.attitude[inside], None if theirs.bias is None else theirs.bias[inside]
-        good = np.isfinite(own.attitude[:, 0])
-    else:
-        q = interpolated(own.time + offset, theirs.time, theirs.attitude, _bridged(theirs))
-        good = np.isfinite(q[:, 0])
-        bias = None
-        if theirs.bias is not None:
-            bias = np.stack([np.interp(own.time + offset, theirs.time, theirs.bias[:, k]) for k in range(3)], axis=1)
-    if good.sum() < 2:
-        raise InputError(
-            f"the estimate goes from {own.time[0] + offset:.6g} to {own.time[-1] + offset:.6g} s of the truth's clock, and the truth from "
-            f"{theirs.time[0]:.6g} to {theirs.time[-1]:.6g} s: they have fewer than two times in common; "
-            "give both of one clock, or --align time (align= in Python)"
-        )
-    return (
-        own.at(good, own.time[good] + offset, own.attitude[good]),
-        Truth(attitude=q[good], bias=np.full((int(good.sum()), 3), np.nan) if bias is None else bias[good]),
-    )
-
-
-def _rates(series: _Series) -> tuple[Array, Array]:
-    """Return the midpoints of the intervals (m − 1,) and the mean body rate over each (m − 1, 3)."""
-    turn = _turns(series.attitude[:-1], series.attitude[1:])
-    return 0.5 * (series.time[1:] + series.time[:-1]), turn / np.diff(series.time)[:, None]
-
-
-def coarse_offset(own_time: Array, own_speed: Array, true_time: Array, true_speed: Array) -> float:
-    """Return the offset, s, to add to the first times for the best correlation of two angular speeds; 0 if none is above 0.5."""
-    step = max(float(np.median(np.diff(own_time))), float(np.median(np.diff(true_time))))
-    apart = own_time[-1] < true_time[0] or true_time[-1] < own_time[0]
-    base = true_time[0] - own_time[0] if apart else 0.0
-    first, last = min(own_time[0] + base, true_time[0]), max(own_time[-1] + base, true_time[-1])
-    grid = np.arange(first, last + step, step)
-    a, b = (
-        np.interp(grid, t, s, left=np.nan, right=np.nan)
-        for t, s in ((own_time + base, own_speed), (true_time, true_speed))
-    )
-    a, b = (np.nan_to_num(x - np.nanmean(x)) for x in (a, b))
-    if min(np.std(a), np.std(b)) < 1e-9:
-        return float(base)
-    size = 1 << (2 * len(grid) - 1).bit_length()
-    product = np.fft.irfft(np.conj(np.fft.rfft(a, size)) * np.fft.rfft(b, size), size)
-    lags = np.arange(size)
-    lags = np.where(lags > size // 2, lags - size, lags)
-    near = np.abs(lags * step) <= (np.inf if apart else LONGEST_OFFSET)
-    best = int(np.argmax(np.where(near, product, -np.inf)))
-    share = product[best] / math.sqrt(float(np.sum(a * a) * np.sum(b * b)))
-    return float(base + lags[best] * step) if share > 0.5 else float(base)
-
-
-def _initial_rotations(own: _Series, theirs: _Series, offset: float) -> list[tuple[Array, Array]]:
-    """Return (fixed, body) quaternions to start from: identity, the fixed frame's, and with the body frame's from the rates."""
-    matched, truth = _at_common_times(own, theirs, offset)
-    identity = np.array([1.0, 0.0, 0.0, 0.0])
-
-    def fixed_of(body: Array) -> Array:
-        turns = quaternion.multiply(truth.attitude, quaternion.conjugate(quaternion.multiply(matched.attitude, body)))
-        return quaternion.from_rotation(quaternion.to_rotation(turns).mean())
-
-    found = [(identity, identity), (fixed_of(identity), identity)]
-    _, w_own = _rates(matched)
-    _, w_true = _rates(_Series(matched.time, truth.attitude))
-    # Wahba's problem: w_true = Bᵀ w_own.
-    u, s, vt = np.linalg.svd(w_own.T @ w_true)
-    if s[1] > 1e-3 * s[0]:
-        B = u @ np.diag([1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)]) @ vt
-        body = quaternion.from_matrix(B)
-        found.append((fixed_of(body), body))
-    return found
-
-
-def fit(own: _Series, theirs: _Series, names: tuple[str, ...], offset: float) -> Alignment:
-    """Return offset and rotations by least squares of the remaining angle; σ from the effective number of residuals."""
-    free = np.array([name in names for name in ("fixed",) * 3 + ("body",) * 3 + ("time",)])
-    starts = _initial_rotations(own, theirs, offset) if free[:6].any() else [(np.array([1.0, 0, 0, 0]),) * 2]
-    best: Alignment | None = None
-    for fixed, body in starts:
-        if (not free[0] and abs(fixed[0]) < 1.0) or (not free[3] and abs(body[0]) < 1.0):
-            continue
-        found = _descended(own, theirs, free, fixed, body, offset, names)
-        if best is None or found.residual < 0.999 * best.residual:
-            best = found
-    assert best is not None
-    return best
-
-
-def _descended(
-    own: _Series, theirs: _Series, free: np.ndarray, fixed: Array, body: Array, offset: float, names: tuple[str, ...]
-) -> Alignment:
-    covariance = np.zeros((7, 7))
-    residual = np.inf
-    for _ in range(20):
-        matched, truth = _at_common_times(own, theirs, offset)
-        aligned = quaternion.multiply(quaternion.multiply(fixed, matched.attitude), body)
-        r = _turns(aligned, truth.attitude)
-        now = float(np.sqrt(np.mean(np.sum(r * r, axis=1))))
-        if not free.any():
-            residual = now
-            break
-        J = _jacobian(matched.time, aligned, truth)[:, :, free]
-        information = np.einsum("mij,mik->jk", J, J)
-        scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
-        value, vector = np.linalg.eigh(information * np.outer(scale, scale))
-        seen = value > 1e-6 * value[-1]  # directions that the motion does not determine are left unchanged
-        inverse = (vector[:, seen] / value[seen]) @ vector[:, seen].T * np.outer(scale, scale)
-        step = np.zeros(7)
-        step[free] = inverse @ np.einsum("mij,mi->j", J, r)
-        left = r - np.einsum("mij,j->mi", J, step[free])
-        share = len(r) / effective_samples(left / max(float(np.sqrt(np.mean(left**2))), 1e-300)) if len(r) > 10 else 1.0
-        covariance = np.zeros((7, 7))
-        covariance[np.ix_(free, free)] = inverse * float(np.mean(left**2)) * share
-        fixed = quaternion.normalize(quaternion.multiply(quaternion.exp(step[:3]), fixed))
-        body = quaternion.normalize(quaternion.multiply(body, quaternion.exp(step[3:6])))
-        offset += float(step[6])
-        residual = float(np.sqrt(np.mean(np.sum(left**2, axis=1))))
-        if np.all(np.abs(step) <= 1e-3 * np.sqrt(np.diag(covariance)) + 1e-12):
-            break
-    return Alignment(
-        offset=offset,
-        fixed=quaternion.log(fixed),
-        body=quaternion.log(body),
-        sigma=np.sqrt(np.diag(covariance)),
-        covariance=covariance,
-        estimated=tuple(name for name in ALIGNED if name in names),
-        residual=residual,
-    )
-
-
-def _jacobian(time: Array, aligned: Array, truth: Truth) -> Array:
-    """Return the derivatives (m, 3, 7) of the attitude error with respect to fixed rotation, body rotation and clock offset."""
-    middle, rate = _rates(_Series(time, truth.attitude))
-    J = np.zeros((len(time), 3, 7))
-    J[:, :, :3] = np.swapaxes(quaternion.to_matrix(aligned), 1, 2)
-    J[:, :, 3:6] = np.eye(3)
-    J[:, :, 6] = -np.stack([np.interp(time, middle, rate[:, k]) for k in range(3)], axis=1)
-    return J
-
-
-def _aligned(
-    own: _Series, theirs: _Series, wanted: tuple[str, ...] | None, remarks: list[str]
-) -> tuple[_Series, Alignment]:
-    """Return the estimate, its quaternions in the convention that fits, and its alignment with the truth."""
-    offset = 0.0
-    if wanted is None or "time" in wanted:
-        own_at, own_rate = _rates(own)
-        true_at, true_rate = _rates(theirs)
-        speeds = (np.linalg.norm(own_rate, axis=1), np.linalg.norm(true_rate, axis=1))
-        offset = coarse_offset(own_at, speeds[0], true_at, speeds[1])
-    if wanted is not None:
-        return own, fit(own, theirs, wanted, offset)
-    whole = fit(own, theirs, ALIGNED, offset)
-    if _gross(whole):
-        others = {words: replace(own, attitude=meant(own.attitude)) for words, meant in _CONVENTIONS.items()}
-        fits = {words: fit(other, theirs, ALIGNED, offset) for words, other in others.items()}
-        words = min(fits, key=lambda words: _gross(fits[words]))
-        if _gross(fits[words]) < _gross(whole):
-            remarks.append(f"the quaternions fit the truth best if read as {words}, so they are read as such")
-            own, whole = others[words], fits[words]
-    moved = ("time",) if abs(whole.offset) > 3.0 * whole.sigma[6] + 1e-9 else ()
-    base = whole.offset if moved else 0.0
-    trials = (moved, ("fixed", *moved), ("body", *moved), ("fixed", "body", *moved))
-    for names in trials:
-        found = fit(own, theirs, names, base)
-        if found.residual < max(GROSS if names == moved else 0.0, 1.5 * whole.residual):
-            break
-    return own, found
-
-
-def _gross(found: Alignment) -> int:
-    """Return the number of gross rotations, plus 3 if even with them the residual is gross."""
-    turned = sum(float(np.linalg.norm(vector)) > GROSS for vector in (found.fixed, found.body))
-    return turned + (3 if found.residual > GROSS else 0)
-
-
-_CONVENTIONS = {
-    "the inverse, fixed frame to body": quaternion.conjugate,
-    "scalar last": lambda q: q[:, [3, 0, 1, 2]],
-    "scalar last and the inverse": lambda q: quaternion.conjugate(q[:, [3, 0, 1, 2]]),
-}
-
-
-def _in_truth_axes(P: Array, own: _Series, truth: Truth, alignment: Alignment) -> Array:
+def _in_truth_axes(P: Array, own: Series, truth: Truth, alignment: Alignment) -> Array:
     """Return covariances in the truth's body axes, with the uncertainty of the alignment added."""
     turn = quaternion.to_matrix(quaternion.exp(alignment.body)).T
     size = P.shape[1]
     T = np.kron(np.eye(size // 3), turn)
     result = T @ P @ T.T
     if alignment.estimated:
-        J = _jacobian(own.time, replace_attitude(own.attitude, alignment), truth)
+        J = jacobian(own.time, in_truth_frames(own.attitude, alignment), truth)
         result[:, :3, :3] += J @ alignment.covariance @ np.swapaxes(J, 1, 2)
     return np.asarray(result)
 
@@ -600,17 +321,17 @@ def explanations(
     truth: Truth,
     time: Array,
     attitude: Array,
+    bias: Array | None = None,
+    confidence_level: float = 0.99,
 ) -> tuple[Explanation, ...]:
-    """Return differences that would explain the attitude errors (m, 3) better than the covariance, the most likely first."""
-    from scipy.special import chdtrc
+    """Return differences that would explain the errors, (m, 3) of the attitude, better than the covariance, the most likely first.
 
+    For a consistent filter none is likely with ``confidence_level``.
+    """
     P = readings[chosen][:, :3, :3]
     white = whitened(error, P)
-    m = len(error)
-    before = float(np.mean(white * white))
-    effective = effective_samples(white / math.sqrt(max(before, 1e-300))) if m > 10 else 1.0
     factor = np.linalg.cholesky(P)
-    whole = _jacobian(time, attitude, truth)
+    whole = jacobian(time, attitude, truth)
     designs = {
         "constant rotation of the fixed frame (heading, gravity)": whole[:, :, :3],
         "constant rotation of the body frame (mounting)": whole[:, :, 3:6],
@@ -624,15 +345,19 @@ def explanations(
             continue
         x = np.linalg.solve(N, np.einsum("mij,mi->j", A, white))
         left = white - np.einsum("mij,j->mi", A, x)
-        after = float(np.mean(left**2))
-        # The scale of σ is free: the gain is a ratio of variances, so that an optimistic filter does not make everything significant.
-        samples = effective_samples(left / math.sqrt(max(after, 1e-300))) if m > 10 else 1.0
-        gain = 3.0 * samples * math.log(max(before, 1e-300) / max(after, 1e-300))
         size = f"{1e3 * x[0]:.4g} ms" if len(x) == 1 else f"{', '.join(f'{v / DEGREE:.3g}' for v in x)}°"
-        found.append(Explanation(name=name, value=size, nees=after, p_value=float(chdtrc(len(x), max(gain, 0.0)))))
-    scale_gain = 3.0 * effective * (before - 1.0 - math.log(max(before, 1e-300)))
-    p_value = float(chdtrc(1, max(scale_gain, 0.0)))
-    found.append(Explanation(name=SCALE, value=f"{math.sqrt(before):.3g}", nees=1.0, p_value=p_value))
+        p_value = _constant_p_value(N @ x, np.einsum("mij,mi->mj", A, left))
+        found.append(Explanation(name=name, value=size, nees=float(np.mean(left**2)), p_value=p_value))
+    average = time_average(white, np.broadcast_to(np.eye(3), (len(white), 3, 3))) if len(white) > MIN_ROWS else None
+    p_value, scale = 1.0, math.sqrt(float(np.mean(white * white)))
+    if average is not None and average.reliable:
+        p_value = mean_p_value(average.mean, 3, average.effective, certainty=average.certainty)
+    found.append(Explanation(name=SCALE, value=f"{scale:.3g}", nees=1.0, p_value=p_value))
+    if bias is not None and not bias.any() and truth.has_bias:
+        rms = float(np.sqrt(np.mean(np.sum(truth.bias**2, axis=1))))
+        sigma = np.sqrt(float(np.mean(np.trace(readings[chosen][:, 3:, 3:], axis1=1, axis2=2))))
+        value = f"{rms / DEGREE_PER_HOUR:.3g} °/h"
+        found.append(Explanation(name=NO_BIAS, value=value, nees=math.nan, p_value=0.0 if rms > 3.0 * sigma else 1.0))
     for name, P_other in readings.items():
         if name == chosen or probabilities[name] <= probabilities[chosen]:
             continue
@@ -645,5 +370,39 @@ def explanations(
                 p_value=min(1.0, probabilities[chosen] / max(probabilities[name], 1e-300)),
             )
         )
+    order = sorted(found, key=lambda one: one.p_value)
+    for rank, one in enumerate(order):  # Holm
+        if one.p_value > (1.0 - confidence_level) / (len(order) - rank):
+            break
+        order[rank] = replace(one, likely=True)
     # Specific causes come before a factor on σ, which would absorb all of them.
-    return tuple(sorted(found, key=lambda one: (not one.likely, one.name == SCALE, one.p_value)))
+    return tuple(sorted(order, key=lambda one: (not one.likely, one.name == SCALE, one.p_value)))
+
+
+def _constant_p_value(total: Array, scores: Array) -> float:
+    """Return the p-value of the sum (k,) of scores by their sums left (m, k) after the fit: Hotelling's T² with the variance of their mean.
+
+    That variance is the spectral density of the scores at frequency zero, by a vector autoregression of sums over blocks. The largest over
+    the lengths of the blocks counts, since a slow part is hidden by a fast one in short blocks. 1 if the samples are too few.
+    """
+    from scipy.special import fdtrc
+
+    m, k = scores.shape
+    density, length = None, 1
+    while m // length >= MIN_ROWS:
+        sums = scores[: m // length * length].reshape(-1, length, k).sum(axis=1)
+        B = np.linalg.lstsq(sums[:-1], sums[1:], rcond=None)[0].T * (1.0 + 2.0 / len(sums))
+        B /= max(1.0, float(np.max(np.abs(np.linalg.eigvals(B)))) / 0.99)
+        noise = sums[1:] - sums[:-1] @ B.T
+        inverse = np.linalg.inv(np.eye(k) - B)
+        of_mean = inverse @ (noise.T @ noise / len(noise)) @ inverse.T / length
+        density = of_mean if density is None or np.linalg.det(of_mean) > np.linalg.det(density) else density
+        length *= 2
+    if density is None:
+        return 1.0
+    spread = scores.T @ scores / m
+    effective = m * (np.linalg.det(spread) / max(float(np.linalg.det(density)), 1e-300)) ** (1.0 / k)
+    if effective <= k + 1.0:
+        return 1.0
+    square = float(total @ np.linalg.solve(m * density, total))
+    return float(fdtrc(k, effective - k, square * (effective - k) / (k * (effective - 1.0))))

@@ -1,20 +1,21 @@
 """The verdict: does the filter's covariance agree with its errors? In words, with the evidence, at one stated probability of a false alarm.
 
 Every statistic gives a p-value, exact or nearly so. Holm's procedure (1979) combines them: whatever their dependence, the probability that
-a consistent filter is rejected by any of them is at most 1 − ``probability``.
+a consistent filter is rejected by any of them is at most 1 − ``confidence_level``.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 
 from strapdown.checks import Array, InputError, unit_quaternions
+from strapdown.consistency.accuracy import KINDS, accuracy
 from strapdown.consistency.bounds import log_mean_bounds, mean_bounds, mean_p_value, tail
 from strapdown.consistency.manifold import SUBSETS, errors, nees
 from strapdown.consistency.timeaverage import time_average
@@ -24,6 +25,7 @@ from strapdown.consistency.whiteness import (
     ljung_box,
     mean_innovation_p_value,
 )
+from strapdown.estimation.setup.for_record import unmodelled_errors
 from strapdown.files import plain
 from strapdown.records import Estimate, Truth
 from strapdown.results import Listed, Listing, figure
@@ -36,15 +38,19 @@ MIN_SAMPLES = 50
 FEWEST_TO_AVERAGE = 20
 """Minimum number of epochs for errors to be judged over the run and not only at the end."""
 
-RESOLUTION = 1.5
-"""A filter that passes is "consistent" if the tests would have detected a σ wrong by this factor; else "cannot tell"."""
+DETECTABLE = 1.5
+"""Default of the error of σ, as a factor, that tests must be able to detect for "consistent"."""
 
 STATES = ("attitude", "bias")
-"""States of every filter."""
+"""States of a filter whose σ are tested."""
+NO_TRUTH = "no truth for it"
+"""Reason why a part of a result is not tested."""
+NO_COVARIANCE = "no covariance"
+"""Another one."""
 
 WITHOUT_TRUTH = (
     "without a truth only the innovations are judged: they do not show an attitude error that all sensors share, "
-    "nor a bias error that the initial state hides, such as commutation of coning"
+    "nor a bias error that the initial state hides, such as the coning error of the integration"
 )
 """A limit of a judgement."""
 
@@ -79,6 +85,8 @@ class Finding:
         Probability of a value at least as extreme for a consistent filter.
     samples : float
         Number of samples of the statistic; the effective number if they are correlated.
+    certainty : float, default inf
+        Degrees of freedom with which an effective number of samples is known; infinite if the samples are counted.
     degrees : int, default 1
         Degrees of freedom of one sample.
     epochs : int, default 1
@@ -98,6 +106,7 @@ class Finding:
     high: float = math.nan
     p_value: float
     samples: float
+    certainty: float = math.inf
     degrees: int = 1
     epochs: int = 1
     at: str = ""
@@ -120,30 +129,29 @@ class Finding:
             return self
         within = 1.0 - error / self.epochs
         if self.is_ratio:
-            low, high = mean_bounds(self.degrees, self.samples, within)
+            low, high = mean_bounds(self.degrees, self.samples, within, certainty=self.certainty)
         else:
             low, high = log_mean_bounds(self.degrees, int(self.samples), within)
         return replace(self, low=low, high=high)
 
 
-_INNOVATIONS = "innovations of "
+INNOVATIONS = "innovations of "
+"""Beginning of the name of a part that is the innovations of a sensor."""
 LOG_NEES = "log-NEES"
 _RATIOS = ("NIS", "NEES at the end", "time-averaged NEES", "ANEES")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Power:
-    """Smallest error of a σ that the tests detect."""
+class Part:
+    """A part of a result whose σ is tested: the attitude, the bias, the innovations of a sensor."""
 
     of: str
-    """"innovations of SENSOR", or a state: "attitude", "bias", an error state."""
-    factor: float
-    """A σ too small or large by this factor is detected with about the verdict's probability; infinite if no test covers it."""
-
-    @property
-    def seen(self) -> bool:
-        """Whether the factor is at most :data:`RESOLUTION`."""
-        return self.factor <= RESOLUTION
+    """"attitude", "bias" or "innovations of SENSOR"."""
+    detectable_error: float
+    """Detectable error of σ: σ too small or too large by this factor would have contradicted the filter, with about the probability of the
+    confidence level; infinite if no test covers it."""
+    why: str = ""
+    """Reason why it is not tested; empty if it is."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -153,17 +161,20 @@ class Judgement(Listed):
     Parameters
     ----------
     verdict : {"consistent", "not consistent", "cannot tell"}
-        Whether the covariance agrees with the errors.
+        Whether the covariance agrees with the errors. "consistent" only if each part was tested and the tests would have detected an error
+        of its σ by the factor ``required``.
     reason : str
-        Reason for the verdict, one sentence.
+        Which parts agree and which could not be tested, or what contradicts the filter; one sentence.
     findings : tuple of Finding
         Every statistic with its bounds and p-value.
     limits : tuple of str
         Limitations of the evidence, in words.
-    probability : float
+    confidence_level : float
         Minimum probability that a consistent filter is not rejected.
-    power : tuple of Power, default empty
-        For the innovations of each sensor and for each state, the smallest factor on σ that the tests would have detected.
+    parts : tuple of Part, default empty
+        The innovations of each sensor, the attitude, the bias, with the detectable error of their σ.
+    required : float, default 1.5
+        Largest detectable error of σ of a part that counts as tested.
     unmodelled : tuple of str, default empty
         Specified errors that the filter has no state for.
     """
@@ -172,14 +183,15 @@ class Judgement(Listed):
     reason: str
     findings: tuple[Finding, ...]
     limits: tuple[str, ...]
-    probability: float
-    power: tuple[Power, ...] = ()
+    confidence_level: float
+    parts: tuple[Part, ...] = ()
+    required: float = DETECTABLE
     unmodelled: tuple[str, ...] = ()
 
     @property
-    def states(self) -> tuple[str, ...]:
-        """States of the filter."""
-        return tuple(one.of for one in self.power if not one.of.startswith(_INNOVATIONS))
+    def headline(self) -> str:
+        """Verdict and reason, as the terminal, the JSON file and the report print them."""
+        return f"{self.verdict}: {self.reason}"
 
     def listing(self) -> Listing:
         """Return the verdict and each statistic with its bounds, as a table."""
@@ -195,15 +207,13 @@ class Judgement(Listed):
             )
             for one in self.findings
         ]
-        columns = ("statistic", "of", "value", f"{100.0 * self.probability:g} % bounds", "p-value", "samples", "")
-        return Listing(
-            f"{self.verdict}: {self.reason}", columns, rows, [f"Note: {one}." for one in self.limits], left=2
-        )
+        columns = ("statistic", "of", "value", f"{100.0 * self.confidence_level:g} % bounds", "p-value", "samples", "")
+        return Listing(self.headline, columns, rows, [f"Note: {one}." for one in self.limits], left=2)
 
     @property
     def words(self) -> str:
         """The verdict and the findings that contradict the filter, as text."""
-        lines = [f"{self.verdict}: {self.reason}"]
+        lines = [self.headline]
         lines += [f"  - {finding.means}" for finding in self.findings if finding.rejected and finding.means]
         return "\n".join(lines)
 
@@ -213,15 +223,17 @@ class Judgement(Listed):
         Returns
         -------
         dict
-            Verdict, reason, probability, findings, limits, power and unmodelled, by these names.
+            Verdict, reason, headline, confidence_level, findings, limits, parts, required and unmodelled, by these names.
         """
         table = {
             "verdict": self.verdict,
             "reason": self.reason,
-            "probability": self.probability,
+            "headline": self.headline,
+            "confidence_level": self.confidence_level,
             "findings": [{**vars(one), "means": one.means if one.rejected else ""} for one in self.findings],
             "limits": self.limits,
-            "power": [{"of": one.of, "factor": one.factor} for one in self.power],
+            "parts": [vars(one) for one in self.parts],
+            "required": self.required,
             "unmodelled": self.unmodelled,
         }
         return plain(table)  # type: ignore[no-any-return]
@@ -231,34 +243,31 @@ def judge(
     estimate: Estimate,
     truth: Truth | None = None,
     *,
-    probability: float = 0.99,
-    upper_bounds: bool = False,
-    error_states: Sequence[str] | None = None,
-    unmodelled: Sequence[str] = (),
+    confidence_level: float = 0.99,
+    detectable_error: float = DETECTABLE,
 ) -> Judgement:
     """Return the verdict on one run.
+
+    If the estimate is that of a recording (``motion``), the filter's noise covers disturbances that last over many samples. Its
+    innovations are then neither white nor as large as their variance, and only larger ones contradict it: σ are upper bounds.
 
     Parameters
     ----------
     estimate : Estimate
-        Estimate with innovations; if a truth is given, with full covariances.
+        Estimate with innovations; if a truth is known, with full covariances.
     truth : Truth, optional
-        Attitude and bias at the estimate's times, NaN if unknown. Without it only the innovations are judged.
-    probability : float, default 0.99
-        A consistent filter is rejected with probability at most 1 − ``probability``, all tests together.
-    upper_bounds : bool, default False
-        Whether the filter's noise covers disturbances that last over many samples, as that of :mod:`strapdown.ahrs` does. Its innovations
-        are then neither white nor as large as their variance, and only larger ones contradict it.
-    error_states : sequence of str, optional
-        Names of the filter's error states. Default: those of the estimate.
-    unmodelled : sequence of str, default empty
-        Specified errors that the filter has no state for (:func:`strapdown.estimation.setup.unmodelled_errors`); named in the verdict.
+        Attitude and bias at the estimate's times, NaN if unknown. Default: that of the estimate; without any only the innovations are
+        judged.
+    confidence_level : float, default 0.99
+        Minimum probability that a consistent filter is not rejected by any of the tests.
+    detectable_error : float, default 1.5
+        Largest detectable error of σ, as a factor, of a part that counts as tested.
 
     Returns
     -------
     Judgement
-        The verdict; its ``power`` is the error of each state's σ that the tests would have detected. Error states have no truth here and
-        are not tested.
+        The verdict; its ``parts`` have the error of their σ that the tests would have detected. Error states have no truth here and are not
+        tested. Errors that the estimate's ``origin`` specifies and its filter has no state for are named in the verdict.
 
     References
     ----------
@@ -268,55 +277,71 @@ def judge(
     Examples
     --------
     >>> from strapdown import consistency
-    >>> print(consistency.judge(estimate, truth))  # doctest: +SKIP
+    >>> print(consistency.judge(estimate))  # doctest: +SKIP
     """
-    tail(probability)
+    tail(confidence_level)
+    if not detectable_error > 1.0:
+        raise InputError(f"detectable_error is {detectable_error}; give the factor on σ, greater than 1")
     findings: list[Finding] = []
     limits: list[str] = []
+    untested: dict[str, str] = {}
     for sensor, innovations in estimate.innovations.items():
         used = innovations.used
-        findings += _of_sensor(sensor, innovations.whitened[used], innovations.nis[used])
+        if used.any():
+            findings += _of_sensor(sensor, innovations.whitened[used], innovations.nis[used])
+            untested[f"{INNOVATIONS}{sensor}"] = ""
         if innovations.refused:
             limits.append(f"{innovations.refused} measurements of {sensor} that the gate refused are left out")
     findings += _of_pairs(estimate)
-    beside = tuple(estimate.error_states if error_states is None else error_states)
+    without = not np.isfinite(estimate.variance[:, :3]).any()
+    untested |= dict.fromkeys(STATES if estimate.has_bias else STATES[:1], NO_COVARIANCE if without else NO_TRUTH)
+    truth = estimate.truth if truth is None else truth
     if truth is None:
         limits.append(WITHOUT_TRUTH)
     else:
-        findings += _of_errors(estimate, truth, limits, beside)
-    if upper_bounds:
-        return _bounded(findings, limits, probability, unmodelled)
-    return concluded(findings, limits, probability, states=(*STATES, *beside), unmodelled=unmodelled)
+        findings += _of_errors(estimate, truth, limits, untested)
+    if estimate.error_states:
+        names = tuple(estimate.error_states)
+        limits.append(f"the σ of {listed(names)} {'is' if len(names) == 1 else 'are'} not tested: no truth for it")
+    rules = {"required": detectable_error, "unmodelled": unmodelled_errors(estimate.origin, estimate.setup)}
+    if not estimate.motion:
+        return concluded(findings, limits, confidence_level, parts=untested, **rules)  # type: ignore[arg-type]
+    return _bounded(estimate, truth, findings, limits, confidence_level, untested, rules)
 
 
 def _bounded(
-    findings: Sequence[Finding], limits: Sequence[str], probability: float, unmodelled: Sequence[str]
+    estimate: Estimate,
+    truth: Truth | None,
+    findings: Sequence[Finding],
+    limits: Sequence[str],
+    confidence_level: float,
+    parts: Mapping[str, str],
+    rules: Mapping[str, Any],
 ) -> Judgement:
     """Return the verdict on a filter whose σ are upper bounds: one-sided tests of the ratios only."""
-    ratios = [
-        replace(one, p_value=mean_p_value(one.value, one.degrees, one.samples) if one.value > 1.0 else 1.0)
-        for one in findings
-        if one.is_ratio
-    ]
-    judged = concluded(ratios, limits, probability, states=(), unmodelled=unmodelled)
+    ratios = [replace(one, p_value=one.p_value if one.value > 1.0 else 1.0) for one in findings if one.is_ratio]
+    judged = concluded(ratios, limits, confidence_level, parts=parts, agree="within σ", **rules)
     judged = replace(judged, findings=tuple(replace(one, low=0.0) for one in judged.findings))
-    errors_judged = any(one.name != "NIS" for one in ratios)
     if judged.verdict == "not consistent" or not ratios:
         return judged
-    sizes = ", ".join(f"{math.sqrt(one.value):.2g} σ of {one.of}" for one in ratios if one.name == "NIS")
-    reason = (
-        "the filter's σ are upper bounds, because its noise covers lasting disturbances, and no error exceeds them"
-        f"{f' (RMS innovations {sizes})' if sizes else ''}"
+    sizes = [f"innovations of {one.of} {math.sqrt(one.value):.2g}" for one in ratios if one.name == "NIS"]
+    if truth is not None:
+        table = accuracy(estimate, truth)
+        sizes = [f"{kind} {table.rms_over_sigma[kind]:.2g}" for kind in KINDS if kind in table.rms_over_sigma] + sizes
+    words = (
+        f"σ are upper bounds, because the filter's noise covers lasting disturbances; RMS over σ: {', '.join(sizes)}"
     )
-    if not errors_judged:
-        reason += "; the σ of attitude and bias are not tested without a truth"
-    return replace(judged, verdict="consistent" if errors_judged else "cannot tell", reason=reason, power=())
+    return replace(judged, reason=f"{judged.reason} ({words})")
 
 
-def ratio(name: str, of: str, mean: float, degrees: int, samples: float, means: str) -> Finding:
+def ratio(
+    name: str, of: str, mean: float, degrees: int, samples: float, means: str, certainty: float = math.inf
+) -> Finding:
     """Return the finding of a mean of χ² values per degree of freedom, of which ``samples`` are independent."""
-    p = mean_p_value(mean, degrees, max(samples, 1.0))
-    return Finding(name=name, of=of, value=mean, p_value=p, samples=samples, degrees=degrees, means=means)
+    p = mean_p_value(mean, degrees, max(samples, 1.0), certainty=certainty)
+    return Finding(
+        name=name, of=of, value=mean, p_value=p, samples=samples, certainty=certainty, degrees=degrees, means=means
+    )
 
 
 def _of_sensor(sensor: str, white: Array, nis: Array) -> list[Finding]:
@@ -363,7 +388,8 @@ def _of_pairs(estimate: Estimate) -> list[Finding]:
     return found
 
 
-def _of_errors(estimate: Estimate, truth: Truth, limits: list[str], beside: Sequence[str]) -> list[Finding]:
+def _of_errors(estimate: Estimate, truth: Truth, limits: list[str], untested: dict[str, str]) -> list[Finding]:
+    """Return the findings on the errors; ``untested`` receives the reason for each part that no test covers."""
     m = len(estimate.time)
     if np.shape(truth.attitude) != (m, 4) or np.shape(truth.bias) != (m, 3):
         raise InputError(
@@ -377,33 +403,39 @@ def _of_errors(estimate: Estimate, truth: Truth, limits: list[str], beside: Sequ
     attitude = unit_quaternions("truth.attitude", truth.attitude[seen])
     e = errors(estimate.attitude[seen], estimate.bias[seen], attitude, truth.bias[seen])
     variance = estimate.variance[seen]
+    # The filter or the reference may have no bias.
+    known = 6 if np.isfinite(e[:, 3:]).any() and np.isfinite(variance[:, 3:]).any() else 3
+    tested = STATES[: known // 3]
     if estimate.covariance is None:
         limits.append(
             "the estimate holds variances only, so errors are judged axis by axis at the end; keep full covariances"
         )
+        untested |= dict.fromkeys(tested, "no full covariances")
         return [_largest_at_end(e[-1], variance[-1])]
-    # The filter or the reference may have no bias.
-    known = 6 if np.isfinite(e[:, 3:]).any() and np.isfinite(variance[:, 3:]).any() else 3
     e, P = e[:, :known], estimate.covariance[seen][:, :known, :known]
+    untested |= dict.fromkeys(tested, "")
     found: list[Finding] = []
-    hidden: list[str] = []
     for subset, states in SUBSETS.items():
         if max(states) >= known:
             continue
         value = float(nees(e[-1], P[-1], states)) / len(states)
         words = error_words(f"the {subset} error at the end", value)
         found.append(ratio("NEES at the end", subset, value, len(states), 1, words))
+        why = ""
         if len(e) < FEWEST_TO_AVERAGE:
-            continue
-        if _averages(subset, beside):
-            found += _over_the_run(subset, e, P, states, limits)
+            why = "too few epochs with a truth"
+        elif not (estimate.motion or _averages(subset, tuple(estimate.error_states))):
+            why = "the correlation time of errors with further error states is not known from one run"
         else:
-            hidden.append(subset)
-    if hidden:
-        limits.append(
-            f"the {' and '.join(hidden)} errors of a filter with further error states are not averaged over one run, because their "
-            "correlation time is not known"
-        )
+            average = time_average(e, P, states)
+            words = error_words(f"the {subset} error over the run", average.mean)
+            if average.reliable:
+                size = (average.mean, len(states), average.effective)
+                found.append(ratio("time-averaged NEES", subset, *size, words, average.certainty))
+            else:
+                why = f"its error changes too slowly for this run, {average.effective:.2g} effective samples"
+        if subset in untested:
+            untested[subset] = why
     return found
 
 
@@ -420,18 +452,6 @@ def _largest_at_end(error: Array, variance: Array) -> Finding:
         samples=1,
         means=f"the {name} error at the end is {ratio:.3g} σ",
     )
-
-
-def _over_the_run(subset: str, e: Array, P: Array, states: tuple[int, ...], limits: list[str]) -> list[Finding]:
-    """Return the time-averaged NEES of a subset of the states; none, and a limit, if its error changes too slowly."""
-    average = time_average(e, P, states)
-    if not average.reliable:
-        limits.append(
-            f"the {subset} error changes too slowly for this run to average over: {average.effective:.3g} effective samples"
-        )
-        return []
-    words = error_words(f"the {subset} error over the run", average.mean)
-    return [ratio("time-averaged NEES", subset, average.mean, len(states), average.effective, words)]
 
 
 def _averages(subset: str, beside: Sequence[str]) -> bool:
@@ -452,42 +472,43 @@ def error_words(what: str, ratio: float) -> str:
 def concluded(
     findings: Sequence[Finding],
     limits: Sequence[str],
-    probability: float,
+    confidence_level: float,
     *,
-    states: Sequence[str] = STATES,
-    needed: Sequence[str] = (),
+    parts: Mapping[str, str],
+    required: float = DETECTABLE,
     unmodelled: Sequence[str] = (),
+    runs: str = "this run",
+    agree: str = "consistent",
 ) -> Judgement:
     """Return the verdict that findings lead to, all taken together; their ``rejected`` is ignored and evaluated again.
 
-    ``states`` are the filter's states, whose power is reported; ``needed`` those whose σ the tests must be able to check for "consistent"
-    (if empty, the most powerful test decides); ``unmodelled`` errors that the filter has no state for.
+    ``parts``: reason by part (:class:`Part`) why no test covers it, empty if one does; ``unmodelled``: errors that the filter has no state
+    for; ``runs``: the runs, in words; ``agree``: what is said of the parts that were tested.
     """
-    marked = holm(findings, 1.0 - probability)
+    marked = holm(findings, 1.0 - confidence_level)
     kept = sum(not one.rejected for one in marked)
     # Bounds at the significance level at which Holm's procedure has stopped.
-    marked = [one._with_bounds((1.0 - probability) / max(kept, 1)) for one in marked]
-    power = powers(marked, probability, states)
+    marked = [one._with_bounds((1.0 - confidence_level) / max(kept, 1)) for one in marked]
+    seen = detectable_errors(marked, confidence_level)
+    tested = tuple(Part(of=of, detectable_error=seen.get(of, math.inf), why=why) for of, why in parts.items())
     rejected = [finding for finding in marked if finding.rejected]
     verdict: Answer
     if rejected:
         verdict = "not consistent"
         leaning = _LEANINGS[frozenset(finding.value > 1.0 for finding in rejected if finding.is_ratio)]
-        reason = f"{leaning}; {len(rejected)} of {len(marked)} tests contradict it"
+        which = "the one test contradicts it"
+        if len(marked) > 1:
+            which = f"{len(rejected)} of {len(marked)} tests contradict{'s' if len(rejected) == 1 else ''} it"
+        reason = f"{leaning}; {which}"
     elif not marked:
-        verdict, reason = "cannot tell", "there is nothing to judge: no innovation, and no truth"
+        nothing = (
+            "no covariance: nothing to test"
+            if NO_COVARIANCE in parts.values()
+            else "no innovation, and no truth: nothing to test"
+        )
+        verdict, reason = "cannot tell", nothing
     else:
-        sharpest = min((x for one, x in _factors(marked, probability) if one.samples > 1), default=math.inf)
-        unseen = [one.of for one in power if one.of in needed and not one.seen]
-        which = f"none of {len(marked)} tests contradicts" if len(marked) > 1 else "the one test does not contradict"
-        outcome = f"{which} the filter"
-        if sharpest > RESOLUTION:
-            verdict = "cannot tell"
-            factor = f"by a factor of {sharpest:.2g}" if math.isfinite(sharpest) else "by any factor"
-            reason = f"{outcome}, but a σ wrong {factor} would not be seen either: too few samples"
-        else:
-            verdict = "cannot tell" if unseen else "consistent"
-            reason = f"{outcome}; {power_words(power)}"
+        verdict, reason = _of_parts(tested, required, runs, agree)
     if unmodelled:
         reason += f"; the filter has no state for {', '.join(unmodelled)}"
     return Judgement(
@@ -495,53 +516,63 @@ def concluded(
         reason=reason,
         findings=tuple(marked),
         limits=tuple(limits),
-        probability=probability,
-        power=power,
+        confidence_level=confidence_level,
+        parts=tested,
+        required=required,
         unmodelled=tuple(unmodelled),
     )
 
 
-def powers(findings: Sequence[Finding], probability: float, states: Sequence[str]) -> tuple[Power, ...]:
-    """Return the smallest error of σ that the tests would have detected, by sensor (innovations) and by state."""
-    best = {f"{_INNOVATIONS}{one.of}": math.inf for one in findings if one.name == "NIS"}
-    best |= dict.fromkeys(states, math.inf)
-    for one, factor in _factors(findings, probability):
-        of = f"{_INNOVATIONS}{one.of}" if one.name == "NIS" else one.of
-        if of in best:
-            best[of] = min(best[of], factor)
-    return tuple(Power(of=of, factor=factor) for of, factor in best.items())
+def detectable_errors(findings: Sequence[Finding], confidence_level: float) -> dict[str, float]:
+    """Return the detectable error of σ of each part that a ratio tests: the root of the ratio of its bounds, with Bonferroni's correction.
 
-
-def _factors(findings: Sequence[Finding], probability: float) -> Iterator[tuple[Finding, float]]:
-    """Yield the ratios with the factor on σ that each detects: the root of the ratio of its bounds, with Bonferroni's correction."""
-    within = (1.0 - probability) / max(len(findings), 1)
+    If σ is too small by the factor f, the mean is f² times that of a consistent filter: it exceeds the upper bound with the probability
+    that the mean of a consistent filter exceeds that bound divided by f², which is the lower bound.
+    """
+    within = (1.0 - confidence_level) / max(len(findings), 1)
+    best: dict[str, float] = {}
     for one in findings:
-        if one.is_ratio:
-            low, high = mean_bounds(one.degrees, one.samples, 1.0 - within / one.epochs)
-            yield one, math.sqrt(high / low)
+        if not one.is_ratio:
+            continue
+        low, high = mean_bounds(one.degrees, one.samples, 1.0 - within / one.epochs, certainty=one.certainty)
+        of = f"{INNOVATIONS}{one.of}" if one.name == "NIS" else one.of
+        best[of] = min(best.get(of, math.inf), math.sqrt(high / low) if low > 0.0 else math.inf)
+    return best
 
 
-def power_words(power: Sequence[Power]) -> str:
-    """Return in words which errors of σ would have been detected."""
-    seen = [one for one in power if one.seen]
-    coarse = [one for one in power if not one.seen and math.isfinite(one.factor)]
-    untested = [one.of for one in power if math.isinf(one.factor)]
-    words = []
-    if seen:
-        words.append(
-            "a σ wrong by this factor would have been seen: "
-            + ", ".join(f"{math.ceil(100.0 * one.factor) / 100.0:g} of the {one.of}" for one in seen)
-        )
-    if coarse:
-        words.append(
-            "this cannot show the σ of the "
-            + ", ".join(f"{one.of} (only one wrong by a factor of {one.factor:.2g})" for one in coarse)
-        )
-    if untested:
-        words.append(
-            f"the σ of {', '.join(untested)} {'is' if len(untested) == 1 else 'are'} not tested: no truth for it"
-        )
-    return "; ".join(words)
+def _of_parts(parts: Sequence[Part], required: float, runs: str, agree: str) -> tuple[Answer, str]:
+    """Return the verdict if no test contradicts the filter, and which parts were tested."""
+    tested = [one for one in parts if one.detectable_error <= required]
+    others = [one for one in parts if one.detectable_error > required]
+    factors = ", ".join(f"{one.of} ×{math.ceil(100.0 * one.detectable_error) / 100.0:g}" for one in tested)
+    powers = f"; detectable error of σ: {factors}" if tested else ""
+    if not others:
+        return ("consistent", f"{_named(tested, parts)}{powers}") if tested else ("cannot tell", "no σ was tested")
+    reasons: dict[str, list[Part]] = {}
+    for one in others:
+        coarse = f"only an error of σ of ×{one.detectable_error:.2g} or more is detectable"
+        reasons.setdefault(
+            one.why or (coarse if math.isfinite(one.detectable_error) else "too few samples"), []
+        ).append(one)
+    untested = "; ".join(f"{_named(part, parts)} not testable from {runs}: {why}" for why, part in reasons.items())
+    agrees = f"{_named(tested, parts)} {agree}; " if tested else ""
+    return "cannot tell", f"{agrees}{untested}{powers}"
+
+
+def _named(some: Sequence[Part], parts: Sequence[Part]) -> str:
+    """Return the names of some of the parts, those of all sensors' innovations together as "innovations"."""
+    sensors = [one.of for one in some if one.of.startswith(INNOVATIONS)]
+    every = [one.of for one in parts if one.of.startswith(INNOVATIONS)]
+    names = [one.of for one in some if one.of not in sensors]
+    if sensors:
+        of = listed([name.removeprefix(INNOVATIONS) for name in sensors])
+        names.append("innovations" if sensors == every else f"{INNOVATIONS}{of}")
+    return listed(names)
+
+
+def listed(names: Sequence[str]) -> str:
+    """Return names in a sentence: "a", "a and b", "a, b and c"."""
+    return " and ".join([*([", ".join(names[:-1])] if names[1:] else []), *names[-1:]])
 
 
 def holm(findings: Iterable[Finding], error: float) -> list[Finding]:

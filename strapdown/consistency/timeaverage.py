@@ -15,11 +15,10 @@ from numpy.typing import ArrayLike
 from strapdown.checks import InputError, array
 from strapdown.consistency.manifold import whitened
 
-MIN_EFFECTIVE = 50.0
-"""Minimum effective samples: with fewer, the correlation estimated from the run is too uncertain for a valid p-value."""
-
-MARKOV = 0.6
-"""The autocorrelation of the NEES replaces the vector autoregression if it leaves less than this fraction of its effective samples."""
+MIN_EFFECTIVE = 5.0
+"""Minimum effective samples: with fewer, the correlation time cannot be estimated from the run."""
+MIN_ROWS = 40
+"""Minimum number of rows of a thinned series."""
 
 POWERS = 256
 """Number of powers of the matrix computed at once."""
@@ -39,6 +38,14 @@ class TimeAverage:
     def reliable(self) -> bool:
         """Whether the run is long compared with the correlation time of its errors; if not, the p-value is not valid."""
         return self.effective >= MIN_EFFECTIVE
+
+    @property
+    def certainty(self) -> float:
+        """Degrees of freedom with which the number of effective samples is known from the run itself.
+
+        Half of them: on series of known correlation, false alarms are then at the nominal rate or below.
+        """
+        return 0.5 * self.effective
 
 
 def time_average(error: ArrayLike, covariance: ArrayLike, states: tuple[int, ...] | None = None) -> TimeAverage:
@@ -64,25 +71,28 @@ def time_average(error: ArrayLike, covariance: ArrayLike, states: tuple[int, ...
 
 
 def _effective(white: np.ndarray, first: int) -> float:
-    """Return the effective samples by the autoregression from one epoch to the next, unless that over longer intervals shows too few.
+    """Return the effective samples: the fewest by the autoregression over several intervals and by the autocorrelation of the squares.
 
-    A sum of a fast and a slow error is no Markov process: from one epoch to the next the fast part hides the correlation of the slow.
+    A sum of a fast and a slow error is no Markov process, as the six states of a filter with further error states are not: from one epoch
+    to the next the fast part hides the correlation of the slow. A thinned series of white appearance says nothing.
     """
-    # A series of fewer epochs could not show that there are enough effective samples.
-    least = max(8 * (white.shape[1] + 1), 2 * int(MIN_EFFECTIVE))
-    most = max(1, len(white) // least)
-    found = [effective_samples(white[:: 2**k], first) for k in range(most.bit_length())]
-    by_model = found[0] if min(found) >= MIN_EFFECTIVE else min(found)
-    # The six states of a filter with further error states are no Markov process either.
-    direct = squares_effective(white[:, :first])
-    return direct if direct < MARKOV * by_model else by_model
+    found = [effective_samples(white, first), squares_effective(white[:, :first])]
+    stride, rows = 2, max(MIN_ROWS, 8 * (white.shape[1] + 1))
+    while len(white) // stride >= rows:
+        part = white[::stride]
+        slow = effective_samples(part, first)
+        if slow < 0.5 * len(part):
+            found.append(slow)
+        stride *= 2
+    return min(found)
 
 
 def squares_effective(white: ArrayLike) -> float:
     """Return the number of independent samples with the same variance of the mean of |z|², by the autocorrelation of |z|² (m, n).
 
-    The sum over the lags ends where that of two neighbours is negative (Geyer 1992, initial positive sequence). The mean of the series is
-    subtracted, because a wrong σ would count as correlation if the nominal one, n, were.
+    The sum over the lags ends where that of two neighbours is negative, and its terms do not increase (Geyer 1992, initial monotone
+    sequence). The mean of the series is subtracted, because a wrong σ would count as correlation if the nominal one, n, were; that
+    reduces each autocovariance by the variance of the mean, which is added again.
     """
     z = array("white", white, ("m", "n"))
     m = len(z)
@@ -94,8 +104,9 @@ def squares_effective(white: ArrayLike) -> float:
     correlation = correlation / max(correlation[0], 1e-300)
     pairs = correlation[0 : m - 1 : 2] + correlation[1:m:2]
     ends = np.flatnonzero(pairs <= 0.0)
-    total = float(np.sum(pairs[: ends[0] if len(ends) else len(pairs)]))
-    return float(max(1.0, m / max(2.0 * total - 1.0, 1.0)))
+    number = int(ends[0]) if len(ends) else len(pairs)
+    total = 2.0 * float(np.sum(np.minimum.accumulate(pairs[:number]))) - 1.0
+    return float(max(1.0, m / max(total, 1.0) * max(1.0 - 4.0 * number / m, 0.05)))
 
 
 def effective_samples(white: ArrayLike, first: int | None = None) -> float:

@@ -15,7 +15,7 @@ import os
 import platform
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -243,7 +243,7 @@ def run(
                 reason=chosen.reason,
                 chunk=size,
                 runs=runs,
-                statistics=state.statistics,
+                statistics=None if state.statistics is None else replace(state.statistics, plan=plan),
                 **identity()._asdict(),
                 seconds=before + time.perf_counter() - begun,
             )
@@ -356,7 +356,8 @@ def _write(path: Path, campaign: Campaign, state: _Progress, table: Mapping[str,
         set_attributes(file, attributes)
         if campaign.statistics is not None:
             _put_statistics(file.create_group("statistics"), campaign.statistics)
-        if state.early and state.whole is not None and campaign.statistics is not state.whole:
+        folded = campaign.statistics is not None and campaign.statistics.runs == state.merged
+        if state.early and state.whole is not None and not folded:
             _put_statistics(file.create_group("resume/whole"), state.whole)
         for first_run, part in sorted(state.early.items()):
             _put_statistics(file.create_group(f"resume/{first_run}"), part)
@@ -402,7 +403,7 @@ def _statistics_of(group: Any, plan: Plan) -> Statistics:
     names = tuple(reading.from_json(attributes["sensors"], f"{place}: sensors"))
     if names != plan.sensors:
         raise InputError(f"{place}: sensors are {names}, those of the plan {plan.sensors}; run the campaign again")
-    return Statistics(runs=count(f"{place}: runs", attributes["runs"]), sensors=names, **arrays)
+    return Statistics(runs=count(f"{place}: runs", attributes["runs"]), sensors=names, plan=plan, **arrays)
 
 
 def read(path: str | os.PathLike[str]) -> Campaign:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import json
 import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -11,6 +12,8 @@ from pathlib import Path
 from queue import SimpleQueue
 from threading import Thread
 from typing import Any, NamedTuple
+
+import numpy as np
 
 import strapdown
 from strapdown.checks import InputError, count, one_of
@@ -132,7 +135,13 @@ def replay(plan: Plan, run: int, *, machine: str = "auto") -> Replay:
     if spec is not plan.scenario.gyro:  # dispersed, so no longer a preset
         of_this_run = replace(plan.scenario, gyro=spec, gyro_preset="")
     origin = Origin(gyro=spec, scenario=of_this_run, seed=plan.seed, run=run)
-    return replace(found, record=replace(found.record, origin=origin))
+    record, estimate = found.record, found.estimate
+    assert record.truth is not None
+    # If a filter step combines several samples, the record is at the samples or at the steps, depending on the machine.
+    truth = record.truth.taken(np.searchsorted(record.time, estimate.time - 1e-9))
+    details = {"machine": choose(plan, machine).machine, "dispersions": json.dumps(plan.to_table()["dispersions"])}
+    estimate = replace(estimate, setup=plan.setup, origin=origin, truth=truth, details=details)
+    return replace(found, record=replace(record, origin=origin), estimate=estimate)
 
 
 @dataclass(frozen=True)
@@ -353,4 +362,5 @@ def _run(work: Work, runs: int, chunk: int, workers: Workers, progress: Callable
                 progress(chunks[place][1])
             yield place, parts
 
-    return merged_in_order(counted())
+    parts = merged_in_order(counted())
+    return tuple(replace(part, plan=plan) for part, plan in zip(parts, work.plans, strict=True))

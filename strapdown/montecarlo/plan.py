@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import hashlib
 import json
 import os
@@ -102,7 +104,7 @@ class Plan:
     """Definition of a campaign: everything that run number k depends on, and the epochs of the statistics.
 
     Filter and truth are separate: a ``setup`` that differs from :meth:`strapdown.estimation.setup.FilterSetup.for_scenario` is a mismatched
-    filter. Outages, outliers and correlated noise are properties of the scenario's sensors. Plans are compared and hashed by identity, so a
+    filter. Outages, outliers and correlated noise are properties of the scenario's sensors. Plans are equal if their tables are, so a
     machine may cache data derived from one in a ``weakref.WeakKeyDictionary``.
 
     Parameters
@@ -146,6 +148,18 @@ class Plan:
                 f"{self.samples} gyro samples do not divide into {self.epochs} epochs of whole {self.setup.integration.name} steps; choose "
                 f"a duration whose sample count is a multiple of {self.epochs * self.setup.integration.samples}, or other epochs"
             )
+
+    def __eq__(self, other: object) -> bool:
+        """Compare the tables; plans of user-defined motions, which have none, are equal only to themselves."""
+        if not isinstance(other, Plan):
+            return NotImplemented
+        with contextlib.suppress(InputError):
+            return self is other or self.digest == other.digest
+        return False
+
+    def __hash__(self) -> int:
+        """Return a hash that equal plans share."""
+        return hash((self.seed, self.epochs, self.nis_bins, self.precision))
 
     @property
     def samples(self) -> int:
@@ -197,7 +211,7 @@ class Plan:
             **({"individuals": True} if self.individuals else {}),
         }
 
-    @property
+    @functools.cached_property
     def digest(self) -> str:
         """SHA-256 of :meth:`to_table`."""
         text = json.dumps(self.to_table(), sort_keys=True, allow_nan=False, default=float)

@@ -23,7 +23,7 @@ errors e = (δθ, δb) of :func:`strapdown.consistency.errors` and the filter's 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -35,6 +35,7 @@ from strapdown.checks import Array, InputError
 from strapdown.consistency import Finding, Judgement, Verdict
 from strapdown.consistency.bounds import coverage_p_values, log_mean_p_value, tail
 from strapdown.consistency.judgement import (
+    INNOVATIONS,
     LOG_NEES,
     STATES,
     concluded,
@@ -43,8 +44,9 @@ from strapdown.consistency.judgement import (
     ratio,
     state_name,
 )
+from strapdown.montecarlo.plan import Plan
 from strapdown.records import Estimate, ImuRecord
-from strapdown.results import Listed, Listing, figure
+from strapdown.results import ByContent, Listed, Listing, figure
 
 Counts = NDArray[np.int64]
 
@@ -101,7 +103,7 @@ class Replay:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Statistics(Listed):
+class Statistics(ByContent, Listed):
     """Sums over independent runs at each epoch.
 
     Errors are e = (δθ, δb): rad in the body frame, rad/s. The sums at an epoch exclude runs that are not finite there.
@@ -149,6 +151,8 @@ class Statistics(Listed):
         Errors of these runs, finite or not, rad and rad/s.
     example_sigma : ndarray (x, m, 6)
         The filter's σ in these runs, rad and rad/s.
+    plan : Plan, optional
+        Scenario, filter, seed and dispersions of the runs.
     """
 
     _drawn_by = "runs_overview"
@@ -173,9 +177,14 @@ class Statistics(Listed):
     example_run: Counts
     example_error: Array
     example_sigma: Array
+    plan: Plan | None = None
 
     def judge(
-        self, *, epochs: Iterable[int] | None = None, probability: float = 0.99, unmodelled: Sequence[str] = ()
+        self,
+        *,
+        epochs: Iterable[int] | None = None,
+        confidence_level: float = 0.99,
+        detectable_error: float = consistency.DETECTABLE,
     ) -> Judgement:
         """Return the verdict on these independent runs.
 
@@ -183,23 +192,20 @@ class Statistics(Listed):
         ----------
         epochs : iterable of int, optional
             Indices of the epochs at which errors are judged. Default: 20 evenly spaced ones without the first, which is the prior.
-        probability : float, default 0.99
-            A consistent filter is rejected with probability at most 1 − ``probability``, all tests together.
-        unmodelled : sequence of str, default empty
-            Specified errors that the filter has no state for; named in the verdict.
+        confidence_level, detectable_error : float
+            As for :func:`strapdown.consistency.judge`.
 
         Returns
         -------
         Judgement
-            "consistent" only if the runs would have shown a σ of attitude or bias wrong by a factor of
-            :data:`strapdown.consistency.judgement.RESOLUTION`.
+            "consistent" only if the runs would have shown an error of σ of attitude, bias and innovations by ``detectable_error``.
         """
-        tail(probability)
+        tail(confidence_level)
         chosen = judged_epochs(len(self.time) - 1) if epochs is None else np.array(list(epochs), int)
         failed = int(self.runs - np.min(self.finite[chosen]))
         findings = []
         for subset in self.subsets:
-            findings.append(_anees(self, chosen, subset, probability, failed))
+            findings.append(_anees(self, chosen, subset, confidence_level, failed))
             if failed == 0:
                 findings.append(_log_nees(self, chosen, subset))
         if failed == 0 and self.runs >= 3:
@@ -209,8 +215,17 @@ class Statistics(Listed):
             if degrees >= 1.0:
                 mean = float(np.sum(self.sensor_nis_sum[row]) / degrees)
                 findings.append(ratio("NIS", sensor, mean, 1, degrees, innovation_words(sensor, mean)))
-        tested = [name for name in STATES if name in self.subsets]
-        return concluded(findings, [], probability, states=tested, needed=tested, unmodelled=unmodelled)
+        parts = [f"{INNOVATIONS}{one.of}" for one in findings if one.name == "NIS"]
+        parts += [name for name in STATES if name in self.subsets]
+        return concluded(
+            findings,
+            [],
+            confidence_level,
+            parts=dict.fromkeys(parts, ""),
+            required=detectable_error,
+            unmodelled=() if self.plan is None else self.plan.unmodelled,
+            runs=f"{self.runs} runs",
+        )
 
     def listing(self) -> Listing:
         """Return NEES and NIS per degree of freedom, and the errors at the end, as a table."""
@@ -239,7 +254,7 @@ class Statistics(Listed):
         ]
         if self.failed:
             notes.append(f"{self.failed} runs failed: their errors or covariances are not finite")
-        title = f"{self.runs} runs, per degree of freedom (1 expected); {100.0 * judgement.probability:g} % bounds of all together"
+        title = f"{self.runs} runs, per degree of freedom (1 expected); {100.0 * judgement.confidence_level:g} % bounds of all together"
         return Listing(title, ("statistic", "value", "bounds", ""), rows, notes)
 
     @property
@@ -504,7 +519,7 @@ def merge(a: Statistics, b: Statistics) -> Statistics:
     for name in _SAME:
         if not np.array_equal(getattr(a, name), getattr(b, name)):
             raise InputError(f"statistics of different {name} cannot be merged; they are of different plans")
-    merged: dict[str, Any] = {name: getattr(a, name) for name in _SAME}
+    merged: dict[str, Any] = {name: getattr(a, name) for name in (*_SAME, "plan")}
     merged.update(zip(_WORST, worst(*(np.concatenate([getattr(a, n), getattr(b, n)]) for n in _WORST)), strict=True))
     first = np.argsort(np.concatenate([a.example_run, b.example_run]), kind="stable")[:EXAMPLES]
     merged.update({name: np.concatenate([getattr(a, name), getattr(b, name)])[first] for name in _EXAMPLES})

@@ -42,12 +42,12 @@ def efficiency(statistics: Statistics, bound: Array) -> Array:
 
 
 def summary(
-    statistics: Statistics, *, epochs: Counts | None = None, probability: float = 0.99, bound: Array | None = None
+    statistics: Statistics, *, epochs: Counts | None = None, confidence_level: float = 0.99, bound: Array | None = None
 ) -> dict[str, Any]:
     """Return verdict and numbers: ANEES and NIS per degree of freedom, coverage, errors, worst runs; units in the names.
 
     The bounds are those of the verdict (:meth:`Statistics.judge`): all its tests together reject a consistent filter with at
-    most 1 − ``probability``.
+    most 1 − ``confidence_level``.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ def summary(
         Statistics of the filter to be tested.
     epochs : array of int, optional
         Indices of the epochs judged. Default: 20 evenly spaced ones.
-    probability : float, default 0.99
+    confidence_level : float, default 0.99
         Probability that a consistent filter passes all tests together.
     bound : ndarray (m, 6, 6), optional
         Cramér–Rao bound at the epochs (:attr:`strapdown.covariance.Analysis.cramer_rao`), with which the errors are compared.
@@ -66,7 +66,7 @@ def summary(
         Plain values for JSON.
     """
     chosen = judged_epochs(len(statistics.time) - 1) if epochs is None else epochs
-    judgement = statistics.judge(epochs=chosen, probability=probability)
+    judgement = statistics.judge(epochs=chosen, confidence_level=confidence_level)
     found = {(one.name, one.of): one for one in judgement.findings}
     nees = {}
     for subset in statistics.subsets:
@@ -95,7 +95,7 @@ def summary(
     table = {
         "runs": statistics.runs,
         "failed_runs": statistics.failed,
-        "probability": probability,
+        "confidence_level": confidence_level,
         "epochs_judged": len(chosen),
         "nees": nees,
         "nis": nis,

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from strapdown import quaternion, records
+from strapdown import quaternion
 from strapdown.checks import Array, InputError, array, one_of
 from strapdown.files import reading
 from strapdown.recordings import bag_files, delimited, recordfiles, ros, trajectories, ulog
@@ -49,6 +49,8 @@ class Attitudes:
     """Gyro bias (m, 3), rad/s, body axes."""
     innovations: Mapping[str, Innovations] = field(default_factory=dict)
     """Innovations by sensor; times in s since the first stamp."""
+    movement: NDArray[np.bool_] | None = None
+    """Whether the unit moved (m,), if the file states it."""
     remarks: tuple[str, ...] = ()
 
     def seconds(self, origin_ns: int) -> Array:
@@ -90,19 +92,18 @@ def _whole_ns(time: Array) -> NDArray[np.int64]:
 def _own(path: Path, kind: str) -> Attitudes:
     """Read a result of this package, of this kind."""
     if kind == "strapdown estimate":
-        estimate = records.read_estimate(path)
-        size = 6 if estimate.has_bias else 3
-        P = estimate.covariance
-        if P is None:
-            P = np.apply_along_axis(np.diag, 1, estimate.variance)
+        with reading.hdf5(path) as file:
+            arrays = {name: reading.numbers(file, name) for name in ("time", "attitude", "variance")}
+            size = arrays["variance"].shape[1]
+            P = reading.numbers(file, "covariance") if "covariance" in file else None
+            bias = reading.numbers(file, "bias") if "bias" in file else None
         return Attitudes(
             source=path.name,
-            stamps_ns=_whole_ns(estimate.time),
-            attitude=quaternion.normalize(estimate.attitude),
-            covariance=P[:, :size, :size],
+            stamps_ns=_whole_ns(arrays["time"]),
+            attitude=quaternion.normalize(arrays["attitude"]),
+            covariance=arrays["variance"][:, :, None] * np.eye(size) if P is None else P,
             error_frame="body",
-            bias=estimate.bias if estimate.has_bias else None,
-            innovations=estimate.innovations,
+            bias=bias,
         )
     if kind == recordfiles.KIND:
         record = recordfiles.read_record(path)
@@ -126,7 +127,10 @@ def _of_recording(recording: Recording) -> Attitudes:
         raise InputError(f"{recording.source} is a recording without a reference attitude; give another reference")
     known = np.isfinite(recording.true_attitude).all(axis=1)
     stamps = recording.epoch_ns + _whole_ns(recording.time[known])
-    return Attitudes(source=recording.source, stamps_ns=stamps, attitude=recording.true_attitude[known])
+    movement = None if recording.movement is None else recording.movement[known]
+    return Attitudes(
+        source=recording.source, stamps_ns=stamps, attitude=recording.true_attitude[known], movement=movement
+    )
 
 
 # ------------------------------------------------------------------------------------------------------------ tables

@@ -1,4 +1,4 @@
-"""Estimates in files: CSV and TSV, Parquet, TUM, HDF5, Rerun. The columns are those of :meth:`strapdown.records.Estimate.table`."""
+"""Estimates in files: CSV and TSV, Parquet, TUM, Rerun. The columns are those of :meth:`strapdown.records.Estimate.table`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from strapdown.files.extras import library
 from strapdown.recordings.dataframes import write_parquet_columns
 from strapdown.recordings.delimited import write_columns
 from strapdown.records import Estimate
-from strapdown.records import write_estimate as write_result
 from strapdown.records.recording import Recording
 from strapdown.units import DEGREE
 
@@ -25,11 +24,6 @@ def write_table(
     """Write an estimate as Parquet or text, by the suffix; options as for :meth:`strapdown.records.Estimate.table`."""
     write = write_parquet_columns if Path(path).suffix.lower() == ".parquet" else write_columns
     write(path, estimate.table(recording=recording, **options))
-
-
-def write_hdf5(estimate: Estimate, path: str | os.PathLike[str], *, recording: Recording | None = None) -> None:
-    """Write an estimate in the HDF5 layout of this package, which `strapdown check` and `report` read."""
-    write_result(path, estimate, {} if recording is None else {"source": recording.source})
 
 
 def write_tum(

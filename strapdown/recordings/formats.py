@@ -129,7 +129,6 @@ FORMATS: tuple[Format, ...] = (
         read="broad:read_broad",
         write="broad:write_broad",
         lacks=("temperature", "clock"),
-        write_estimate="estimates:write_hdf5",
     ),
     Format(
         name="CSV",

@@ -203,3 +203,31 @@ def turn_variance_over(time: Array, rate: Array, length: float, usual: float) ->
     """
     lag = min(max(1, round(length / usual)), len(time) - 1)
     return length**2 / 12.0 * float(np.mean((rate[lag:] - rate[:-lag]) ** 2))
+
+
+STUCK_TIME = 2.0
+"""Minimum time of equal gyro samples about an axis to be reported while the unit rotates about the others, s."""
+STUCK_SAMPLES = 50
+"""Minimum number of them."""
+ROTATES = 0.2
+"""RMS rate about the other axes above which a unit rotates, rad/s."""
+
+
+def stuck_words(recording: Recording) -> tuple[str, ...]:
+    """Return a sentence for each gyro axis stuck at one value, throughout or for seconds in which the unit rotates about the others."""
+    time, found = recording.time, []
+    for axis, name in enumerate("xyz"):
+        values = recording.rate[:, axis]
+        edges = np.concatenate([[0], np.flatnonzero(np.diff(values)) + 1, [len(values)]])
+        longest = int(np.argmax(np.diff(edges)))
+        first, last = int(edges[longest]), int(edges[longest + 1]) - 1
+        others = np.delete(recording.rate[first : last + 1], axis, axis=1)
+        rotates = float(np.sqrt(np.mean(np.sum(others**2, axis=1)))) > ROTATES
+        whole = len(edges) == 2
+        if last - first + 1 < STUCK_SAMPLES or not (whole or (time[last] - time[first] >= STUCK_TIME and rotates)):
+            continue
+        span = "throughout" if whole else f"from {time[first]:.6g} to {time[last]:.6g} s"
+        found.append(
+            f"The gyro is stuck about {name}: {values[first] / DEGREE:.4g} °/s {span}; the attitude is not tracked then. Check the sensor."
+        )
+    return tuple(found)

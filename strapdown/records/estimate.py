@@ -23,8 +23,9 @@ from strapdown.checks import (
     unit_quaternions,
 )
 from strapdown.records import outputs
+from strapdown.records.record import Origin, Truth
 from strapdown.records.recording import Recording
-from strapdown.results import Listed, Listing, figure
+from strapdown.results import ByContent, Listed, Listing, figure
 from strapdown.units import DEGREE, DEGREE_PER_HOUR
 
 if TYPE_CHECKING:
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Innovations:
+class Innovations(ByContent):
     """Innovations of one sensor, in the order of its measurements.
 
     Parameters
@@ -132,7 +133,7 @@ class Event:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class ErrorStateEstimate:
+class ErrorStateEstimate(ByContent):
     """Estimate of one group of error states (:mod:`strapdown.estimation.error_states`) at the stored edges.
 
     Parameters
@@ -180,7 +181,7 @@ def _checked(sensor: str, given: Innovations) -> Innovations:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Estimate(Listed):
+class Estimate(ByContent, Listed):
     """Attitude and gyro bias with their covariance, at the stored epochs of a filter run.
 
     Parameters
@@ -205,6 +206,23 @@ class Estimate(Listed):
         Error states c by name, in the order given.
     whole_covariance : ndarray (m, n, n), optional
         P of (δθ, δb, δc) of a filter with error states, if requested; ``covariance`` is its part (m, 6, 6).
+    setup : strapdown.estimation.setup.FilterSetup, optional
+        The filter.
+    origin : Origin, optional
+        Scenario and random streams of the record, or the file it was read from.
+    truth : Truth, optional
+        Truth at ``time``, or a reference, NaN where it is not known.
+    fixed_frame : str, default ""
+        Fixed frame of the attitude in words, if it is not that of the record's references.
+    motion : str, default ""
+        For a recording: model of its motion (:data:`strapdown.ahrs.MOTIONS`). Its noise covers disturbances that last over many samples,
+        so that σ are upper bounds.
+    smoothed : bool, default False
+        Whether each epoch is estimated from all measurements, before and after it.
+    remarks : tuple of str, default empty
+        What a user of the estimate should know, one sentence each: how the filter was started, choices of the reader.
+    details : mapping of str to number or str, default empty
+        Further particulars for the reader of a file, such as parameters of the unit's model.
     """
 
     _drawn_by = "estimate_overview"
@@ -219,6 +237,14 @@ class Estimate(Listed):
     events: tuple[Event, ...] = ()
     error_states: Mapping[str, ErrorStateEstimate] = field(default_factory=dict)
     whole_covariance: Array | None = None
+    setup: Any = None
+    origin: Origin | None = None
+    truth: Truth | None = None
+    fixed_frame: str = ""
+    motion: str = ""
+    smoothed: bool = False
+    remarks: tuple[str, ...] = ()
+    details: Mapping[str, Any] = field(default_factory=dict)
 
     def listing(self) -> Listing:
         """Return σ at the start and at the end, the estimate at the end, and the innovations, as a table."""

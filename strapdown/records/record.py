@@ -16,7 +16,7 @@ import numpy as np
 
 from strapdown import coning
 from strapdown.checks import Array, InputError, array, increasing, instance, unit_quaternions
-from strapdown.results import Listed, Listing
+from strapdown.results import ByContent, Listed, Listing
 from strapdown.vectors import VectorMeasurements
 
 if TYPE_CHECKING:
@@ -27,24 +27,66 @@ LARGEST_TURN = 1e6
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Truth:
+class Truth(ByContent):
     """True attitude and bias, known from a simulation or a reference system.
 
     Parameters
     ----------
     attitude : ndarray (n + 1, 4)
-        True q_fb at the edges.
+        True q_fb at the edges. NaN where a reference system has no attitude.
     bias : ndarray (n + 1, 3)
-        True gyro bias at the edges, rad/s.
+        True gyro bias at the edges, rad/s. NaN if it is not known, as from a reference system.
+    movement : ndarray (n + 1,) of bool, optional
+        Whether the unit moved, in the judgement of the reference's source; None: not stated.
     """
 
     attitude: Array
     bias: Array
+    movement: np.ndarray | None = None
+
+    @property
+    def has_bias(self) -> bool:
+        """Whether the gyro bias is known."""
+        return bool(np.isfinite(self.bias).any())
+
+    @classmethod
+    def of_reference(cls, attitude: Array, movement: np.ndarray | None = None) -> Truth:
+        """Return the truth that the attitudes of a reference system give; the bias is not known.
+
+        Parameters
+        ----------
+        attitude : ndarray (m, 4)
+            Unit quaternions q_fb, NaN where there is none.
+        movement : ndarray (m,) of bool, optional
+            Whether the unit moved.
+
+        Returns
+        -------
+        Truth
+            Truth with a bias of NaN.
+        """
+        return cls(attitude=attitude, bias=np.full((len(attitude), 3), np.nan), movement=movement)
+
+    def taken(self, rows: Any) -> Truth:
+        """Return the truth at some of its rows.
+
+        Parameters
+        ----------
+        rows : slice, ndarray of int or of bool
+            Rows, by index, slice or mask.
+
+        Returns
+        -------
+        Truth
+            Truth at these rows.
+        """
+        movement = None if self.movement is None else self.movement[rows]
+        return Truth(attitude=self.attitude[rows], bias=self.bias[rows], movement=movement)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Origin:
-    """Origin of a simulated record; fields that are not known are None.
+class Origin(ByContent):
+    """Origin of a record or a result; fields that are not known are None.
 
     Parameters
     ----------
@@ -56,12 +98,15 @@ class Origin:
         Seed of the random streams.
     run : int, optional
         Run number of the random streams.
+    source : str, default ""
+        File or recording that it was read from; empty for a record in memory.
     """
 
     gyro: GyroSpec | None = None
     scenario: Any = None
     seed: int | None = None
     run: int | None = None
+    source: str = ""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -117,10 +162,10 @@ class ImuRecord(Listed):
         if len(set(names)) < len(names):
             raise InputError(f"vectors has two series of the same name among {names}; give each sensor its own name")
         if self.truth is not None:
-            truth = Truth(
-                attitude=unit_quaternions(
-                    "truth.attitude", array("truth.attitude", self.truth.attitude, (len(time), 4))
-                ),
+            attitude = array("truth.attitude", self.truth.attitude, (len(time), 4))
+            truth = dataclasses.replace(
+                self.truth,
+                attitude=unit_quaternions("truth.attitude", attitude),
                 bias=array("truth.bias", self.truth.bias, (len(time), 3)),
             )
             object.__setattr__(self, "truth", truth)
@@ -226,6 +271,6 @@ def _at_edges(record: ImuRecord, edges: slice, increments: Array, vectors: Itera
         time=record.time[edges],
         increments=increments,
         vectors=tuple(vectors),
-        truth=None if truth is None else Truth(attitude=truth.attitude[edges], bias=truth.bias[edges]),
+        truth=None if truth is None else truth.taken(edges),
         temperature=None if temperature is None else temperature[edges],
     )

@@ -50,7 +50,7 @@ def write(
     out: str | os.PathLike[str] | None = None,
     *,
     other: str | os.PathLike[str] | None = None,
-    probability: float = 0.99,
+    confidence_level: float = 0.99,
 ) -> Report:
     """Write the report of a result file, and its statistics as JSON beside it, atomically.
 
@@ -62,7 +62,7 @@ def write(
         The page. Default: ``result`` with the suffix .html.
     other : path, optional
         A second estimate of the same motion: the page has both, and their difference.
-    probability : float
+    confidence_level : float
         Probability that no test rejects a consistent filter.
 
     Returns
@@ -81,7 +81,7 @@ def write(
         raise InputError(f"{source} holds: {kind.removeprefix('strapdown ')}; reports are available for: {known}")
     with from_file(source):  # errors while drawing invalid numbers name the file
         if other is None:
-            content, statistics = _WRITERS[kind](source, probability)
+            content, statistics = _WRITERS[kind](source, confidence_level)
         else:
             existing_file(Path(other))
             if {kind, _kind(Path(other))} != {"strapdown estimate"}:

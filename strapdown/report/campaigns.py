@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from strapdown import consistency, plots, records
+from strapdown import consistency, plots, records, workflows
 from strapdown.checks import Array, InputError
 from strapdown.files import plain
 from strapdown.montecarlo import campaign, verdicts
@@ -17,14 +17,14 @@ from strapdown.plots.statistics import STATES, state_unit
 from strapdown.report import findings, page
 
 
-def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
+def report(path: Path, confidence_level: float) -> tuple[str, dict[str, Any]]:
     """Return the page and the statistics for a campaign file."""
     attributes = records.read_attributes(path)
     held = campaign.read(path)
     statistics = held.statistics
     if statistics is None:
         raise InputError(f"{path} has no completed run yet; continue the campaign with --resume first")
-    judgement = statistics.judge(probability=probability, unmodelled=held.plan.unmodelled)
+    judgement = workflows.check(held, confidence_level=confidence_level)
     bound = verdicts.bound_of(held.plan)
     name = held.plan.scenario.name or "a scenario"
     unfinished = "" if held.finished else f"; incomplete: {statistics.runs} of {held.runs} runs"
@@ -35,7 +35,7 @@ def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
         findings.verdict(judgement),
         _numbers(statistics, bound, judgement),
         findings.evidence(judgement),
-        page.section("Over time", *_over_time(statistics, judgement, probability)),
+        page.section("Over time", *_over_time(statistics, judgement, confidence_level)),
         page.section(
             "At the end",
             page.figure(
@@ -112,7 +112,12 @@ def _numbers(statistics: Statistics, bound: Array | None, judgement: consistency
     if nis:
         parts.append(
             page.table(
-                ("sensor", "NIS per degree of freedom", "from", f"to ({100.0 * judgement.probability:g} %, all tests)"),
+                (
+                    "sensor",
+                    "NIS per degree of freedom",
+                    "from",
+                    f"to ({100.0 * judgement.confidence_level:g} %, all tests)",
+                ),
                 nis,
                 numbers=3,
             )

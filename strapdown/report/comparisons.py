@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from strapdown import quaternion, records
+from strapdown import quaternion
 from strapdown.checks import Array, InputError
+from strapdown.estimation import setup
 from strapdown.plots.estimates import angle_labels
 from strapdown.plots.style import AXES
 from strapdown.records import Estimate
@@ -20,7 +21,7 @@ _COLOURS = ("--a", "--b", "--c")
 
 def report(first: Path, second: Path) -> tuple[str, dict[str, Any]]:
     """Return the page and the statistics for two estimate files; the second is interpolated at the times of the first."""
-    a, b = records.read_estimate(first), records.read_estimate(second)
+    a, b = setup.read_estimate(first), setup.read_estimate(second)
     names = (first.name, second.name) if first.name != second.name else (str(first), str(second))
     inside = (a.time >= b.time[0]) & (a.time <= b.time[-1])
     if not inside.any():
@@ -41,7 +42,7 @@ def report(first: Path, second: Path) -> tuple[str, dict[str, Any]]:
         "attitude_difference_rms_by_axis_rad": np.sqrt(np.mean(difference**2, axis=0)).tolist(),
         "judgement": {"verdict": f"RMS difference of attitude {np.sqrt(np.mean(angle**2)) / DEGREE:.4g}°"},
     }
-    charts = _angles(time, (attitude, other), names, str(records.read_attributes(first).get("fixed_frame", "")))
+    charts = _angles(time, (attitude, other), names, a.fixed_frame)
     charts += _differences("Attitude", time, difference, (sigma[:, :3], other_sigma[:, :3]), names, angle_unit)
     if a.has_bias and b.has_bias:
         charts += _differences(
@@ -50,7 +51,7 @@ def report(first: Path, second: Path) -> tuple[str, dict[str, Any]]:
         statistics["bias_difference_rms_by_axis_rad_per_s"] = np.sqrt(
             np.mean((other_bias - bias) ** 2, axis=0)
         ).tolist()
-    truth = records.read_truth(first)
+    truth = a.truth
     if truth is not None:
         charts += _errors(time, truth.attitude[inside], (attitude, other), names)
     content = page.page(

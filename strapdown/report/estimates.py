@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from strapdown import consistency, plots, quaternion, records
+from strapdown import consistency, plots, quaternion, records, workflows
 from strapdown.checks import Array
+from strapdown.estimation import setup
 from strapdown.plots.estimates import angle_labels
 from strapdown.plots.style import AXES
 from strapdown.records import Estimate, Innovations, Truth
@@ -20,22 +21,28 @@ from strapdown.units import DEGREE, angle_unit, rate_unit
 _COLOURS = ("--a", "--b", "--c")
 
 
-def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
+def report(path: Path, confidence_level: float) -> tuple[str, dict[str, Any]]:
     """Return the page and the statistics for an estimate file."""
     attributes = records.read_attributes(path)
-    estimate = records.read_estimate(path)
-    truth = records.read_truth(path)
+    estimate = setup.read_estimate(path)
+    truth = estimate.truth
     error = None
     if truth is not None:
-        error = consistency.errors(estimate.attitude, estimate.bias, truth.attitude, truth.bias)
-    judgement = findings.judged(path, attributes, estimate, truth, probability=probability)
+        known = np.isfinite(truth.attitude).all(axis=1)
+        error = np.full((len(estimate.time), 6), np.nan)
+        error[known] = consistency.errors(
+            estimate.attitude[known], estimate.bias[known], truth.attitude[known], truth.bias[known]
+        )
+    judgement = workflows.check(estimate, confidence_level=confidence_level)
+    table = None if truth is None else workflows.accuracy(estimate)
     span = estimate.time[-1] - estimate.time[0]
     used = sum(len(one.time) for one in estimate.innovations.values())
     content = page.page(
         f"Estimate: {path.name}",
         f"{len(estimate.time)} epochs over {span:g} s, {used} measurements of {len(estimate.innovations)} "
         f"sensor{'' if len(estimate.innovations) == 1 else 's'}, "
-        f"{'with' if truth is not None else 'without'} truth; strapdown {attributes.get('version', '')}",
+        f"{'without truth' if truth is None else 'with truth' if truth.has_bias else 'with a reference attitude'}; "
+        f"strapdown {attributes.get('version', '')}",
         findings.verdict(judgement),
         *(
             [page.section("Events", *(page.paragraph(str(event)) for event in estimate.events))]
@@ -43,9 +50,10 @@ def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
             else []
         ),
         _numbers(estimate, error),
+        *([] if table is None else [findings.listed(table.listing(), numbers=5)]),
         findings.evidence(judgement),
-        _over_time(estimate, truth, error, str(attributes.get("fixed_frame", ""))),
-        *[_sensor(name, one, probability) for name, one in estimate.innovations.items()],
+        _over_time(estimate, truth, error),
+        *[_sensor(name, one, confidence_level) for name, one in estimate.innovations.items()],
         *_distribution(estimate, truth),
         page.section(
             "Provenance",
@@ -58,6 +66,7 @@ def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
         "source": path.name,
         "judgement": judgement.summary(),
         "key_numbers": _key_numbers(estimate, error),
+        "accuracy": None if table is None else table.summary(),
     }
 
 
@@ -80,10 +89,14 @@ def _key_numbers(estimate: Estimate, error: Array | None) -> dict[str, Any]:
         numbers["final_bias_rad_per_s"] = estimate.bias[-1].tolist()
         numbers["final_bias_sigma_rad_per_s"] = estimate.sigma[-1, 3:].tolist()
     if error is not None:
-        rms = np.sqrt(np.mean(error[len(error) // 2 :] ** 2, axis=0))
-        numbers["rms_attitude_error_second_half_rad"] = rms[:3].tolist()
-        if estimate.has_bias:
-            numbers["rms_bias_error_second_half_rad_per_s"] = rms[3:].tolist()
+        half = error[len(error) // 2 :]
+        for name, states in (
+            ("attitude_error_second_half_rad", slice(3)),
+            ("bias_error_second_half_rad_per_s", slice(3, 6)),
+        ):
+            known = half[np.isfinite(half[:, states]).all(axis=1), states]
+            if len(known):
+                numbers[f"rms_{name}"] = np.sqrt(np.mean(known**2, axis=0)).tolist()
     return numbers
 
 
@@ -97,8 +110,9 @@ def _numbers(estimate: Estimate, error: Array | None) -> str:
             k = states.start + axis
             row = [f"{what} {name}, {unit}", page.number(float(sigma[k] / size))]
             if error is not None:
-                own = error[half:, k] / size
-                row += [page.number(float(x)) for x in (np.sqrt(np.mean(own**2)), np.mean(own), np.abs(own).max())]
+                own = error[half:, k][np.isfinite(error[half:, k])] / size
+                values = (np.sqrt(np.mean(own**2)), np.mean(own), np.abs(own).max()) if len(own) else (np.nan,) * 3
+                row += [page.number(float(x)) for x in values]
             rows.append(row)
     head = ["second half of the run", "σ of the filter"]
     head += ["RMS error", "mean error", "largest"] if error is not None else []
@@ -121,12 +135,14 @@ def _numbers(estimate: Estimate, error: Array | None) -> str:
     return page.section("Key numbers", *parts)
 
 
-def _over_time(estimate: Estimate, truth: Truth | None, error: Array | None, fixed_frame: str) -> str:
+def _over_time(estimate: Estimate, truth: Truth | None, error: Array | None) -> str:
     sigma = estimate.sigma
     charts = []
     settled = slice(len(estimate.time) // 20, None)
     if truth is not None and error is not None:
         for what, (states, unit_of) in zip(("Attitude error", "Bias error"), _parts(estimate), strict=False):
+            if not np.isfinite(error[:, states]).any():
+                continue
             unit, size = unit_of(3.0 * sigma[settled, states])
             for k, axis in enumerate(AXES):
                 state = states.start + k
@@ -136,14 +152,14 @@ def _over_time(estimate: Estimate, truth: Truth | None, error: Array | None, fix
                     page.Series(label="−3σ", value=-bound, colour="--faint", band=True),
                     page.Series(label=f"{what.lower()} {axis}", value=value, colour=_COLOURS[k]),
                 )
-                reach = 1.3 * max(float(bound[settled].max()), float(np.abs(value[settled]).max()))
+                reach = 1.3 * max(float(bound[settled].max()), float(np.nanmax(np.abs(value[settled]), initial=0.0)))
                 label = f"{what.lower()} {axis}, {unit}"
                 charts.append(page.chart(f"{what} {axis}", label, estimate.time, series, reach=reach))
     else:
         euler = quaternion.to_rotation(estimate.attitude).as_euler("ZYX", degrees=True)[:, ::-1]
         series = tuple(
             page.Series(label=name, value=euler[:, k], colour=_COLOURS[k], wraps=True)
-            for k, name in enumerate(angle_labels(fixed_frame))
+            for k, name in enumerate(angle_labels(estimate.fixed_frame))
         )
         charts.append(page.chart("Attitude, Euler angles Z-Y-X", "angle, °", estimate.time, series))
         unit, size = rate_unit(3.0 * sigma[settled, 3:])
@@ -157,7 +173,7 @@ def _over_time(estimate: Estimate, truth: Truth | None, error: Array | None, fix
     return page.section("Over time", page.beside_body(charts, estimate.time, estimate.attitude))
 
 
-def _sensor(name: str, innovations: Innovations, probability: float) -> str:
+def _sensor(name: str, innovations: Innovations, confidence_level: float) -> str:
     if len(innovations.time) < 8:
         return page.section(
             f"Innovations of {name}", page.paragraph(f"{len(innovations.time)} measurements are too few to draw.")
@@ -167,8 +183,8 @@ def _sensor(name: str, innovations: Innovations, probability: float) -> str:
     def draw() -> Figure:
         figure, axes = plots.new_figure(2, 2, size=(10.5, 7.0))
         plots.innovation_histogram(white, axes[0, 0])
-        plots.innovation_quantiles(consistency.quantile_pairs(white, probability), axes[0, 1])
-        plots.innovation_autocorrelation(consistency.autocorrelation(white, probability=probability), axes[1, 0])
+        plots.innovation_quantiles(consistency.quantile_pairs(white, confidence_level), axes[0, 1])
+        plots.innovation_autocorrelation(consistency.autocorrelation(white, probability=confidence_level), axes[1, 0])
         plots.nis_over_record(innovations, consistency.mean_bounds(white.shape[1], 1, 0.99), axes[1, 1])
         return figure
 
@@ -179,7 +195,8 @@ def _sensor(name: str, innovations: Innovations, probability: float) -> str:
 def _distribution(estimate: Estimate, truth: Truth | None) -> list[str]:
     if truth is None:
         return []
-    angle = quaternion.angle_between(estimate.attitude, truth.attitude)
+    known = np.isfinite(truth.attitude).all(axis=1)
+    angle = quaternion.angle_between(estimate.attitude[known], truth.attitude[known])
 
     def draw() -> Figure:
         figure, ax = plots.new_figure(size=(6.5, 4.2))

@@ -207,7 +207,7 @@ def of_montecarlo(summary: Mapping[str, Any]) -> list[Table]:
     return [
         Table(
             "consistency",
-            f"NEES and NIS per degree of freedom, {runs}, bounds {100 * summary['probability']:g} % together",
+            f"NEES and NIS per degree of freedom, {runs}, bounds {100 * summary['confidence_level']:g} % together",
             ("statistic", "of", "mean", *_RANGE, "lower_bound", "upper_bound", "consistent"),
             rows,
         ),

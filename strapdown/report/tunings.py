@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from strapdown.checks import InputError
+from strapdown.consistency.judgement import INNOVATIONS
 from strapdown.files import reading
 from strapdown.report import page
 
@@ -98,8 +99,8 @@ class _Tuning(_Table):
     unmodelled: list[_Unmodelled] = []
 
 
-def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
-    """Return the page and the statistics for the JSON of a tuning; ``probability`` is not used, since the verdicts are in the JSON."""
+def report(path: Path, confidence_level: float) -> tuple[str, dict[str, Any]]:
+    """Return the page and the statistics for the JSON of a tuning; ``confidence_level`` is not used, since the verdicts are in the JSON."""
     content = read(path)
     held = content.get("held_out")
     answer = verdict(content)
@@ -164,14 +165,21 @@ def verdict(content: dict[str, Any]) -> tuple[str, str, list[str]]:
 
 def _on_its_own_data(content: dict[str, Any]) -> tuple[str, str, list[str]]:
     examined = content.get("unmodelled", [])
-    answers = [one.get("judgement", {}).get("verdict") for one in examined]
     prove = "--holdout validates a tuning on held-out data"
     details = [words for one in examined for words in one["words"]]
     if content.get("innovations_fit") is False or details:
         return "not consistent", f"the tuned filter does not agree with the data used for tuning; {prove}", details
-    if "cannot tell" in answers:
+    if any(_untested(one.get("judgement", {})) for one in examined):
         return "cannot tell", f"the data used for tuning are too few to judge the filter; {prove}", []
     return "consistent", f"the tuned filter agrees with the data used for tuning; {prove}", []
+
+
+def _untested(judgement: dict[str, Any]) -> bool:
+    """Return whether the innovations of a judgement are too few to test."""
+    return any(
+        part["of"].startswith(INNOVATIONS) and (part["detectable_error"] or math.inf) > judgement["required"]
+        for part in judgement.get("parts", ())
+    )
 
 
 def _parameters(content: dict[str, Any]) -> list[str]:

@@ -142,7 +142,7 @@ def unmodelled(case: Case, chosen: FilterSetup, *, probability: float = 0.99) ->
     if used.gate is not None:
         # A gate removes the tails of the innovations and passes small outliers: NIS and normality are not evidence then.
         kept = tuple(one for one in judgement.findings if one.name not in ("NIS", "normality"))
-        judgement = concluded(kept, judgement.limits, probability)
+        judgement = concluded(kept, judgement.limits, probability, parts={})
         record = accepted(record, setup.run(record, used, initial, every=len(record.increments)))
     causes: tuple[Cause, ...] = ()
     if any(finding.rejected and finding.name in SHAPES for finding in judgement.findings):

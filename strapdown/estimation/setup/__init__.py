@@ -9,8 +9,11 @@ the names of its keys; a setup is read back bit for bit.
 - ``running``: The filter of a setup over a record: :func:`run`, :func:`smooth`.
 - ``files``: Setups in TOML files.
 - ``for_record``: The initial state for a record.
+- ``estimate_files``: Estimates in HDF5 files, with their filter.
 """
 
+from strapdown.estimation.setup.estimate_files import read_estimate as read_estimate
+from strapdown.estimation.setup.estimate_files import write_estimate as write_estimate
 from strapdown.estimation.setup.files import from_table as from_table
 from strapdown.estimation.setup.files import from_toml as from_toml
 from strapdown.estimation.setup.files import read_setup

@@ -21,10 +21,9 @@ UNEVEN = 2.0
 REMEDY = "give the initial attitude (--attitude, or --from-truth; initial= in Python)"
 
 
-def unmodelled_errors(record: ImuRecord, chosen: FilterSetup) -> tuple[str, ...]:
-    """Return, as texts, the specified errors of a record for which a filter has no state; empty if nothing is specified."""
-    origin = record.origin or Origin()
-    if origin.gyro is None:
+def unmodelled_errors(origin: Origin | None, chosen: FilterSetup | None) -> tuple[str, ...]:
+    """Return, as texts, the errors that an origin specifies and a filter has no state for; empty if nothing is specified."""
+    if origin is None or origin.gyro is None or chosen is None:
         return ()
     sensors, gravity_f = setup.specified(origin)
     return setup.unmodelled_errors(origin.gyro, sensors, chosen.states, gravity_f=gravity_f)

@@ -66,7 +66,7 @@ def diagnose(
     estimate = estimation.run(model.record, model.noise, model.initial, every=every, full_covariance=True)
     kept = None if truth is None else Truth(attitude=truth.attitude[::every], bias=truth.bias[::every])
     if judgement is None:
-        judgement = consistency.judge(estimate, kept, probability=probability)
+        judgement = consistency.judge(estimate, kept, confidence_level=probability)
     base = run(model)
     considered = [by_variance(model, base, hypothesis) for hypothesis in noise_hypotheses(model)]
     considered += [by_mean(model, base, hypothesis) for hypothesis in mean_hypotheses(model)]
@@ -80,7 +80,12 @@ def diagnose(
     considered.sort(key=lambda cause: (cause.log_p, -cause.gain))
     evidence = [*judgement.findings, *(cause.finding for cause in considered)]
     together = consistency.concluded(
-        evidence, judgement.limits, probability, states=judgement.states, unmodelled=judgement.unmodelled
+        evidence,
+        judgement.limits,
+        probability,
+        parts={part.of: part.why for part in judgement.parts},
+        required=judgement.required,
+        unmodelled=judgement.unmodelled,
     )
     rejected = [finding.rejected for finding in together.findings[len(judgement.findings) :]]
     return Diagnosis(

@@ -1,0 +1,240 @@
+"""Estimates in self-describing HDF5 files, complete: with their filter, origin, truth and error states."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import numpy as np
+
+from strapdown.checks import Array, InputError, array, count, finite, increasing, one_of, unit_quaternions
+from strapdown.estimation.setup.files import from_toml, to_toml
+from strapdown.files import reading, set_attributes
+from strapdown.recordings.recordfiles import origin_attributes, origin_of
+from strapdown.records import ErrorStateEstimate, Estimate, Event, Innovations, Truth, put, result_file
+from strapdown.records.estimate import EVENT_KINDS
+
+KIND = "strapdown estimate"
+"""The attribute ``kind`` of an estimate's file."""
+LARGEST_BIAS = 1e6
+"""Maximum gyro bias accepted, rad/s; an estimate beyond it comes from a filter that diverged or a damaged file."""
+_VALUES = {
+    "time": "s",
+    "attitude": "1",
+    "bias": "rad/s",
+    "variance": "rad^2 (columns 0-2), (rad/s)^2 (columns 3-5)",
+    "covariance": "rad^2, rad^2/s, (rad/s)^2",
+    "whole_covariance": "of attitude, bias and error states, in their units",
+}
+_ORIGIN = ("gyro", "scenario", "seed", "run", "source")
+_CONTEXT = ("kind", "version", "conventions", "filter", "fixed_frame", "motion", "smoothed", "remarks", *_ORIGIN)
+
+
+def write_estimate(path: str | os.PathLike[str], estimate: Estimate) -> None:
+    """Write an estimate with all its context to HDF5; the file is created only when complete.
+
+    A scenario with a Python function or a user-defined class cannot be written to a file and is left out, as is the code of a user-defined
+    filter.
+    """
+    clash = sorted(set(estimate.details) & set(_CONTEXT))
+    if clash:
+        raise InputError(f"details has {clash[0]!r}, which the file uses for itself; choose another name")
+    truth = estimate.truth
+    if truth is not None and len(truth.attitude) != len(estimate.time):
+        raise InputError(
+            f"truth has {len(truth.attitude)} rows and the estimate {len(estimate.time)}; give the truth at the estimate's times"
+        )
+    context = {name: getattr(estimate, name) for name in ("fixed_frame", "motion", "smoothed", "remarks")}
+    attributes = {name: value for name, value in context.items() if value or name == "smoothed"}
+    if estimate.setup is not None:
+        attributes["filter"] = to_toml(estimate.setup)
+    with result_file(
+        path, "estimate", {**attributes, **origin_attributes(estimate.origin), **estimate.details}
+    ) as file:
+        size = 6 if estimate.has_bias else 3
+        for name, unit in _VALUES.items():
+            value = getattr(estimate, name)
+            if name in ("variance", "covariance") and value is not None:
+                value = value[:, :size] if name == "variance" else value[:, :size, :size]
+            if value is not None and (name != "bias" or estimate.has_bias):
+                put(file, name, value, unit)
+        if truth is not None:
+            _put_truth(file, truth)
+        for number, (sensor, innovations) in enumerate(estimate.innovations.items()):
+            group = file.create_group(f"innovations/{number:06d}")
+            # The sensor is not the group's name, because a slash in it would create a subgroup.
+            set_attributes(group, {"sensor": sensor})
+            put(group, "time", innovations.time, "s")
+            put(
+                group,
+                "innovation",
+                innovations.innovation,
+                "rad, or the sensor's unit over the length of its reference",
+            )
+            put(group, "variance", innovations.variance, "the square of the innovation's")
+            if innovations.weight is not None:
+                put(group, "weight", innovations.weight, "1", "0: rejected; 1: full weight")
+        for number, (sensor, skipped) in enumerate(estimate.skipped.items()):
+            set_attributes(file.create_group(f"skipped/{number:06d}"), {"sensor": sensor, "number": skipped})
+        for number, event in enumerate(estimate.events):
+            set_attributes(file.create_group(f"events/{number:06d}"), vars(event))
+        for number, (name, block) in enumerate(estimate.error_states.items()):
+            group = file.create_group(f"states/{number:06d}")
+            set_attributes(group, {"name": name, "components": block.components, "units": block.units})
+            put(group, "values", block.values, "those of the attribute units")
+            put(group, "variance", block.variance, "the square of the values'")
+
+
+def _put_truth(file: Any, truth: Truth) -> None:
+    """Write the rows of a truth at which it is known."""
+    known = np.isfinite(truth.attitude).all(axis=1)
+    if not known.all():
+        put(file, "truth/row", np.flatnonzero(known).astype(np.float64), "1", "rows of the estimate with a truth")
+    put(file, "truth/attitude", truth.attitude[known], "1")
+    if truth.has_bias:
+        put(file, "truth/bias", truth.bias, "rad/s")
+    if truth.movement is not None:
+        put(file, "truth/movement", truth.movement.astype(np.float64), "1", "1: the unit moves")
+
+
+def read_estimate(path: str | os.PathLike[str]) -> Estimate:
+    """Read an estimate written by :func:`write_estimate`, with all its context.
+
+    Rejected are shapes that do not fit each other, decreasing times, quaternions that are not of unit norm, variances of zero or less, and
+    biases above 1e6 rad/s.
+    """
+    with reading.hdf5(path) as file:
+        attributes = reading.attributes(file)
+        if attributes.get("kind") != KIND:
+            raise InputError(
+                f"{path} is not a strapdown estimate; pass the estimate.h5 that `strapdown estimate` writes"
+            )
+        time = increasing(_place(file, "time"), _numbers(file, "time", ("n",)))
+        rows = len(time)
+        attitude = _attitudes(file, "attitude", rows)
+        size = 6 if "bias" in file else 3  # an estimate of another program may have none
+        covariance = _numbers(file, "covariance", (rows, size, size)) if "covariance" in file else None
+        if covariance is not None:
+            _above_zero(f"{_place(file, 'covariance')}, diagonal", np.diagonal(covariance, axis1=1, axis2=2))
+            covariance = _padded(covariance, ((0, 0), (0, 6 - size), (0, 6 - size)))
+        variance = _above_zero(_place(file, "variance"), _numbers(file, "variance", (rows, size)))
+        return Estimate(
+            time=time,
+            attitude=attitude,
+            bias=_biases(file, "bias", rows) if size == 6 else np.full((rows, 3), np.nan),
+            variance=_padded(variance, ((0, 0), (0, 6 - size))),
+            covariance=covariance,
+            whole_covariance=_numbers(file, "whole_covariance", (rows, "n", "n"))
+            if "whole_covariance" in file
+            else None,
+            innovations={str(own["sensor"]): _innovations(part) for own, part in _parts(file, "innovations")},
+            skipped={
+                str(own["sensor"]): count("skipped", own["number"], minimum=0) for own, _ in _parts(file, "skipped")
+            },
+            events=tuple(
+                Event(
+                    kind=one_of("kind of an event", own["kind"], EVENT_KINDS),
+                    sensor=str(own["sensor"]),
+                    **{name: finite(f"{name} of an event", own[name]) for name in ("start", "end", "value")},
+                )
+                for own, _ in _parts(file, "events")
+            ),
+            error_states={str(own["name"]): _states(own, part, rows) for own, part in _parts(file, "states")},
+            truth=_truth(file, rows) if "truth" in file else None,
+            setup=from_toml(str(attributes["filter"]), f"{path}: filter") if "filter" in attributes else None,
+            origin=origin_of(attributes, path),
+            fixed_frame=str(attributes.get("fixed_frame", "")),
+            motion=str(attributes.get("motion", "")),
+            smoothed=bool(attributes.get("smoothed", False)),
+            remarks=tuple(map(str, attributes.get("remarks", ()))),
+            details={name: value for name, value in attributes.items() if name not in _CONTEXT},
+        )
+
+
+def _padded(values: Array, widths: Any) -> Array:
+    return np.pad(values, widths, constant_values=np.nan)
+
+
+def _numbers(group: Any, name: str, shape: tuple[int | str, ...]) -> Array:
+    """Return an array of a file, checked by :func:`strapdown.checks.array`."""
+    return array(_place(group, name), reading.numbers(group, name), shape)
+
+
+def _place(group: Any, name: str) -> str:
+    return f"{group.file.filename}: {f'{group.name}/{name}'.lstrip('/')}"
+
+
+def _above_zero(place: str, variance: Array) -> Array:
+    """Return variances, checked to be positive."""
+    if np.any(variance <= 0.0):
+        index = tuple(int(i) for i in np.argwhere(variance <= 0.0)[0])
+        raise InputError(
+            f"{place}{list(index)} is {variance[index]:g}, and a variance must be greater than zero; the file is damaged, or a sensor had "
+            "no noise: give each a sigma above zero and repeat the estimate"
+        )
+    return variance
+
+
+def _biases(group: Any, name: str, rows: int) -> Array:
+    """Return gyro biases (rows, 3), checked not to exceed :data:`LARGEST_BIAS`."""
+    value = _numbers(group, name, (rows, 3))
+    if np.any(np.abs(value) > LARGEST_BIAS):
+        index = tuple(int(i) for i in np.argwhere(np.abs(value) > LARGEST_BIAS)[0])
+        raise InputError(
+            f"{_place(group, name)}{list(index)} is {value[index]:g} rad/s, more than any gyro has; the file is damaged or its filter "
+            "diverged: repeat the estimate, and check its initial state and the gyro's unit"
+        )
+    return value
+
+
+def _attitudes(group: Any, name: str, rows: int) -> Array:
+    """Return attitudes (rows, 4) unchanged, checked to be of unit norm."""
+    value = _numbers(group, name, (rows, 4))
+    unit_quaternions(_place(group, name), value)
+    return value
+
+
+def _truth(file: Any, rows: int) -> Truth:
+    """Return the truth at the rows of an estimate, NaN where there is none."""
+    row = np.arange(rows)
+    if "truth/row" in file:
+        row = _numbers(file, "truth/row", ("m",)).astype(np.intp)
+        if np.any(np.diff(row, prepend=-1) <= 0) or np.any(row >= rows):
+            raise InputError(
+                f"{_place(file, 'truth/row')} are not increasing rows of the estimate; the file is damaged"
+            )
+    attitude = np.full((rows, 4), np.nan)
+    attitude[row] = _attitudes(file, "truth/attitude", len(row))
+    bias = _biases(file, "truth/bias", rows) if "truth/bias" in file else np.full((rows, 3), np.nan)
+    movement = _numbers(file, "truth/movement", (rows,)) > 0.0 if "truth/movement" in file else None
+    return Truth(attitude=attitude, bias=bias, movement=movement)
+
+
+def _parts(file: Any, name: str) -> list[tuple[dict[str, Any], Any]]:
+    """Return the subgroups of a group, each with its attributes; empty if there is no such group."""
+    return [(reading.attributes(part), part) for part in file[name].values()] if name in file else []
+
+
+def _innovations(part: Any) -> Innovations:
+    """Return the innovations of one sensor's group."""
+    number = len(_numbers(part, "time", ("m",)))
+    innovation = _numbers(part, "innovation", (number, "degrees of freedom"))
+    return Innovations(
+        time=_numbers(part, "time", (number,)),
+        innovation=innovation,
+        variance=_above_zero(_place(part, "variance"), _numbers(part, "variance", innovation.shape)),
+        weight=_numbers(part, "weight", (number,)) if "weight" in part else None,
+    )
+
+
+def _states(attributes: dict[str, Any], part: Any, rows: int) -> ErrorStateEstimate:
+    """Return the estimate of one group of error states."""
+    values = _numbers(part, "values", (rows, len(attributes["components"])))
+    if len(attributes["units"]) != len(attributes["components"]):
+        raise InputError(f"{_place(part, 'units')} and components differ in number; the file is damaged, make it again")
+    return ErrorStateEstimate(
+        components=tuple(map(str, attributes["components"])),
+        units=tuple(map(str, attributes["units"])),
+        values=values,
+        variance=_above_zero(_place(part, "variance"), _numbers(part, "variance", values.shape)),
+    )

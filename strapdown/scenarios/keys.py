@@ -1,0 +1,291 @@
+"""Keys of a scenario file with units, defaults and examples, from the tables and dataclasses that the parser itself uses."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import functools
+import inspect
+import itertools
+import json
+import math
+import re
+import textwrap
+import typing
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from strapdown import gyro, motion, scenarios, vectors
+from strapdown.checks import InputError
+from strapdown.files import tables
+from strapdown.gyro import datasheets
+from strapdown.motion import orbit
+
+SYMBOLS = {
+    "": "",
+    "s": "s",
+    "hz": "Hz",
+    "m": "m",
+    "km": "km",
+    "degc": "°C",
+    "kg_m2": "kg m²",
+    "deg": "°",
+    "rad": "rad",
+    "arcsec": "″",
+    "mrad": "mrad",
+    "ppm": "ppm",
+    "ratio": "1",
+    "nt": "nT",
+    "t": "T",
+    "deg_per_s": "°/s",
+    "deg_per_hour": "°/h",
+    "deg_per_sqrt_hour": "°/√h",
+    "deg_per_hour_per_sqrt_hour": "°/h/√h",
+    "deg_per_hour_per_hour": "°/h²",
+    "deg_per_hour_per_g": "°/h/g",
+    "rad_per_s": "rad/s",
+    "rad_per_sqrt_s": "rad/√s",
+    "rad_per_s_per_sqrt_s": "rad/s/√s",
+    "rad_per_s2": "rad/s²",
+    "rad_s_per_m": "rad s/m",
+    "m_per_s2": "m/s²",
+}
+"""The unit that each ending of a key stands for."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Key:
+    """One quantity of a table."""
+
+    name: str
+    """Key with its usual unit."""
+    others: tuple[str, ...] = ()
+    """The same quantity in other units."""
+    unit: str = ""
+    type: str
+    default: str
+    """As TOML; "required" where there is none, "none" for one that no number stands for."""
+    meaning: str = ""
+    example: Any
+    """A value that the parser accepts."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Section:
+    """One table of the file, of one type."""
+
+    group: Literal["top", "motion", "gyro", "sensors"]
+    header: str
+    """How the table begins in the file."""
+    type: str = ""
+    """Value of the key ``type``, if the table has one."""
+    summary: str
+    keys: tuple[Key, ...] = ()
+
+
+def sections() -> list[Section]:
+    """Return every table of a scenario file.
+
+    Returns
+    -------
+    list of Section
+        Tables in the order of a file, one for each type of motion and of sensor.
+    """
+    said = _meanings(scenarios.Scenario)
+    names = (_text(name, said.get(name, "")) for name in ("name", "description"))
+    keys = (*names, *_keys(scenarios.Scenario, scenarios._TOP_FORM))
+    top = Section(group="top", header="top of the file", summary="before the first table.", keys=keys)
+    warm = Section(
+        group="gyro",
+        header="[temperature]",
+        summary=_summary(scenarios.Temperature),
+        keys=_keys(scenarios.Temperature, scenarios._TEMPERATURE),
+    )
+    return [top, *_motions(), _gyro(), warm, *_sensors()]
+
+
+def named(name: str) -> list[Section]:
+    """Return the tables of a group, ``top``, ``motion``, ``gyro`` or ``sensors``, or those of one ``type``, such as "coning".
+
+    Parameters
+    ----------
+    name : str
+        Group, type, or header of a table.
+
+    Returns
+    -------
+    list of Section
+        Its tables.
+    """
+    every = sections()
+    found = [one for one in every if name in (one.group, one.type, one.header, one.header.strip("[]"))]
+    if not found:
+        known = [*dict.fromkeys(one.group for one in every), *dict.fromkeys(one.type for one in every if one.type)]
+        raise InputError(f"there is no section {name!r} in a scenario file; name one of {', '.join(known)}")
+    return found
+
+
+def example(section: Section) -> str:
+    """Return a table as in a scenario file: its required keys, and the others as comments with their default.
+
+    Parameters
+    ----------
+    section : Section
+        One of :func:`sections`.
+
+    Returns
+    -------
+    str
+        TOML.
+    """
+    lines = [] if section.group == "top" else [section.header]
+    if section.type:
+        lines.append(f'type = "{section.type}"')
+    for key in section.keys:
+        value = json.dumps(key.example, ensure_ascii=False).replace("Infinity", "inf")
+        lines.append(f"{'' if key.default == 'required' else '# '}{key.name} = {value}")
+    return "\n".join(lines)
+
+
+# ---------------------------------------------------------------------------------------------------------------- the tables
+
+
+def _motions() -> list[Section]:
+    def section(word: str, subject: Any, keys: tuple[Key, ...], more: str = "", header: str = "[motion]") -> Section:
+        return Section(group="motion", header=header, type=word, summary=_summary(subject) + more, keys=keys)
+
+    lists: dict[str, dict[str, Any]] = {  # of a sampled motion
+        "time_s": {"type": "list of numbers", "example": [0.4 * k for k in range(6)]},
+        "attitudes": {"type": "list of quaternions", "example": [[1.0, 0.0, 0.0, 0.0]] * 6},
+    }
+
+    def keys_of(word: str, kind: type, form: tables.Form) -> tuple[Key, ...]:
+        return tuple(replace(k, **lists.get(k.name, {})) if word == "sampled" else k for k in _keys(kind, form))
+
+    found = [section(word, kind, keys_of(word, kind, form)) for word, (kind, form) in scenarios._MOTIONS.items()]
+    harmonic = _keys(motion.Harmonic, scenarios._HARMONIC)
+    start = _keys(motion.ConstantRate, {"initial_attitude": tables.PLAIN})
+    parts = " Each is a table with a `type` and keys of its own: `[motion.base]`, `[motion.vibration]`."
+    return [
+        *found,
+        section("", motion.Harmonic, harmonic, " One such table for each.", "[[motion.harmonics]]"),
+        section("rest", motion.rest, start),
+        section("composed", motion.Composed, (), parts),
+    ]
+
+
+def _gyro() -> Section:
+    names = ", ".join(f"`{name}`" for name in datasheets.PRESETS)
+    preset = _text("preset", f"A gyro on the market, of which other keys change what they name. One of {names}.")
+    own = (replace(k, type=_TYPES[gyro.Axes]) if k.type == "list of 3" else k for k in _keys(gyro.GyroSpec, gyro.FORM))
+    keys = (replace(preset, example=next(iter(datasheets.PRESETS))), *own)
+    summary = (
+        "the gyro; what is left out is perfect. A bias over temperature is a table `[gyro.temperature]`, as `strapdown allan "
+        "--temperature` writes it to `gyro-temperature.toml`."
+    )
+    return Section(group="gyro", header="[gyro]", summary=summary, keys=keys)
+
+
+def _sensors() -> list[Section]:
+    def section(word: str, subject: Any, keys: tuple[Key, ...], header: str = "[[sensors]]") -> Section:
+        return Section(group="sensors", header=header, type=word, summary=_summary(subject), keys=keys)
+
+    found = [
+        section(word, kind, (*_keys(kind, form), *_keys(vectors.Faults, faults)))
+        for word, (kind, form, faults) in scenarios._SENSORS.items()
+    ]
+    return [*found, section("", orbit.CircularOrbit, _keys(orbit.CircularOrbit, scenarios._ORBIT), "[sensors.orbit]")]
+
+
+# ------------------------------------------------------------------------------------------------------- from the dataclasses
+
+
+def _keys(kind: type, form: tables.Form) -> tuple[Key, ...]:
+    meanings, hints = _meanings(kind), typing.get_type_hints(kind, localns={"CircularOrbit": orbit.CircularOrbit})
+    fields = {field.name: field for field in dataclasses.fields(kind)}
+    return tuple(_key(fields[name], hints[name], choice, meanings.get(name, "")) for name, choice in form.items())
+
+
+def _key(field: dataclasses.Field[Any], hint: Any, choice: tables.Choice, meaning: str) -> Key:
+    names = [f"{field.name}_{suffix}" if suffix else field.name for suffix, _ in choice]
+    suffix, factor = choice[0]
+    default = field.default if field.default_factory is dataclasses.MISSING else field.default_factory()
+    kind = _type(hint, default)
+    if default is dataclasses.MISSING:
+        example = _EXAMPLES[kind]
+    else:
+        example = default if isinstance(default, str | int) else (np.asarray(default, float) / (factor or 1.0)).tolist()
+    return Key(
+        name=names[0],
+        others=tuple(names[1:]),
+        unit=SYMBOLS[suffix],
+        type=kind,
+        default="required" if default is dataclasses.MISSING else _toml(example),
+        meaning=meaning,
+        example=example,
+    )
+
+
+_TYPES = {str: "text", int: "whole number", float: "number", gyro.Axes: "number, or one an axis"}
+
+
+def _type(hint: Any, default: Any) -> str:
+    if hint in _TYPES or typing.get_origin(hint) is Literal:
+        return _TYPES.get(hint, "text")
+    if isinstance(default, str):
+        return "text, or list of numbers"
+    shape: tuple[int, ...] = (3,) if default is dataclasses.MISSING else np.shape(default)
+    if shape == (0,):
+        return "list of [from, to]"
+    return f"{shape[0]} rows of {shape[1]}" if len(shape) == 2 else f"list of {shape[0]}"
+
+
+_EXAMPLES: dict[str, Any] = {"text": "some text", "number": 1.0, "list of 3": [1.0, 1.0, 1.0]}
+
+
+def _text(name: str, meaning: str) -> Key:
+    return Key(name=name, type="text", default="none", meaning=meaning, example="some text")
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, list):
+        flat = np.asarray(value).ravel()
+        if value and not np.any(flat):
+            return "zeros"
+        return "[" + ", ".join(_toml(one) for one in value) + "]"
+    if isinstance(value, float):
+        return "none (`inf`)" if math.isinf(value) else f"{value:.9g}"
+    return f"`{value!r}`".replace("'", '"') if isinstance(value, str) else str(value)
+
+
+def _summary(subject: Any) -> str:
+    text = " ".join((inspect.getdoc(subject) or "").split("\n\n")[0].split())
+    return text.replace("``", "`").removeprefix("Return ")
+
+
+@functools.cache
+def _meanings(kind: type) -> dict[str, str]:
+    """Return what is said of each field: in the string below it, or in the section Parameters or Attributes of the class."""
+    said = dict(_documented(inspect.getdoc(kind) or ""))
+    body = ast.parse(textwrap.dedent(inspect.getsource(kind))).body[0].body  # type: ignore[attr-defined]
+    for statement, below in itertools.pairwise(body):
+        if (
+            isinstance(statement, ast.AnnAssign)
+            and isinstance(below, ast.Expr)
+            and isinstance(below.value, ast.Constant)
+            and isinstance(below.value.value, str)
+        ):
+            said[ast.unparse(statement.target)] = below.value.value
+    said = {name: re.sub(r":\w+:`", "`", text) for name, text in said.items()}
+    return {name: " ".join(text.split()).replace("``", "`").replace("|", "\\|") for name, text in said.items()}
+
+
+def _documented(text: str) -> Iterator[tuple[str, str]]:
+    """Yield name and description of each entry of the sections Parameters and Attributes of a docstring."""
+    for part in re.findall(r"^(?:Parameters|Attributes)\n-+\n(.*?)(?=^\S+\n-+\n|\Z)", text, re.M | re.S):
+        for names, description in re.findall(r"^(\S[^:\n]*?) ?:.*\n((?:[ \n].*\n?)*)", part + "\n", re.M):
+            for name in names.split(","):
+                yield name.strip(), " ".join(description.split())

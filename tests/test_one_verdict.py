@@ -1,0 +1,120 @@
+"""One result, one verdict: the command, Python in memory, Python on a file, and the report agree in words, numbers and exit status."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import strapdown as sd
+from strapdown.cli import app
+from strapdown.records import Estimate
+from tests.conftest import BROAD
+
+TRIALS = sorted(BROAD.glob("*.hdf5"))
+STATUS = {"consistent": 0, "not consistent": 1, "cannot tell": 3}
+
+
+def run(*arguments: object) -> int:
+    return int(CliRunner().invoke(app, [str(one) for one in arguments]).exit_code)
+
+
+def agree(result, file: Path) -> dict:
+    """Check a file by the command, by Python and in a report, and compare with the result in memory."""
+    in_memory = sd.check(result).summary()
+    assert sd.check(sd.read(file)).summary() == in_memory
+    code = run("check", file, "--json", file.with_suffix(".json"))
+    by_command = json.loads(file.with_suffix(".json").read_text())
+    assert {name: by_command[name] for name in in_memory} == in_memory
+    assert code == STATUS[in_memory["verdict"]]
+    page = sd.report.write(file, file.with_suffix(".html"))
+    assert json.loads(page.statistics.read_text())["judgement"] == in_memory
+    assert page.verdict == in_memory["verdict"]
+    return in_memory
+
+
+SCENARIOS = [name for name in sd.scenarios.SCENARIOS if name != "rest"]  # which has no sensor besides the gyro
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_a_scenario_by_every_way(name, tmp_path):
+    source = sd.write(sd.simulate(name, seed=5), tmp_path / "record.h5")
+    assert run("estimate", source, "--out", tmp_path / "out") == 0
+    result = sd.estimate(sd.read(source))
+    file = tmp_path / "out" / "estimate.h5"
+    assert sd.read(file) == result
+    agree(result, file)
+    assert sd.read(sd.write(result, tmp_path / "again.h5")) == result
+
+
+@pytest.mark.skipif(not TRIALS, reason="the BROAD trials are not here")
+@pytest.mark.parametrize("trial", TRIALS, ids=lambda path: path.stem[:2])
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_a_recording_with_a_reference_by_every_way(trial, tmp_path):
+    assert run("estimate", trial, "--out", tmp_path / "out") == 0
+    recording = sd.read(trial)
+    result = sd.estimate(recording)
+    file = tmp_path / "out" / "estimate.h5"
+    assert sd.read(file) == result
+    found = agree(result, file)
+    assert any(one["name"] != "NIS" for one in found["findings"])  # the reference takes part
+    assert sd.check(result, recording).summary() == found
+    assert sd.read(sd.write(result, tmp_path / "again.h5")) == result
+
+
+def test_a_smoothed_and_a_gated_estimate_by_every_way(tmp_path):
+    source = sd.write(sd.simulate("hand-held", seed=5), tmp_path / "record.h5")
+    for name, flags, options in (
+        ("smooth", ("--smooth",), {"smooth": True}),
+        ("gate", ("--gate", "0.99"), {"gate": 0.99}),
+        ("huber", ("--robust", "huber", "--no-states"), {"robust": "huber", "states": False}),
+    ):
+        assert run("estimate", source, "--out", tmp_path / name, *flags) == 0
+        result = sd.estimate(sd.read(source), **options)
+        assert sd.read(tmp_path / name / "estimate.h5") == result
+        agree(result, tmp_path / name / "estimate.h5")
+
+
+def test_a_filter_with_an_error_of_its_own_by_every_way(tmp_path):
+    """One-sample integration of coning: errors that its innovations hardly show, and that the truth in the result does."""
+    record = sd.simulate("coning", seed=5)
+    source = sd.write(record, tmp_path / "record.h5")
+    setup = sd.FilterSetup.for_record(record)
+    assert setup.integration.name == "one-sample"
+    given = sd.write(setup, tmp_path / "filter.toml")
+    assert run("estimate", source, "--filter", given, "--out", tmp_path / "out") == 0
+    result = sd.estimate(sd.read(source), setup=setup)
+    assert sd.read(tmp_path / "out" / "estimate.h5") == result
+    assert agree(result, tmp_path / "out" / "estimate.h5")["verdict"] == "not consistent"
+
+
+def held(record, initial):
+    """A filter of one's own: the initial attitude, for ever, without innovations."""
+    m = len(record.time)
+    return Estimate.from_arrays(
+        record.time, np.tile(initial.attitude, (m, 1)), np.tile(initial.covariance[:3, :3], (m, 1, 1))
+    )
+
+
+def test_a_filter_of_ones_own_by_every_way(tmp_path):
+    from dataclasses import replace
+
+    scenario = replace(sd.scenarios.load_scenario("two-stars"), duration=20.0)
+    setup = replace(sd.FilterSetup.for_scenario(scenario), estimator=held)
+    plan = sd.montecarlo.Plan(scenario=scenario, setup=setup, epochs=10)
+    again = sd.montecarlo.replay(plan, 3)
+    file = sd.write(again.estimate, tmp_path / "own.h5")
+    assert sd.read(file) == again.estimate
+    agree(again.estimate, file)
+
+
+def test_a_campaign_by_every_way(tmp_path):
+    file = tmp_path / "c.h5"
+    assert run("montecarlo", "two-stars", "--runs", 40, "--out", file) in STATUS.values()
+    campaign = sd.read(file)
+    by_command = json.loads(file.with_suffix(".json").read_text())["judgement"]
+    assert agree(campaign, file) == by_command
+    in_memory = sd.monte_carlo("two-stars", runs=40)
+    assert in_memory == campaign.statistics
+    assert sd.check(in_memory).summary() == by_command
