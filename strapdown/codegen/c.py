@@ -71,7 +71,7 @@ def members(program: Program) -> list[tuple[str, int, str]]:
     rows.append(("nis", max(len(program.sensors), 1), "last normalised innovation squared of each sensor"))
     if program.structure.chains:
         rows.append(("coefficients", k.SET * len(program.model.last), "of the states that decay, for steps of dt"))
-        rows.append(("dt", 0, "s"))
+        rows.append(("step_dt", 0, "s"))
     return rows
 
 

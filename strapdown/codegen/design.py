@@ -10,9 +10,8 @@ import numpy as np
 from strapdown.checks import InputError
 from strapdown.codegen.c import identifier
 from strapdown.codegen.program import Program, Sensor
-from strapdown.estimation import forward, temperature
+from strapdown.estimation import forward, initial_state, temperature
 from strapdown.estimation import model as modelling
-from strapdown.estimation.error_states import ErrorStates
 from strapdown.estimation.live import template
 from strapdown.estimation.setup import FilterSetup
 from strapdown.estimation.setup.running import with_sigma
@@ -43,10 +42,8 @@ def program_of(setup: FilterSetup, sensors: Sequence[VectorSensor | VectorMeasur
     noise = setup.process_noise
     variances = noise.angle_random_walk**2, noise.rate_random_walk**2
     numbers = forward.kernel_model(model, variances)
-    sigma = (setup.attitude_sigma,) * 3 + (setup.bias_sigma,) * 3
-    sigma += tuple(float(x) for block in error_states for x in block.sigma)
-    if setup.states is not None:
-        sigma = tuple(np.sqrt(np.diag(_initial_covariance(setup, error_states))).tolist())
+    start = initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=setup.attitude_sigma, bias_sigma=setup.bias_sigma)
+    covariance = modelling.with_error_states(start, error_states).covariance
     program = Program(
         structure=model.structure,
         model=_plain(numbers),
@@ -55,7 +52,7 @@ def program_of(setup: FilterSetup, sensors: Sequence[VectorSensor | VectorMeasur
         ),
         thresholds=None if setup.gate is None else tuple(float(x) for x in setup.gate.thresholds),
         max_precision=MAX_PRECISION_SINGLE if single else MAX_PRECISION,
-        sigma=sigma,
+        covariance=tuple(map(tuple, covariance.tolist())),
         state_names=tuple(
             f"{block.name} {component} ({unit})"
             for block in error_states
@@ -66,17 +63,6 @@ def program_of(setup: FilterSetup, sensors: Sequence[VectorSensor | VectorMeasur
     if single:
         _need_single(setup, program)
     return program
-
-
-def _initial_covariance(setup: FilterSetup, error_states: tuple[ErrorStates, ...]) -> np.ndarray:
-    """Return the initial covariance; one that is not diagonal is refused."""
-    from strapdown.estimation import initial_state
-
-    state = initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=setup.attitude_sigma, bias_sigma=setup.bias_sigma)
-    P = modelling.with_error_states(state, error_states).covariance
-    if np.any(P != np.diag(np.diag(P))):
-        raise InputError("the setup has error states with correlated initial errors; the exported start has none")
-    return np.asarray(P)
 
 
 def _need_exportable(setup: FilterSetup) -> None:

@@ -83,8 +83,8 @@ class Program:
     """Maximum NIS for 1, 2, 3 degrees of freedom; None: no gate."""
     max_precision: float
     """Maximum ratio of an innovation's variance to the measurement's."""
-    sigma: tuple[float, ...]
-    """Initial standard deviations of all states (n,)."""
+    covariance: tuple[tuple[float, ...], ...]
+    """Initial covariance of all states (n, n)."""
     state_names: tuple[str, ...] = ()
     """Names of the error states, with their units."""
     offsets: tuple[tuple[float, ...], ...] = ()
@@ -283,7 +283,7 @@ def initialize(m: Any, program: Program, f: SimpleNamespace, attitude: Any) -> N
     place = 0
     for i in range(program.n):
         for j in range(i, program.n):
-            f.P[place] = program.sigma[i] * program.sigma[i] if i == j else 0.0
+            f.P[place] = program.covariance[i][j]
             place += 1
     for i in range(len(program.sensors)):
         f.nis[i] = 0.0

@@ -29,7 +29,7 @@ class Symbol:
         raise TypeError(f"a condition ({self.kind}) that is known only on the target; a kernel must use anywhere or chosen")
 
     def __add__(self, other: Any) -> Any:
-        return self.trace.sum(self, other)
+        return NotImplemented if isinstance(other, list) else self.trace.sum(self, other)
 
     def __radd__(self, other: Any) -> Any:
         return self.trace.sum(other, self)
@@ -41,7 +41,7 @@ class Symbol:
         return self.trace.symbol("-", other, self)
 
     def __mul__(self, other: Any) -> Any:
-        return self.trace.product(self, other)
+        return NotImplemented if isinstance(other, list) else self.trace.product(self, other)
 
     def __rmul__(self, other: Any) -> Any:
         return self.trace.product(other, self)

@@ -32,7 +32,7 @@ class Target(Function):
             "far_turn": self._far_turn,
             "load": load,
             "spread": spread,
-            "total": sum,
+            "total": total,
             "math": SimpleNamespace(expm1=lambda x: trace.symbol("expm1", x), nan=float("nan"), pi=3.141592653589793),
         }
         self.kernels = Kernels(program.kernels, helpers, dict.fromkeys(FORKED, trace.fork))
@@ -42,7 +42,7 @@ class Target(Function):
             P=self.array(lambda i: f"f->P[{i}]"),
             nis=self.array(lambda i: f"f->nis[{i}]"),
             coefficients=self.array(lambda i: f"f->coefficients[{i}]"),
-            dt=self.array(lambda i: "f->dt"),
+            dt=self.array(lambda i: "f->step_dt"),
         )
 
     def _far_turn(self, phi: Any) -> tuple[Any, Any]:
@@ -87,6 +87,14 @@ def name_of_state(i: int) -> str:
 def load(array: Any, start: int) -> Eight:
     """Return eight numbers as one value."""
     return Eight(array.reshape(-1)[start : start + 8].tolist())
+
+
+def total(x: Any) -> Any:
+    """Return the sum of eight numbers, the upper half added to the lower until one is left."""
+    while len(x) > 1:
+        half = len(x) // 2
+        x = [a + b for a, b in zip(x[:half], x[half:], strict=True)]
+    return x[0]
 
 
 def spread(x: Any) -> Eight:
