@@ -7,7 +7,8 @@
 
 Tasks
     ``simulate``, ``read``, ``write``, ``estimate``, ``smooth``, ``integrate``, ``check``, ``tune``, ``monte_carlo``,
-    ``covariance_analysis``, ``allan_deviation``, ``fit_noise``, ``initial_state``
+    ``covariance_analysis``, ``allan_deviation``, ``fit_noise``, ``initial_state``,
+    ``export``
 Classes
     ``Scenario``, ``GyroSpec``, ``VectorSensor``, ``FilterSetup``, ``ProcessNoise``, ``Gate``, ``Robust``; ``LiveFilter`` and
     ``StepFilter`` filter sample by sample, compiled and on filterpy. Every function raises ``InputError`` on bad input; the message names
@@ -59,6 +60,7 @@ if TYPE_CHECKING:
         vectors,
     )
     from strapdown.checks import InputError
+    from strapdown.codegen import export
     from strapdown.estimation import Gate, LiveFilter, ProcessNoise, Robust, StepFilter, initial_state
     from strapdown.estimation.setup import FilterSetup
     from strapdown.gyro import GyroSpec
@@ -100,6 +102,7 @@ __all__ = [
     "covariance_analysis",
     "estimate",
     "estimation",
+    "export",
     "fit_noise",
     "gyro",
     "initial_state",
@@ -139,6 +142,7 @@ _HOMES = {
     "check": "workflows",
     "covariance_analysis": "workflows",
     "estimate": "workflows",
+    "export": "codegen",
     "fit_noise": "workflows",
     "initial_state": "estimation",
     "integrate": "workflows",

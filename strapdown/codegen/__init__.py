@@ -124,6 +124,6 @@ Multiplicative extended Kalman filter of attitude and gyro bias. Quaternions are
 fixed axes, v_f = q_fb v_b q_fb*. Errors are those of the body side: q_true = q exp(error). SI units and radians. One filter is one struct; \
 nothing is allocated, and nothing is global. An invalid sample sets a flag and leaves the filter as it was.
 
-The setup:
+{c.SETUP}
 {to_toml(setup).strip()}
 """

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import textwrap
 
 import numpy as np
 
@@ -75,14 +76,19 @@ def members(program: Program) -> list[tuple[str, int, str]]:
     return rows
 
 
-def wrapped(text: str, start: str = " * ", width: int = 100) -> str:
-    """Return text in lines of a comment."""
-    import textwrap
+def wrapped(text: str) -> str:
+    """Return text as the lines inside a comment, which it cannot end."""
+    lines: list[str] = []
+    prose, _, setup = text.replace("*/", "* /").partition(SETUP)
+    for part in prose.split("\n"):
+        lines += textwrap.wrap(part, 100) or [""]
+    if setup:
+        lines += [SETUP, *setup.splitlines()[1:]]
+    return "\n".join(f" * {line}".rstrip() for line in lines)
 
-    lines = []
-    for part in text.split("\n"):
-        lines += textwrap.wrap(part, width, initial_indent=start, subsequent_indent=start) or [start.rstrip()]
-    return "\n".join(lines)
+
+SETUP = "The setup:"
+"""Line of the origin after which lines are kept as they are."""
 
 
 def header(program: Program, functions: list[Target], origin: str, *, single: bool) -> str:
@@ -171,7 +177,7 @@ def source(program: Program, functions: list[Target], origin: str, *, single: bo
     words = language(single=single)
     out = ["/*", wrapped(origin), " */", '#include "strapdown_filter.h"', "", "#include <math.h>", ""]
     for function in functions:
-        out += [f"/* {function.words} */", f"{signature(function)} {{", *Writer(function, words).lines, "}", ""]
+        out += [f"/*\n{wrapped(function.words)}\n */", f"{signature(function)} {{", *Writer(function, words).lines, "}", ""]
     return "\n".join(out + accessors(program, single=single))
 
 
