@@ -24,7 +24,16 @@ ROUNDING = 1e-14
 
 
 class InputError(ValueError):
-    """Bad input: the message names the value, the place and the remedy."""
+    """Bad input: the message names the value, the place and the remedy.
+
+    Examples
+    --------
+    >>> import strapdown as sd
+    >>> sd.simulate("two-star")
+    Traceback (most recent call last):
+        ...
+    strapdown.checks.InputError: scenario 'two-star' is not known; did you mean 'two-stars'? ...
+    """
 
 
 OF_YOUR_OWN = "a filter of your own"
@@ -112,6 +121,22 @@ def array(name: str, value: ArrayLike, shape: Sequence[int | str | EllipsisType]
         index = _first(bad)
         raise InputError(f"{place(name, index)} is {result[index]}; remove or interpolate such samples first")
     return result
+
+
+def symmetric(name: str, value: Array, tolerance: float = 1e-9) -> Array:
+    """Return matrices (..., n, n), unless an element differs from the one across the diagonal by more than rounding.
+
+    ``tolerance`` is in units of σᵢσⱼ: a computed covariance is symmetric to rounding of its diagonal, not of each small element.
+    """
+    sigma = np.sqrt(np.abs(np.diagonal(value, axis1=-2, axis2=-1)))
+    apart = np.abs(value - np.swapaxes(value, -1, -2)) > tolerance * sigma[..., :, None] * sigma[..., None, :]
+    if apart.any():
+        *row, i, j = (int(k) for k in _first(apart))
+        raise InputError(
+            f"{place(name, row)} is not symmetric: [{i}, {j}] is {value[*row, i, j]:g} but [{j}, {i}] is {value[*row, j, i]:g}; "
+            "use ½(P + Pᵀ)"
+        )
+    return value
 
 
 def positive(name: str, value: float, *, unit: str = "") -> float:
@@ -220,15 +245,7 @@ def increasing(name: str, time: ArrayLike, *, minimum: int = 1) -> Array:
 
 def covariance(name: str, value: ArrayLike, size: int) -> Array:
     """Return ``value`` as a symmetric positive-definite matrix (size, size)."""
-    matrix = array(name, value, (size, size))
-    # A computed covariance is symmetric to rounding of its diagonal, not of each small entry.
-    size_of = np.sqrt(np.abs(np.diag(matrix)))
-    lopsided = np.abs(matrix - matrix.T) > 1e-9 * np.outer(size_of, size_of)
-    if lopsided.any():
-        i, j = _first(lopsided)
-        raise InputError(
-            f"{name} is not symmetric: [{i}, {j}] is {matrix[i, j]:g} but [{j}, {i}] is {matrix[j, i]:g}; use ½(P + Pᵀ)"
-        )
+    matrix = symmetric(name, array(name, value, (size, size)))
     # Scaled to unit diagonal first: with rad² and (rad/s)² in one matrix, rounding could make it appear indefinite.
     scale = np.sqrt(np.diag(matrix)) if np.all(np.diag(matrix) > 0.0) else np.full(size, np.nan)
     least = (

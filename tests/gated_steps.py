@@ -28,7 +28,6 @@ from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.states import GateMemory, State, check_arguments, restart_bias_variance
 from strapdown.estimation.step_filter import StepFilter
 from strapdown.kernels import filter, gate_rules, iterated_update, machine, structure
-from strapdown.kernels.algebra import cross, dot
 from strapdown.kernels.gate_rules import WIDE_PASSES
 from strapdown.kernels.iterated_update import (
     ACCEPTED,
@@ -141,7 +140,13 @@ class Linearization:
 
 
 def linearize(
-    model: MeasurementModel, attitude: Array, others: Array, P: Array, turning: Callable[[Array, Array], Array], passes: int, threshold: float
+    model: MeasurementModel,
+    attitude: Array,
+    others: Array,
+    P: Array,
+    turning: Callable[[Array, Array], Array],
+    passes: int,
+    threshold: float,
 ) -> Linearization:
     """Return a measurement linearised at the state after its update (:mod:`strapdown.kernels.gate`).
 
@@ -188,7 +193,9 @@ def linearize(
         done += 1
 
 
-def prior_at(prior: Linearization, attitude: Array, others: Array, turning: Callable[[Array, Array], Array]) -> tuple[Array, Array]:
+def prior_at(
+    prior: Linearization, attitude: Array, others: Array, turning: Callable[[Array, Array], Array]
+) -> tuple[Array, Array]:
     """Return the covariance of the prior (n, n) in the tangent space of another state, and its mean minus that state (n,)."""
     P, back = seen_from(quaternion.multiply(quaternion.conjugate(prior.attitude), attitude), prior.covariance)
     T = turning(prior.attitude, attitude)

@@ -26,7 +26,14 @@ STRANGERS = (("motion", "coning"),)
 
 DRAWING = ("plots", "report")
 PRINTING = ("cli", "__main__")
-MACHINES = ("kernels.machine", "kernels.lanes", "kernels.packed", "kernels.compiler", "kernels.tracing")
+MACHINES = (
+    "kernels.machine",
+    "kernels.cache",
+    "kernels.lanes",
+    "kernels.packed",
+    "kernels.compiler",
+    "kernels.tracing",
+)
 """Kernel modules that know of compilers; all others are plain Python."""
 
 
@@ -137,7 +144,7 @@ PARSERS = ("np.load", "np.loadtxt", "np.genfromtxt", "np.fromfile", "tomllib.loa
 PARSERS += ("json.load", "json.loads", "pickle.load")
 READERS = ("open", "io.open", "os.open", "h5py.File", *PARSERS)
 OF_A_PATH = (".read_text", ".read_bytes", ".open")
-NOT_OF_THE_USER = ("kernels.machine", "report.page")
+NOT_OF_THE_USER = ("kernels.machine", "kernels.cache", "montecarlo.engine", "report.page")
 """They read files of the package itself."""
 
 

@@ -236,7 +236,7 @@ def test_what_a_record_shows_of_each_state(succeeds, spinning, tmp_path):
 
 def test_what_the_filter_has_no_state_for_is_reported(spinning, record, tmp_path):
     scenario = scenarios.load_scenario("spin")
-    toml = setup.to_toml(setup.FilterSetup.for_scenario(scenario))
+    toml = setup.to_toml(setup.FilterSetup.for_scenario(scenario, states=False))
     (tmp_path / "filter.toml").write_text(toml)
     held = read_record(spinning)
     for file, states in ((None, False), (tmp_path / "filter.toml", None)):
@@ -334,7 +334,7 @@ def test_a_lost_filter_with_states_recovers(succeeds, spinning, tmp_path):
 
 def test_states_are_refused_where_they_make_no_sense(refusal, spinning, tmp_path):
     (tmp_path / "filter.toml").write_text(
-        setup.to_toml(setup.FilterSetup.for_scenario(scenarios.load_scenario("spin")))
+        setup.to_toml(setup.FilterSetup.for_scenario(scenarios.load_scenario("spin"), states=False))
     )
     (tmp_path / "rec.csv").write_text("")
     cases = (

@@ -313,7 +313,9 @@ def rows_at(face, sensor, kind, reference, z, transverse):
 
 
 @pytest.mark.parametrize(
-    ("prior", "sigma", "bound"), [(1.0, 5e-6, 1e-6), (10.0, 1e-6, 1e-3)], ids=["1 arcsecond", "anywhere, 0.2 arcseconds"]
+    ("prior", "sigma", "bound"),
+    [(1.0, 5e-6, 1e-6), (10.0, 1e-6, 1e-3)],
+    ids=["1 arcsecond", "anywhere, 0.2 arcseconds"],
 )
 def test_two_directions_and_a_diffuse_prior_give_the_closed_form(prior, sigma, bound):
     """σ² diag(1, 1, ½): each axis is shown by the direction across it, the third by both."""

@@ -1,11 +1,13 @@
 """Compiling kernels: what is compiled, what is refused, and a disk cache that is never stale."""
 
 import ast
+import hashlib
 import importlib
 import math
 import multiprocessing
 import os
 import pkgutil
+import re
 import shutil
 import subprocess
 import sys
@@ -25,18 +27,21 @@ from measured import series_of
 import strapdown
 from strapdown import estimation
 from strapdown.estimation import forward, schedule
+from strapdown.estimation.model import assemble
 from strapdown.kernels import (
     algebra,
-    covariance_form,
+    filter_lanes,
     filters,
     gate,
     hypotheses,
     likelihood,
     likelihood_outliers,
     machine,
-    root_form,
+    six_states,
 )
+from strapdown.kernels import filter as filter_kernels
 from strapdown.kernels.filters import body_side, extended
+from strapdown.kernels.lane_values import WIDTH
 from strapdown.kernels.walk import walk
 from strapdown.records import ImuRecord
 
@@ -71,16 +76,16 @@ def test_a_kernel_that_names_a_module_is_refused():
 
 
 def test_compiled_once():
-    assert machine.compiled(walk, covariance_form) is machine.compiled(walk, covariance_form)
+    assert machine.compiled(walk, six_states) is machine.compiled(walk, six_states)
     assert machine.helper(algebra.dot) is machine.helper(algebra.dot)
 
 
 def test_the_plain_function_stays_plain():
     machine.helper(algebra.dot)
     assert isinstance(algebra.dot, FunctionType)
-    machine.compiled(walk, covariance_form)
+    machine.compiled(walk, six_states)
     assert isinstance(walk, FunctionType)
-    assert isinstance(covariance_form.predict, FunctionType)
+    assert isinstance(six_states.predict, FunctionType)
 
 
 def is_nan(x):
@@ -205,14 +210,19 @@ def test_a_missing_definition_is_refused_by_its_name():
         machine.compiled(walk, algebra)
 
 
+SENSORS = {"star": "direction", "field": "vector", "compass": "heading", "tracker": "attitude"}
+FILTER, SEVERAL = (
+    machine.instance(filter_kernels, STRUCTURE=assemble((), SENSORS).structure, **lanes)
+    for lanes in ({}, {"LANES": WIDTH})
+)
 BODIES = [
-    (covariance_form,),
-    (root_form,),
-    (gate, covariance_form),
-    (gate, root_form),
+    (six_states,),
+    (FILTER,),
+    (gate, FILTER),
+    (filter_lanes, SEVERAL),
     (likelihood,),
     (likelihood_outliers, likelihood),
-    (likelihood_outliers, root_form),
+    (likelihood_outliers, FILTER),
     (hypotheses,),
     *(
         (importlib.import_module(f"{filters.__name__}.{name}"), extended, body_side)
@@ -237,10 +247,10 @@ def parts_used() -> set[tuple[str, ...]]:
 
 def test_every_body_of_the_walk_is_listed_here():
     assert parts_used() == {
-        ("covariance_form",),
-        ("root_form",),
-        ("gate", "covariance_form"),
-        ("gate", "root_form"),
+        ("six_states",),
+        ("kernels",),
+        ("gate", "kernels"),
+        ("filter_lanes", "kernels"),
         ("*bodies",),
         ("hypotheses_kernel",),
         ("definition", "kernel", "body_side"),
@@ -462,6 +472,83 @@ def test_cache_is_used_and_notices_edited_constants_and_helpers(copied_kernels):
     edit(kernels / "probe_helpers.py", "def lifted(x):\n    return x + 9.0\n")
     changed = ask()
     assert (changed["value"], changed["hits"]) == (30.0, 0)
+
+
+ASK_WARNED = """
+import warnings
+with warnings.catch_warnings(record=True) as caught:
+    warnings.simplefilter("always")
+    from strapdown.kernels import machine, probe
+    fast = machine.compiled(probe.run)
+    values = fast(1.0), fast(1), fast(True)
+answer = values, sum(fast.stats.cache_hits.values()), [f"{one.category.__name__}: {one.message}" for one in caught]
+"""
+
+
+def flipped(content: bytes, place: float) -> bytes:
+    k = int(place * (len(content) - 1))
+    return content[:k] + bytes([content[k] ^ 4]) + content[k + 1 :]
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda content: b"",
+        lambda content: content[:20],
+        lambda content: content[: len(content) // 2],
+        lambda content: bytes(len(content)),
+        lambda content: content + b"x",
+        *(partial(flipped, place=place) for place in (0.0, 0.01, 0.3, 0.5, 0.8, 1.0)),
+        lambda content: hashlib.sha256(b"no pickle").digest() + b"no pickle",
+    ],
+)
+def test_damaged_entries_of_the_cache_are_compiled_again_with_one_warning(copied_kernels, damage):
+    root = copied_kernels.parent.parent
+    ask = partial(in_a_new_process, root, ASK_WARNED)
+    values = (4.0, 4.0, 4.0)
+    assert ask() == (values, 0, [])
+    entries = [path for path in (root / "cache").rglob("*") if path.is_file()]
+    assert len(entries) == 3
+    for entry in entries:
+        entry.write_bytes(damage(entry.read_bytes()))
+    again, hits, warned = ask()
+    assert (again, hits) == (values, 0)
+    assert len(warned) == 1
+    assert re.match(r"CacheWarning: a compiled kernel in .* is damaged: it is discarded and compiled again", warned[0])
+    assert ask() == (values, 3, [])
+
+
+LIMITED = """
+import resource, signal
+resource.setrlimit(resource.RLIMIT_FSIZE, (100, resource.RLIM_INFINITY))
+"""
+
+
+@pytest.mark.parametrize("fault", ["full disk", "a file for the folder", "no folder", "deleted meanwhile"])
+def test_a_cache_that_cannot_be_written_ends_no_run(copied_kernels, fault):
+    root = copied_kernels.parent.parent
+    code, values = ASK_WARNED, (4.0, 4.0, 4.0)
+    if fault == "full disk":
+        code = LIMITED + code
+    elif fault == "a file for the folder":
+        (root / "cache").write_text("")
+        copied_kernels.joinpath("__pycache__").write_text("")
+    elif fault == "no folder":
+        code = f"import numba; numba.config.CACHE_DIR = {os.devnull!r}\n" + code
+    else:
+        code = code.replace("values =", "import shutil; shutil.rmtree(fast._cache.cache_path)\n    values =")
+    found, _, warned = in_a_new_process(root, code)
+    assert found == values
+    assert len(warned) == (fault == "full disk")
+    assert all("compiled kernels cannot be stored" in words for words in warned)
+
+
+def test_entries_of_earlier_sources_are_deleted(copied_kernels):
+    root = copied_kernels.parent.parent
+    for factor in ("2.0", "3.0", "4.0"):
+        (copied_kernels / "probe_constants.py").write_text(f"FACTOR = {factor}\n")
+        assert in_a_new_process(root, ASK)["value"] == 2.0 * float(factor)
+    assert len([path for path in (root / "cache").rglob("*") if path.is_file()]) == 1
 
 
 OPEN_PROBE = """

@@ -75,16 +75,60 @@ def test_an_error_on_a_worker_comes_out(client):
 
 
 @pytest.mark.parametrize(
-    ("version", "arithmetic", "words"),
+    ("change", "words"),
     [
-        ("0.0.1", engine.arithmetic(), r"a worker has strapdown 0\.0\.1"),
-        (strapdown.__version__, "no FMA", "a worker computes on no FMA, this process on .*, which round differently"),
+        ({"version": "0.0.1"}, r"a worker has strapdown 0\.0\.1"),
+        ({"sources": "0123"}, r"a worker has other sources of strapdown \S+ \(digest 0123\) than this process \(\w+\)"),
+        ({"arithmetic": "no FMA"}, "a worker computes on no FMA, this process on .*, which round differently"),
     ],
 )
-def test_a_worker_of_another_version_or_rounding_is_refused(client, monkeypatch, version, arithmetic, words):
-    monkeypatch.setattr(cluster, "_chunk", lambda payload, first, runs: (version, arithmetic, ()))
+def test_a_worker_of_another_version_edit_or_rounding_is_refused(client, monkeypatch, change, words):
+    other = engine.identity()._replace(**change)
+    assert cluster._chunk(b"no work", 0, 2, other) == (engine.identity(), ())  # nothing is unpacked or computed
+    monkeypatch.setattr(cluster, "_chunk", lambda payload, first, runs, wanted: (other, ()))
     with pytest.raises(InputError, match=words):
-        montecarlo.run_plan(PLAN, runs=4, chunk=2, machine="scalar", workers=cluster.on_dask(client))
+        montecarlo.run_plan(PLAN, runs=2, chunk=2, machine="scalar", workers=cluster.on_dask(client))
+
+
+def test_a_scheduler_without_workers_is_refused_and_not_waited_for(monkeypatch):
+    monkeypatch.setattr(cluster, "WORKERS_SECONDS", 0.2)
+    with (
+        distributed.LocalCluster(
+            n_workers=0,
+            processes=False,
+            protocol="tcp",
+            host="127.0.0.1",
+            dashboard_address=None,
+            silence_logs="CRITICAL",
+        ) as local,
+        cluster.dask_client(address=local.scheduler_address) as here,
+        pytest.raises(InputError, match=r"the scheduler at tcp://\S+ has no workers; start some, `dask worker tcp://"),
+    ):
+        montecarlo.run_plan(PLAN, runs=2, chunk=2, machine="scalar", workers=cluster.on_dask(here))
+
+
+def test_a_scheduler_that_is_killed_ends_the_campaign_with_one_line(tmp_path, monkeypatch):
+    """Its processes are killed while a chunk computes."""
+    monkeypatch.setattr(cluster, "WORKERS_SECONDS", 2)
+    code = (
+        "import time, distributed\n"
+        "local = distributed.LocalCluster(n_workers=1, processes=False, protocol='tcp', host='127.0.0.1', dashboard_address=None)\n"
+        "print(local.scheduler_address, flush=True)\n"
+        "time.sleep(600)\n"
+    )
+    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, cwd=tmp_path)
+    try:
+        address = process.stdout.readline().strip()
+        with (
+            cluster.dask_client(address=address) as here,
+            pytest.raises(InputError, match=rf"the scheduler at {address} was lost .*; what was finished is kept"),
+        ):
+            montecarlo.run_plan(
+                PLAN, runs=400, chunk=2, workers=cluster.on_dask(here), progress=lambda _: process.kill()
+            )
+    finally:
+        process.kill()
+        process.wait()
 
 
 @pytest.fixture
@@ -167,7 +211,9 @@ def test_worker_processes_give_the_bits_of_one_process(workers, machine):
 def test_a_killed_worker_costs_only_its_chunk(tmp_path):
     """Two worker processes without a nurse; one is killed by its pid in the middle, the campaign ends in the same bits."""
     longer = replace(SCENARIO, duration=60.0)
-    plan = montecarlo.Plan(scenario=longer, setup=setups.FilterSetup.for_scenario(longer), seed=4, epochs=6, nis_bins=5)
+    plan = montecarlo.Plan(
+        scenario=longer, setup=setups.FilterSetup.for_scenario(longer, states=False), seed=4, epochs=6, nis_bins=5
+    )
     address, workers = tmp_path / "scheduler.json", []
     dask = [sys.executable, "-m", "dask"]
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "cwd": tmp_path}

@@ -44,7 +44,9 @@ def scenario():
 
 @pytest.fixture(scope="module")
 def filter_setup(scenario):
-    return dataclasses.replace(setup.FilterSetup.for_scenario(scenario), integration=coning.ALGORITHMS["four-sample"])
+    return dataclasses.replace(
+        setup.FilterSetup.for_scenario(scenario, states=False), integration=coning.ALGORITHMS["four-sample"]
+    )
 
 
 @pytest.fixture(scope="module")

@@ -6,12 +6,14 @@ import gc
 import json
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
 import threading
 import time
 import tracemalloc
+import warnings
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -21,6 +23,7 @@ import pytest
 from hdf5 import changed
 from targets import targets
 
+import strapdown
 from strapdown import coning, files, montecarlo, recordings, records, report, scenarios
 from strapdown.checks import InputError
 from strapdown.files import reading
@@ -607,16 +610,41 @@ def test_a_campaign_goes_on_only_on_a_processor_that_rounds_alike(known, tmp_pat
     held = campaign.read(path)
     campaign._write(
         path,
-        dataclasses.replace(held, arithmetic=engine.arithmetic()),
+        dataclasses.replace(held, **engine.identity()._asdict()),
         campaign._Progress(held.statistics, {}, 4),
         plan.to_table(),
     )
     assert campaign.read(path).arithmetic == engine.arithmetic()
-    monkeypatch.setattr(campaign, "arithmetic", lambda: "x86_64, no vectors, no FMA")
-    with pytest.raises(
-        InputError, match=r"another campaign; arithmetic is \w+, .* there and x86_64, no vectors, no FMA here"
+    assert campaign.run(plan, path, runs=4, resume=True, chunk=4, machine="lanes").finished
+    here = engine.identity()
+    for change, words in (
+        (
+            {"arithmetic": "x86_64, no vectors, no FMA"},
+            r"arithmetic is \w+, .* there and x86_64, no vectors, no FMA here",
+        ),
+        ({"sources": "0123"}, r"sources is \w+ there and 0123 here; continue it with the strapdown that began it, or"),
+        ({"version": "0.0.9"}, r"version is \S+ there and 0\.0\.9 here; continue it with the strapdown"),
     ):
-        campaign.run(plan, path, runs=4, resume=True, chunk=4, machine="lanes")
+        monkeypatch.setattr(campaign, "identity", lambda change=change: here._replace(**change))
+        with pytest.raises(InputError, match=f"another campaign; {words}"):
+            campaign.run(plan, path, runs=4, resume=True, chunk=4, machine="lanes")
+
+
+def test_the_digest_of_the_sources_is_of_all_that_computes(tmp_path, monkeypatch):
+    package = tmp_path / "strapdown"
+    shutil.copytree(Path(strapdown.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__"))
+    monkeypatch.setattr(strapdown, "__file__", str(package / "__init__.py"))
+    digest = engine.sources.__wrapped__
+    before = digest()
+    assert before == engine.sources()
+    for name in ("__init__.py", "kernels/algebra.py", "montecarlo/lanes.py", "scenarios/__init__.py"):
+        (package / name).write_text((package / name).read_text() + "# edited\n")
+        assert digest() != before, name
+        before = digest()
+    (package / "cli" / "__init__.py").write_text("# edited\n")
+    assert digest() == before
+    (package / "quaternion.py").rename(package / "quaternions.py")
+    assert digest() != before
 
 
 def test_the_arithmetic_names_vectors_and_fused_multiply_add():
@@ -685,3 +713,26 @@ def test_a_tuning_without_a_unit_is_shown_in_si(known, tmp_path):
     content = tunings.report(tmp_path / "tuning.json", 0.99)[0]
     assert ">0.0123<" in content
     assert ">0.0456<" in content
+
+
+def test_a_fault_in_compiling_is_not_blamed_on_the_file(tmp_path):
+    """A reader's handler of exceptions may be around a first call of a kernel."""
+    import numba
+
+    broken = numba.njit(lambda x: x.nothing)
+    with pytest.raises(numba.TypingError), reading.from_file(tmp_path / "record.h5"):
+        broken(1.0)
+
+
+def test_a_damaged_cache_of_kernels_is_one_line_of_warning_in_the_program(known, tmp_path, run, monkeypatch):
+    from strapdown.kernels.cache import CacheWarning
+
+    (tmp_path / "walk.csv").write_bytes(known["walk.csv"].content)
+    read = recordings.read
+
+    def warned(*arguments, **options):
+        warnings.warn(CacheWarning("a kernel was damaged"), stacklevel=1)
+        return read(*arguments, **options)
+
+    monkeypatch.setattr(recordings, "read", warned)
+    assert run("integrate", "walk.csv")[::2] == (0, "warning: a kernel was damaged\n")

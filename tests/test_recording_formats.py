@@ -84,7 +84,7 @@ def test_a_data_frame_is_a_recording():
     with pytest.raises(InputError, match=r"frame: .*lacks gy"):
         recordings.from_table(frame.drop(columns="gy"), source="frame")
     frame["gx [dps]"] = ["fast", "slow", "still"]
-    with pytest.raises(InputError, match=r"frame: column gx \[dps\] has .*, not numbers"):
+    with pytest.raises(InputError, match=r"frame: column gx \[dps\] is not an array of numbers"):
         recordings.from_table(frame, source="frame")
 
 

@@ -27,7 +27,6 @@ from strapdown.checks import OF_YOUR_OWN, InputError
 from strapdown.cli.layout import register as register
 from strapdown.cli.progress import be_quiet, errors
 from strapdown.cli.terminal import app, console
-from strapdown.files.reading import NoDigestWarning
 
 
 @app.callback(invoke_without_command=True)
@@ -47,8 +46,8 @@ def _about(
 
 
 def _say(usual: Callable[..., None], message: Warning | str, category: type[Warning], *place: Any) -> None:
-    """Print a warning about a file in one line, without its place in the code."""
-    if issubclass(category, NoDigestWarning):
+    """Print a warning of this package in one line, without its place in the code."""
+    if category.__module__.startswith("strapdown."):
         errors.print(f"warning: {message}", soft_wrap=True)
     else:
         usual(message, category, *place)

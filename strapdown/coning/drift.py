@@ -34,7 +34,15 @@ def predicted_coning_drift(algorithm: str | Algorithm, angle: float, frequency: 
     -------
     float
         Drift about the cone's axis, rad/s: −C β² ω λ^(drift order), which for M = N + p compressed samples is −c_M β² ω λ^(2M),
-        c_M = (M!)²/(2(2M+1)!) (Miller 1983; Ignagni 1996). For one sample without correction, exactly −½ sin²β ω (1 − sin λ/λ).
+        c_M = (M!)²/(2(2M+1)!) (Miller 1983; Ignagni 1996). For one sample without correction, −½ sin²β ω (1 − sin λ/λ) for any λ, also
+        without the terms of order β⁴: with ten samples per turn, 0.1 % too small at β = 17° and 0.6 % at 45°.
+
+    Examples
+    --------
+    >>> from strapdown.units import DEGREE, DEGREE_PER_HOUR
+    >>> drift = predicted_coning_drift("two-sample", angle=0.7 * DEGREE, frequency=10.0, sample_interval=0.01)
+    >>> print(f"{drift / DEGREE_PER_HOUR:.2f} °/h")
+    -5.02 °/h
     """
     table = named(algorithm)
     beta, omega, lam = _motion(angle, frequency, sample_interval)

@@ -22,6 +22,7 @@ from strapdown.consistency.judgement import WITHOUT_TRUTH, Judgement, judge
 from strapdown.consistency.manifold import whitened
 from strapdown.consistency.timeaverage import effective_samples
 from strapdown.records import Estimate, Innovations, Truth
+from strapdown.records.estimate import matrices
 from strapdown.records.outputs import euler_axes
 from strapdown.records.recording import BRIDGED
 from strapdown.records.recording import interpolated as between_stamps
@@ -291,9 +292,7 @@ def _series(
     stamps = increasing(f"{prefix}time", time, minimum=2)
     m = len(stamps)
     q = unit_quaternions(f"{prefix}attitude", array(f"{prefix}attitude", attitude, (m, 4)))
-    P = None if covariance is None else np.array(covariance, np.float64)
-    if P is not None and P.shape not in ((m, 3, 3), (m, 6, 6)):
-        raise InputError(f"covariance has shape {P.shape}, wanted ({m}, 3, 3) or ({m}, 6, 6)")
+    P = None if covariance is None else matrices("covariance", covariance, m)
     return _Series(stamps, q, P, None if bias is None else array(f"{prefix}bias", bias, (m, 3)))
 
 

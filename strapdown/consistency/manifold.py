@@ -50,8 +50,16 @@ def errors(attitude: ArrayLike, bias: ArrayLike, true_attitude: ArrayLike, true_
         raise InputError(
             f"attitude, bias, true_attitude and true_bias have {', '.join(map(str, rows))} rows; give all at the same times"
         ) from None
-    estimate = quaternion.multiply(quaternion.conjugate(attitude), true_attitude)
-    return np.concatenate([quaternion.log(estimate), np.asarray(true_bias) - np.asarray(bias)], axis=-1)
+    pairs = {"attitude": (attitude, true_attitude), "bias": (bias, true_bias)}
+    own, true = (
+        {
+            name: array(f"{prefix}{name}", pair[k], (..., 4 - i), allow_nan=name == "bias")
+            for i, (name, pair) in enumerate(pairs.items())
+        }
+        for k, prefix in enumerate(("", "true_"))
+    )
+    turn = quaternion.multiply(quaternion.conjugate(own["attitude"]), true["attitude"])
+    return np.concatenate([quaternion.log(turn), true["bias"] - own["bias"]], axis=-1)
 
 
 def whitened(error: ArrayLike, covariance: ArrayLike) -> Array:

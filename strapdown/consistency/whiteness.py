@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from strapdown.checks import Array, InputError, array, count
+from strapdown.checks import Array, InputError, array, count, numbers
 from strapdown.consistency.bounds import tail
 
 MAX_LAGS = 20
@@ -186,7 +186,7 @@ def cross_correlation_p_value(
     from scipy.special import chdtrc
 
     a, b = _series(one), _series(other)
-    ta, tb = np.asarray(one_time), np.asarray(other_time)
+    ta, tb = array("one_time", one_time, (len(a),)), array("other_time", other_time, (len(b),))
     before = np.searchsorted(ta, tb, side="right") - 1  # index of the last of the one at or before each of the other
     first = np.ones(len(tb), bool)
     first[1:] = before[1:] != before[:-1]
@@ -202,5 +202,5 @@ def cross_correlation_p_value(
 
 
 def _series(whitened: ArrayLike) -> Array:
-    given = np.asarray(whitened, np.float64)
+    given = numbers("whitened", whitened)
     return array("whitened", given[:, None] if given.ndim == 1 else given, ("m", "dof"))

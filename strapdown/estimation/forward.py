@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import ModuleType
-from typing import Any
 
 import numpy as np
 
@@ -28,7 +27,6 @@ from strapdown.estimation.states import (
     ProcessNoise,
     State,
     check_arguments,
-    covariance_blocks,
     covariance_matrices,
     first_bias_variance,
     pack,
@@ -38,12 +36,12 @@ from strapdown.kernels import filter as filter_kernels
 from strapdown.kernels import gate, gate_rules, iterated_update, likelihood_outliers, machine, six_states, structure
 from strapdown.kernels.lane_values import WIDTH
 from strapdown.kernels.machine import compiled, read_only
-from strapdown.kernels.measurement import Measurements
 from strapdown.kernels.series import LARGEST_ANGLE
 from strapdown.kernels.walk import walk
 from strapdown.records import ErrorStateEstimate, Estimate, Event, ImuRecord, cut
 from strapdown.records.recording import GAP
 from strapdown.vectors import KINDS, VectorMeasurements
+
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
@@ -235,7 +233,13 @@ def filtered(problem: Problem, options: Options) -> Passed:
     slopes = temperature.slopes(problem.error_states)
     if slopes is not None:
         passed = _over_temperature(problem, options, slopes)
-    elif problem.model.states or options.judged or options.whole_bias or options.outliers or problem.events.noise is not None:
+    elif (
+        problem.model.states
+        or options.judged
+        or options.whole_bias
+        or options.outliers
+        or problem.events.noise is not None
+    ):
         passed = _run(problem, options)
     else:
         passed = _in_registers(problem, options)
@@ -302,7 +306,7 @@ def _in_registers(problem: Problem, options: Options) -> Passed:
     shapes = (rows, 4), (rows, 3), (rows, 6), (rows if options.full_covariance else 0, 21)
     written = side_by_side(*((shape, float) for shape in (*shapes, _innovations(events, judged=False))))
     (segments,) = side_by_side(((options.segments + 1 if options.segments else 0, 32), float))
-    out = six_states.Outputs(*written, segments[: options.segments])
+    out = six_states.Outputs._make((*written, segments[: options.segments]))
     initial = problem.initial
     state = pack(initial.attitude, initial.bias, initial.covariance)
     body = six_states.Body(state, *problem.variances)
@@ -512,9 +516,8 @@ def _run(problem: Problem, options: Options) -> Passed:
         _innovations(events, judged=options.judged) if options.outliers is None else (len(events.time), 9),
         (options.segments + 1 if options.segments else 0, segment_width(model)),
     )
-    written = side_by_side(*((shape, float) for shape in shapes))
-    stored = written.pop()
-    out = structure.Outputs(*written, segments=stored[: options.segments])
+    *written, stored = side_by_side(*((shape, float) for shape in shapes))
+    out = structure.Outputs._make((*written, stored[: options.segments]))
     judge = Judge(problem, options)
     weight, happened = None, []
     arguments = *problem.gyro, events.measurements, every
@@ -576,8 +579,7 @@ def whole_bias(model: Model, x: Array) -> Array:
 def covariance_at(body: structure.Body, i: int) -> Array:
     """Return the covariance (n, n) of state i."""
     n = body.x.shape[1] - 1
-    P = body.P[i].reshape(n, -1)[:, :n]
-    return np.asarray(0.5 * (P + P.T))
+    return np.array(body.P[i].reshape(n, -1)[:, :n])
 
 
 def candidate_of(body: structure.Body, model: Model) -> Candidate:

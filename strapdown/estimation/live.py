@@ -23,11 +23,10 @@ from strapdown.estimation import forward
 from strapdown.estimation.error_states import ErrorStates
 from strapdown.estimation.forward import Judge, Options, gate_events
 from strapdown.estimation.gating import Gate, Robust
-from strapdown.kernels.measurement import KIND_CODES
 from strapdown.estimation.states import ProcessNoise, State, check_arguments
 from strapdown.kernels import gate, gate_rules, structure
 from strapdown.kernels.machine import compiled, read_only
-from strapdown.kernels.measurement import Measurements
+from strapdown.kernels.measurement import KIND_CODES, Measurements
 from strapdown.kernels.walk import walk
 from strapdown.records import LARGEST_TURN, Event, ImuRecord, Innovations
 from strapdown.vectors import KINDS, VectorMeasurements, VectorSensor, need_level, triad
@@ -74,9 +73,9 @@ class LiveFilter:
 
     Notes
     -----
-    For the samples of a record, the estimate equals that of :func:`strapdown.estimation.run`: bit for bit with error states or a gate, otherwise
-    to rounding, because without them the state of a record stays in registers. Late measurements within the look-back
-    give the same bits as those in order. A filter is not thread-safe and cannot be copied; start another one from its :meth:`state`.
+    For the samples of a record, the estimate equals that of :func:`strapdown.estimation.run`: bit for bit with error states or a gate,
+    otherwise to rounding, because without them the state of a record stays in registers. Late measurements within the look-back give the
+    same bits as those in order. A filter is not thread-safe and cannot be copied; start another one from its :meth:`state`.
 
     Examples
     --------

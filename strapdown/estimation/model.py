@@ -220,15 +220,15 @@ def _on_sensors(
                     vectors[(k, k + third, k + 2 * third)] = None
             for k, row in enumerate(_numbers(block, effect)):
                 if np.any(row):
-                    offset, fixed, scale = (numbers.entries(row[part]) for part in (slice(3), slice(3, 6), slice(6, 15)))
+                    offset, fixed, scale = (
+                        numbers.entries(row[part]) for part in (slice(3), slice(3, 6), slice(6, 15))
+                    )
                     states[sensor].append(
                         SensorState(6 + own.start + k, offset, effect.lever is not None, fixed, carried, scale)
                     )
             if effect.varying and kinds[sensor] in ("direction", "heading"):
                 varying.add(sensor)
-    sensors = [
-        Sensor(KIND_CODES[kind], isotropic, tuple(sorted(states[name]))) for name, kind in kinds.items()
-    ]
+    sensors = [Sensor(KIND_CODES[kind], isotropic, tuple(sorted(states[name]))) for name, kind in kinds.items()]
     return sensors, tuple(sorted(vectors)), frozenset(varying)
 
 

@@ -13,8 +13,8 @@ import numpy as np
 from strapdown.checks import Array, InputError
 from strapdown.estimation.memory import side_by_side
 from strapdown.kernels import measurement
-from strapdown.kernels.measurement import KIND_CODES
 from strapdown.kernels.machine import compiled, read_only
+from strapdown.kernels.measurement import KIND_CODES
 from strapdown.records import Estimate, Innovations
 from strapdown.vectors import KINDS, VectorMeasurements, triad
 

@@ -343,17 +343,15 @@ class _ManyStates:
         kernels = forward.instance_of(self.problem.model)
         model = forward.kernel_model(self.problem.model, self.problem.variances)
         n = kernels.N
-        states, matrices = (np.zeros((count, size)) for count, size in ((4, n + 1), (4, n * kernels.W + WIDTH)))
-        space = smoother.Workspace(
-            *states,
-            *matrices,
-            gain=np.zeros(n * kernels.NOISY_WIDTH),
-            top=np.zeros(3 * kernels.W),
-            error=np.zeros(2 * n),
-            coefficients=np.zeros(kernels.SET * max(len(model.last), 1)),
-            states=np.array(kernels.NOISY, np.int64),
-            noisy=len(kernels.NOISY),
+        states, matrices = np.zeros((4, n + 1)), np.zeros((4, n * kernels.W + WIDTH))
+        noisy = np.array(kernels.NOISY, np.int64)
+        others = (
+            np.zeros(n * kernels.NOISY_WIDTH),
+            np.zeros(3 * kernels.W),
+            np.zeros(2 * n),
+            np.zeros(kernels.SET * max(len(model.last), 1)),
         )
+        space = smoother.Workspace._make((*states, *matrices, *others, noisy, len(noisy)))
         models = smoother.Models(model, *(_with_noise_times(factor, model) for factor in (-1.0, 0.0)))
         compiled(smoother.smooth_back, kernels)(segments, starts, first, models, space, smoother.Outputs(*outputs))
 

@@ -443,6 +443,7 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         T = np.array(axes)
         return np.array(y), np.array(rows, np.float64), (T @ measurement.noise @ T.T)
 
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Measurement:
     """A measurement as the arguments of :func:`strapdown.kernels.filter.rows_and_axes`."""

@@ -25,6 +25,7 @@ import subprocess
 import sys
 import threading
 import tomllib
+import traceback
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -62,7 +63,7 @@ class NoDigestWarning(UserWarning):
 
 @contextlib.contextmanager
 def from_file(path: Name) -> Iterator[None]:
-    """Raise any exception within as an InputError that names the file and blames it, except for a missing library."""
+    """Raise any exception within as an InputError that blames the file, except for a missing library or a fault in compiling."""
     try:
         yield
     except InputError as error:
@@ -78,10 +79,18 @@ def from_file(path: Name) -> Iterator[None]:
             "brings its libraries"
         ) from error
     except Exception as error:
+        if _in_compiler(error):
+            raise
         what = _short(f"{type(error).__name__}: {error}" if isinstance(error, LookupError) else str(error))
         raise InputError(
             f"{path} cannot be read ({what or type(error).__name__}); the file is truncated, damaged or of another kind"
         ) from error
+
+
+def _in_compiler(error: BaseException) -> bool:
+    """Return whether an exception was raised while a kernel was compiled, for which no file is to blame."""
+    modules = (frame.f_globals.get("__name__", "") for frame, _ in traceback.walk_tb(error.__traceback__))
+    return any(name.partition(".")[0] in ("numba", "llvmlite") for name in modules)
 
 
 def _short(text: str) -> str:

@@ -15,6 +15,7 @@ once. P has two layouts, which differ in the functions under *layout* only:
 from __future__ import annotations
 
 import math
+
 from strapdown.kernels.algebra import (
     add,
     combine,
@@ -43,7 +44,7 @@ from strapdown.kernels.gate_rules import (
     restart_width,
     start_undone,
 )
-from strapdown.kernels.iterated_update import arc_over_chord, seen_from
+from strapdown.kernels.iterated_update import ACCEPTED, PASSED_OVER, REFUSED, arc_over_chord, robust_weight, seen_from
 from strapdown.kernels.lane_angles import arctangent, rotation_vector
 from strapdown.kernels.lane_values import anywhere, chosen, lanes_of, load_like, store
 from strapdown.kernels.measurement import (
@@ -59,7 +60,7 @@ from strapdown.kernels.measurement import (
 )
 from strapdown.kernels.rotation import far_turn, quaternion_multiply, right_jacobian, rotation_matrix, turned, unit
 from strapdown.kernels.series import SQUARED_RANGE
-from strapdown.kernels.structure import MAX_PRECISION, SIX_STATES, Effects, Measured, Progress, Structure
+from strapdown.kernels.structure import MAX_PRECISION, SIX_STATES, Effects, Gains, Measured, Progress, Structure
 from strapdown.kernels.walk import step_within, turn_squared
 
 REPLACEABLE = ("take",)
@@ -73,7 +74,7 @@ N = STRUCTURE.n
 STATES = tuple(range(N))
 OTHERS = STATES[3:]
 CHAINED = tuple(k for states, _ in STRUCTURE.chains for k in states)
-ROTATED = (0, 1, 2) + tuple(k for v in STRUCTURE.vectors for k in v)
+ROTATED = (0, 1, 2, *tuple(k for v in STRUCTURE.vectors for k in v))
 """States that a correction of the attitude rotates."""
 PLAIN = tuple(k for k in STATES if k not in ROTATED)
 WIDTH_OF_ROW = N + 7 - (N + 7) % 8
@@ -95,7 +96,7 @@ MEAN = 12
 # Lines of the work space, each of LINE values.
 LINE = W + 8
 FACTORS, GAINS, ROWS = 0, 3, 6
-"""Products P h of the rows of a measurement, given those before; the same over their innovation variance; the rows h."""
+"""Products P h of the rows of a measurement, given those before; the same over the roots of their innovation variances; the rows h."""
 PRODUCT, STEP, ROUNDING, PRIOR, NOW_X, PRIOR_ROWS = 9, 10, 11, 12, 13, 14
 """P h of one row; a correction; the rounding error of P h; prior mean relative to a point of linearisation, the state there, and the rows
 there in the tangent space of the prior."""
@@ -153,14 +154,14 @@ def times(a, b):
 def products(a, b):
     """Return Σ aᵢ bᵢ; zeros vanish."""
     s = 0
-    for x, y in zip(a, b):
+    for x, y in zip(a, b, strict=True):
         s = plus(s, times(x, y))
     return s
 
 
 def sum_of(a, b):
     """Return a + b of two tuples; zeros vanish."""
-    return tuple(plus(x, y) for x, y in zip(a, b))
+    return tuple(plus(x, y) for x, y in zip(a, b, strict=True))
 
 
 def matrix_products(A, v):
@@ -202,12 +203,12 @@ def place(i, j):
     return a * N - a * (a - 1) // 2 + b - a
 
 
-def P_at(P, i, j, like):
+def element_at(P, i, j, like):
     """Return P[i, j]."""
     return value_at(P, place(i, j), like)
 
 
-def put_P(P, i, j, value):
+def put_element(P, i, j, value):
     """Write P[i, j] and P[j, i]."""
     put_at(P, place(i, j), value)
     if LANES == 1 and i != j:
@@ -216,7 +217,7 @@ def put_P(P, i, j, value):
 
 def part(P, i, c, like):
     """Return the value of row i from column c on."""
-    return load_like(P, W * i + c, lanes_of(EIGHT)) if LANES == 1 else P_at(P, i, c, like)
+    return load_like(P, W * i + c, lanes_of(EIGHT)) if LANES == 1 else element_at(P, i, c, like)
 
 
 def put_part(P, i, c, value):
@@ -229,7 +230,7 @@ def put_part(P, i, c, value):
 
 def kept(parts, work, line):
     """Return a row, given by parts, for :func:`entry`; if a part has several entries, it is written to a line of the work space."""
-    for c, value in zip(PARTS, parts) if LANES == 1 else ():
+    for c, value in zip(PARTS, parts, strict=True) if LANES == 1 else ():
         store(work, line + c, value)
     return parts
 
@@ -349,10 +350,10 @@ def gyro_effects(x, delta, dt, model, coefficients, like):
         if any_number(g.offset):
             mean = coefficients[SET * g.decay + MEAN] if g.decay >= 0 else dt
             e = numbers_of(g.offset, numbers)
-            r = tuple(plus(s, times(-(mean * c), t)) for s, t in zip(r, e))
+            r = tuple(plus(s, times(-(mean * c), t)) for s, t in zip(r, e, strict=True))
         if any_number(g.force):
             f = matrix_products(numbers_of(g.force, numbers), force)
-            r = tuple(plus(s, times(-(dt * c), t)) for s, t in zip(r, f))
+            r = tuple(plus(s, times(-(dt * c), t)) for s, t in zip(r, f, strict=True))
         if any_number(g.scale):
             M = sum_of(M, tuple(times(c, t) for t in numbers_of(g.scale, numbers)))
     if not scaled:
@@ -404,7 +405,7 @@ def driven_noise(q11, rate, D, dt, model, like):
                 nodes[g.decay] = tuple(response(rate, dt * (1.0 - node), decay) for node in NODES)
             e = numbers_of(g.offset, model.numbers)
             column = (like, like, like)
-            for (E, mean), weight in zip(nodes[g.decay], WEIGHTS):
+            for (E, mean), weight in zip(nodes[g.decay], WEIGHTS, strict=True):
                 q = (weight * dt) * density
                 # The response of the attitude is −E e, that of the state 1 − λ ∫e^{−λs} ds.
                 t = matrix_products(E if D is None else multiply(E, D), e)
@@ -431,7 +432,7 @@ def top_rows(P, phi11, phi12, effects, columns, like):
                 for a in AXES
             )
         )
-    return tuple(zip(*rows))
+    return tuple(zip(*rows, strict=True))
 
 
 def predict_formula(x, P, delta, dt, model, coefficients, like):
@@ -455,15 +456,15 @@ def predict_formula(x, P, delta, dt, model, coefficients, like):
             s = products(t[:3], phi11[3 * d : 3 * d + 3])
             s = s + products(rates, phi12[3 * d : 3 * d + 3])
             s = plus(s, products(direct, tuple(e[d] for _, e in columns)))
-            put_P(P, a, d, s + q11[place_6(a, d)])
+            put_element(P, a, d, s + q11[place_6(a, d)])
         for j in OTHERS:
             if j not in CHAINED:
                 if j < 6:
-                    put_P(P, a, j, t[j] + q12[3 * a + j - 3])
+                    put_element(P, a, j, t[j] + q12[3 * a + j - 3])
                 else:
                     put_at(P, place(j, a), t[j])  # of one run, the row is written already
     for j in (3, 4, 5):
-        put_P(P, j, j, P_at(P, j, j, like) + q22)
+        put_element(P, j, j, element_at(P, j, j, like) + q22)
     predict_chains(x, P, top, c, cross_noise, coefficients, like)
 
 
@@ -472,11 +473,11 @@ def predict_chains(x, P, top, c, cross_noise, coefficients, like):
     half = {}
     for states, g in STRUCTURE.chains:
         F = chain_matrix(coefficients, g, len(states))
-        for k, row in zip(states, F):
+        for k, row in zip(states, F, strict=True):
             put_at(x, 1 + k, products(row, tuple(c[j - 6] for j in states)))
         for first in PARTS if LANES == 1 else OTHERS:
             old = tuple(part(P, k, first, like) for k in states)
-            for k, row in zip(states, F):
+            for k, row in zip(states, F, strict=True):
                 half[k, first] = products(row, old)
         for k in states:
             for first in PARTS if LANES == 1 else OTHERS:
@@ -484,24 +485,24 @@ def predict_chains(x, P, top, c, cross_noise, coefficients, like):
                     put_part(P, k, first, half[k, first])
     for states, g in STRUCTURE.chains:
         F = chain_matrix(coefficients, g, len(states))
-        for k, row in zip(states, F):
+        for k, row in zip(states, F, strict=True):
             for a in AXES:
                 s = products(row, tuple(entry(top[a], P, W * a, j) for j in states))
-                put_P(P, a, k, s if cross_noise[k] is None else s + cross_noise[k][a])
+                put_element(P, a, k, s if cross_noise[k] is None else s + cross_noise[k][a])
             for j in OTHERS if LANES == 1 else ():
                 if j not in CHAINED:
-                    put_P(P, k, j, P_at(P, k, j, like))
+                    put_element(P, k, j, element_at(P, k, j, like))
     for m, (states, _) in enumerate(STRUCTURE.chains):
         for others, g in STRUCTURE.chains[m:]:
             F = chain_matrix(coefficients, g, len(others))
             for i, k in enumerate(states):
-                old = tuple(P_at(P, k, j, like) if LANES == 1 else half[k, j] for j in others)
-                for row, j in zip(F, others):
+                old = tuple(element_at(P, k, j, like) if LANES == 1 else half[k, j] for j in others)
+                for row, j in zip(F, others, strict=True):
                     if j >= k:
                         t = products(row, old)
                         if states == others:
                             t = t + chain_noise(coefficients, g, len(states), i, others.index(j))
-                        put_P(P, k, j, t)
+                        put_element(P, k, j, t)
 
 
 def advance(x, P, delta, dt, model, coefficients, like):
@@ -606,7 +607,7 @@ def apply_chains(array, first, coefficients, like):
     for states, g in STRUCTURE.chains:
         F = chain_matrix(coefficients, g, len(states))
         old = tuple(value_at(array, first + k, like) for k in states)
-        for k, row in zip(states, F):
+        for k, row in zip(states, F, strict=True):
             put_at(array, first + k, products(row, old))
 
 
@@ -659,12 +660,13 @@ def effects_of(sensor, x, measured, numbers, like):
         turn = measured.turning
         W_b = turning_matrix(subtract(turn[:3], tuple_at(x, 4, 3, like)), turn[3:6])
         offsets = tuple(
-            matrix_products(W_b, offset) if t.lever else offset for t, offset in zip(sensor.states, offsets)
+            matrix_products(W_b, offset) if t.lever else offset
+            for t, offset in zip(sensor.states, offsets, strict=True)
         )
     fixed = tuple(numbers_of(t.fixed, numbers) for t in sensor.states)
     scales = tuple(numbers_of(t.scale, numbers) for t in sensor.states)
-    constant = tuple((0, 0, 0) if t.carried else d for t, d in zip(sensor.states, fixed))
-    carried = tuple(d if t.carried else (0, 0, 0) for t, d in zip(sensor.states, fixed))
+    constant = tuple((0, 0, 0) if t.carried else d for t, d in zip(sensor.states, fixed, strict=True))
+    carried = tuple(d if t.carried else (0, 0, 0) for t, d in zip(sensor.states, fixed, strict=True))
     return Effects(
         offsets,
         fixed,
@@ -736,10 +738,8 @@ def attitude_rows(s, x, measured, numbers, like):
         quaternion_multiply((predicted[0], -predicted[1], -predicted[2], -predicted[3]), measured.frame[:4])
     )
     E = transpose(rotation_matrix(turn))  # exp(−[φ]): transforms a body-side error by the further rotation φ
-    entering = {t.state: matrix_products(J, a) for t, a in zip(sensor.states, effects.offsets)}
-    rows = tuple(
-        E[3 * i : 3 * i + 3] + tuple(entering[k][i] if k in entering else 0 for k in OTHERS) for i in AXES
-    )
+    entering = {t.state: matrix_products(J, a) for t, a in zip(sensor.states, effects.offsets, strict=True)}
+    rows = tuple(E[3 * i : 3 * i + 3] + tuple(entering[k][i] if k in entering else 0 for k in OTHERS) for i in AXES)
     axes = ((one, like, like), (like, one, like), (like, like, one))
     return rows, y, axes, dot(offset, offset) < SQUARED_RANGE * 1e9
 
@@ -782,7 +782,7 @@ def heading_rows(s, x, measured, numbers, like):
     g = (-inverted * m[1], inverted * m[0], like)
     h = dict(enumerate(transpose_times_vector(R, cross(p, g))))
     share = 1.0 / measured.length
-    for t, a, d, U in zip(sensor.states, effects.offsets, effects.fixed_each, effects.scales):
+    for t, a, d, U in zip(sensor.states, effects.offsets, effects.fixed_each, effects.scales, strict=True):
         e = tuple(times(share, value) for value in a)
         e = sum_of(e, matrix_products(U, clean))
         if D is not None:
@@ -793,7 +793,7 @@ def heading_rows(s, x, measured, numbers, like):
 
 
 def vector_rows(s, x, measured, numbers, like, transverse):
-    """Return the rows of a direction or vector, residuals, the axes along which the rows measure, and the cosine of the angle to the prediction.
+    """Return the rows of a direction or vector, residuals, the axes along which the rows measure, and the cosine of :func:`rows_and_axes`.
 
     The axes of a direction are transverse to the predicted one, and divided by the predicted magnitude, which scales its noise. Those of a
     vector are the frame about its reference or, with error states, the fixed axes: a state along one of them enters one row.
@@ -804,14 +804,14 @@ def vector_rows(s, x, measured, numbers, like, transverse):
     if not sensor.states:
         u, v = transpose_times_vector(R, measured.frame[:3]), transpose_times_vector(R, measured.frame[3:6])
         third = transpose_times_vector(R, r)
-        rows = ((-v[0], -v[1], -v[2]) + none, u + none)
+        rows = ((-v[0], -v[1], -v[2], *none), u + none)
         y = (dot(u, z), dot(v, z))
         along = dot(third, z)
         if sensor.kind == DIRECTION:
             return rows, y, (u, v), along
         return (*rows, (0,) * N), (*y, along - 1.0), (u, v, third), along
     effects = effects_of(sensor, x, measured, numbers, like)
-    turnable = transpose_times_vector(R, tuple(plus(p, q) for p, q in zip(r, effects.fixed)))
+    turnable = transpose_times_vector(R, tuple(plus(p, q) for p, q in zip(r, effects.fixed, strict=True)))
     before = tuple(plus(p, products(R[i::3], effects.carried)) for i, p in enumerate(turnable))
     scaled = any(any_number(t.scale) for t in sensor.states)
     M = tuple(plus(like + 1.0 if i in DIAGONAL else 0, m) for i, m in enumerate(effects.M)) if scaled else None
@@ -835,7 +835,7 @@ def vector_rows(s, x, measured, numbers, like, transverse):
     for i, t in enumerate(axes):
         ahead = tuple(products(M[j::3], t) for j in AXES) if scaled else t
         h = dict(enumerate(cross(ahead, turnable)))
-        for state, a, d, U in zip(sensor.states, effects.offsets, effects.fixed_each, effects.scales):
+        for state, a, d, U in zip(sensor.states, effects.offsets, effects.fixed_each, effects.scales, strict=True):
             e = products(t, a)
             if scaled or transverse or sensor.kind == DIRECTION:
                 e = plus(e, products(ahead, tuple(products(R[j::3], d) for j in AXES)))
@@ -854,7 +854,7 @@ def arm_noise(s, x, measured, noise, numbers, like):
     for t in sensor.states:
         if t.lever:
             c = share * value_at(x, 1 + t.state, like)
-            r = tuple(plus(p, times(c, number(a, numbers))) for p, a in zip(r, t.offset))
+            r = tuple(plus(p, times(c, number(a, numbers))) for p, a in zip(r, t.offset, strict=True))
     return (
         noise[0] + r[2] * r[2] * variance[1] + r[1] * r[1] * variance[2],
         noise[1] - r[0] * r[1] * variance[2],
@@ -877,7 +877,7 @@ def independent(rows, y, axes, noise):
                 m = m - below[i, k] * below[j, k] * variances[k]
             below[i, j] = m / variances[j]
             d = d - below[i, j] * m
-            rows[i] = tuple(plus(p, times(-below[i, j], q)) for p, q in zip(rows[i], rows[j]))
+            rows[i] = tuple(plus(p, times(-below[i, j], q)) for p, q in zip(rows[i], rows[j], strict=True))
             y[i] = y[i] - below[i, j] * y[j]
         variances.append(d)
     return tuple(rows), tuple(y), tuple(variances)
@@ -901,6 +901,8 @@ def turned_by(q, correction):
 def measurement_of(s, body, measured, e):
     """Return the e-th measurement, by a sensor of shape s."""
     shape, at, sensor = STRUCTURE.sensors[s], measured.place[e], measured.sensor[e]
+    if LANES > 1:
+        return measurement_in_lanes(s, body, measured, e, at, sensor)
     z = value_of(measured, at, sensor)
     if not shape.isotropic:
         noise = six_at(measured.noise, at)
@@ -914,48 +916,127 @@ def measurement_of(s, body, measured, e):
     return Measured(z, frame_of(measured, at, sensor), noise, body.length[e] if shape.states else 1.0, turning)
 
 
-def gains(s, x, P, work, measured, numbers, innovation, e, like):
-    """Write innovations and their variances to row e; return what :func:`apply_gains` needs, and where a row is too precise for the short form.
+def measurement_in_lanes(s, body, measured, e, at, sensor):
+    """Return the e-th measurement of several runs: ``value`` has four numbers of each run, a vector or an attitude."""
+    shape, like = STRUCTURE.sensors[s], lanes_of((0.0,) * LANES)
+    value = tuple_at(measured.value, 4 * at, 4, like)
+    noise = six_at(measured.noise, at)
+    levers = any(t.lever for t in shape.states)
+    turning = tuple_at(body.turning, 9 * e, 9, like) if levers else (0.0,) * 9
+    length = body.length[e] if shape.states else 1.0
+    if shape.kind == ATTITUDE:
+        return Measured((noise[0], noise[3], noise[5]), value, noise, length, turning)
+    return Measured(value[:3], frame_of(measured, at, sensor), noise, length, turning)
 
-    For each row p = P h, given the rows before it, by parts; its entries over the innovation's variance; and its innovation.
+
+def gains(s, x, P, work, measured, numbers, factor, like):
+    """Return the gains of a measurement whose noise variances are multiplied by a factor, as a :class:`Gains`.
+
+    Of each row p = P h, given the rows before it, by parts, over the root of its innovation's variance: P decreases by the sum of the outer
+    products of these gains, which is symmetric to the last bit.
     """
-    H, y, r, _, valid = rows_of(s, x, measured, numbers, like)
+    H, y, r, angle, valid = rows_of(s, x, measured, numbers, like)
+    r = tuple(factor * t for t in r) if factor is not None else r
     used = tuple(i for i in STATES if any(not is_zero(h[i]) for h in H))
     p = [tuple(products(tuple(h[i] for i in used), tuple(part(P, i, c, like) for i in used)) for c in PARTS) for h in H]
-    errors, gain, inverted = list(y), [], []
+    errors, gain, steps, inverted, variances, shares = list(y), [], [], [], [], []
     precise = None
     for i, h in enumerate(H):
         if any_number(h):
             row = tuple(h[k] for k in used)
             for j in AXES[:i]:
                 share = products(row, tuple(entry(p[j], work, LINE * (FACTORS + j), k) for k in used)) * inverted[j]
-                p[i] = tuple(u - share * v for u, v in zip(p[i], p[j]))
+                p[i] = tuple(u - share * v for u, v in zip(p[i], p[j], strict=True))
                 errors[i] = errors[i] - share * errors[j]
+                shares.append(share)
             p[i] = kept(p[i], work, LINE * (FACTORS + i))
-            S = products(row, tuple(entry(p[i], work, LINE * (FACTORS + i), k) for k in used)) + r[i]
-            inverted.append(1.0 / S)
-            gain.append(kept(tuple(inverted[i] * t for t in p[i]), work, LINE * (GAINS + i)))
-            far = S > SHORT_FORM * r[i]
+            variances.append(products(row, tuple(entry(p[i], work, LINE * (FACTORS + i), k) for k in used)) + r[i])
+            inverted.append(1.0 / variances[i])
+            root = square_root(inverted[i])
+            gain.append(kept(tuple(root * t for t in p[i]), work, LINE * (GAINS + i)))
+            steps.append(root * errors[i])
+            far = variances[i] > SHORT_FORM * r[i]
             precise = far if precise is None else precise | far
-        else:
-            S = r[i]  # the length of a vector has no information, but is part of the innovation
-        store_innovation(innovation, e, i, errors[i], S)
-    if STRUCTURE.sensors[s].kind == HEADING:
-        innovation[e, 0] = chosen(valid, errors[0], math.nan)  # a vertical vector has no heading: skipped
-    return tuple(p[: len(gain)]), tuple(gain), tuple(errors[: len(gain)]), precise
+        else:  # the length of a vector has no information, but is part of the innovation
+            variances.append(r[i])
+            inverted.append(1.0 / r[i])
+            shares.extend([like, like])
+    nis = products(tuple(e * e for e in errors), tuple(inverted))
+    errors, variances = tuple(errors), tuple(variances)
+    skipped = STRUCTURE.sensors[s].kind == HEADING  # possibly: a vertical vector has no heading
+    reported = (chosen(valid, errors[0], like + math.nan),) if skipped else errors
+    rest = precise, tuple(shares), tuple(r), tuple(y), angle, valid, nis
+    return Gains(tuple(gain), tuple(steps), errors, variances, reported, *rest)
 
 
-def store_innovation(innovation, e, i, value, variance):
-    """Write innovation i of a measurement, and its variance."""
-    innovation[e, 2 * i] = value
-    innovation[e, 2 * i + 1] = variance
+def innovation_covariance_of(shares, variances, noise, like):
+    """Return H P Hᵀ (6-tuple), zero for absent rows, from ``H P Hᵀ + R = L D Lᵀ``: the entries of L, D and R."""
+    l10, l20, l21 = (*shares, like, like, like)[:3]
+    d = (*variances, like, like)[:3]
+    r = (*noise, like, like)[:3]
+    return (
+        d[0] - r[0],
+        l10 * d[0],
+        l20 * d[0],
+        l10 * l10 * d[0] + d[1] - r[1],
+        l20 * l10 * d[0] + l21 * d[1],
+        l20 * l20 * d[0] + l21 * l21 * d[1] + d[2] - r[2],
+    )
 
 
-def reduced(P, work, p, gain, i, c, like):
-    """Return the value of row i of P from column c on after the update; p: that value of each row p, gain: its gains."""
+def padded(values, number, like):
+    """Return a 3-tuple, with a number for absent rows."""
+    return tuple(like + v for v in (*values, number, number)[:3])
+
+
+def store_innovations(innovation, e, errors, variances):
+    """Write the innovations of a measurement, and their variances."""
+    for i, (value, variance) in enumerate(zip(errors, variances, strict=True)):
+        store_value(innovation, e, 2 * i, value)
+        store_value(innovation, e, 2 * i + 1, variance)
+
+
+def judged(s, g, options):
+    """Return the outcome of a measurement: refused if its NIS exceeds the threshold, or a direction is more than 90° from the predicted."""
+    kind = STRUCTURE.sensors[s].kind
+    threshold = options.thresholds[len(g.errors) - 1]
+    accepted = g.nis <= threshold
+    if kind == DIRECTION:  # the transverse rows cannot detect it
+        accepted = accepted & ((g.angle[1] >= 0.0) | (threshold == math.inf))
+    outcome = chosen(accepted, ACCEPTED, REFUSED)
+    return chosen(g.valid, outcome, PASSED_OVER) if kind == HEADING else outcome
+
+
+def weighted(s, g, options, like):
+    """Return the robust weight of a measurement."""
+    degrees = len(g.errors)
+    S = innovation_covariance_of(g.shares, g.variances, g.noise, like)
+    parameter, numerator = options.parameters[degrees - 1, 0], options.parameters[degrees - 1, 1]
+    y, noise = padded(g.residuals, 0.0, like), padded(g.noise, 1.0, like)
+    return robust_weight(options.robust, parameter, numerator, options.iterations, S, y, noise)
+
+
+def divide_variances(work, rows, weight, like):
+    """Divide the variances of the rows in the work space by a weight."""
+    for r in range(rows):
+        at = LINE * (ROWS + r) + VARIANCE
+        put_at(work, at, value_at(work, at, like) / weight)
+
+
+def store_value(innovation, e, i, value):
+    """Write a number to a row of the innovations; of several runs, (events, 6, runs)."""
+    if LANES == 1:
+        innovation[e, i] = value
+    else:
+        put_at(innovation, 6 * e + i, value)
+
+
+def reduced(P, work, gain, i, c, like):
+    """Return the value of row i of P from column c on after the update."""
     t = part(P, i, c, like)
-    for r, u in enumerate(p):
-        t = t - (work[LINE * (GAINS + r) + i] if LANES == 1 else gain[r]) * u
+    rows = at_part(gain, i)
+    for r, u in enumerate(at_part(gain, c)):
+        t = t - (work[LINE * (GAINS + r) + i] if LANES == 1 else rows[r]) * u
     return t
 
 
@@ -964,10 +1045,12 @@ def at_part(rows, c):
     return tuple(row[PARTS.index(c)] for row in rows if c in PARTS)
 
 
-def apply_gains(x, P, work, p, gain, errors, like):
+def apply_gains(x, P, work, gain, steps, like):
     """Correct the state, update the covariance and transform it to the new tangent space, in one pass."""
-    step = tuple(products(errors, tuple(entry(k, work, LINE * (GAINS + r), j) for r, k in enumerate(gain))) for j in STATES)
-    correct_by(x, P, work, p, gain, step, like)
+    step = tuple(
+        products(steps, tuple(entry(k, work, LINE * (GAINS + r), j) for r, k in enumerate(gain))) for j in STATES
+    )
+    correct_by(x, P, work, gain, step, like)
 
 
 def fixed_turn(before, after):
@@ -975,8 +1058,8 @@ def fixed_turn(before, after):
     return rotation_matrix(quaternion_multiply(after, (before[0], -before[1], -before[2], -before[3])))
 
 
-def correct_by(x, P, work, p, gain, step, like):
-    """Correct the state by a step; subtract Σ k pᵀ from the covariance, and transform it to the new tangent space, in one pass.
+def correct_by(x, P, work, gain, step, like):
+    """Correct the state by a step; subtract Σ g gᵀ from the covariance, and transform it to the new tangent space, in one pass.
 
     A vector of carried states is defined in the axes of the *estimated* attitude: a correction that rotates the attitude by A in fixed axes
     changes it to A c, and its error likewise.
@@ -987,21 +1070,21 @@ def correct_by(x, P, work, p, gain, step, like):
     c = {k: value_at(x, 1 + k, like) + step[k] for k in OTHERS}
     A = fixed_turn(before, q) if STRUCTURE.vectors else None
     for v in STRUCTURE.vectors:
-        for k, t in zip(v, matrix_times_vector(A, tuple(c[k] for k in v))):
+        for k, t in zip(v, matrix_times_vector(A, tuple(c[k] for k in v)), strict=True):
             c[k] = t
     for i, t in enumerate((*q, *(c[k] for k in OTHERS))):
         put_at(x, i, t)
-    rotate_covariance(P, work, p, gain, G, A, like)
+    rotate_covariance(P, work, gain, G, A, like)
 
 
-def rotate_covariance(P, work, p, gain, G, A, like):
-    """Subtract Σ k pᵀ from P, and transform the attitude by G and the carried vectors by A."""
+def rotate_covariance(P, work, gain, G, A, like):
+    """Subtract Σ g gᵀ from P, and transform the attitude by G and the carried vectors by A."""
     groups = ((AXES, G), *((v, A) for v in STRUCTURE.vectors))
     half = {}
     for m, (v, T) in enumerate(groups):
         for first in PARTS if LANES == 1 else STATES:
             if first in PLAIN or LANES == 1 or any(first in w for w, _ in groups[m:]):
-                t = tuple(reduced(P, work, at_part(p, first), at_part(gain, i), i, first, like) for i in v)
+                t = tuple(reduced(P, work, gain, i, first, like) for i in v)
                 for a in AXES:
                     half[v[a], first] = products(T[3 * a : 3 * a + 3], t)
                     if first in PLAIN or LANES == 1:
@@ -1010,20 +1093,20 @@ def rotate_covariance(P, work, p, gain, G, A, like):
         for i in PLAIN:
             for first in block:
                 if first >= i or LANES == 1:
-                    put_part(P, i, first, reduced(P, work, at_part(p, first), at_part(gain, i), i, first, like))
+                    put_part(P, i, first, reduced(P, work, gain, i, first, like))
     for i in ROTATED if LANES == 1 else ():
         for j in PLAIN:
-            put_P(P, i, j, P_at(P, i, j, like))
+            put_element(P, i, j, element_at(P, i, j, like))
     for m, (v, _) in enumerate(groups):
         for w, T in groups[m:]:
-            old = tuple(tuple(P_at(P, i, j, like) if LANES == 1 else half[i, j] for j in w) for i in v)
+            old = tuple(tuple(element_at(P, i, j, like) if LANES == 1 else half[i, j] for j in w) for i in v)
             for a in AXES:
                 for d in AXES:
                     if w[d] >= v[a] or w != v:
-                        put_P(P, v[a], w[d], products(old[a], T[3 * d : 3 * d + 3]))
+                        put_element(P, v[a], w[d], products(old[a], T[3 * d : 3 * d + 3]))
 
 
-# ----------------------------------------------------------------------------------------------- very precise measurements, by Joseph's form
+# ---------------------------------------------------------------------------------------- very precise measurements, by Joseph's form
 
 
 def store_rows(s, x, work, measured, numbers, transverse, like):
@@ -1047,6 +1130,43 @@ def row_place_below(i, j):
 
 def product(P, work, row, line, like):
     """Write P h of a row of the work space to another line."""
+    if LANES == 1:
+        product_by_parts(P, work, row, line, like)
+    else:
+        product_by_elements(P, work, row, line, like)
+
+
+def minus_outer_rows(P, work, left, right, factor, like):
+    """Subtract a factor times the outer product of two lines of the work space, known to be symmetric, from P."""
+    if LANES == 1:
+        minus_outer_by_parts(P, work, left, right, factor, like)
+    else:
+        minus_outer_by_elements(P, work, left, right, factor, like)
+
+
+def product_by_parts(P, work, row, line, like):
+    """Write P h, eight columns at once."""
+    for c in PARTS:
+        s = work[row] * part(P, 0, c, like)
+        for i in STATES[1:]:
+            s = s + work[row + i] * part(P, i, c, like)
+        store(work, line + c, s)
+
+
+def minus_outer_by_parts(P, work, left, right, factor, like):
+    """Subtract an outer product, eight columns at once, and copy the upper triangle to the lower one."""
+    columns = tuple(load_like(work, right + c, lanes_of(EIGHT)) for c in PARTS)
+    for i in STATES:
+        f = factor * work[left + i]
+        for c, column in zip(PARTS, columns, strict=True):
+            put_part(P, i, c, part(P, i, c, like) - f * column)
+    for i in STATES:
+        for j in STATES[i + 1 :]:
+            P[W * j + i] = P[W * i + j]
+
+
+def product_by_elements(P, work, row, line, like):
+    """Write P h, one element after the other."""
     for j in range(N):
         t = like
         for i in range(N):
@@ -1054,8 +1174,8 @@ def product(P, work, row, line, like):
         put_at(work, line + j, t)
 
 
-def minus_outer_rows(P, work, left, right, factor, like):
-    """Subtract a factor times the outer product of two lines of the work space, known to be symmetric, from P."""
+def minus_outer_by_elements(P, work, left, right, factor, like):
+    """Subtract an outer product, one element after the other."""
     for i in range(N):
         t = factor * value_at(work, left + i, like)
         for j in range(i, N):
@@ -1103,7 +1223,7 @@ def clear_step(work, like):
 def take_precisely(x, P, work, rows, like):
     """Update with the rows in the work space, one after the other; return whether one was too precise for double precision."""
     clear_step(work, like)
-    lost = like > like
+    lost = like < 0.0  # false, of the type of the lanes
     for i in range(rows):
         line = LINE * (ROWS + i)
         variance = value_at(work, line + VARIANCE, like)
@@ -1113,18 +1233,42 @@ def take_precisely(x, P, work, rows, like):
     return anywhere(lost)
 
 
+def take_precisely_in_lanes(body, gain, steps, precise, rows, like):
+    """Update by both forms, Joseph's for the runs that are precise."""
+    x, P = body.x, body.P
+    copy_values(x[0], x[1], N + 1, like)
+    copy_values(P[0], P[1], SIZE_OF_P // LANES, like)
+    apply_gains(x[0], P[0], body.work, gain, steps, like)
+    lost = take_precisely(x[1], P[1], body.work, rows, like)
+    blend_values(x[1], x[0], precise, N + 1, like)
+    blend_values(P[1], P[0], precise, SIZE_OF_P // LANES, like)
+    return lost
+
+
+def copy_values(a, b, count, like):
+    """Copy values of an array of lanes to another."""
+    for i in range(count):
+        put_at(b, i, value_at(a, i, like))
+
+
+def blend_values(a, b, condition, count, like):
+    """Replace values of b by those of a in the runs in which the condition holds."""
+    for i in range(count):
+        put_at(b, i, chosen(condition, value_at(a, i, like), value_at(b, i, like)))
+
+
 def apply_step(x, P, work, like):
     """Correct the state by the step in the work space, and transform the covariance."""
-    correct_by(x, P, work, (), (), tuple_at(work, LINE * STEP, N, like), like)
+    correct_by(x, P, work, (), tuple_at(work, LINE * STEP, N, like), like)
 
 
 # --------------------------------------------------------------------------------------- updates by shape, which is known while compiling
 
 ROWS_OF_KIND = {DIRECTION: 2, VECTOR: 3, HEADING: 1, ATTITUDE: 3}
 _OF_A_SHAPE = """
-def gains_{s}(body, measured, e, innovation, like):
+def gains_{s}(body, measured, e, factor, like):
     m = measurement_of({s}, body, measured, e)
-    return gains({s}, body.x[0], body.P[0], body.work, m, body.model.numbers, innovation, measured.place[e], like)
+    return gains({s}, body.x[0], body.P[0], body.work, m, body.model.numbers, factor, like)
 
 
 def rows_{s}(x, body, measured, e, like):
@@ -1136,12 +1280,40 @@ def transverse_rows_{s}(x, body, measured, e, like):
 
 
 def take_{s}(body, measured, e, innovation, like):
-    p, gain, errors, precise = gains_{s}(body, measured, e, innovation, like)
-    if anywhere(precise):
+    g = gains_{s}(body, measured, e, None, like)
+    store_innovations(innovation, measured.place[e], g.reported, g.variances)
+    if anywhere(g.precise):
         rows_{s}(body.x[0], body, measured, e, like)
-        return take_precisely(body.x[0], body.P[0], body.work, {rows}, like)
-    apply_gains(body.x[0], body.P[0], body.work, p, gain, errors, like)
+        return {precise}
+    apply_gains(body.x[0], body.P[0], body.work, g.gain, g.steps, like)
     return False
+
+
+def outcome_{s}(g, options):
+    return judged({s}, g, options)
+
+
+def weight_{s}(g, options, like):
+    return weighted({s}, g, options, like)
+
+
+def judge_{s}(body, measured, e, options, like):
+    g = gains_{s}(body, measured, e, None, like)
+    errors, variances = padded(g.reported, 0.0, like), padded(g.variances, 1.0, like)
+    outcome = outcome_{s}(g, options)
+    weight, lost = 0.0, False
+    if outcome == ACCEPTED:
+        weight = 1.0
+        if options.robust > 0:
+            weight = weight_{s}(g, options, like)
+            g = gains_{s}(body, measured, e, 1.0 / weight, like)
+        if anywhere(g.precise):
+            rows_{s}(body.x[0], body, measured, e, like)
+            divide_variances(body.work, {rows}, weight, like)
+            lost = take_precisely(body.x[0], body.P[0], body.work, {rows}, like)
+        else:
+            apply_gains(body.x[0], body.P[0], body.work, g.gain, g.steps, like)
+    return outcome, weight, errors, variances, lost
 
 
 def write_{s}(x, body, measured, e, like):
@@ -1150,14 +1322,37 @@ def write_{s}(x, body, measured, e, like):
 """
 
 
+def take(shape, body, measured, e, innovation, like):
+    """Update with the e-th measurement, by a sensor of a shape; return whether it was too precise. Defined below for the structure."""
+
+
+def judge(shape, body, measured, e, options, like):
+    """Test a measurement and update if it is accepted; return what :func:`strapdown.kernels.gate.iterated_update` does. Defined below."""
+
+
+def write(shape, x, body, measured, e, like):
+    """Write the rows of a measurement at a state to the work space; return their number, angle and validity. Defined below."""
+
+
 def _dispatch(name: str, arguments: str, otherwise: str) -> str:
     """Return the source of a function that calls the one of a shape."""
     calls = (f"    if shape == {s}:\n        return {name}_{s}({arguments})\n" for s in range(len(STRUCTURE.sensors)))
     return f"\n\ndef {name}(shape, {arguments}):\n{''.join(calls)}    return {otherwise}\n"
 
 
-_SOURCE = "\n".join(_OF_A_SHAPE.format(s=s, rows=ROWS_OF_KIND[t.kind]) for s, t in enumerate(STRUCTURE.sensors))
+# In lanes a run that needs Joseph's form must not change the bits of those beside it.
+_PRECISE = {
+    True: "take_precisely(body.x[0], body.P[0], body.work, {rows}, like)",
+    False: "take_precisely_in_lanes(body, g.gain, g.steps, g.precise, {rows}, like)",
+}[LANES == 1]
+_SOURCE = "\n".join(
+    _OF_A_SHAPE.format(s=s, rows=rows, precise=_PRECISE.format(rows=rows))
+    for s, rows in enumerate(ROWS_OF_KIND[t.kind] for t in STRUCTURE.sensors)
+)
 _SOURCE += _dispatch("take", "body, measured, e, innovation, like", "False")
+if LANES == 1:
+    _NONE = "0, 0.0, (like, like, like), (like, like, like), like < like"
+    _SOURCE += _dispatch("judge", "body, measured, e, options, like", _NONE)
 _SOURCE += _dispatch("write", "x, body, measured, e, like", "0, (like, like), like < like")
 exec(compile(_SOURCE, __file__, "exec"), globals())
 
@@ -1354,7 +1549,7 @@ def linearised(form, i, e, now_q, q, M, measured, kind, sensor, prior):
         )
         rotate_vectors(work, before, transpose(fixed_turn(q, now_q)))
     far = 1.0
-    if kind == DIRECTION or kind == VECTOR:
+    if kind in (DIRECTION, VECTOR):
         far = arc_over_chord(math.sqrt(squared), along)
     return rows, y, p, variance, far, along
 
@@ -1368,7 +1563,7 @@ def rotate_vectors(array, first, A):
     """Rotate the carried vectors among n neighbouring numbers, one per state, by A."""
     for v in STRUCTURE.vectors:
         old = tuple(array[first + k] for k in v)
-        for k, value in zip(v, matrix_times_vector(A, old)):
+        for k, value in zip(v, matrix_times_vector(A, old), strict=True):
             array[first + k] = value
 
 
@@ -1463,7 +1658,7 @@ def turn_covariance(P, v, A):
         old = tuple(part(P, k, c, 0.0) for k in v)
         for i, k in enumerate(v):
             put_part(P, k, c, products(A[3 * i : 3 * i + 3], old))
-    for i, k in enumerate(v):
+    for k in v:
         block = tuple(P[W * k + j] for j in v)
         for d, j in enumerate(v):
             P[W * k + j] = products(A[3 * d : 3 * d + 3], block)
@@ -1560,17 +1755,17 @@ def age_chains(x, P, coefficients):
     for states, g in STRUCTURE.chains:
         F = chain_matrix(coefficients, g, len(states))
         values = tuple(x[1 + k] for k in states)
-        for k, row in zip(states, F):
+        for k, row in zip(states, F, strict=True):
             x[1 + k] = products(row, values)
         for j in OTHERS[3:]:
             old = tuple(P[W * k + j] for k in states)
-            for k, row in zip(states, F):
+            for k, row in zip(states, F, strict=True):
                 P[W * k + j] = products(row, old)
     for states, g in STRUCTURE.chains:
         F = chain_matrix(coefficients, g, len(states))
         for j in OTHERS[3:]:
             old = tuple(P[W * j + k] for k in states)
-            for i, (k, row) in enumerate(zip(states, F)):
+            for i, (k, row) in enumerate(zip(states, F, strict=True)):
                 t = products(row, old)
                 if j in states:
                     d = states.index(j)

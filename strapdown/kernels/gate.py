@@ -20,6 +20,7 @@ from strapdown.kernels.filter import (
     bias_at,
     correct,
     innovation_covariance,
+    judge,
     keep_row,
     linearised,
     load,
@@ -96,6 +97,7 @@ OPEN = (
     "set_attitude",
     "start_candidate",
     "widen",
+    "judge",
     "keep_row",
 )
 """Functions of the instance of the filter; in this module those of six states."""
@@ -206,9 +208,12 @@ def update(state, e, now, measured, body, out):
     i = 0
     while i < running:
         passes = int(memory[PASSES]) if i == 0 else WIDE_PASSES
-        outcome, weight, innovation, variance, share = judged_update(form, i, e, measured, passes, options)
+        if passes == 1:
+            outcome, weight, innovation, variance, far = judge(form.shape[sensor], form, measured, e, options, 0.0)
+        else:
+            outcome, weight, innovation, variance, far = iterated_update(form, i, e, measured, passes, options)
         if i == 0:
-            lost = lost or not share >= 1.0 / MAX_PRECISION
+            lost = lost or far
             out.weight[place] = weight
             store_innovations(out.form.innovation, place, innovation, variance)
             lock_outs, start = judge_filter(
@@ -257,20 +262,19 @@ def finish(state, row, e, body):
 # ---------------------------------------------------------------------------------------------------------- one measurement, tested first
 
 
-def judged_update(form, i, e, measured, passes, options):
+def iterated_update(form, i, e, measured, passes, options):
     """Test a measurement with state i, and update if its NIS does not exceed the threshold and a direction is within 90° of the predicted.
 
-    If ``passes`` is above one, the update is relinearised at its own result, at most that number of times, while the correction exceeds
-    ``RELINEARIZED``. Rows are transformed to the tangent space of the prior, and the final covariance to that of the estimate
+    The update is relinearised at its own result, at most ``passes`` times, while the correction exceeds ``RELINEARIZED``. Rows are
+    transformed to the tangent space of the prior, and the final covariance to that of the estimate
     (:func:`strapdown.kernels.iterated_update.tangent_at`). If the result exceeds the threshold and the attitude is nearly unknown, the
     update is repeated from 120° to either side about the least certain axis.
 
-    If ``passes`` is above one, a heading is skipped while the tilt, on which its row depends, is unknown. The heading of a vertical vector
-    is undefined: it is always skipped, with an innovation of NaN.
+    A heading is skipped while the tilt, on which its row depends, is unknown; that of a vertical vector is undefined, with an innovation of
+    NaN.
 
-    Returns ``ACCEPTED``, ``REFUSED`` or ``PASSED_OVER``, the weight, and independent innovations (3,) with their variances (3,) under the
-    nominal noise, from the last linearisation or, without convergence, from the first. The last value is the smallest ratio of measurement
-    noise to innovation variance of an accepted measurement; its inverse is the loss of precision of the covariance.
+    Returns ``ACCEPTED``, ``REFUSED`` or ``PASSED_OVER``, the weight, independent innovations (3,) with their variances (3,) under the
+    nominal noise, from the last linearisation or, without convergence, from the first, and whether it was too precise for double precision.
     """
     place = measured.place[e]
     sensor = measured.sensor[e]
@@ -282,10 +286,8 @@ def judged_update(form, i, e, measured, passes, options):
     q = attitude_of(state)
     R = rotation_matrix(q)
     if kind == HEADING and not has_heading(R, z):
-        return PASSED_OVER, 0.0, (math.nan, 0.0, 0.0), (1.0, 1.0, 1.0), 1.0
-    A = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    if passes > 1:
-        A = attitude_covariance(form, i, state)
+        return PASSED_OVER, 0.0, (math.nan, 0.0, 0.0), (1.0, 1.0, 1.0), False
+    A = attitude_covariance(form, i, state)
     unknown = A[0] + A[3] + A[5] >= UNKNOWN
     tolerance = SETTLED if unknown else RELINEARIZED
     now_q = q
@@ -307,8 +309,6 @@ def judged_update(form, i, e, measured, passes, options):
         accepted = e1 * e1 * F[3] + e2 * e2 * F[4] + e3 * e3 * F[5] <= threshold
         if kind == DIRECTION and along < 0.0 and threshold < math.inf:
             accepted = False  # more than 90° from the predicted one, which the transverse rows cannot detect
-        if passes == 1:
-            break
         if done == 1 and trials == 0:
             first_e = (e1, e2, e3)
             first_F = F
@@ -334,25 +334,24 @@ def judged_update(form, i, e, measured, passes, options):
         relinearise(form, i, q, old_q, now_q, prior, fresh)
         done += 1
     weight = 0.0
-    share = 1.0
+    lost = False
     outcome = REFUSED
-    if kind == HEADING and passes > 1 and tilt_variance(R, A) > UNKNOWN_TILT:
+    if kind == HEADING and tilt_variance(R, A) > UNKNOWN_TILT:
         outcome = PASSED_OVER
     elif accepted:
         outcome = ACCEPTED
         weight = 1.0
-        share = min(F[3] * variance[0], F[4] * variance[1], F[5] * variance[2])
+        lost = min(F[3] * variance[0], F[4] * variance[1], F[5] * variance[2]) < 1.0 / MAX_PRECISION
         if options.robust > 0:
             parameter, numerator = options.parameters[degrees - 1, 0], options.parameters[degrees - 1, 1]
             weight = robust_weight(options.robust, parameter, numerator, options.iterations, S, innovation, variance)
         state, taken = correct(form, i, state, rows, innovation, scale(1.0 / weight, variance))
-        if passes > 1:
-            taken = add(prior, matrix_times_vector(M, taken))
-            state = turn_tangent(form, i, state, M)
-            A = attitude_covariance(form, i, state)
+        taken = add(prior, matrix_times_vector(M, taken))
+        state = turn_tangent(form, i, state, M)
+        A = attitude_covariance(form, i, state)
         new_q, G = moved(now_q, taken)
-        if passes > 1 and A[0] + A[3] + A[5] > KNOWN:
+        if A[0] + A[3] + A[5] > KNOWN:
             _, G = seen_from(taken, A)
         state = turn_tangent(form, i, state, G)
         save(form, i, set_attitude(form, i, state, new_q, q))
-    return outcome, weight, (e1, e2, e3), (1.0 / F[3], 1.0 / F[4], 1.0 / F[5]), share
+    return outcome, weight, (e1, e2, e3), (1.0 / F[3], 1.0 / F[4], 1.0 / F[5]), lost

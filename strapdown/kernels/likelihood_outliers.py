@@ -11,7 +11,7 @@ import math
 
 from strapdown.kernels.algebra import full, scale, subtract
 from strapdown.kernels.filter import LINES, PRIOR, ROWS, STEP, apply_step, clear_step, take_row, write
-from strapdown.kernels.lane_values import WIDTH, load, store
+from strapdown.kernels.lane_values import WIDTH, load
 from strapdown.kernels.likelihood import FOUND, WIDE, WORK, deviance_of, updated, variance_of
 from strapdown.kernels.measurement import KIND, VECTOR
 
@@ -108,10 +108,10 @@ def take(shape, body, measured, e, innovation, like):
     at = measured.place[e]
     for i in range(n * width):
         Q[i] = P[i]
-    wide_nis, wide_product, _ = taken(Q, work, rows, line, n, spread)
+    wide_nis, wide_product, _ = taken(Q, work, rows, line, n, spread, False)
     for i in range(n):
         work[line * PRIOR + i] = work[line * STEP + i]
-    nis, product, noise = taken(P, work, rows, line, n, 1.0)
+    nis, product, noise = taken(P, work, rows, line, n, 1.0, True)
     for r in range(rows):
         innovation[at, 2 * r] = work[line * (ROWS + r) + n]
         innovation[at, 2 * r + 1] = work[line * (ROWS + r) + n + 1]
@@ -129,10 +129,10 @@ def take(shape, body, measured, e, innovation, like):
     return False
 
 
-def taken(P, work, rows, line, n, factor):
+def taken(P, work, rows, line, n, factor, replaces):
     """Update P and the step with the rows in the work space, their variances times a factor; return NIS, determinant and noise ratios.
 
-    With a factor of 1 the residuals and variances in the work space become the innovations and theirs.
+    If ``replaces``, the residuals and variances in the work space become the innovations and theirs.
     """
     clear_step(work, 0.0)
     nis, product, noise = 0.0, 1.0, 0.0
@@ -141,6 +141,6 @@ def taken(P, work, rows, line, n, factor):
         variance = factor * work[place + 1]
         error, s = take_row(P, work, ROWS + r, work[place], variance, 0.0)
         nis, product, noise = nis + error * error / s, product * s, noise + variance / s
-        if factor == 1.0:
+        if replaces:
             work[place], work[place + 1] = error, s
     return nis, product, noise

@@ -17,7 +17,7 @@ import sys
 from collections.abc import Callable, Hashable
 from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -73,6 +73,9 @@ def _defined(name: str, value: FunctionType, function: FunctionType, parts: tupl
             return found
     if name in function.__globals__.get("REPLACEABLE", ()):
         return value
+    for module in parts:  # the default of another module
+        if name in vars(module).get("REPLACEABLE", ()):
+            return cast(FunctionType, getattr(module, name))
     names = ", ".join(module.__name__ for module in parts) or "nothing"
     raise TypeError(f"{function.__module__} leaves {name} open, and {names} does not define it")
 
@@ -154,8 +157,8 @@ def compiled(function: Callable[..., Any], *parts: ModuleType) -> Any:
     GIL, so records can be distributed over threads.
     """
     import numba
-    from numba.core.caching import FunctionCache
 
+    from strapdown.kernels.cache import KernelCache
     from strapdown.kernels.compiler import KernelCompiler
 
     if not isinstance(function, FunctionType) or not _is_kernel(function):
@@ -164,25 +167,19 @@ def compiled(function: Callable[..., Any], *parts: ModuleType) -> Any:
     # Built only if something is compiled: it takes a tenth of a warm `strapdown estimate`.
     twin = functools.partial(_twin, function, parts)
 
-    class KernelCache(FunctionCache):  # type: ignore[misc]
-        def _index_key(self, signature: Any, codegen: Any) -> Any:
-            names = tuple(module.__name__ for module in parts)
-            return (*super()._index_key(signature, codegen), names, sources_digest(parts))
-
+    class Cache(KernelCache):
         def load_overload(self, signature: Any, target: Any) -> Any:
-            # Not numba's own, which first imports everything that compilation might need, including SciPy's linear algebra.
-            found = None
-            with self._guard_against_spurious_io_errors():
-                found = self._load_overload(signature, target)
+            found = super().load_overload(signature, target)
             if found is None:
                 dispatcher._compiler.py_func = twin()
             return found
 
     options = {"pipeline_class": KernelCompiler, "no_cfunc_wrapper": True, **_options()}
     dispatcher = numba.njit(**options)(function)
+    key = (*(module.__name__ for module in parts), sources_digest(parts))
     try:
-        dispatcher._cache = KernelCache(function)
-    except RuntimeError:  # no writable directory for a cache: compile in every process
+        dispatcher._cache = Cache(function, sources_digest(), key)
+    except (RuntimeError, OSError):  # no writable directory for a cache: compile in every process
         dispatcher._compiler.py_func = twin()
     return dispatcher
 

@@ -127,8 +127,7 @@ def update(state, e, now, measured, body, out):
 
 def keep(state, row, e, body, out):
     """Write a row."""
-    q, b, A, B, C, segments, lost = state
-    keep_state(out, row, q, b, A, B, C)
+    keep_state(out, row, *state[:5])
     return state
 
 

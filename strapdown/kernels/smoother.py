@@ -116,7 +116,9 @@ def load_segment(segments, k, x, P, width):
     at = 5 + n + k * segments.shape[1]
     for i in range(n):
         for j in range(i, n, WIDTH):
-            store(P, width * i + j, load(segments, at + j - i))  # the excess is in the next row, which is written after it
+            store(
+                P, width * i + j, load(segments, at + j - i)
+            )  # the excess is in the next row, which is written after it
         at += n - i
 
 
@@ -168,7 +170,15 @@ def step_back(segments, k, models, space):
 
     A step back in time has the transition Φ⁻¹ and, for noise of negative variance, the process noise Q̄ = Φ⁻¹ Q Φ⁻ᵀ.
     """
-    x, predicted, after, P, Q, gain, work = space.x, space.predicted, space.after, space.P, space.Q, space.gain, space.work
+    x, predicted, after, P, Q, gain, work = (
+        space.x,
+        space.predicted,
+        space.after,
+        space.P,
+        space.Q,
+        space.gain,
+        space.work,
+    )
     later_x, later_P, error, coefficients = space.later_x, space.later_P, space.error, space.coefficients
     n, width, noisy = len(x) - 1, len(space.top) // 3, space.noisy
     load_segment(segments, k, x, P, width)

@@ -6,7 +6,7 @@ of one index. :func:`strapdown.estimation.model.structure` makes a structure fro
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,13 +18,13 @@ class GyroState(NamedTuple):
     """An error state c that enters the gyro, which measures ``(I + Σ c T) w + b + Σ c e + Σ c G R_fbᵀ f + n``."""
 
     state: int
-    offset: tuple
+    offset: tuple[Any, ...]
     """e (3)."""
     decay: int
     """Set of coefficients of a state with an offset e that decays or is driven; −1: constant."""
-    scale: tuple
+    scale: tuple[Any, ...]
     """T (9)."""
-    force: tuple
+    force: tuple[Any, ...]
     """G (9)."""
 
 
@@ -32,15 +32,15 @@ class SensorState(NamedTuple):
     """An error state c that enters a sensor, which measures ``(I + Σ c U) R_fbᵀ (r + Σ c d) + Σ c a + v``."""
 
     state: int
-    offset: tuple
+    offset: tuple[Any, ...]
     """a (3), body axes."""
     lever: bool
     """Whether the offset is W a instead, ``W = [ẇ] + [w]²``: the acceleration at lever arm a."""
-    fixed: tuple
+    fixed: tuple[Any, ...]
     """d (3), fixed axes."""
     carried: bool
     """Whether d rotates with corrections of the estimated attitude, so that the derivative by the attitude omits it."""
-    scale: tuple
+    scale: tuple[Any, ...]
     """U (9)."""
 
 
@@ -97,15 +97,15 @@ class Model(NamedTuple):
 class Measured(NamedTuple):
     """A measurement."""
 
-    z: tuple
+    z: tuple[Any, ...]
     """Measured vector over ``length`` (3), or the three variances of an attitude."""
-    frame: tuple
+    frame: tuple[Any, ...]
     """Right-handed frame about the reference by rows (9); of an attitude the measured quaternion first."""
-    noise: tuple
+    noise: tuple[Any, ...]
     """Covariance in body axes (6); only the first number, a variance, if it is isotropic."""
     length: float
     """Divisor of the effects of error states."""
-    turning: tuple
+    turning: tuple[Any, ...]
     """Measured rate, angular acceleration, and the latter's variances per axis (9), for lever arms."""
 
 
@@ -166,14 +166,40 @@ class Progress(NamedTuple):
 class Effects(NamedTuple):
     """Effects of the states on a sensor: of each state on the offset, and their sums."""
 
-    offsets: tuple
+    offsets: tuple[Any, ...]
     """Offset in body axes by each state."""
-    fixed_each: tuple
-    scales: tuple
-    offset: tuple
+    fixed_each: tuple[Any, ...]
+    scales: tuple[Any, ...]
+    offset: tuple[Any, ...]
     """Sum of the offsets in body axes."""
-    fixed: tuple
-    carried: tuple
+    fixed: tuple[Any, ...]
+    carried: tuple[Any, ...]
     """Sums of the constant and of the carried offsets in fixed axes."""
-    M: tuple
+    M: tuple[Any, ...]
     """Σ c U"""
+
+
+class Gains(NamedTuple):
+    """A measurement at a state, with up to three rows h of independent noise that are processed one after the other."""
+
+    gain: tuple[Any, ...]
+    """g of each row: P h, given the rows before it, over the root of its innovation's variance."""
+    steps: tuple[Any, ...]
+    """Innovation of each row over the same root."""
+    errors: tuple[Any, ...]
+    """Innovations, and their variances."""
+    variances: tuple[Any, ...]
+    reported: tuple[Any, ...]
+    """Innovations, NaN for the heading of a vertical vector."""
+    precise: Any
+    """Whether a row is too precise for the short form of the update."""
+    shares: tuple[Any, ...]
+    """Entries (10, 20, 21) of L in ``H P Hᵀ + R = L D Lᵀ``."""
+    noise: tuple[Any, ...]
+    """Variances of the rows, R, and their residuals."""
+    residuals: tuple[Any, ...]
+    angle: tuple[Any, ...]
+    """Squared sine and cosine of the angle between the measured and the predicted vector."""
+    valid: Any
+    """Whether it has information: not the heading of a vertical vector."""
+    nis: Any

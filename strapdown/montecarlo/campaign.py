@@ -27,7 +27,7 @@ from strapdown import scenarios
 from strapdown.checks import InputError, count, finite, one_of
 from strapdown.estimation import setup
 from strapdown.files import locked, reading, set_attributes, whole_hdf5
-from strapdown.montecarlo.engine import MACHINES, Chunks, Work, Workers, arithmetic, choose, in_threads
+from strapdown.montecarlo.engine import MACHINES, Chunks, Identity, Work, Workers, choose, identity, in_threads
 from strapdown.montecarlo.plan import Plan, from_table
 from strapdown.montecarlo.statistics import BINS, Statistics, merge
 from strapdown.records import CONVENTIONS, put
@@ -105,6 +105,8 @@ class Campaign(Listed):
         Statistics of the finished runs from the first without a gap; None if there are none.
     version : str, optional
         Version of this package that computed it. Default: the running one.
+    sources : str, default ""
+        Digest of the sources of this package that computed it; empty for earlier versions.
     arithmetic : str, default ""
         Processor features that the rounding depends on (:func:`strapdown.montecarlo.engine.arithmetic`); empty for earlier versions.
     seconds : float, default 0.0
@@ -118,6 +120,7 @@ class Campaign(Listed):
     runs: int
     statistics: Statistics | None
     version: str = strapdown.__version__
+    sources: str = ""
     arithmetic: str = ""
     seconds: float = 0.0
 
@@ -242,7 +245,7 @@ def run(
                 chunk=size,
                 runs=runs,
                 statistics=state.statistics,
-                arithmetic=arithmetic(),
+                **identity()._asdict(),
                 seconds=before + time.perf_counter() - begun,
             )
             _write(target, now, state, table)
@@ -283,16 +286,17 @@ def _compute(
 
 def _need_same(target: Path, held: Campaign, plan: Plan, machine: str, chunk: int, runs: int) -> None:
     """Raise if the file is of another plan, naming the first difference."""
-    names = ("machine", "chunk", "version", "arithmetic")
-    given = _flat(plan.to_table()) | dict(
-        zip(names, (machine, chunk, strapdown.__version__, arithmetic()), strict=True)
-    )
-    there = _flat(held.plan.to_table()) | {name: getattr(held, name) for name in names}
+    given = _flat(plan.to_table()) | {"machine": machine, "chunk": chunk, **identity()._asdict()}
+    there = _flat(held.plan.to_table()) | {
+        name: getattr(held, name) for name in ("machine", "chunk", *Identity._fields)
+    }
     for name in sorted(given.keys() | there.keys()):
         if given.get(name) != there.get(name):
+            of_code = name in ("version", "sources")
+            remedy = "continue it with the strapdown that began it" if of_code else "give the value in the file"
             raise InputError(
-                f"{target} is of another campaign; {name} is {there.get(name, 'not given')} there and {given.get(name, 'not given')} here; "
-                "give the value in the file, or choose another file"
+                f"{target} is of another campaign; {name} is {there.get(name) or 'not given'} there and {given.get(name) or 'not given'} "
+                f"here; {remedy}, or choose another file"
             )
     finished = 0 if held.statistics is None else held.statistics.runs
     if runs < finished:
@@ -359,6 +363,7 @@ def _write(path: Path, campaign: Campaign, state: _Progress, table: Mapping[str,
             "digest": plan.digest,
             "seed": plan.seed,
             "machine": campaign.machine,
+            "sources": campaign.sources,
             "arithmetic": campaign.arithmetic,
             "reason": campaign.reason,
             "precision": plan.precision,
@@ -455,6 +460,7 @@ def _stored(path: Path) -> tuple[Campaign, _Progress]:
             runs=count("runs", attributes["runs"]),
             statistics=_statistics_of(file["statistics"], plan) if "statistics" in file else None,
             version=str(attributes["version"]),
+            sources=str(attributes.get("sources", "")),
             arithmetic=str(attributes.get("arithmetic", "")),
             seconds=finite("seconds", attributes["seconds"], unit="s"),
         )

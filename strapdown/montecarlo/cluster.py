@@ -15,12 +15,14 @@ import contextlib
 import functools
 import pickle
 from collections.abc import Iterator
+from concurrent.futures import CancelledError
+from queue import Empty, SimpleQueue
 from typing import Any
 
 import strapdown
 from strapdown.checks import InputError, count
 from strapdown.files.extras import library
-from strapdown.montecarlo.engine import Chunks, Parts, Window, Work, Workers, arithmetic
+from strapdown.montecarlo.engine import Chunks, Identity, Parts, Window, Work, Workers, identity
 
 __all__ = [
     "dask_client",
@@ -28,6 +30,8 @@ __all__ = [
 ]
 
 CONNECT_SECONDS = 15
+WORKERS_SECONDS = 60
+"""Time without a finished chunk after which there must be a worker, and time that a scheduler has to get its first."""
 
 
 @contextlib.contextmanager
@@ -96,45 +100,63 @@ def on_dask(client: Any) -> Workers:
     Raises
     ------
     InputError
-        If the cluster has no workers, or another version of this package.
+        If the cluster has no workers, if a worker has other sources of this package, or if the scheduler is lost.
     """
     distributed = library("distributed", "a cluster of workers", "cluster")
 
     def work_through(work: Work, chunks: Chunks) -> Iterator[tuple[int, Parts]]:
         payload = distributed.protocol.pickle.dumps(work)  # the user's classes and functions are pickled by value
+        _need_workers(client, distributed)
         window = Window(len(chunks), 2 * max(1, sum(client.nthreads().values())))
         places: dict[Any, int] = {}
-        finished = distributed.as_completed(loop=client.loop)
+        finished: SimpleQueue[Any] = SimpleQueue()
         try:
             while window.open:
                 while (place := window.begin()) is not None:
-                    future = client.submit(_chunk, payload, *chunks[place], pure=False)
+                    future = client.submit(_chunk, payload, *chunks[place], identity(), pure=False)
                     places[future] = place
-                    finished.add(future)
-                future = next(finished)
+                    future.add_done_callback(finished.put)
+                try:
+                    future = finished.get(timeout=WORKERS_SECONDS)
+                except Empty:
+                    _need_workers(client, distributed)
+                    continue
                 place = places.pop(future)
-                version, features, parts = _result(distributed, future, chunks[place])
-                if version != strapdown.__version__:
-                    raise InputError(
-                        f"a worker has strapdown {version}, this process {strapdown.__version__}; install the same everywhere"
-                    )
-                if features != arithmetic():
-                    raise InputError(
-                        f"a worker computes on {features}, this process on {arithmetic()}, which round differently; use workers "
-                        "of one kind and start the campaign on such a machine"
-                    )
+                parts = _result(distributed, client, future, chunks[place])
                 window.finish(place)
                 yield place, parts
         finally:
-            client.cancel(list(places))
+            with contextlib.suppress(distributed.comm.CommClosedError):
+                client.cancel(list(places))
 
     return work_through
 
 
-def _result(distributed: Any, future: Any, chunk: tuple[int, int]) -> tuple[str, str, Parts]:
+def _need_workers(client: Any, distributed: Any) -> None:
+    """Wait for a worker; raise an error if none comes, or if the scheduler is gone."""
+    try:
+        client.wait_for_workers(1, timeout=WORKERS_SECONDS)
+    except TimeoutError:
+        address = client.scheduler.address
+        raise InputError(
+            f"the scheduler at {address} has no workers; start some, `dask worker {address}`, and begin or continue the campaign"
+        ) from None
+    except (OSError, ValueError, RuntimeError) as error:
+        raise _lost(client, error) from None
+
+
+def _lost(client: Any, error: object) -> InputError:
+    return InputError(
+        f"the scheduler at {client.scheduler.address} was lost ({error or type(error).__name__}); what was finished is kept: start it "
+        "again and continue the campaign"
+    )
+
+
+def _result(distributed: Any, client: Any, future: Any, chunk: tuple[int, int]) -> Parts:
+    """Return what a worker computed, if it is of the same identity."""
     runs = f"runs {chunk[0]} to {sum(chunk) - 1}"
     try:
-        result: tuple[str, str, Parts] = future.result()
+        there, parts = future.result()
     except distributed.KilledWorker:
         raise InputError(
             f"{runs} were lost because every worker that computed them died; check the workers' logs and memory"
@@ -143,12 +165,31 @@ def _result(distributed: Any, future: Any, chunk: tuple[int, int]) -> tuple[str,
         raise InputError(
             f"a worker cannot compute {runs} ({error}); install strapdown {strapdown.__version__} there"
         ) from None
-    return result
+    except (CancelledError, distributed.comm.CommClosedError) as error:
+        raise _lost(client, error) from None
+    here = identity()
+    if there.version != here.version:
+        raise InputError(
+            f"a worker has strapdown {there.version}, this process {here.version}; install the same everywhere"
+        )
+    if there.sources != here.sources:
+        raise InputError(
+            f"a worker has other sources of strapdown {here.version} (digest {there.sources}) than this process ({here.sources}); "
+            "install the same everywhere and restart the workers"
+        )
+    if there.arithmetic != here.arithmetic:
+        raise InputError(
+            f"a worker computes on {there.arithmetic}, this process on {here.arithmetic}, which round differently; use workers "
+            "of one kind and start the campaign on such a machine"
+        )
+    found: Parts = parts
+    return found
 
 
-def _chunk(payload: bytes, first_run: int, runs: int) -> tuple[str, str, Parts]:
-    """Compute a chunk on a worker; return it with the worker's version and arithmetic."""
-    return strapdown.__version__, arithmetic(), _work(payload)(first_run, runs)
+def _chunk(payload: bytes, first_run: int, runs: int, wanted: Identity) -> tuple[Identity, Parts]:
+    """Compute a chunk on a worker, if it is of the wanted identity; return it with the worker's."""
+    own = identity()
+    return own, _work(payload)(first_run, runs) if own == wanted else ()
 
 
 @functools.lru_cache(maxsize=4)

@@ -306,7 +306,7 @@ def own_summary(algorithm: coning.Algorithm) -> dict[str, Any]:
 def predicted_drift(motion: Coning, rate: float, algorithm: coning.Algorithm) -> float:
     """Return the theoretical drift, rad/s along the cone's axis.
 
-    Exact for one sample per step; otherwise the full power series of the part in β², which begins with ``−c_M β² ω λ^{2M}``, λ = ω/rate.
+    For one sample per step at any λ; otherwise the full power series of the part in β², which begins with ``−c_M β² ω λ^{2M}``, λ = ω/rate.
     The term in β⁴ of rotation-vector forms is neglected. NaN where the series does not apply, λ > 1.
     """
     ratio = 2.0 * np.pi * motion.frequency / rate

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import functools
+import hashlib
 import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from queue import SimpleQueue
 from threading import Thread
-from typing import Any
+from typing import Any, NamedTuple
 
+import strapdown
 from strapdown.checks import InputError, count, one_of
 from strapdown.estimation.setup import FilterSetup
 from strapdown.montecarlo import lanes, scalar
@@ -56,6 +60,38 @@ def choose(plan: Plan, machine: str = "auto") -> Choice:
     raise InputError(
         f"no machine covers this plan ({refusals}); use a simpler filter or scenario, or precision float64"
     )
+
+
+class Identity(NamedTuple):
+    """What the bits of a run depend on beside its plan; equal in all parts of a campaign."""
+
+    version: str
+    """Version of this package."""
+    sources: str
+    """Digest of its sources, which differ between two edits of one version."""
+    arithmetic: str
+    """See :func:`arithmetic`."""
+
+
+def identity() -> Identity:
+    """Return the identity of this process."""
+    return Identity(strapdown.__version__, sources(), arithmetic())
+
+
+FACES = ("cli", "plots", "report")
+"""Sub-packages that compute nothing."""
+
+
+@functools.cache
+def sources() -> str:
+    """Return a digest of the sources of this package, without :data:`FACES`."""
+    root = Path(strapdown.__file__).parent
+    digest = hashlib.sha256()
+    for path in sorted(root.rglob("*.py")):
+        name = path.relative_to(root)
+        if name.parts[0] not in FACES:
+            digest.update(f"{name.as_posix()}\n".encode() + path.read_bytes().replace(b"\r\n", b"\n"))
+    return digest.hexdigest()[:16]
 
 
 def arithmetic() -> str:

@@ -139,18 +139,31 @@ def run_chunk(plan: Plan, first_run: int, runs: int) -> Statistics:
 
 def run_chunks(plans: Sequence[Plan], first_run: int, runs: int) -> tuple[Statistics, ...]:
     """Return the statistics of several plans that differ only in the filter; each run is simulated once for all filters."""
+    one, end = plans[0], first_run + runs
     sums = [Sums(plan, runs) for plan in plans]
-    for run in range(first_run, first_run + runs):
-        record = record_of(plans[0], run)
+    at_once = max(_at_once(plan) for plan in plans)
+    for first in range(first_run, end, at_once):
+        numbers = range(first, min(first + at_once, end))
+        records = [record_of(one, run) for run in numbers]
         for part in sums:
-            part.add([run], [record])
+            part.add(numbers, records)
     return tuple(part.statistics for part in sums)
+
+
+def _at_once(plan: Plan) -> int:
+    """Return the number of runs filtered at once: more than one if all have the same times."""
+    spec = plan.scenario.gyro
+    losses = [getattr(getattr(one, "faults", None), "drop_probability", 0.0) for one in plan.scenario.sensors]
+    differ = any((spec.sampling_jitter, spec.timestamp_error, spec.drop_probability, *losses))
+    return 1 if differ else setup.runs_at_once(plan.setup)
 
 
 def _estimates(
     plan: Plan, records: Sequence[ImuRecord], initials: Sequence[estimation.State], every: int
 ) -> list[Estimate]:
     """Filter runs of a plan, and keep every ``every``-th state with its covariance."""
+    if _at_once(plan) > 1:
+        return setup.run_together(records, plan.setup, initials, every)
     pairs = zip(records, initials, strict=True)
     return [setup.run(record, plan.setup, initial, every=every, full_covariance=True) for record, initial in pairs]
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from strapdown.checks import Array, InputError
+from strapdown.checks import Array, InputError, numbers
 from strapdown.files import written_beside
 from strapdown.files.extras import library
 from strapdown.recordings import columns as naming
@@ -73,11 +73,10 @@ def from_table(
                 "(n, 3) of one length"
             )
 
-    def values(k: int) -> Array:
-        try:
-            return np.asarray(arrays[k], np.float64)
-        except (TypeError, ValueError):
-            raise InputError(f"{source}: column {names[k]} has {arrays[k].dtype}, not numbers") from None
+    def values(k: int, time: int) -> Array:
+        x = arrays[k]
+        converted = x.astype(np.float64) if x.dtype.kind == "b" or (k == time and x.dtype.kind in "mM") else x
+        return numbers(f"{source}: column {names[k]}", converted, allow_nan=True)
 
     def clock_ns(k: int) -> tuple[Array, int] | None:
         x = arrays[k]
@@ -93,7 +92,7 @@ def from_table(
     return naming.recording(
         source,
         names,
-        lambda places, _: {k: values(k) for k in places},
+        lambda places, time: {k: values(k, time) for k in places},
         clock_ns,
         units=units,
         mapping=columns,
@@ -115,7 +114,7 @@ def _columns(source: str, table: Any) -> dict[str, NDArray[np.generic]]:
         found |= {str(name): _plain(table[name]) for name in table.columns}
     else:
         for name, values in dict(table).items():
-            found |= _by_axis(str(name), np.asarray(values))
+            found |= _by_axis(str(name), _unmasked(values))
     if not found:
         raise InputError(f"{source} has no columns; give time, gx, gy, gz, …")
     return found
@@ -133,6 +132,16 @@ def _plain(series: Any) -> NDArray[np.generic]:
             )
         return np.asarray(series.to_numpy())
     return np.asarray(series)
+
+
+def _unmasked(values: Any) -> NDArray[np.generic]:
+    """Return an array with NaN, or NaT, in place of masked values."""
+    if not np.ma.is_masked(values):
+        return np.asarray(values)
+    dates = values.dtype.kind in "mM"
+    result = np.array(values.data if dates or values.dtype.kind == "c" else values.data.astype(np.float64))
+    result[np.ma.getmaskarray(values)] = np.array("NaT", result.dtype) if dates else np.nan
+    return result
 
 
 def _by_axis(name: str, values: NDArray[np.generic]) -> dict[str, NDArray[np.generic]]:

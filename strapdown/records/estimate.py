@@ -4,14 +4,24 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from strapdown import quaternion
-from strapdown.checks import Array, InputError, array, increasing, one_of, unit_quaternions
+from strapdown.checks import (
+    Array,
+    InputError,
+    array,
+    increasing,
+    instance,
+    numbers,
+    one_of,
+    symmetric,
+    unit_quaternions,
+)
 from strapdown.records import outputs
 from strapdown.records.recording import Recording
 from strapdown.results import Listed, Listing, figure
@@ -63,6 +73,9 @@ class Innovations:
         """Normalised innovation squared (m,), χ² with dof degrees of freedom if the filter is consistent."""
         return np.asarray(np.sum(self.innovation**2 / self.variance, axis=1))
 
+
+SINGLE_ROUNDING = 1e-6
+"""Asymmetry of a covariance, in units of σᵢσⱼ, that a filter in single precision may have."""
 
 EVENT_KINDS = ("recovery", "hypotheses", "lock-out", "gap")
 """Kinds of :class:`Event`."""
@@ -143,6 +156,27 @@ class ErrorStateEstimate:
     def sigma(self) -> Array:
         """Standard deviations (m, size)."""
         return np.sqrt(self.variance)
+
+
+def matrices(name: str, value: ArrayLike, m: int) -> Array:
+    """Return covariances (m, 3, 3) or (m, 6, 6) of attitude or attitude and bias; NaN at times without an estimate."""
+    P = numbers(name, value, allow_nan=True)
+    if P.shape not in ((m, 3, 3), (m, 6, 6)):
+        raise InputError(f"{name} has shape {P.shape}, wanted ({m}, 3, 3) or ({m}, 6, 6), a matrix for each time")
+    return symmetric(name, array(name, P, P.shape, allow_nan=True), SINGLE_ROUNDING)
+
+
+def _checked(sensor: str, given: Innovations) -> Innovations:
+    """Return innovations of another filter with their arrays checked."""
+    instance(f"innovations of {sensor}", given, Innovations, "give strapdown.records.Innovations")
+    time = array(f"{sensor}: time", given.time, ("m",))
+    return replace(
+        given,
+        time=time,
+        innovation=array(f"{sensor}: innovation", given.innovation, (len(time), "dof")),
+        variance=array(f"{sensor}: variance", given.variance, (len(time), "dof")),
+        weight=None if given.weight is None else array(f"{sensor}: weight", given.weight, (len(time),)),
+    )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -257,11 +291,7 @@ class Estimate(Listed):
         q = array("attitude", attitude, (m, 4), allow_nan=True)
         known = np.isfinite(q).all(axis=1)
         unit_quaternions("attitude", q[known])
-        P = np.asarray(covariance, np.float64)
-        if P.shape not in ((m, 3, 3), (m, 6, 6)):
-            raise InputError(
-                f"covariance has shape {P.shape}, wanted ({m}, 3, 3) or ({m}, 6, 6), a matrix for each time"
-            )
+        P = matrices("covariance", covariance, m)
         if bias is not None and P.shape[1] == 3:
             raise InputError("bias is given, but covariance is of the attitude only; give that of (δθ, δb), (m, 6, 6)")
         whole = np.full((m, 6, 6), np.nan)
@@ -273,7 +303,7 @@ class Estimate(Listed):
             bias=np.full((m, 3), np.nan) if bias is None else array("bias", bias, (m, 3), allow_nan=True),
             variance=np.diagonal(whole, axis1=1, axis2=2).copy(),
             covariance=whole,
-            innovations=dict(innovations or {}),
+            innovations={name: _checked(name, one) for name, one in (innovations or {}).items()},
         )
 
     @property
@@ -307,8 +337,10 @@ class Estimate(Listed):
                 f"true_values has {sorted(given)}, and the error states are {sorted(self.error_states)}; give each of them"
             )
         turn = quaternion.log(quaternion.multiply(quaternion.conjugate(self.attitude), true_attitude))
-        parts = [turn, np.asarray(true_bias) - self.bias]
-        parts += [np.asarray(given[name]) - states.values for name, states in self.error_states.items()]
+        parts = [turn, numbers("true_bias", true_bias, allow_nan=True) - self.bias]
+        parts += [
+            numbers(f"true_values: {name}", given[name]) - states.values for name, states in self.error_states.items()
+        ]
         return np.concatenate(parts, axis=-1)
 
     @property

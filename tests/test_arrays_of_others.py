@@ -1,0 +1,145 @@
+"""Arrays of other programs: what is masked, complex or asymmetric is never judged or filtered as if it were plain numbers."""
+
+import numpy as np
+import pytest
+
+import strapdown as sd
+from strapdown import consistency, quaternion, recordings, records
+from strapdown.checks import InputError
+
+N = 200
+DRAW = np.random.default_rng(5)
+TIME = np.arange(float(N))
+TRUE = quaternion.exp(np.cumsum(0.1 * DRAW.standard_normal((N, 3)), axis=0) % 2.0)
+BIAS = 1e-3 * DRAW.standard_normal((N, 3))
+P = np.tile(np.diag([1e-4] * 3 + [1e-8] * 3), (N, 1, 1))
+INNOVATIONS = {
+    "star": records.Innovations(time=TIME, innovation=DRAW.standard_normal((N, 2)), variance=np.ones((N, 2)))
+}
+GIVEN = {"time": TIME, "attitude": TRUE, "covariance": P, "bias": BIAS}
+PAIRS = {"attitude": TRUE, "bias": BIAS, "true_attitude": TRUE, "true_bias": BIAS}
+
+
+def estimate(**change):
+    return records.Estimate.from_arrays(**GIVEN | change)
+
+
+def checked(**change):
+    given = {**GIVEN, "true_time": TIME, "true_attitude": TRUE, "true_bias": BIAS} | change
+    return consistency.check_arrays(**given)
+
+
+def errors(**change):
+    return consistency.errors(**PAIRS | change)
+
+
+CALLS = [
+    *((estimate, name) for name in GIVEN),
+    *((checked, name) for name in (*GIVEN, "true_time", "true_attitude", "true_bias")),
+    *((errors, name) for name in PAIRS),
+]
+VALUES = {**GIVEN, **PAIRS, "true_time": TIME}
+
+
+def masked(value):
+    """Return an array whose values under the mask would change the result."""
+    hidden = np.ma.array(value, copy=True)
+    hidden[3] = np.ma.masked
+    hidden.data[3] = hidden.data[2]
+    return hidden
+
+
+@pytest.mark.parametrize(("call", "name"), CALLS, ids=lambda one: getattr(one, "__name__", one))
+def test_complex_arrays_are_refused_by_name(call, name):
+    with pytest.raises(InputError, match=rf"{name} is not an array of numbers \(it holds complex numbers\)"):
+        call(**{name: VALUES[name] + 1e-3j})
+
+
+MISSING = {
+    (estimate, "attitude"),
+    (estimate, "covariance"),
+    (estimate, "bias"),
+    (errors, "bias"),
+    (errors, "true_bias"),
+}
+"""Arrays with NaN at times without an estimate, or without a bias."""
+
+
+@pytest.mark.parametrize(("call", "name"), CALLS, ids=lambda one: getattr(one, "__name__", one))
+def test_masked_values_are_missing_or_refused_by_name(call, name):
+    value = masked(VALUES[name])
+    with_nan = np.array(VALUES[name])
+    with_nan[3] = np.nan
+    if (call, name) in MISSING:
+        result, expected = call(**{name: value}), call(**{name: with_nan})
+        if call is estimate:
+            result, expected = getattr(result, name), getattr(expected, name)
+        assert np.isnan(np.asarray(result)[3]).any()
+        np.testing.assert_array_equal(result, expected)
+    else:
+        with pytest.raises(InputError, match=rf"{name}(\[3.*\])? is (masked|nan)"):
+            call(**{name: value})
+
+
+@pytest.mark.parametrize("field", ["time", "innovation", "variance", "weight"])
+def test_masked_and_complex_innovations_are_refused(field):
+    whole = {**vars(INNOVATIONS["star"]), "weight": np.ones(N)}
+    for call in (estimate, checked):
+        for change, words in ((masked, "is masked"), (lambda value: value + 1e-3j, "complex numbers")):
+            with pytest.raises(InputError, match=rf"star: {field}.* {words}|star: {field} .*{words}"):
+                call(innovations={"star": records.Innovations(**whole | {field: change(whole[field])})})
+
+
+def table():
+    return {
+        "time": TIME / 100.0,
+        "gyro [rad/s]": 0.1 * DRAW.standard_normal((N, 3)),
+        "acc [m/s2]": [0.0, 0.0, 9.8] + 0.01 * DRAW.standard_normal((N, 3)),
+        "temperature": np.full(N, 20.0),
+    }
+
+
+@pytest.mark.parametrize("read", [sd.read, recordings.from_table])
+def test_masked_columns_are_missing_samples(read):
+    columns = table()
+    nan = {name: value.copy() for name, value in columns.items()}
+    for name in ("gyro [rad/s]", "acc [m/s2]", "temperature"):
+        columns[name] = masked(columns[name])
+        nan[name][3] = np.nan
+    found, expected = read(columns), read(nan)
+    for name in ("time", "rate", "specific_force", "temperature", "missing_gyro"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+    assert len(found.missing_gyro) == 1
+    assert len(read(table() | {"time": np.ma.array(TIME)}).time) == N  # nothing masked
+
+
+@pytest.mark.parametrize(
+    "change", [{"time": masked(TIME)}, {"time": masked(np.arange(N))}, {"time": masked(np.arange(N).astype("M8[s]"))}]
+)
+def test_a_masked_time_is_refused(change):
+    with pytest.raises(InputError, match=r"table: time.*\[3\] is (nan|not a date)"):
+        recordings.from_table(table() | change)
+
+
+@pytest.mark.parametrize("name", ["time", "gyro [rad/s]", "acc [m/s2]", "temperature"])
+def test_complex_columns_are_refused(name):
+    with pytest.raises(InputError, match=r"table: column .* is not an array of numbers \(it holds complex numbers\)"):
+        recordings.from_table(table() | {name: table()[name] + 1e-3j})
+
+
+# ---------------------------------------------------------------------------------------------------- asymmetric covariances
+
+
+@pytest.mark.parametrize(("i", "j"), [(0, 2), (1, 0), (0, 4), (5, 3)])
+def test_an_asymmetric_covariance_is_refused_with_its_place(i, j):
+    """Its Cholesky factor is of the lower triangle alone: the other is not judged."""
+    lopsided = P.copy()
+    sigma = np.sqrt(np.diagonal(P[7]))
+    lopsided[7, i, j] += 1e-3 * sigma[i] * sigma[j]
+    i, j = sorted((i, j))
+    for call in (estimate, checked):
+        with pytest.raises(InputError, match=rf"covariance\[7\] is not symmetric: \[{i}, {j}\] is .* use ½\(P \+ Pᵀ\)"):
+            call(covariance=lopsided)
+    rounded = P.astype(np.float32)
+    rounded[7, i, j] += np.float32(2e-7) * sigma[i] * sigma[j]
+    assert checked(covariance=rounded).judgement.verdict == checked().judgement.verdict
