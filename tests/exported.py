@@ -38,7 +38,7 @@ class Plain:
         helpers = {
             "square_root": math.sqrt,
             "chosen": lambda condition, a, b: a if condition else b,
-            "anywhere": bool,
+            "anywhere": self.turned_far,
         }
         self.kernels = body.Kernels(program.kernels, helpers, {})
         self.chosen, self.root, self.equal = helpers["chosen"], math.sqrt, lambda a, b: a == b
@@ -50,7 +50,11 @@ class Plain:
             coefficients=[0.0] * (16 * len(program.model.last)),
             dt=[0.0],
         )
-        self.status = 0
+        self.status, self.called, self.far_turns = 0, set(), 0
+
+    def turned_far(self, condition):
+        self.far_turns += bool(condition)
+        return bool(condition)
 
     def run(self, function, *arguments):
         try:
@@ -108,6 +112,7 @@ class Plain:
         return body.Scratch(self.step, k.LINE * k.STEP, self.program.n, {})
 
     def call(self, name, *arguments):
+        self.called.add(name)
         given = tuple(self.step if argument == "step" else argument for argument in arguments)
         getattr(body, name)(self, self.program, self.f, *given)
 
@@ -174,7 +179,9 @@ def samples(record, kinds):
         order += [(t, i, v) for t, v in zip(series.time.tolist(), values.tolist(), strict=True)]
     order.sort(key=lambda one: one[:2])
     k = 0
-    for edge, before, increment in zip(record.time[1:].tolist(), record.time.tolist(), record.increments.tolist(), strict=False):
+    for edge, before, increment in zip(
+        record.time[1:].tolist(), record.time.tolist(), record.increments.tolist(), strict=False
+    ):
         dt = edge - before
         rows.append((None, [x / dt for x in increment], dt))
         while k < len(order) and order[k][0] <= edge + 1e-9:

@@ -68,7 +68,9 @@ def members(program: Program) -> list[tuple[str, int, str]]:
     ]
     if program.n > 6:
         rows.append(("states", program.n - 6, "error states: " + ", ".join(program.state_names)))
-    rows.append(("P", program.size_of_P, "covariance of the errors of attitude, bias and states: upper triangle by rows"))
+    rows.append(
+        ("P", program.size_of_P, "covariance of the errors of attitude, bias and states: upper triangle by rows")
+    )
     rows.append(("nis", max(len(program.sensors), 1), "last normalised innovation squared of each sensor"))
     if program.structure.chains:
         rows.append(("coefficients", k.SET * len(program.model.last), "of the states that decay, for steps of dt"))
@@ -97,7 +99,9 @@ def header(program: Program, functions: list[Target], origin: str, *, single: bo
     out += ["#ifdef __cplusplus", 'extern "C" {', "#endif", ""]
     out += [f"typedef {'float' if single else 'double'} strapdown_real;", ""]
     out += [f"#define STRAPDOWN_STATES {program.n}", ""]
-    out.append("/* Status of a call, and flags in the filter's status, where they stay until strapdown_clear_status. */")
+    out.append(
+        "/* Status of a call, and flags in the filter's status, where they stay until strapdown_clear_status. */"
+    )
     out += [f"#define STRAPDOWN_{name} {bit}u /* {words} */" for name, (bit, words) in STATUS.items()]
     if program.sensors:
         out += ["", "/* Sensors, for strapdown_nis. */"]
@@ -177,7 +181,13 @@ def source(program: Program, functions: list[Target], origin: str, *, single: bo
     words = language(single=single)
     out = ["/*", wrapped(origin), " */", '#include "strapdown_filter.h"', "", "#include <math.h>", ""]
     for function in functions:
-        out += [f"/*\n{wrapped(function.words)}\n */", f"{signature(function)} {{", *Writer(function, words).lines, "}", ""]
+        out += [
+            f"/*\n{wrapped(function.words)}\n */",
+            f"{signature(function)} {{",
+            *Writer(function, words).lines,
+            "}",
+            "",
+        ]
     return "\n".join(out + accessors(program, single=single))
 
 

@@ -83,16 +83,22 @@ def _need_exportable(setup: FilterSetup) -> None:
         )
 
 
-def _series(
-    setup: FilterSetup, sensors: Sequence[VectorSensor | VectorMeasurements]
-) -> tuple[VectorMeasurements, ...]:
+def _series(setup: FilterSetup, sensors: Sequence[VectorSensor | VectorMeasurements]) -> tuple[VectorMeasurements, ...]:
     """Return one measurement of each sensor, with the σ of the setup."""
     if not sensors:
         raise InputError("there is no sensor; give the sensors, a record, or a scenario with sensors")
     for one in sensors:
         if isinstance(one, VectorMeasurements) and len(one.time):
-            for name, values in (("sigma", one.sigma), ("reference_f", one.reference_f), ("covariance", one.covariance)):
-                per_sample = values is not None and len(values) == len(one.time) and (name == "sigma" or values.ndim > 2 or name == "reference_f" and values.ndim == 2)
+            for name, values in (
+                ("sigma", one.sigma),
+                ("reference_f", one.reference_f),
+                ("covariance", one.covariance),
+            ):
+                per_sample = (
+                    values is not None
+                    and len(values) == len(one.time)
+                    and (name == "sigma" or values.ndim > 2 or name == "reference_f" and values.ndim == 2)
+                )
                 if per_sample and np.any(values != values[0]):
                     raise InputError(f"{one.sensor}: {name} varies from sample to sample; give one for all")
     series = [template(one, 0.0) for one in sensors]

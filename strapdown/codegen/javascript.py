@@ -45,7 +45,13 @@ def files(program: Program, origin: str) -> dict[str, str]:
         out.append(f"        {name}: {f'new Float64Array({size})' if size else '0'}, // {words}")
     out += ["        status: 0,", "    };", "}", ""]
     for function in traced(program):
-        out += [f"/*\n{wrapped(function.words)}\n */", f"{head(function)} {{", *Writer(function, LANGUAGE).lines, "}", ""]
+        out += [
+            f"/*\n{wrapped(function.words)}\n */",
+            f"{head(function)} {{",
+            *Writer(function, LANGUAGE).lines,
+            "}",
+            "",
+        ]
     places = ", ".join(map(str, diagonal(program.n)))
     biases = ", ".join(whole_bias(program, i, LANGUAGE) for i in range(3))
     out += [

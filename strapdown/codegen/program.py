@@ -196,26 +196,21 @@ def update(m: Any, program: Program, f: SimpleNamespace, sensor: Sensor, index: 
     k, s = m.kernels, sensor.shape
     z, frame = measured_values(m, sensor, value)
     measured = Measured(z, frame, sensor.noise, sensor.length, (0.0,) * 9)
-    innovation = m.scratch()
     m.comment("innovations and gains")
-    H, _, variances, angle, valid = k.rows_of(s, f.x, measured, program.model.numbers, 0.0)
-    p, gain, errors, precise = k.gains(s, f.x, f.P, None, measured, program.model.numbers, innovation, 0, 0.0)
-    m.unless(valid, lambda: m.leave("NO_HEADING"))
-    degrees = degrees_of_freedom(sensor.kind)
-    nis: Any = 0.0
+    g = k.gains(s, f.x, f.P, None, measured, program.model.numbers, None, 0.0)
+    m.unless(g.valid, lambda: m.leave("NO_HEADING"))
+    degrees, nis = degrees_of_freedom(sensor.kind), g.nis
     sound: Any = True
     lost: Any = False
-    for i in range(degrees):
-        e, S = errors[i] if i < len(errors) else innovation[0, 2 * i], innovation[0, 2 * i + 1]
-        nis = nis + e * e / S
+    for S, variance in zip(g.variances, g.noise, strict=True):
         sound = (S > 0.0) & sound
-        lost = lost | (S > program.max_precision * variances[i])
+        lost = lost | (S > program.max_precision * variance)
     m.unless(sound & (nis <= MAX_NIS), lambda: m.leave("BAD_INPUT"))
     f.nis[index] = nis
     if program.thresholds is not None:
         accepted = nis <= program.thresholds[degrees - 1]
         if sensor.kind == DIRECTION:
-            accepted = accepted & (angle[1] >= 0.0)
+            accepted = accepted & (g.angle[1] >= 0.0)
         m.unless(accepted, lambda: m.leave("REJECTED"))
     m.unless(m.no(lost), lambda: m.leave("TOO_PRECISE"))
 
@@ -231,9 +226,9 @@ def update(m: Any, program: Program, f: SimpleNamespace, sensor: Sensor, index: 
         m.call("apply_step", "step")
         m.leave("OK")
 
-    m.branch(precise, precisely)
+    m.branch(g.precise, precisely)
     m.comment("correction, covariance, and its transformation to the tangent space of the corrected attitude")
-    k.apply_gains(f.x, f.P, None, p, gain, errors, 0.0)
+    k.apply_gains(f.x, f.P, None, g.gain, g.steps, 0.0)
     m.leave("OK")
 
 

@@ -26,7 +26,9 @@ class Symbol:
         self.place = trace.place
 
     def __bool__(self) -> bool:
-        raise TypeError(f"a condition ({self.kind}) that is known only on the target; a kernel must use anywhere or chosen")
+        raise TypeError(
+            f"a condition ({self.kind}) that is known only on the target; a kernel must use anywhere or chosen"
+        )
 
     def __add__(self, other: Any) -> Any:
         return NotImplemented if isinstance(other, list) else self.trace.sum(self, other)
@@ -217,7 +219,9 @@ class Values:
         """Return copies of the known and of the changed elements."""
         return dict(self.known), dict(self.changed)
 
-    def merge(self, before: dict[Any, Any], select: Callable[[Any, Any], Any], true: dict[Any, Any], false: dict[Any, Any]) -> None:
+    def merge(
+        self, before: dict[Any, Any], select: Callable[[Any, Any], Any], true: dict[Any, Any], false: dict[Any, Any]
+    ) -> None:
         """Select between the elements that a function has changed for two outcomes."""
         self.known = dict(before)
         old = {i: self[i] for i in (*true, *false) if i in before or self.name is not None}

@@ -106,7 +106,9 @@ class Eight(list[Any]):
     """Eight numbers, which a kernel treats as one value."""
 
     def _with(self, other: Any, operation: Callable[[Any, Any], Any]) -> Eight:
-        return Eight([operation(a, b) for a, b in zip(self, other if isinstance(other, Eight) else [other] * 8, strict=True)])
+        return Eight(
+            [operation(a, b) for a, b in zip(self, other if isinstance(other, Eight) else [other] * 8, strict=True)]
+        )
 
     def __add__(self, other: Any) -> Any:
         return self._with(other, lambda a, b: a + b)
@@ -123,7 +125,12 @@ def traced(program: Program) -> list[Target]:
     """Return the functions of the filter, in an order in which each calls only those before it."""
 
     def function(
-        name: str, words: str, parameters: Sequence[tuple[str, int]], returns: str, formula: Callable[..., None], *more: Any
+        name: str,
+        words: str,
+        parameters: Sequence[tuple[str, int]],
+        returns: str,
+        formula: Callable[..., None],
+        *more: Any,
     ) -> Target:
         m = Target(program, name, parameters, returns=returns, words=words)
         formula(m, program, m.state, *more, *(m.argument(parameter) for parameter, _ in parameters))
@@ -133,10 +140,14 @@ def traced(program: Program) -> list[Target]:
     made = [turn_function(program)]
     if program.structure.chains:
         made.append(
-            function("prepare", "Coefficients of the states that decay, for steps of dt.", [("dt", 0)], "", body.prepare)
+            function(
+                "prepare", "Coefficients of the states that decay, for steps of dt.", [("dt", 0)], "", body.prepare
+            )
         )
     made += [
-        function("step", "Propagate over one step: delta is the rotation vector.", [("delta", 3), ("dt", 0)], "", body.step),
+        function(
+            "step", "Propagate over one step: delta is the rotation vector.", [("delta", 3), ("dt", 0)], "", body.step
+        ),
         row_function(program),
         correction_function(program),
         function(

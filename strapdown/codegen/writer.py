@@ -204,9 +204,7 @@ class Writer:
             self._user_here = set()
             for user in self.placement.alive:
                 if user not in groups and user.kind not in PINNED:
-                    self._user_here |= {
-                        x for x in user.operands if isinstance(x, Symbol) and places[x] is places[user]
-                    }
+                    self._user_here |= {x for x in user.operands if isinstance(x, Symbol) and places[x] is places[user]}
                 elif user in groups:
                     arms = groups[user].arms
                     assert arms is not None
