@@ -1,8 +1,8 @@
-"""Is the filter on the microcontroller the one that was tuned in Python?
+"""The filter on the microcontroller is the one that was tuned in Python.
 
-A filter is tuned on a simulated record of a hand-held unit, exported as C99, compiled, and run over the samples of another record, as is the
-filter of :func:`strapdown.estimate` on the same samples. The figure shows both errors with the filter's ±3σ and their difference, which is
-rounding in double precision; single precision is for a microcontroller.
+A filter is tuned on a simulated record of a hand-held unit, exported as C99, compiled, and run over the samples of another record, as is
+the filter of :func:`strapdown.estimate`. The figure shows both errors with the filter's ±3σ and their difference, which is rounding in double
+precision; single precision is for a microcontroller.
 
 Run it: ``python sims/export_filter.py``. It needs a C compiler.
 """
@@ -182,7 +182,7 @@ def draw(record: ImuRecord, estimate: Estimate, double: Exported, single: Export
         angle = quaternion.angle_between(estimate.attitude[1:], run.attitude) / unit
         bottom.plot(time, np.maximum(angle, 1e-17), label=f"C, {label}")
     bottom.set(xlabel="time, s", ylabel="difference from Python, °", yscale="log")
-    bottom.legend(ncols=2)
+    bottom.legend(ncols=2, loc="center right")
     return plots.save(figure, place)
 
 

@@ -26,7 +26,7 @@ def compiler():
     return gcc
 
 
-class Left(Exception):
+class LeftError(Exception):
     """A function of the filter has returned a status."""
 
 
@@ -45,7 +45,7 @@ class Plain:
         self.whole, self.scratch = math.floor, dict
         self.f = SimpleNamespace(
             x=[0.0] * (n + 1),
-            P=[0.0] * program.size_of_P,
+            P=[0.0] * program.number_of_covariances,
             nis=[0.0] * len(program.sensors),
             coefficients=[0.0] * (16 * len(program.model.last)),
             dt=[0.0],
@@ -59,7 +59,7 @@ class Plain:
     def run(self, function, *arguments):
         try:
             function(self, self.program, self.f, *arguments)
-        except Left as left:
+        except LeftError as left:
             bits = int(body.STATUS[str(left)][0])
             self.status |= bits
             return bits
@@ -104,7 +104,7 @@ class Plain:
         self.status = 0
 
     def leave(self, status):
-        raise Left(status)
+        raise LeftError(status)
 
     def work(self):
         k = self.kernels

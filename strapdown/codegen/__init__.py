@@ -9,8 +9,8 @@
 - ``writer``: A function as text.
 - ``c``, ``javascript``: The files.
 
-The formulas are those of :mod:`strapdown.kernels.filter`, executed on symbols instead of numbers. So the exported filter in double precision
-gives the same bits as these formulas in Python, if the compiler does not contract products and sums.
+The formulas are those of :mod:`strapdown.kernels.filter`, executed on symbols instead of numbers. So the exported filter in double
+precision gives the same bits as these formulas in Python, if the compiler does not contract products and sums.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ def export(
 ) -> tuple[Path, ...]:
     """Write a filter as source code that needs nothing else: C99 for a microcontroller, or JavaScript.
 
-    The filter predicts with each gyro sample and updates with each measurement, as :class:`strapdown.LiveFilter`. In C it has no heap and no
-    global variables, and needs only ``sqrt`` (with states that decay, ``expm1`` too).
+    The filter predicts with each gyro sample and updates with each measurement, as :class:`strapdown.LiveFilter`. In C it has no heap and
+    no global variables, and needs only ``sqrt`` (with states that decay, ``expm1`` too).
 
     Parameters
     ----------
@@ -118,12 +118,12 @@ def _sensors_of(sensors: Sensors | Scenario) -> Sequence[VectorSensor | VectorMe
 
 def _origin(setup: FilterSetup, precision: str) -> str:
     """Return what the files say of themselves."""
-    return f"""Attitude filter exported by strapdown {strapdown.__version__}, {precision} precision. Do not edit: export again.
-
-Multiplicative extended Kalman filter of attitude and gyro bias. Quaternions are Hamilton's, scalar first; q_fb takes vectors from body axes to \
-fixed axes, v_f = q_fb v_b q_fb*. Errors are those of the body side: q_true = q exp(error). SI units and radians. One filter is one struct; \
-nothing is allocated, and nothing is global. An invalid sample sets a flag and leaves the filter as it was.
-
-{c.SETUP}
-{to_toml(setup).strip()}
-"""
+    prose = (
+        f"Attitude filter exported by strapdown {strapdown.__version__}, {precision} precision. Do not edit: export again.",
+        "",
+        "Multiplicative extended Kalman filter of attitude and gyro bias. Quaternions are Hamilton's, scalar first; q_fb takes vectors "
+        "from body axes to fixed axes, v_f = q_fb v_b q_fb*. Errors are those of the body side: q_true = q exp(error). SI units and radians. "
+        "One filter is one struct; nothing is allocated, and nothing is global. An invalid sample sets a flag and leaves the filter as it was.",
+        "",
+    )
+    return "\n".join((*prose, c.SETUP, to_toml(setup).strip(), ""))

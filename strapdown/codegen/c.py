@@ -69,7 +69,11 @@ def members(program: Program) -> list[tuple[str, int, str]]:
     if program.n > 6:
         rows.append(("states", program.n - 6, "error states: " + ", ".join(program.state_names)))
     rows.append(
-        ("P", program.size_of_P, "covariance of the errors of attitude, bias and states: upper triangle by rows")
+        (
+            "P",
+            program.number_of_covariances,
+            "covariance of the errors of attitude, bias and states: upper triangle by rows",
+        )
     )
     rows.append(("nis", max(len(program.sensors), 1), "last normalised innovation squared of each sensor"))
     if program.structure.chains:

@@ -91,15 +91,10 @@ def _series(setup: FilterSetup, sensors: Sequence[VectorSensor | VectorMeasureme
         if isinstance(one, VectorMeasurements) and len(one.time):
             for name, values in (
                 ("sigma", one.sigma),
-                ("reference_f", one.reference_f),
-                ("covariance", one.covariance),
+                ("reference_f", one.references_f),
+                ("covariance", one.covariances),
             ):
-                per_sample = (
-                    values is not None
-                    and len(values) == len(one.time)
-                    and (name == "sigma" or values.ndim > 2 or name == "reference_f" and values.ndim == 2)
-                )
-                if per_sample and np.any(values != values[0]):
+                if np.any(values != values[0]):
                     raise InputError(f"{one.sensor}: {name} varies from sample to sample; give one for all")
     series = [template(one, 0.0) for one in sensors]
     record = ImuRecord(time=np.arange(2.0), increments=np.zeros((1, 3)), vectors=tuple(series))
@@ -142,12 +137,13 @@ def _sensor(series: VectorMeasurements, shape: int, *, isotropic: bool) -> Senso
 
 def _plain(model: Model) -> Model:
     """Return the numbers of a model as floats of Python, which a program keeps while it is traced."""
-    return model._replace(
-        numbers=tuple(model.numbers.tolist()),
-        decay=tuple(model.decay.tolist()),
-        last=tuple(model.last.tolist()),
-        chains=Table(model.chains.tolist()),
-    )
+    numbers: dict[str, Any] = {
+        "numbers": tuple(model.numbers.tolist()),
+        "decay": tuple(model.decay.tolist()),
+        "last": tuple(model.last.tolist()),
+        "chains": Table(model.chains.tolist()),
+    }
+    return model._replace(**numbers)
 
 
 class Table(list[Any]):

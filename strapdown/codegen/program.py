@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
+from strapdown.codegen.symbols import rebound
 from strapdown.kernels import filter as filter_kernels
 from strapdown.kernels import machine
 from strapdown.kernels.algebra import dot, scale
@@ -19,7 +20,6 @@ from strapdown.kernels.measurement import ATTITUDE, DIRECTION, VECTOR, degrees_o
 from strapdown.kernels.series import LARGEST_ANGLE, SQUARED_RANGE
 from strapdown.kernels.structure import Measured, Model, Structure
 from strapdown.kernels.walk import turn_squared
-from strapdown.codegen.symbols import rebound
 
 MAX_TURN = 100.0
 """Maximum rotation in one gyro sample, rad; it is divided into steps of a third of a radian."""
@@ -79,7 +79,7 @@ class Program:
     structure: Structure
     model: Model
     sensors: tuple[Sensor, ...]
-    thresholds: tuple[float, float, float] | None
+    thresholds: tuple[float, ...] | None
     """Maximum NIS for 1, 2, 3 degrees of freedom; None: no gate."""
     max_precision: float
     """Maximum ratio of an innovation's variance to the measurement's."""
@@ -101,7 +101,7 @@ class Program:
         return self.structure.n
 
     @property
-    def size_of_P(self) -> int:
+    def number_of_covariances(self) -> int:
         """Number of elements of the upper triangle of P."""
         return self.n * (self.n + 1) // 2
 
@@ -203,8 +203,8 @@ def update(m: Any, program: Program, f: SimpleNamespace, sensor: Sensor, index: 
     sound: Any = True
     lost: Any = False
     for S, variance in zip(g.variances, g.noise, strict=True):
-        sound = (S > 0.0) & sound
-        lost = lost | (S > program.max_precision * variance)
+        sound = sound & (S > 0.0)
+        lost = lost | (program.max_precision * variance < S)
     m.unless(sound & (nis <= MAX_NIS), lambda: m.leave("BAD_INPUT"))
     f.nis[index] = nis
     if program.thresholds is not None:

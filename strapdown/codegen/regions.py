@@ -92,7 +92,7 @@ class Placement:
     def _alive(self, body: Block) -> list[Symbol]:
         """Return the symbols that are needed, in order, and count their uses."""
         self.uses: dict[Symbol, int] = {}
-        waiting = []
+        waiting: list[Symbol] = []
         for block in blocks_of(body):
             for statement in block.statements:
                 waiting.extend(symbols_of(statement.values))
@@ -130,8 +130,8 @@ class Placement:
             for statement in block.statements:
                 for symbol in symbols_of(statement.values):
                     use(symbol, self.blocks[block])
-        for group in self.groups.values():
-            group.slot = group.arms = None
+        for known in self.groups.values():
+            known.slot = known.arms = None
         for symbol in reversed(self.alive):
             if symbol.kind in PINNED:
                 places[symbol] = self.blocks[symbol.place]

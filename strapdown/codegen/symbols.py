@@ -1,8 +1,8 @@
 """Symbols that trace formulas: executing a kernel on them records its operations, equal ones once.
 
-A number that is known while tracing stays a Python float, and zeros and ones vanish as they do in the kernels. A condition on symbols has no
-truth value: :func:`anywhere` has the function under :func:`fork` executed for both outcomes, and what differs between the two results becomes
-a selection, which :mod:`strapdown.codegen.regions` writes as an ``if``.
+A number that is known while tracing stays a Python float, and zeros and ones vanish as they do in the kernels. A condition on symbols has
+no truth value: :meth:`Trace.anywhere` has the function under :meth:`Trace.fork` executed for both outcomes, and what differs between the
+two results becomes a selection, which :mod:`strapdown.codegen.regions` writes as an ``if``.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ class Symbol:
     __ror__ = __or__
 
 
-class Undecided(Exception):
+class UndecidedError(Exception):
     """A condition with no known outcome, while a function under :func:`fork` is executed."""
 
     def __init__(self, condition: Symbol) -> None:
@@ -160,7 +160,7 @@ class Trace:
         if not isinstance(condition, Symbol):
             return bool(condition)
         if condition not in self.outcomes:
-            raise Undecided(condition)
+            raise UndecidedError(condition)
         return self.outcomes[condition]
 
     def fork(self, function: Callable[..., Any]) -> Callable[..., Any]:
@@ -170,7 +170,7 @@ class Trace:
             before = [array.copied() for array in self.arrays]
             try:
                 return function(*arguments)
-            except Undecided as undecided:
+            except UndecidedError as undecided:
                 condition = undecided.condition
             results, effects = [], []
             for outcome in (True, False):
@@ -227,7 +227,7 @@ class Values:
         old = {i: self[i] for i in (*true, *false) if i in before or self.name is not None}
         self.changed = {}
         for i in dict.fromkeys((*true, *false)):
-            if i in true and i in false or i in old:  # a scratch element of one outcome only is not read later
+            if (i in true and i in false) or i in old:  # a scratch element of one outcome only is not read later
                 self[i] = select(true.get(i, old.get(i)), false.get(i, old.get(i)))
 
     def forget(self) -> None:

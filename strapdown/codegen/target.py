@@ -38,7 +38,7 @@ class Target(Function):
         self.kernels = Kernels(program.kernels, helpers, dict.fromkeys(FORKED, trace.fork))
         self.chosen, self.root = trace.chosen, trace.square_root
         self.state = SimpleNamespace(
-            x=self.array(lambda i: name_of_state(i)),
+            x=self.array(name_of_state),
             P=self.array(lambda i: f"f->P[{i}]"),
             nis=self.array(lambda i: f"f->nis[{i}]"),
             coefficients=self.array(lambda i: f"f->coefficients[{i}]"),
@@ -214,7 +214,8 @@ def turn_function(program: Program) -> Target:
         words="Quaternion and Jacobian of a rotation vector of any size, by doubling.",
     )
     turn = m.array(lambda i: f"turn[{i}]")
-    q, J = rebound(far_turn, {"square_root": m.trace.square_root}, {})(tuple(m.argument(name) for name in "xyz"))
+    formula: Any = far_turn
+    q, J = rebound(formula, {"square_root": m.trace.square_root}, {})(tuple(m.argument(name) for name in "xyz"))
     for i, value in enumerate((*q, *J)):
         turn[i] = value
     m.flush()

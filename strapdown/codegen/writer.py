@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
@@ -159,10 +160,7 @@ class Writer:
             self.names[symbol] = symbol.operands[0]
             return
         text = self._expression(symbol)
-        if symbol.kind == "load":
-            name = self._new(symbol.operands[0].replace("f->", "").replace("[", "_").rstrip("]"))
-        else:
-            name = self._new("t")
+        name = self._new("t" if symbol.kind != "load" else re.sub(r"f->|\]", "", symbol.operands[0]).replace("[", "_"))
         self.names[symbol] = name
         word = self.language.condition if is_condition(symbol) else self.language.constant
         self.line(f"{word} {name} = {text};")
@@ -243,29 +241,24 @@ class Writer:
         return f"({text})" if text.startswith("-") else text
 
     def _expression(self, symbol: Symbol) -> str:
-        kind, operands = symbol.kind, symbol.operands
+        kind, operands, language = symbol.kind, symbol.operands, self.language
+        if kind in PRECEDENCE:
+            level = PRECEDENCE[kind]
+            pair = self._operand(operands[0], level, right=False), self._operand(operands[1], level, right=True)
+            left, right = (f"({x})" if kind == "||" and "&&" in x else x for x in pair)
+            return f"{left} {kind} {right}"
         if kind == "load":
             return self._member(operands[0])
         if kind == "item":
             return f"{self.names[operands[0]]}[{int(operands[1])}]"
-        if kind == "sqrt":
-            return f"{self.language.root}({self._operand(operands[0], 0, right=False)})"
-        if kind == "expm1":
-            return f"{self.language.expm1}({self._operand(operands[0], 0, right=False)})"
-        if kind == "neg":
-            return f"-{self._operand(operands[0], 6, right=True)}"
-        if kind == "not":
-            return f"!({self._operand(operands[0], 0, right=False)})"
-        if kind == "floor":
-            return self.language.whole(self._operand(operands[0], 0, right=False))
         if kind == "select":
             c, a, b = (self._operand(x, 5, right=True) for x in operands)
             return f"{c} ? {a} : {b}"
-        level = PRECEDENCE[kind]
-        left, right = self._operand(operands[0], level, right=False), self._operand(operands[1], level, right=True)
-        if kind == "||":
-            left, right = (f"({x})" if "&&" in x else x for x in (left, right))
-        return f"{left} {kind} {right}"
+        if kind == "neg":
+            return f"-{self._operand(operands[0], 6, right=True)}"
+        inner = self._operand(operands[0], 0, right=False)
+        functions = {"sqrt": f"{language.root}({inner})", "expm1": f"{language.expm1}({inner})", "not": f"!({inner})"}
+        return functions.get(kind) or language.whole(inner)
 
 
 def is_condition(symbol: Symbol) -> bool:
