@@ -1,7 +1,7 @@
 """The filter on the microcontroller is the one that was tuned in Python.
 
 A filter is tuned on a simulated record of a hand-held unit, exported as C99, compiled, and run over the samples of another record, as is
-the filter of :func:`strapdown.estimate`. The figure shows both errors with the filter's ±3σ and their difference, which is rounding in double
+the filter of :func:`strapdown.estimate`. The figure shows both errors with ±3σ and their difference, which is rounding in double
 precision; single precision is for a microcontroller.
 
 Run it: ``python sims/export_filter.py``. It needs a C compiler.

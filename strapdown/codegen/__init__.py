@@ -122,8 +122,9 @@ def _origin(setup: FilterSetup, precision: str) -> str:
         f"Attitude filter exported by strapdown {strapdown.__version__}, {precision} precision. Do not edit: export again.",
         "",
         "Multiplicative extended Kalman filter of attitude and gyro bias. Quaternions are Hamilton's, scalar first; q_fb takes vectors "
-        "from body axes to fixed axes, v_f = q_fb v_b q_fb*. Errors are those of the body side: q_true = q exp(error). SI units and radians. "
-        "One filter is one struct; nothing is allocated, and nothing is global. An invalid sample sets a flag and leaves the filter as it was.",
+        "from body axes to fixed axes, v_f = q_fb v_b q_fb*. Errors are those of the body side: q_true = q exp(error). SI units and "
+        "radians. One filter is one struct; nothing is allocated, and nothing is global. An invalid sample sets a flag and leaves the "
+        "filter as it was.",
         "",
     )
     return "\n".join((*prose, c.SETUP, to_toml(setup).strip(), ""))

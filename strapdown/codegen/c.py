@@ -199,7 +199,8 @@ def example(program: Program) -> str:
     """Return an example of the use."""
     calls = []
     for sensor in program.sensors:
-        value = "1.0, 0.0, 0.0, 0.0" if sensor.size == 4 else "0.0, 0.0, 1.0"
+        example_value = (1.0, 0.0, 0.0, 0.0) if sensor.size == 4 else tuple(sensor.length * x for x in sensor.frame[6:])
+        value = ", ".join(f"(strapdown_real){x:.6g}" for x in example_value)
         calls += [
             f"        const strapdown_real {sensor.name}[{sensor.size}] = {{{value}}}; /* read the sensor here */",
             f"        if (strapdown_update_{sensor.name}(&f, {sensor.name}) != STRAPDOWN_OK) {{",
