@@ -22,7 +22,7 @@ from strapdown import results
 
 NAMES = {
     *("FilterSetup", "Gate", "GyroSpec", "InputError", "LiveFilter", "ProcessNoise", "Robust", "Scenario"),
-    *("StepFilter", "VectorSensor", "allan_deviation", "check", "covariance_analysis", "estimate", "fit_noise"),
+    *("StepFilter", "VectorSensor", "allan_deviation", "check", "covariance_analysis", "estimate", "export", "fit_noise"),
     *("initial_state", "integrate", "monte_carlo", "read", "simulate", "smooth", "tune", "write"),
 }
 

@@ -117,7 +117,7 @@ def _sensors_of(sensors: Sensors | Scenario) -> Sequence[VectorSensor | VectorMe
 
 
 def _origin(setup: FilterSetup, precision: str) -> str:
-    """Return what the files say of themselves."""
+    """Return the comment at the top of the files: version, conventions, setup."""
     prose = (
         f"Attitude filter exported by strapdown {strapdown.__version__}, {precision} precision. Do not edit: export again.",
         "",
