@@ -1,5 +1,6 @@
 """Exported filters: C and JavaScript against the same formulas in plain Python, and against the compiled filter over records."""
 
+import ctypes
 import dataclasses
 import functools
 import subprocess
@@ -11,6 +12,9 @@ from exported import STRICT, Compiled, Plain, compiler, fed, fed_javascript, pro
 import strapdown as sd
 from strapdown import estimation, quaternion
 from strapdown.checks import InputError
+from strapdown.codegen import c
+from strapdown.codegen.functions import Function
+from strapdown.codegen.writer import Writer
 from strapdown.estimation import setup as setups
 from strapdown.estimation.setup import SensorStates, States
 
@@ -155,8 +159,6 @@ def test_the_cases_take_the_rare_branches():
 
 
 def sources(name):
-    from strapdown.codegen import c
-
     record, setup, _ = case(name)
     return c.files(program_of(setup, record.vectors), "test", single=False)
 
@@ -382,3 +384,52 @@ def test_refusals_of_arguments(tmp_path):
     growing = dataclasses.replace(series, sigma=np.linspace(0.01, 0.02, len(series.time)))
     with pytest.raises(InputError, match="sigma varies"):
         sd.export(setup, [growing], folder=tmp_path)
+
+
+def test_values_read_before_an_effect_are_those_before_it(tmp_path):
+    """A load may not move behind a call or a branch that changes the array, nor be remembered after it."""
+    m = Function("work", [("x", 0)])
+    P = m.array(lambda i: f"f->P[{i}]")
+    old = P[0]
+    m.call("double_all")
+    after = P[0]
+    x = m.argument("x")
+
+    def change():
+        P[0] = P[0] + 100.0
+
+    m.branch(x > 0.0, change)
+    P[1] = P[0]
+    P[2] = old
+    P[3] = after
+    m.flush()
+    text = "\n".join(
+        [
+            "typedef double strapdown_real; typedef struct { double P[4]; } strapdown_filter;",
+            "static void double_all(strapdown_filter *f) { for (int i = 0; i < 4; i++) f->P[i] *= 2.0; }",
+            "void work(strapdown_filter *f, double x) {",
+            *Writer(m, c.language(single=False)).lines,
+            "}",
+        ]
+    )
+    (tmp_path / "work.c").write_text(text, encoding="utf-8")
+    subprocess.run([compiler(), *STRICT, "-shared", "-fPIC", "work.c", "-o", "work.so"], cwd=tmp_path, check=True)
+    work = ctypes.CDLL(str(tmp_path / "work.so")).work
+    for x, expected in ((1.0, [106.0, 106.0, 3.0, 6.0]), (-1.0, [6.0, 6.0, 3.0, 6.0])):
+        numbers = (ctypes.c_double * 4)(3.0, 0.0, 0.0, 0.0)
+        work(numbers, ctypes.c_double(x))
+        assert list(numbers) == expected
+
+
+def test_a_covariance_that_is_not_a_number_does_not_reach_the_attitude(tmp_path):
+    """Memory of a microcontroller may be damaged; the attitude by the gyro alone goes on."""
+    record, setup, start = case("direction")
+    f = Compiled(program_of(setup, record.vectors), tmp_path)
+    f.init(list(start))
+    for i in range(21):
+        f.state.P[i] = np.nan
+    before = f.numbers[:7]
+    assert f.update(0, [0.6, 0.0, 0.8]) == 1
+    np.testing.assert_array_equal(f.numbers[:7], before)
+    assert f.predict([0.1, 0.0, 0.0], 0.02) == 0
+    assert np.isfinite(f.numbers[:7]).all()
