@@ -32,7 +32,6 @@ SHORTEST_SQUARED = 1e-24
 LONGEST_SQUARED = 1e24
 UNIT = 2e-6
 """A direction whose squared length differs from 1 by less than this is used as it is, as in :class:`strapdown.estimation.LiveFilter`."""
-MAX_NIS = 1e30
 
 STATUS = {
     "OK": ("0", "The sample was used."),
@@ -205,7 +204,7 @@ def update(m: Any, program: Program, f: SimpleNamespace, sensor: Sensor, index: 
     for S, variance in zip(g.variances, g.noise, strict=True):
         sound = sound & (S > 0.0)
         lost = lost | (program.max_precision * variance < S)
-    m.unless(sound & (nis <= MAX_NIS), lambda: m.leave("BAD_INPUT"))
+    m.unless(sound, lambda: m.leave("BAD_INPUT"))
     f.nis[index] = nis
     if program.thresholds is not None:
         accepted = nis <= program.thresholds[degrees - 1]
