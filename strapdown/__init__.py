@@ -7,8 +7,7 @@
 
 Tasks
     ``simulate``, ``read``, ``write``, ``estimate``, ``smooth``, ``integrate``, ``check``, ``tune``, ``monte_carlo``,
-    ``covariance_analysis``, ``allan_deviation``, ``fit_noise``, ``initial_state``,
-    ``export``
+    ``covariance_analysis``, ``allan_deviation``, ``fit_noise``, ``calibrate``, ``initial_state``, ``export``
 Classes
     ``Scenario``, ``GyroSpec``, ``VectorSensor``, ``FilterSetup``, ``ProcessNoise``, ``Gate``, ``Robust``; ``LiveFilter`` and
     ``StepFilter`` filter sample by sample, compiled and on filterpy. Every function raises ``InputError`` on bad input; the message names
@@ -41,6 +40,7 @@ if TYPE_CHECKING:
     from strapdown import (
         ahrs,
         allan,
+        calibration,
         coning,
         consistency,
         covariance,
@@ -59,6 +59,7 @@ if TYPE_CHECKING:
         units,
         vectors,
     )
+    from strapdown.calibration import calibrate
     from strapdown.checks import InputError
     from strapdown.codegen import export
     from strapdown.estimation import Gate, LiveFilter, ProcessNoise, Robust, StepFilter, initial_state
@@ -95,6 +96,8 @@ __all__ = [
     "ahrs",
     "allan",
     "allan_deviation",
+    "calibrate",
+    "calibration",
     "check",
     "coning",
     "consistency",
@@ -139,6 +142,7 @@ _HOMES = {
     "StepFilter": "estimation",
     "VectorSensor": "vectors",
     "allan_deviation": "workflows",
+    "calibrate": "calibration",
     "check": "workflows",
     "covariance_analysis": "workflows",
     "estimate": "workflows",

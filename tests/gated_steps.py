@@ -471,8 +471,8 @@ class GatedStepFilter(StepFilter):
         """Return a measurement's rows at an attitude (4,) and (b, c) (3 + m,), by the function of the kernels."""
         kernels = machine.instance(filter, STRUCTURE=model.structure)
         measured = structure.Measured(measurement.z, measurement.frame, (), measurement.length, (0.0,) * 9)
-        x, transverse = np.concatenate([attitude, others]), self.gate is not None or self.robust is not None
-        H, y, axes, (squared, along), _ = kernels.rows_and_axes(0, x, measured, model.numbers, 0.0, transverse)
+        x, iterated = np.concatenate([attitude, others]), self._passes > 1
+        H, y, axes, (squared, along), _ = kernels.rows_and_axes(0, x, measured, model.numbers, 0.0, iterated)
         y, basis, sine = np.array(y), np.array(axes), math.sqrt(squared)
         angle = math.atan2(sine, along)
         arc = 1.0 if sine < 1e-9 else angle / sine

@@ -22,8 +22,8 @@ from strapdown import results
 
 NAMES = {
     *("FilterSetup", "Gate", "GyroSpec", "InputError", "LiveFilter", "ProcessNoise", "Robust", "Scenario"),
-    *("StepFilter", "VectorSensor", "allan_deviation", "check", "covariance_analysis", "estimate", "export", "fit_noise"),
-    *("initial_state", "integrate", "monte_carlo", "read", "simulate", "smooth", "tune", "write"),
+    *("StepFilter", "VectorSensor", "allan_deviation", "calibrate", "check", "covariance_analysis", "estimate"),
+    *("export", "fit_noise", "initial_state", "integrate", "monte_carlo", "read", "simulate", "smooth", "tune", "write"),
 }
 
 
@@ -473,7 +473,7 @@ def test_dir_shows_the_names_and_the_public_submodules_alone():
 
 BELOW = ("ahrs.check_conventions", "allan.parameters", "allan.temperature", "estimation.error_states")
 BELOW += ("estimation.filters", "estimation.multiple_model", "gyro.datasheets", "montecarlo.campaign")
-BELOW += ("montecarlo.cluster", "motion.orbit", "recordings.unit_calibration", "records.outputs", "vectors.wahba")
+BELOW += ("montecarlo.cluster", "motion.orbit", "records.outputs", "vectors.wahba")
 """Public modules below the public submodules."""
 
 

@@ -55,7 +55,7 @@ OPTIONS = Gate(probability=1.0 - 1e-12)
 DECADES = [(exponent, gate) for exponent in range(-9, 4) for gate in (None, OPTIONS)]
 """Of σ over the prior's."""
 NAMES = [f"1e{exponent}-{'plain' if gate is None else 'options'}" for exponent, gate in DECADES]
-REFUSED = r"^a measurement is more than 1e\+08 times as precise as the state"
+REFUSED = r"^a measurement is more than 7e\+06 times as precise as the state"
 
 
 ROUNDING = 1e-15
@@ -72,7 +72,8 @@ def taken_or_refused(sigma, record, process, start, **options):
     try:
         estimate, end = estimation.run_part(record, process, start, full_covariance=True, **options)
     except InputError as error:
-        assert sigma < 1e-6 and re.match(REFUSED, str(error)), error
+        assert sigma < 1e-6, error  # noqa: PT017
+        assert re.match(REFUSED, str(error)), error  # noqa: PT017
         return None
     assert np.array_equal(np.diag(end.covariance)[:6], estimate.variance[-1])
     return estimate
@@ -209,8 +210,8 @@ def test_variances_are_those_in_sixty_digits(options, sensors, sigma, noise):
 
 
 def test_an_outage_that_makes_attitude_and_bias_one_leaves_the_covariance_definite():
-    """After 1e7 s the attitude's error is the bias's, to 1e-18 of its variance; a measurement then determines both."""
-    time = np.concatenate([[0.0, 1.0], 1e7 + np.arange(3.0)])
+    """After 1e4 s the attitude's error is the bias's, to 1e-12 of its variance; a measurement then determines both."""
+    time = np.concatenate([[0.0, 1.0], 1e4 + np.arange(3.0)])
     series = tuple(
         series_of(name, "direction", time[[0, 3]], np.tile(r, (2, 1)), r, 1e-3)
         for name, r in (("x", [1.0, 0.0, 0.0]), ("y", [0.0, 0.6, 0.8]))
@@ -224,7 +225,7 @@ def test_an_outage_that_makes_attitude_and_bias_one_leaves_the_covariance_defini
         for gate in (None, OPTIONS):
             estimate, _ = estimation.run_part(record, process, start, full_covariance=True, gate=gate)
             assert least_eigenvalue(estimate.covariance) > -ROUNDING
-            assert np.max(np.abs(estimate.variance / expected - 1.0)) < 1e-6
+            assert np.max(np.abs(estimate.variance / expected - 1.0)) < 1e-3
 
 
 @pytest.mark.parametrize("gate", [Gate(), Gate(probability=0.99, recovery=4)], ids=["usual", "eager"])
@@ -456,9 +457,9 @@ def test_single_precision_is_good_to_a_hundredth_of_a_sigma():
     assert np.max(np.abs(broken[at, :3] / right[at, :3] - 1.0)) > 0.1
 
 
-@pytest.mark.parametrize("sigma", [1e-7, 1e-6])
+@pytest.mark.parametrize("sigma", [3e-7, 1e-6])
 def test_the_smoother_takes_directions_much_sharper_than_its_start(sigma):
-    """Directions to a tenth of a microradian at a start known to a radian, and little noise."""
+    """Directions to a third of a microradian at a start known to a radian, and little noise."""
     record, truth = sharp_record(sigma, steps=30)
     for process in (NOISE, ProcessNoise(angle_random_walk=1e-12, rate_random_walk=1e-14)):
         start = initial_state(truth[0], attitude_sigma=1.0, bias_sigma=0.1)

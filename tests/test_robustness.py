@@ -14,8 +14,8 @@ from strapdown.estimation import gating
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.states import GateMemory, ProcessNoise, initial_state, restart_bias_variance
 from strapdown.gyro import GyroSpec
-from strapdown.kernels import gate_rules, machine, structure
 from strapdown.kernels import filter as filter_kernels
+from strapdown.kernels import gate_rules, machine, structure
 from strapdown.kernels.iterated_update import ACCEPTED, PASSED_OVER, REFUSED
 from strapdown.randomness import generator
 from strapdown.scenarios import Scenario, simulate

@@ -329,7 +329,9 @@ def _in_registers(problem: Problem, options: Options) -> Passed:
     )
     return Passed(
         estimate=estimate,
-        make_end=lambda: State(attitude=state[:4], bias=state[4:7], covariance=covariance_matrices(state[7:])),
+        make_end=lambda: State(
+            attitude=state[:4], bias=state[4:7], covariance=definite(covariance_matrices(state[7:]))
+        ),
         segments=segments[: number + 1],
     )
 
@@ -561,13 +563,14 @@ def _run(problem: Problem, options: Options) -> Passed:
 
 
 class TooPreciseError(InputError):
-    """A measurement is so much more precise than the state that a covariance in double precision keeps no digits."""
+    """A measurement is so much more precise than the state that a covariance in double precision has too few digits left."""
 
     def __init__(self) -> None:
         ratio = np.sqrt(structure.MAX_PRECISION)
         super().__init__(
-            f"a measurement is more than {ratio:.0e} times as precise as the state, and the covariance in double precision keeps no "
-            "digits; give the initial state a smaller sigma, or the measurement a larger one"
+            f"a measurement is more than {ratio:.0e} times as precise as the state, and its update would leave the covariance with no "
+            "digits left in double precision; give the initial state a smaller sigma, or the measurement a larger one. If both are right, "
+            "the filter has diverged before: the errors of the start are many times their sigmas"
         )
 
 
@@ -579,7 +582,16 @@ def whole_bias(model: Model, x: Array) -> Array:
 def covariance_at(body: structure.Body, i: int) -> Array:
     """Return the covariance (n, n) of state i."""
     n = body.x.shape[1] - 1
-    return np.array(body.P[i].reshape(n, -1)[:, :n])
+    return definite(np.array(body.P[i].reshape(n, -1)[:, :n]))
+
+
+def definite(P: Array) -> Array:
+    """Return a covariance; if rounding has made it indefinite, with smaller correlations."""
+    sigma = np.sqrt(np.diag(P))
+    least = float(np.linalg.eigvalsh(P / np.outer(sigma, sigma))[0])
+    if least > 0.0:
+        return P
+    return np.where(np.eye(len(P), dtype=bool), P, (1.0 - 4.0 * abs(least) - 1e-14) * P)
 
 
 def candidate_of(body: structure.Body, model: Model) -> Candidate:

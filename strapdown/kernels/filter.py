@@ -34,7 +34,7 @@ from strapdown.kernels.algebra import (
     transpose_times_vector,
 )
 from strapdown.kernels.chains import chain_start, chain_step
-from strapdown.kernels.filter_step import SHORT_FORM, chosen_parts, process_noise, transition
+from strapdown.kernels.filter_step import chosen_parts, process_noise, transition
 from strapdown.kernels.gate_rules import (
     FIRST_BIAS,
     count_widening,
@@ -104,6 +104,8 @@ LINES = 17
 RESIDUAL, VARIANCE = N, N + 1
 """Places in a line of the rows, after h."""
 
+SHORT_FORM = 30.0
+"""Maximum ratio of innovation variance to measurement variance for the short form of the update, which then loses one or two digits."""
 SERIES = tuple(1.0 / math.factorial(k) for k in range(16, 1, -1))
 """1/16! to 1/2!."""
 NODES = (0.5 - 0.5 * math.sqrt(0.6), 0.5, 0.5 + 0.5 * math.sqrt(0.6))

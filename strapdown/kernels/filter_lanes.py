@@ -11,11 +11,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from strapdown.kernels import structure
 from strapdown.kernels.algebra import combine, dot
 from strapdown.kernels.filter import advance, fill_coefficients, take
 from strapdown.kernels.lane_values import WIDTH, chosen, lanes_of, load_like, store
 from strapdown.kernels.series import SQUARED_RANGE
+from strapdown.kernels.structure import Body as Filter
 
 OPEN = ("advance", "fill_coefficients", "take")
 PATTERN = (0.0,) * WIDTH
@@ -25,7 +25,7 @@ PATTERN = (0.0,) * WIDTH
 class Body(NamedTuple):
     """The filters, and which runs are lost."""
 
-    filters: structure.Body
+    filters: Filter
     """Arrays whose last axis is that of the runs."""
     lost: np.ndarray
     """1 if the run is lost (``WIDTH``,)."""

@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from strapdown.kernels import structure
 from strapdown.kernels.algebra import add, factored, matrix_times_vector, scale, solved
 from strapdown.kernels.filter import (
     attitude_covariance,
@@ -75,6 +74,8 @@ from strapdown.kernels.measurement import (
 )
 from strapdown.kernels.rotation import moved, quaternion_multiply, rotation_matrix
 from strapdown.kernels.structure import MAX_PRECISION
+from strapdown.kernels.structure import Body as Filter
+from strapdown.kernels.structure import Outputs as FilterOutputs
 from strapdown.kernels.walk import step_within, turn_squared
 
 OPEN = (
@@ -137,7 +138,7 @@ class Restart(NamedTuple):
 class Body(NamedTuple):
     """A filter with its gate."""
 
-    form: structure.Body
+    form: Filter
     options: Options
     restart: Restart
     """Initial values of a candidate."""
@@ -150,7 +151,7 @@ class Body(NamedTuple):
 class Outputs(NamedTuple):
     """Outputs of a run in addition to those of the form."""
 
-    form: structure.Outputs
+    form: FilterOutputs
     weight: np.ndarray
     """Weight of each measurement (events,), by place; 0: refused."""
     recoveries: np.ndarray

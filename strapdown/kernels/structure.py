@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-MAX_PRECISION = 1e16
-"""Maximum ratio of an innovation's variance to the measurement's for which a covariance in double precision keeps any digit."""
+MAX_PRECISION = 5e13
+"""Maximum ratio of an innovation's variance to the measurement's: a covariance in double precision then keeps three digits."""
 
 
 class GyroState(NamedTuple):

@@ -2,9 +2,9 @@
 
 ``sensor_combined``: gyro rad/s and specific force m/s², in the body axes of the vehicle, forward, right, down (so at rest and level the
 specific force is (0, 0, −9.81)). In addition ``vehicle_magnetometer`` (Gauss; for old logs the field in ``sensor_combined``) is read at the
-nearest stamps, and as reference ``vehicle_attitude``, the vehicle's estimate, which PX4 gives from body to North-East-Down and which is
-transformed to East-North-Up here; its North is true North if the vehicle had a position. Body axes are unchanged. Numbers are single
-precision. The clock counts µs from the start of the machine.
+nearest stamps, and as reference ``vehicle_attitude_groundtruth`` of a simulator, else ``vehicle_attitude``, the vehicle's estimate. PX4
+gives them from body to North-East-Down, and they are transformed to East-North-Up here; its North is true North if the vehicle had a
+position. Body axes are unchanged. Numbers are single precision. The clock counts µs from the start of the machine.
 
 For a damaged or truncated log, the complete messages are read.
 """
@@ -15,6 +15,8 @@ import contextlib
 import io
 import os
 import struct
+import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +31,8 @@ from strapdown.records import outputs
 from strapdown.records.recording import Recording, at_nearest, field_in, interpolated, relative_time, with_gyro
 
 UNIT, FIELD, ATTITUDE = "sensor_combined", "vehicle_magnetometer", "vehicle_attitude"
+TRUTH = "vehicle_attitude_groundtruth"
+"""Attitude of a simulator, which is the reference if there is one."""
 NO_SAMPLE = 0x7FFFFFFF
 """``accelerometer_timestamp_relative`` if there is no new sample."""
 HEADER, TAIL = 16, 1 << 17
@@ -42,7 +46,7 @@ LATE = 0.5
 def read_ulog(path: str | os.PathLike[str], *, topic: str = "") -> Recording:
     """Read the inertial unit of a flight log."""
     file = Path(path)
-    log = opened(file, [UNIT, FIELD, ATTITUDE])
+    log = opened(file, [UNIT, FIELD, ATTITUDE, TRUTH])
     data = {one.name if one.multi_id == 0 else f"{one.name}:{one.multi_id}": one.data for one in log.data_list}
     units = [name for name in data if name.startswith(UNIT) and len(data[name]["timestamp"])]
     if not units:
@@ -80,26 +84,66 @@ def read_ulog(path: str | os.PathLike[str], *, topic: str = "") -> Recording:
         own["magnetic_field"] = field
     if "magnetic_field" in own:
         own["magnetic_unit"] = "G"
-    if ATTITUDE in data and len(data[ATTITUDE]["timestamp"]) > 1:
-        at, kept, words = in_order(ATTITUDE, data[ATTITUDE]["timestamp"])
-        ned = quaternion.normalize(columns(data[ATTITUDE], "q", 4)[kept])
+    reference = next((name for name in (TRUTH, ATTITUDE) if name in data and len(data[name]["timestamp"]) > 1), None)
+    if reference is not None:
+        at, kept, words = in_order(reference, data[reference]["timestamp"])
+        ned = quaternion.normalize(columns(data[reference], "q", 4)[kept])
         own["true_attitude"] = interpolated(time, (at * 1000 - epoch) / 1e9, outputs.to_ned(ned))
-        remarks += [f"Reference: {ATTITUDE}, the vehicle's estimate.", *words]
+        whose = "that of the simulator" if reference == TRUTH else "the vehicle's estimate"
+        remarks += [f"Reference: {reference}, {whose}.", *words]
     return with_gyro(
         source=file.name, time=time, rate=rate, specific_force=force, epoch_ns=epoch, remarks=tuple(remarks), **own
     )
 
 
+SECONDS, SECONDS_PER_MB = 2.0, 2.0
+"""Maximum time of the processor that the library may take for a log, more than ten times the usual: on damaged bytes it may go back and
+forth for ever."""
+LONGEST = 65535
+"""Maximum number of fields of a message, whose length is a number of 16 bits."""
+
+
+class _Content(io.BytesIO):
+    """The content of a log, with a limit on the time that its reading takes."""
+
+    def __init__(self, content: bytes) -> None:
+        super().__init__(content)
+        self._until = time.thread_time() + SECONDS + SECONDS_PER_MB * len(content) / 1e6
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        if time.thread_time() > self._until:
+            raise _TooLongError(f"the library does not come to an end at byte {self.tell()}")
+        return super().read(size)
+
+
+class _TooLongError(Exception):
+    """The library takes too long; it handles all usual exceptions as damage."""
+
+
 def opened(file: Path, topics: list[str]) -> Any:
     """Return a flight log with these topics, read by the library."""
     pyulog = library("pyulog", f"{file.name} is a flight log of PX4, which")
-    try:
-        with contextlib.redirect_stdout(io.StringIO()):  # the library prints its findings
-            return pyulog.ULog(str(file), topics)
-    except Exception as error:  # for a damaged log the library raises any exception of its parsers
+    content = reading.content(file)
+    with contextlib.redirect_stdout(io.StringIO()):  # the library prints its findings
+        definitions = pyulog.ULog(_Content(content), parse_header_only=True).message_formats
+        for name in definitions:
+            _need_fields(file, name, definitions, {})
+        return pyulog.ULog(_Content(content), topics)
+
+
+def _need_fields(file: Path, name: str, definitions: Mapping[str, Any], known: dict[str, int]) -> int:
+    """Return the number of fields of a message with its nested messages, which the library enumerates; reject too many."""
+    if name not in known:
+        known[name] = LONGEST + 1  # while it is counted: for one that contains itself
+        known[name] = sum(
+            max(1, size) * (_need_fields(file, kind, definitions, known) if kind in definitions else 1)
+            for kind, size, _ in definitions[name].fields
+        )
+    if known[name] > LONGEST:
         raise InputError(
-            f"{file.name} cannot be read as ULog ({' '.join(str(error).split())}); the log is damaged"
-        ) from None
+            f"{file.name} cannot be read: its message {name} has more than {LONGEST} fields; it is damaged"
+        )
+    return known[name]
 
 
 def _is_cut(file: Path) -> bool:
@@ -120,6 +164,8 @@ def _is_cut(file: Path) -> bool:
 
 def columns(rows: dict[str, Any], name: str, size: int) -> Array:
     """Return the elements of an array field, one row per message."""
+    if missing := [f"{name}[{k}]" for k in range(size) if f"{name}[{k}]" not in rows]:
+        raise InputError(f"a message has no field {missing[0]} (it has: {', '.join(rows)}); the log is damaged")
     return np.stack([np.asarray(rows[f"{name}[{k}]"], np.float64) for k in range(size)], axis=1)
 
 
