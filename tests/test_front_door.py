@@ -23,7 +23,18 @@ from strapdown import results
 NAMES = {
     *("FilterSetup", "Gate", "GyroSpec", "InputError", "LiveFilter", "ProcessNoise", "Robust", "Scenario"),
     *("StepFilter", "VectorSensor", "allan_deviation", "calibrate", "check", "covariance_analysis", "estimate"),
-    *("export", "fit_noise", "initial_state", "integrate", "monte_carlo", "read", "simulate", "smooth", "tune", "write"),
+    *(
+        "export",
+        "fit_noise",
+        "initial_state",
+        "integrate",
+        "monte_carlo",
+        "read",
+        "simulate",
+        "smooth",
+        "tune",
+        "write",
+    ),
 }
 
 
