@@ -1,6 +1,9 @@
 """Figures: what is drawn is what was given, with units, in both themes, and no extreme is lost."""
 
 import dataclasses
+import os
+import subprocess
+import sys
 import xml.etree.ElementTree
 from types import SimpleNamespace
 
@@ -596,3 +599,11 @@ def test_a_name_that_the_font_lacks_makes_no_noise(tmp_path, recwarn):
     ax.set_title("記録.h5")
     plots.save(figure, tmp_path / "x.png")
     assert not recwarn.list
+
+
+def test_a_backend_that_matplotlib_does_not_know_is_reported_in_one_line(tmp_path):
+    code = "from strapdown.checks import InputError\ntry:\n    import strapdown.plots\nexcept InputError as error:\n    print(error)"
+    environment = {**os.environ, "MPLBACKEND": "nonsense"}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("matplotlib cannot be loaded (Key backend: 'nonsense'")
+    assert "correct the environment variable MPLBACKEND" in done.stdout
