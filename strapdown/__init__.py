@@ -7,7 +7,7 @@
 
 Tasks
     ``simulate``, ``read``, ``read_attitudes``, ``write``, ``estimate``, ``smooth``, ``integrate``, ``check``, ``accuracy``, ``tune``,
-    ``monte_carlo``, ``covariance_analysis``, ``allan_deviation``, ``fit_noise``, ``calibrate``, ``initial_state``
+    ``monte_carlo``, ``covariance_analysis``, ``allan_deviation``, ``fit_noise``, ``calibrate``, ``export``, ``initial_state``
 Classes
     ``Scenario``, ``GyroSpec``, ``VectorSensor``, ``FilterSetup``, ``ProcessNoise``, ``Gate``, ``Robust``; ``LiveFilter`` and
     ``StepFilter`` filter sample by sample, compiled and on filterpy. Every function raises ``InputError`` on bad input; the message names
@@ -61,6 +61,7 @@ if TYPE_CHECKING:
     )
     from strapdown.calibration import calibrate
     from strapdown.checks import InputError
+    from strapdown.codegen import export
     from strapdown.estimation import Gate, LiveFilter, ProcessNoise, Robust, StepFilter, initial_state
     from strapdown.estimation.setup import FilterSetup
     from strapdown.gyro import GyroSpec
@@ -107,6 +108,7 @@ __all__ = [
     "covariance_analysis",
     "estimate",
     "estimation",
+    "export",
     "fit_noise",
     "gyro",
     "initial_state",
@@ -149,6 +151,7 @@ _HOMES = {
     "check": "workflows",
     "covariance_analysis": "workflows",
     "estimate": "workflows",
+    "export": "codegen",
     "fit_noise": "workflows",
     "initial_state": "estimation",
     "integrate": "workflows",

@@ -36,6 +36,7 @@ NAMES = {
         "initial_state",
         "integrate",
         "calibrate",
+        "export",
         "monte_carlo",
         "read",
         "read_attitudes",

@@ -52,6 +52,9 @@ COMMANDS: dict[str, dict[str, tuple[str, ...]]] = {
         "algorithms": ("integration",),
         "coning-budget": ("integration", "strapdown coning-budget --psd psd.csv --rate 200"),
     },
+    "On a microcontroller": {
+        "export": ("exporting", "strapdown export filter.toml satellite.toml --precision single --out firmware"),
+    },
     "This installation": {"info": ("installation",)},
 }
 """Commands by group: the module that registers each, and examples."""

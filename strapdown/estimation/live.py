@@ -103,7 +103,7 @@ class LiveFilter:
         check_arguments(gate=gate, robust=robust)
         self._time = finite("time", time, unit="s")
         self.look_back = non_negative("look_back", look_back, unit="s")
-        series = [_template(one, self._time) for one in sensors]
+        series = [template(one, self._time) for one in sensors]
         self._sensors = {one.sensor: _Sensor.of(one, place) for place, one in enumerate(series)}
         if len(self._sensors) < len(series):
             raise InputError(f"sensors has a name twice: {', '.join(one.sensor for one in series)}")
@@ -508,7 +508,7 @@ class _Sensor:
         return time, self.place, z, row
 
 
-def _template(sensor: VectorSensor | VectorMeasurements, time: float) -> VectorMeasurements:
+def template(sensor: VectorSensor | VectorMeasurements, time: float) -> VectorMeasurements:
     """Return one measurement of a sensor as declared."""
     if isinstance(sensor, VectorSensor):
         r = sensor.reference_f

@@ -1,0 +1,130 @@
+"""Export of a filter as source code for a microcontroller (C99) or a web page (JavaScript).
+
+- ``design``: The setup and its sensors as a program; refusals.
+- ``program``: The filter sample by sample, with checks, flags and a gate, around the formulas of the kernels.
+- ``symbols``: Tracing of formulas.
+- ``functions``: A function of the target: statements, branches, calls.
+- ``regions``: The block to which each operation belongs.
+- ``target``: All functions of a filter, traced.
+- ``writer``: A function as text.
+- ``c``, ``javascript``: The files.
+
+The formulas are those of :mod:`strapdown.kernels.filter`, executed on symbols instead of numbers. So the exported filter in double
+precision gives the same bits as these formulas in Python, if the compiler does not contract products and sums.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import strapdown
+from strapdown.checks import InputError, one_of
+from strapdown.codegen import c, design, javascript
+from strapdown.estimation.setup import FilterSetup, read_setup, to_toml
+from strapdown.files import usable_folder, written_beside
+from strapdown.records import ImuRecord
+from strapdown.vectors import VectorMeasurements, VectorSensor
+
+if TYPE_CHECKING:
+    from strapdown.scenarios import Scenario
+
+__all__ = ["export"]
+
+Sensors = ImuRecord | Sequence[VectorSensor | VectorMeasurements]
+
+
+def export(
+    setup: FilterSetup | str | os.PathLike[str],
+    sensors: Sensors | Scenario,
+    *,
+    folder: str | os.PathLike[str],
+    to: Literal["c", "js"] = "c",
+    precision: Literal["double", "single"] = "double",
+) -> tuple[Path, ...]:
+    """Write a filter as source code that needs nothing else: C99 for a microcontroller, or JavaScript.
+
+    The filter predicts with each gyro sample and updates with each measurement, as :class:`strapdown.LiveFilter`. In C it has no heap and
+    no global variables, and needs only ``sqrt`` (with states that decay, ``expm1`` too).
+
+    Parameters
+    ----------
+    setup : FilterSetup or path
+        Noise of the gyro, initial σ, σ of sensors, error states and gate; or a TOML file of them.
+    sensors : ImuRecord, Scenario or sequence of VectorSensor or VectorMeasurements
+        Sensors of the filter: their names, kinds, references and σ. Of a record or scenario all are exported.
+    folder : path
+        Folder of the files: ``strapdown_filter.h`` and ``.c``, ``main.c`` (an example) and ``CMakeLists.txt``; or
+        ``strapdown_filter.mjs``. Files of these names are replaced.
+    to : {"c", "js"}, default "c"
+        Language.
+    precision : {"double", "single"}, default "double"
+        Precision of all numbers; JavaScript has only double.
+
+    Returns
+    -------
+    tuple of Path
+        The files.
+
+    Raises
+    ------
+    InputError
+        If an argument is invalid, or the setup has what the exported filter has not: another estimator than the mekf, robust updates,
+        a gate with recovery, an integration algorithm of several samples, temperature, lever arms, noise that varies.
+
+    Examples
+    --------
+    >>> import strapdown as sd
+    >>> noise = sd.ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-6)
+    >>> up = sd.VectorSensor(name="accelerometer", reference_f=[0.0, 0.0, 1.0], sigma=0.02, rate=100.0)
+    >>> setup = sd.FilterSetup(process_noise=noise, bias_sigma=1e-3)
+    >>> sd.export(setup, [up], folder="firmware", precision="single")  # doctest: +SKIP
+    """
+    one_of("to", to, ("c", "js"))
+    one_of("precision", precision, ("double", "single"))
+    if to == "js" and precision == "single":
+        raise InputError("precision is 'single', but numbers in JavaScript are double; use 'double'")
+    if not isinstance(setup, FilterSetup):
+        setup = read_setup(setup)
+    usable_folder("folder", folder)
+    program = design.program_of(setup, _sensors_of(sensors), single=precision == "single")
+    origin = _origin(setup, precision)
+    made = c.files(program, origin, single=precision == "single") if to == "c" else javascript.files(program, origin)
+    paths = []
+    for name, text in made.items():
+        path = Path(folder) / name
+        with written_beside(path) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+        paths.append(path)
+    return tuple(paths)
+
+
+def _sensors_of(sensors: Sensors | Scenario) -> Sequence[VectorSensor | VectorMeasurements]:
+    """Return the sensors of a record, of a scenario, or those given."""
+    if isinstance(sensors, ImuRecord):
+        return sensors.vectors
+    if isinstance(sensors, VectorSensor | VectorMeasurements):
+        return [sensors]
+    if isinstance(sensors, Sequence):
+        return sensors
+    from strapdown.scenarios import Scenario, simulate
+
+    if isinstance(sensors, Scenario):
+        return simulate(sensors).vectors
+    raise InputError(f"sensors is {sensors!r}; give a record, a scenario, or a sequence of sensors")
+
+
+def _origin(setup: FilterSetup, precision: str) -> str:
+    """Return the comment at the top of the files: version, conventions, setup."""
+    prose = (
+        f"Attitude filter exported by strapdown {strapdown.__version__}, {precision} precision. Do not edit: export again.",
+        "",
+        "Multiplicative extended Kalman filter of attitude and gyro bias. Quaternions are Hamilton's, scalar first; q_fb takes vectors "
+        "from body axes to fixed axes, v_f = q_fb v_b q_fb*. Errors are those of the body side: q_true = q exp(error). SI units and "
+        "radians. One filter is one struct; nothing is allocated, and nothing is global. An invalid sample sets a flag and leaves the "
+        "filter as it was.",
+        "",
+    )
+    return "\n".join((*prose, c.SETUP, to_toml(setup).strip(), ""))

@@ -1,0 +1,165 @@
+"""A filter setup with its sensors as a program; what cannot be exported is refused with the reason."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from strapdown.checks import InputError
+from strapdown.codegen.c import identifier
+from strapdown.codegen.program import Program, Sensor
+from strapdown.estimation import forward, initial_state, temperature
+from strapdown.estimation import model as modelling
+from strapdown.estimation.live import template
+from strapdown.estimation.setup import FilterSetup
+from strapdown.estimation.setup.running import with_sigma
+from strapdown.kernels.measurement import KIND_CODES
+from strapdown.kernels.structure import MAX_PRECISION, Model
+from strapdown.records import ImuRecord
+from strapdown.units import ARCSECOND, DEGREE
+from strapdown.vectors import VectorMeasurements, VectorSensor, triad
+
+MAX_PRECISION_SINGLE = 1.0 / float(np.finfo(np.float32).eps)
+"""The same limit as :data:`strapdown.kernels.structure.MAX_PRECISION` in single precision."""
+
+
+def program_of(setup: FilterSetup, sensors: Sequence[VectorSensor | VectorMeasurements], *, single: bool) -> Program:
+    """Return the program of a setup for these sensors."""
+    _need_exportable(setup)
+    series = _series(setup, sensors)
+    kinds: Mapping[str, Any] = {one.sensor: one.kind for one in series}
+    error_states = () if setup.states is None else setup.states.blocks(kinds)
+    if temperature.slopes(error_states) is not None:
+        raise InputError("the setup has a bias driven by temperature, which predict does not receive; leave it out")
+    isotropic = not any(one.anisotropic for one in series)
+    model = modelling.assemble(error_states, kinds, isotropic=isotropic)
+    if model.levers.any() or model.varying:
+        raise InputError(
+            "the setup has a lever arm, or effects relative to a varying field magnitude, which need the whole record; leave them out"
+        )
+    noise = setup.process_noise
+    variances = noise.angle_random_walk**2, noise.rate_random_walk**2
+    numbers = forward.kernel_model(model, variances)
+    start = initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=setup.attitude_sigma, bias_sigma=setup.bias_sigma)
+    covariance = modelling.with_error_states(start, error_states).covariance
+    program = Program(
+        structure=model.structure,
+        model=_plain(numbers),
+        sensors=tuple(
+            _sensor(one, int(shape), isotropic=isotropic) for one, shape in zip(series, model.shape, strict=True)
+        ),
+        thresholds=None if setup.gate is None else tuple(float(x) for x in setup.gate.thresholds),
+        max_precision=MAX_PRECISION_SINGLE if single else MAX_PRECISION,
+        covariance=tuple(map(tuple, covariance.tolist())),
+        state_names=tuple(
+            f"{block.name} {component} ({unit})"
+            for block in error_states
+            for component, unit in zip(block.components, block.units, strict=True)
+        ),
+        offsets=tuple(tuple(float(x) for x in row) for row in model.offsets),
+    )
+    if single:
+        _need_single(setup, program)
+    return program
+
+
+def _need_exportable(setup: FilterSetup) -> None:
+    """Refuse what the exported filter does not have."""
+    if setup.estimator_name != "mekf":
+        raise InputError(f"the estimator is {setup.estimator_name}; only the mekf can be exported")
+    if setup.robust is not None:
+        raise InputError("robust updates iterate a weight, which the exported filter does not; use a gate, or none")
+    if setup.gate is not None and setup.gate.recovery is not None:
+        raise InputError(
+            "recovery of the gate runs a second filter beside the first, which the exported filter does not; give a gate with "
+            "recovery None, and start again by init when the status reports rejections in a row"
+        )
+    if setup.integration.samples != 1 or setup.integration.name != "one-sample":
+        raise InputError(
+            f"the integration is {setup.integration.name}, but predict takes one gyro sample at a time; use one-sample, or correct "
+            "the increments for coning before they are given to predict"
+        )
+
+
+def _series(setup: FilterSetup, sensors: Sequence[VectorSensor | VectorMeasurements]) -> tuple[VectorMeasurements, ...]:
+    """Return one measurement of each sensor, with the σ of the setup."""
+    if not sensors:
+        raise InputError("there is no sensor; give the sensors, a record, or a scenario with sensors")
+    for one in sensors:
+        if isinstance(one, VectorMeasurements) and len(one.time):
+            for name, values in (
+                ("sigma", one.sigma),
+                ("reference_f", one.references_f),
+                ("covariance", one.covariances),
+            ):
+                if np.any(values != values[0]):
+                    raise InputError(f"{one.sensor}: {name} varies from sample to sample; give one for all")
+    series = [template(one, 0.0) for one in sensors]
+    record = ImuRecord(time=np.arange(2.0), increments=np.zeros((1, 3)), vectors=tuple(series))
+    identifiers = [identifier(one.sensor) for one in record.vectors]
+    if len(set(identifiers)) < len(identifiers):
+        raise InputError(f"two sensors have the same name in code: {', '.join(identifiers)}; rename one")
+    return with_sigma(record, setup).vectors
+
+
+def _sensor(series: VectorMeasurements, shape: int, *, isotropic: bool) -> Sensor:
+    """Return a sensor with its numbers in the form of the kernels."""
+    reference, sigma = series.references_f[0], float(series.sigma[0])
+    if sigma == 0.0:
+        raise InputError(f"{series.sensor}: sigma is 0; give the noise of the sensor")
+    length = float(np.linalg.norm(reference)) if series.kind == "vector" else 1.0
+    covariance = series.covariances[0] / length**2
+    attitude = series.kind == "attitude"
+    scaled = sigma / length
+    noise = (scaled * scaled,) if isotropic else tuple(covariance[np.triu_indices(3)].tolist())
+    what = {
+        "direction": "a direction; its length is ignored",
+        "vector": "a whole vector, in the unit of its reference",
+        "heading": "a vector of which only the heading is used",
+        "attitude": "an attitude q_fb, scalar first",
+    }[series.kind]
+    place = "" if attitude else f" Reference in fixed axes: ({', '.join(f'{x:.6g}' for x in reference)})."
+    angle = f" = {sigma / DEGREE:.4g} deg" if sigma > 0.1 * DEGREE else f" = {sigma / ARCSECOND:.4g} arcsec"
+    unit = "" if series.kind == "vector" else f" rad{angle}"
+    return Sensor(
+        name=identifier(series.sensor),
+        kind=KIND_CODES[series.kind],
+        shape=shape,
+        frame=(0.0,) * 9 if attitude else tuple(triad(reference).ravel().tolist()),
+        length=length,
+        noise=noise,
+        variances=tuple(np.diag(covariance).tolist()),
+        words=f"Update with {series.sensor}: {what}, body axes.{place} sigma {sigma:.6g}{unit}.",
+    )
+
+
+def _plain(model: Model) -> Model:
+    """Return the numbers of a model as floats of Python, which a program keeps while it is traced."""
+    numbers: dict[str, Any] = {
+        "numbers": tuple(model.numbers.tolist()),
+        "decay": tuple(model.decay.tolist()),
+        "last": tuple(model.last.tolist()),
+        "chains": Table(model.chains.tolist()),
+    }
+    return model._replace(**numbers)
+
+
+class Table(list[Any]):
+    """Rows that are read by two indices, as those of an array."""
+
+    def __getitem__(self, place: Any) -> Any:
+        return super().__getitem__(place[0])[place[1]] if isinstance(place, tuple) else super().__getitem__(place)
+
+
+def _need_single(setup: FilterSetup, program: Program) -> None:
+    """Refuse sensors that are too precise for single precision."""
+    for sensor in program.sensors:
+        variance = min(sensor.variances)
+        ratio = (setup.attitude_sigma**2 + variance) / variance
+        if ratio > MAX_PRECISION_SINGLE:
+            raise InputError(
+                f"{sensor.name}: its sigma is {np.sqrt(ratio):.0f} times smaller than the initial attitude_sigma, and a covariance in "
+                "single precision keeps no digits; use double precision, or a smaller attitude_sigma"
+            )

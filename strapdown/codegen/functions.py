@@ -1,0 +1,148 @@
+"""A function of the target while it is traced: statements in blocks, among them branches, calls and returns."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from strapdown.codegen.symbols import Symbol, Trace, Values
+
+
+@dataclass(eq=False)
+class Block:
+    """Statements that are executed together."""
+
+    parent: Block | None = None
+    statements: list[Statement] = field(default_factory=list)
+
+
+@dataclass(eq=False)
+class Statement:
+    """A statement: what it is, the symbols that it needs, and blocks inside it."""
+
+    kind: str
+    """``"store"``, ``"if"``, ``"repeat"``, ``"call"``, ``"return"``, ``"comment"`` or ``"array"``."""
+    text: str = ""
+    """Name of the called function, of the status returned, of an array; or a comment."""
+    values: Sequence[Any] = ()
+    targets: Sequence[str] = ()
+    blocks: Sequence[Block] = ()
+    result: Symbol | None = None
+    number: int = 0
+    """Place in the order of symbols and statements."""
+
+
+class Function:
+    """A function of the target; its methods are those that :mod:`strapdown.codegen.program` asks of a machine."""
+
+    def __init__(self, name: str, parameters: Sequence[tuple[str, int]], *, returns: str = "") -> None:
+        self.name, self.parameters, self.returns = name, parameters, returns
+        self.trace = Trace()
+        self.body = self.block = self.trace.place = Block()
+        self.calls = 0
+
+    # ------------------------------------------------------------------------------------------------------------- arrays and parameters
+
+    def array(self, name: Callable[[int], str] | None = None) -> Values:
+        """Return an array; None: of elements that exist only while tracing."""
+        return Values(self.trace, name)
+
+    def argument(self, name: str) -> Any:
+        """Return a parameter: a symbol, or a tuple of them."""
+        size = dict(self.parameters)[name]
+        if size:
+            return tuple(self.trace.symbol("load", f"{name}[{i}]", name) for i in range(size))
+        return self.trace.symbol("parameter", name)
+
+    def local(self, name: str, size: int) -> Values:
+        """Return a local array, initially zero."""
+        self.add(Statement("array", name, values=(size,)))
+        return self.array(lambda i: f"{name}[{i}]")
+
+    # ------------------------------------------------------------------------------------------------------------------------ statements
+
+    def add(self, statement: Statement) -> None:
+        """Add a statement to the present block."""
+        statement.number = self.trace.count()
+        self.block.statements.append(statement)
+
+    def comment(self, text: str) -> None:
+        """Add a comment."""
+        self.add(Statement("comment", text))
+
+    def flush(self) -> None:
+        """Store the changed elements of all arrays."""
+        targets, values = [], []
+        for array in self.trace.arrays:
+            if array.name is not None:
+                for i in sorted(array.changed):
+                    targets.append(array.name(i))
+                    values.append(array.changed[i])
+                    array.loaded[i] = array.changed[i]
+                array.changed = {}
+        if targets:
+            self.add(Statement("store", targets=targets, values=values))
+
+    def inside(self, block: Block, body: Callable[[], None]) -> None:
+        """Trace a body into a block; what it knows of arrays is not known after it."""
+        before = [(*array.copied(), dict(array.loaded)) for array in self.trace.arrays]
+        outer = self.block
+        self.block = self.trace.place = block
+        body()
+        self.flush()
+        self.block = self.trace.place = outer
+        left = bool(block.statements) and block.statements[-1].kind == "return"
+        for array, state in zip(self.trace.arrays, before, strict=False):
+            empty: Any = ({}, {}, {})
+            array.known, array.changed, array.loaded = state if left or array.name is None else empty
+
+    def branch(self, condition: Any, then: Callable[[], None], otherwise: Callable[[], None] | None = None) -> None:
+        """Execute one of two bodies."""
+        if not isinstance(condition, Symbol):
+            body = then if condition else otherwise
+            if body is not None:
+                body()
+            return
+        self.flush()
+        blocks = [Block(self.block)]
+        if otherwise is not None:
+            blocks.append(Block(self.block))
+        self.add(Statement("if", values=(condition,), blocks=blocks))
+        for block, body in zip(blocks, (then, otherwise), strict=False):
+            assert body is not None
+            self.inside(block, body)
+
+    def unless(self, condition: Any, body: Callable[[], None]) -> None:
+        """Execute a body if a condition does not hold, also if it involves a NaN."""
+        if isinstance(condition, Symbol):
+            self.branch(self.trace.symbol("not", condition), body)
+        elif not condition:
+            body()
+
+    def repeat(self, count: Any, body: Callable[[], None]) -> None:
+        """Execute a body ``count`` times, rounded up."""
+        self.flush()
+        block = Block(self.block)
+        self.add(Statement("repeat", values=(count,), blocks=[block]))
+        self.inside(block, body)
+
+    def call(self, name: str, *arguments: Any, result: bool = False) -> Any:
+        """Call another function of the filter: symbols, tuples and local arrays are its arguments."""
+        self.flush()
+        self.calls += 1
+        value = self.trace.symbol("result", name, self.calls) if result else None
+        self.add(Statement("call", name, values=arguments, result=value))
+        for array in self.trace.arrays:
+            array.forget()
+        return value
+
+    def leave(self, status: str) -> None:
+        """Return a status."""
+        self.flush()
+        self.add(Statement("return", status))
+
+    def give(self, value: Any) -> None:
+        """Return a number."""
+        self.flush()
+        self.add(Statement("return", values=(value,)))

@@ -1,0 +1,71 @@
+"""The filter as an ES module."""
+
+from __future__ import annotations
+
+from strapdown.codegen.c import PUBLIC, constant_of, diagonal, members, whole_bias, wrapped
+from strapdown.codegen.program import STATUS, Program
+from strapdown.codegen.target import Target, traced
+from strapdown.codegen.writer import Language, Writer
+
+LANGUAGE = Language(
+    constant="const",
+    condition="const",
+    variable="let",
+    member=".",
+    number=repr,
+    root="Math.sqrt",
+    expm1="Math.expm1",
+    numbers=lambda texts: f"[{', '.join(texts)}]",
+    array=lambda name, size: f"const {name} = new Float64Array({size});",
+    status=lambda name: f"STATUS.{name}",
+    counter="let",
+    whole=lambda text: f"Math.floor({text})",
+)
+
+
+def head(function: Target) -> str:
+    """Return the head of a function."""
+    public = function.name in PUBLIC or function.name.startswith("update_")
+    parameters = [] if function.name == "far_turn" else ["f"]
+    parameters += [parameter for parameter, _ in function.parameters]
+    return f"{'export ' if public else ''}function {function.name}({', '.join(parameters)})"
+
+
+def files(program: Program, origin: str) -> dict[str, str]:
+    """Return the files of the filter by name."""
+    out = ["/*", wrapped(origin), " */", ""]
+    out.append("/** Status of a call, and flags in the filter's status. */")
+    out.append("export const STATUS = Object.freeze({")
+    out += [f"    {name}: {bit}, // {words}" for name, (bit, words) in STATUS.items()]
+    out += ["});", ""]
+    for i, sensor in enumerate(program.sensors):
+        out.append(f"export const {constant_of(sensor).removeprefix('STRAPDOWN_')} = {i};")
+    out += ["", "/** A filter; start it with init. */", "export function create() {", "    return {"]
+    for name, size, words in members(program):
+        out.append(f"        {name}: {f'new Float64Array({size})' if size else '0'}, // {words}")
+    out += ["        status: 0,", "    };", "}", ""]
+    for function in traced(program):
+        out += [
+            f"/*\n{wrapped(function.words)}\n */",
+            f"{head(function)} {{",
+            *Writer(function, LANGUAGE).lines,
+            "}",
+            "",
+        ]
+    places = ", ".join(map(str, diagonal(program.n)))
+    biases = ", ".join(whole_bias(program, i, LANGUAGE) for i in range(3))
+    out += [
+        "/** Attitude q_fb, scalar first. */",
+        "export const attitude = (f) => Array.from(f.attitude);",
+        "",
+        "/** Whole gyro bias, rad/s, body axes. */",
+        f"export const bias = (f) => [{biases}];",
+        "",
+        "/** Standard deviations of the errors: attitude (rad, body axes), bias (rad/s), error states. */",
+        f"export const sigma = (f) => [{places}].map((i) => Math.sqrt(f.P[i]));",
+        "",
+        "/** Last normalised innovation squared of a sensor. */",
+        "export const nis = (f, sensor) => f.nis[sensor];",
+        "",
+    ]
+    return {"strapdown_filter.mjs": "\n".join(out)}

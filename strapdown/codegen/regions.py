@@ -1,0 +1,181 @@
+"""Where each operation of a traced function belongs: in the innermost block, or arm of a selection, that contains all its uses."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+from strapdown.codegen.functions import Block, Function, Statement
+from strapdown.codegen.symbols import Symbol
+
+WORTH_A_BRANCH = 4
+"""Operations in the arms of a selection from which on it is written as ``if``."""
+PINNED = ("load", "result", "parameter")
+"""Kinds of symbols that stay in the block in which they were made."""
+
+
+@dataclass(eq=False)
+class Slot:
+    """A place for operations: a block, or an arm of a selection."""
+
+    parent: Slot | None
+    depth: int
+
+
+@dataclass(eq=False)
+class Group:
+    """Selections with the same condition, made one after the other, as one ``if``."""
+
+    members: list[Symbol] = field(default_factory=list)
+    slot: Slot | None = None
+    arms: tuple[Slot, Slot] | None = None
+
+
+def symbols_of(values: Iterable[Any]) -> Iterator[Symbol]:
+    """Return the symbols among values, and in tuples of them."""
+    for value in values:
+        if isinstance(value, Symbol):
+            yield value
+        elif isinstance(value, tuple):
+            yield from symbols_of(value)
+
+
+def operands_of(symbol: Symbol) -> Iterator[Symbol]:
+    """Return the symbols on which a symbol depends."""
+    if symbol.kind not in PINNED:
+        yield from symbols_of(symbol.operands)
+
+
+def blocks_of(block: Block) -> Iterator[Block]:
+    """Return a block and all inside it."""
+    yield block
+    for statement in block.statements:
+        for inner in statement.blocks:
+            yield from blocks_of(inner)
+
+
+def common(a: Slot, b: Slot) -> Slot:
+    """Return the innermost slot that contains both."""
+    while a is not b:
+        if a.depth >= b.depth:
+            assert a.parent is not None
+            a = a.parent
+        else:
+            assert b.parent is not None
+            b = b.parent
+    return a
+
+
+class Placement:
+    """Slots of all live symbols of a function, and the number of uses of each."""
+
+    def __init__(self, function: Function) -> None:
+        self.blocks: dict[Block, Slot] = {}
+        self._add_blocks(function.body, None)
+        self.alive = self._alive(function.body)
+        self.groups: dict[Symbol, Group] = {}
+        self._place(function.body)
+        sizes = self._sizes()
+        for symbol, group in list(self.groups.items()):
+            assert group.arms is not None
+            if sum(sizes.get(arm, 0) for arm in group.arms) < WORTH_A_BRANCH:
+                del self.groups[symbol]
+        self._place(function.body, keep=True)
+
+    def _add_blocks(self, block: Block, parent: Slot | None) -> None:
+        slot = self.blocks[block] = Slot(parent, 0 if parent is None else parent.depth + 1)
+        for statement in block.statements:
+            for inner in statement.blocks:
+                self._add_blocks(inner, slot)
+
+    def _alive(self, body: Block) -> list[Symbol]:
+        """Return the symbols that are needed, in order, and count their uses."""
+        self.uses: dict[Symbol, int] = {}
+        waiting: list[Symbol] = []
+        for block in blocks_of(body):
+            for statement in block.statements:
+                waiting.extend(symbols_of(statement.values))
+        for symbol in waiting:
+            self.uses[symbol] = self.uses.get(symbol, 0) + 2  # a root is never written into an expression
+        seen = set()
+        while waiting:
+            symbol = waiting.pop()
+            if symbol not in seen:
+                seen.add(symbol)
+                for operand in operands_of(symbol):
+                    self.uses[operand] = self.uses.get(operand, 0) + 1
+                    waiting.append(operand)
+        return sorted(seen, key=lambda symbol: symbol.number)
+
+    def _grouped(self) -> None:
+        """Group the live selections."""
+        groups: dict[tuple[Any, int], Group] = {}
+        for symbol in self.alive:
+            if symbol.kind == "select":
+                group = groups.setdefault((symbol.operands[0], symbol.run), Group())
+                group.members.append(symbol)
+                self.groups[symbol] = group
+
+    def _place(self, body: Block, *, keep: bool = False) -> None:
+        if not keep:
+            self._grouped()
+        places: dict[Symbol, Slot] = {}
+
+        def use(value: Any, slot: Slot) -> None:
+            if isinstance(value, Symbol):
+                places[value] = common(places[value], slot) if value in places else slot
+
+        for block in blocks_of(body):
+            for statement in block.statements:
+                for symbol in symbols_of(statement.values):
+                    use(symbol, self.blocks[block])
+        for known in self.groups.values():
+            known.slot = known.arms = None
+        for symbol in reversed(self.alive):
+            if symbol.kind in PINNED:
+                places[symbol] = self.blocks[symbol.place]
+                continue
+            group = self.groups.get(symbol)
+            if group is None:
+                for operand in operands_of(symbol):
+                    use(operand, places[symbol])
+                continue
+            if group.slot is None:
+                slot = places[symbol]
+                for member in group.members:
+                    slot = common(slot, places[member])
+                group.slot = slot
+                group.arms = Slot(slot, slot.depth + 1), Slot(slot, slot.depth + 1)
+            assert group.arms is not None
+            places[symbol] = group.slot
+            condition, a, b = symbol.operands
+            use(condition, group.slot)
+            use(a, group.arms[0])
+            use(b, group.arms[1])
+        self.places = places
+
+    def _sizes(self) -> dict[Slot, int]:
+        sizes: dict[Slot, int] = {}
+        for symbol in self.alive:
+            place = self.places[symbol]
+            sizes[place] = sizes.get(place, 0) + 1
+        return sizes
+
+    def needed(self, values: Iterable[Any], slot: Slot, written: set[Symbol]) -> list[Symbol]:
+        """Return the symbols of a slot that are needed for values and not yet written, in order."""
+        waiting, seen = list(symbols_of(values)), set()
+        while waiting:
+            symbol = waiting.pop()
+            if symbol not in seen and symbol not in written:
+                seen.add(symbol)
+                waiting.extend(operands_of(symbol))
+        return sorted((x for x in seen if self.places[x] is slot), key=lambda symbol: symbol.number)
+
+
+def values_in(statement: Statement) -> Iterator[Any]:
+    """Return the values that a statement and the blocks inside it need."""
+    yield from statement.values
+    for block in statement.blocks:
+        for inner in block.statements:
+            yield from values_in(inner)

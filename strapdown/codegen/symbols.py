@@ -1,0 +1,275 @@
+"""Symbols that trace formulas: executing a kernel on them records its operations, equal ones once.
+
+A number that is known while tracing stays a Python float, and zeros and ones vanish as they do in the kernels. A condition on symbols has
+no truth value: :meth:`Trace.anywhere` has the function under :meth:`Trace.fork` executed for both outcomes, and what differs between the
+two results becomes a selection, which :mod:`strapdown.codegen.regions` writes as an ``if``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from types import CodeType, FunctionType
+from typing import Any, NamedTuple
+
+KERNELS = "strapdown.kernels"
+
+
+class Symbol:
+    """Result of an operation: ``kind`` and operands, other symbols or numbers."""
+
+    __array_ufunc__ = None
+    """Operations with NumPy arrays are refused, not applied to each element."""
+
+    def __init__(self, trace: Trace, kind: str, operands: tuple[Any, ...], number: int, run: int) -> None:
+        self.trace, self.kind, self.operands, self.number, self.run = trace, kind, operands, number, run
+        self.place = trace.place
+
+    def __bool__(self) -> bool:
+        raise TypeError(
+            f"a condition ({self.kind}) that is known only on the target; a kernel must use anywhere or chosen"
+        )
+
+    def __add__(self, other: Any) -> Any:
+        return NotImplemented if isinstance(other, list) else self.trace.sum(self, other)
+
+    def __radd__(self, other: Any) -> Any:
+        return self.trace.sum(other, self)
+
+    def __sub__(self, other: Any) -> Any:
+        return self if other == 0 and not isinstance(other, Symbol) else self.trace.symbol("-", self, other)
+
+    def __rsub__(self, other: Any) -> Any:
+        return self.trace.symbol("-", other, self)
+
+    def __mul__(self, other: Any) -> Any:
+        return NotImplemented if isinstance(other, list) else self.trace.product(self, other)
+
+    def __rmul__(self, other: Any) -> Any:
+        return self.trace.product(other, self)
+
+    def __truediv__(self, other: Any) -> Any:
+        return self.trace.symbol("/", self, other)
+
+    def __rtruediv__(self, other: Any) -> Any:
+        return self.trace.symbol("/", other, self)
+
+    def __neg__(self) -> Any:
+        return self.trace.symbol("neg", self)
+
+    def __lt__(self, other: Any) -> Any:
+        return self.trace.symbol("<", self, other)
+
+    def __gt__(self, other: Any) -> Any:
+        return self.trace.symbol(">", self, other)
+
+    def __le__(self, other: Any) -> Any:
+        return self.trace.symbol("<=", self, other)
+
+    def __ge__(self, other: Any) -> Any:
+        return self.trace.symbol(">=", self, other)
+
+    def __and__(self, other: Any) -> Any:
+        return self.trace.condition("&&", self, other)
+
+    __rand__ = __and__
+
+    def __or__(self, other: Any) -> Any:
+        return self.trace.condition("||", self, other)
+
+    __ror__ = __or__
+
+
+class UndecidedError(Exception):
+    """A condition with no known outcome, while a function under :func:`fork` is executed."""
+
+    def __init__(self, condition: Symbol) -> None:
+        super().__init__(condition.kind)
+        self.condition = condition
+
+
+class Trace:
+    """The operations of a function of the target, in order."""
+
+    def __init__(self) -> None:
+        self.symbols: dict[tuple[Any, ...], Symbol] = {}
+        self.number = 0
+        self.run = 0
+        self.group: tuple[Any, ...] = ()
+        self.outcomes: dict[Symbol, bool] = {}
+        self.arrays: list[Values] = []
+        self.place: Any = None
+        """Block of the function in which symbols are made at present."""
+
+    def count(self) -> int:
+        """Return the next number in the order of symbols and statements."""
+        self.number += 1
+        return self.number
+
+    def symbol(self, kind: str, *operands: Any) -> Symbol:
+        """Return the symbol of an operation."""
+        operands = tuple(float(x) if isinstance(x, int) and not isinstance(x, bool) else x for x in operands)
+        key = (kind, *operands)
+        known = self.symbols.get(key)
+        if known is None:
+            group = (operands[0],) if kind == "select" else ()
+            members = any(isinstance(x, Symbol) and x.kind == "select" and x.run == self.run for x in operands)
+            if group != self.group or not group or members:
+                self.run, self.group = self.run + 1, group
+            known = self.symbols[key] = Symbol(self, kind, operands, self.count(), self.run)
+        return known
+
+    def sum(self, a: Any, b: Any) -> Any:
+        """Return a + b."""
+        if not isinstance(a, Symbol) and a == 0:
+            return b
+        return a if not isinstance(b, Symbol) and b == 0 else self.symbol("+", a, b)
+
+    def product(self, a: Any, b: Any) -> Any:
+        """Return a b."""
+        for x, y in ((a, b), (b, a)):
+            if not isinstance(x, Symbol) and x in (0, 1, -1):
+                return 0.0 if x == 0 else y if x == 1 else -y
+        return self.symbol("*", a, b)
+
+    def condition(self, kind: str, a: Any, b: Any) -> Any:
+        """Return a and b, or a or b."""
+        for x, y in ((a, b), (b, a)):
+            if isinstance(x, bool):
+                return y if x == (kind == "&&") else x
+        return self.symbol(kind, a, b)
+
+    # ------------------------------------------------------------------------------------ the functions that kernels leave to the machine
+
+    def square_root(self, x: Any) -> Any:
+        """Return √x."""
+        return self.symbol("sqrt", x) if isinstance(x, Symbol) else math.sqrt(x)
+
+    def chosen(self, condition: Any, a: Any, b: Any) -> Any:
+        """Return a where the condition holds, else b."""
+        if isinstance(condition, Symbol) and condition in self.outcomes:
+            condition = self.outcomes[condition]
+        if not isinstance(condition, Symbol):
+            return a if condition else b
+        if a is b or (not isinstance(a, Symbol) and not isinstance(b, Symbol) and a == b):
+            return a
+        return self.symbol("select", condition, a, b)
+
+    def anywhere(self, condition: Any) -> bool:
+        """Return the outcome of a condition under :meth:`fork`."""
+        if not isinstance(condition, Symbol):
+            return bool(condition)
+        if condition not in self.outcomes:
+            raise UndecidedError(condition)
+        return self.outcomes[condition]
+
+    def fork(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        """Return a function that is executed for both outcomes of each condition, with its results and its effects on arrays selected."""
+
+        def both(*arguments: Any) -> Any:
+            before = [array.copied() for array in self.arrays]
+            try:
+                return function(*arguments)
+            except UndecidedError as undecided:
+                condition = undecided.condition
+            results, effects = [], []
+            for outcome in (True, False):
+                for array, (known, changed) in zip(self.arrays, before, strict=False):
+                    array.known, array.changed = dict(known), dict(changed)
+                self.outcomes[condition] = outcome
+                results.append(both(*arguments))
+                del self.outcomes[condition]
+                effects.append([array.copied() for array in self.arrays])
+            for array, (known, _), (_, true), (_, false) in zip(self.arrays, before, *effects, strict=False):
+                array.merge(known, lambda a, b: self.chosen(condition, a, b), true, false)
+            return tuple(self.chosen(condition, a, b) for a, b in zip(*results, strict=True))
+
+        return both
+
+
+class Values:
+    """An array of the target: each element is loaded when it is first read, and stored by the function that changed it.
+
+    ``name`` maps an index to the place on the target; None: the elements exist only while tracing.
+    """
+
+    def __init__(self, trace: Trace, name: Callable[[int], str] | None = None) -> None:
+        self.trace, self.name = trace, name
+        self.known: dict[Any, Any] = {}
+        self.changed: dict[Any, Any] = {}
+        self.loaded: dict[Any, Any] = {}
+        """Elements as they are on the target, which :meth:`Trace.fork` does not reset."""
+        self.loads = 0
+        trace.arrays.append(self)
+
+    def __getitem__(self, i: Any) -> Any:
+        if i not in self.known:
+            if self.name is None:
+                raise KeyError(f"element {i} is read before it is written")
+            if i not in self.loaded:
+                self.loads += 1
+                self.loaded[i] = self.trace.symbol("load", self.name(i), Version((id(self), self.loads)))
+            self.known[i] = self.loaded[i]
+        return self.known[i]
+
+    def __setitem__(self, i: Any, value: Any) -> None:
+        self.known[i] = self.changed[i] = value
+
+    def copied(self) -> tuple[dict[Any, Any], dict[Any, Any]]:
+        """Return copies of the known and of the changed elements."""
+        return dict(self.known), dict(self.changed)
+
+    def merge(
+        self, before: dict[Any, Any], select: Callable[[Any, Any], Any], true: dict[Any, Any], false: dict[Any, Any]
+    ) -> None:
+        """Select between the elements that a function has changed for two outcomes."""
+        self.known = dict(before)
+        old = {i: self[i] for i in (*true, *false) if i in before or self.name is not None}
+        self.changed = {}
+        for i in dict.fromkeys((*true, *false)):
+            if (i in true and i in false) or i in old:  # a scratch element of one outcome only is not read later
+                self[i] = select(true.get(i, old.get(i)), false.get(i, old.get(i)))
+
+    def forget(self) -> None:
+        """Forget the elements: the target may have other values now."""
+        if self.name is not None:
+            self.known, self.changed, self.loaded = {}, {}, {}
+
+
+class Version(NamedTuple):
+    """Makes loads of one element at two places two symbols."""
+
+    key: tuple[int, int]
+
+
+# --------------------------------------------------------------------------------------------------------- kernels with other helpers
+
+
+def names_in(code: CodeType) -> tuple[str, ...]:
+    """Return the global names in a function's code and in its generator expressions."""
+    inner = (names_in(part) for part in code.co_consts if isinstance(part, CodeType))
+    return sum(inner, code.co_names)
+
+
+def rebound(
+    function: FunctionType,
+    replaced: dict[str, Any],
+    wrapped: dict[str, Callable[[Any], Any]],
+    copies: dict[FunctionType, Any] | None = None,
+) -> Any:
+    """Return a copy of a kernel in which it and all kernels that it calls use other helpers.
+
+    ``replaced``: helpers by name; ``wrapped``: functions applied to the copies of the kernels of these names.
+    """
+    copies = {} if copies is None else copies
+    if function not in copies:
+        names = dict(function.__globals__)
+        copy = FunctionType(function.__code__, names, function.__name__, function.__defaults__)
+        copies[function] = wrapped.get(function.__name__, lambda x: x)(copy)
+        for name in names_in(function.__code__):
+            value = names.get(name)
+            if name in replaced:
+                names[name] = replaced[name]
+            elif isinstance(value, FunctionType) and value.__module__.startswith(KERNELS):
+                names[name] = rebound(value, replaced, wrapped, copies)
+    return copies[function]

@@ -1,0 +1,222 @@
+"""The functions of the exported filter, traced."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from types import SimpleNamespace
+from typing import Any
+
+from strapdown.codegen import program as body
+from strapdown.codegen.functions import Function, Statement
+from strapdown.codegen.program import Kernels, Program, Scratch
+from strapdown.codegen.symbols import Symbol, Values, rebound
+from strapdown.kernels.rotation import far_turn
+
+FORKED = ("turned_by", "take_row")
+"""Kernels with branches; each is traced for both outcomes."""
+
+
+class Target(Function):
+    """A function of the filter while it is traced, as a machine for :mod:`strapdown.codegen.program`."""
+
+    def __init__(
+        self, program: Program, name: str, parameters: Sequence[tuple[str, int]], *, returns: str, words: str
+    ) -> None:
+        super().__init__(name, parameters, returns=returns)
+        self.words, self.n = words, program.n
+        trace = self.trace
+        helpers = {
+            "square_root": trace.square_root,
+            "chosen": trace.chosen,
+            "anywhere": trace.anywhere,
+            "far_turn": self._far_turn,
+            "load": load,
+            "spread": spread,
+            "total": total,
+            "math": SimpleNamespace(expm1=lambda x: trace.symbol("expm1", x), nan=float("nan"), pi=3.141592653589793),
+        }
+        self.kernels = Kernels(program.kernels, helpers, dict.fromkeys(FORKED, trace.fork))
+        self.chosen, self.root = trace.chosen, trace.square_root
+        self.state = SimpleNamespace(
+            x=self.array(name_of_state),
+            P=self.array(lambda i: f"f->P[{i}]"),
+            nis=self.array(lambda i: f"f->nis[{i}]"),
+            coefficients=self.array(lambda i: f"f->coefficients[{i}]"),
+            dt=self.array(lambda i: "f->step_dt"),
+        )
+
+    def _far_turn(self, phi: Any) -> tuple[Any, Any]:
+        values = self.trace.symbol("tuple", "far_turn", 13, *phi)
+        items = tuple(self.trace.symbol("item", values, i) for i in range(13))
+        return items[:4], items[4:]
+
+    def whole(self, x: Any) -> Any:
+        """Return x rounded down."""
+        return self.trace.symbol("floor", x)
+
+    def equal(self, a: Any, b: Any) -> Any:
+        """Return whether two numbers are equal."""
+        return self.trace.symbol("==", a, b)
+
+    def no(self, condition: Any) -> Any:
+        """Return whether a condition does not hold."""
+        return self.trace.symbol("not", condition) if isinstance(condition, Symbol) else not condition
+
+    def scratch(self) -> Values:
+        """Return numbers that exist while tracing."""
+        return self.array()
+
+    def work(self) -> Scratch:
+        """Return work space with a local array for the correction."""
+        k = self.kernels
+        return Scratch(self.local("step", self.n), k.LINE * k.STEP, self.n, self.array())
+
+    def clear_status(self) -> None:
+        """Clear the flags."""
+        self.flush()
+        self.add(Statement("clear"))
+
+
+def name_of_state(i: int) -> str:
+    """Return the member of the filter that holds element i of x."""
+    if i < 4:
+        return f"f->attitude[{i}]"
+    return f"f->bias[{i - 4}]" if i < 7 else f"f->states[{i - 7}]"
+
+
+def load(array: Any, start: int) -> Eight:
+    """Return eight numbers as one value."""
+    return Eight(array.reshape(-1)[start : start + 8].tolist())
+
+
+def total(x: Any) -> Any:
+    """Return the sum of eight numbers, the upper half added to the lower until one is left."""
+    while len(x) > 1:
+        half = len(x) // 2
+        x = [a + b for a, b in zip(x[:half], x[half:], strict=True)]
+    return x[0]
+
+
+def spread(x: Any) -> Eight:
+    """Return a number eight times."""
+    return Eight([x] * 8)
+
+
+class Eight(list[Any]):
+    """Eight numbers, which a kernel treats as one value."""
+
+    def _with(self, other: Any, operation: Callable[[Any, Any], Any]) -> Eight:
+        return Eight(
+            [operation(a, b) for a, b in zip(self, other if isinstance(other, Eight) else [other] * 8, strict=True)]
+        )
+
+    def __add__(self, other: Any) -> Any:
+        return self._with(other, lambda a, b: a + b)
+
+    __radd__ = __add__
+
+    def __mul__(self, other: Any) -> Any:
+        return self._with(other, lambda a, b: a * b)
+
+    __rmul__ = __mul__
+
+
+def traced(program: Program) -> list[Target]:
+    """Return the functions of the filter, in an order in which each calls only those before it."""
+
+    def function(
+        name: str,
+        words: str,
+        parameters: Sequence[tuple[str, int]],
+        returns: str,
+        formula: Callable[..., None],
+        *more: Any,
+    ) -> Target:
+        m = Target(program, name, parameters, returns=returns, words=words)
+        formula(m, program, m.state, *more, *(m.argument(parameter) for parameter, _ in parameters))
+        m.flush()
+        return m
+
+    made = [turn_function(program)]
+    if program.structure.chains:
+        made.append(
+            function(
+                "prepare", "Coefficients of the states that decay, for steps of dt.", [("dt", 0)], "", body.prepare
+            )
+        )
+    made += [
+        function(
+            "step", "Propagate over one step: delta is the rotation vector.", [("delta", 3), ("dt", 0)], "", body.step
+        ),
+        row_function(program),
+        correction_function(program),
+        function(
+            "init",
+            "Start at an attitude, with the sigma of the setup and zero bias.",
+            [("attitude", 4)],
+            "status",
+            body.initialize,
+        ),
+        function(
+            "predict",
+            "Propagate over a gyro sample: the mean rate over the last dt.",
+            [("gyro", 3), ("dt", 0)],
+            "status",
+            body.predict,
+        ),
+    ]
+    for index, sensor in enumerate(program.sensors):
+        made.append(
+            function(
+                f"update_{sensor.name}", sensor.words, [("value", sensor.size)], "status", body.update, sensor, index
+            )
+        )
+    return made
+
+
+def row_function(program: Program) -> Target:
+    """Return the update with one very precise row."""
+    n = program.n
+    m = Target(
+        program,
+        "take_row",
+        [("row", n), ("residual", 0), ("variance", 0), ("step", -n)],
+        returns="",
+        words="Update P and the correction with one row, in Joseph's form.",
+    )
+    step = m.array(lambda i: f"step[{i}]")
+    body.take_row(m, program, m.state, m.argument("row"), m.argument("residual"), m.argument("variance"), step)
+    m.flush()
+    return m
+
+
+def correction_function(program: Program) -> Target:
+    """Return the correction of the state by a step."""
+    m = Target(
+        program,
+        "apply_step",
+        [("step", program.n)],
+        returns="",
+        words="Correct the state, and transform P to the tangent space of the corrected attitude.",
+    )
+    body.apply_step(m, program, m.state, m.argument("step"))
+    m.flush()
+    return m
+
+
+def turn_function(program: Program) -> Target:
+    """Return the rotation by a large correction."""
+    m = Target(
+        program,
+        "far_turn",
+        [("x", 0), ("y", 0), ("z", 0), ("turn", -13)],
+        returns="",
+        words="Quaternion and Jacobian of a rotation vector of any size, by doubling.",
+    )
+    turn = m.array(lambda i: f"turn[{i}]")
+    formula: Any = far_turn
+    q, J = rebound(formula, {"square_root": m.trace.square_root}, {})(tuple(m.argument(name) for name in "xyz"))
+    for i, value in enumerate((*q, *J)):
+        turn[i] = value
+    m.flush()
+    return m

@@ -1,0 +1,266 @@
+"""A traced function as text in C or JavaScript, which differ in few words."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+from strapdown.codegen.functions import Block, Function, Statement
+from strapdown.codegen.regions import PINNED, Group, Placement, Slot, values_in
+from strapdown.codegen.symbols import Symbol
+
+PRECEDENCE = {"||": 1, "&&": 2, "<": 3, ">": 3, "<=": 3, ">=": 3, "==": 3, "+": 4, "-": 4, "*": 5, "/": 5}
+LONGEST = 72
+"""Longest expression, in characters, that is written into another."""
+WIDTH = 118
+
+
+@dataclass(frozen=True, kw_only=True)
+class Language:
+    """Words of a language."""
+
+    constant: str
+    """Declaration of a constant number."""
+    condition: str
+    variable: str
+    member: str
+    """Between the filter and its member."""
+    number: Callable[[float], str]
+    root: str
+    """Name of the square root."""
+    expm1: str
+    numbers: Callable[[Iterable[str]], str]
+    """A list of numbers as an argument."""
+    array: Callable[[str, int], str]
+    """Declaration of an array of zeros."""
+    status: Callable[[str], str]
+    """A status of the filter."""
+    counter: str
+    """Declaration of a counter."""
+    whole: Callable[[str], str]
+    """A number rounded down."""
+
+
+class Writer:
+    """The lines of a function."""
+
+    def __init__(self, function: Function, language: Language) -> None:
+        self.function, self.language = function, language
+        self.placement = Placement(function)
+        self.lines: list[str] = []
+        self.indent = 1
+        self.names: dict[Symbol, str] = {}
+        self.used: dict[str, int] = {}
+        self.written: set[Symbol] = set()
+        self._block(function.body)
+
+    def line(self, text: str) -> None:
+        """Add a line."""
+        self.lines.append("    " * self.indent + text)
+
+    # ------------------------------------------------------------------------------------------------------------------------ statements
+
+    def _block(self, block: Block) -> None:
+        slot = self.placement.blocks[block]
+        for statement in block.statements:
+            if statement.kind not in ("comment", "array"):
+                self._symbols(self._loads_before(statement, slot), slot)
+                self._symbols(self.placement.needed(values_in(statement), slot, self.written), slot)
+            getattr(self, f"_{statement.kind}")(statement)
+
+    def _loads_before(self, statement: Statement, slot: Slot) -> list[Symbol]:
+        """Return the loads that a statement with an effect must not overtake."""
+        alive, places = self.placement.alive, self.placement.places
+        return [
+            x
+            for x in alive
+            if x.kind == "load" and x.number < statement.number and places[x] is slot and x not in self.written
+        ]
+
+    def _clear(self, statement: Statement) -> None:
+        self.line(f"{self._member('f->status')} = 0;")
+
+    def _comment(self, statement: Statement) -> None:
+        self.line(f"/* {statement.text} */")
+
+    def _array(self, statement: Statement) -> None:
+        self.line(self.language.array(statement.text, statement.values[0]))
+
+    def _store(self, statement: Statement) -> None:
+        for target, value in zip(statement.targets, statement.values, strict=True):
+            self.line(f"{self._member(target)} = {self.text(value)};")
+
+    def _if(self, statement: Statement) -> None:
+        self.line(f"if ({self.text(statement.values[0])}) {{")
+        for i, block in enumerate(statement.blocks):
+            if i:
+                self.line("} else {")
+            self.indent += 1
+            self._block(block)
+            self.indent -= 1
+        self.line("}")
+
+    def _repeat(self, statement: Statement) -> None:
+        count = self.text(statement.values[0])
+        self.line(f"for ({self.language.counter} i = 0; i < {count}; i++) {{")
+        self.indent += 1
+        self._block(statement.blocks[0])
+        self.indent -= 1
+        self.line("}")
+
+    def _call(self, statement: Statement) -> None:
+        arguments = ["f"]
+        for value in statement.values:
+            if isinstance(value, str):
+                arguments.append(value)
+            else:
+                arguments.append(
+                    self.language.numbers(self.text(x) for x in value) if isinstance(value, tuple) else self.text(value)
+                )
+        text = f"{statement.text}({', '.join(arguments)})"
+        if statement.result in self.placement.places:
+            assert statement.result is not None
+            name = self.names[statement.result] = self._new("s")
+            self.written.add(statement.result)
+            text = f"{self.language.constant} {name} = {text}"
+        self.line(f"{text};")
+
+    def _return(self, statement: Statement) -> None:
+        if statement.text:
+            status = self.language.status(statement.text)
+            if statement.text != "OK":
+                self.line(f"{self._member('f->status')} |= {status};")
+            self.line(f"return {status};")
+        elif statement.values:
+            self.line(f"return {self.text(statement.values[0])};")
+
+    # --------------------------------------------------------------------------------------------------------------------------- symbols
+
+    def _symbols(self, symbols: list[Symbol], slot: Slot) -> None:
+        for symbol in symbols:
+            if symbol in self.written:
+                continue
+            group = self.placement.groups.get(symbol)
+            if group is not None:
+                self._group(group, slot)
+            elif not self._inlined(symbol):
+                self._declare(symbol)
+
+    def _declare(self, symbol: Symbol) -> None:
+        self.written.add(symbol)
+        if symbol.kind == "tuple":
+            name, size, *arguments = symbol.operands
+            here = self.names[symbol] = self._new(f"{name}_")
+            self.line(self.language.array(here, int(size)))
+            self.line(f"{name}({', '.join([*(self.text(x) for x in arguments), here])});")
+            return
+        if symbol.kind == "parameter" or (symbol.kind == "load" and not symbol.operands[0].startswith("f->")):
+            self.names[symbol] = symbol.operands[0]
+            return
+        text = self._expression(symbol)
+        name = self._new("t" if symbol.kind != "load" else re.sub(r"f->|\]", "", symbol.operands[0]).replace("[", "_"))
+        self.names[symbol] = name
+        word = self.language.condition if is_condition(symbol) else self.language.constant
+        self.line(f"{word} {name} = {text};")
+
+    def _group(self, group: Group, slot: Slot) -> None:
+        """Write selections with the same condition as one branch."""
+        members = group.members
+        self._symbols(self.placement.needed((x for m in members for x in m.operands), slot, self.written), slot)
+        names = [self._new("m") for _ in members]
+        self.line(f"{self.language.variable} {', '.join(names)};")
+        self.line(f"if ({self.text(members[0].operands[0])}) {{")
+        assert group.arms is not None
+        for i, arm in enumerate(group.arms, 1):
+            if i == 2:
+                self.line("} else {")
+            self.indent += 1
+            self._symbols(self.placement.needed((m.operands[i] for m in members), arm, self.written), arm)
+            for name, member in zip(names, members, strict=True):
+                self.line(f"{name} = {self._operand(member.operands[i], 0, right=False)};")
+            self.indent -= 1
+        self.line("}")
+        for name, member in zip(names, members, strict=True):
+            self.names[member] = name
+            self.written.add(member)
+
+    def _inlined(self, symbol: Symbol) -> bool:
+        """Return whether an operation is written into the only one that uses it."""
+        if symbol.kind == "item":
+            return True
+        if symbol.kind in (*PINNED, "select", "tuple") or self.placement.uses[symbol] != 1:
+            return False
+        return symbol in self.user_here and len(self._expression(symbol)) <= LONGEST
+
+    @property
+    def user_here(self) -> set[Symbol]:
+        """Operations whose users are in the same slot, outside the arms of a selection."""
+        if not hasattr(self, "_user_here"):
+            places, groups = self.placement.places, self.placement.groups
+            self._user_here = set()
+            for user in self.placement.alive:
+                if user not in groups and user.kind not in PINNED:
+                    self._user_here |= {x for x in user.operands if isinstance(x, Symbol) and places[x] is places[user]}
+                elif user in groups:
+                    arms = groups[user].arms
+                    assert arms is not None
+                    self._user_here |= {
+                        x
+                        for x, arm in zip(user.operands[1:], arms, strict=True)
+                        if isinstance(x, Symbol) and places[x] is arm
+                    }
+        return self._user_here
+
+    def _new(self, stem: str) -> str:
+        number = self.used[stem] = self.used.get(stem, 0) + 1
+        if stem in ("t", "m", "s"):
+            return f"{stem}{number}"
+        return stem if number == 1 else f"{stem}_{number}"
+
+    # ----------------------------------------------------------------------------------------------------------------------- expressions
+
+    def _member(self, text: str) -> str:
+        return text.replace("->", self.language.member)
+
+    def text(self, value: Any) -> str:
+        """Return a value where it is used."""
+        if isinstance(value, Symbol):
+            if value in self.names:
+                return self.names[value]
+            return self._expression(value) if value.kind == "item" else f"({self._expression(value)})"
+        return self.language.number(float(value))
+
+    def _operand(self, value: Any, level: int, *, right: bool) -> str:
+        if isinstance(value, Symbol) and value not in self.names:
+            own = PRECEDENCE.get(value.kind, 6 if value.kind in ("sqrt", "expm1", "load", "item") else 0)
+            text = self._expression(value)
+            return text if own > level or (own == level and not right) else f"({text})"
+        text = self.text(value)
+        return f"({text})" if text.startswith("-") else text
+
+    def _expression(self, symbol: Symbol) -> str:
+        kind, operands, language = symbol.kind, symbol.operands, self.language
+        if kind in PRECEDENCE:
+            level = PRECEDENCE[kind]
+            pair = self._operand(operands[0], level, right=False), self._operand(operands[1], level, right=True)
+            left, right = (f"({x})" if kind == "||" and "&&" in x else x for x in pair)
+            return f"{left} {kind} {right}"
+        if kind == "load":
+            return self._member(operands[0])
+        if kind == "item":
+            return f"{self.names[operands[0]]}[{int(operands[1])}]"
+        if kind == "select":
+            c, a, b = (self._operand(x, 5, right=True) for x in operands)
+            return f"{c} ? {a} : {b}"
+        if kind == "neg":
+            return f"-{self._operand(operands[0], 6, right=True)}"
+        inner = self._operand(operands[0], 0, right=False)
+        functions = {"sqrt": f"{language.root}({inner})", "expm1": f"{language.expm1}({inner})", "not": f"!({inner})"}
+        return functions.get(kind) or language.whole(inner)
+
+
+def is_condition(symbol: Symbol) -> bool:
+    """Return whether a symbol is true or false."""
+    return symbol.kind in ("<", ">", "<=", ">=", "==", "&&", "||", "not")

@@ -1,0 +1,237 @@
+"""Exported filters for tests: the program in plain Python, and the compiled or executed code fed with the same samples."""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import math
+import shutil
+import subprocess
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from strapdown.codegen import c, design
+from strapdown.codegen import program as body
+
+STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-ffp-contract=off")
+
+
+def compiler():
+    gcc = shutil.which("gcc") or shutil.which("cc")
+    if gcc is None:
+        pytest.skip("no C compiler on this machine")
+    return gcc
+
+
+class LeftError(Exception):
+    """A function of the filter has returned a status."""
+
+
+class Plain:
+    """The program on floats of Python: the machine of :mod:`strapdown.codegen.program` without code."""
+
+    def __init__(self, program):
+        self.program, n = program, program.n
+        helpers = {
+            "square_root": math.sqrt,
+            "chosen": lambda condition, a, b: a if condition else b,
+            "anywhere": self.turned_far,
+        }
+        self.kernels = body.Kernels(program.kernels, helpers, {})
+        self.chosen, self.root, self.equal = helpers["chosen"], math.sqrt, lambda a, b: a == b
+        self.whole, self.scratch = math.floor, dict
+        self.f = SimpleNamespace(
+            x=[0.0] * (n + 1),
+            P=[0.0] * program.number_of_covariances,
+            nis=[0.0] * len(program.sensors),
+            coefficients=[0.0] * (16 * len(program.model.last)),
+            dt=[0.0],
+        )
+        self.status, self.called, self.far_turns = 0, set(), 0
+
+    def turned_far(self, condition):
+        self.far_turns += bool(condition)
+        return bool(condition)
+
+    def run(self, function, *arguments):
+        try:
+            function(self, self.program, self.f, *arguments)
+        except LeftError as left:
+            bits = int(body.STATUS[str(left)][0])
+            self.status |= bits
+            return bits
+        raise AssertionError("no status")
+
+    def init(self, attitude):
+        return self.run(body.initialize, attitude)
+
+    def predict(self, gyro, dt):
+        return self.run(body.predict, tuple(gyro), dt)
+
+    def update(self, i, value):
+        return self.run(body.update, self.program.sensors[i], i, tuple(value))
+
+    @property
+    def numbers(self):
+        return np.array([*self.f.x, *self.f.P, *self.f.nis])
+
+    # The machine of the program.
+
+    def branch(self, condition, then, otherwise=None):
+        if condition:
+            then()
+        elif otherwise is not None:
+            otherwise()
+
+    def unless(self, condition, then):
+        if not condition:
+            then()
+
+    def no(self, condition):
+        return not condition
+
+    def repeat(self, count, then):
+        for _ in range(int(count)):
+            then()
+
+    def comment(self, text):
+        pass
+
+    def clear_status(self):
+        self.status = 0
+
+    def leave(self, status):
+        raise LeftError(status)
+
+    def work(self):
+        k = self.kernels
+        self.step = [0.0] * self.program.n
+        return body.Scratch(self.step, k.LINE * k.STEP, self.program.n, {})
+
+    def call(self, name, *arguments):
+        self.called.add(name)
+        given = tuple(self.step if argument == "step" else argument for argument in arguments)
+        getattr(body, name)(self, self.program, self.f, *given)
+
+
+class Compiled:
+    """The filter in C, compiled into a library."""
+
+    def __init__(self, program, folder, *, single=False, flags=("-O2",)):
+        folder = Path(folder)
+        for name, text in c.files(program, "test", single=single).items():
+            (folder / name).write_text(text, encoding="utf-8")
+        library = folder / "filter.so"
+        subprocess.run(
+            [compiler(), *STRICT, *flags, "-shared", "-fPIC", "strapdown_filter.c", "-o", library.name, "-lm"],
+            cwd=folder,
+            check=True,
+            capture_output=True,
+            text=True,
+        )
+        self.real = ctypes.c_float if single else ctypes.c_double
+        fields = [(name, self.real * size if size else self.real) for name, size, _ in c.members(program)]
+        self.struct = type("Filter", (ctypes.Structure,), {"_fields_": [*fields, ("status", ctypes.c_uint)]})
+        self.state, self.library, self.program = self.struct(), ctypes.CDLL(str(library.resolve())), program
+
+    def _call(self, name, *arguments):
+        given = [a if not isinstance(a, float) else self.real(a) for a in arguments]
+        given = [(self.real * len(a))(*a) if isinstance(a, list | tuple | np.ndarray) else a for a in given]
+        return getattr(self.library, f"strapdown_{name}")(ctypes.byref(self.state), *given)
+
+    def init(self, attitude):
+        return self._call("init", attitude)
+
+    def predict(self, gyro, dt):
+        return self._call("predict", gyro, float(dt))
+
+    def update(self, i, value):
+        return self._call(f"update_{self.program.sensors[i].name}", value)
+
+    @property
+    def status(self):
+        return self.state.status
+
+    @property
+    def numbers(self):
+        names = ["attitude", "bias", *(["states"] if self.program.n > 6 else []), "P", "nis"]
+        return np.concatenate([np.asarray(getattr(self.state, name)[:], float) for name in names])
+
+    def sigma(self):
+        out = (self.real * self.program.n)()
+        self.library.strapdown_sigma(ctypes.byref(self.state), out)
+        return np.array(out[:])
+
+
+def program_of(setup, sensors, *, single=False):
+    return design.program_of(setup, sensors, single=single)
+
+
+def samples(record, kinds):
+    """Rows of (None, gyro, dt) and (sensor, value, 0) of a record, in order of time."""
+    rows = []
+    order = []
+    for i, series in enumerate(record.vectors):
+        values = series.attitude if kinds[i] == "attitude" else series.vector_b
+        order += [(t, i, v) for t, v in zip(series.time.tolist(), values.tolist(), strict=True)]
+    order.sort(key=lambda one: one[:2])
+    k = 0
+    for edge, before, increment in zip(
+        record.time[1:].tolist(), record.time.tolist(), record.increments.tolist(), strict=False
+    ):
+        dt = edge - before
+        rows.append((None, [x / dt for x in increment], dt))
+        while k < len(order) and order[k][0] <= edge + 1e-9:
+            rows.append((order[k][1], order[k][2], 0.0))
+            k += 1
+    return rows
+
+
+def fed(f, rows, start):
+    """Feed a filter; return its numbers and the statuses after each row."""
+    f.init(list(start))
+    numbers, statuses = [], []
+    for sensor, value, dt in rows:
+        statuses.append(f.predict(value, dt) if sensor is None else f.update(sensor, value))
+        numbers.append(f.numbers)
+    return np.array(numbers), statuses
+
+
+def node():
+    found = shutil.which("node")
+    if found is None:
+        pytest.skip("no node on this machine")
+    return found
+
+
+FEED = """
+import * as filter from './strapdown_filter.mjs';
+import fs from 'fs';
+const {rows, start, names} = JSON.parse(fs.readFileSync('rows.json'));
+const f = filter.create();
+filter.init(f, start);
+const numbers = [], statuses = [];
+for (const [sensor, value, dt] of rows) {
+    statuses.push(sensor === null ? filter.predict(f, value, dt) : filter[`update_${names[sensor]}`](f, value));
+    numbers.push([...f.attitude, ...f.bias, ...(f.states ?? []), ...f.P, ...f.nis]);
+}
+console.log(JSON.stringify([numbers, statuses]));
+"""
+
+
+def fed_javascript(program, folder, rows, start):
+    """Feed the ES module, by node."""
+    from strapdown.codegen import javascript
+
+    folder = Path(folder)
+    for name, text in javascript.files(program, "test").items():
+        (folder / name).write_text(text, encoding="utf-8")
+    (folder / "feed.mjs").write_text(FEED, encoding="utf-8")
+    given = {"rows": rows, "start": list(start), "names": [sensor.name for sensor in program.sensors]}
+    (folder / "rows.json").write_text(json.dumps(given), encoding="utf-8")
+    run = subprocess.run([node(), "feed.mjs"], cwd=folder, check=True, capture_output=True, text=True)
+    numbers, statuses = json.loads(run.stdout)
+    return np.array(numbers), statuses

@@ -1,0 +1,435 @@
+"""Exported filters: C and JavaScript against the same formulas in plain Python, and against the compiled filter over records."""
+
+import ctypes
+import dataclasses
+import functools
+import subprocess
+
+import numpy as np
+import pytest
+from exported import STRICT, Compiled, Plain, compiler, fed, fed_javascript, program_of, samples
+
+import strapdown as sd
+from strapdown import estimation, quaternion
+from strapdown.checks import InputError
+from strapdown.codegen import c
+from strapdown.codegen.functions import Function
+from strapdown.codegen.writer import Writer
+from strapdown.estimation import setup as setups
+from strapdown.estimation.setup import SensorStates, States
+
+NOISE = sd.ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-5)
+GATE = sd.Gate(recovery=None)
+RATE = 50.0
+TILT = [[4e-4, 1e-4, 0.0], [1e-4, 2e-4, 0.0], [0.0, 0.0, 3e-4]]
+
+SENSORS = {
+    "direction": sd.VectorSensor(name="star", reference_f=[0.6, 0.0, 0.8], sigma=0.02, rate=10.0),
+    "level": sd.VectorSensor(name="accelerometer", reference_f=[0.0, 0.0, 1.0], sigma=0.02, rate=RATE),
+    "vector": sd.VectorSensor(name="field", reference_f=[20.0, 3.0, -40.0], sigma=0.02, rate=10.0),
+    "heading": sd.VectorSensor(
+        name="magnetometer", kind="heading", reference_f=[0.1, 1.0, -2.0], sigma=0.03, rate=10.0
+    ),
+    "attitude": sd.vectors.AttitudeSensor(name="star tracker", sigma_across=1e-3, sigma_about=1e-2, rate=2.0),
+    "oblique": sd.vectors.AttitudeSensor(
+        name="tracker", sigma_across=1e-3, sigma_about=1e-2, rate=2.0, boresight=[1.0, 2.0, 2.0]
+    ),
+    "precise": sd.VectorSensor(name="precise", reference_f=[0.6, 0.0, 0.8], sigma=1e-6, rate=10.0),
+}
+
+STATES = {
+    "scale": States(
+        gyro_scale_sigma=5e-3, gyro_misalignment_sigma=((0.0, 2e-3, 2e-3),) * 1 + ((2e-3, 0.0, 2e-3), (2e-3, 2e-3, 0.0))
+    ),
+    "force": States(gyro_force_sigma=1e-5),
+    "drift": States(gyro_drift_sigma=(1e-4, 3e-5), gyro_drift_time=(10.0, 100.0)),
+    "bias": States(sensors={"field": SensorStates(bias_sigma=2.0, mounting_sigma=0.01)}),
+    "mounting": States(sensors={"star tracker": SensorStates(bias_sigma=1e-3)}),
+    "heading bias": States(sensors={"magnetometer": SensorStates(bias_sigma=0.03)}),
+    "correlated": States(
+        sensors={"star": SensorStates(bias_sigma=0.01, correlated_sigma=0.02, correlation_time=3.0, frame="fixed")}
+    ),
+    "hand": States(
+        sensors={"accelerometer": SensorStates(velocity_time=0.5, velocity_sigma=0.5, acceleration_sigma=1.0)}
+    ),
+}
+
+CASES = {
+    **{kind: ((kind,), None, None) for kind in SENSORS},
+    "gate": (("direction", "vector", "heading"), None, GATE),
+    "scale": (("direction", "vector"), "scale", None),
+    "force": (("direction", "vector"), "force", None),
+    "drift": (("direction", "level"), "drift", GATE),
+    "bias": (("level", "vector"), "bias", None),
+    "mounting": (("attitude",), "mounting", None),
+    "heading bias": (("level", "heading"), "heading bias", GATE),
+    "correlated": (("direction", "level"), "correlated", None),
+    "hand": (("level", "heading"), "hand", None),
+}
+
+
+def whole(series):
+    """The field as a whole vector with its length."""
+    if series.sensor != "field":
+        return series
+    length = np.linalg.norm([20.0, 3.0, -40.0])
+    return sd.vectors.VectorMeasurements(
+        sensor="field",
+        kind="vector",
+        time=series.time,
+        vector_b=length * series.vector_b,
+        reference_f=length * series.reference_f,
+        sigma=length * series.sigma,
+    )
+
+
+@functools.cache
+def case(name):
+    """Record, setup and start of a case: with outliers and fast turns, so that every branch is taken somewhere."""
+    sensors, states, gate = CASES[name]
+    motion = sd.motion.SpinCone(angle=0.4, precession_rate=2.0, spin_rate=-1.5)
+    spec = sd.GyroSpec(angle_random_walk=1e-4, rate_random_walk=1e-5, turn_on_bias_sigma=5e-3)
+    scenario = sd.Scenario(
+        motion=motion, gyro=spec, sensors=tuple(SENSORS[kind] for kind in sensors), rate=RATE, duration=6.0
+    )
+    record = sd.simulate(scenario, seed=3)
+    record = dataclasses.replace(record, vectors=tuple(map(whole, record.vectors)))
+    setup = sd.FilterSetup(
+        process_noise=NOISE,
+        attitude_sigma=0.4,
+        bias_sigma=5e-3,
+        gate=gate,
+        states=None if states is None else STATES[states],
+    )
+    start = quaternion.multiply(record.truth.attitude[0], quaternion.exp([0.4, -0.2, 0.3]))
+    return record, setup, start
+
+
+def rows_of(name):
+    record, _, start = case(name)
+    rows = samples(record, [series.kind for series in record.vectors])
+    # Beyond the range of the polynomials, and an outlier: a turn of 1.2 rad in one sample, and a measurement from the other side.
+    rows.insert(40, (None, [40.0, -40.0, 20.0], 0.02))
+    rows.insert(41, (None, [-40.0, 40.0, -20.0], 0.02))
+    at = next(k for k in range(150, len(rows)) if rows[k][0] is not None)
+    sensor, value, _ = rows[at]
+    rows.insert(at, (sensor, [-x for x in value] if len(value) == 3 else value[::-1], 0.0))
+    return rows, start
+
+
+@functools.cache
+def plain(name):
+    rows, start = rows_of(name)
+    record, setup, _ = case(name)
+    return fed(Plain(program_of(setup, record.vectors)), rows, start)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_c_equals_python_to_the_bit(name, tmp_path):
+    record, setup, _ = case(name)
+    rows, start = rows_of(name)
+    numbers, statuses = fed(Compiled(program_of(setup, record.vectors), tmp_path), rows, start)
+    expected, expected_statuses = plain(name)
+    assert statuses == expected_statuses
+    assert np.isfinite(expected).all()
+    np.testing.assert_array_equal(numbers, expected)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_javascript_equals_python_to_the_bit(name, tmp_path):
+    record, setup, _ = case(name)
+    rows, start = rows_of(name)
+    numbers, statuses = fed_javascript(program_of(setup, record.vectors), tmp_path, rows, start)
+    expected, expected_statuses = plain(name)
+    assert statuses == expected_statuses
+    np.testing.assert_array_equal(numbers, expected)
+
+
+def test_the_cases_take_the_rare_branches():
+    """Otherwise equality of bits would say nothing about them."""
+    for name in ("gate", "precise"):
+        rows, start = rows_of(name)
+        record, setup, _ = case(name)
+        f = Plain(program_of(setup, record.vectors))
+        _, statuses = fed(f, rows, start)
+        assert statuses.count(0) > 0.9 * len(statuses)
+        assert (2 in statuses) == (name == "gate")
+        assert f.far_turns > 0
+        assert name == "gate" or f.called == {"step", "take_row", "apply_step"}
+
+
+def sources(name):
+    record, setup, _ = case(name)
+    return c.files(program_of(setup, record.vectors), "test", single=False)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        name if name in ("gate", "drift") else pytest.param(name, marks=pytest.mark.slow)
+        for name in CASES
+        if name != "precise"
+    ],
+)
+def test_program_equals_the_compiled_filter(name):
+    record, setup, start = case(name)
+    rows, _ = rows_of(name)
+    kinds = {series.sensor: series.kind for series in record.vectors}
+    live = estimation.LiveFilter(
+        setup.process_noise,
+        estimation.initial_state(start, attitude_sigma=setup.attitude_sigma, bias_sigma=setup.bias_sigma),
+        error_states=() if setup.states is None else setup.states.blocks(kinds),
+        sensors=record.vectors,
+        gate=setup.gate,
+    )
+    numbers, statuses = plain(name)
+    n = 6 + len(live.values)
+    names = list(kinds)
+    for k, (sensor, value, dt) in enumerate(rows):
+        refused = sum(live.refused.values())
+        if sensor is None:
+            live.update(live.time + dt, value)
+        else:
+            live.update(live.time, **{names[sensor]: value})
+        assert (sum(live.refused.values()) > refused) == (statuses[k] == 2), k
+        expected = np.concatenate([live.attitude, live.bias, live.values])
+        sigma = np.sqrt(np.diag(live.covariance))
+        np.testing.assert_allclose(
+            numbers[k][7 : n + 1], expected[7:], rtol=0.0, atol=1e-7 * np.max(sigma[6:], initial=1e-3)
+        )
+        assert quaternion.angle_between(numbers[k][:4], expected[:4]) < 1e-9
+        np.testing.assert_allclose(numbers[k][4:7], expected[4:7], rtol=0.0, atol=1e-9)
+        P = numbers[k][n + 1 : n + 1 + n * (n + 1) // 2]
+        off = P - live.covariance[np.triu_indices(n)]
+        assert np.max(np.abs(off) / np.outer(sigma, sigma)[np.triu_indices(n)]) < 1e-6
+
+
+@pytest.mark.parametrize("name", ["direction", "vector", "heading", "gate", "drift", "bias", "hand"])
+def test_single_precision_within_a_thirtieth_of_sigma(name, tmp_path):
+    record, setup, _ = case(name)
+    rows, start = rows_of(name)
+    program = program_of(setup, record.vectors, single=True)
+    compiled = Compiled(program, tmp_path, single=True)
+    numbers, statuses = fed(compiled, rows, start)
+    expected, expected_statuses = plain(name)
+    n, whole = program.n, len(rows) - 1
+    assert np.mean(np.array(statuses) != expected_statuses) < 0.01
+    P = np.zeros((n, n))
+    P[np.triu_indices(n)] = expected[whole][n + 1 : n + 1 + n * (n + 1) // 2]
+    sigma = np.sqrt(np.diag(P))
+    away = quaternion.log(quaternion.multiply(quaternion.conjugate(expected[whole][:4]), numbers[whole][:4]))
+    assert np.max(np.abs(away) / sigma[:3]) < 1.0 / 30.0
+    assert np.max(np.abs(numbers[whole] - expected[whole])[4 : n + 1] / sigma[3:]) < 1.0 / 30.0
+    np.testing.assert_allclose(compiled.sigma(), sigma, rtol=1e-2)
+
+
+HOSTILE = [np.nan, np.inf, -np.inf, 1e9, -1e9, 1e300, 1e-300, 0.0]
+
+
+@pytest.mark.parametrize("single", [False, True])
+@pytest.mark.parametrize("name", ["gate", "attitude", "scale", "correlated", "heading bias"])
+def test_hostile_samples_set_a_flag_and_leave_the_state_valid(name, single, tmp_path):
+    record, setup, start = case(name)
+    f = Compiled(program_of(setup, record.vectors, single=single), tmp_path, single=single)
+    n = f.program.n
+    generator = np.random.default_rng(1)
+    f.init(list(start))
+    flagged = 0
+    for k in range(3000):
+        before = f.numbers[: -len(f.program.sensors)]
+        value = generator.normal(size=4)
+        if k % 2:
+            value[generator.integers(4)] = generator.choice(HOSTILE)
+        if k % 3 == 0:
+            dt = float(generator.choice([0.02, 0.02, 0.0, -1.0, np.nan, np.inf, 1e9]))
+            status = f.predict(value[:3], dt)
+            invalid = (
+                not (0.0 < dt <= 3600.0) or not np.isfinite(value[:3]).all() or np.max(np.abs(value[:3])) * dt > 200.0
+            )
+        else:
+            i = int(generator.integers(len(f.program.sensors)))
+            value = value[: f.program.sensors[i].size]
+            status = f.update(i, value)
+            invalid = not np.isfinite(value).all()
+        assert not invalid or status == 1, (k, value, status)
+        if status:
+            flagged += 1
+            np.testing.assert_array_equal(f.numbers[: -len(f.program.sensors)], before)
+        numbers = f.numbers[: -len(f.program.sensors)]
+        assert np.isfinite(numbers).all(), (k, value)
+        assert abs(np.linalg.norm(numbers[:4]) - 1.0) < (1e-5 if single else 1e-12)
+        P = np.zeros((n, n))
+        P[np.triu_indices(n)] = numbers[n + 1 :]
+        assert np.diag(P).min() > 0.0, (k, value)
+    assert flagged > 500
+    assert f.status & 1
+
+
+def test_a_bad_start_is_level_and_flagged(tmp_path):
+    record, setup, _ = case("direction")
+    f = Compiled(program_of(setup, record.vectors), tmp_path)
+    for bad in ([np.nan, 0.0, 0.0, 0.0], [0.0] * 4, [np.inf, 0.0, 0.0, 0.0]):
+        assert f.init(bad) == 1
+        np.testing.assert_array_equal(f.numbers[:4], [1.0, 0.0, 0.0, 0.0])
+    assert f.init([2.0, 0.0, 0.0, 0.0]) == 0
+
+
+SANITIZED = """
+#include <math.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include "strapdown_filter.h"
+int main(void) {
+    strapdown_filter f;
+    const strapdown_real start[4] = {1, 0, 0, 0};
+    const strapdown_real bad[8] = {NAN, INFINITY, -INFINITY, 1e9, -1e9, 1e30, 1e-30, 0};
+    strapdown_init(&f, start);
+    srand(1);
+    for (int k = 0; k < 20000; k++) {
+        strapdown_real v[4];
+        for (int i = 0; i < 4; i++) v[i] = (strapdown_real)rand() / RAND_MAX - (strapdown_real)0.5;
+        if (k % 3 == 0) v[rand() % 4] = bad[rand() % 8];
+        strapdown_predict(&f, v, k % 7 ? (strapdown_real)0.02 : bad[rand() % 8]);
+        UPDATES
+    }
+    strapdown_real sigma[STRAPDOWN_STATES];
+    strapdown_sigma(&f, sigma);
+    for (int i = 0; i < STRAPDOWN_STATES; i++) if (!(sigma[i] > 0)) return 1;
+    printf("%u", strapdown_status(&f));
+    return 0;
+}
+"""
+
+
+@pytest.mark.parametrize("name", ["gate", pytest.param("drift", marks=pytest.mark.slow)])
+def test_sanitizers_find_nothing(name, tmp_path):
+    gcc = compiler()
+    record, setup, _ = case(name)
+    program = program_of(setup, record.vectors)
+    updates = " ".join(f"strapdown_update_{sensor.name}(&f, v);" for sensor in program.sensors)
+    for file, text in {**sources(name), "main.c": SANITIZED.replace("UPDATES", updates)}.items():
+        (tmp_path / file).write_text(text, encoding="utf-8")
+    sanitize = ["-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+    build = subprocess.run(
+        [gcc, *STRICT, *sanitize, "main.c", "strapdown_filter.c", "-o", "run", "-lm"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if "cannot find" in build.stderr:
+        pytest.skip(f"no sanitizers: {build.stderr.splitlines()[0]}")
+    assert build.returncode == 0, build.stderr
+    run = subprocess.run(["./run"], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert (run.returncode, run.stderr) == (0, "")
+
+
+def test_the_example_and_the_header_of_the_export(tmp_path):
+    record, setup, _ = case("gate")
+    paths = sd.export(setup, record, folder=tmp_path, precision="single")
+    assert [path.name for path in paths] == ["strapdown_filter.h", "strapdown_filter.c", "main.c", "CMakeLists.txt"]
+    header = paths[0].read_text(encoding="utf-8")
+    assert sd.__version__ in header
+    assert "angle_random_walk" in header
+    assert (
+        setups.from_toml(
+            "\n".join(
+                line.removeprefix(" *").strip()
+                for line in header.partition("The setup:")[2].partition(" */")[0].splitlines()
+            )
+        )
+        == setup
+    )
+    gcc = compiler()
+    subprocess.run([gcc, *STRICT, "main.c", "strapdown_filter.c", "-o", "run", "-lm"], cwd=tmp_path, check=True)
+    run = subprocess.run(["./run"], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert run.stdout.startswith("attitude ")
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"gate": sd.Gate()}, "recovery"),
+        ({"robust": sd.Robust()}, "robust"),
+        ({"integration": sd.coning.ALGORITHMS["three-sample"]}, "one gyro sample"),
+        ({"states": States(gyro_temperature_sigma=1e-5)}, "temperature"),
+        ({"states": States(sensors={"star": SensorStates(lever_arm_sigma=0.1)})}, "lever arm"),
+    ],
+)
+def test_what_cannot_be_exported_is_refused_before_anything_is_written(change, words, tmp_path):
+    record, setup, _ = case("direction")
+    with pytest.raises(InputError, match=words):
+        sd.export(dataclasses.replace(setup, **change), record, folder=tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_refusals_of_arguments(tmp_path):
+    record, setup, _ = case("precise")
+    for arguments, words in (
+        ({"to": "rust"}, "rust"),
+        ({"precision": "half"}, "half"),
+        ({"to": "js", "precision": "single"}, "double"),
+        ({"precision": "single"}, "keeps no digits"),
+    ):
+        with pytest.raises(InputError, match=words):
+            sd.export(setup, record, folder=tmp_path, **arguments)
+    for sensors, words in (
+        ([], "no sensor"),
+        ("star", "give vectors.VectorSensor"),
+        ([record.vectors[0]] * 2, "twice|same name"),
+    ):
+        with pytest.raises(InputError, match=words):
+            sd.export(setup, sensors, folder=tmp_path)
+    series = record.vectors[0]
+    growing = dataclasses.replace(series, sigma=np.linspace(0.01, 0.02, len(series.time)))
+    with pytest.raises(InputError, match="sigma varies"):
+        sd.export(setup, [growing], folder=tmp_path)
+
+
+def test_values_read_before_an_effect_are_those_before_it(tmp_path):
+    """A load may not move behind a call or a branch that changes the array, nor be remembered after it."""
+    m = Function("work", [("x", 0)])
+    P = m.array(lambda i: f"f->P[{i}]")
+    old = P[0]
+    m.call("double_all")
+    after = P[0]
+    x = m.argument("x")
+
+    def change():
+        P[0] = P[0] + 100.0
+
+    m.branch(x > 0.0, change)
+    P[1] = P[0]
+    P[2] = old
+    P[3] = after
+    m.flush()
+    text = "\n".join(
+        [
+            "typedef double strapdown_real; typedef struct { double P[4]; } strapdown_filter;",
+            "static void double_all(strapdown_filter *f) { for (int i = 0; i < 4; i++) f->P[i] *= 2.0; }",
+            "void work(strapdown_filter *f, double x) {",
+            *Writer(m, c.language(single=False)).lines,
+            "}",
+        ]
+    )
+    (tmp_path / "work.c").write_text(text, encoding="utf-8")
+    subprocess.run([compiler(), *STRICT, "-shared", "-fPIC", "work.c", "-o", "work.so"], cwd=tmp_path, check=True)
+    work = ctypes.CDLL(str(tmp_path / "work.so")).work
+    for x, expected in ((1.0, [106.0, 106.0, 3.0, 6.0]), (-1.0, [6.0, 6.0, 3.0, 6.0])):
+        numbers = (ctypes.c_double * 4)(3.0, 0.0, 0.0, 0.0)
+        work(numbers, ctypes.c_double(x))
+        assert list(numbers) == expected
+
+
+def test_a_covariance_that_is_not_a_number_does_not_reach_the_attitude(tmp_path):
+    """Memory of a microcontroller may be damaged; the attitude by the gyro alone goes on."""
+    record, setup, start = case("direction")
+    f = Compiled(program_of(setup, record.vectors), tmp_path)
+    f.init(list(start))
+    for i in range(21):
+        f.state.P[i] = np.nan
+    before = f.numbers[:7]
+    assert f.update(0, [0.6, 0.0, 0.8]) == 1
+    np.testing.assert_array_equal(f.numbers[:7], before)
+    assert f.predict([0.1, 0.0, 0.0], 0.02) == 0
+    assert np.isfinite(f.numbers[:7]).all()
