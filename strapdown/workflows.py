@@ -231,7 +231,7 @@ def estimate(
     """Estimate attitude and gyro bias with a multiplicative extended Kalman filter, as the command ``strapdown estimate`` does.
 
     For a simulated record, the filter matches the scenario and is initialised from the first measurements. For a recording, the
-    accelerometer gives the vertical and the magnetometer the heading (:mod:`strapdown.ahrs`), from the first interval at rest on.
+    accelerometer gives the vertical and the magnetometer the heading (:mod:`strapdown.ahrs`), from the first sample on.
 
     Parameters
     ----------
@@ -251,9 +251,9 @@ def estimate(
         Reject measurements beyond this quantile of χ² (such as 0.999), and recover from a lost attitude.
     robust : Robust or {"huber", "student"}, optional
         Weight measurements by the size of their innovations.
-    motion : {"auto", "hand", "vehicle", "any"}, optional
-        For a recording: model of the motion, with states for the gyro's scale factors. ``"hand"``: bounded velocity; ``"vehicle"``:
-        acceleration that lasts for seconds; ``"auto"``, the default: that of higher likelihood; ``"any"``: white noise, without states.
+    motion : {"hand", "vehicle", "vessel", "any"}, optional
+        For a recording: model of the motion. ``"hand"``, the default: bounded velocity, as of a hand, a person or a small aircraft;
+        ``"vehicle"``: acceleration that lasts for seconds; ``"vessel"``: bounded position, as on waves; ``"any"``: white noise.
     latency : float, optional
         For a recording: delay of the gyro's samples, s. Default: half a sample interval.
     calibration : UnitCalibration, optional
@@ -290,13 +290,13 @@ def estimate(
     robust = Robust(kind=robust) if isinstance(robust, str) else robust  # type: ignore[arg-type]
     if isinstance(source, Recording):
         _refuse("a record", setup=setup, initial=initial, states=states or None)
-        begun: Recording | ahrs.Begun = ahrs.begin(source)
+        ahrs.need_accelerometer(source)
         _doubt(source)
-        parameters = _recording_parameters(begun, motion, noise)
+        parameters = _recording_parameters(source, motion, noise, smooth)
         if isinstance(noise, GyroSpec) and noise.temperature is not None:
-            begun, parameters = ahrs.without_temperature(source, parameters, noise.temperature, walks=smooth)
+            source, parameters = ahrs.without_temperature(source, parameters, noise.temperature, walks=smooth)
         found = ahrs.estimate(
-            begun,
+            source,
             parameters,
             latency=latency,
             calibration=calibration,
@@ -363,9 +363,9 @@ def _specification(noise: GyroSpec | NoiseFit) -> GyroSpec:
 
 
 def _recording_parameters(
-    source: Recording | ahrs.Begun, motion: str | None, noise: GyroSpec | NoiseFit | ProcessNoise | None
+    source: Recording, motion: str | None, noise: GyroSpec | NoiseFit | ProcessNoise | None, smooth: bool
 ) -> ahrs.AhrsParameters:
-    parameters = ahrs.MOTIONS[ahrs.motions.chosen(source, motion or "auto")[0]]
+    parameters = ahrs.of_motion(motion or "hand", magnetometer=source.magnetic_field is not None, smooth=smooth)
     if noise is None:
         return parameters
     if isinstance(noise, ProcessNoise):

@@ -33,7 +33,7 @@ from strapdown.files import usable_folder, write_json
 from strapdown.units import DEGREE, DEGREE_PER_HOUR, DEGREE_PER_HOUR_PER_ROOT_HOUR, DEGREE_PER_ROOT_HOUR
 
 if TYPE_CHECKING:
-    from strapdown.ahrs import AhrsEstimate, AhrsParameters, Begun
+    from strapdown.ahrs import AhrsEstimate, AhrsParameters
     from strapdown.estimation.setup import FilterSetup
     from strapdown.estimation.setup.for_record import Start
     from strapdown.estimation.states import State
@@ -459,18 +459,18 @@ def _estimate_recording(
     from strapdown.consistency import reference_errors
     from strapdown.recordings import unit_calibration
 
-    motion = one_of("--motion", options.motion or "auto", ("auto", *ahrs.MOTIONS))
+    motion = one_of("--motion", options.motion or "hand", ahrs.MOTIONS)
     late = None if options.latency is None else 1e-3 * non_negative("--latency", options.latency, unit="ms")
     robustness = shared.robustness
     carried = None if options.calibration is None else unit_calibration.read(options.calibration)
-    begun, parameters, motion, odds = _read_recording(recording, layout, motion, shared, options.temperature)
+    source, parameters = _read_recording(recording, layout, motion, shared, options.temperature)
     with progress_bar("smoothing" if shared.smooth else "filtering"):
         result = ahrs.estimate(
-            begun,
+            source,
             parameters,
             latency=late,
             calibration=carried,
-            full_covariance=begun.recording.true_attitude is not None
+            full_covariance=source.true_attitude is not None
             if shared.full_covariance is None
             else shared.full_covariance,
             smooth=shared.smooth,
@@ -480,7 +480,7 @@ def _estimate_recording(
     errors = None if used.true_attitude is None else reference_errors(result.estimate.attitude, used.true_attitude)
     rms = None if errors is None else {name: value / DEGREE for name, value in errors.rms(used.movement).items()}
     paths = _write_recording(result, replace(parameters.setup, **robustness), motion, shared.smooth, out)
-    _say_recording(result, motion, odds)
+    _say_recording(result, motion)
     if shared.gyro is not None:
         arw, rrw = parameters.angle_random_walk, parameters.rate_random_walk
         console.print(
@@ -492,7 +492,7 @@ def _estimate_recording(
     if rms is not None:
         over = "the whole recording" if used.movement is None else "the movement phase"
         paths.append(_rms(out, used.source, rms, over))
-    paths += _export(exports, result.estimate, begun.recording)
+    paths += _export(exports, result.estimate, source)
     if output.drawn_as is not None:
         frame = _fixed_frame(used)
         paths += _drawn(out, output.drawn_as, result.estimate, used.source, used=used, errors=errors, fixed_frame=frame)
@@ -501,11 +501,8 @@ def _estimate_recording(
 
 def _read_recording(
     recording: Path, layout: dict[str, Any], motion: str, shared: _Shared, temperature: Path | None
-) -> tuple[Begun, AhrsParameters, str, float]:
-    """Return the recording less its bias over temperature, the parameters of the filter, the motion, and the margin of its log-likelihood.
-
-    The margin over the other motion is infinite if the motion was given.
-    """
+) -> tuple[Recording, AhrsParameters]:
+    """Return the recording less its bias over temperature, and the parameters of the filter."""
     from strapdown import ahrs, recordings
     from strapdown.gyro import read_spec
     from strapdown.gyro import temperature as thermal
@@ -513,10 +510,9 @@ def _read_recording(
     warm = None if temperature is None else thermal.read(temperature)
     with progress_bar("reading"):
         source = recordings.read(recording, **layout)
-    begun = ahrs.begin(source)
+    ahrs.need_accelerometer(source)
     doubt(source, recording)
-    motion, odds = ahrs.motions.chosen(begun, motion, name="--motion")
-    parameters = ahrs.MOTIONS[motion]
+    parameters = ahrs.of_motion(motion, magnetometer=source.magnetic_field is not None, smooth=shared.smooth)
     if shared.gyro is not None:
         from strapdown import workflows  # slow to import
 
@@ -525,8 +521,7 @@ def _read_recording(
     if warm is not None:
         walks = shared.smooth or shared.observability
         source, parameters = ahrs.without_temperature(source, parameters, warm, walks=walks)
-        begun = ahrs.begin(source)
-    return begun, parameters, motion, odds
+    return source, parameters
 
 
 def _fixed_frame(used: Recording) -> str:
@@ -570,21 +565,18 @@ def _write_recording(result: AhrsEstimate, chosen: FilterSetup, motion: str, smo
     return paths
 
 
-def _say_recording(result: AhrsEstimate, motion: str, odds: float) -> None:
-    """Print what was read, the initial state, the motion model, and faults of the samples."""
+def _say_recording(result: AhrsEstimate, motion: str) -> None:
+    """Print what was read, the motion model, what was found of the unit, and faults of the samples."""
     from strapdown import recordings
 
     used, found = result.recording, result.estimate
-    console.print(
-        f"{used.source}: {len(used.time)} samples over {used.time[-1] - used.time[0]:.1f} s, initialised in "
-        f"{'the quiet second' if _rested(result) else 'its quietest second, which is not at rest,'} from {used.time[0]:.2f} s."
-    )
-    say(*used.remarks, f"Fixed frame: {_fixed_frame(used)}.", _model(motion, odds, result))
+    console.print(f"{used.source}: {len(used.time)} samples over {used.time[-1] - used.time[0]:.1f} s.")
+    say(*used.remarks, f"Fixed frame: {_fixed_frame(used)}.", _model(motion, result))
     say(*result.delays.words, *(f"{one}." for one in result.faults.words))
     if result.hard_iron.any():
         iron = ", ".join(f"{value:.3g}" for value in result.hard_iron)
         console.print(
-            f"Hard iron of ({iron}) {used.magnetic_unit or '(unit of the magnetometer)'}, body axes, at the end, is subtracted."
+            f"Hard iron of ({iron}) {used.magnetic_unit or '(unit of the magnetometer)'}, body axes, is estimated at the end."
         )
     if words := gap_words(recordings.gaps(used.time)):
         console.print(f"{words}.")
@@ -604,29 +596,16 @@ def _rms(out: Path, source: str, rms: dict[str, float], over: str) -> Path:
     return out / "errors.json"
 
 
-def _rested(result: AhrsEstimate) -> bool:
-    """Return whether the gyro bias was estimated at the start, if the filter is initialised with it."""
-    p = result.parameters
-    return p.rest_bias_sigma == 0.0 or bool(result.initial.covariance[3, 3] <= (0.5 * p.bias_sigma) ** 2)
-
-
-def _model(moved_by: str, odds: float, result: AhrsEstimate) -> str:
-    """Return a description of the motion model and of the initial gyro bias."""
-    if moved_by == "any":
-        return "Motion: any, its acceleration modelled as white noise."
-    bias, sigma = result.initial.bias / DEGREE, np.sqrt(result.initial.covariance[3, 3]) / DEGREE
+def _model(moved_by: str, result: AhrsEstimate) -> str:
+    """Return a description of the motion model and of the spans at rest."""
     parameters = result.parameters
-    shown = " (from the recording)" if parameters.velocity_from_record else ""
-    likelier = (
-        f" (log-likelihood larger by {odds:.0f} than for a {'hand' if moved_by == 'vehicle' else 'vehicle'})"
-        if odds < np.inf
-        else ""
-    )
-    words = (
-        f"Motion: of a {moved_by}{likelier}, velocity σ {parameters.velocity_sigma:.2g} m/s{shown}, correlation time "
-        f"{parameters.velocity_time:g} s. "
-        f"Initial gyro bias: {', '.join(f'{value:.3g}' for value in bias)} °/s, σ {sigma:.2g} °/s"
-    )
-    if not _rested(result):
-        return f"{words}: no second is quiet enough to estimate it, so the heading may drift at first."
-    return f"{words}, from that second."
+    words = f"Motion: of a {moved_by}, velocity σ {parameters.velocity_sigma:.2g} m/s, correlation time {parameters.velocity_time:g} s."
+    if parameters.velocity_sigma == 0.0:
+        words = "Motion: any, its acceleration modelled as white noise."
+    if parameters.rest_bias_sigma == 0.0:
+        return words
+    number, time = len(result.rests.last), result.recording.time
+    if number == 0:
+        return f"{words} No second is quiet enough to measure the gyro's bias, so the heading may drift at first."
+    at = ", ".join(f"{time[last]:.2f}" for last in result.rests.last[:4]) + (", …" if number > 4 else "")
+    return f"{words} The gyro's bias is measured at rest, in {number} second{'s' if number > 1 else ''}, until {at} s."
