@@ -3,7 +3,10 @@
 Every page is executed when it is built, in an empty folder, and nothing is fetched from the network, neither by the build nor by the pages.
 """
 
+import functools
 import html
+import importlib
+import inspect
 import os
 import re
 import shutil
@@ -19,6 +22,7 @@ from sphinx.errors import ExtensionError
 DOCS = Path(__file__).resolve().parent
 sys.path[:0] = [str(DOCS.parent), str(DOCS)]
 
+import command_server  # noqa: E402
 import formula_font  # noqa: E402
 
 import strapdown  # noqa: E402
@@ -30,12 +34,20 @@ version = release = strapdown.__version__
 
 shutil.rmtree(DOCS / "api/generated", ignore_errors=True)  # pages of modules that are no more would be read too
 
-extensions = ["myst_nb", "numpydoc", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.viewcode"]
+extensions = [
+    "presentation",
+    "myst_nb",
+    "numpydoc",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
+    "sphinx.ext.viewcode",
+]
 exclude_patterns = ["_build", "jupyter_execute", "_data", "_templates", "**.ipynb_checkpoints"]
 templates_path = ["_templates"]
 
 # What a page's kernel needs: the program and the package of this build, one thread, tables of one width, and the way back to the docs.
-os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+_programs = tempfile.TemporaryDirectory()
+os.environ["PATH"] = os.pathsep.join([_programs.name, str(Path(sys.executable).parent), os.environ["PATH"]])
 os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(DOCS.parent), os.environ.get("PYTHONPATH", "")]))
 os.environ.update(
     STRAPDOWN_DOCS=str(DOCS),
@@ -47,6 +59,7 @@ os.environ.update(
     OPENBLAS_NUM_THREADS="1",
 )
 os.environ.pop("MPLBACKEND", None)  # pages draw inline
+command_server.start(Path(_programs.name))
 _profile = tempfile.TemporaryDirectory()
 os.environ["IPYTHONDIR"] = _profile.name
 (Path(_profile.name) / "profile_default").mkdir()
@@ -65,12 +78,13 @@ nb_execution_timeout = 900  # a cell may compile a filter
 nb_merge_streams = True
 nb_render_markdown_format = "myst"
 nb_output_stderr = "remove"  # progress bars; an error still stops the build
-myst_enable_extensions = ["amsmath", "dollarmath", "deflist", "attrs_inline"]
+myst_enable_extensions = ["amsmath", "dollarmath", "deflist", "attrs_inline", "colon_fence"]
 myst_heading_anchors = 3
 
 autosummary_generate = True
 autodoc_member_order = "bysource"
 autodoc_typehints = "none"  # numpydoc's parameters say it
+nitpicky = True
 autodoc_default_options = {"members": True}
 numpydoc_show_class_members = False
 numpydoc_class_members_toctree = False
@@ -79,6 +93,7 @@ html_theme = "furo"
 html_title = "strapdown"
 html_static_path = ["_static"]
 html_css_files = ["strapdown.css"]
+html_js_files = ["copy.js"]
 html_copy_source = False
 html_show_sphinx = False
 html_theme_options = {"navigation_with_keys": True}
@@ -117,8 +132,9 @@ def _spaced(markup: str) -> str:
 
 def _plain_marks(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
     """Let docstrings be read as they are meant: |q| is an absolute value and no substitution, a literal may touch a sign, as in ``x``²."""
+    role = re.compile(r":(?:func|class|meth|mod|data|attr|exc):`~?([\w.]+)`")
     for k, line in enumerate(lines):
-        parts = re.split(r"(``.+?``)", line)
+        parts = re.split(r"(``.+?``)", role.sub(functools.partial(_linked, name), line))
         for i in range(0, len(parts), 2):  # the texts between literals
             parts[i] = parts[i].replace("|", r"\|")
             if i and re.match(r"[^\s.,;:!?'\")\]}>/-]", parts[i]):
@@ -126,6 +142,30 @@ def _plain_marks(app: Any, what: str, name: str, obj: Any, options: Any, lines: 
             if i + 1 < len(parts) and re.search(r"[^\s'\"(\[{</:-]$", parts[i]):
                 parts[i] += r"\ "
         lines[k] = "".join(parts)
+
+
+@functools.cache
+def _documented() -> frozenset[str]:
+    """Return the names that have an entry in the reference: modules, what their ``__all__`` lists, and members of classes."""
+    names = {"strapdown.estimation.StepFilter", "strapdown.checks.InputError"}
+    listed = re.findall(r"^   ([\w.]+)$", (DOCS / "api/index.md").read_text(encoding="utf-8"), re.MULTILINE)
+    for module in (importlib.import_module(f"strapdown.{name}") for name in listed):
+        names.add(module.__name__)
+        for name in module.__all__:
+            value = getattr(module, name)
+            if inspect.isfunction(value) or inspect.isclass(value):
+                names.add(f"{module.__name__}.{name}")
+                names |= {f"{module.__name__}.{name}.{member}" for member in dir(value) if member[0] != "_"}
+    return frozenset(names)
+
+
+def _linked(place: str, role: re.Match[str]) -> str:
+    """Return a role whose target has an entry in the reference, else its target as a literal."""
+    target = role.group(1)
+    parts = place.split(".")
+    scopes = ["", "strapdown.", *(".".join(parts[:k]) + "." for k in range(1, len(parts) + 1))]
+    found = next((scope + target for scope in reversed(scopes) if scope + target in _documented()), "")
+    return f":py:obj:`{target} <{found}>`" if found else f"``{target}``"
 
 
 def setup(app: Any) -> None:

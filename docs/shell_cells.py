@@ -1,12 +1,13 @@
 """IPython extension of the documentation's pages: ``%%bash`` cells whose output comes in one piece, and that fail with their commands.
 
-The cells look and act as in any notebook; ``%%bash --no-raise-error`` goes on whatever the exit status.
+The cells act as in any notebook; ``%%bash --no-raise-error`` goes on whatever the exit status. ``%%writefile`` writes in silence.
 """
 
 from __future__ import annotations
 
 import subprocess
 import textwrap
+from pathlib import Path
 from typing import Any
 
 WIDTH = 88
@@ -31,6 +32,12 @@ def _wrapped(row: str) -> str:
     return textwrap.fill(row, WIDTH, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
 
 
+def writefile(line: str, cell: str) -> None:
+    """Write a cell to a file."""
+    Path(line.strip()).write_text(cell, encoding="utf-8")
+
+
 def load_ipython_extension(shell: Any) -> None:
-    """Register the magic."""
+    """Register the magics."""
     shell.register_magic_function(bash, magic_kind="cell")
+    shell.register_magic_function(writefile, magic_kind="cell")

@@ -1,6 +1,6 @@
 """Reference of the scenario file, generated from the tables and dataclasses that the parser itself uses.
 
-``sections()`` returns every table of a scenario file with its keys; ``markdown()`` renders those of one table for ``guide/simulate.md``.
+``sections()`` returns every table of a scenario file with its keys; ``markdown()`` renders those of one table for ``scenario-keys.md``.
 """
 
 from __future__ import annotations
@@ -118,7 +118,8 @@ def markdown(group: str) -> str:
 
 def _section(section: Section) -> str:
     type_line = f', `type = "{section.type}"`' if section.type else ""
-    head = f"**`{section.header}`{type_line}**: {section.summary}"
+    summary = f"{section.summary[:1].upper()}{section.summary[1:]}"
+    head = summary if section.group == "top" else f"### `{section.header}`{type_line}\n\n{summary}"
     rows = ["| key | unit | value | default | meaning |", "|---|---|---|---|---|"]
     for key in section.keys:
         names = "<br>or ".join(_broken(name) for name in (key.name, *key.others))

@@ -48,7 +48,7 @@ from strapdown.records import ImuRecord
 from strapdown.records.outputs import euler
 from strapdown.units import DEGREE, DEGREE_PER_HOUR_PER_ROOT_HOUR, DEGREE_PER_ROOT_HOUR
 
-SMALL = {"runs": 2, "unscented_runs": 1, "training": 1, "duration": 8.0, "own": ("mekf", "usque", "mahony")}
+SMALL = {"runs": 2, "training": 1, "duration": 8.0}
 """Arguments of a quick test run."""
 
 RATE = 50.0
@@ -56,7 +56,6 @@ FORCE_NOISE = 0.01 * 9.81 / np.sqrt(RATE)
 """White noise of the specific force, m/s²/√Hz."""
 FIELD = np.array([0.0, 0.45, -0.89])
 """Direction of the magnetic field, North and down, fixed frame East-North-Up."""
-OWN = ("mekf", "right-invariant", "equivariant", "geometric", "usque", "mahony")
 
 Peer = Callable[[Array, Array, Array, float, float], Array]
 """Attitudes (n, 4) from gyro (n, 3), rad/s, accelerometer (n, 3), g, magnetometer (n, 3), interval, s, and gain over the default."""
@@ -272,11 +271,9 @@ def starts(record: ImuRecord, plan: montecarlo.Plan, run: int) -> State:
 def main(
     *,
     runs: int = 50,
-    unscented_runs: int = 10,
     training: int = 4,
     duration: float = 60.0,
     seed: int = 1,
-    own: Sequence[str] = OWN,
     files: Sequence[Path] = (),
     out: Path | str | None = None,
     progress: Callable[[str], None] | None = None,
@@ -290,10 +287,10 @@ def main(
     bound = float(np.sqrt(np.mean(np.diagonal(predicted.cramer_rao, axis1=1, axis2=2)[10:, :3])))
     records = [scenarios.simulate(scene, seed, run) for run in range(runs)]
     outcomes = []
-    for name in own:
+    for name in filters.FILTERS:
         squares, nees, spent = [], [], []
         filters.run(name, records[0], base.process_noise, starts(records[0], plan, 0))  # compiles
-        for run, record in enumerate(records[: unscented_runs if name == "usque" else runs]):
+        for run, record in enumerate(records):
             begun = clock.process_time()
             estimate = filters.run(name, record, base.process_noise, starts(record, plan, run), full_covariance=True)
             spent.append(clock.process_time() - begun)
@@ -491,7 +488,6 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("files", nargs="*", type=Path, metavar="RECORDING", help="BROAD files")
     parser.add_argument("--runs", type=int, default=50)
-    parser.add_argument("--unscented-runs", type=int, default=10)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path, default=Path("results/filter_comparison"))
     found = main(**vars(parser.parse_args()), progress=lambda line: print(line, file=sys.stderr))

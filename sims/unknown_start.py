@@ -5,9 +5,9 @@ magnetometer every ten seconds. One direction at a time leaves the rotation abou
 attitudes are uniform over all attitudes, gyro biases normal with 20 °/h. On the same records run
 
 - the bank of hypotheses (:mod:`strapdown.estimation.multiple_model`), for several numbers of hypotheses;
-- single filters of the family from the identity, with the covariance of an unknown attitude: mekf, usque.
+- the MEKF from the identity, with the covariance of an unknown attitude.
 
-Run ``python sims/unknown_start.py --out unknown-start-results`` (minutes, nearly all for the unscented filter).
+Run ``python sims/unknown_start.py --out unknown-start-results`` (a minute).
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ ANYWHERE = float(np.sqrt((np.pi**2 / 3.0 + 2.0) / 3.0))
 """RMS error per axis of an attitude uniform over all attitudes, rad: the angle has the density (1 − cos θ)/π."""
 EVERY = 10
 """Interval of the kept edges: one per measurement."""
-FILTERS = ("bank of 24", "bank of 48", "bank of 96", "mekf", "usque")
+FILTERS = ("bank of 24", "bank of 48", "bank of 96", "mekf")
 
-SMALL = {"runs": 3, "unscented_runs": 1, "duration": 900.0}
+SMALL = {"runs": 3, "duration": 900.0}
 """Arguments of a quick test run."""
 
 COLOURS = {
@@ -47,7 +47,6 @@ COLOURS = {
     "bank of 48": style.GREEN,
     "bank of 96": style.BLUE,
     "mekf": style.VERMILION,
-    "usque": style.PURPLE,
 }
 
 
@@ -192,17 +191,13 @@ def table(result: Result) -> str:
 def main(
     *,
     runs: int = 200,
-    unscented_runs: int = 20,
     duration: float = 10800.0,
     filters: Sequence[str] = FILTERS,
     seed: int = 1,
     out: str | os.PathLike[str] | None = None,
 ) -> Result:
     """Compare the filters; ``duration`` in s. The figure and the table are written to ``out`` if it is given."""
-    outcomes = tuple(
-        study(name, runs=min(runs, unscented_runs) if name == "usque" else runs, duration=duration, seed=seed)
-        for name in filters
-    )
+    outcomes = tuple(study(name, runs=runs, duration=duration, seed=seed) for name in filters)
     if out is None:
         return Result(outcomes=outcomes, figures=())
     folder = Path(out)
@@ -216,7 +211,6 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("results/unknown_start"))
     parser.add_argument("--runs", type=int, default=200)
-    parser.add_argument("--unscented-runs", type=int, default=20)
     parser.add_argument("--duration", type=float, default=10800.0, help="s")
     parser.add_argument("--seed", type=int, default=1)
     print(table(main(**vars(parser.parse_args()))))

@@ -24,7 +24,16 @@ ROUNDING = 1e-14
 
 
 class InputError(ValueError):
-    """Bad input: the message names the value, the place and the remedy."""
+    """Bad input: the message names the value, the place and the remedy.
+
+    Examples
+    --------
+    >>> import strapdown as sd
+    >>> sd.simulate("two-star")
+    Traceback (most recent call last):
+        ...
+    strapdown.checks.InputError: scenario 'two-star' is not known; did you mean 'two-stars'? ...
+    """
 
 
 OF_YOUR_OWN = "a filter of your own"

@@ -338,6 +338,12 @@ def smooth(source: ImuRecord | Recording, **options: Any) -> Estimate:
     References
     ----------
     H. E. Rauch, F. Tung, C. T. Striebel, Maximum likelihood estimates of linear dynamic systems, AIAA Journal 3(8), 1965.
+
+    Examples
+    --------
+    >>> record = simulate("two-stars", seed=1)
+    >>> smooth(record).attitude.shape  # doctest: +SKIP
+    (30001, 4)
     """
     return estimate(source, **options, smooth=True)
 

@@ -78,6 +78,16 @@ def test_every_command_and_option_exists(page):
     assert [problem for words in found if (problem := unknown(words))] == []
 
 
+def test_the_reference_of_the_command_line_has_every_command_and_option():
+    program = get_command(importlib.import_module("strapdown.cli").app)
+    sections = re.split(r"^### strapdown ", with_generated(DOCS / "commands.md"), flags=re.MULTILINE)[1:]
+    printed = {section.split()[0]: set(re.findall(r"(?<![\w-])--?[a-z][\w-]*", section)) for section in sections}
+    assert set(printed) == set(program.commands)
+    for name, command in program.commands.items():
+        flags = {flag for option in command.params for flag in option.opts if flag.startswith("-") and flag != "--help"}
+        assert flags <= printed[name], f"{name}: {flags - printed[name]}"
+
+
 def test_the_commands_are_seen():
     """What the test above reads: a page that it read nothing of would pass."""
     assert ["simulate", "two-stars"] in commands(ROOT / "README.md")
@@ -87,9 +97,21 @@ def test_the_commands_are_seen():
     assert unknown(["simulat"]) == "command simulat"
 
 
+def with_generated(page: Path) -> str:
+    """Return the text of a page with the Markdown that its ``{generated}`` directives insert."""
+    text = page.read_text(encoding="utf-8")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(DOCS))
+        for call in re.findall(r"^```\{generated\} (.*)$", text, re.MULTILINE):
+            name, *arguments = call.split()
+            module, _, function = name.rpartition(".")
+            text += "\n\n" + getattr(pytest.importorskip(module), function)(*arguments)
+    return text
+
+
 def anchors(page: Path) -> set[str]:
     """Return what a link into a page may end in: its headings as GitHub and MyST name them, and its labels."""
-    text = page.read_text(encoding="utf-8")
+    text = with_generated(page)
     heads = re.findall(r"^#{1,6}\s+(.*)$", without_output(text), re.MULTILINE)
     slugs = {re.sub(r"[^\w\- ]", "", head.lower()).strip().replace(" ", "-") for head in heads}
     return slugs | set(re.findall(r"^\(([\w-]+)\)=$", text, re.MULTILINE))

@@ -8,6 +8,7 @@ import pytest
 from measured import FIELD, HAND, UP, drawn_start, seen, series_of
 
 from strapdown import consistency, estimation, gyro, quaternion
+from strapdown.checks import InputError
 from strapdown.estimation import error_states
 from strapdown.estimation.observability import state_names
 from strapdown.estimation.states import ProcessNoise
@@ -235,6 +236,33 @@ def test_an_acceleration_is_followed():
     late = slice(200, None)
     assert np.sqrt(np.mean(error[late] ** 2)) < 0.2
     assert 0.7 < np.mean((error[late] / found.sigma[1:][late]) ** 2) < 1.4
+
+
+@pytest.mark.parametrize("initial_sigma", [8e-3, np.array([1e-3, 4e-3, 3e-2])])
+def test_a_drift_that_starts_larger_settles_to_its_stationary_sigma(initial_sigma):
+    """Without measurements the variance is σ² + (σ₀² − σ²) e^{−2t/τ}; the attitude has the integral of the drift, by quadrature."""
+    sigma, tau, dt, steps = 2e-3, 3.0, 0.1, 120
+    block = error_states.GyroGaussMarkov(bias_sigma=sigma, initial_sigma=initial_sigma, correlation_time=tau)
+    record = ImuRecord(time=dt * np.arange(steps + 1), increments=np.zeros((steps, 3)), vectors=())
+    start = estimation.initial_state([1.0, 0.0, 0.0, 0.0], attitude_sigma=1e-9, bias_sigma=1e-12)
+    noise = ProcessNoise(angle_random_walk=1e-9, rate_random_walk=0.0)
+    estimate = estimation.run(record, noise, start, (block,), full_covariance=True)
+    t, start_variance = estimate.time[:, None], np.broadcast_to(np.square(initial_sigma), 3)
+    expected = sigma**2 + (start_variance - sigma**2) * np.exp(-2.0 * t / tau)
+    np.testing.assert_allclose(estimate.error_states["gyro drift"].sigma ** 2, expected, rtol=1e-9)
+    # E of the square of ∫ c dt: that of the start decays, the driven rest is white.
+    s, end = np.linspace(0.0, t[-1, 0], 4001), t[-1, 0]
+    gain = tau * -np.expm1(-(end - s) / tau)
+    driven = 2.0 * sigma**2 / tau * np.trapezoid(gain**2, s)
+    angle = start_variance * gain[0] ** 2 + driven
+    np.testing.assert_allclose(np.diagonal(estimate.covariance[-1, :3, :3]), angle, rtol=1e-5)
+
+
+def test_a_drift_without_an_initial_sigma_is_stationary():
+    block = error_states.GyroGaussMarkov(bias_sigma=2e-3, correlation_time=3.0)
+    assert dataclasses.replace(block, bias_sigma=1e-3).sigma.tolist() == [1e-3] * 3
+    with pytest.raises(InputError, match=r"gyro drift: initial_sigma\[0\] is -1"):
+        dataclasses.replace(block, initial_sigma=-1.0)
 
 
 @pytest.mark.parametrize("sigma", [0.5, 5.0])

@@ -2,12 +2,14 @@
 
 import json
 import math
+import os
 import subprocess
 import sys
 
 import pytest
 
-from strapdown.files import tables, write_json, written_beside
+from strapdown.checks import InputError
+from strapdown.files import locked, tables, write_json, written_beside
 
 
 def names(folder) -> list[str]:
@@ -138,3 +140,60 @@ def test_numbers_of_few_digits_are_written_with_them(suffix, factor):
     for number in (k / 1000.0 for k in range(1, 1001)):
         (found,) = tables._entry("angle", number * factor, ((suffix, factor),)).items()
         assert found == (f"angle_{suffix}", number)
+
+
+# ---------------------------------------------------------------------------------------------------- links, permissions
+
+
+POSIX = pytest.mark.skipif(sys.platform == "win32", reason="links and permissions of POSIX")
+
+
+@POSIX
+@pytest.mark.parametrize("make", [os.symlink, os.link])
+@pytest.mark.parametrize("name", [".out.h5.lock", ".out.h5.part"])
+def test_links_beside_an_output_do_not_lead_to_what_is_overwritten(tmp_path, name, make):
+    victim = tmp_path / "victim"
+    victim.write_text("precious")
+    make(victim, tmp_path / name)
+    target = tmp_path / "out.h5"
+    if name.endswith("lock"):
+        with pytest.raises(InputError, match=r"\.out\.h5\.lock is (a link|not a regular file)"), locked(target):
+            pass
+        assert not target.exists()
+    else:
+        with written_beside(target, durable=True) as temporary:
+            temporary.write_text("whole")
+        assert target.read_text() == "whole"
+    assert victim.read_text() == "precious"
+
+
+@POSIX
+def test_a_pipe_in_the_place_of_the_lock_is_refused_at_once(tmp_path):
+    os.mkfifo(tmp_path / ".out.h5.lock")
+    with pytest.raises(InputError, match=r"\.out\.h5\.lock is not a regular file"), locked(tmp_path / "out.h5"):
+        pass
+
+
+@POSIX
+@pytest.mark.parametrize(("umask", "mode"), [(0o077, 0o600), (0o022, 0o644), (0o002, 0o664)])
+@pytest.mark.parametrize("durable", [False, True])
+def test_files_have_the_permissions_of_the_umask_or_of_what_they_replace(tmp_path, umask, mode, durable):
+    target = tmp_path / "result.json"
+    before = os.umask(umask)
+    try:
+        for expected in (mode, 0o640):
+            with written_beside(target, durable=durable) as temporary:
+                temporary.write_text("{}")
+            assert target.stat().st_mode & 0o777 == expected
+            target.chmod(0o640)
+    finally:
+        os.umask(before)
+
+
+@POSIX
+def test_a_link_in_the_place_of_an_output_is_replaced_and_not_followed(tmp_path):
+    (tmp_path / "victim").write_text("precious")
+    (tmp_path / "result.json").symlink_to(tmp_path / "victim")
+    write_json(tmp_path / "result.json", {})
+    assert (tmp_path / "victim").read_text() == "precious"
+    assert not (tmp_path / "result.json").is_symlink()

@@ -2,11 +2,9 @@
 
 import ast
 import hashlib
-import importlib
 import math
 import multiprocessing
 import os
-import pkgutil
 import re
 import shutil
 import subprocess
@@ -29,8 +27,8 @@ from strapdown import estimation
 from strapdown.estimation import forward, schedule
 from strapdown.kernels import (
     algebra,
+    complementary,
     covariance_form,
-    filters,
     gate,
     hypotheses,
     likelihood,
@@ -38,7 +36,6 @@ from strapdown.kernels import (
     machine,
     root_form,
 )
-from strapdown.kernels.filters import body_side, extended
 from strapdown.kernels.walk import walk
 from strapdown.records import ImuRecord
 
@@ -216,11 +213,7 @@ BODIES = [
     (likelihood_outliers, likelihood),
     (likelihood_outliers, root_form),
     (hypotheses,),
-    *(
-        (importlib.import_module(f"{filters.__name__}.{name}"), extended, body_side)
-        for name in sorted(one.name for one in pkgutil.iter_modules(filters.__path__))
-        if name not in ("extended", "body_side")
-    ),
+    (complementary,),
 ]
 """What the walk is compiled with."""
 
@@ -245,7 +238,7 @@ def test_every_body_of_the_walk_is_listed_here():
         ("gate", "root_form"),
         ("*bodies",),
         ("hypotheses_kernel",),
-        ("definition", "kernel", "body_side"),
+        ("complementary",),
     }
 
 

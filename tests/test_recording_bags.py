@@ -245,10 +245,11 @@ def test_a_message_of_another_layout_is_named(bag):
     """A type of the right name and another definition: its message is too short."""
     from strapdown.recordings import ros
 
-    topic = ros._Topic("/imu", ros.IMU)
-    topic.add([(None, k, bytes([0, 1, 0, 0]) + bytes(size)) for k, size in enumerate((340, 20))])
+    topic = ros.Topic("/imu", ros.IMU, span=ros.READ[ros.IMU])
+    for k, size in enumerate((340, 20)):
+        topic.add(k, bytes([0, 1, 0, 0]) + bytes(size))
     with pytest.raises(InputError, match=r"x.bag, topic /imu: message 2 is 24 bytes long, shorter than its type"):
-        ros._joined("x.bag", topic)
+        topic.decoded("x.bag")
 
 
 def tesla(*size, **options) -> Recording:
@@ -336,10 +337,9 @@ def test_commands_read_bags_and_say_the_topic(bag, tmp_path):
         assert said.exit_code == status, said.output
 
 
-def test_without_the_library_the_remedy_is_one_line(bag, monkeypatch):
+def test_without_the_library_the_remedy_is_one_line(tmp_path, monkeypatch):
     import sys
 
-    path = bag("mcap", imu()[1])
-    monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
+    monkeypatch.setitem(sys.modules, "rosbags.typesys", None)
     with pytest.raises(InputError, match=r"needs rosbags .*pip install 'strapdown\[formats\]'"):
-        read(path)
+        recordings.write(tesla(), tmp_path / "x.mcap")

@@ -1,11 +1,13 @@
 """Reports: self-contained pages whose words, numbers and figures are those of the result."""
 
+import base64
 import dataclasses
 import html.parser
 import json
 import re
 import shutil
 import subprocess
+import zlib
 
 import numpy as np
 import pytest
@@ -116,21 +118,42 @@ def test_numbers_are_those_of_the_estimate(folder):
     assert numbers["states"] == len(estimate.time)
 
 
-def test_charts_hold_every_extreme(folder):
-    content = body(folder / "right.html")
-    charts = [
-        json.loads(text.replace("<\\/", "</"))
-        for text in re.findall(r'<script type="application/json">(.*?)</script>', content, re.S)
-    ]
+def unpacked(column, kind):
+    """Return the integers of a packed column, read independently of the page's JavaScript."""
+    planes = np.frombuffer(zlib.decompress(base64.b64decode(column["deflate"])), np.uint8)
+    size = np.dtype(kind).itemsize
+    steps = np.ascontiguousarray(planes.reshape(size, -1).T).view(kind)[:, 0]
+    return np.cumsum(steps.astype(np.int64)) if size == 4 else np.cumsum(steps, dtype=np.int16)
+
+
+def columns(content):
+    """Return the times and the series of a chart, NaN where there is a gap."""
+    integers = [unpacked(column, "<i2") for column in content["data"]]
+    time = content["time"]["first"] + content["time"]["tick"] * unpacked(content["time"], "<i4")
+    block = np.arange(len(time)) // page.BLOCK
+    return time, *(
+        np.where(whole == -32768, np.nan, np.array(one["offset"])[block] + np.array(one["scale"])[block] * whole)
+        for one, whole in zip(content["data"], integers, strict=True)
+    )
+
+
+def charts_of(content):
+    """Return the JSON of the charts of a page."""
+    texts = re.findall(r'<script type="application/json">(.*?)</script>', content, re.S)
+    return [chart for text in texts if "unit" in (chart := json.loads(text.replace("<\\/", "</")))]
+
+
+def test_charts_hold_every_sample(folder):
+    charts = charts_of(body(folder / "right.html"))
     assert [chart["unit"].split(", ")[1] for chart in charts] == ["arcsec"] * 3 + ["°/h"] * 3
     estimate, truth = records.read_estimate(folder / "right.h5"), records.read_truth(folder / "right.h5")
     error = (truth.bias - estimate.bias) * 180.0 / np.pi * 3600.0
+    sigma = np.sqrt(estimate.variance[:, 3:]) * 180.0 / np.pi * 3600.0
     for axis in range(3):
-        high, low, drawn = (np.array(values) for values in charts[3 + axis]["data"][1:])
-        sigma = np.sqrt(estimate.variance[:, 3 + axis]).max() * 180.0 / np.pi * 3600.0
-        np.testing.assert_allclose([high.max(), low.min()], [3.0 * sigma, -3.0 * sigma], rtol=1e-6)
-        assert drawn.max() == pytest.approx(error[:, axis].max(), rel=1e-6)
-        assert drawn.min() == pytest.approx(error[:, axis].min(), rel=1e-6)
+        time, high, low, drawn = columns(charts[3 + axis])
+        np.testing.assert_allclose(time, estimate.time, atol=1e-6)
+        for value, true in ((high, 3.0 * sigma[:, axis]), (low, -3.0 * sigma[:, axis]), (drawn, error[:, axis])):
+            np.testing.assert_allclose(value, true, atol=0.51 * np.ptp(true) / 65534.0)
 
 
 def test_what_a_file_says_of_itself_cannot_break_the_page(folder):
@@ -159,7 +182,7 @@ def test_the_campaign_page_says_what_the_filter_has_no_state_for(folder, scenari
     assert "<strong>Not consistent.</strong>" in content
     assert (
         "; the filter has no state for the gyro&#x27;s scale factor of 5e+04 ppm"
-        in content[: content.index("Key numbers")]
+        in content[: content.index("<h2>Key numbers")]
     )
 
 
@@ -211,38 +234,40 @@ def test_the_verdict_of_a_tuning_is_the_worst_on_held_out_data():
     assert "RMS attitude error: 1° before, 0.5° after." in words
 
 
-def test_gaps_become_null_not_nan():
-    chart = page.chart("t", "u", np.arange(3.0), [page.Series(label="a", value=np.array([1.0, np.nan, 2.0]))])
-    assert "NaN" not in chart
-    assert "null" in chart
+def test_packed_numbers_are_read_back():
+    draw = np.random.default_rng(2)
+    value = np.concatenate([1e6 * draw.standard_normal(page.BLOCK), draw.standard_normal(5000), [7.0, np.nan, 7.0]])
+    time = np.cumsum(draw.uniform(1e-3, 5.0, len(value))) + 1e5
+    content = {"time": page.packed_time(time), "data": [page.packed(value), page.packed(np.full(len(value), np.nan))]}
+    back, number, nothing = columns(content)
+    np.testing.assert_allclose(back, time, atol=0.51e-6)
+    np.testing.assert_array_equal(np.isnan(number), np.isnan(value))
+    assert np.isnan(nothing).all()
+    for part in (slice(0, page.BLOCK), slice(page.BLOCK, 2 * page.BLOCK), slice(2 * page.BLOCK, None)):
+        known = value[part][np.isfinite(value[part])]
+        assert np.nanmax(np.abs(number[part] - value[part])) <= 0.51 * np.ptp(known) / 65534.0
+    wide = page.packed_time(np.array([0.0, 1e-6, 1e7]))  # longer than 32 bits of microseconds
+    np.testing.assert_allclose(columns({"time": wide, "data": []})[0], [0.0, 1e-6, 1e7], atol=2.0 * wide["tick"])
 
 
-def test_the_band_of_a_long_chart_is_its_widest_in_each_column():
-    """Between two measurements σ grows: drawn through its extremes it would be a bar over the errors."""
-    time = np.arange(200_000) / 100.0
-    sigma = 1.0 + np.mod(np.arange(200_000), 50) / 50.0
-    sigma[100_000] = 9.0
-    series = (
-        page.Series(label="+", value=sigma, band=True),
-        page.Series(label="-", value=-sigma, band=True),
-        page.Series(label="error", value=np.random.default_rng(1).standard_normal(len(time))),
-    )
-    content = json.loads(re.search(r"json\">(.*?)</script>", page.chart("t", "u", time, series), re.S).group(1))
-    when, upper, lower, _ = (np.array(row) for row in content["data"])
-    assert 3000 < len(when) <= 6002
-    assert upper.min() == pytest.approx(1.98)  # each column holds a whole tooth; its least would be 1
-    assert upper.max() == 9.0
-    np.testing.assert_array_equal(lower, -upper)
+def test_a_very_long_chart_keeps_its_extremes():
+    time = np.arange(600_000) / 100.0
+    value = np.random.default_rng(1).standard_normal(len(time))
+    value[300_001] = 50.0
+    (chart,) = charts_of(page.chart("t", "u", time, (page.Series(label="error", value=value),)))
+    when, drawn = columns(chart)
+    assert page.CHART_SAMPLES // 2 < len(when) <= page.CHART_SAMPLES + 2
+    assert drawn.max() == pytest.approx(50.0, rel=1e-6)
+    assert when[drawn.argmax()] == pytest.approx(time[300_001], abs=1e-6)
 
 
 def test_a_chart_of_an_angle_breaks_where_it_wraps():
-    time = np.linspace(0.0, 10.0, 50_001)
+    time = np.linspace(0.0, 10.0, 5001)
     angle = np.mod(90.0 * time + 180.0, 360.0) - 180.0
-    series = (page.Series(label="yaw", value=angle, wraps=True),)
-    content = page.chart("t", "°", time, series)
-    data = json.loads(re.search(r"json\">(.*?)</script>", content, re.S).group(1))["data"][1]
-    assert data.count(None) == 3  # 900° in all: past 180°, 540° and at the end 900°
-    assert np.nanmax(np.abs(np.diff(np.array(data, float)))) < 180.0
+    (chart,) = charts_of(page.chart("t", "°", time, (page.Series(label="yaw", value=angle, wraps=True),)))
+    data = columns(chart)[1]
+    assert np.isnan(data).sum() == 3  # 900° in all: past 180°, 540° and at the end 900°
+    assert np.nanmax(np.abs(np.diff(data))) < 180.0
 
 
 PARENTS = {"li": "ul", "tr": "table", "td": "tr", "th": "tr", "figcaption": "figure", "source": "picture"}
@@ -317,36 +342,89 @@ def test_a_folder_without_a_name_is_no_result(place):
     assert isinstance(found.exception, InputError)
 
 
-PROBE = """<script>window.addEventListener("load", () => setTimeout(() => {
-document.title = JSON.stringify({charts: document.querySelectorAll(".uplot canvas").length,
-hidden: [...document.images].filter((i) => i.naturalWidth === 0 || i.getBoundingClientRect().width < 100).length,
-images: document.images.length, tables: [...document.querySelectorAll(".scroll")].filter((e) => e.querySelector("table")).map(
-(e) => { e.scrollLeft = 1e4; const cell = e.querySelector("tr:last-child").lastElementChild.getBoundingClientRect();
-return cell.right <= e.getBoundingClientRect().right + 2 && getComputedStyle(e).overflowX === "auto"; }),
-overflow: document.documentElement.scrollWidth - window.innerWidth});}, 300));
-window.onerror = (message) => { document.body.dataset.error = message; };</script></head>"""
+PROBE = """<script>window.onerror = (message) => { document.body.dataset.error = message; };
+const wait = setInterval(async () => {
+  if (PAGE_HAS_CHARTS && !document.documentElement.dataset.drawn) return;
+  clearInterval(wait);
+  const found = {charts: document.querySelectorAll(".uplot canvas").length, images: document.images.length,
+    hidden: [...document.images].filter((i) => i.naturalWidth === 0 || i.getBoundingClientRect().width < 100).length,
+    tables: [...document.querySelectorAll(".scroll")].filter((e) => e.querySelector("table")).map((e) => { e.scrollLeft = 1e4;
+      const cell = e.querySelector("tr:last-child").lastElementChild.getBoundingClientRect();
+      return cell.right <= e.getBoundingClientRect().right + 2 && getComputedStyle(e).overflowX === "auto"; }),
+    overflow: document.documentElement.scrollWidth - window.innerWidth,
+    unnamed: [...document.querySelectorAll("canvas")].filter((one) => !one.getAttribute("aria-label")).length,
+    dead: [...document.querySelectorAll("nav a")].filter((a) => !document.querySelector(a.getAttribute("href"))).length,
+    contents: document.querySelectorAll("nav a").length};
+  if (PAGE_HAS_CHARTS) {
+    const soon = () => new Promise((done) => setTimeout(done, 20));
+    const drawn = strapdownCharts.drawn();
+    const seen = () => drawn.map(({plot}) => ["x", "y"].flatMap((k) => [plot.scales[k].min, plot.scales[k].max]));
+    const press = (place, name) => place.dispatchEvent(new KeyboardEvent("keydown", {key: name, bubbles: true}));
+    await soon();
+    found.begin = seen();
+    found.samples = drawn[0].plot.data[0].length;
+    press(drawn[1].place, "+"); await soon(); press(drawn[1].place, "+"); await soon();
+    found.zoomed = seen();
+    found.visible = drawn[0].plot.data[0].filter((t) => t >= found.zoomed[0][0] && t <= found.zoomed[0][1]).length;
+    drawn[2].plot.over.dispatchEvent(new MouseEvent("dblclick", {bubbles: true})); await soon();
+    found.reset = seen();
+    const head = document.querySelector(".u-legend .u-series:not(:first-child) th");
+    found.focusable = [head.tabIndex, head.getAttribute("role")];
+    press(head, "Enter"); await soon();
+    found.pressed = head.getAttribute("aria-pressed");
+    const bodies = strapdownCharts.bodies();
+    found.body = bodies.map((one) => one.k);
+    drawn[0].plot.setCursor({left: 0, top: 10}); await soon();
+    found.turned = bodies.map((one) => one.k);
+    window.dispatchEvent(new Event("beforeprint"));
+    found.ink = getComputedStyle(document.documentElement).getPropertyValue("--ink").trim();
+  }
+  document.title = JSON.stringify(found);
+}, 50);</script></head>"""
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine; install it to see the pages in a browser")
-@pytest.mark.parametrize(("name", "width"), [("right", 1280), ("campaign", 390)])
-def test_a_browser_shows_figures_and_charts(folder, tmp_path, name, width):
+def shown_by_a_browser(content, tmp_path, width):
+    """Return what the probe finds on a page in headless Chromium, in the dark theme."""
+    charts = str('class="chart"' in content).lower()
     probe = tmp_path / "probe.html"
-    probe.write_text(body(folder / f"{name}.html").replace("</head>", PROBE, 1), encoding="utf-8")
+    probe.write_text(content.replace("</head>", PROBE.replace("PAGE_HAS_CHARTS", charts), 1), encoding="utf-8")
     options = ["--headless", "--no-sandbox", "--no-first-run", f"--user-data-dir={tmp_path / 'profile'}"]
     options += ["--disable-gpu", "--disable-background-networking", "--disable-component-update", "--disable-sync"]
-    options += ["--enable-logging=stderr", f"--window-size={width},900", "--virtual-time-budget=4000", "--dump-dom"]
+    options += ["--blink-settings=preferredColorScheme=0", "--enable-logging=stderr", f"--window-size={width},900"]
+    options += ["--virtual-time-budget=20000", "--dump-dom"]
     shown = subprocess.run(
         [str(CHROMIUM), *options, probe.as_uri()], capture_output=True, text=True, timeout=120, check=True
     )
     assert "data-error" not in shown.stdout[: shown.stdout.index("<style>") + 10] + shown.stdout[-3000:]
     assert ":CONSOLE" not in shown.stderr, shown.stderr
-    found = json.loads(re.search(r"<title>(\{.*?\})</title>", shown.stdout).group(1).replace("&quot;", '"'))
+    found = re.search(r"<title>(\{.*?\})</title>", shown.stdout)
+    assert found, "the page did not finish drawing"
+    return json.loads(found.group(1).replace("&quot;", '"'))
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine; install it to see the pages in a browser")
+@pytest.mark.parametrize(("name", "width"), [("right", 1280), ("campaign", 390)])
+def test_a_browser_shows_figures_and_charts(folder, tmp_path, name, width):
+    found = shown_by_a_browser(body(folder / f"{name}.html"), tmp_path, width)
     assert found["hidden"] == 0
-    assert found["images"] >= 3
+    assert found["images"] >= 1
     assert found["overflow"] <= 0
     assert found["tables"]
     assert all(found["tables"])  # scrolled to its end, a table shows its last column
-    assert found["charts"] == (6 if name == "right" else 0)
+    assert found["charts"] == (6 if name == "right" else 9)
+    assert (found["unnamed"], found["dead"]) == (0, 0)
+    assert found["contents"] >= 5
+    whole, zoomed = np.array(found["begin"]), np.array(found["zoomed"])
+    np.testing.assert_allclose(np.ptp(zoomed[:, :2], axis=1), 0.25 * np.ptp(whole[1, :2]), rtol=0.02)  # all of them
+    assert found["visible"] == pytest.approx(0.25 * found["samples"], rel=0.05, abs=2)
+    np.testing.assert_allclose(found["reset"], whole)  # a double click on one chart restores all of them
+    assert found["focusable"] == [0, "button"]
+    assert found["pressed"] == "false"
+    assert found["ink"] == "#16181d"  # dark on paper, also in the dark theme
+    if name == "right":
+        assert found["samples"] == len(records.read_estimate(folder / "right.h5").time)
+        assert found["body"] == [found["samples"] - 1]
+        assert found["turned"] == [0]
 
 
 def rows_of(content, first):
@@ -419,5 +497,5 @@ def test_what_a_campaign_page_says_of_the_end_is_of_the_last_epoch(folder, monke
 
 @pytest.mark.parametrize("name", ["right", "blind", "wrong", "campaign"])
 def test_no_panel_of_a_figure_is_empty(folder, panels, name):
-    assert len(panels[name]) > 3
+    assert len(panels[name]) >= (2 if name == "campaign" else 4)  # each in two themes
     assert all(all(one) for one in panels[name])

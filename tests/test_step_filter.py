@@ -453,7 +453,7 @@ FACES = {
     "estimation.observability": estimation.observability,
     "estimation.relinearized_start": estimation.relinearized_start,
     "multiple_model.run": lambda record, noise, initial, **options: multiple_model.run(record, noise, **options),
-    "filters.run": lambda *given: filters.run("usque", *given),
+    "filters.run": lambda *given: filters.run("mahony", *given),
     "filters.compare": filters.compare,
 }
 WRONG_ARGUMENTS = {"record": None, "process_noise": 1e-4, "initial": None, "gate": 0.999, "robust": "huber"}

@@ -100,7 +100,7 @@ def test_every_section_and_key_is_printed():
     page = "\n".join(reference.markdown(group) for group in ("top", "motion", "gyro", "sensors"))
     printed = set(re.findall(r"<code class=\"key\">([a-z0-9_]+)</code>", page.replace("<wbr>", "")))
     for section in SECTIONS:
-        assert f"`{section.header}`" in page
+        assert f"`{section.header}`" in page or section.group == "top"
         assert f'type = "{section.type}"' in page or not section.type
         assert {name for key in section.keys for name in (key.name, *key.others)} <= printed
 

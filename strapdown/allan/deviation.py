@@ -28,7 +28,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from strapdown import checks
 from strapdown.allan import gaps
-from strapdown.allan.spectrum import flicker_covariance
+from strapdown.allan.spectrum import flicker_covariance, inner
 from strapdown.checks import Array, InputError
 from strapdown.kernels.allan import accumulate, second_difference_sizes, second_difference_squares
 from strapdown.kernels.machine import compiled, read_only
@@ -238,7 +238,7 @@ def _third_differences(series: Array, m: int) -> float:
         end = min(start + _STRETCH, count)
         a, b, c, d = (series[start + j * m : end + j * m] for j in range(4))
         difference = (d - a) - 3.0 * (c - b)
-        total += float(difference @ difference)
+        total += inner(difference, difference)
     return total / count
 
 
@@ -355,10 +355,10 @@ def _power_law(phase: Array, m: int, otherwise: int) -> int:
         return otherwise
     for differenced in range(3):
         centred = blocks - blocks.mean()
-        power = float(centred @ centred)
+        power = inner(centred, centred)
         if power <= 0.0:
             return -2
-        correlation = float(centred[1:] @ centred[:-1]) / power
+        correlation = inner(centred[1:], centred[:-1]) / power
         delta = correlation / (1.0 + correlation) if correlation > -1.0 else -math.inf
         if delta < 0.25 or differenced == 2:
             alpha = int(np.clip(np.round(-2.0 * (max(delta, -2.0) + differenced)), -2, 2))
@@ -386,7 +386,7 @@ def flicker_variance(multiples: ArrayLike) -> Array:
         else:
             lag = np.arange(1 - m, m)
             weight = m - np.abs(lag)
-            result[index] = weight @ (covariance[np.abs(lag)] - covariance[lag + m]) / m**2
+            result[index] = inner(weight, covariance[np.abs(lag)] - covariance[lag + m]) / m**2
     return result
 
 

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from strapdown import checks
+from strapdown.allan.spectrum import inner
 from strapdown.checks import Array, InputError
 
 SIMULATED = 1 << 12
@@ -108,7 +109,7 @@ class _Pairs(NamedTuple):
         for i, m in enumerate(multiples.tolist()):
             k = np.arange(1, 2 * m)
             correlation = np.where(k <= m, 2.0 * m - 3.0 * k, k - 2.0 * m)
-            found[i] = -float(correlation @ semivariogram[1 : 2 * m]) / m**2
+            found[i] = -inner(correlation, semivariogram[1 : 2 * m]) / m**2
         return found
 
 

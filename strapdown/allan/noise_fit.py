@@ -34,6 +34,7 @@ from strapdown.allan.spectrum import (
     binned,
     cosine_transform,
     expected_power,
+    inner,
     last_coefficient,
     mean_power,
     ramp_coefficients,
@@ -641,7 +642,7 @@ def _misfit_of(
     size = abs(float(white[largest]))
     stretches = min(_STRETCHES, samples // 16)
     edges = np.linspace(0, samples, stretches + 1).astype(np.int64)
-    energy = np.array([white[a:b] @ white[a:b] for a, b in itertools.pairwise(edges)])
+    energy = np.array([inner(white[a:b], white[a:b]) for a, b in itertools.pairwise(edges)])
     number = np.diff(edges)
     freedom = number * (last / samples)
     loudest = int(np.argmax(energy / number))

@@ -104,6 +104,11 @@ def ramp_coefficients(samples: int, j: NDArray[np.int64]) -> Array:
     return np.asarray(np.where(j % 2 == 1, -math.sqrt(2.0 / samples) * np.cos(half) / (2.0 * np.sin(half) ** 2), 0.0))
 
 
+def inner(a: Array, b: Array) -> float:
+    """Return Σ a b of two vectors without BLAS, whose threads cost many times the sum itself where other work keeps the cores busy."""
+    return float(np.einsum("i,i->", a, b))
+
+
 class Bins(NamedTuple):
     """Sums over each bin: squared coefficients less a first slope, their products with those of the ramp, squares of those of the ramp."""
 
@@ -147,14 +152,14 @@ def binned(coefficients: Sequence[Array], segments: Sequence[Segment], dt: float
     ramps = [
         dt * ramp_coefficients(len(c), np.arange(1, len(part) + 1)) for c, part in zip(coefficients, low, strict=True)
     ]
-    slope = float(sum(r @ c for r, c in zip(ramps, low, strict=True)) / sum(r @ r for r in ramps))
+    slope = sum(inner(r, c) for r, c in zip(ramps, low, strict=True)) / sum(inner(r, r) for r in ramps)
     each = []
     for coefficient, one in zip(coefficients, segments, strict=True):
         sums = []
         for s in bin_slices(one.starts, one.last):
             ramp = dt * ramp_coefficients(len(coefficient), np.arange(s.start, s.stop))
             rest = coefficient[s] - slope * ramp
-            sums.append((len(rest), rest @ rest, rest @ ramp, ramp @ ramp))
+            sums.append((len(rest), inner(rest, rest), inner(rest, ramp), inner(ramp, ramp)))
         number, square, product, ramp_square = np.array(sums, dtype=float).T
         each.append(Bins(number, square, product, ramp_square, one.basis, slope))
     frequency = [one.starts / len(c) for c, one in zip(coefficients, segments, strict=True)]

@@ -3,12 +3,15 @@
 ``x = c_0 + c_1 (T − T_0) + c_2 (T − T_0)² + … + noise``. The noise is far from white (a drifting bias resembles one that depends on the
 temperature), so the intervals of ordinary least squares would be too small. The coefficients of the cosine transform of the record are
 independent, and their variances follow from the noise terms (:mod:`strapdown.allan`). The regression is therefore by generalised least
-squares with these weights, iterated with the noise of the residuals until it converges. No rate ramp is fitted, because the bias of a
-sensor that warms up resembles one.
+squares with these weights. A weak rate random walk is hardly seen in the record, and yet limits the coefficients: they are averaged over
+all walks that the record allows, weighted by the restricted likelihood of the noise terms, and the intervals are those of the mixture. If
+the bias only flickers, the intervals are about twice as large as with the noise known, because a walk cannot be excluded. No rate ramp is
+fitted, because the bias of a sensor that warms up resembles one.
 
 ``c_0``, the bias at ``T_0``, is the mean of the residuals; it has no interval, since the bias drifts. The record must have no gaps.
 
-Source: IEEE Std 952-1997, 12.11 (temperature sensitivity); the weights: as in :mod:`strapdown.allan`.
+Sources: IEEE Std 952-1997, 12.11 (temperature sensitivity); Harville, "Maximum likelihood approaches to variance component estimation",
+J. Am. Stat. Assoc. 72, 1977; Berger, de Oliveira & Sansó, "Objective Bayesian analysis of spatially correlated data", ibid. 96, 2001.
 """
 
 from __future__ import annotations
@@ -16,7 +19,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from strapdown import checks
 from strapdown.allan.deviation import TERMS
@@ -30,9 +33,17 @@ __all__ = [
 ]
 
 MAX_PASSES = 50
-"""Maximum number of iterations of the regression, each with the noise of the last residuals."""
-SETTLED = 1e-3
-"""Tolerance of convergence: change of a coefficient, in σ, and relative change of the noise spectrum."""
+"""Maximum number of iterations for the noise terms."""
+SETTLED = 1e-6
+"""Smallest increase of the log-likelihood of a further iteration."""
+SHORTEST_STEP = 1e-6
+FLICKER, WALK = TERMS.index("bias_instability"), TERMS.index("rate_random_walk")
+SUPPORT = 4.8
+"""Log-likelihood ratio that supports flicker: probability 1e-3 without it, as in :mod:`strapdown.allan.noise_fit`."""
+COARSE, FINE = 25, 40
+"""Number of values of the rate random walk: for the limits of what is possible, and between these."""
+UNLIKELY = 12.0
+"""Decrease of the log-likelihood from its maximum beyond which a rate random walk is not considered."""
 LEVEL = 0.95
 """Confidence of the intervals."""
 SMALLEST_SPAN = 0.5
@@ -95,53 +106,157 @@ def fit_temperature(
         )
     reference = float(T.mean())
     powers = (T[:, None] - reference) ** np.arange(1, order + 1)
-    from scipy.stats import norm
-
-    coefficients, sigma = np.zeros((2, order + 1, x.shape[1]))
+    coefficients, sigma, reach = np.zeros((3, order + 1, x.shape[1]))
     left = np.empty_like(x)
     for axis in range(x.shape[1]):
-        found, sigma[1:, axis] = _regression(x[:, axis], powers, dt)
-        left[:, axis] = x[:, axis] - (powers - powers.mean(axis=0)) @ found
-        coefficients[:, axis] = float(np.mean(x[:, axis] - powers @ found)), *found
+        found, sigma[1:, axis], reach[1:, axis] = _regression(x[:, axis], powers, dt)
+        left[:, axis] = x[:, axis] - np.sum((powers - powers.mean(axis=0)) * found, axis=1)
+        coefficients[:, axis] = float(np.mean(x[:, axis]) - powers.mean(axis=0) @ found), *found
     polynomial = BiasOverTemperature(reference=reference, span=span, coefficients=coefficients, sigma=sigma)
-    return TemperatureFit(polynomial, float(norm.ppf(0.5 + 0.5 * LEVEL)) * sigma, left)
+    return TemperatureFit(polynomial, reach, left)
 
 
-def _regression(x: Array, powers: Array, dt: float) -> tuple[Array, Array]:
-    """Return the coefficients of the powers and their σ, weighted by the noise, whose terms maximise the restricted likelihood.
+class _Bins(NamedTuple):
+    """Sums over each bin of cosine coefficients: of the residuals y of a first fit and the regressors A, and the expected noise."""
 
-    Fisher scoring as in :func:`strapdown.allan.fit_noise`: the noise terms are fitted to the squared residuals, each with the expected
-    reduction by the regression added back.
+    number: Array
+    square: Array
+    """Σ y² (b,)."""
+    product: Array
+    """Σ y A (b, p)."""
+    gram: Array
+    """Σ A Aᵀ (b, p, p)."""
+    basis: Array
+    """Expected square of a coefficient for unit noise of each term (terms, b)."""
+
+
+class _Fit(NamedTuple):
+    """Coefficients (p,) and their covariance (p, p) for given noise, whose restricted log-likelihood is −``loss``."""
+
+    loss: float
+    theta: Array
+    variance: Array
+    coefficients: Array
+    covariance: Array
+
+
+def _regression(x: Array, powers: Array, dt: float) -> tuple[Array, Array, Array]:
+    """Return the coefficients of the powers, their σ and the half-widths of their intervals.
+
+    A mixture over the rate random walk K: for each K the other noise terms maximise the restricted likelihood, and this likelihood times
+    Jeffreys' prior of K² is the weight of the coefficients that follow by generalised least squares.
     """
+    bins, first, scale = _binned(x, powers, dt)
+    fits, weights = _over_walk(bins)
+    each = np.array([fit.coefficients for fit in fits])
+    variances = np.array([fit.covariance.diagonal() for fit in fits])
+    mean = weights @ each
+    sigma = np.sqrt(weights @ (variances + (each - mean) ** 2))
+    reach = np.array([_half_width(weights, *one) for one in zip((each - mean).T, np.sqrt(variances).T, strict=True)])
+    return (first + mean) / scale, sigma / scale, reach / scale
+
+
+def _binned(x: Array, powers: Array, dt: float) -> tuple[_Bins, Array, Array]:
+    """Return the bins, the coefficients of a first fit, which is subtracted so that no digits cancel, and the scale of both."""
     from scipy.fft import dct
-    from scipy.optimize import nnls
 
     samples = len(x)
-    scale = np.linalg.norm(powers - powers.mean(axis=0), axis=0)
-    A = dct((powers - powers.mean(axis=0)) / scale, type=2, norm="ortho", axis=0)[1:]
+    centred = powers - powers.mean(axis=0)
+    scale = np.sqrt(np.sum(centred**2, axis=0))
+    A = dct(centred / scale, type=2, norm="ortho", axis=0)[1:]
     y = dct(x - x.mean(), type=2, norm="ortho")[1:]
     starts = bin_starts(samples - 1)
     basis = np.stack([mean_power(term, samples, dt, starts, samples - 1) for term in TERMS[:4]])
+
+    def sums(values: Array) -> Array:
+        return np.asarray(np.add.reduceat(values, starts - 1, axis=0))
+
+    gram = sums(A[:, :, None] * A[:, None, :])
+    first = np.linalg.solve(gram.sum(axis=0), sums(A * y[:, None]).sum(axis=0))
+    rest = y - np.sum(A * first, axis=1)
     number = np.diff(np.append(starts, samples)).astype(np.float64)
+    return _Bins(number, sums(rest**2), sums(A * rest[:, None]), gram, basis), first, scale
 
-    def binned(values: Array) -> Array:
-        return np.asarray(np.add.reduceat(values, starts - 1))
 
-    found = np.linalg.lstsq(A, y, rcond=None)[0]
-    variance = np.maximum(binned((y - A @ found) ** 2) / number, 1e-300)
-    errors = np.full(len(found), np.inf)
+def _fitted(bins: _Bins, theta: Array) -> _Fit:
+    """Return the generalised least squares fit for noise coefficients squared (terms,)."""
+    variance = theta @ bins.basis
+    if not np.all(variance > 0.0):
+        nothing = np.zeros_like(bins.product[0])
+        return _Fit(np.inf, theta, variance, nothing, np.outer(nothing, nothing))
+    information = np.sum(bins.gram / variance[:, None, None], axis=0)
+    covariance = np.linalg.inv(information)
+    right = np.sum(bins.product / variance[:, None], axis=0)
+    coefficients = covariance @ right
+    loss = 0.5 * float(np.sum(bins.number * np.log(variance) + bins.square / variance) - right @ coefficients)
+    return _Fit(loss + 0.5 * float(np.linalg.slogdet(information)[1]), theta, variance, coefficients, covariance)
+
+
+def _maximised(bins: _Bins, start: Array, free: NDArray[np.bool_]) -> _Fit:
+    """Return the fit at the maximum of the restricted likelihood over the free noise terms, by Fisher scoring.
+
+    The noise terms are fitted to the squared residuals, each with the expected reduction by the regression added back.
+    """
+    from scipy.optimize import nnls
+
+    fit = _fitted(bins, start)
+    held = np.where(free, 0.0, start) @ bins.basis
     for _ in range(MAX_PASSES):
-        weight = np.repeat(1.0 / np.sqrt(variance), number.astype(np.int64))
-        Q, R = np.linalg.qr(A * weight[:, None])
-        before, found = found, np.linalg.solve(R, Q.T @ (y * weight))
-        errors = np.sqrt(np.sum(np.linalg.inv(R) ** 2, axis=1))
-        taken = np.sum(Q**2, axis=1) / weight**2
-        power = binned((y - A @ found) ** 2 + taken) / number
-        design = (basis * np.sqrt(number) / variance).T
+        c, C = fit.coefficients, fit.covariance
+        power = bins.square - 2.0 * bins.product @ c + np.einsum("bij,ij->b", bins.gram, np.outer(c, c) + C)
+        weight = np.sqrt(bins.number) / fit.variance
+        design = (bins.basis[free] * weight).T
         norm = np.linalg.norm(design, axis=0)
-        theta = nnls(design / norm, power * np.sqrt(number) / variance)[0] / norm
-        after = theta @ basis
-        if np.all(np.abs(found - before) < SETTLED * errors) and np.all(np.abs(after - variance) < SETTLED * variance):
+        target = start.copy()
+        target[free] = nnls(design / norm, (power / bins.number - held) * weight)[0] / norm
+        step, trial = 1.0, _fitted(bins, target)
+        while trial.loss > fit.loss and step > SHORTEST_STEP:
+            step *= 0.5
+            trial = _fitted(bins, fit.theta + step * (target - fit.theta))
+        gain = fit.loss - trial.loss
+        if gain > 0.0:
+            fit = trial
+        if gain < SETTLED:
             break
-        variance = after
-    return found / scale, errors / scale
+    return fit
+
+
+def _over_walk(bins: _Bins) -> tuple[list[_Fit], Array]:
+    """Return fits over the rate random walk K, without flicker and with it, and their weights.
+
+    From a walk without effect to the largest that is possible. The weight is the restricted likelihood, maximised over the other noise,
+    times Jeffreys' prior of θ = K², the root of its information; with flicker, divided by the likelihood ratio that supports a term.
+    """
+    every = np.ones(len(bins.basis), bool)
+    best = _maximised(bins, np.asarray(bins.square.sum() / (bins.basis @ bins.number) / len(bins.basis)), every)
+
+    def held(size: float, flicker: bool) -> _Fit:
+        start, free = best.theta.copy(), every.copy()
+        start[WALK], free[WALK], free[FLICKER] = size, False, flicker
+        start[FLICKER] *= flicker
+        return _maximised(bins, start, free)
+
+    def information(fit: _Fit) -> float:
+        return float(np.sum(0.5 * bins.number * (bins.basis[WALK] / fit.variance) ** 2))
+
+    negligible = 1e-3 / np.sqrt(information(held(0.0, False)))
+    grid = np.geomspace(negligible, 1e3 * max(1e3 * negligible, best.theta[WALK]), COARSE)
+    near = np.flatnonzero([held(size, True).loss < best.loss + UNLIKELY for size in grid])
+    grid = np.geomspace(grid[max(near[0] - 1, 0)], grid[min(near[-1] + 1, COARSE - 1)], FINE)
+    fits = [held(size, flicker) for flicker in (False, True) for size in grid]
+    cost = np.repeat([0.0, SUPPORT], FINE) + [fit.loss - best.loss for fit in fits]
+    density = (
+        np.tile(grid, 2) * np.sqrt([information(fit) for fit in fits]) * np.exp(cost.min() - cost)
+    )  # dθ = θ d ln θ
+    return fits, density / density.sum()
+
+
+def _half_width(weights: Array, centre: Array, sigma: Array) -> float:
+    """Return r with probability LEVEL of ±r in a mixture of normal distributions."""
+    from scipy.optimize import brentq
+    from scipy.special import ndtr
+
+    def outside(r: float) -> float:
+        return float(weights @ (ndtr((-r - centre) / sigma) + ndtr((centre - r) / sigma))) - (1.0 - LEVEL)
+
+    return float(brentq(outside, 0.0, float(np.max(np.abs(centre) + 10.0 * sigma)), xtol=1e-9 * float(sigma.max())))

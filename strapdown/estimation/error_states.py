@@ -347,9 +347,11 @@ class GyroTemperature(ErrorStates):
 
 
 class _FirstOrder(ErrorStates):
-    """First-order Gauss–Markov states with one correlation time, stationary with ``sigma``."""
+    """First-order Gauss–Markov states with one correlation time."""
 
     correlation_time: float
+    stationary_sigma: Array
+    """Stationary standard deviation σ of each state (3,)."""
 
     @property
     def decay(self) -> Array:
@@ -359,12 +361,12 @@ class _FirstOrder(ErrorStates):
     @property
     def density(self) -> Array:
         """2σ²/τ."""
-        return 2.0 * self.sigma**2 / self.correlation_time
+        return 2.0 * self.stationary_sigma**2 / self.correlation_time
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class GyroGaussMarkov(_FirstOrder):
-    """Gyro drift in addition to the bias: first-order Gauss–Markov, stationary. Several with different times together approximate flicker.
+    """Gyro drift in addition to the bias: first-order Gauss–Markov. Several with different times together approximate flicker.
 
     Parameters
     ----------
@@ -372,20 +374,27 @@ class GyroGaussMarkov(_FirstOrder):
         Stationary standard deviation of the drift, rad/s, by body axis.
     correlation_time : float
         Correlation time of the drift, s.
+    initial_sigma : float or ndarray (3,), optional
+        Standard deviation of the drift at the start, rad/s, by body axis: larger than the stationary one for a drift that settles after
+        switching on. Default: the stationary one.
     name : str, default "gyro drift"
         Name of these error states.
     """
 
     bias_sigma: float | Array
     correlation_time: float
+    initial_sigma: float | Array | None = None
     name: str = "gyro drift"
     components = AXES
     units = ("rad/s",) * 3
 
     def __post_init__(self) -> None:
-        """Check both."""
-        sigma = _spread(f"{self.name}: bias_sigma", self.bias_sigma, "rad/s")
-        self._set(bias_sigma=sigma, sigma=sigma)
+        """Check all."""
+        stationary = sigma = _spread(f"{self.name}: bias_sigma", self.bias_sigma, "rad/s")
+        if self.initial_sigma is not None:
+            sigma = _spread(f"{self.name}: initial_sigma", self.initial_sigma, "rad/s")
+            self._set(initial_sigma=sigma)
+        self._set(bias_sigma=stationary, stationary_sigma=stationary, sigma=sigma)
         positive(f"{self.name}: correlation_time", self.correlation_time, unit="s")
 
     @property
@@ -593,7 +602,7 @@ class GaussMarkov(_FirstOrder):
         """Check all."""
         self._set(name=self.name or f"{self.sensor} disturbance", units=(self.unit,) * 3)
         sigma = _spread(f"{self.name}: noise_sigma", self.noise_sigma, self.unit)
-        self._set(noise_sigma=sigma, sigma=sigma)
+        self._set(noise_sigma=sigma, stationary_sigma=sigma, sigma=sigma)
         positive(f"{self.name}: correlation_time", self.correlation_time, unit="s")
         one_of(f"{self.name}: frame", self.frame, ("body", "fixed"))
         if self.frame == "fixed" and len(set(self.sigma)) > 1:

@@ -273,17 +273,26 @@ def first_state(
 def _attitude_of_set(
     record: ImuRecord, process_noise: ProcessNoise, bias: Array, bias_sigma: float, k: int
 ) -> tuple[Array, Array]:
-    """Return attitude and covariance at the first edge from the k-th usable measurement of each sensor."""
-    body, fixed, sigmas, headings = [], [], [], []
+    """Return attitude and covariance at the first edge from the k-th usable measurement of each sensor.
+
+    The error of the gyro up to the first of these measurements is common to all, and is added at the end; that from there on is a rotation
+    of the later ones.
+    """
+    body, fixed, sigmas, headings, chosen = [], [], [], [], []
     for series in record.vectors:
         content = series.vector_b if series.attitude is None else series.attitude
         inside = (series.time >= record.time[0]) & (series.time <= record.time[-1]) & np.isfinite(content).all(axis=1)
-        if np.sum(inside) <= k:
-            continue
-        one = series.taken(np.flatnonzero(inside)[k : k + 1])
+        if np.sum(inside) > k:
+            chosen.append(series.taken(np.flatnonzero(inside)[k : k + 1]))
+
+    def turn_variance(time: float) -> float:
+        span = time - record.time[0]
+        return float(process_noise.angle_random_walk**2 * span + (bias_sigma * span) ** 2)
+
+    common = turn_variance(min((one.time[0] for one in chosen), default=record.time[0]))
+    for one in chosen:
         turn = _turn_until(record, bias, float(one.time[0]))
-        span = one.time[0] - record.time[0]
-        grown = process_noise.angle_random_walk**2 * span + (bias_sigma * span) ** 2
+        grown = turn_variance(one.time[0])
         if one.attitude is not None:
             attitude = quaternion.multiply(one.attitude[0], quaternion.conjugate(turn))
             R = quaternion.to_matrix(turn)
@@ -293,12 +302,13 @@ def _attitude_of_set(
         body.append(quaternion.rotate(turn, one.vector_b[0] / np.linalg.norm(one.vector_b[0])))
         fixed.append(reference / length)
         scale = length if one.kind == "vector" else 1.0
-        sigmas.append(float(np.hypot(one.sigma[0] / scale, np.sqrt(grown))))
         if one.kind == "heading":
-            headings.append((body.pop(), fixed.pop(), sigmas.pop()))
+            headings.append((body.pop(), fixed.pop(), float(one.sigma[0]), grown - common))
+        else:
+            sigmas.append(float(np.hypot(one.sigma[0] / scale, np.sqrt(grown - common))))
     if len(body) == 1 and headings and abs(fixed[0][2]) > np.cos(VERTICAL):
         # Together with the vertical, a heading is a direction: the horizontal part of its vector.
-        seen, reference, sigma = headings[0]
+        seen, reference, sigma, turned = headings[0]
         level = seen - body[0] * (seen @ body[0])
         horizontal = reference - fixed[0] * (reference @ fixed[0])
         attitude = wahba.solve(
@@ -310,14 +320,15 @@ def _attitude_of_set(
         if not row.any():
             raise InputError("the vector that should give the heading is vertical")
         tilt = np.eye(3) - np.outer(R[2], R[2])
-        return attitude, np.asarray(np.linalg.inv(tilt / sigmas[0] ** 2 + np.outer(row, row) / sigma**2))
+        variance = sigma**2 + turned * (row @ row)
+        return attitude, np.linalg.inv(tilt / sigmas[0] ** 2 + np.outer(row, row) / variance) + common * np.eye(3)
     if len(body) < 2:
         raise InputError(
             f"two directions are needed, or the vertical and a heading; the record has {len(body)} of directions "
             f"and {len(headings)} of headings"
         )
     solution = wahba.solve(np.array(body), np.array(fixed), np.array(sigmas))
-    return solution.attitude, solution.covariance
+    return solution.attitude, solution.covariance + common * np.eye(3)
 
 
 def _turn_until(record: ImuRecord, bias: Array, time: float) -> Array:

@@ -17,9 +17,11 @@ import functools
 import hashlib
 import io
 import json
+import mmap
 import multiprocessing
 import os
 import re
+import signal
 import stat
 import subprocess
 import sys
@@ -62,10 +64,17 @@ class NoDigestWarning(UserWarning):
 
 
 @contextlib.contextmanager
-def from_file(path: Name) -> Iterator[None]:
-    """Raise any exception within as an InputError that blames the file, except for a missing library or a fault in compiling."""
+def from_file(path: Name, kind: str = "") -> Iterator[None]:
+    """Raise any exception within as an InputError that blames the file, except for a missing library or a fault in compiling.
+
+    This is the guard around every reader: libraries for foreign formats raise any exception of their parsers. An interruption (Ctrl-C) that
+    a library turned into another exception remains one. ``kind`` is the format as which the file is read, for the message.
+    """
+    handled = sys.exception()
     try:
         yield
+    except (KeyboardInterrupt, SystemExit, GeneratorExit):
+        raise
     except InputError as error:
         said = _short(str(error))
         if said == str(error) and Path(path).name in said:
@@ -78,13 +87,40 @@ def from_file(path: Name) -> Iterator[None]:
             f"{path} is not read: a library that strapdown needs is missing or broken ({error}); install strapdown again with pip, which "
             "brings its libraries"
         ) from error
-    except Exception as error:
-        if _in_compiler(error):
+    except BaseException as error:  # a fault inside a library written in Rust is not a subclass of Exception
+        if _interrupted(error, handled):
+            raise KeyboardInterrupt from error
+        if _in_compiler(error) or not (isinstance(error, Exception) or type(error).__module__ == "pyo3_runtime"):
             raise
-        what = _short(f"{type(error).__name__}: {error}" if isinstance(error, LookupError) else str(error))
-        raise InputError(
-            f"{path} cannot be read ({what or type(error).__name__}); the file is truncated, damaged or of another kind"
-        ) from error
+        text = " ".join(str(error).split())
+        what = _short(f"{type(error).__name__}: {text}" if isinstance(error, LookupError) else text)
+        said = f"{path} cannot be read {f'as {kind} ' if kind else ''}({what or type(error).__name__})"
+        raise InputError(f"{said}; the file is truncated, damaged or of another kind") from error
+
+
+def _interrupted(error: BaseException | None, handled: BaseException | None) -> bool:
+    """Return whether an exception came from an interruption, unless that was ``handled`` already before the file was read."""
+    while error is not None and error is not handled:
+        if isinstance(error, KeyboardInterrupt):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
+
+
+@contextlib.contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Defer Ctrl-C to the end: interrupted within the HDF5 library, finalizers may free memory twice."""
+    if threading.current_thread() is not threading.main_thread() or not callable(signal.getsignal(signal.SIGINT)):
+        yield
+        return
+    signals: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, frame: signals.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+        if signals:
+            signal.raise_signal(signal.SIGINT)
 
 
 def _in_compiler(error: BaseException) -> bool:
@@ -105,6 +141,41 @@ def limit() -> int:
     if not value.isdecimal() or int(value) == 0:
         raise InputError(f"the environment variable {LIMIT} is {value!r}; it must be a whole number of megabytes")
     return int(value) * 1_000_000
+
+
+FREELY_UNPACKED = 64_000_000
+"""Number of bytes that any file may unpack to."""
+USUAL_PACKING = 100
+"""Maximum compression ratio of a larger file, unless the user sets a limit: samples of sensors have noise, which hardly compresses."""
+
+
+class Unpacked:
+    """The number of bytes that a packed file of another program may still unpack to, counted before memory is spent."""
+
+    def __init__(self, path: Name, packed: int) -> None:
+        """``packed`` is the size of the file, bytes."""
+        self.path = path
+        self.left = limit() if LIMIT in os.environ else min(limit(), max(FREELY_UNPACKED, USUAL_PACKING * packed))
+
+    def take(self, size: int) -> None:
+        """Count bytes that will be unpacked; raise an error if they are too many."""
+        if size > self.left:
+            raise InputError(
+                f"{self.path} unpacks to more than its limit, {self.left / 1e6:.4g} MB left and {size / 1e6:.4g} MB to come; if that is "
+                f"intended, set the limit with the environment variable {LIMIT}"
+            )
+        self.left -= size
+
+
+@contextlib.contextmanager
+def mapped(path: Name) -> Iterator[memoryview]:
+    """Yield the content of a regular file, of which only the parts used are brought into memory if it is large."""
+    with opened(path) as handle:
+        size = os.fstat(handle.fileno()).st_size
+        if size < FREELY_UNPACKED:
+            yield memoryview(handle.read(size))
+        else:
+            yield memoryview(mmap.mmap(handle.fileno(), 0, access=mmap.ACCESS_READ))
 
 
 def existing_file(path: Name) -> None:
@@ -155,9 +226,13 @@ def content(path: Name, *, link: bool = True, maximum: int | None = None) -> byt
     """Return the bytes of a regular file."""
     with from_file(path), opened(path, link=link, maximum=maximum) as handle:
         maximum = limit() if maximum is None else maximum
-        found = handle.read(maximum + 1)
-        _need_size(path, len(found), maximum)  # again, for a file without a stated size (/proc) or a growing one
-        return found
+        parts, size = [], 0
+        # In parts: a buffer of the size asked for is allocated at once. A file may have no stated size (/proc), or grow.
+        while part := handle.read(min(maximum + 1, max(os.fstat(handle.fileno()).st_size, 1 << 20))):
+            parts.append(part)
+            size += len(part)
+            _need_size(path, size, maximum)
+        return b"".join(parts)
 
 
 def text(path: Name, *, link: bool = True, maximum: int | None = None) -> str:
@@ -245,7 +320,7 @@ def hdf5(path: Name) -> Iterator[Any]:
             )
         if not sealed:
             _need_readable(path)
-        with h5py.File(path, "r") as file:
+        with uninterrupted(), h5py.File(path, "r") as file:
             if not sealed and str(attributes(file).get("kind", "")).startswith("strapdown "):
                 if file.userblock_size:  # which files of earlier versions do not have
                     raise InputError(f"{path} is damaged: its digest is missing; make it again, or restore a copy")

@@ -4,34 +4,47 @@ from __future__ import annotations
 
 import contextlib
 import datetime
+import errno
 import hashlib
 import io
 import json
 import math
 import os
 import platform
-import tempfile
+import secrets
+import stat
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import numpy as np
 
 from strapdown.checks import InputError
-from strapdown.files.reading import BLOCK, SEAL
+from strapdown.files.reading import BLOCK, SEAL, uninterrupted
 
 
 @contextlib.contextmanager
-def written_beside(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Yield a temporary path in the same folder; on success it replaces ``path``, on any error it is removed."""
+def written_beside(path: str | os.PathLike[str], *, durable: bool = False) -> Iterator[Path]:
+    """Yield a temporary path in the same folder; on success it replaces ``path``, on any error it is removed.
+
+    The file is new, whatever another user may have put beside ``path``, and has the permissions of what it replaces, else those of the
+    umask. If ``durable``, it is flushed to disk before, and its name is always the same: a process that is killed while writing leaves at
+    most one such file, which the next write removes; only one process may write then (:func:`locked`).
+    """
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{target.stem}-", suffix=target.suffix, dir=target.parent)
-    os.close(handle)
-    temporary = Path(name)
+    name = f".{target.name}.part" if durable else f".{target.stem}-{secrets.token_hex(8)}{target.suffix}"
+    temporary = target.with_name(name)
+    if durable:
+        temporary.unlink(missing_ok=True)
+    os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
     try:
         yield temporary
-        os.chmod(temporary, 0o644)
+        if target.is_file() and not target.is_symlink():
+            os.chmod(temporary, stat.S_IMODE(target.stat().st_mode))
+        if durable:
+            with open(temporary, "r+b") as file:
+                os.fsync(file.fileno())
         os.replace(temporary, target)
     finally:
         temporary.unlink(missing_ok=True)
@@ -46,7 +59,10 @@ def whole_hdf5(path: str | os.PathLike[str]) -> Iterator[Any]:
     import h5py
 
     content = io.BytesIO()
-    with h5py.File(content, "w", userblock_size=BLOCK, libver=("v110", "v110")) as file:  # v110: attributes above 64 kB
+    with (
+        uninterrupted(),
+        h5py.File(content, "w", userblock_size=BLOCK, libver=("v110", "v110")) as file,
+    ):  # v110: attributes above 64 kB
         yield file
     held = content.getbuffer()
     held[:BLOCK] = _user_block(held[BLOCK:])
@@ -68,7 +84,7 @@ def locked(path: str | os.PathLike[str]) -> Iterator[None]:
     target.parent.mkdir(parents=True, exist_ok=True)
     lock = target.with_name(f".{target.name}.lock")
     while True:
-        with open(lock, "a+", encoding="utf-8") as handle:
+        with _own_file(lock) as handle:
             try:
                 fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
@@ -91,6 +107,21 @@ def locked(path: str | os.PathLike[str]) -> Iterator[None]:
             finally:
                 lock.unlink(missing_ok=True)
             return
+
+
+def _own_file(lock: Path) -> TextIO:
+    """Open a lock file, which is created if necessary; a link or a pipe that another user may have put there is rejected."""
+    try:
+        handle = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK | os.O_NOFOLLOW, 0o666)
+    except OSError as error:
+        if error.errno == errno.ELOOP:
+            raise InputError(f"{lock} is a link, which is not followed; remove it") from None
+        raise
+    status = os.fstat(handle)
+    if not stat.S_ISREG(status.st_mode) or status.st_nlink > 1:
+        os.close(handle)
+        raise InputError(f"{lock} is not a regular file of one name, as locks are; remove it")
+    return os.fdopen(handle, "r+", encoding="utf-8")
 
 
 def _user_block(content: bytes | memoryview) -> bytes:

@@ -121,6 +121,13 @@ class GyroSpec(ByValue):
         Delay of the time stamps after the nominal instants, s.
     drop_probability : float, default 0.0
         Probability that a sample is lost, independently of the others; 0 to below 1.
+
+    Examples
+    --------
+    >>> from strapdown.units import DEGREE_PER_HOUR, DEGREE_PER_ROOT_HOUR
+    >>> spec = GyroSpec(angle_random_walk=0.15 * DEGREE_PER_ROOT_HOUR, turn_on_bias_sigma=20.0 * DEGREE_PER_HOUR)
+    >>> print(f"{spec.angle_random_walk:.3g} rad/√s, {spec.turn_on_bias_sigma:.3g} rad/s")
+    4.36e-05 rad/√s, 9.7e-05 rad/s
     """
 
     angle_random_walk: Axes = 0.0

@@ -15,8 +15,8 @@ import hashlib
 import os
 import pickle
 import platform
+import secrets
 import sys
-import tempfile
 import warnings
 from pathlib import Path
 from typing import Any
@@ -70,14 +70,14 @@ class KernelCache(FunctionCache):  # type: ignore[misc]
         entry = self._entry(signature, result.codegen)
         try:
             entry.parent.mkdir(parents=True, exist_ok=True)
-            handle, temporary = tempfile.mkstemp(dir=entry.parent, prefix=f"{entry.stem}-")
+            temporary = entry.with_name(f"{entry.stem}-{secrets.token_hex(8)}")
+            handle = os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY | getattr(os, "O_BINARY", 0), 0o666)
             try:
                 with open(handle, "wb") as file:
                     file.write(hashlib.sha256(content).digest() + content)
                 os.replace(temporary, entry)
-            except BaseException:
-                Path(temporary).unlink(missing_ok=True)
-                raise
+            finally:
+                temporary.unlink(missing_ok=True)
             for other in entry.parent.glob(f"{self._prefix}-*"):
                 if not other.name.startswith(f"{self._prefix}-{self._sources[:8]}-"):
                     other.unlink(missing_ok=True)

@@ -10,12 +10,11 @@ the fold without it, ``resume/whole``. So an extended campaign is bitwise identi
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import platform
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -26,7 +25,7 @@ import strapdown
 from strapdown import scenarios
 from strapdown.checks import InputError, count, finite, one_of
 from strapdown.estimation import setup
-from strapdown.files import locked, reading, set_attributes, whole_hdf5
+from strapdown.files import locked, reading, set_attributes, whole_hdf5, written_beside
 from strapdown.montecarlo.engine import MACHINES, Chunks, Identity, Work, Workers, choose, identity, in_threads
 from strapdown.montecarlo.plan import Plan, from_table
 from strapdown.montecarlo.statistics import BINS, Statistics, merge
@@ -320,30 +319,12 @@ def _flat(table: Mapping[str, Any], place: str = "") -> dict[str, Any]:
 # -------------------------------------------------------------------------------------------------------------------------- file
 
 
-@contextlib.contextmanager
-def _replacing(path: Path) -> Iterator[Path]:
-    """Yield a temporary file that replaces ``path`` on success, flushed to disk before.
-
-    Its name is always the same, unlike that of :func:`strapdown.files.written_beside`: a process killed while writing leaves at most one
-    such file, which the next write overwrites. The lock that :func:`run` holds keeps other processes away.
-    """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.part")
-    try:
-        yield temporary
-        with temporary.open("rb") as written:
-            os.fsync(written.fileno())
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
 def _write(path: Path, campaign: Campaign, state: _Progress, table: Mapping[str, Any]) -> None:
     import h5py
     import numba
 
     plan = campaign.plan
-    with _replacing(path) as temporary, whole_hdf5(temporary) as file:
+    with written_beside(path, durable=True) as temporary, whole_hdf5(temporary) as file:
         attributes = {
             "kind": KIND,
             "format": FORMAT,

@@ -13,7 +13,6 @@
 from __future__ import annotations
 
 import io
-import operator
 import os
 import re
 from collections.abc import Mapping
@@ -27,7 +26,7 @@ from numpy.typing import NDArray
 from strapdown import quaternion, records
 from strapdown.checks import Array, InputError, array, one_of
 from strapdown.files import reading
-from strapdown.recordings import delimited, recordfiles, ros, trajectories, ulog
+from strapdown.recordings import bag_files, delimited, recordfiles, ros, trajectories, ulog
 from strapdown.recordings.broad import read_broad
 from strapdown.records import Innovations, Recording, outputs
 from strapdown.units import DEGREE, DEGREE_PER_HOUR
@@ -59,8 +58,12 @@ class Attitudes:
 
 def read_attitudes(path: str | os.PathLike[str], *, topic: str = "") -> Attitudes:
     """Read the attitudes of a file, or of the folder of a ROS 2 bag; ``topic`` selects one if several have attitudes."""
-    file = Path(path)
-    if ros.is_folder(file):
+    with reading.from_file(path):
+        return _read(Path(path), topic)
+
+
+def _read(file: Path, topic: str) -> Attitudes:
+    if bag_files.is_folder(file):
         return _bag(file, topic)
     reading.existing_file(file)
     if reading.is_hdf5(file):
@@ -68,7 +71,7 @@ def read_attitudes(path: str | os.PathLike[str], *, topic: str = "") -> Attitude
         return _own(file, kind) if kind else _of_recording(read_broad(file))
     with reading.opened(file) as stream:
         head = stream.read(4096)
-    if head.startswith(ros.MAGICS):
+    if head.startswith(bag_files.MAGICS):
         return _bag(file, topic)
     if topic:
         raise InputError(f"{file.name} is not a bag; leave --topic out")
@@ -147,44 +150,48 @@ _PATTERNS = {name: re.compile(pattern) for name, pattern in COLUMNS.items()}
 
 def _table(path: Path) -> Attitudes:
     """Read a table of text."""
-    with reading.from_file(path):
-        table = delimited.Table(path.name, io.StringIO(reading.text(path), newline=""))
-        found: dict[str, dict[str, tuple[int, str]]] = {name: {} for name in COLUMNS}
-        frames: set[str] = set()
-        for place, cell in enumerate(table.header):
-            for name, pattern in _PATTERNS.items():
-                match = pattern.fullmatch(cell.strip().lower())
-                if match is None:
-                    continue
-                parts = match.groupdict()
-                key = f"{parts['one']} {parts['two']}" if name == "cov" else str(parts.get("axis", ""))
-                if parts.get("frame"):
-                    frames.add(parts["frame"])
-                if key in found[name]:
-                    raise InputError(
-                        f"{path.name}: column {cell} has the same meaning as column {table.header[found[name][key][0]]}"
-                    )
-                found[name][key] = (place, parts.get("unit") or "")
-        if len(frames) > 1:
-            raise InputError(
-                f"{path.name}: its covariance is of {' and '.join(sorted(frames))} axes; name all its columns alike"
-            )
-        if set(found["q"]) != set("wxyz") or not found["time"]:
-            raise InputError(
-                f"{path.name} lacks {'time' if not found['time'] else 'the four columns of a quaternion'}; wanted time_s (or _ns), "
-                f"qw, qx, qy, qz[, cov_xx_rad2, …], and it has: {', '.join(table.header[:12])}"
-            )
-        time_place, time_unit = found["time"][""]
-        places = sorted({place for group in found.values() for place, _ in group.values()})
-        numbers = table.load(places, time_place)
-        whole = table.clock_ns(time_place)
+    table = delimited.Table(path.name, io.StringIO(reading.text(path), newline=""))
+    found: dict[str, dict[str, tuple[int, str]]] = {name: {} for name in COLUMNS}
+    frames: set[str] = set()
+    for place, cell in enumerate(table.header):
+        for name, pattern in _PATTERNS.items():
+            match = pattern.fullmatch(cell.strip().lower())
+            if match is None:
+                continue
+            parts = match.groupdict()
+            key = f"{parts['one']} {parts['two']}" if name == "cov" else str(parts.get("axis", ""))
+            if parts.get("frame"):
+                frames.add(parts["frame"])
+            if key in found[name]:
+                raise InputError(
+                    f"{path.name}: column {cell} has the same meaning as column {table.header[found[name][key][0]]}"
+                )
+            found[name][key] = (place, parts.get("unit") or "")
+    if len(frames) > 1:
+        raise InputError(
+            f"{path.name}: its covariance is of {' and '.join(sorted(frames))} axes; name all its columns alike"
+        )
+    if set(found["q"]) != set("wxyz") or not found["time"]:
+        raise InputError(
+            f"{path.name} lacks {'time' if not found['time'] else 'the four columns of a quaternion'}; wanted time_s (or _ns), "
+            f"qw, qx, qy, qz[, cov_xx_rad2, …], and it has: {', '.join(table.header[:12])}"
+        )
+    time_place, time_unit = found["time"][""]
+    places = sorted({place for group in found.values() for place, _ in group.values()})
+    numbers = table.load(places, time_place)
+    whole = table.clock_ns(time_place)
     columns = {
         name: {key: (numbers[place], unit) for key, (place, unit) in group.items()} for name, group in found.items()
     }
     if whole is not None:
         stamps = np.rint(whole[0] * 1e9).astype(np.int64) + whole[1]
     else:
-        stamps = np.rint(numbers[time_place] * _TIME[time_unit or "s"]).astype(np.int64)
+        counts = array(f"{path.name}: time", np.rint(numbers[time_place] * _TIME[time_unit or "s"]), ("m",))
+        if np.any(np.abs(counts) >= 2.0**63):
+            raise InputError(
+                f"{path.name}: a time is {numbers[time_place][np.argmax(np.abs(counts))]:g}, which no clock counts"
+            )
+        stamps = counts.astype(np.int64)
     q = np.stack([columns["q"][axis][0] for axis in "wxyz"], axis=1)
     known = np.isfinite(q).all(axis=1)
     covariance, frame, remarks = _covariance(path.name, columns, len(stamps))
@@ -254,60 +261,41 @@ def _need_order(name: str, stamps: NDArray[np.int64]) -> None:
 
 # -------------------------------------------------------------------------------------------------------------- bags
 
-_ORIENTED = {
-    "sensor_msgs/msg/Imu": ("orientation", "orientation_covariance"),
-    "nav_msgs/msg/Odometry": ("pose.pose.orientation", "pose.covariance"),
-    "geometry_msgs/msg/PoseWithCovarianceStamped": ("pose.pose.orientation", "pose.covariance"),
-    "geometry_msgs/msg/PoseStamped": ("pose.orientation", ""),
-    "geometry_msgs/msg/QuaternionStamped": ("quaternion", ""),
-}
-"""Fields of an orientation and its covariance by message: 3 × 3, or the last rows and columns of 6 × 6."""
-
 
 def _bag(path: Path, topic: str) -> Attitudes:
     """Read the orientations of a bag. By REP 103, covariances of poses are about fixed axes; drivers of Imu messages differ."""
-    rows: list[tuple[int, list[float], Array | None]] = []
-    with ros.opened(path.name, [path]) as reader:
-        found = {c.topic: c for c in reader.connections if c.msgtype in _ORIENTED}
-        chosen = _topic(path.name, found, topic)
-        where, beside = _ORIENTED[found[chosen].msgtype]
-        for connection, logged, raw in reader.messages(connections=[found[chosen]]):
-            message = reader.deserialize(raw, connection.msgtype)
-            stamp = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
-            q = operator.attrgetter(where)(message)
-            P = np.asarray(operator.attrgetter(beside)(message), np.float64) if beside else None
-            rows.append((stamp or logged, [q.w, q.x, q.y, q.z], P))
-    known = [row for row in rows if any(row[1]) and not (row[2] is not None and row[2][0] == -1.0)]
-    if len(known) < 2:
-        raise InputError(f"{path.name}: topic {chosen} has no orientation in its {len(rows)} messages")
-    known.sort(key=lambda row: row[0])
-    stamps = np.array([row[0] for row in known], np.int64)
+    topics, _, words = ros.topics_of(path, ros.ORIENTED)
+    chosen = _topic(path.name, topics, topic)
+    number = len(topics[chosen])
+    stamps, values, order_words = topics[chosen].decoded(path.name)
+    q, P = values[:, [3, 0, 1, 2]], values[:, 4:]
+    known = q.any(axis=1) & (P[:, 0] != -1.0 if P.size else True)
+    if known.sum() < 2:
+        raise InputError(f"{path.name}: topic {chosen} has no orientation in its {number} messages")
+    stamps, q, P = stamps[known], q[known], P[known]
     fresh = np.concatenate([[True], np.diff(stamps) > 0])
-    remarks = [f"Topic {chosen}: {int(fresh.sum())} orientations of {len(rows)} messages."]
+    remarks = [f"Topic {chosen}: {int(fresh.sum())} orientations of {number} messages.", *words, *order_words]
     covariance = None
-    if beside:
-        P = np.array([row[2] for row in known])
-        P = P.reshape(-1, 6, 6)[:, 3:, 3:] if P.shape[1] == 36 else P.reshape(-1, 3, 3)
-        if P.any():
-            covariance = P[fresh]
-        else:
-            remarks.append("Its covariances are zero: unknown.")
+    if P.any():
+        covariance = (P.reshape(-1, 6, 6)[:, 3:, 3:] if P.shape[1] == 36 else P.reshape(-1, 3, 3))[fresh]
+    elif P.size:
+        remarks.append("Its covariances are zero: unknown.")
     return Attitudes(
         source=path.name,
         stamps_ns=stamps[fresh],
-        attitude=_unit(path.name, np.array([row[1] for row in known])[fresh]),
+        attitude=_unit(path.name, q[fresh]),
         covariance=covariance,
         remarks=tuple(remarks),
     )
 
 
-def _topic(name: str, found: Mapping[str, Any], topic: str) -> str:
+def _topic(name: str, found: Mapping[str, ros.Topic], topic: str) -> str:
     if not found:
-        raise InputError(f"{name} has no topic of {', '.join(kind.rpartition('/')[2] for kind in _ORIENTED)}")
+        raise InputError(f"{name} has no topic of {', '.join(kind.rpartition('/')[2] for kind in ros.ORIENTED)}")
     if topic:
         return one_of(f"{name}: topic", topic, found)
     if len(found) > 1:
-        listed = ", ".join(f"{t} ({c.msgtype.rpartition('/')[2]}, {c.msgcount} messages)" for t, c in found.items())
+        listed = ", ".join(f"{t} ({c.kind.rpartition('/')[2]}, {len(c)} messages)" for t, c in found.items())
         raise InputError(
             f"{name} has several topics with orientations: {listed}; choose one by --topic (topic= in Python)"
         )

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from strapdown.checks import Array, InputError, numbers
-from strapdown.files import written_beside
+from strapdown.files import reading, written_beside
 from strapdown.files.extras import library
 from strapdown.recordings import columns as naming
 from strapdown.recordings.delimited import recording_columns
@@ -175,17 +175,23 @@ def read_parquet(
     """Read a recording from Parquet; options as for :func:`strapdown.recordings.read`."""
     file = Path(path)
     parquet = library("pyarrow.parquet", f"{file.name} is Parquet, which")
-    try:
-        table = parquet.read_table(file)
-    except Exception as error:  # for a truncated file the library raises several kinds
-        raise InputError(
-            f"{file.name} cannot be read as Parquet ({' '.join(str(error).split())}); the file is truncated or damaged"
-        ) from None
+    reading.existing_file(file)
+    with parquet.ParquetFile(file, page_checksum_verification=True) as content:
+        schema, rows = content.schema_arrow, content.metadata.num_rows
+        flat = [k for k, entry in enumerate(schema) if _is_number(entry.type)]
+        reading.Unpacked(file, file.stat().st_size).take(8 * rows * len(flat))
+        table = content.read([schema[k].name for k in flat], use_threads=False)
     found: dict[str, NDArray[np.generic]] = {}
     for entry, chunks in zip(table.schema, table.columns, strict=True):
         unit = (entry.metadata or {}).get(b"unit", b"").decode()
         found[f"{entry.name} [{unit}]" if unit else entry.name] = np.asarray(chunks.to_numpy())
     return from_table(found, source=file.name, units=units, columns=columns, gyro_alone=gyro_alone)
+
+
+def _is_number(kind: Any) -> bool:
+    """Return whether a column of an Arrow type has numbers, flags or dates; others, which may have any size, are not read."""
+    types = library("pyarrow", "Parquet").types
+    return bool(types.is_primitive(kind) or types.is_null(kind))
 
 
 def write_parquet(recording: Recording, path: str | os.PathLike[str]) -> None:
@@ -206,4 +212,5 @@ def write_parquet_columns(
         for name, values in zip(found, arrays, strict=True)
     ]
     with written_beside(path) as temporary:
-        parquet.write_table(arrow.Table.from_arrays(arrays, schema=arrow.schema(fields)), temporary)
+        table = arrow.Table.from_arrays(arrays, schema=arrow.schema(fields))
+        parquet.write_table(table, temporary, write_page_checksum=True)

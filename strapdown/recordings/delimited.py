@@ -54,17 +54,10 @@ def read_csv(
         raise InputError(
             f"{file.name} is a simulated record, not a recording; integrate it (`strapdown integrate`) or filter it (`strapdown estimate`)"
         )
-    with reading.from_file(file):
-        table = Table(file.name, io.StringIO(reading.text(file), newline=""))
-        return naming.recording(
-            file.name,
-            table.header,
-            table.load,
-            table.clock_ns,
-            units=units,
-            mapping=columns,
-            gyro_alone=gyro_alone,
-        )
+    table = Table(file.name, io.StringIO(reading.text(file), newline=""))
+    return naming.recording(
+        file.name, table.header, table.load, table.clock_ns, units=units, mapping=columns, gyro_alone=gyro_alone
+    )
 
 
 class Table:

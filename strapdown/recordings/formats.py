@@ -17,7 +17,7 @@ import numpy as np
 
 from strapdown.checks import InputError
 from strapdown.files import reading
-from strapdown.recordings import recordfiles, ros, telemetry, trajectories
+from strapdown.recordings import bag_files, recordfiles, telemetry, trajectories
 from strapdown.recordings.body_axes import with_axes
 from strapdown.records import Estimate, ImuRecord
 from strapdown.records.recording import Recording, with_gyro
@@ -69,7 +69,7 @@ FORMATS: tuple[Format, ...] = (
     Format(
         name="ROS bag",
         endings=(".bag", ".mcap", ".db3"),
-        recognised=lambda path, head: ros.is_folder(path) or head.startswith(ros.MAGICS),
+        recognised=lambda path, head: bag_files.is_folder(path) or head.startswith(bag_files.MAGICS),
         read="ros:read_bag",
         options=("topic",),
         write="ros:write_bag",
@@ -237,7 +237,8 @@ def read(
     options: dict[str, Any] = {name: value for name, value in given.items() if name in found.options}
     if "gyro_alone" in found.options:
         options["gyro_alone"] = gyro_alone
-    recording: Recording = _function(found.read)(file, **options)
+    with reading.from_file(file, found.name):
+        recording: Recording = _function(found.read)(file, **options)
     return with_axes(recording, axes, invert) if axes or invert else recording
 
 

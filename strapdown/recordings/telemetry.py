@@ -40,17 +40,10 @@ def read_telemetry(path: str | os.PathLike[str]) -> Recording:
     """Read the inertial unit of a camera's, flight controller's or phone's log."""
     file = Path(path)
     parser = library("telemetry_parser", f"{file.name} is a log of a camera or flight controller, which")
-    try:
-        with tempfile.TemporaryDirectory() as folder:
-            found = parser.Parser(str(with_ending(file, _ending(file), Path(folder))))
-            rows: list[dict[str, Any]] = found.normalized_imu()
-    except (KeyboardInterrupt, SystemExit, MemoryError):
-        raise
-    except BaseException as error:  # a fault inside the library is not a subclass of Exception
-        reason = " ".join(str(error).split())
-        raise InputError(
-            f"{file.name} cannot be read by telemetry-parser ({reason}); the log is damaged or of another device"
-        ) from None
+    reading.existing_file(file)
+    with tempfile.TemporaryDirectory() as folder:
+        found = parser.Parser(str(with_ending(file, _ending(file), Path(folder))))
+        rows: list[dict[str, Any]] = found.normalized_imu()
     if len(rows) < 2 or all(row.get("gyro") is None for row in rows):
         raise InputError(
             f"{file.name} ({found.camera or 'unknown device'}) has no gyro samples; give a log with raw inertial data"

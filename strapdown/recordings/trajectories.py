@@ -14,7 +14,9 @@ stamps on both sides are at most :data:`strapdown.records.recording.BRIDGED` apa
 
 from __future__ import annotations
 
+import math
 import os
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -113,11 +115,17 @@ def _whole(path: Path, cells: list[str], factor: int) -> NDArray[np.int64]:
     stamps = np.empty(len(cells), np.int64)
     for k, cell in enumerate(cells):
         whole, _, part = cell.partition(".")
-        if whole.lstrip("-").isdigit() and (part.isdigit() or not part):
+        if re.fullmatch("-?[0-9]{1,19}", whole) and re.fullmatch("[0-9]*", part):
             digits = int((part + "0" * 9)[:9]) if factor > 1 else 0
-            stamps[k] = int(whole) * factor + (-digits if whole.startswith("-") else digits)
+            stamp = int(whole) * factor + (-digits if whole.startswith("-") else digits)
         else:
-            stamps[k] = round(float(cell) * factor)
+            number = float(cell) * factor
+            stamp = round(number) if math.isfinite(number) else 2**63
+        if abs(stamp) >= 2**63:
+            raise InputError(
+                f"{path.name}: data row {k + 1}: the time is {cell}, which no clock counts; remove the row"
+            )
+        stamps[k] = stamp
     back = np.diff(stamps) <= 0
     if back.any():
         raise InputError(f"{path.name}: data row {int(np.argmax(back)) + 2} is not after the one before; sort the rows")
@@ -126,7 +134,8 @@ def _whole(path: Path, cells: list[str], factor: int) -> NDArray[np.int64]:
 
 def with_reference(recording: Recording, path: str | os.PathLike[str]) -> Recording:
     """Return a recording with the attitudes of a TUM trajectory, with the same clock and body axes, as its reference."""
-    stamps, attitude = read_tum(path)
+    with reading.from_file(path):
+        stamps, attitude = read_tum(path)
     return _with_reference(recording, stamps, attitude, Path(path).name)
 
 

@@ -15,6 +15,8 @@ import contextlib
 import io
 import os
 import struct
+import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -90,16 +92,54 @@ def read_ulog(path: str | os.PathLike[str], *, topic: str = "") -> Recording:
     )
 
 
+SECONDS, SECONDS_PER_MB = 2.0, 2.0
+"""Maximum time of the processor that the library may take for a log, more than ten times the usual: on damaged bytes it may go back and
+forth for ever."""
+LONGEST = 65535
+"""Maximum number of fields of a message, whose length is a number of 16 bits."""
+
+
+class _Content(io.BytesIO):
+    """The content of a log, with a limit on the time that its reading takes."""
+
+    def __init__(self, content: bytes) -> None:
+        super().__init__(content)
+        self._until = time.thread_time() + SECONDS + SECONDS_PER_MB * len(content) / 1e6
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        if time.thread_time() > self._until:
+            raise _TooLongError(f"the library does not come to an end at byte {self.tell()}")
+        return super().read(size)
+
+
+class _TooLongError(Exception):
+    """The library takes too long; it handles all usual exceptions as damage."""
+
+
 def opened(file: Path, topics: list[str]) -> Any:
     """Return a flight log with these topics, read by the library."""
     pyulog = library("pyulog", f"{file.name} is a flight log of PX4, which")
-    try:
-        with contextlib.redirect_stdout(io.StringIO()):  # the library prints its findings
-            return pyulog.ULog(str(file), topics)
-    except Exception as error:  # for a damaged log the library raises any exception of its parsers
+    content = reading.content(file)
+    with contextlib.redirect_stdout(io.StringIO()):  # the library prints its findings
+        definitions = pyulog.ULog(_Content(content), parse_header_only=True).message_formats
+        for name in definitions:
+            _need_fields(file, name, definitions, {})
+        return pyulog.ULog(_Content(content), topics)
+
+
+def _need_fields(file: Path, name: str, definitions: Mapping[str, Any], known: dict[str, int]) -> int:
+    """Return the number of fields of a message with its nested messages, which the library enumerates; reject too many."""
+    if name not in known:
+        known[name] = LONGEST + 1  # while it is counted: for one that contains itself
+        known[name] = sum(
+            max(1, size) * (_need_fields(file, kind, definitions, known) if kind in definitions else 1)
+            for kind, size, _ in definitions[name].fields
+        )
+    if known[name] > LONGEST:
         raise InputError(
-            f"{file.name} cannot be read as ULog ({' '.join(str(error).split())}); the log is damaged"
-        ) from None
+            f"{file.name} cannot be read: its message {name} has more than {LONGEST} fields; it is damaged"
+        )
+    return known[name]
 
 
 def _is_cut(file: Path) -> bool:
@@ -120,6 +160,8 @@ def _is_cut(file: Path) -> bool:
 
 def columns(rows: dict[str, Any], name: str, size: int) -> Array:
     """Return the elements of an array field, one row per message."""
+    if missing := [f"{name}[{k}]" for k in range(size) if f"{name}[{k}]" not in rows]:
+        raise InputError(f"a message has no field {missing[0]} (it has: {', '.join(rows)}); the log is damaged")
     return np.stack([np.asarray(rows[f"{name}[{k}]"], np.float64) for k in range(size)], axis=1)
 
 

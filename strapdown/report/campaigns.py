@@ -14,7 +14,6 @@ from strapdown.files import plain
 from strapdown.montecarlo import campaign, verdicts
 from strapdown.montecarlo.statistics import SUBSETS, Statistics
 from strapdown.plots.statistics import STATES, state_unit
-from strapdown.plots.style import legend_below, match_scales
 from strapdown.report import findings, page
 
 
@@ -36,17 +35,7 @@ def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
         findings.verdict(judgement),
         _numbers(statistics, bound, judgement),
         findings.evidence(judgement),
-        page.section(
-            "Over time",
-            page.figure(
-                lambda: plots.runs_overview(statistics, probability),
-                "ANEES of attitude and bias, and NIS, with the bounds of a consistent filter",
-            ),
-            page.figure(
-                lambda: _fans(statistics),
-                "Quantiles of the errors over the runs, and those predicted by the filter",
-            ),
-        ),
+        page.section("Over time", *_over_time(statistics, judgement, probability)),
         page.section(
             "At the end",
             page.figure(
@@ -135,16 +124,54 @@ def _numbers(statistics: Statistics, bound: Array | None, judgement: consistency
     return page.section("Key numbers", *parts)
 
 
-def _fans(statistics: Statistics) -> Figure:
-    rows = len(_estimated(statistics)) // 3
-    figure, axes = plots.new_figure(rows, 3, size=(13.0, 3.5 * rows), squeeze=False)
-    for row, first in zip(axes, (0, 3), strict=False):
-        for k, ax in enumerate(row):
-            plots.fan(statistics, first + k, ax)
-            ax.get_legend().remove()
-        match_scales(row)
-    legend_below(figure, [axes[0, 0]], ncols=3)
-    return figure
+def _over_time(statistics: Statistics, judgement: consistency.Judgement, probability: float) -> list[str]:
+    """Return charts of ANEES and NIS with their bounds, and of the quantiles of the errors with those that the filter predicts."""
+    charts = []
+    for one in judgement.findings:
+        if one.name == "ANEES" and one.of in ("attitude", "bias"):
+            lines = (page.Series(label="ANEES, all runs", value=statistics.anees[:, SUBSETS[one.of][0]]),)
+            charts.append(_bounded(f"ANEES of the {one.of}", statistics.time, lines, (one.low, one.high)))
+    known = statistics.nis_degrees > 0
+    if known.any():
+        samples = round(float(np.median(statistics.nis_degrees[known]) * statistics.runs))
+        lines = (page.Series(label="NIS, all runs", value=np.where(known, statistics.nis, np.nan), colour="--b"),)
+        bounds = consistency.mean_bounds(1, samples, probability)
+        charts.append(_bounded("NIS in each interval", statistics.nis_time, lines, bounds))
+    settled = slice(len(statistics.time) // 20, None)
+    for k, name in enumerate(_estimated(statistics)):
+        sigma = statistics.sigma[:, k]
+        unit, size = state_unit(k, 3.0 * statistics.sigma[settled, k // 3 * 3 : k // 3 * 3 + 3])
+        quantiles = [
+            page.Series(
+                label=f"{100 * share:g} % of the runs",
+                value=statistics.error_quantile(share)[:, k] / size,
+                colour=colour,
+            )
+            for share, colour in ((0.99, "--a"), (0.5, "--c"))
+        ]
+        predicted = [
+            page.Series(label=f"{100 * share:g} % by the filter", value=factor * sigma / size, colour=colour, dash=True)
+            for share, factor, colour in ((0.99, 2.5758, "--a"), (0.5, 0.6745, "--c"))
+        ]
+        title = f"|{name} error|: quantiles of the runs, and those predicted by the filter"
+        charts.append(page.chart(title, f"|{name} error|, {unit}", statistics.time, (*quantiles, *predicted)))
+    return charts
+
+
+def _bounded(title: str, time: Array, lines: tuple[page.Series, ...], bounds: tuple[float, float]) -> str:
+    """Return a chart of a statistic per degree of freedom with the bounds of a consistent filter."""
+    low, high = (np.full(len(time), bound) for bound in bounds)
+    band = (
+        page.Series(label="upper bound", value=high, colour="--faint", band=True),
+        page.Series(label="lower bound", value=low, colour="--faint", band=True),
+    )
+    return page.chart(
+        title,
+        "per degree of freedom",
+        time,
+        (*band, *lines),
+        log=bool(max(np.nanmax(one.value) for one in lines) > 4.0),
+    )
 
 
 def _end(statistics: Statistics) -> Figure:

@@ -124,7 +124,6 @@ def _numbers(estimate: Estimate, error: Array | None) -> str:
 def _over_time(estimate: Estimate, truth: Truth | None, error: Array | None, fixed_frame: str) -> str:
     sigma = estimate.sigma
     charts = []
-    figure = ""
     settled = slice(len(estimate.time) // 20, None)
     if truth is not None and error is not None:
         for what, (states, unit_of) in zip(("Attitude error", "Bias error"), _parts(estimate), strict=False):
@@ -140,11 +139,6 @@ def _over_time(estimate: Estimate, truth: Truth | None, error: Array | None, fix
                 reach = 1.3 * max(float(bound[settled].max()), float(np.abs(value[settled]).max()))
                 label = f"{what.lower()} {axis}, {unit}"
                 charts.append(page.chart(f"{what} {axis}", label, estimate.time, series, reach=reach))
-        if estimate.has_bias:
-            figure = page.figure(
-                lambda: plots.error_overview(estimate, truth),
-                "Errors relative to the truth with the filter's ±3σ, body axes",
-            )
     else:
         euler = quaternion.to_rotation(estimate.attitude).as_euler("ZYX", degrees=True)[:, ::-1]
         series = tuple(
@@ -160,11 +154,7 @@ def _over_time(estimate: Estimate, truth: Truth | None, error: Array | None, fix
         spread = np.linalg.norm(sigma[:, :3], axis=1) / DEGREE
         series = (page.Series(label="σ, root sum square of the three axes", value=spread),)
         charts.append(page.chart("Attitude σ", "attitude σ, °", estimate.time, series))
-        figure = page.figure(
-            lambda: plots.estimate_overview(estimate, fixed_frame=fixed_frame),
-            "Attitude, gyro bias with ±3σ, attitude σ",
-        )
-    return page.section("Over time", *charts, figure)
+    return page.section("Over time", page.beside_body(charts, estimate.time, estimate.attitude))
 
 
 def _sensor(name: str, innovations: Innovations, probability: float) -> str:

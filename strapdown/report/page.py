@@ -8,19 +8,22 @@ import importlib.resources
 import io
 import json
 import math
+import re
+import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from strapdown.checks import Array
 from strapdown.plots import style
-from strapdown.plots.decimation import column_starts, extreme_rows
+from strapdown.plots.decimation import extreme_rows
 from strapdown.plots.estimates import wraps
 
-CHART_POINTS = 6000
+CHART_SAMPLES = 200_000
 """Maximum number of times of an interactive chart; longer series are reduced to the extremes of each column."""
 _DOTS_PER_INCH = 120
 _WIDE = 7.0
@@ -40,6 +43,8 @@ class Series:
     """Whether it is the upper limit, followed by the lower limit, of a band, which is filled without lines."""
     wraps: bool = False
     """Whether it is an angle in degrees, whose line is interrupted where it wraps at ±180°."""
+    dash: bool = False
+    """Whether the line is dashed."""
 
 
 def text(content: Any) -> str:
@@ -49,7 +54,18 @@ def text(content: Any) -> str:
 
 def section(title: str, *parts: str) -> str:
     """Return a section with a heading."""
-    return f"<section><h2>{text(title)}</h2>\n" + "\n".join(parts) + "</section>\n"
+    return f'<section id="{_anchor(title)}"><h2>{text(title)}</h2>\n' + "\n".join(parts) + "</section>\n"
+
+
+def _anchor(title: str) -> str:
+    return re.sub(r"\W+", "-", title.lower()).strip("-")
+
+
+def _contents(parts: Sequence[str]) -> str:
+    """Return links to the sections among the parts of a page."""
+    heads = [found for part in parts for found in re.findall(r'<section id="([^"]*)"><h2>(.*?)</h2>', part)]
+    links = "".join(f'<li><a href="#{anchor}">{title}</a></li>' for anchor, title in heads)
+    return f'<nav aria-label="Contents"><ul>{links}</ul></nav>\n' if len(heads) > 1 else ""
 
 
 def paragraph(content: str, *, faint: bool = False) -> str:
@@ -107,41 +123,118 @@ def _image(draw: Callable[[], Figure], theme: str) -> tuple[str, bool]:
     return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode(), drawn.get_figwidth() > _WIDE
 
 
-def chart(title: str, unit: str, time: Array, series: Sequence[Series], *, reach: float | None = None) -> str:
-    """Return an interactive time series with its data; the initial vertical axis is ±``reach``, or the range of the data."""
+def chart(
+    title: str,
+    unit: str,
+    time: Array,
+    series: Sequence[Series],
+    *,
+    reach: float | None = None,
+    x: str = "time, s",
+    ticks: Sequence[str] = (),
+    log: bool = False,
+) -> str:
+    """Return an interactive chart with its data, all samples as 16-bit numbers, compressed.
+
+    Parameters
+    ----------
+    title, unit : str
+        Heading, and label of the vertical axis.
+    time : ndarray (n,)
+        Horizontal axis, increasing.
+    series : sequence of Series
+        Lines; a band is two successive series.
+    reach : float, optional
+        The vertical axis is ±``reach`` at first. Default: the range of the data.
+    x : str
+        Label of the horizontal axis.
+    ticks : sequence of str
+        Names of the values 0, 1, … of the horizontal axis, if it has no numbers; lines are then drawn as points.
+    log : bool
+        Whether the vertical axis is logarithmic.
+
+    Returns
+    -------
+    str
+        HTML.
+    """
     lines = [one.value for one in series if not one.band]
-    bands = [k for k, one in enumerate(series) if one.band][::2]
-    columns = CHART_POINTS // (2 * len(lines))
-    rows = np.unique(np.concatenate([extreme_rows(time, value, columns) for value in lines]))
-    reduced = len(rows) < len(time)
-    shown = [one.value[rows] for one in series]
-    if reduced:
-        starts = column_starts(time, columns)
-        group = np.searchsorted(starts, rows, side="right") - 1
-        for k in bands:
-            shown[k] = np.fmax.reduceat(series[k].value, starts)[group]
-            shown[k + 1] = np.fmin.reduceat(series[k + 1].value, starts)[group]
+    rows = np.arange(len(time))
+    if len(rows) > CHART_SAMPLES:  # a page of some ten megabytes
+        columns = CHART_SAMPLES // (2 * len(lines))
+        rows = np.unique(np.concatenate([extreme_rows(time, value, columns) for value in lines]))
+    values = [one.value[rows] for one in series]
     for k, one in enumerate(series):
         if one.wraps:
-            shown[k] = np.where(np.isin(np.arange(len(rows)), wraps(one.value, rows)), np.nan, shown[k])
+            values[k] = np.where(np.isin(rows, wraps(one.value, rows)), np.nan, values[k])
     content = {
+        "title": title,
         "unit": unit,
-        "series": [{"label": s.label, "colour": s.colour, "band": s.band} for s in series],
-        "bands": [[1 + k, 2 + k] for k in bands],
+        "x": x,
+        "ticks": list(ticks),
+        "log": log,
+        "series": [{"label": s.label, "colour": s.colour, "band": s.band, "dash": s.dash} for s in series],
         "range": None if reach is None else [-reach, reach],
-        "data": [_numbers(time[rows]), *(_numbers(values) for values in shown)],
+        "time": packed_time(time[rows]),
+        "data": [packed(value) for value in values],
     }
-    plain = json.dumps(content, allow_nan=False).replace("</", "<\\/")
-    widest = ", band at its widest" if bands else ""
-    note = f" ({len(rows)} of {len(time)} times, extremes kept{widest})" if reduced else ""
+    note = f" ({len(rows)} of {len(time)} times, extremes kept)" if len(rows) < len(time) else ""
     return (
-        f'<div class="chart"><h3>{text(title + note)}</h3><div class="plot"></div>'
-        f'<script type="application/json">{plain}</script></div>'
+        f'<div class="chart"><h3>{text(title + note)}</h3><div class="plot" tabindex="0"></div>'
+        f'<script type="application/json">{_json(content)}</script></div>'
     )
 
 
-def _numbers(values: Array) -> list[float | None]:
-    return [float(f"{x:.7g}") if math.isfinite(x) else None for x in values.tolist()]
+def beside_body(charts: Sequence[str], time: Array, attitude: Array) -> str:
+    """Return charts beside a picture of the body that shows the attitude q_fb (n, 4) at their cursor."""
+    rows = np.unique(np.linspace(0, len(time) - 1, min(len(time), CHART_SAMPLES)).astype(int))
+    content = {"time": packed_time(time[rows]), "data": [packed(attitude[rows, k]) for k in range(4)]}
+    return (
+        f'<div class="beside"><div>{"".join(charts)}</div>'
+        '<div class="body"><canvas width="360" height="360" role="img" aria-label="Attitude of the body at the cursor"></canvas>'
+        f'<p class="faint"></p><script type="application/json">{_json(content)}</script></div></div>'
+    )
+
+
+def _json(content: Any) -> str:
+    return json.dumps(content, allow_nan=False).replace("</", "<\\/")
+
+
+BLOCK = 4096
+"""Number of samples that share a scale, so that a large value does not coarsen the others."""
+_MISSING = -32768
+
+
+def packed(values: Array) -> dict[str, Any]:
+    """Return numbers as differences of 16-bit integers, compressed: 1/65534 of the range of each block of 4096; NaN is a gap."""
+    scales, offsets = [], []
+    integers = np.full(len(values), _MISSING, np.int16)
+    for start in range(0, len(values), BLOCK):
+        part = values[start : start + BLOCK]
+        known = np.isfinite(part)
+        low, high = (float(part[known].min()), float(part[known].max())) if known.any() else (0.0, 0.0)
+        offset, scale = 0.5 * (low + high), (high - low) / 65534.0
+        integers[start : start + BLOCK][known] = np.rint((part[known] - offset) / scale) if scale > 0.0 else 0
+        scales.append(scale)
+        offsets.append(offset)
+    return {"scale": scales, "offset": offsets, "deflate": _compressed(np.diff(integers, prepend=np.int16(0)))}
+
+
+def packed_time(time: Array) -> dict[str, Any]:
+    """Return times as differences of whole microseconds, or of longer ticks if 32 bits do not hold them, compressed."""
+    tick = max(1e-6, float(np.diff(time).max(initial=0.0)) / 2.0**30)
+    ticks = np.rint((time - time[0]) / tick).astype(np.int64)
+    return {
+        "first": float(time[0]),
+        "tick": tick,
+        "deflate": _compressed(np.diff(ticks, prepend=0).astype(np.int32)),
+    }
+
+
+def _compressed(integers: NDArray[Any]) -> str:
+    """Return little-endian integers as base64 of zlib, low bytes before high bytes, which compress better apart."""
+    plane = np.ascontiguousarray(integers.astype(integers.dtype.newbyteorder("<"))).view(np.uint8)
+    return base64.b64encode(zlib.compress(plane.reshape(len(integers), -1).T.tobytes(), 9)).decode()
 
 
 def verdict(answer: str, reason: str, details: Sequence[str] = ()) -> str:
@@ -166,7 +259,7 @@ def page(title: str, subtitle: str, *parts: str) -> str:
         f"<title>{text(title)}</title>\n"
         '<link rel="icon" href="data:,">\n'
         f"<style>{read('uplot/uPlot.min.css')}\n{read('page.css')}</style></head>\n<body>\n"
-        f'<header><h1>{text(title)}</h1><p class="faint">{text(subtitle)}</p></header>\n'
+        f'<header><h1>{text(title)}</h1><p class="faint">{text(subtitle)}</p></header>\n{_contents(parts)}'
         + "\n".join(parts)
         + f"\n{scripts}</body></html>\n"
     )

@@ -595,6 +595,12 @@ class VectorSensor(_Sampled, ByValue):
         ``"direction"``, or ``"heading"`` (only the rotation about the fixed z axis).
     faults : Faults, default no faults
         Errors beyond the white noise.
+
+    Examples
+    --------
+    >>> star = VectorSensor(name="star 1", reference_f=[3.0, 0.0, 4.0], sigma=20.0 * np.pi / 648000.0, rate=1.0)
+    >>> print(star.reference_f)
+    [0.6 0.  0.8]
     """
 
     name: str

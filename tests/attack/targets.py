@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+import importlib.util
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,7 +19,7 @@ from strapdown import coning, gyro, montecarlo, quaternion, recordings, records,
 from strapdown.estimation import setup
 from strapdown.montecarlo import campaign
 from strapdown.montecarlo import statistics as sums
-from strapdown.recordings import recordfiles
+from strapdown.recordings import attitudes, recordfiles
 from strapdown.report import tunings
 
 Damage = Callable[..., bytes]
@@ -98,7 +100,63 @@ def targets(folder: Path) -> list[Target]:
         target("dispersions.toml", montecarlo.read_dispersions, damage.TEXT, 0.05),
         target("vibration.csv", coning.read_vibration, damage.TEXT, 0.11),
         target("tuning.json", lambda path: tunings.report(path, 0.99), (*damage.TEXT, damage.replace_node, damage.replace_node), 0.12),
+        *foreign(folder),
     ]  # fmt: skip
+
+
+FOREIGN = {"bag": 0.03, "mcap": 0.03, "db3": 0.02, "ulg": 0.03, "parquet": 0.02, "tum": 0.02, "gcsv": 0.01}
+"""Shares of the formats of other programs, by ending."""
+
+
+def foreign(folder: Path) -> list[Target]:
+    """Write one file of each format of other programs that its library can write; return them."""
+    n, draw = 30, np.random.default_rng(2)
+    whole = recordings.Recording(
+        source="flight",
+        time=0.01 * np.arange(n),
+        rate=0.1 * draw.standard_normal((n, 3)),
+        specific_force=np.array([0.0, 0.0, 9.8]) + draw.standard_normal((n, 3)),
+        magnetic_field=1e-5 * draw.standard_normal((n, 3)),
+        magnetic_unit="T",
+        temperature=20.0 + draw.standard_normal(n),
+        true_attitude=quaternion.normalize(draw.standard_normal((n, 4))),
+        epoch_ns=1_700_000_000_123_456_789,
+    )
+    found = []
+    for ending, share in FOREIGN.items():
+        path = folder / f"flight.{ending}"
+        damages: tuple[Damage, ...] = damage.BYTES
+        read: Callable[[Path], Any] = recordings.read
+        if ending == "tum":
+            rows = zip(whole.clock_ns.tolist(), whole.true_attitude[:, [1, 2, 3, 0]].tolist(), strict=True)
+            text = "".join(f"{t // 10**9}.{t % 10**9:09d} 0 0 0 {' '.join(map(repr, q))}\n" for t, q in rows)
+            path.write_text(text)
+            damages, read = damage.TEXT, attitudes.read_attitudes
+        elif ending == "gcsv":
+            if importlib.util.find_spec("telemetry_parser") is None:
+                continue
+            lines = "".join(f"{k},{k},-{k},1,2,3,4\n" for k in range(n))
+            path.write_text(
+                f"GYROFLOW IMU LOG\nversion,1.3\nid,x\ntscale,0.001\ngscale,0.001\nascale,0.01\nt,gx,gy,gz,ax,ay,az\n{lines}"
+            )
+            damages = damage.TEXT
+        else:
+            library = {"ulg": "pyulog", "parquet": "pyarrow"}.get(ending, "rosbags")
+            if importlib.util.find_spec(library) is None:
+                continue
+            recordings.write(whole, path)
+            more = {
+                "ulg": (damage.replace_word,) * 3,
+                "db3": (damage.change_sqlite,) * 3,
+                "parquet": (damage.change_parquet,) * 2,
+            }
+            damages += more.get(ending, ())
+        found.append(Target(path.name, path.read_bytes(), read, damages, share))
+        if ending in ("bag", "mcap", "ulg"):
+            topic = "" if ending == "ulg" else "/imu/reference"
+            read = functools.partial(attitudes.read_attitudes, topic=topic)
+            found.append(Target(path.name, path.read_bytes(), read, damages, 0.3 * share))
+    return found
 
 
 def _whole_estimate(path: Path) -> tuple[Any, ...]:

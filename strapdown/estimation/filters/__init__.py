@@ -1,45 +1,34 @@
-"""Other attitude filters with the same interface, for comparison.
+"""The MEKF and a complementary filter with the same interface, and filters of your own, for comparison.
 
 They are compared by one call, which returns a table::
 
     print(filters.compare(record, process_noise, initial))
 
-All of them estimate attitude and gyro bias from the same record, with the same order of measurements and the same model of the gyro, and
-report their covariance in the body-side convention of the package, (δθ, δb). They differ in the definition of the error:
-
-- ``mekf``: body side, ``q_true = q ⊗ exp(δθ)``, with the reset of the covariance (:mod:`strapdown.estimation.forward`; recommended);
-- ``fixed-side``: ``q_true = exp(δφ) ⊗ q``, with its reset: the same filter in other coordinates;
-- ``right-invariant``: fixed-side without a reset, the "imperfect" invariant filter (Barrau & Bonnabel 2017);
-- ``two-frame``: right-invariant on the two-frames group, attitude and bias error both in fixed axes (Barrau & Bonnabel 2023);
-- ``equivariant``: two-frame with the equivariant rows of directions (van Goor, Hamel & Mahony 2022; Fornasier et al. 2022);
-- ``geometric``: bias error in a common frame, body side (Andrle & Crassidis 2015);
-- ``schmidt``: body side, the gyro bias considered and not estimated (Schmidt 1966);
-- ``usque``: unscented, generalised Rodrigues parameters (Crassidis & Markley 2003);
+- ``mekf``: multiplicative extended Kalman filter (:mod:`strapdown.estimation.forward`; recommended);
 - ``mahony``: complementary, fixed gains (Mahony, Hamel & Pflimlin 2008).
 
-Every filter accepts directions, vectors, headings and attitudes with every kind of noise (:mod:`strapdown.vectors`). Mahony's filter has
-one gain per sensor, whatever the shape of its noise; the covariance that it reports is that of those gains under that noise.
+Both estimate attitude and gyro bias from the same record, with the same order of measurements and the same model of the gyro, and report
+their covariance in the body-side convention of the package, (δθ, δb). Both accept directions, vectors, headings and attitudes with every
+kind of noise (:mod:`strapdown.vectors`). Mahony's filter has one gain per sensor, whatever the shape of its noise; the covariance that it
+reports is that of those gains under that noise. They run over whole records only; for sample-by-sample processing use the MEKF
+(:class:`strapdown.estimation.StepFilter`).
 
-They run over whole records only; for sample-by-sample processing use the MEKF (:class:`strapdown.estimation.StepFilter`).
-
-A filter of your own can be compared with them (:mod:`strapdown.estimation.filters.own`). To add one to the package, write a module like
-those of :mod:`strapdown.kernels.filters`, which defines its error, and enter it in :data:`FILTERS`.
+A filter of your own is compared with them by :mod:`strapdown.estimation.filters.own`; right-invariant, two-frame, equivariant, geometric
+and unscented filters written in this way are in ``sims/filter_family.py``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from functools import partial
 
 from numpy.typing import ArrayLike
 
 from strapdown.checks import InputError, array, one_of
 from strapdown.estimation import forward
-from strapdown.estimation.filters import complementary, extended, unscented
+from strapdown.estimation.filters import complementary
 from strapdown.estimation.filters.comparison import Comparison as Comparison
 from strapdown.estimation.filters.own import Own, OwnFilter, as_own
 from strapdown.estimation.states import ProcessNoise, State
-from strapdown.kernels.filters import equivariant, fixed_side, geometric, right_invariant, schmidt, two_frame
 from strapdown.records import Estimate, ImuRecord, Truth
 
 __all__ = [
@@ -52,13 +41,6 @@ __all__ = [
 
 FILTERS: dict[str, Callable[..., Estimate]] = {
     "mekf": forward.run,
-    "fixed-side": partial(extended.run, fixed_side),
-    "right-invariant": partial(extended.run, right_invariant),
-    "two-frame": partial(extended.run, two_frame),
-    "equivariant": partial(extended.run, equivariant),
-    "geometric": partial(extended.run, geometric),
-    "schmidt": partial(extended.run, schmidt),
-    "usque": unscented.run,
     "mahony": complementary.run,
 }
 """Filters by name: functions with the arguments of :func:`run` after the name."""
@@ -126,8 +108,7 @@ def compare(
     process_noise, initial : ProcessNoise, State
         As for :func:`run`, for all filters.
     filters : iterable of str or filter, default all of :data:`FILTERS`
-        Names, and filters of your own (:mod:`strapdown.estimation.filters.own`). The unscented filter needs some tenths of a
-        millisecond per step, the others a microsecond.
+        Names, and filters of your own (:mod:`strapdown.estimation.filters.own`).
     every, full_covariance : int, bool
         As for :func:`run`.
     bound : array_like (n, 6, 6), optional

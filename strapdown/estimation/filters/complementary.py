@@ -11,11 +11,13 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from strapdown.checks import Array, array
-from strapdown.estimation.filters import extended
-from strapdown.estimation.schedule import Schedule
-from strapdown.estimation.states import ProcessNoise, State
-from strapdown.kernels.filters import complementary as kernel
+from strapdown.checks import Array, array, count
+from strapdown.estimation.forward import gaps
+from strapdown.estimation.schedule import Schedule, innovations_by_sensor, schedule, skipped_too
+from strapdown.estimation.states import ProcessNoise, State, check_arguments, covariance_matrices, pack
+from strapdown.kernels import complementary
+from strapdown.kernels.machine import compiled, read_only
+from strapdown.kernels.walk import walk
 from strapdown.records import Estimate, ImuRecord
 
 
@@ -71,7 +73,29 @@ def run(
     Default: Farrenkopf's for all sensors together, divided among them by information, with random walks increased by the initial
     standard deviations of attitude and bias over the record: a fixed gain must be suitable for the start as well as the end.
     """
-    events = extended.checked_schedule(record, process_noise, initial, every)
+    check_arguments(record=record, process_noise=process_noise, initial=initial)
+    count("every", every)
+    events = schedule(record.vectors, record.time[0], record.time[-1], anisotropic=True)
     chosen = _steady_gains(record, events, process_noise, initial) if gains is None else gains
-    rows = array("gains", chosen, (2, len(events.sensors)))
-    return extended.run_scheduled(kernel, record, events, process_noise, initial, rows, every, full_covariance)
+    states, innovation = np.empty((len(record.increments) // every + 1, 28)), np.empty((len(events.time), 6))
+    body = complementary.Body(
+        state=pack(initial.attitude, initial.bias, initial.covariance),
+        angle_variance=process_noise.angle_random_walk**2,
+        rate_variance=process_noise.rate_random_walk**2,
+        gains=array("gains", chosen, (2, len(events.sensors))),
+    )
+    out = complementary.Outputs(states=states, innovation=innovation)
+    compiled(walk, complementary)(
+        read_only(record.time), read_only(record.increments), events.measurements, every, body, out
+    )
+    covariance, innovations = covariance_matrices(states[:, 7:]), innovations_by_sensor(events, innovation)
+    return Estimate(
+        time=record.time[::every],
+        attitude=states[:, :4],
+        bias=states[:, 4:7],
+        variance=np.diagonal(covariance, axis1=1, axis2=2).copy(),
+        covariance=covariance if full_covariance else None,
+        innovations=innovations,
+        skipped=skipped_too(events, innovations),
+        events=tuple(gaps(record)),
+    )

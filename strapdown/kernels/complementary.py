@@ -1,4 +1,4 @@
-"""The complementary filter of Mahony, Hamel & Pflimlin (2008), with the covariance for its gains.
+"""The complementary filter of Mahony, Hamel & Pflimlin (2008), with the covariance for its gains: a body of :mod:`strapdown.kernels.walk`.
 
 Each measurement rotates the attitude by the sensor's gain times ``ω_mes = z × R̂ᵀ r`` and changes the bias by its bias gain times ω_mes:
 equations (32) of the paper over one sample interval, k_P dt and −k_I dt.
@@ -7,6 +7,9 @@ equations (32) of the paper over one sample interval, k_P dt and −k_I dt.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
+
+import numpy as np
 
 from strapdown.kernels.algebra import (
     combine,
@@ -25,8 +28,7 @@ from strapdown.kernels.algebra import (
     transpose,
     transpose_times_vector,
 )
-from strapdown.kernels.filters.body_side import from_body_side, propagated, to_body_side
-from strapdown.kernels.filters.extended import negated
+from strapdown.kernels.filter_step import predict as propagated
 from strapdown.kernels.iterated_update import IDENTITY
 from strapdown.kernels.measurement import (
     ATTITUDE,
@@ -41,13 +43,66 @@ from strapdown.kernels.measurement import (
     value_of,
 )
 from strapdown.kernels.rotation import moved, quaternion_multiply, rotation_matrix, unit
-
-__all__ = ["from_body_side", "propagated", "to_body_side", "update"]
+from strapdown.kernels.state import load_state, store_state
+from strapdown.kernels.walk import step_within, turn_squared
 
 NOTHING = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 MAX_VARIANCE = 100.0
 """Maximum trace of the attitude covariance, rad²."""
+
+
+class Body(NamedTuple):
+    """State, noise and gains of the filter."""
+
+    state: np.ndarray
+    """Packed state (28,); at return, the end state."""
+    angle_variance: float
+    """σ_v², rad²/s."""
+    rate_variance: float
+    """σ_u², rad²/s³."""
+    gains: np.ndarray
+    """Gains of attitude and bias (1/s) by sensor (2, sensors)."""
+
+
+class Outputs(NamedTuple):
+    """Output arrays."""
+
+    states: np.ndarray
+    """Packed states (rows, 28)."""
+    innovation: np.ndarray
+    """(events, 6) by place."""
+
+
+def begin(body):
+    """Return (q, b, A, B, C)."""
+    return load_state(body.state)
+
+
+def longest_step(state, part, dt, body):
+    """Return the longest step, s."""
+    return step_within(turn_squared(part, dt, state[1]), dt)
+
+
+def predict(state, part, dt, body, out):
+    """Propagate."""
+    q, b, A, B, C = state
+    q, A, B, C = propagated(q, b, A, B, C, part, dt, body.angle_variance, body.rate_variance)
+    return q, b, A, B, C
+
+
+def keep(state, row, e, body, out):
+    """Write a row."""
+    q, b, A, B, C = state
+    store_state(out.states[row], q, b, A, B, C)
+    return state
+
+
+def finish(state, row, e, body):
+    """Store the end state."""
+    q, b, A, B, C = state
+    store_state(body.state, q, b, A, B, C)
+    return row
 
 
 def held(A):
@@ -90,7 +145,7 @@ def measured_turn(kind, q, R, z, frame, noise, h, y):
         return scale(2.0 * d[0], (d[1], d[2], d[3])), IDENTITY, noise
     if kind == HEADING:
         up = (R[6], R[7], R[8])
-        M = minus_outer(NOTHING, negated(up), h)
+        M = minus_outer(NOTHING, scale(-1.0, up), h)
         return scale(y, up), M, symmetric_minus_outer(NOTHING[:6], scale(-noise[0], up), up)
     r_b = transpose_times_vector(R, (frame[6], frame[7], frame[8]))
     # z = r_b + r_b × δθ + v: z × r_b = (I − r_b r_bᵀ) δθ − r_b × v.
