@@ -539,7 +539,7 @@ def test_a_calibration_is_written_and_used(succeeds, recording, tmp_path):
     again = ("--calibration", tmp_path / "first" / "calibration.toml")
     succeeds("estimate", recording, "--out", tmp_path / "again", *again)
     second = unit_calibration.read(tmp_path / "again" / "calibration.toml")
-    assert second.sigma < first.sigma < 2e-3
+    assert second.sigma < first.sigma < 4e-3  # of the smoother's prior
     assert np.abs(second.matrix - first.matrix).max() < 2e-3
 
 

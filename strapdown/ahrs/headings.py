@@ -1,8 +1,8 @@
 """Heading measurements from a magnetometer.
 
-Iron in the surroundings disturbs the heading, and the magnitude and the dip of the field too. The noise of the heading is computed from their
-deviation from what is usual, and from the change of the whole field in the frame fixed by the gyro; it is larger for a steeper field. Iron in
-the unit is subtracted (:mod:`strapdown.recordings.hard_iron`), and what remains of it has states in the filter.
+Iron in the surroundings disturbs the heading, and the magnitude and the dip of the field too. The noise of the heading is computed from
+their deviation from what is usual, and from the change of the whole field in the frame fixed by the gyro; it is larger for a steeper field.
+Much iron in the unit is subtracted (:mod:`strapdown.recordings.hard_iron`); the rest of it has states in the filter.
 """
 
 from __future__ import annotations
@@ -27,6 +27,8 @@ MEDIAN_INTERVAL = 0.3
 """Interval of the values of which running medians are computed, s."""
 MEDIAN_SAMPLES = 1024
 """Number of those values that are kept; above it every other one is dropped, and the interval doubled."""
+OWN_IRON = 1.5
+"""Iron up to this multiple of the σ of the filter's states for it is left to them."""
 IRON_DEVIATION = 0.025
 """Increase of the deviation, relative to the magnitude, at which iron is no longer subtracted."""
 MAX_DIP = np.radians(80.0)
@@ -74,6 +76,10 @@ def measured(steps: FieldSteps, parameters: AhrsParameters, *, causal: bool) -> 
         without = _look(field - quaternion.rotate(steps.frame, iron), vertical, parameters, interval, causal=causal)
         odds = np.clip((as_measured.deviation - without.deviation) / (2.0 * IRON_DEVIATION**2), -50.0, 0.0)
         iron *= (2.0 / (1.0 + np.exp(-odds)))[:, None]
+        left = (OWN_IRON * parameters.hard_iron_sigma * seen.usual[0, 0]) ** 2 / np.maximum(
+            np.sum(iron**2, axis=1), 1e-30
+        )
+        iron *= np.maximum(1.0 - left, 0.0)[:, None]
         iron[lengths(iron) < hard_iron.NEGLIGIBLE * seen.usual[0, 0]] = 0.0
         field = field - quaternion.rotate(steps.frame, iron)
         seen = _look(field, vertical, parameters, interval, causal=causal)
@@ -158,4 +164,3 @@ def held(values: Array, known: np.ndarray) -> Array:
     """Return rows (k, …) with each unknown row replaced by the last known one before it, or by the first known one."""
     last = np.maximum.accumulate(np.where(known, np.arange(len(values)), -1))
     return np.asarray(values[np.where(last < 0, int(np.argmax(known)), last)])
-

@@ -171,12 +171,14 @@ HAND_HELD = AhrsParameters(
     tilt_sigma=0.06,
     tilt_by_field=0.7,
     heading_share=0.1,
-    heading_by_field=4.5,
+    heading_by_field=1.2,
     gyro_scale_sigma=3e-3,
 )
-"""A unit with a magnetometer in the hand, on a person or a small aircraft: its velocity is bounded. Chosen on the development halves of BROAD,
-RepoIMU, Sassari, OxIOD and the phones of PerCom 2017 (``benchmarks/recordings.py``)."""
-HAND_HELD_SMOOTHED = replace(HAND_HELD, velocity_sigma=1.0, gyro_scale_sigma=4e-3, field_disturbance=0.02)
+"""A unit with a magnetometer in the hand, on a person or a small aircraft: its velocity is bounded. Chosen on the development halves of
+BROAD, RepoIMU, Sassari, OxIOD and the phones of PerCom 2017 (``benchmarks/recordings.py``)."""
+HAND_HELD_SMOOTHED = replace(
+    HAND_HELD, velocity_sigma=1.0, gyro_scale_sigma=4e-3, field_disturbance=0.02, tilt_sigma=0.055
+)
 """The same for the smoother, which weighs acceleration that lasts over all the time before and after. Chosen on the same recordings."""
 HAND_HELD_WITHOUT_MAGNETOMETER = replace(
     HAND_HELD,
@@ -196,7 +198,10 @@ _VEHICLE = {"specific_force_noise": 0.15, "velocity_sigma": 8.0, "velocity_time"
 _VESSEL = {"velocity_sigma": 3.0, "velocity_time": 10.0, "acceleration_time": 2.0, "position_time": 10.0}
 MOTIONS: dict[str, tuple[AhrsParameters, AhrsParameters]] = {
     "hand": (HAND_HELD, HAND_HELD_WITHOUT_MAGNETOMETER),
-    "vehicle": (replace(HAND_HELD, field_disturbance=0.1, **_VEHICLE), replace(HAND_HELD_WITHOUT_MAGNETOMETER, **_VEHICLE)),
+    "vehicle": (
+        replace(HAND_HELD, field_disturbance=0.1, **_VEHICLE),
+        replace(HAND_HELD_WITHOUT_MAGNETOMETER, **_VEHICLE),
+    ),
     "vessel": (replace(HAND_HELD, **_VESSEL), replace(HAND_HELD_WITHOUT_MAGNETOMETER, **_VESSEL)),
     "any": (AhrsParameters(), AhrsParameters()),
 }

@@ -47,8 +47,8 @@ def prepare(
 ) -> Prepared:
     """Return the record that the filter runs on, and its initial state.
 
-    ``field_delay`` is that of the magnetometer's samples relative to the gyro's, s, one number or one per sample; each is rotated forward by
-    the gyro. ``causal``: a heading's noise depends only on the samples up to it. ``turned`` (n, 4): attitude from the gyro only, if already
+    ``field_delay`` is that of the magnetometer relative to the gyro, s, one number or one per sample; each sample is rotated forward
+    by the gyro. ``causal``: a heading's noise depends only on the samples up to it. ``turned`` (n, 4): attitude from the gyro only, if already
     computed.
     """
     if turned is None:
@@ -122,4 +122,3 @@ def averages(samples: Array, frame: Array, edge: Array) -> tuple[Array, Array]:
     total, number = np.empty((len(edge) - 1, 3)), np.empty(len(edge) - 1)
     compiled(recording_steps.average_samples)(read_only(samples), read_only(frame), edge, total, number)
     return total / np.maximum(number, 1.0)[:, None], number
-

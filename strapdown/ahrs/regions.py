@@ -30,6 +30,8 @@ MAX_BY_FIELD = 0.3
 """Maximum σ of the accelerometer's error computed from the level of the field's disturbance, m/s²."""
 FIELD_LEVEL = 0.02
 """Mean NIS of the magnetometer in a field disturbed as that along the path of a phone indoors."""
+MAX_HEADING = 30.0
+"""Maximum factor on the variance of the heading."""
 FIRST_LEVEL = (0.01, 15.0)
 """Mean NIS of the magnetometer assumed at first, and the number of measurements that weigh as much."""
 FIELD_MEMORY = 60.0
@@ -66,7 +68,7 @@ def scales(filtered: Estimate, parameters: AhrsParameters, level: Array, *, caus
     """
     field = field_level(filtered, parameters, causal=causal) / FIELD_LEVEL
     error = parameters.tilt_sigma**2 + np.minimum(parameters.tilt_by_field * field**2, MAX_BY_FIELD) ** 2
-    heading = parameters.heading_share + parameters.heading_by_field * field**1.5
+    heading = np.minimum(parameters.heading_share + parameters.heading_by_field * field**1.5, MAX_HEADING)
     if "magnetometer" not in filtered.innovations:
         heading = np.ones(len(field))
     return np.sqrt(TILT_SHARES[0] + TILT_SHARES[1] * np.sqrt(level)), error / STANDARD_GRAVITY**2, np.sqrt(heading)

@@ -92,7 +92,9 @@ def first_vector(samples: Array, turned: Array, source: str, sensor: str) -> Arr
     valid = np.isfinite(size) & (size > 0.0)
     if not valid.any():
         state = "is zero and gives no direction" if np.isfinite(size).any() else "has no valid sample"
-        raise InputError(f"{source}: the {sensor} {state}; cut the recording to a part where it has, or leave its columns out")
+        raise InputError(
+            f"{source}: the {sensor} {state}; cut the recording to a part where it has, or leave its columns out"
+        )
     k = int(np.argmax(valid))
     return np.asarray(quaternion.rotate(turned[k], samples[k]))
 
@@ -155,7 +157,14 @@ def rests(recording: Recording, parameters: AhrsParameters) -> Rests:
     steady = recording.time[last] - recording.time[last - length + 1] < 1.5 * QUIET_SPAN  # no gap
     used = np.flatnonzero(steady & (sigma < MAX_REST_SIGMA))
     turning = lengths(mean[used]) > TURNING_RATE
-    used = np.array([k for k, doubtful in zip(used, turning, strict=True) if not (doubtful and _turns(recording, slice(last[k] - length + 1, last[k] + 1), mean[k]))], np.intp)
+    used = np.array(
+        [
+            k
+            for k, doubtful in zip(used, turning, strict=True)
+            if not (doubtful and _turns(recording, slice(last[k] - length + 1, last[k] + 1), mean[k]))
+        ],
+        np.intp,
+    )
     return Rests(last[used], mean[used], sigma[used])
 
 
