@@ -48,8 +48,8 @@ def prepare(
     """Return the record that the filter runs on, and its initial state.
 
     ``field_delay`` is that of the magnetometer relative to the gyro, s, one number or one per sample; each sample is rotated forward
-    by the gyro. ``causal``: a heading's noise depends only on the samples up to it. ``turned`` (n, 4): attitude from the gyro only, if already
-    computed.
+    by the gyro. ``causal``: a heading's noise depends only on the samples up to it. ``turned`` (n, 4): attitude from the gyro only, if
+    already computed.
     """
     if turned is None:
         turned = sensor_delays.gyro_attitude(recording)
