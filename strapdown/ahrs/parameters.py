@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -131,7 +132,7 @@ class AhrsParameters:
     @property
     def setup(self) -> FilterSetup:
         """Setup of the filter with this model."""
-        force: dict[str, float] = {}
+        force: dict[str, Any] = {}
         if self.velocity_sigma > 0.0:
             names = ("velocity_sigma", "velocity_time", "acceleration_time", "position_time")
             force = {name: getattr(self, name) for name in names}
