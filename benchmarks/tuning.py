@@ -75,7 +75,7 @@ def step_seconds(one: tuning.Case, chosen: setup.FilterSetup, samples: int) -> f
 def main(*, duration: float = 1800.0, rate: float = 100.0, wrong: float = 30.0, repeats: int = 5) -> dict[str, Any]:
     """Return times of a pass, and of each optimiser with the difference of its end from the best."""
     scenario, data = record(duration, rate)
-    right = setup.FilterSetup.for_scenario(scenario, attitude_sigma=1e-3)
+    right = setup.FilterSetup.for_scenario(scenario, attitude_sigma=1e-3, states=False)
     one = tuning.record_case(data, right, seed=1)
     values = tuning.values_of(right, FREE, [data])
     off = tuning.with_values(right, {name: wrong * value for name, value in values.items()})

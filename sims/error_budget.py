@@ -144,7 +144,7 @@ def main(
     chosen = scenarios.load_scenario(scenario)
     if duration is not None:
         chosen = dataclasses.replace(chosen, duration=duration)
-    matched = setup.FilterSetup.for_scenario(chosen, attitude_sigma=0.1 * DEGREE)
+    matched = setup.FilterSetup.for_scenario(chosen, attitude_sigma=0.1 * DEGREE, states=False)
     filters = (("matched", matched), ("a quarter of Q", more_sure(matched)))
     comparisons = tuple(
         compare(name, chosen, filter_setup, runs=runs, epochs=epochs, seed=seed) for name, filter_setup in filters

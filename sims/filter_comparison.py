@@ -281,7 +281,7 @@ def main(
     """Run the study; JSON is written to ``out`` if it is given."""
     recorded = [recordings.read(file) for file in files]  # fails first if a file cannot be read
     scene = scenario(duration)
-    base = setup.FilterSetup.for_scenario(scene)
+    base = setup.FilterSetup.for_scenario(scene, states=False)
     plan = montecarlo.Plan(scenario=scene, setup=base, seed=seed, epochs=20)
     predicted = covariance.analyse(scene, base, epochs=20)
     bound = float(np.sqrt(np.mean(np.diagonal(predicted.cramer_rao, axis1=1, axis2=2)[10:, :3])))

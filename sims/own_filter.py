@@ -101,7 +101,7 @@ FILTERS: dict[str, str | Callable[[ImuRecord, State], Estimate]] = {
 def main(*, runs: int = 200, duration: float = 60.0, seed: int = 1, out: Path | str | None = None) -> Result:
     """Judge the filters over the same runs; verdicts are written to ``out`` if it is given."""
     flight = scenario(duration)
-    base = setup.FilterSetup.for_scenario(flight)
+    base = setup.FilterSetup.for_scenario(flight, states=False)
     setups = [replace(base, estimator=one) for one in FILTERS.values()]
     found = montecarlo.run(flight, setups, runs=runs, seed=seed, epochs=20)
     judgements = {name: one.judge() for name, one in zip(FILTERS, found, strict=True)}

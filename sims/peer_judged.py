@@ -292,7 +292,10 @@ def main(*, runs: int = 200, duration: float = 40.0, seed: int = 1, out: Path | 
     found, plans = {}, {}
     for name, (_, scene, estimator) in given.items():
         chosen = replace(
-            setup.FilterSetup.for_scenario(scene), attitude_sigma=1.0 * DEGREE, bias_sigma=BIAS, estimator=estimator
+            setup.FilterSetup.for_scenario(scene, states=False),
+            attitude_sigma=1.0 * DEGREE,
+            bias_sigma=BIAS,
+            estimator=estimator,
         )
         plans[name] = montecarlo.Plan(scenario=scene, setup=chosen, seed=seed, epochs=10)
         found[name] = montecarlo.run_plan(plans[name], runs=runs)

@@ -62,7 +62,7 @@ def main(*, duration=1800.0, rate=20.0, wrong=30.0, starts=20, seed=1, out=None)
         rate=rate,
         duration=duration,
     )
-    right = setup.FilterSetup.for_scenario(scenario, attitude_sigma=0.1 * units.DEGREE)
+    right = setup.FilterSetup.for_scenario(scenario, attitude_sigma=0.1 * units.DEGREE, states=False)
     predicted = tuning.plan(scenario, right, FREE, lengths=[0.7 * duration], seed=seed)
     record = scenarios.simulate(scenario, seed)
     whole = tuning.record_case(record, right, seed=seed)

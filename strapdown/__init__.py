@@ -7,7 +7,7 @@
 
 Tasks
     ``simulate``, ``read``, ``write``, ``estimate``, ``smooth``, ``integrate``, ``check``, ``tune``, ``monte_carlo``,
-    ``covariance_analysis``, ``allan_deviation``, ``fit_noise``, ``initial_state``
+    ``covariance_analysis``, ``allan_deviation``, ``fit_noise``, ``calibrate``, ``initial_state``
 Classes
     ``Scenario``, ``GyroSpec``, ``VectorSensor``, ``FilterSetup``, ``ProcessNoise``, ``Gate``, ``Robust``; ``LiveFilter`` and
     ``StepFilter`` filter sample by sample, compiled and on filterpy. Every function raises ``InputError`` on bad input; the message names
@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from strapdown import (
         ahrs,
         allan,
+        calibration,
         coning,
         consistency,
         covariance,
@@ -58,6 +59,7 @@ if TYPE_CHECKING:
         units,
         vectors,
     )
+    from strapdown.calibration import calibrate
     from strapdown.checks import InputError
     from strapdown.estimation import Gate, LiveFilter, ProcessNoise, Robust, StepFilter, initial_state
     from strapdown.estimation.setup import FilterSetup
@@ -93,6 +95,8 @@ __all__ = [
     "ahrs",
     "allan",
     "allan_deviation",
+    "calibrate",
+    "calibration",
     "check",
     "coning",
     "consistency",
@@ -136,6 +140,7 @@ _HOMES = {
     "StepFilter": "estimation",
     "VectorSensor": "vectors",
     "allan_deviation": "workflows",
+    "calibrate": "calibration",
     "check": "workflows",
     "covariance_analysis": "workflows",
     "estimate": "workflows",

@@ -735,7 +735,7 @@ def analyse(
     >>> print(found)  # doctest: +SKIP
     """
     scenario = scenarios.chosen(scenario)
-    setup = FilterSetup.for_scenario(scenario) if setup is None else setup
+    setup = FilterSetup.for_scenario(scenario, states=False) if setup is None else setup
     consider = Consider() if consider is None else consider
     _check_considered(scenario, consider)
     edges = scenario.edges

@@ -11,6 +11,7 @@ import dataclasses
 import os
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -44,10 +45,10 @@ from strapdown.scenarios import Scenario, simulate
 
 if TYPE_CHECKING:
     from strapdown.allan import AllanDeviation, NoiseFit
+    from strapdown.calibration import UnitCalibration
     from strapdown.montecarlo import Dispersions, Plan, Statistics
     from strapdown.montecarlo.campaign import Campaign
     from strapdown.recordings import GyroSamples
-    from strapdown.recordings.unit_calibration import UnitCalibration
     from strapdown.tuning import Prior, Tuning
 
 __all__ = [
@@ -77,6 +78,10 @@ SAME_STAMP = 1e-9
 # ------------------------------------------------------------------------------------------------------------------ read, write
 
 
+COLUMNS = ("columns", "data_vars", "__arrow_c_stream__")
+"""Attributes of an object that holds columns."""
+
+
 def read(path: Any, **options: Any) -> ImuRecord | Recording | Estimate | Campaign:
     """Read a file of any known format, identified by its content, or a table in memory.
 
@@ -85,7 +90,7 @@ def read(path: Any, **options: Any) -> ImuRecord | Recording | Estimate | Campai
     path : path, DataFrame, Dataset or mapping
         A simulated record, an estimate or a Monte Carlo of this package, or a recording in a format of
         :data:`strapdown.recordings.FORMATS` (CSV, ROS bag, ULog, EuRoC folder, …); or the columns of a recording, as for
-        :func:`strapdown.recordings.from_table` (pandas, xarray, arrays by name).
+        :func:`strapdown.recordings.from_table` (pandas, polars, pyarrow, xarray, structured arrays, arrays by name).
     **options
         For recordings: ``units``, ``columns`` and ``topic`` of :func:`strapdown.recordings.read`.
 
@@ -104,9 +109,9 @@ def read(path: Any, **options: Any) -> ImuRecord | Recording | Estimate | Campai
     >>> import strapdown as sd
     >>> walk = sd.read("walk.csv", units={"gyro": "deg/s", "accelerometer": "g"})  # doctest: +SKIP
     """
-    if isinstance(path, Mapping) or hasattr(path, "columns") or hasattr(path, "data_vars"):
+    if isinstance(path, (Mapping, np.ndarray)) or any(map(partial(hasattr, path), COLUMNS)):
         return recordings.from_table(path, **options)
-    instance("path", path, (str, os.PathLike), "give a path, a DataFrame, a Dataset, or arrays by name")
+    instance("path", path, (str, os.PathLike), "give a path, a data frame, a Dataset, or arrays by name")
     file = Path(path)
     kinds = {"strapdown estimate": "estimate", "strapdown montecarlo": "Monte Carlo"}
     kind = ""
@@ -257,7 +262,7 @@ def estimate(
     latency : float, optional
         For a recording: delay of the gyro's samples, s. Default: half a sample interval.
     calibration : UnitCalibration, optional
-        For a recording: calibration from an earlier recording of the same unit.
+        For a recording: calibration of the unit, from :func:`strapdown.calibrate`; the bias is then that of the corrected rates.
     full_covariance : bool, optional
         Whether to store covariance matrices rather than their diagonals. Default: True for a record, False for a recording.
     smooth : bool, default False

@@ -25,12 +25,9 @@ from strapdown.checks import Array, InputError
 from strapdown.estimation import model as modelling
 from strapdown.estimation.forward import gate_events, remembered, restart_states
 from strapdown.estimation.gating import Gate, Robust
-from strapdown.estimation.model import turning_matrix
-from strapdown.estimation.schedule import KIND_CODES
 from strapdown.estimation.states import GateMemory, State, check_arguments, restart_bias_variance
-from strapdown.estimation.step_filter import NO_LEVER, StepFilter
-from strapdown.kernels import gate_rules, iterated_update, sensor_rows
-from strapdown.kernels.algebra import cross, dot
+from strapdown.estimation.step_filter import StepFilter
+from strapdown.kernels import filter, gate_rules, iterated_update, machine, structure
 from strapdown.kernels.gate_rules import WIDE_PASSES
 from strapdown.kernels.iterated_update import (
     ACCEPTED,
@@ -143,7 +140,13 @@ class Linearization:
 
 
 def linearize(
-    model: MeasurementModel, attitude: Array, others: Array, P: Array, chains: Array, passes: int, threshold: float
+    model: MeasurementModel,
+    attitude: Array,
+    others: Array,
+    P: Array,
+    turning: Callable[[Array, Array], Array],
+    passes: int,
+    threshold: float,
 ) -> Linearization:
     """Return a measurement linearised at the state after its update (:mod:`strapdown.kernels.gate`).
 
@@ -182,18 +185,20 @@ def linearize(
             done, start, step = 0, first, zero.copy()
             step[:3] = math.copysign(TURN_ASIDE, trials - 1.5) * least_certain_axis(P)
         now = quaternion.normalize(quaternion.multiply(start.attitude, quaternion.exp(step[:3])))
-        now_others = turning_matrix(chains, len(P), start.attitude, now)[3:, 3:] @ (start.others + step[3:])
-        moved, prior = prior_at(first, now, now_others, chains)
+        now_others = turning(start.attitude, now)[3:, 3:] @ (start.others + step[3:])
+        moved, prior = prior_at(first, now, now_others, turning)
         seen = Linearization(
             attitude=now, others=now_others, covariance=moved, prior=prior, rows=model(now, now_others)
         )
         done += 1
 
 
-def prior_at(prior: Linearization, attitude: Array, others: Array, chains: Array) -> tuple[Array, Array]:
+def prior_at(
+    prior: Linearization, attitude: Array, others: Array, turning: Callable[[Array, Array], Array]
+) -> tuple[Array, Array]:
     """Return the covariance of the prior (n, n) in the tangent space of another state, and its mean minus that state (n,)."""
     P, back = seen_from(quaternion.multiply(quaternion.conjugate(prior.attitude), attitude), prior.covariance)
-    T = turning_matrix(chains, len(P), prior.attitude, attitude)
+    T = turning(prior.attitude, attitude)
     return T @ P @ T.T, np.concatenate([back, T[3:, 3:] @ prior.others - others])
 
 
@@ -342,19 +347,6 @@ class _Prior:
     covariance: Array
 
 
-def arc_of(measurement: Any, y: Array, basis: Array) -> tuple[float, float]:
-    """Return the angle θ between measured and predicted vector, rad, and θ/sin θ; 0 and 1 for other kinds."""
-    if measurement.kind not in ("direction", "vector"):
-        return 0.0, 1.0
-    along = y[2] + 1.0
-    if measurement.kind == "direction":
-        predicted = cross(tuple(basis[0].tolist()), tuple(basis[1].tolist()))
-        along = dot(predicted, measurement.z) / math.sqrt(dot(predicted, predicted))
-    sine = math.hypot(y[0], y[1])
-    angle = math.atan2(sine, along)
-    return angle, 1.0 if sine < 1e-9 else angle / sine
-
-
 class GatedStepFilter(StepFilter):
     """:class:`strapdown.StepFilter` with a gate and robust weights; ``weight`` is that of the last measurement."""
 
@@ -388,7 +380,7 @@ class GatedStepFilter(StepFilter):
         if one is not None and self._supervision.has_candidate:
             bias, values = one.others[:3], one.others[3:]
             self._supervision.candidate = self._candidate(
-                State(attitude=one.attitude, bias=bias, values=values, covariance=one.covariance, factor=one.factor)
+                State(attitude=one.attitude, bias=bias, values=values, covariance=one.covariance)
             )
 
     def _predict(self, increment: Array, step: float, end: float) -> None:
@@ -429,7 +421,7 @@ class GatedStepFilter(StepFilter):
         threshold = float(self._thresholds[KINDS[measurement.kind] - 1])
         others = np.concatenate([self.bias, self.values])
         rows = partial(self._rows_at, measurement, self._sensor_model(sensor, measurement.kind))
-        seen = linearize(rows, self.attitude, others, self.P, self._motion.chains, self._passes, threshold)
+        seen = linearize(rows, self.attitude, others, self.P, self._motion.turning_matrix, self._passes, threshold)
         self.nis = seen.nis
         self.dim_z = len(seen.rows.residual)
         unknown = self._passes > 1 and measurement.kind == "heading" and tilt_unknown(self.attitude, self.P)
@@ -464,9 +456,8 @@ class GatedStepFilter(StepFilter):
             G = np.eye(len(P))
             G[:3, :3] = kinematics.right_jacobian(correction[:3])
             P = G @ P @ G.T
-        if len(self._motion.chains):
-            T = modelling.turning_matrix(self._motion.chains, len(P), before, self.attitude)
-            self.values, P = T[6:, 6:] @ self.values, T @ P @ T.T
+        T = self._motion.turning_matrix(before, self.attitude)
+        self.values, P = T[6:, 6:] @ self.values, T @ P @ T.T
         self.P = P
 
     def _show_refused(self, seen: Linearization, unit: float) -> None:
@@ -478,14 +469,14 @@ class GatedStepFilter(StepFilter):
 
     def _rows_at(self, measurement: Any, model: Any, attitude: Array, others: Array) -> Rows:
         """Return a measurement's rows at an attitude (4,) and (b, c) (3 + m,), by the function of the kernels."""
-        H = np.zeros((3, 3 + len(others)))
-        value = measurement.frame[:4] if measurement.kind == "attitude" else (*measurement.z, 0.0)
-        given = KIND_CODES[measurement.kind], value, measurement.frame, measurement.length
-        effects = 0, model.sensors, model.sensor_use, NO_LEVER
-        d, y, axes, _ = sensor_rows.fill_rows(tuple(attitude.tolist()), others, H, *given, *effects, 0.0)
-        y, basis = np.array(y), np.array(axes)
-        angle, arc = arc_of(measurement, y, basis)
-        return Rows(y[:d].copy(), H[:d].copy(), (basis @ measurement.noise @ basis.T)[:d, :d], angle, arc)
+        kernels = machine.instance(filter, STRUCTURE=model.structure)
+        measured = structure.Measured(measurement.z, measurement.frame, (), measurement.length, (0.0,) * 9)
+        x, iterated = np.concatenate([attitude, others]), self._passes > 1
+        H, y, axes, (squared, along), _ = kernels.rows_and_axes(0, x, measured, model.numbers, 0.0, iterated)
+        y, basis, sine = np.array(y), np.array(axes), math.sqrt(squared)
+        angle = math.atan2(sine, along)
+        arc = 1.0 if sine < 1e-9 else angle / sine
+        return Rows(y, np.array(H, np.float64), basis @ measurement.noise @ basis.T, angle, arc)
 
     def _restarted(self, attitude_sigma: float, bias_width: float) -> GatedStepFilter:
         """Return a restart candidate: optional states at their prior, attitude and bias independent of them, with the given uncertainty."""

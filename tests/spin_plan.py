@@ -9,7 +9,7 @@ from strapdown.estimation.setup import FilterSetup
 from strapdown.montecarlo.statistics import Statistics
 
 SCENARIO = replace(scenarios.load_scenario("spin"), duration=2.4)
-SETUP = FilterSetup.for_scenario(SCENARIO)
+SETUP = FilterSetup.for_scenario(SCENARIO, states=False)
 PLAN = montecarlo.Plan(scenario=SCENARIO, setup=SETUP, seed=4, epochs=6, nis_bins=5)
 
 

@@ -143,3 +143,53 @@ def test_an_asymmetric_covariance_is_refused_with_its_place(i, j):
     rounded = P.astype(np.float32)
     rounded[7, i, j] += np.float32(2e-7) * sigma[i] * sigma[j]
     assert checked(covariance=rounded).judgement.verdict == checked().judgement.verdict
+
+
+# ------------------------------------------------------------------------------------------- frames of other libraries
+
+
+def flat():
+    columns = table()
+    found = {"time": columns["time"]}
+    for name, prefix in (("gyro [rad/s]", "g"), ("acc [m/s2]", "a")):
+        unit = name.partition(" ")[2]
+        found |= {f"{prefix}{axis} {unit}": columns[name][:, k] for k, axis in enumerate("xyz")}
+    return columns, found
+
+
+class Stream:
+    """A frame of any library that speaks Arrow, such as polars: it has columns that are names, and no index."""
+
+    def __init__(self, held):
+        self.held, self.columns = held, held.column_names
+
+    def __arrow_c_stream__(self, schema=None):
+        return self.held.__arrow_c_stream__(schema)
+
+
+@pytest.mark.parametrize("frame", ["table", "stream", "batch"])
+def test_arrow_tables_and_frames_of_its_kind_are_read(frame):
+    arrow = pytest.importorskip("pyarrow")
+    columns, found = flat()
+    held = arrow.table({name: arrow.array(value) for name, value in found.items()})
+    given = {"table": held, "stream": Stream(held), "batch": held.to_batches()[0]}[frame]
+    np.testing.assert_array_equal(sd.read(given).rate, columns["gyro [rad/s]"])
+    nulls = held.set_column(1, "gx [rad/s]", arrow.array([None, *found["gx [rad/s]"][1:]]))
+    assert sd.read(nulls).missing_gyro.tolist() == [0.0]
+    unit = arrow.field("temperature", arrow.float64(), metadata={b"unit": b"degC"})
+    with_unit = held.append_column(unit, arrow.array(columns["temperature"]))
+    np.testing.assert_array_equal(sd.read(with_unit).temperature, columns["temperature"])
+
+
+def test_structured_arrays_are_read():
+    columns, _ = flat()
+    kinds = [(name, "f8", np.shape(value)[1:]) for name, value in columns.items()]
+    held = np.zeros(N, kinds)
+    for name, value in columns.items():
+        held[name] = value
+    for given in (held, held.view(np.recarray)):
+        found = sd.read(given)
+        np.testing.assert_array_equal(found.rate, columns["gyro [rad/s]"])
+        np.testing.assert_array_equal(found.specific_force, columns["acc [m/s2]"])
+    with pytest.raises(InputError, match="table is an array without names of columns"):
+        sd.read(np.zeros((N, 4)))

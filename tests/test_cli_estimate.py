@@ -10,13 +10,24 @@ import pytest
 from matplotlib.figure import Figure
 
 from sims import hand_held
-from strapdown import ahrs, coning, consistency, estimation, motion, quaternion, records, report, scenarios, units
+from strapdown import (
+    ahrs,
+    calibration,
+    coning,
+    consistency,
+    estimation,
+    motion,
+    quaternion,
+    records,
+    report,
+    scenarios,
+    units,
+)
 from strapdown.checks import InputError
 from strapdown.cli.filters import filter_for
 from strapdown.estimation import setup
 from strapdown.estimation.states import ONCE, ProcessNoise
 from strapdown.gyro import GyroSpec
-from strapdown.recordings import unit_calibration
 from strapdown.recordings.recordfiles import read_record, write_record
 from strapdown.records import ImuRecord, Truth, read_estimate, read_states
 from strapdown.report import findings
@@ -236,7 +247,7 @@ def test_what_a_record_shows_of_each_state(succeeds, spinning, tmp_path):
 
 def test_what_the_filter_has_no_state_for_is_reported(spinning, record, tmp_path):
     scenario = scenarios.load_scenario("spin")
-    toml = setup.to_toml(setup.FilterSetup.for_scenario(scenario))
+    toml = setup.to_toml(setup.FilterSetup.for_scenario(scenario, states=False))
     (tmp_path / "filter.toml").write_text(toml)
     held = read_record(spinning)
     for file, states in ((None, False), (tmp_path / "filter.toml", None)):
@@ -334,7 +345,7 @@ def test_a_lost_filter_with_states_recovers(succeeds, spinning, tmp_path):
 
 def test_states_are_refused_where_they_make_no_sense(refusal, spinning, tmp_path):
     (tmp_path / "filter.toml").write_text(
-        setup.to_toml(setup.FilterSetup.for_scenario(scenarios.load_scenario("spin")))
+        setup.to_toml(setup.FilterSetup.for_scenario(scenarios.load_scenario("spin"), states=False))
     )
     (tmp_path / "rec.csv").write_text("")
     cases = (
@@ -535,12 +546,12 @@ def test_gate_robust_weights_and_observability_of_a_recording(succeeds, recordin
 
 def test_a_calibration_is_written_and_used(succeeds, recording, tmp_path):
     succeeds("estimate", recording, "--out", tmp_path / "first", "--smooth")
-    first = unit_calibration.read(tmp_path / "first" / "calibration.toml")
+    first = calibration.read(tmp_path / "first" / "calibration.toml")
     again = ("--calibration", tmp_path / "first" / "calibration.toml")
     succeeds("estimate", recording, "--out", tmp_path / "again", *again)
-    second = unit_calibration.read(tmp_path / "again" / "calibration.toml")
-    assert second.sigma < first.sigma < 4e-3  # of the smoother's prior
-    assert np.abs(second.matrix - first.matrix).max() < 2e-3
+    second = calibration.read(tmp_path / "again" / "calibration.toml")
+    assert second.gyro_scale_sigma < first.gyro_scale_sigma < 4e-3  # of the smoother's prior
+    assert np.abs(second.gyro_matrix - first.gyro_matrix).max() < 2e-3
 
 
 def test_a_clipped_gyro_is_reported(succeeds, recording, tmp_path):

@@ -148,3 +148,15 @@ def test_a_fault_ends_the_compiling():
     compiling.started(later)
     compiling.finished(later)  # by a fault, before what it calls
     assert compiling.current == ""
+
+
+def test_control_characters_of_names_do_not_reach_the_terminal(capsys):
+    """Such as those that set its title, or hide the line before."""
+    from strapdown.cli.progress import PlainConsole
+
+    name = "star\x1b]0;title\x07\x1b[2K\x9b1A\ttab"
+    PlainConsole(markup=False, highlight=False, soft_wrap=True).print(f"{name}: 1\n[red]2")
+    said = capsys.readouterr().out
+    assert not {code for code in said if code not in "\t\n" and (ord(code) < 32 or 127 <= ord(code) < 160)}
+    assert said.startswith("star\N{REPLACEMENT CHARACTER}]0;title")
+    assert said.endswith(": 1\n[red]2\n")

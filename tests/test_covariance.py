@@ -95,7 +95,7 @@ def white(name, duration, **gyro):
 @pytest.mark.parametrize("name", ["spin", "tumbling-satellite", "magnetometer-only", "slew-vibration"])
 def test_the_budget_of_a_matched_filter_adds_up_to_its_own_covariance(name):
     scenario = white(name, min(load_scenario(name).duration, 60.0))
-    belief = setup.FilterSetup.for_scenario(scenario)
+    belief = setup.FilterSetup.for_scenario(scenario, states=False)
     found = covariance.analyse(scenario, belief, epochs=5)
     assert np.allclose(found.covariance, found.filter_covariance, rtol=1e-7, atol=1e-24)
     assert np.allclose(found.filter_covariance, np.swapaxes(found.filter_covariance, 1, 2))
@@ -115,7 +115,7 @@ def test_the_axes_of_a_considered_error_are_one_row_of_the_budget():
     scenario = white("spin", 20.0)
     errors = np.arange(1.0, 25.0).reshape(1, 4, 6)
     found = dataclasses.replace(
-        covariance.analyse(scenario, setup.FilterSetup.for_scenario(scenario), epochs=1),
+        covariance.analyse(scenario, setup.FilterSetup.for_scenario(scenario, states=False), epochs=1),
         fixed=("start",),
         fixed_errors=np.repeat(errors[:, :1], 2, axis=0),
         considered=("mounting, x", "mounting, y", "delay"),
@@ -396,7 +396,9 @@ def test_coning_shows_as_the_bias_that_the_formula_gives():
     )
     for name in ("one-sample", "two-sample"):
         algorithm = coning.ALGORITHMS[name]
-        belief = dataclasses.replace(setup.FilterSetup.for_scenario(scenario), integration=algorithm, bias_sigma=1e-3)
+        belief = dataclasses.replace(
+            setup.FilterSetup.for_scenario(scenario, states=False), integration=algorithm, bias_sigma=1e-3
+        )
         found = covariance.analyse(scenario, belief, epochs=4)
         # A hundred cycles: the body is back where it was.
         increments = scenario.motion.increments(np.arange(1001) / rate)
@@ -462,7 +464,9 @@ def quarter(belief):
 
 def test_a_filter_that_models_a_quarter_of_the_process_noise_agrees_too():
     scenario = dataclasses.replace(white("spin", 120.0, scale_factor=np.array([0.0, 0.0, 1e-6])), rate=20.0)
-    found, _ = check_monte_carlo(scenario, quarter(setup.FilterSetup.for_scenario(scenario)), runs=150, epochs=5)
+    found, _ = check_monte_carlo(
+        scenario, quarter(setup.FilterSetup.for_scenario(scenario, states=False)), runs=150, epochs=5
+    )
     assert found.expected_nees[-1, 0] > 1.5  # the mismatch is one to see
 
 
@@ -472,7 +476,7 @@ def test_a_filter_that_models_a_quarter_of_the_process_noise_agrees_too():
 def test_the_built_in_scenarios_agree_with_monte_carlo(name, change):
     scenario = load_scenario(name)
     scenario = dataclasses.replace(scenario, duration=min(scenario.duration, 600.0))
-    belief = change(setup.FilterSetup.for_scenario(scenario, attitude_sigma=0.2 * DEGREE))
+    belief = change(setup.FilterSetup.for_scenario(scenario, attitude_sigma=0.2 * DEGREE, states=False))
     check_monte_carlo(scenario, belief, runs=400, epochs=10)
 
 
@@ -494,7 +498,8 @@ def against_the_bound(name, algorithm, *, duration, runs, epochs):
     """Return mean square errors over the posterior Cramér–Rao bound, and mean errors over its root, by epoch and state (epochs, 6)."""
     scenario = white(name, min(load_scenario(name).duration, duration))
     belief = dataclasses.replace(
-        setup.FilterSetup.for_scenario(scenario, attitude_sigma=0.1 * DEGREE), integration=coning.ALGORITHMS[algorithm]
+        setup.FilterSetup.for_scenario(scenario, attitude_sigma=0.1 * DEGREE, states=False),
+        integration=coning.ALGORITHMS[algorithm],
     )
     bound = covariance.analyse(scenario, belief, epochs=epochs).filter_sigma[1:]
     found = montecarlo.run_plan(montecarlo.Plan(scenario=scenario, setup=belief, seed=3, epochs=epochs), runs=runs)
@@ -548,7 +553,7 @@ def test_every_state_is_within_three_percent_of_the_bound_at_every_epoch(name):
 
 def test_initial_errors_may_differ_from_the_filters_model():
     scenario = white("spin", 30.0)
-    belief = setup.FilterSetup.for_scenario(scenario)
+    belief = setup.FilterSetup.for_scenario(scenario, states=False)
     right = covariance.analyse(scenario, belief, epochs=3)
     wrong = covariance.analyse(
         scenario, belief, epochs=3, initial_attitude_sigma=2.0 * belief.attitude_sigma, initial_bias_sigma=0.0
@@ -565,7 +570,9 @@ def test_what_is_left_out_or_beyond_linear_is_reported():
     assert found.left_out == ("gyro rate resolution",)
     assert any("accelerometer" in one for one in found.beyond_linear)
     wide = covariance.analyse(
-        white("spin", 10.0), setup.FilterSetup.for_scenario(white("spin", 10.0), attitude_sigma=0.5), epochs=2
+        white("spin", 10.0),
+        setup.FilterSetup.for_scenario(white("spin", 10.0), attitude_sigma=0.5, states=False),
+        epochs=2,
     )
     assert any("initial attitude" in one for one in wide.beyond_linear)
     assert covariance.analyse(white("spin", 10.0), epochs=2).beyond_linear == ()
@@ -587,7 +594,9 @@ def test_what_is_considered_too_large_is_reported():
 def test_an_attitude_error_beyond_linear_is_reported_with_its_time():
     """A gyro alone: the initial bias turns the attitude away in proportion to time."""
     scenario = dataclasses.replace(load_scenario("rest"), duration=100.0)
-    belief = dataclasses.replace(setup.FilterSetup.for_scenario(scenario, attitude_sigma=1e-3), bias_sigma=1e-2)
+    belief = dataclasses.replace(
+        setup.FilterSetup.for_scenario(scenario, attitude_sigma=1e-3, states=False), bias_sigma=1e-2
+    )
     found = covariance.analyse(scenario, belief, epochs=4)
     assert found.beyond_linear == (f"the attitude error itself, {found.rms[-1, :3].max() / DEGREE:.3g}° at 100 s",)
     assert found.rms[-1, 0] == pytest.approx(1.0, rel=0.01)
@@ -659,7 +668,7 @@ def test_the_command_prints_a_budget_and_writes_it(succeeds, tmp_path):
 
 
 def test_the_command_takes_a_filter_and_units(succeeds, tmp_path):
-    belief = setup.FilterSetup.for_scenario(load_scenario("low-orbit"))
+    belief = setup.FilterSetup.for_scenario(load_scenario("low-orbit"), states=False)
     (tmp_path / "filter.toml").write_text(setup.to_toml(belief), encoding="utf-8")
     arguments = ("low-orbit", "--filter", "filter.toml", "--epochs", 5, "--sensor-bias", "magnetometer=100")
     said = succeeds("covariance", *arguments, "--attitude-sigma", 2, "--bias-sigma", 30)

@@ -13,12 +13,13 @@ from strapdown import consistency, estimation, kinematics, motion, quaternion, r
 from strapdown.checks import InputError
 from strapdown.estimation import angular_acceleration, error_states, forward, setup
 from strapdown.estimation.gating import Gate, Robust
+from strapdown.estimation.model import assemble
 from strapdown.estimation.setup import FilterSetup, matching
 from strapdown.estimation.setup import states as optional
 from strapdown.estimation.setup.states import SensorStates, States
 from strapdown.estimation.states import ProcessNoise
 from strapdown.gyro import GyroSpec
-from strapdown.kernels import error_state_step, sensor_rows
+from strapdown.kernels import structure
 from strapdown.randomness import generator
 from strapdown.records import ImuRecord, Truth
 from strapdown.scenarios import Scenario
@@ -397,12 +398,12 @@ def test_rate_and_angular_acceleration_are_those_of_the_motion(body, white):
 def test_the_noise_of_an_angular_acceleration_turns_with_the_arm():
     """``n × r`` of noise n with a variance about each axis, over the length that the sensor's vector is divided by."""
     arm, variance, length = np.array([0.2, -0.1, 0.3]), np.array([1.0, 3.0, 7.0]), 2.0
-    sensors = np.zeros((1, 3, 15))
-    sensors[0, :, :3] = np.eye(3)
-    x, upper = np.concatenate([np.zeros(3), arm]), np.triu_indices(3)
+    model = assemble((error_states.LeverArm(sensor="acc", arm_sigma=0.3, strength=1.0),), {"acc": "vector"})
+    x, upper = np.concatenate([np.zeros(7), arm]), np.triu_indices(3)
     C = np.array([[2.0, 0.3, 0.1], [0.3, 1.0, -0.2], [0.1, -0.2, 3.0]])
-    use = np.full((1, 3), error_state_step.LEVER)
-    found = sensor_rows.arm_noise(x, 0, sensors, use, length, tuple(variance), tuple(C[upper]), 0.0)
+    measured = structure.Measured((), (), (), length, (0.0,) * 6 + tuple(variance))
+    kernels = forward.instance_of(model)
+    found = kernels.arm_noise(0, x, measured, tuple(C[upper]), model.numbers, 0.0)
     r = kinematics.skew(arm / length)
     np.testing.assert_allclose(found, (C + r @ np.diag(variance) @ r.T)[upper], rtol=1e-14)
 
@@ -514,7 +515,7 @@ def test_what_a_specification_gives_is_matched_entry_by_entry():
     chosen = setup.FilterSetup.for_scenario(scenario, states=True)
     assert chosen.states == States(gyro_scale_sigma=tuple(scenario.gyro.scale_factor))
     assert chosen.states.gyro_scale_sigma[2] == pytest.approx(1e-4)
-    assert chosen.process_noise == setup.FilterSetup.for_scenario(scenario).process_noise
+    assert chosen.process_noise == setup.FilterSetup.for_scenario(scenario, states=False).process_noise
     markov = GyroSpec(angle_random_walk=1e-5, markov_noise=1e-6, markov_correlation_time=50.0)
     found = setup.FilterSetup.for_scenario(dataclasses.replace(scenario, gyro=markov), states=True)
     assert found.states.gyro_drift_time == (50.0,)

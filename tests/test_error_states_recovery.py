@@ -13,14 +13,13 @@ from measured import FIELD, HAND, STAR, UP, assert_inside, drawn_start, errors, 
 from strapdown import consistency, estimation, montecarlo, quaternion, records
 from strapdown.estimation import error_states, forward, setup
 from strapdown.estimation.gating import UNIFORM_SIGMA, Gate, Robust
-from strapdown.estimation.model import Model, assemble
+from strapdown.estimation.model import assemble
 from strapdown.estimation.setup import FilterSetup
 from strapdown.estimation.setup.states import SensorStates, States
 from strapdown.estimation.states import ProcessNoise, State, restart_bias_variance
 from strapdown.gyro import GyroSpec
-from strapdown.kernels import gate_rules, iterated_update, root_form
+from strapdown.kernels import gate, gate_rules, iterated_update, structure
 from strapdown.kernels.gate_rules import WIDE_PASSES
-from strapdown.kernels.triangle import padded
 from strapdown.randomness import generator
 from strapdown.records import ImuRecord, Truth
 from strapdown.scenarios import Scenario
@@ -290,40 +289,58 @@ def test_a_right_filter_never_starts_anew(runs):
 # ---------------------------------------------------------------------------------------------------------- what a candidate knows
 
 
-def still_model(decay, density):
-    """A model of states that enter nothing."""
-    m = len(decay)
-    return Model(
-        order=np.arange(m),
-        decay=decay,
-        density=density,
-        chains=np.empty((0, 3)),
-        changing=int(np.sum((decay > 0.0) | (density > 0.0))),
-        limit=np.inf,
-        gyro=np.zeros((m, 12)),
-        gyro_use=np.zeros(m, np.int64),
-        sensors=np.zeros((0, m, 15)),
-        sensor_use=np.zeros((0, m), np.int64),
-        force_f=np.zeros(3),
-    )
+@dataclasses.dataclass(frozen=True)
+class Still(error_states.ErrorStates):
+    """States that enter nothing."""
+
+    dynamics: np.ndarray
+    """λ and the density of the driving noise of each state (2, size)."""
+    name: str = "still"
+
+    @property
+    def components(self):
+        return tuple(f"c{k}" for k in range(self.dynamics.shape[1]))
+
+    @property
+    def units(self):
+        return ("1",) * self.size
+
+    @property
+    def sigma(self):
+        return np.ones(self.size)
+
+    @property
+    def decay(self):
+        return self.dynamics[0]
+
+    @property
+    def density(self):
+        return self.dynamics[1]
 
 
-def form_of(model):
-    """A filter of a model and its restart candidate, all zero."""
-    size = 6 + model.states
-    return root_form.Body(
-        model=forward.model_arrays(model, (0.0, 0.0)),
-        attitude=np.zeros((2, 4)),
-        x=np.zeros((2, size - 3)),
-        F=np.zeros((2, size + model.noise_rows, padded(size))),
+def form_of(*blocks, **kinds):
+    """A filter of error states and its restart candidate, all zero, and the kernels of its structure."""
+    model = assemble(blocks, kinds)
+    kernels = forward.instance_of(model)
+    form = structure.Body(
+        model=forward.kernel_model(model, (0.0, 0.0)),
+        x=np.zeros((2, kernels.N + 1)),
+        P=np.zeros((2, kernels.N * kernels.W)),
+        coefficients=np.zeros(kernels.SET * max(len(model.last), 1)),
+        dt=np.zeros(1),
+        work=np.zeros(kernels.LINES * kernels.LINE),
+        shape=model.shape,
         length=np.empty(0),
         turning=np.empty((0, 9)),
-        scratch=forward.scratch(model),
-        together=False,
-        sharpness=np.inf,
-        least_share=0.0,
-        check=1,
+        offsets=model.offsets,
     )
+    return form, kernels
+
+
+def covariance_in(form, i):
+    """Return a view of the covariance (n, n) of state i."""
+    n = form.x.shape[1] - 1
+    return form.P[i].reshape(n, -1)[:, :n]
 
 
 @pytest.mark.parametrize("level", [0, 2])
@@ -336,31 +353,25 @@ def test_a_candidate_knows_what_the_prior_says_by_now(level):
     root = np.tril(rng.standard_normal((4, 4)))
     values, age = rng.standard_normal(4), 1.7
     size, bias_sigma = 10, np.array([0.3, 0.1, 0.2])
-    form = form_of(still_model(decay, density))
-    attitude, x, F = form.attitude, form.x, form.F
-    attitude[0], x[0] = unit(rng.standard_normal(4)), rng.standard_normal(7)
-    F[0, :size, :size] = np.tril(rng.standard_normal((size, size)))
-    F[1] = np.nan
-    P = F[0, :size, :size].T @ F[0, :size, :size]
-    restart = root_form.Restart(
-        bias_sigma=bias_sigma, values=values, root=root, time=now - age, fresh=np.empty((18, 8))
-    )
-    root_form.start_candidate(form, memory, now, 1.8, restart)
+    form, kernels = form_of(Still(np.stack([decay, density])))
+    form.P[1], form.x[1], form.coefficients[:] = np.nan, np.nan, np.nan
+    form.x[0] = [*unit(rng.standard_normal(4)), *rng.standard_normal(7)]
+    own = np.tril(rng.standard_normal((size, size)))
+    covariance_in(form, 0)[:] = P = own.T @ own
+    restart = gate.Restart(bias_variance=bias_sigma**2, values=values, covariance=root.T @ root, time=now - age)
+    kernels.start_candidate(form, memory, now, 1.8, restart)
     expected = np.zeros((size, size))
     expected[:3, :3] = max(1.8, min(1.8 * width, UNIFORM_SIGMA)) ** 2 * np.eye(3)
     expected[3:6, 3:6] = P[3:6, 3:6] + width**2 * np.diag(bias_sigma**2)
     kept = np.exp(-decay * age)
     time = np.where(decay > 0.0, (1.0 - kept**2) / np.where(decay > 0.0, 2.0 * decay, 1.0), age)
     expected[6:, 6:] = kept[:, None] * (root.T @ root) * kept + np.diag(density * time)
-    found = F[1, :size, :size]
-    np.testing.assert_allclose(found.T @ found, expected, rtol=1e-12, atol=1e-14)
-    assert np.array_equal(found, np.tril(found))
-    assert np.array_equal(attitude[1], attitude[0])
-    assert np.array_equal(x[1, :3], x[0, :3])
-    np.testing.assert_allclose(x[1, 3:], kept * values, rtol=1e-14)
-    np.testing.assert_allclose(F[0, :size, :size].T @ F[0, :size, :size], P, rtol=1e-14)
+    np.testing.assert_allclose(covariance_in(form, 1), expected, rtol=1e-12, atol=1e-14)
+    assert np.array_equal(form.x[1, :7], form.x[0, :7])
+    np.testing.assert_allclose(form.x[1, 7:], kept * values, rtol=1e-14)
+    assert np.array_equal(covariance_in(form, 0), P)
     assert (memory[gate_rules.CANDIDATE], memory[gate_rules.SINCE]) == (1.0, now)
-    assert np.array_equal(memory[gate_rules.FIRST_BIAS : gate_rules.FIRST_VARIANCE], x[0, :3])
+    assert np.array_equal(memory[gate_rules.FIRST_BIAS : gate_rules.FIRST_VARIANCE], form.x[0, 4:7])
     np.testing.assert_allclose(memory[gate_rules.FIRST_VARIANCE :], np.diag(expected)[3:6], rtol=1e-12)
 
 
@@ -376,15 +387,10 @@ def test_a_candidate_knows_what_the_prior_of_chains_says_by_now(age):
     m = sum(block.size for block in blocks)
     rng = np.random.default_rng(8)
     root, values = np.tril(rng.standard_normal((m, m))), rng.standard_normal(m)
-    model = assemble(blocks, {"acc": "direction"})
-    assert np.array_equal(model.order, np.arange(m))
-    form = form_of(model)
-    x, F = form.x, form.F
-    F[0, : 6 + m, : 6 + m] = np.eye(6 + m)
-    restart = root_form.Restart(
-        bias_sigma=np.ones(3), values=values, root=root, time=0.0, fresh=np.empty((3 * m + 6, padded(3 + m)))
-    )
-    root_form.start_candidate(form, np.zeros(gate_rules.MEMORY), age, 1.8, restart)
+    form, kernels = form_of(*blocks, acc="direction")
+    covariance_in(form, 0)[:] = np.eye(6 + m)
+    restart = gate.Restart(bias_variance=np.ones(3), values=values, covariance=root.T @ root, time=0.0)
+    kernels.start_candidate(form, np.zeros(gate_rules.MEMORY), age, 1.8, restart)
     Phi, Q = np.eye(m), np.zeros((m, m))
     first = 0
     for block in blocks:
@@ -392,21 +398,18 @@ def test_a_candidate_knows_what_the_prior_of_chains_says_by_now(age):
         if age > 0.0:
             Phi[own, own], Q[own, own] = block.transition(age), block.process_noise(age)
         first += block.size
-    np.testing.assert_allclose(x[1, 3:], Phi @ values, rtol=1e-9, atol=1e-12)
-    found = (F[1, : 6 + m].T @ F[1, : 6 + m])[6 : 6 + m, 6 : 6 + m]
-    np.testing.assert_allclose(found, Phi @ root.T @ root @ Phi.T + Q, rtol=1e-8, atol=1e-9)
+    np.testing.assert_allclose(form.x[1, 7:], Phi @ values, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(covariance_in(form, 1)[6:, 6:], Phi @ root.T @ root @ Phi.T + Q, rtol=1e-8, atol=1e-9)
 
 
 def candidate_of(P, bias, values):
-    """A candidate with covariance P, and its memory where its bias, which started at zero, has the σ of ``STARTED``."""
-    size = len(P)
-    form = form_of(still_model(*np.zeros((2, size - 6))))
-    form.attitude[:, 0] = 1.0
-    form.F[1, :size, :size] = np.linalg.cholesky(P[::-1, ::-1])[::-1, ::-1].T
-    form.x[1] = [*bias, *values]
+    """A candidate with covariance P, the kernels, and its memory where its bias, which started at zero, has the σ of ``STARTED``."""
+    form, kernels = form_of(Still(np.zeros((2, len(values)))))
+    covariance_in(form, 1)[:] = P
+    form.x[:, 0], form.x[1, 4:] = 1.0, [*bias, *values]
     memory = np.zeros(gate_rules.MEMORY)
     memory[gate_rules.FIRST_BIAS + 3 : gate_rules.FIRST_BIAS + 6] = STARTED**2
-    return form, memory
+    return form, kernels, memory
 
 
 STARTED = np.array([0.1, 0.2, 0.3])
@@ -421,19 +424,15 @@ def test_a_candidate_that_is_widened_is_what_it_would_be_had_it_started_so():
     wide = start * np.array([1.0, 1.0, 1.0, 3.0, 3.0, 3.0, 1.0, 1.0, 1.0])
     P, expected = (np.linalg.inv(np.diag(sigma**-2.0) + H.T @ H) for sigma in (start, wide))
     mean, there = P @ H.T @ z, expected @ H.T @ z
-    form, memory = candidate_of(P, mean[3:6], mean[6:])
-    root_form.widen(form, memory)
-    found = form.F[1, :9, :9]
-    np.testing.assert_allclose(form.x[1], there[3:], rtol=1e-9, atol=1e-12)
+    form, kernels, memory = candidate_of(P, mean[3:6], mean[6:])
+    kernels.widen(form, memory)
+    np.testing.assert_allclose(form.x[1, 4:], there[3:], rtol=1e-9, atol=1e-12)
     turn = quaternion.exp(there[:3] - mean[:3])
-    np.testing.assert_allclose(form.attitude[1], turn, atol=1e-12)
+    np.testing.assert_allclose(form.x[1, :4], turn, atol=1e-12)
     upper = tuple(expected[:3, :3][np.triu_indices(3)])
     G = np.eye(9)
     G[:3, :3] = np.reshape(iterated_update.tangent_at(tuple(turn), upper)[0], (3, 3))
-    np.testing.assert_allclose(found.T @ found, G @ expected @ G.T, rtol=1e-8, atol=1e-12)
-    assert np.array_equal(
-        found[:, 3:], np.tril(found)[:, 3:]
-    )  # the attitude's columns are loose until the next prediction
+    np.testing.assert_allclose(covariance_in(form, 1), G @ expected @ G.T, rtol=1e-8, atol=1e-12)
     np.testing.assert_allclose(memory[gate_rules.FIRST_BIAS + 3 : gate_rules.FIRST_BIAS + 6], 9.0 * STARTED**2)
     assert memory[gate_rules.LEVEL] == 1.0
 
@@ -442,9 +441,9 @@ def test_widening_a_bias_whose_axes_hang_together_leaves_a_covariance():
     """Of a filter's own bias, as uncertain as its start and correlated: more is known of the start than its diagonal says."""
     P = np.eye(6)
     P[3:, 3:] = np.outer(STARTED, STARTED) * (0.2 * np.eye(3) + 0.8)
-    form, memory = candidate_of(P, 0.5 * STARTED, ())
-    root_form.widen(form, memory)
-    found = form.F[1, :6, :6].T @ form.F[1, :6, :6]
+    form, kernels, memory = candidate_of(P, 0.5 * STARTED, ())
+    kernels.widen(form, memory)
+    found = covariance_in(form, 1)
     assert np.isfinite(found).all()
     assert np.min(np.linalg.eigvalsh(found - P)) > -1e-12
     assert np.all(np.diag(found)[3:] > np.diag(P)[3:])

@@ -38,7 +38,9 @@ FLIGHT = scenarios.Scenario(
 
 @pytest.fixture(scope="module")
 def run():
-    plan = montecarlo.Plan(scenario=FLIGHT, setup=setup.FilterSetup.for_scenario(FLIGHT), seed=5, epochs=20)
+    plan = montecarlo.Plan(
+        scenario=FLIGHT, setup=setup.FilterSetup.for_scenario(FLIGHT, states=False), seed=5, epochs=20
+    )
     return montecarlo.replay(plan, 0, machine="scalar")
 
 

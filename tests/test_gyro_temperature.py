@@ -295,27 +295,21 @@ def test_lost_samples_and_locked_out_sensors():
 
 
 def test_a_change_of_temperature_moves_the_filter_and_its_restart_candidate_alike():
-    """By hand: b + c ΔT, whose variance is P_bb + 2 ΔT P_bc + ΔT² P_cc, with and without the factor."""
+    """By hand: b + c ΔT, whose variance is P_bb + 2 ΔT P_bc + ΔT² P_cc."""
     random = np.random.default_rng(3)
     root = np.tril(random.standard_normal((10, 10))) + 5.0 * np.eye(10)  # attitude, bias, another state, the slopes
     P, values = root.T @ root, random.standard_normal(4)
     own, change, axis = slice(1, 4), 2.5, np.arange(3)
-    for factor in (root, None):
-        one = Candidate(attitude=np.eye(4)[0], others=np.concatenate([axis, values]), covariance=P, factor=factor)
-        memory = GateMemory(restart_bias_variance=np.ones(3), counts=np.zeros(1), counters={}, candidate=one)
-        state = estimation.State(
-            attitude=np.eye(4)[0], bias=axis, values=values, covariance=P, factor=factor, gate=memory
-        )
-        found = driven.shifted(state, own, change)
-        bias = axis + change * values[1:]
-        wanted = np.diag(P)[3:6] + 2.0 * change * P[axis + 3, axis + 7] + change**2 * np.diag(P)[7:]
-        np.testing.assert_allclose(found.bias, bias)
-        np.testing.assert_allclose(found.gate.candidate.others, np.concatenate([bias, values]))
-        for moved in (found, found.gate.candidate):
-            np.testing.assert_allclose(np.diag(moved.covariance)[3:6], wanted)
-            np.testing.assert_allclose(moved.covariance[:3, 3:6], P[:3, 3:6] + change * P[:3, 7:])
-            assert (moved.factor is None) == (factor is None)
-            if factor is not None:
-                np.testing.assert_allclose(moved.factor.T @ moved.factor, moved.covariance)
-        back = driven.shifted(found, own, -change)
-        np.testing.assert_allclose(back.covariance, P, rtol=1e-12)
+    one = Candidate(attitude=np.eye(4)[0], others=np.concatenate([axis, values]), covariance=P)
+    memory = GateMemory(restart_bias_variance=np.ones(3), counts=np.zeros(1), counters={}, candidate=one)
+    state = estimation.State(attitude=np.eye(4)[0], bias=axis, values=values, covariance=P, gate=memory)
+    found = driven.shifted(state, own, change)
+    bias = axis + change * values[1:]
+    wanted = np.diag(P)[3:6] + 2.0 * change * P[axis + 3, axis + 7] + change**2 * np.diag(P)[7:]
+    np.testing.assert_allclose(found.bias, bias)
+    np.testing.assert_allclose(found.gate.candidate.others, np.concatenate([bias, values]))
+    for moved in (found, found.gate.candidate):
+        np.testing.assert_allclose(np.diag(moved.covariance)[3:6], wanted)
+        np.testing.assert_allclose(moved.covariance[:3, 3:6], P[:3, 3:6] + change * P[:3, 7:])
+    back = driven.shifted(found, own, -change)
+    np.testing.assert_allclose(back.covariance, P, rtol=1e-12)

@@ -25,17 +25,20 @@ from measured import series_of
 import strapdown
 from strapdown import estimation
 from strapdown.estimation import forward, schedule
+from strapdown.estimation.model import assemble
 from strapdown.kernels import (
     algebra,
     complementary,
-    covariance_form,
+    filter_lanes,
     gate,
     hypotheses,
     likelihood,
     likelihood_outliers,
     machine,
-    root_form,
+    six_states,
 )
+from strapdown.kernels import filter as filter_kernels
+from strapdown.kernels.lane_values import WIDTH
 from strapdown.kernels.walk import walk
 from strapdown.records import ImuRecord
 
@@ -70,16 +73,16 @@ def test_a_kernel_that_names_a_module_is_refused():
 
 
 def test_compiled_once():
-    assert machine.compiled(walk, covariance_form) is machine.compiled(walk, covariance_form)
+    assert machine.compiled(walk, six_states) is machine.compiled(walk, six_states)
     assert machine.helper(algebra.dot) is machine.helper(algebra.dot)
 
 
 def test_the_plain_function_stays_plain():
     machine.helper(algebra.dot)
     assert isinstance(algebra.dot, FunctionType)
-    machine.compiled(walk, covariance_form)
+    machine.compiled(walk, six_states)
     assert isinstance(walk, FunctionType)
-    assert isinstance(covariance_form.predict, FunctionType)
+    assert isinstance(six_states.predict, FunctionType)
 
 
 def is_nan(x):
@@ -204,14 +207,19 @@ def test_a_missing_definition_is_refused_by_its_name():
         machine.compiled(walk, algebra)
 
 
+SENSORS = {"star": "direction", "field": "vector", "compass": "heading", "tracker": "attitude"}
+FILTER, SEVERAL = (
+    machine.instance(filter_kernels, STRUCTURE=assemble((), SENSORS).structure, **lanes)
+    for lanes in ({}, {"LANES": WIDTH})
+)
 BODIES = [
-    (covariance_form,),
-    (root_form,),
-    (gate, covariance_form),
-    (gate, root_form),
+    (six_states,),
+    (FILTER,),
+    (gate, FILTER),
+    (filter_lanes, SEVERAL),
     (likelihood,),
     (likelihood_outliers, likelihood),
-    (likelihood_outliers, root_form),
+    (likelihood_outliers, FILTER),
     (hypotheses,),
     (complementary,),
 ]
@@ -232,10 +240,10 @@ def parts_used() -> set[tuple[str, ...]]:
 
 def test_every_body_of_the_walk_is_listed_here():
     assert parts_used() == {
-        ("covariance_form",),
-        ("root_form",),
-        ("gate", "covariance_form"),
-        ("gate", "root_form"),
+        ("six_states",),
+        ("kernels",),
+        ("gate", "kernels"),
+        ("filter_lanes", "kernels"),
         ("*bodies",),
         ("hypotheses_kernel",),
         ("complementary",),
@@ -251,9 +259,11 @@ def test_every_body_defines_all_that_is_left_open_with_the_same_arguments(parts)
             defined = [
                 getattr(part, name) for part in parts if name in vars(part) and name not in getattr(part, "OPEN", ())
             ]
+            if module is likelihood_outliers and FILTER not in parts:
+                continue  # what its update of one filter needs; that in lanes needs nothing
             assert defined, f"{name} of {module.__name__}"
             assert len(signature(defined[0]).parameters) == len(signature(stub).parameters), name
-            assert defined[0].__doc__
+            assert defined[0].__doc__ or name in ("judge", "take", "write")  # made for the structure
 
 
 def test_a_literal_argument_compiles_no_helper_twice():

@@ -110,8 +110,8 @@ def test_late_measurements_lead_to_the_same_bits(states, option, shifts):
     latency[-1][:] = 0.0  # in time, but last in the order of the sensors
     live = given_late(record, live_of(record, initial, blocks, look_back=0.25, **given), latency)
     problem = forward.prepared(record, NOISE, initial, blocks)
-    options = forward.Options(factor=True, gate=given.get("gate"), robust=given.get("robust"))
-    passed = forward.filtered(problem, options)
+    options = forward.Options(gate=given.get("gate"), robust=given.get("robust"))
+    passed = forward._run(problem, options)
     assert live.late == 0
     # All measurements lie in the record, the last ones in its last interval.
     assert same(live.state(), passed.end)

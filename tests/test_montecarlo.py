@@ -7,8 +7,10 @@ import pytest
 import scipy.stats
 from measured import errors, turn_to
 
+import strapdown as sd
 from sims import campaign as sim
 from strapdown import coning, estimation, montecarlo, motion
+from strapdown.checks import InputError
 from strapdown.estimation.states import ProcessNoise
 from strapdown.montecarlo import FilterSetup
 from strapdown.montecarlo.coning_study import ConingParameters
@@ -181,3 +183,10 @@ def test_theory_ends_in_the_steady_state_of_farrenkopf():
     assert end.covariance[-1, 1, 1] == pytest.approx(bias, rel=1e-5)
     assert np.allclose(end.covariance, end.true_covariance, rtol=1e-12)
     assert np.allclose(end.nis, 1.0, rtol=1e-12)
+
+
+def test_a_filter_that_is_no_setup_is_refused_by_name():
+    with pytest.raises(
+        InputError, match=r"setup is 'mekf', not of class FilterSetup; give estimation\.setup\.FilterSetup"
+    ):
+        sd.monte_carlo("two-stars", runs=2, setup="mekf")

@@ -13,6 +13,7 @@ from strapdown.checks import InputError
 from strapdown.cli import app
 from strapdown.recordings import Recording
 from strapdown.records import Estimate, outputs, read_estimate
+from strapdown.units import STANDARD_GRAVITY
 
 SEQUENCES = ["".join(s) for s in itertools.product("XYZ", repeat=3) if s[0] != s[1] != s[2]]
 
@@ -272,3 +273,15 @@ def test_a_rerun_recording_holds_curves_and_turns(case, tmp_path):
     )
     turns = np.array(found["/body"]).reshape(-1, 4)
     np.testing.assert_allclose(turns, estimate.attitude[:, [1, 2, 3, 0]], atol=1e-6)
+
+
+@pytest.mark.parametrize(("frame", "expected"), [("ENU", (1.0, 2.0, 3.0)), ("NED", (2.0, 1.0, -3.0))])
+def test_the_free_acceleration_of_a_table_is_along_the_axes_of_its_frame(frame, expected):
+    """A body whose axes are East, North, up accelerates by 1, 2, 3 m/s² along them."""
+    time = np.arange(3.0)
+    force = np.tile([1.0, 2.0, 3.0 + STANDARD_GRAVITY], (3, 1))
+    recording = Recording(source="x", time=time, rate=np.zeros((3, 3)), specific_force=force)
+    estimate = Estimate.from_arrays(time, np.tile([1.0, 0, 0, 0], (3, 1)), np.tile(np.eye(3), (3, 1, 1)))
+    found = estimate.table(recording=recording, frame=frame)
+    for axis, value in zip("xyz", expected, strict=True):
+        np.testing.assert_allclose(found[f"free_acceleration_{axis}_m_per_s2"], value, atol=1e-14)

@@ -21,7 +21,7 @@ from strapdown.report import campaigns
 
 ROOT = Path(__file__).resolve().parents[1]
 SCENARIO = own_filter.scenario(20.0)
-SETUP = setup.FilterSetup.for_scenario(SCENARIO)
+SETUP = setup.FilterSetup.for_scenario(SCENARIO, states=False)
 PLAN = Plan(scenario=SCENARIO, setup=SETUP, seed=3, epochs=20, nis_bins=5)
 
 
@@ -450,7 +450,9 @@ def star_tracker(rate=1.0, duration=2000.0, **gyro):
 
 
 def cramer_rao(scene, attitude_sigma, bias_sigma, epochs):
-    chosen = replace(setup.FilterSetup.for_scenario(scene), attitude_sigma=attitude_sigma, bias_sigma=bias_sigma)
+    chosen = replace(
+        setup.FilterSetup.for_scenario(scene, states=False), attitude_sigma=attitude_sigma, bias_sigma=bias_sigma
+    )
     return covariance.analyse(scene, chosen, epochs=epochs).cramer_rao
 
 
@@ -473,14 +475,16 @@ def test_there_is_no_bound_where_the_noise_is_not_that_of_the_recursion(gyro):
     scene = star_tracker(duration=100.0, **gyro)
     with pytest.raises(InputError, match="the filter's noise is not that of the scenario"):
         cramer_rao(scene, attitude_sigma=1e-3, bias_sigma=1e-5, epochs=10)
-    plan = Plan(scenario=scene, setup=replace(setup.FilterSetup.for_scenario(scene), estimator=wrapped), epochs=10)
+    plan = Plan(
+        scenario=scene, setup=replace(setup.FilterSetup.for_scenario(scene, states=False), estimator=wrapped), epochs=10
+    )
     assert verdicts.bound_of(plan) is None
 
 
 def test_a_filter_that_leaves_measurements_out_stays_above_the_bound_by_just_that(tmp_path, capsys):
     """Every other attitude: the bound of a tracker of half the rate, in closed recursion, says how much that costs."""
     scene = star_tracker(duration=60.0)
-    base = replace(setup.FilterSetup.for_scenario(scene), attitude_sigma=1e-3, bias_sigma=1e-5)
+    base = replace(setup.FilterSetup.for_scenario(scene, states=False), attitude_sigma=1e-3, bias_sigma=1e-5)
 
     def half(record, initial):
         (tracker,) = record.vectors
@@ -517,7 +521,7 @@ def test_a_filter_that_leaves_measurements_out_stays_above_the_bound_by_just_tha
 
 def test_a_comparison_gives_errors_over_the_bound():
     scene = star_tracker(duration=60.0)
-    base = setup.FilterSetup.for_scenario(scene)
+    base = setup.FilterSetup.for_scenario(scene, states=False)
     one = montecarlo.replay(Plan(scenario=scene, setup=base, seed=5, epochs=6), 0, machine="scalar")
     bound = cramer_rao(
         scene, attitude_sigma=base.attitude_sigma, bias_sigma=base.bias_sigma, epochs=len(one.record.increments)

@@ -1,6 +1,9 @@
 """Figures: what is drawn is what was given, with units, in both themes, and no extreme is lost."""
 
 import dataclasses
+import os
+import subprocess
+import sys
 import xml.etree.ElementTree
 from types import SimpleNamespace
 
@@ -31,7 +34,7 @@ from strapdown.estimation import setup
 from strapdown.montecarlo.coning_study import Drift, FilterOutcome
 from strapdown.montecarlo.statistics import BINS_PER_OCTAVE
 from strapdown.plots import decimation, estimates, style, tuning
-from strapdown.records.estimate import ErrorStateEstimate
+from strapdown.records.estimate import ErrorStateEstimate, Estimate
 
 pytestmark = pytest.mark.draws
 
@@ -44,7 +47,9 @@ def scenario():
 
 @pytest.fixture(scope="module")
 def filter_setup(scenario):
-    return dataclasses.replace(setup.FilterSetup.for_scenario(scenario), integration=coning.ALGORITHMS["four-sample"])
+    return dataclasses.replace(
+        setup.FilterSetup.for_scenario(scenario, states=False), integration=coning.ALGORITHMS["four-sample"]
+    )
 
 
 @pytest.fixture(scope="module")
@@ -389,8 +394,6 @@ def figures(run, statistics, outcomes):
     """Every kind of figure with a legend and time axes, by name."""
     estimate, truth = run
     innovations = next(iter(estimate.innovations.values()))
-    reference = consistency.reference_errors(estimate.attitude, truth.attitude)
-
     pairs = [(a, b) for a in "xyz" for b in "xyz"]
     block = ErrorStateEstimate(
         components=tuple(a if a == b else a + b for a, b in pairs),
@@ -407,7 +410,7 @@ def figures(run, statistics, outcomes):
     return {
         "errors": plots.error_overview(estimate, truth, title="record.h5"),
         "estimate": plots.estimate_overview(estimate, title="record.h5"),
-        "recording": plots.recording_errors(estimate.time, reference),
+        "recording": plots.recording_errors(estimate, truth.attitude),
         "states": plots.states_over_time(
             dataclasses.replace(estimate, error_states={"gyro scale": block}), title="record.h5"
         ),
@@ -437,14 +440,42 @@ def test_the_estimate_is_drawn_in_the_unit_of_its_axis(run):
     assert top == pytest.approx(np.linalg.norm(estimate.sigma[:, :3], axis=1).max())
 
 
-def test_errors_of_a_recording_and_their_distribution_are_drawn():
-    half, q = units.DEGREE / 2.0, np.tile([1.0, 0.0, 0.0, 0.0], (4, 1))
-    turned = quaternion.multiply(quaternion.exp([0.0, 0.0, half]), quaternion.exp([3.0 * half, 0.0, 0.0]))
-    (ax,) = plots.recording_errors(np.arange(4.0), consistency.reference_errors(q, np.tile(turned, (4, 1)))).axes
-    drawn = {line.get_label().split(",")[0]: line.get_ydata()[0] for line in ax.lines}
-    assert drawn == pytest.approx({"total": np.hypot(0.5, 1.5), "heading": 0.5, "inclination": 1.5}, rel=1e-3)
+def test_errors_of_a_recording_are_drawn_about_the_fixed_axes_with_sign_and_sigma():
+    """A body on its side: the error about fixed z is one about body y, and so is its σ."""
+    degree, n = units.DEGREE, 50
+    q = np.tile(quaternion.exp([0.5 * np.pi, 0.0, 0.0]), (n, 1))  # body y points along fixed z
+    error = np.array([0.4, -0.2, 0.7]) * degree
+    reference = quaternion.multiply(quaternion.exp(error), q)
+    reference[3] = np.nan
+    covariance = np.tile(np.diag([1.0, 4.0, 9.0]) * degree**2, (n, 1, 1))
+    for estimate in (
+        Estimate.from_arrays(np.arange(n) * 1.0, q, covariance),
+        dataclasses.replace(Estimate.from_arrays(np.arange(n) * 1.0, q, covariance), covariance=None),
+    ):
+        movement = np.arange(n) > 20
+        axes = plots.recording_errors(estimate, reference, movement).axes
+        for ax, name, value, sigma in zip(
+            axes, ("heading", "about x", "about y"), (0.7, 0.4, -0.2), (2.0, 1.0, 3.0), strict=True
+        ):
+            assert name in ax.get_ylabel()
+            drawn = ax.lines[-1].get_ydata()
+            assert np.nanmax(drawn) == pytest.approx(value)
+            assert np.nanmin(drawn) == pytest.approx(value)
+            assert ax.collections[0].get_paths()[0].vertices[:, 1].max() == pytest.approx(3.0 * sigma)
+            assert ax.get_ylim()[1] > abs(value)
+
+
+def test_a_distribution_of_errors_is_drawn():
     ax = plots.error_distribution(units.DEGREE * np.arange(1.0, 101.0))
     assert [line.get_xdata()[0] for line in ax.lines[1:]] == pytest.approx([50.0, 95.0])
+
+
+def test_the_errors_of_many_algorithms_go_into_rows(outcomes):
+    figure = plots.coning_errors(list(outcomes) * 4)
+    assert figure.get_figwidth() <= 3.1 * 5
+    drawn = [ax for ax in figure.axes if ax.get_visible()]
+    assert len(drawn) == 2 * 4 * len(outcomes)
+    assert sum("attitude" in ax.get_ylabel() for ax in drawn) == sum("bias" in ax.get_ylabel() for ax in drawn) == 2
 
 
 def test_error_states_are_drawn_with_three_sigma(run):
@@ -568,3 +599,11 @@ def test_a_name_that_the_font_lacks_makes_no_noise(tmp_path, recwarn):
     ax.set_title("記録.h5")
     plots.save(figure, tmp_path / "x.png")
     assert not recwarn.list
+
+
+def test_a_backend_that_matplotlib_does_not_know_is_reported_in_one_line(tmp_path):
+    code = "from strapdown.checks import InputError\ntry:\n    import strapdown.plots\nexcept InputError as error:\n    print(error)"
+    environment = {**os.environ, "MPLBACKEND": "nonsense"}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("matplotlib cannot be loaded (Key backend: 'nonsense'")
+    assert "correct the environment variable MPLBACKEND" in done.stdout

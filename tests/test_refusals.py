@@ -393,7 +393,7 @@ def test_covariance_refuses_errors_that_nothing_has(there, tmp_path, options, wo
     [("estimate", "record.h5"), ("tune", "record.h5"), ("montecarlo", "short.toml"), ("covariance", "short.toml")],
 )
 def test_sigma_of_an_angle_in_another_unit_is_reported(folder, short, tmp_path, command, source):
-    filter_setup = dataclasses.replace(setup.FilterSetup.for_scenario(short), sigma={"star 1": 20.0})
+    filter_setup = dataclasses.replace(setup.FilterSetup.for_scenario(short, states=False), sigma={"star 1": 20.0})
     (tmp_path / "filter.toml").write_text(setup.to_toml(filter_setup))
     out = tmp_path / {"tune": "new.toml", "montecarlo": "new.h5"}.get(command, "new")
     said = refused([command, folder / source, "--filter", tmp_path / "filter.toml", "--out", out])

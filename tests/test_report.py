@@ -14,11 +14,11 @@ import pytest
 from matplotlib.figure import Figure
 from typer.testing import CliRunner
 
-from strapdown import cli, coning, gyro, montecarlo, plots, records, report, scenarios
+from strapdown import cli, coning, gyro, montecarlo, plots, quaternion, records, report, scenarios
 from strapdown.checks import InputError
 from strapdown.estimation import setup
-from strapdown.montecarlo import campaign
-from strapdown.report import campaigns, estimates, page, tunings
+from strapdown.montecarlo import campaign, coning_study
+from strapdown.report import campaigns, comparisons, estimates, page, tunings
 
 CHROMIUM = next(
     (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
@@ -33,7 +33,9 @@ def scenario():
 
 @pytest.fixture(scope="module")
 def filter_setup(scenario):
-    return dataclasses.replace(setup.FilterSetup.for_scenario(scenario), integration=coning.ALGORITHMS["four-sample"])
+    return dataclasses.replace(
+        setup.FilterSetup.for_scenario(scenario, states=False), integration=coning.ALGORITHMS["four-sample"]
+    )
 
 
 def estimate_of(scenario, chosen):
@@ -217,6 +219,68 @@ def test_a_tuning_is_reported_from_its_json(folder, scenario, tmp_path):
     content = body(report.write(tmp_path / "filter.json").page)
     assert content.count("data:image/png") == 1
     assert "<strong>Consistent.</strong> The tuned filter agrees with the data used for tuning" in content
+
+
+@pytest.fixture(scope="module")
+def coning_json(tmp_path_factory):
+    where = tmp_path_factory.mktemp("coning")
+    study = coning_study.run(coning_study.ConingParameters(runs=4, duration=24.0))
+    (where / "coning.json").write_text(json.dumps(study.summary()), encoding="utf-8")
+    return where / "coning.json"
+
+
+def test_a_coning_study_is_reported_from_its_json(coning_json, tmp_path):
+    study = json.loads(coning_json.read_text())
+    content = body(report.write(coning_json).page)
+    passing = sum(one["consistent"] for one in study["filter"])
+    assert f"{passing} of {len(study['filter'])} algorithms give a consistent filter" in content.split("<h2>")[0]
+    drift = charts_of(content)[0]
+    assert drift["ticks"] == [one["algorithm"] for one in study["integration"]]
+    measured = [abs(one["drift_deg_per_hour"]) for one in study["integration"]]
+    np.testing.assert_allclose(columns(drift)[1][:3], measured[:3], rtol=2e-3)
+    assert np.isnan(columns(drift)[1][4])  # rounding
+    for one in study["filter"]:
+        shown = rows_of(content.split("The same filter")[-1], f"(?:pass|fail)</td><td>{one['integration']}<")
+        np.testing.assert_allclose(shown[2], one["bias_rms_deg_per_hour"], rtol=6e-4)
+    (tmp_path / "broken.json").write_text(json.dumps({**study, "filter": [{}]}), encoding="utf-8")
+    with pytest.raises(InputError, match="does not fit a coning study"):
+        report.write(tmp_path / "broken.json")
+
+
+def test_two_estimates_on_one_page(folder, tmp_path):
+    """The second is three times too sure and sees other measurements as more exact: the difference is that of the files."""
+    first, second = (records.read_estimate(folder / f"{name}.h5") for name in ("right", "wrong"))
+    cut = {name: getattr(second, name)[100:-50] for name in ("time", "attitude", "bias", "variance", "covariance")}
+    records.write_estimate(tmp_path / "cut.h5", dataclasses.replace(second, **cut))
+    difference = quaternion.angle_between(first.attitude, second.attitude)
+    for other, part in ((tmp_path / "cut.h5", slice(100, -50)), (folder / "wrong.h5", slice(None))):
+        written = report.write(folder / "right.h5", tmp_path / "both.html", other=other)
+        numbers = json.loads(written.statistics.read_text())
+        assert numbers["attitude_difference_rms_rad"] == pytest.approx(
+            np.sqrt(np.mean(difference[part] ** 2)), rel=1e-9
+        )
+    bias = np.sqrt(np.mean((second.bias - first.bias) ** 2, axis=0))
+    np.testing.assert_allclose(numbers["bias_difference_rms_by_axis_rad_per_s"], bias, rtol=1e-9)
+    charts = charts_of(body(written.page))
+    assert [chart["title"] for chart in charts][-1] == "Total attitude error relative to the truth"
+    with pytest.raises(InputError, match="only two estimates can be compared"):
+        report.write(folder / "right.h5", tmp_path / "page.html", other=folder / "campaign.h5")
+    later = dataclasses.replace(second, time=second.time + 1e3)
+    records.write_estimate(tmp_path / "later.h5", later)
+    with pytest.raises(InputError, match="give estimates of the same time"):
+        report.write(folder / "right.h5", tmp_path / "page.html", other=tmp_path / "later.h5")
+
+
+def test_a_second_estimate_is_interpolated_by_rotation_at_constant_rate():
+    rate = np.array([0.3, -0.5, 0.8])
+    edges = np.array([0.0, 0.7, 1.0, 2.5])
+    estimate = records.Estimate.from_arrays(
+        edges, quaternion.exp(edges[:, None] * rate), np.tile(0.01 * np.eye(3), (4, 1, 1))
+    )
+    time = np.array([0.0, 0.35, 0.9, 2.0, 2.5])
+    attitude, sigma, _ = comparisons._at(estimate, time)
+    np.testing.assert_allclose(attitude, quaternion.exp(time[:, None] * rate), atol=1e-15)
+    np.testing.assert_allclose(sigma[:, :3], 0.1)
 
 
 def test_the_verdict_of_a_tuning_is_the_worst_on_held_out_data():

@@ -1,6 +1,7 @@
 """Gate, recovery, robust updates: false alarms, lock-in, contaminated noise, each with its two sides."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +14,8 @@ from strapdown.estimation import gating
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.states import GateMemory, ProcessNoise, initial_state, restart_bias_variance
 from strapdown.gyro import GyroSpec
-from strapdown.kernels import covariance_form, gate_rules
+from strapdown.kernels import filter as filter_kernels
+from strapdown.kernels import gate_rules, machine, structure
 from strapdown.kernels.iterated_update import ACCEPTED, PASSED_OVER, REFUSED
 from strapdown.randomness import generator
 from strapdown.scenarios import Scenario, simulate
@@ -432,8 +434,7 @@ def test_a_refused_update_that_does_not_converge_is_reported_at_the_prior(kind, 
 
 def test_a_widened_candidate_is_one_that_started_wider():
     """Of the information of all its measurements, P⁻¹, that of its start counts a ninth: in matrices, without a gain."""
-    from strapdown.estimation.states import covariance_matrices, pack
-
+    kernels = machine.instance(filter_kernels, STRUCTURE=structure.SIX_STATES)
     rng = np.random.default_rng(3)
     for _ in range(20):
         variance = rng.uniform(0.5, 2.0, 3)
@@ -441,27 +442,18 @@ def test_a_widened_candidate_is_one_that_started_wider():
         seen = root @ root.T
         P = np.linalg.inv(seen + np.diag([0.0, 0.0, 0.0, *(1.0 / variance)]))
         bias, first = rng.standard_normal(3), 1e-7 * rng.standard_normal(3)
-        states = np.zeros((2, 28))
-        states[1] = pack(np.array([1.0, 0.0, 0.0, 0.0]), bias, P)
-        form = covariance_form.Body(
-            states=states,
-            angle_variance=0.0,
-            rate_variance=0.0,
-            sharpness=np.inf,
-            least_share=0.0,
-            check=1,
-            good=np.zeros(2, np.int64),
-            work=np.empty((7, 6)),
-        )
+        x, matrices = np.zeros((2, 7)), np.zeros((2, 6, kernels.W))
+        x[1], matrices[1, :, :6] = [1.0, 0.0, 0.0, 0.0, *bias], P
+        form = SimpleNamespace(x=x, P=matrices.reshape(2, -1), work=np.zeros(kernels.LINES * kernels.LINE))
         memory = np.zeros(gate_rules.MEMORY)
         memory[gate_rules.FIRST_BIAS :] = [*(bias + first), *variance]
-        covariance_form.widen(form, memory)
+        kernels.widen(form, memory)
         expected = np.linalg.inv(seen + np.diag([0.0, 0.0, 0.0, *(1.0 / (9.0 * variance))]))
         # The mean solves P⁻¹ x = seen x̂ + start, of which the start's part shrinks too.
         mean = -expected[:, 3:] @ (8.0 / 9.0 / variance * first)
-        assert np.allclose(covariance_matrices(states[1, 7:]), expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max())
-        assert np.allclose(states[1, 4:7] - bias, mean[3:], rtol=1e-6, atol=1e-14)
-        assert np.allclose(quaternion.log(states[1, :4]), mean[:3], rtol=1e-6, atol=1e-14)
+        assert np.allclose(matrices[1, :, :6], expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max())
+        assert np.allclose(x[1, 4:7] - bias, mean[3:], rtol=1e-6, atol=1e-14)
+        assert np.allclose(quaternion.log(x[1, :4]), mean[:3], rtol=1e-6, atol=1e-14)
         assert np.allclose(memory[gate_rules.FIRST_BIAS + 3 :], 9.0 * variance)
 
 
@@ -641,8 +633,7 @@ def test_a_weight_is_the_fixed_point_of_its_equation():
         H = rng.standard_normal((3, 3))
         variance = rng.uniform(0.1, 2.0, 3)
         y = 3.0 * rng.standard_normal(3)
-        packed = tuple(A[np.triu_indices(3)])
-        S = covariance_form.innovation_covariance(None, 0, (None, None, packed, None, None), tuple(map(tuple, H)))
+        S = tuple((H @ A @ H.T)[np.triu_indices(3)])
         w = robust_weight(STUDENT, 5.0, 7.0, 200, S, tuple(y), tuple(variance))
         R = np.diag(variance) / w
         gain = A @ H.T @ np.linalg.inv(H @ A @ H.T + R)

@@ -54,7 +54,7 @@ def test_the_gate_of_a_setup_is_that_of_its_filter():
     vector = first.vector_b.copy()
     vector[-3] = -vector[-3]
     record = dataclasses.replace(record, vectors=(dataclasses.replace(first, vector_b=vector), *rest))
-    filter_setup = setup.FilterSetup.for_scenario(scenario())
+    filter_setup = setup.FilterSetup.for_scenario(scenario(), states=False)
     start = setup.initial_state(filter_setup, record.truth.attitude[0], record.truth.bias[0])
     gated = dataclasses.replace(filter_setup, gate=Gate())
     assert setup.run(record, gated, start).refused[first.sensor] == 1
@@ -112,19 +112,21 @@ def test_a_file_without_the_table_says_what_writes_one(tmp_path):
 def test_matched_takes_the_gyro_at_its_word():
     """A Gauss–Markov bias starts from its stationary spread."""
     spec = GyroSpec(angle_random_walk=2e-5, rate_random_walk=1e-8, turn_on_bias_sigma=3e-5)
-    chosen = setup.FilterSetup.for_scenario(scenario(gyro=spec))
+    chosen = setup.FilterSetup.for_scenario(scenario(gyro=spec), states=False)
     assert chosen.process_noise == estimation.ProcessNoise(angle_random_walk=2e-5, rate_random_walk=1e-8)
     assert chosen.bias_sigma == pytest.approx(3e-5)
     spec = GyroSpec(angle_random_walk=2e-5, markov_noise=1e-6, markov_correlation_time=800.0)
-    assert setup.FilterSetup.for_scenario(scenario(gyro=spec)).bias_sigma == pytest.approx(1e-6 * np.sqrt(400.0))
+    assert setup.FilterSetup.for_scenario(scenario(gyro=spec), states=False).bias_sigma == pytest.approx(
+        1e-6 * np.sqrt(400.0)
+    )
 
 
 def test_flicker_raises_both_noises():
     spec = GyroSpec(angle_random_walk=2e-5, bias_instability=5.0 * units.DEGREE_PER_HOUR)
-    noise = setup.FilterSetup.for_scenario(scenario(gyro=spec)).process_noise
+    noise = setup.FilterSetup.for_scenario(scenario(gyro=spec), states=False).process_noise
     assert noise.angle_random_walk > 2e-5
     assert noise.rate_random_walk > 0.0
-    blind = setup.FilterSetup.for_scenario(scenario(gyro=spec, sensors=())).process_noise
+    blind = setup.FilterSetup.for_scenario(scenario(gyro=spec, sensors=()), states=False).process_noise
     assert blind.rate_random_walk < noise.rate_random_walk  # bounded over the whole record
 
 
@@ -140,7 +142,7 @@ def test_beside_states_the_rate_random_walk_is_that_of_the_worst_axis_alone():
 
 def test_a_gyro_without_noise_is_refused():
     with pytest.raises(InputError, match="angle random walk"):
-        setup.FilterSetup.for_scenario(scenario(gyro=GyroSpec()))
+        setup.FilterSetup.for_scenario(scenario(gyro=GyroSpec()), states=False)
 
 
 def test_measurement_density_counts_what_each_kind_measures():
@@ -178,7 +180,7 @@ def test_the_matched_filter_of_a_scenario_is_consistent():
     # A gyro of noise alone: the errors of shape that presets have too are nothing that the filter has states for.
     noise = GyroSpec(angle_random_walk=5e-5, rate_random_walk=1e-6, turn_on_bias_sigma=1e-4)
     chosen = scenario(gyro=noise, gyro_preset="", duration=30.0)
-    filter_setup = setup.FilterSetup.for_scenario(chosen)
+    filter_setup = setup.FilterSetup.for_scenario(chosen, states=False)
     filter_setup = dataclasses.replace(filter_setup, integration=coning.ALGORITHMS["four-sample"])
     runs, last = 60, []
     for run in range(runs):
@@ -191,7 +193,7 @@ def test_the_matched_filter_of_a_scenario_is_consistent():
 
 def test_truth_travels_in_the_estimate_file(tmp_path):
     record = scenarios.simulate(scenario(duration=5.0))
-    filter_setup = setup.FilterSetup.for_scenario(scenario())
+    filter_setup = setup.FilterSetup.for_scenario(scenario(), states=False)
     estimate = setup.run(record, filter_setup, setup.initial_state(filter_setup, record.truth.attitude[0]))
     records.write_estimate(tmp_path / "with.h5", estimate, truth=record.truth)
     records.write_estimate(tmp_path / "without.h5", estimate)
@@ -293,7 +295,7 @@ def test_a_record_is_modelled_once_also_if_the_filter_starts_late(smooth, monkey
 def test_what_cannot_be_smoothed_is_refused(monkeypatch):
     chosen = scenario(duration=10.0)
     record = scenarios.simulate(chosen, 3)
-    filter_setup = setup.FilterSetup.for_scenario(chosen)
+    filter_setup = setup.FilterSetup.for_scenario(chosen, states=False)
     start = setup.initial_state(filter_setup, record.truth.attitude[0])
     monkeypatch.setattr(setup.running, "MAX_MEMORY", 1e5)
     with pytest.raises(InputError, match=r"with 6 states needs .* GB, more than 0.0001; cut the record"):

@@ -52,7 +52,7 @@ def test_modelled_record_gives_a_series_three_and_keeps_its_course():
     varying = dataclasses.replace(record.vectors[0], sigma=course * 1e-7)
     record = dataclasses.replace(record, vectors=(varying, record.vectors[1]))
     chosen = dataclasses.replace(
-        setup.FilterSetup.for_scenario(swaying(duration=2.0)),
+        setup.FilterSetup.for_scenario(swaying(duration=2.0), states=False),
         sigma={"mag": (1e-7, 2e-7, 3e-7)},
         measurement_sigma_factor=2.0,
     )
@@ -68,7 +68,9 @@ def test_modelled_record_gives_a_series_three_and_keeps_its_course():
 def test_modelled_record_replaces_the_axes_of_an_attitude_and_any_covariance():
     record = scenarios.simulate(tracked(5.0), 1)
     whole = dataclasses.replace(record.vectors[0], sigma_axes=None, covariance=np.diag(STAR**2) + 1e-10)
-    chosen = dataclasses.replace(setup.FilterSetup.for_scenario(tracked(5.0)), sigma={"star": (3e-5, 1e-5, 2e-5)})
+    chosen = dataclasses.replace(
+        setup.FilterSetup.for_scenario(tracked(5.0), states=False), sigma={"star": (3e-5, 1e-5, 2e-5)}
+    )
     silent = dataclasses.replace(record.vectors[0], sigma_axes=np.zeros(3))
     for series in (record.vectors[0], whole, silent):
         (star,) = setup.modelled_record(dataclasses.replace(record, vectors=(series,)), chosen).vectors
@@ -79,7 +81,7 @@ def test_modelled_record_replaces_the_axes_of_an_attitude_and_any_covariance():
 def test_three_equal_ones_are_one():
     scenario = swaying(duration=5.0)
     record = scenarios.simulate(scenario, 2)
-    chosen = setup.FilterSetup.for_scenario(scenario)
+    chosen = setup.FilterSetup.for_scenario(scenario, states=False)
     initial = setup.initial_state(chosen, record.truth.attitude[0], record.truth.bias[0])
     one = setup.run(record, dataclasses.replace(chosen, sigma={"mag": 6e-7}), initial)
     three = setup.run(record, dataclasses.replace(chosen, sigma={"mag": (6e-7,) * 3}), initial)
@@ -90,7 +92,7 @@ def test_three_equal_ones_are_one():
 def test_a_heading_has_one():
     scenario = swaying("heading", 5.0)
     record = scenarios.simulate(scenario, 1)
-    chosen = setup.FilterSetup.for_scenario(scenario)
+    chosen = setup.FilterSetup.for_scenario(scenario, states=False)
     with pytest.raises(InputError, match=r"mag is .*three numbers, but a heading has one degree of freedom; give one"):
         setup.modelled_record(record, dataclasses.replace(chosen, sigma={"mag": (0.1, 0.1, 0.1)}))
     case = case_of(scenario, chosen, 1)
@@ -101,19 +103,21 @@ def test_a_heading_has_one():
 
 def test_the_monte_carlo_takes_three_of_an_attitude_in_lanes_and_others_on_the_scalar_machine():
     sigma = {"star": (3e-5, 6e-5, 1.5e-4)}
-    chosen = dataclasses.replace(setup.FilterSetup.for_scenario(tracked(20.0)), sigma=sigma)
+    chosen = dataclasses.replace(setup.FilterSetup.for_scenario(tracked(20.0), states=False), sigma=sigma)
     plan = montecarlo.Plan(scenario=tracked(20.0), setup=chosen, epochs=4)
     assert lanes.supports(plan) is None
     by_lanes, scalar = (montecarlo.run_plan(plan, runs=8, machine=name) for name in ("lanes", "scalar"))
     np.testing.assert_allclose(by_lanes.sigma, scalar.sigma, rtol=1e-3)
-    chosen = dataclasses.replace(setup.FilterSetup.for_scenario(swaying()), sigma={"mag": (5e-7, 1e-6, 5e-7)})
+    chosen = dataclasses.replace(
+        setup.FilterSetup.for_scenario(swaying(), states=False), sigma={"mag": (5e-7, 1e-6, 5e-7)}
+    )
     reason = lanes.supports(montecarlo.Plan(scenario=swaying(), setup=chosen, epochs=4))
     assert reason == "mag: a different sigma for each axis"
 
 
 def test_names_start_from_the_present_sigma():
     record = scenarios.simulate(tracked(5.0), 1)
-    chosen = setup.FilterSetup.for_scenario(tracked(5.0))
+    chosen = setup.FilterSetup.for_scenario(tracked(5.0), states=False)
     assert tuning.parameters.axis_names([record]) == AXES
     assert tuning.default_names([record]) == ("gyro.arw", "gyro.rrw", "star.sigma")
     values = tuning.values_of(chosen, AXES, [record])
@@ -139,7 +143,7 @@ def test_names_start_from_the_present_sigma():
 
 def test_parts_of_a_parameter_and_what_cannot_have_axes_are_refused():
     scenario = swaying(duration=5.0)
-    chosen = setup.FilterSetup.for_scenario(scenario)
+    chosen = setup.FilterSetup.for_scenario(scenario, states=False)
     case = case_of(scenario, chosen, 1)
     with pytest.raises(InputError, match=r"acc.sigma.y is part of acc.sigma; give that, or the axes"):
         tuning.likelihood([case], chosen, ["acc.sigma", "acc.sigma.y"])
@@ -151,7 +155,7 @@ def test_parts_of_a_parameter_and_what_cannot_have_axes_are_refused():
 
 
 def test_of_an_attitude_one_factor_on_three_is_the_same_in_both_likelihoods():
-    chosen = setup.FilterSetup.for_scenario(tracked(20.0))
+    chosen = setup.FilterSetup.for_scenario(tracked(20.0), states=False)
     three = dataclasses.replace(chosen, sigma={"star": (5e-5, 1e-4, 2e-4)})
     case = case_of(tracked(20.0), chosen, 1)
     plain = tuning.likelihood([case], three, ["gyro.arw", "star.sigma"])
@@ -164,7 +168,7 @@ def test_of_an_attitude_one_factor_on_three_is_the_same_in_both_likelihoods():
 
 def recovered(scenario, truth, free, seed, **measured) -> np.ndarray:
     """Return the errors of the log σ over their standard errors, from a start wrong by 3 either way."""
-    chosen = setup.FilterSetup.for_scenario(scenario)
+    chosen = setup.FilterSetup.for_scenario(scenario, states=False)
     case = case_of(scenario, chosen, seed)
     if measured:
         record = dataclasses.replace(case.record, **measured)
@@ -216,7 +220,7 @@ def test_the_command_tunes_the_axes_of_a_record(succeeds, tmp_path):
     path, out, first = tmp_path / "star.h5", tmp_path / "tuned.toml", tmp_path / "first.toml"
     scenario = tracked(60.0)
     recordfiles.write_record(path, scenarios.simulate(scenario, 4))
-    off = dataclasses.replace(setup.FilterSetup.for_scenario(scenario), sigma={"star": tuple(3.0 * STAR)})
+    off = dataclasses.replace(setup.FilterSetup.for_scenario(scenario, states=False), sigma={"star": tuple(3.0 * STAR)})
     first.write_text(setup.to_toml(off), encoding="utf-8")
     command = ("tune", path, "--filter", first, "--free", ",".join(AXES), "--starts", 1, "-o", out)
     said = succeeds(*command, "--holdout", 0.3)

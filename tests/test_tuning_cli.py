@@ -37,7 +37,7 @@ def record(tmp_path):
 def wrong(tmp_path):
     """A filter wrong by ten."""
     path = tmp_path / "wrong.toml"
-    filter_setup = setup.FilterSetup.for_scenario(SCENARIO)
+    filter_setup = setup.FilterSetup.for_scenario(SCENARIO, states=False)
     values = {"gyro.arw": 1e-3, "gyro.rrw": 3e-7, "star 1.sigma": 1e-5, "star 2.sigma": 2e-3}
     path.write_text(setup.to_toml(tuning.with_values(filter_setup, values)), encoding="utf-8")
     return path

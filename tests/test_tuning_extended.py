@@ -66,7 +66,7 @@ def wrong(chosen, factors) -> setup.FilterSetup:
 def test_without_states_it_is_the_likelihood_of_the_plain_filter(options):
     scenario = dataclasses.replace(scenarios.load_scenario("two-stars"), duration=60.0)
     chosen = dataclasses.replace(
-        setup.FilterSetup.for_scenario(scenario), sigma={"star 1": 2e-4}, measurement_sigma_factor=1.5
+        setup.FilterSetup.for_scenario(scenario, states=False), sigma={"star 1": 2e-4}, measurement_sigma_factor=1.5
     )
     cases = [case_of(scenario, chosen, 3, run) for run in range(2)]
     names = ["gyro.arw", "gyro.rrw", "star 1.sigma"]
@@ -149,7 +149,7 @@ def test_values_scale_all_axes_alike_and_the_rest_stays():
         "mag.bias_sigma",
         "a.b.lever_sigma",
     )
-    chosen = dataclasses.replace(setup.FilterSetup.for_scenario(swaying(5.0)), states=states)
+    chosen = dataclasses.replace(setup.FilterSetup.for_scenario(swaying(5.0), states=False), states=states)
     values = tuning.values_of(chosen, ["mag.bias_sigma", "gyro.scale_sigma"], [])
     assert list(values.values()) == pytest.approx([np.sqrt(3.0), 1e-3 * np.sqrt(2.5)])
     changed = tuning.with_values(

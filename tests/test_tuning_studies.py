@@ -119,7 +119,7 @@ def without_unmodelled(chosen: scenarios.Scenario) -> scenarios.Scenario:
 
 def tuned_from_wrong(chosen: scenarios.Scenario, records: int, factor: float) -> tuple[FilterSetup, FilterSetup]:
     """Return the filter wrong by a factor, one parameter up and the next down, and what tuning on some records makes of it."""
-    filter_setup = setup.FilterSetup.for_scenario(chosen)
+    filter_setup = setup.FilterSetup.for_scenario(chosen, states=False)
     if chosen.name in INTEGRATION:
         filter_setup = dataclasses.replace(filter_setup, integration=coning.ALGORITHMS[INTEGRATION[chosen.name]])
     train = [tuning.record_case(scenarios.simulate(chosen, 5, k), filter_setup, seed=k) for k in range(records)]
@@ -172,7 +172,7 @@ def efficiencies(chosen: scenarios.Scenario, tuned: FilterSetup) -> tuple[np.nda
 
     The posterior Cramér–Rao bound is the Riccati recursion along the truth with the true noise; the RMSE that of the tuned filter's gains.
     """
-    right = dataclasses.replace(setup.FilterSetup.for_scenario(chosen), integration=tuned.integration)
+    right = dataclasses.replace(setup.FilterSetup.for_scenario(chosen, states=False), integration=tuned.integration)
     bound = covariance.analyse(chosen, right, epochs=20).filter_covariance[1:]
     actual = covariance.analyse(chosen, tuned, epochs=20).covariance[1:]
     found = [

@@ -35,7 +35,7 @@ def scenario(scale_factor: float = 0.0, duration: float = 900.0) -> scenarios.Sc
 
 def tuned(seed: int, scale_factor: float = 0.0) -> tuple[tuning.Case, tuning.Tuning]:
     chosen = scenario(scale_factor)
-    filter_setup = setup.FilterSetup.for_scenario(chosen)
+    filter_setup = setup.FilterSetup.for_scenario(chosen, states=False)
     one = tuning.record_case(scenarios.simulate(chosen, seed), filter_setup, name=f"record {seed}", seed=seed)
     names = tuning.default_names([one.record])
     return one, tuning.fit(tuning.likelihood([one], filter_setup, names), starts=1)
@@ -94,7 +94,7 @@ def test_the_turns_are_those_of_the_body_without_its_bias():
 
 def test_the_turns_leave_out_a_large_bias():
     chosen = dataclasses.replace(scenario(), gyro=dataclasses.replace(SPEC, turn_on_bias=np.full(3, 1e-2)))
-    filter_setup = dataclasses.replace(setup.FilterSetup.for_scenario(chosen), bias_sigma=1e-2)
+    filter_setup = dataclasses.replace(setup.FilterSetup.for_scenario(chosen, states=False), bias_sigma=1e-2)
     one = tuning.record_case(scenarios.simulate(chosen, 1), filter_setup, seed=1)
     found = turning.turns(one.record, filter_setup.process_noise, one.initial)
     excess = (found - chosen.motion.increments(one.record.time))[2000:-100] * 10.0
@@ -121,7 +121,7 @@ def test_noise_explains_nothing(changes, seeds):
     Of 16 hours even what is left of it in an average over a few samples would seem a scale factor of several percent.
     """
     chosen = dataclasses.replace(scenario(), **changes)
-    filter_setup = setup.FilterSetup.for_scenario(chosen)
+    filter_setup = setup.FilterSetup.for_scenario(chosen, states=False)
     for seed in seeds:
         one = tuning.record_case(scenarios.simulate(chosen, seed), filter_setup, seed=seed)
         found = residual_checks.scale_factor(one.record, filter_setup.process_noise, one.initial)
@@ -142,7 +142,9 @@ def test_what_the_gate_refuses_is_left_out():
     chosen = dataclasses.replace(
         scenario(), sensors=tuple(dataclasses.replace(sensor, faults=faults) for sensor in scenario().sensors)
     )
-    filter_setup = dataclasses.replace(setup.FilterSetup.for_scenario(chosen), gate=Gate(probability=0.999))
+    filter_setup = dataclasses.replace(
+        setup.FilterSetup.for_scenario(chosen, states=False), gate=Gate(probability=0.999)
+    )
     suspected = 0
     for seed in range(2):
         one = tuning.record_case(scenarios.simulate(chosen, seed), filter_setup, seed=seed)
@@ -184,7 +186,7 @@ def test_what_is_held_out_is_left_out():
 
 def test_a_hard_iron_is_named_where_the_innovations_are_not_white():
     chosen = scenarios.load_scenario("low-orbit")
-    filter_setup = setup.FilterSetup.for_scenario(chosen)
+    filter_setup = setup.FilterSetup.for_scenario(chosen, states=False)
     one = tuning.record_case(scenarios.simulate(dataclasses.replace(chosen, duration=1200.0), 5), filter_setup, seed=5)
     found = tuning.unmodelled(one, filter_setup)
     assert found.causes

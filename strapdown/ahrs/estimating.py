@@ -23,16 +23,16 @@ from strapdown.ahrs.starting import (
     with_all_rests,
     with_rate_at_rest,
 )
+from strapdown.calibration import UnitCalibration, with_gyro_states
 from strapdown.checks import Array
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.memory import side_by_side
 from strapdown.estimation.schedule import joined
 from strapdown.kernels import recording_steps
 from strapdown.kernels.machine import compiled, read_only
-from strapdown.recordings import Recording, sensor_delays, sensor_faults, unit_calibration
+from strapdown.recordings import Recording, sensor_delays, sensor_faults
 from strapdown.recordings.sensor_delays import Delays
 from strapdown.recordings.sensor_faults import Faults
-from strapdown.recordings.unit_calibration import UnitCalibration
 from strapdown.records import ErrorStateEstimate, Estimate, ImuRecord, cut
 from strapdown.records.recording import sampled
 
@@ -103,7 +103,7 @@ def estimate(
         default each sample is treated as the mean over the interval before its stamp, so its delay is half the interval. The delay of
         the magnetometer relative to the gyro is found by :func:`strapdown.recordings.sensor_delays.magnetometer_delay`.
     calibration : UnitCalibration, optional
-        Calibration from an earlier recording of the same unit: scale and misalignment of its gyro, the magnetometer's delay.
+        Calibration of the unit (:func:`strapdown.calibrate`, or that of an earlier estimate), by which its samples are corrected.
     gate : Gate, optional
         Rejects measurements whose innovation is too large for its predicted covariance.
     robust : Robust, optional
@@ -133,8 +133,8 @@ def estimate(
     field_delay = None
     if calibration is not None:
         used, field_delay = calibration.applied(used), calibration.magnetometer_delay or None
-        if parameters.gyro_scale_sigma > 0.0:
-            parameters = replace(parameters, gyro_scale_sigma=calibration.sigma)
+        if parameters.gyro_scale_sigma > 0.0 < calibration.gyro_scale_sigma:
+            parameters = replace(parameters, gyro_scale_sigma=calibration.gyro_scale_sigma)
     turned = sensor_delays.gyro_attitude(used)
     delays = sensor_delays.find(used, latency, field_delay, causal=not smooth, turned=turned)
     prepared = prepare(used, parameters, delays.field, causal=not smooth, turned=turned)
@@ -146,11 +146,11 @@ def estimate(
     options = _Options(gate, robust, smooth, full_covariance)
     filtered = _run(prepared, parameters, faults.turn_variance, at_rest, options)
     found = _at_stamps(filtered, used, prepared, parameters, delays, faults.turn_variance, options)
-    scale, own = filtered.error_states.get("gyro scale"), calibration or unit_calibration.NONE
+    scale = filtered.error_states.get("gyro scale")
     return AhrsEstimate(
         recording=used,
         estimate=found,
-        calibration=None if scale is None else unit_calibration.combined(own, scale, delays.last_field, used.source),
+        calibration=None if scale is None else with_gyro_states(calibration, scale, delays.last_field, used.source),
         record=prepared.record,
         initial=prepared.initial,
         parameters=parameters,

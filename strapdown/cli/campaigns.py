@@ -252,7 +252,7 @@ def _plan(scenario: str, model: _Model) -> Plan:
         chosen = (
             filter_of_scenario(model.filter_file, loaded)
             if own is None
-            else replace(FilterSetup.for_scenario(loaded), estimator=own)
+            else replace(FilterSetup.for_scenario(loaded, states=False), estimator=own)
         )
     plan = workflows.plan(
         loaded,

@@ -133,7 +133,8 @@ class _Recorded:
         help="Delay of the gyro's samples by its low-pass filter, ms; 0: point samples. Default: half a sample interval.",
     )
     calibration: Path | None = typer.Option(
-        None, help="calibration.toml of an earlier recording of the same unit; a new one is written."
+        None,
+        help="calibration.toml of the unit, from `strapdown calibrate` or an earlier estimate; a new one is written.",
     )
     temperature: Path | None = typer.Option(
         None,
@@ -345,7 +346,6 @@ def _drawn(
     title: str,
     truth: Any = None,
     used: Any = None,
-    errors: Any = None,
     fixed_frame: str = "",
 ) -> list[Path]:
     """Draw the estimate, its optional states, and its errors relative to a truth or a reference; return the files."""
@@ -357,8 +357,8 @@ def _drawn(
         figures[out / "states"] = plots.states_over_time(result, title=title)
     if truth is not None:
         figures[out / "errors"] = plots.error_overview(result, truth, title=title)
-    if errors is not None:
-        figures[out / "errors"] = plots.recording_errors(used.time, errors, used.movement)
+    if used is not None and used.true_attitude is not None:
+        figures[out / "errors"] = plots.recording_errors(result, used.true_attitude, used.movement)
     return save_as(figures, form)
 
 
@@ -455,14 +455,13 @@ def _estimate_recording(
     recording: Path, layout: dict[str, Any], shared: _Shared, options: _Recorded, output: _Output, exports: Exports
 ) -> None:
     """Run the filter over a recording: accelerometer as the vertical, magnetometer as the heading."""
-    from strapdown import ahrs
+    from strapdown import ahrs, calibration
     from strapdown.consistency import reference_errors
-    from strapdown.recordings import unit_calibration
 
     motion = one_of("--motion", options.motion or "hand", ahrs.MOTIONS)
     late = None if options.latency is None else 1e-3 * non_negative("--latency", options.latency, unit="ms")
     robustness = shared.robustness
-    carried = None if options.calibration is None else unit_calibration.read(options.calibration)
+    carried = None if options.calibration is None else calibration.read(options.calibration)
     source, parameters = _read_recording(recording, layout, motion, shared, options.temperature)
     with progress_bar("smoothing" if shared.smooth else "filtering"):
         result = ahrs.estimate(
@@ -495,7 +494,7 @@ def _estimate_recording(
     paths += _export(exports, result.estimate, source)
     if output.drawn_as is not None:
         frame = _fixed_frame(used)
-        paths += _drawn(out, output.drawn_as, result.estimate, used.source, used=used, errors=errors, fixed_frame=frame)
+        paths += _drawn(out, output.drawn_as, result.estimate, used.source, used=used, fixed_frame=frame)
     written(*paths)
 
 
@@ -534,8 +533,8 @@ def _fixed_frame(used: Recording) -> str:
 
 def _write_recording(result: AhrsEstimate, chosen: FilterSetup, motion: str, smoothed: bool, out: Path) -> list[Path]:
     """Write the estimate, its states and the calibration; return the files."""
+    from strapdown import calibration
     from strapdown.estimation import setup
-    from strapdown.recordings import unit_calibration
     from strapdown.records import write_estimate
 
     used, found = result.recording, result.estimate
@@ -561,7 +560,7 @@ def _write_recording(result: AhrsEstimate, chosen: FilterSetup, motion: str, smo
         write_json(paths[-1], {"source": used.source, **_states(found)})
     if result.calibration is not None:
         paths.append(out / "calibration.toml")
-        paths[-1].write_text(unit_calibration.to_toml(result.calibration), encoding="utf-8")
+        calibration.write(result.calibration, paths[-1])
     return paths
 
 

@@ -38,6 +38,11 @@ COMMANDS: dict[str, dict[str, tuple[str, ...]]] = {
     },
     "Recordings": {
         "doctor": ("judgement", "strapdown doctor walk.csv --gyro-unit deg/s --accelerometer-unit g"),
+        "calibrate": (
+            "calibrating",
+            "strapdown calibrate turned.csv --gyro-unit deg/s --accelerometer-unit g",
+            "strapdown estimate walk.csv --calibration calibration.toml",
+        ),
         "convert": ("conversion", "strapdown convert walk.bag walk.csv"),
     },
     "Integration of the gyro": {

@@ -126,7 +126,9 @@ def covariance(
     tables_folder(tables)
     writable("out", out / "covariance.json", out / f"budget.{form}", sources=(scenario, filter_file))
     considered = errors.considered(chosen.sensors)
-    modelled = filter_of_scenario(filter_file, chosen) if filter_file else setup.FilterSetup.for_scenario(chosen)
+    modelled = (
+        filter_of_scenario(filter_file, chosen) if filter_file else setup.FilterSetup.for_scenario(chosen, states=False)
+    )
     with progress_bar("covariance analysis"):
         found = analysis.analyse(
             chosen,

@@ -22,7 +22,19 @@ from rich.progress import (
 )
 from rich.text import Text
 
-errors = Console(stderr=True, markup=False, highlight=False)
+_CONTROL = dict.fromkeys((*range(9), *range(11, 32), *range(127, 160)), "�")
+"""Control characters except tab and newline."""
+
+
+class PlainConsole(Console):
+    """A console without control characters in its text: names of sensors and files may hold sequences that change a terminal."""
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        """Return a text with a mark in place of each control character."""
+        return super().render_str(text.translate(_CONTROL), **options)
+
+
+errors = PlainConsole(stderr=True, markup=False, highlight=False)
 
 LINE_INTERVAL = 10.0
 """Time between two lines if the output is no terminal, s."""

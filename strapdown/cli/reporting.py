@@ -15,8 +15,15 @@ from strapdown.files.reading import existing_file
 @command
 def report(
     result: Annotated[
-        Path, typer.Argument(help="HDF5 file of `strapdown estimate` or `montecarlo`, or the JSON of `strapdown tune`.")
+        Path,
+        typer.Argument(
+            help="HDF5 file of `strapdown estimate` or `montecarlo`, or the JSON of `strapdown tune` or `coning`."
+        ),
     ],
+    other: Annotated[
+        Path | None,
+        typer.Argument(help="A second estimate of the same motion: both on one page, with their difference."),
+    ] = None,
     out: Path | None = typer.Option(
         None, "--out", "-o", help="The page, .html. Default: the file name of the result with this suffix."
     ),
@@ -29,8 +36,8 @@ def report(
 
     existing_file(result)
     page = result.with_suffix(".html") if out is None else out
-    writable("out", page, page.with_suffix(".report.json"), sources=(result,))
+    writable("out", page, page.with_suffix(".report.json"), sources=(result, other))
     with progress_bar("judging, drawing"):
-        done = reports.write(result, out, probability=probability)
+        done = reports.write(result, out, other=other, probability=probability)
     console.print(f"{result.name}: {done.verdict}.", highlight=False)
     written(done.page, done.statistics)

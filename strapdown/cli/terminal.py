@@ -14,12 +14,11 @@ from typing import TYPE_CHECKING, Any, get_type_hints
 
 import typer
 from rich import box
-from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
 from strapdown.checks import InputError
-from strapdown.cli.progress import progress_bar
+from strapdown.cli.progress import PlainConsole, progress_bar
 from strapdown.files import json_text, output_file, usable_folder, write_json
 
 if TYPE_CHECKING:
@@ -38,7 +37,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 # Without markup, so that brackets in file names are printed; a statement is one line, which the terminal wraps.
-console = Console(markup=False, highlight=False, soft_wrap=True)
+console = PlainConsole(markup=False, highlight=False, soft_wrap=True)
 
 
 def command(function: Callable[..., None]) -> Callable[..., None]:

@@ -1,14 +1,14 @@
 """The compiled filter over whole records: :func:`run`, and :func:`run_part` for a record in parts.
 
-Without error states the covariance is carried in blocks (:mod:`strapdown.kernels.covariance_form`), which is faster; with error states,
-and where the blocks would lose their digits, as its triangular factor (:mod:`strapdown.kernels.root_form`).
+The filter is that of :mod:`strapdown.kernels.filter`, compiled for its number of states. Six states without a gate stay in registers
+(:mod:`strapdown.kernels.six_states`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from types import ModuleType
 
 import numpy as np
 
@@ -27,43 +27,20 @@ from strapdown.estimation.states import (
     ProcessNoise,
     State,
     check_arguments,
-    covariance_blocks,
     covariance_matrices,
     first_bias_variance,
     pack,
     restart_bias_variance,
 )
-from strapdown.kernels import covariance_form, gate, gate_rules, iterated_update, likelihood_outliers, root_form
-from strapdown.kernels.chains import LINKS
-from strapdown.kernels.error_state_step import OFFSET
+from strapdown.kernels import filter as filter_kernels
+from strapdown.kernels import gate, gate_rules, iterated_update, likelihood_outliers, machine, six_states, structure
 from strapdown.kernels.lane_values import WIDTH
 from strapdown.kernels.machine import compiled, read_only
-from strapdown.kernels.measurement import Measurements
 from strapdown.kernels.series import LARGEST_ANGLE
-from strapdown.kernels.triangle import padded
 from strapdown.kernels.walk import walk
 from strapdown.records import ErrorStateEstimate, Estimate, Event, ImuRecord, cut
 from strapdown.records.recording import GAP
 from strapdown.vectors import KINDS, VectorMeasurements
-
-CHECK_INTERVALS = 1024
-"""Number of intervals between checks of the covariance for lost digits."""
-SHARPNESS = 1e9
-"""Maximum ratio of an innovation's variance to the measurement's at which the covariance keeps enough digits."""
-MIN_SHARE = 1e-10
-"""Minimum conditional variance of a state, given the states after it, relative to its variance, at which enough digits are kept."""
-SMOOTHED_DIGITS = (1e11, 1e-11)
-"""The same two limits for a smoother, which beyond them uses the factor for the whole record, a dozen times as slow."""
-HEALTHY_SHARE = 1e-7
-"""Conditional variance, relative to the variance, from which on the covariance is carried in blocks again."""
-FIRST_SPAN = 64
-"""Number of intervals carried as a factor before the covariance is checked again; each further span is twice as long."""
-SHRINK = 1.0 - 1e-14
-"""Factor on reported correlations: near 1, rounding could make the covariance indefinite."""
-
-
-class LostDigitsError(InputError):
-    """The covariance in blocks has lost its digits; the caller that needs the segments must use the factor."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,17 +53,13 @@ class Options:
     """Whether ``full_covariance`` includes the covariance of the error states."""
     gate: Gate | None = None
     robust: Robust | None = None
-    together: bool = False
-    """Whether the factor takes all steps between two measurements at once: faster if few rows of a long record are stored."""
     segments: int = 0
     """Maximum number of predictions to store for a smoother."""
     whole_bias: bool = False
     """Report the whole gyro bias, including the contributions of the error states, and with ``full_covariance`` its covariance instead of
     that of all states."""
-    factor: bool = False
-    """Whether to carry the triangular factor even without error states."""
     outliers: tuple[float, float] | None = None
-    """Share and variance ratio of outliers, for the factor without a gate. ``weight`` of each measurement is then minus its log likelihood,
+    """Share and variance ratio of outliers, without a gate. ``weight`` of each measurement is then minus its log likelihood,
     the probability that it is an outlier, and the mean ratio of its noise to its innovations' variances (m, 3)."""
 
     def __post_init__(self) -> None:
@@ -185,9 +158,7 @@ def run(
     InputError
         If an argument is invalid.
     """
-    options = Options(
-        every=count("every", every), full_covariance=full_covariance, gate=gate, robust=robust, together=every > 1
-    )
+    options = Options(every=count("every", every), full_covariance=full_covariance, gate=gate, robust=robust)
     return filtered(prepared(record, process_noise, initial, error_states, driven=True), options).estimate
 
 
@@ -245,7 +216,8 @@ def prepared(
         temperature.need_none(declared, "this estimator")
     state = modelling.begin(initial, declared)
     events = schedule(record.vectors, record.time[0], record.time[-1], anisotropic=True)
-    model = modelling.assemble(declared, dict(zip(events.sensors, events.kinds, strict=True)))
+    kinds = dict(zip(events.sensors, events.kinds, strict=True))
+    model = modelling.assemble(declared, kinds, isotropic=events.noise is None)
     return Problem(
         record=record,
         events=events,
@@ -257,16 +229,20 @@ def prepared(
 
 
 def filtered(problem: Problem, options: Options) -> Passed:
-    """Run the filter over a prepared record, in the form that it needs; raise an error if it diverges."""
+    """Run the filter over a prepared record; raise an error if it diverges."""
     slopes = temperature.slopes(problem.error_states)
     if slopes is not None:
         passed = _over_temperature(problem, options, slopes)
-    elif problem.model.states or options.factor or options.whole_bias:
-        passed = _in_factor(problem, options)
-    elif options.judged or problem.events.noise is not None:
-        passed = _judged_in_blocks(problem, options)
+    elif (
+        problem.model.states
+        or options.judged
+        or options.whole_bias
+        or options.outliers
+        or problem.events.noise is not None
+    ):
+        passed = _run(problem, options)
     else:
-        passed = _in_blocks(problem, options)
+        passed = _in_registers(problem, options)
     attitude = passed.estimate.attitude
     if not np.isfinite(attitude[-1]).all():  # NaN persists
         end = problem.record.time[options.every * int(np.argmin(np.isfinite(attitude).all(axis=1)))]
@@ -288,7 +264,7 @@ def _over_temperature(problem: Problem, options: Options, slopes: slice) -> Pass
         state = temperature.shifted(state, slopes, mean - before)
         part, off = temperature.at_mean(cut(record, first, last), mean, state.values[slopes])
         declared = prepared(part, problem.process_noise, state, problem.error_states, driven=True)
-        passed = _in_factor(declared, options)
+        passed = _run(declared, options)
         parts.append(temperature.at_edges(passed.estimate, slopes, off[:: options.every]))
         state, before = passed.end, mean
     end = temperature.shifted(state, slopes, float(T[-1]) - before)
@@ -320,153 +296,43 @@ def _innovations(events: Schedule, *, judged: bool) -> tuple[int, int]:
     return int(events.bounds[-1]), most
 
 
-# ------------------------------------------------------------------------------------------------------------- the covariance in blocks
+# -------------------------------------------------------------------------------------------------------------- six states in registers
 
 
-def _block_outputs(problem: Problem, options: Options, *, judged: bool) -> covariance_form.Outputs:
-    """Return arrays for the outputs of a run."""
-    rows = len(problem.record.increments) // options.every + 1
-    shapes = (rows, 4), (rows, 3), (rows, 6), (rows if options.full_covariance else 0, 21)
-    innovations = _innovations(problem.events, judged=judged)
-    written = side_by_side(*((shape, float) for shape in (*shapes, innovations)))
-    segments = side_by_side(((options.segments + 1 if options.segments else 0, 32), float))
-    return covariance_form.Outputs(*written, *segments)
-
-
-def _block_body(problem: Problem, options: Options, states: Array) -> covariance_form.Body:
-    """Return the filter as the kernels' arguments."""
-    sharpness, share = SMOOTHED_DIGITS if options.segments else (SHARPNESS, MIN_SHARE)
-    angle_variance, rate_variance = problem.variances
-    return covariance_form.Body(
-        states=states,
-        angle_variance=angle_variance,
-        rate_variance=rate_variance,
-        sharpness=sharpness,
-        least_share=share,
-        check=(CHECK_INTERVALS + options.every - 1) // options.every,
-        good=np.zeros(2, np.int64),
-        work=np.empty((7, 6)),
-    )
-
-
-def _packed_states(initial: State) -> Array:
-    """Return the states of the filter and its candidate, packed (2, 28)."""
-    states = np.zeros((2, 28))
-    states[0] = pack(initial.attitude, initial.bias, initial.covariance)
-    if initial.gate is not None and initial.gate.candidate is not None:
-        one = initial.gate.candidate
-        states[1] = pack(one.attitude, one.others, one.covariance)
-    return states
-
-
-def _in_blocks(problem: Problem, options: Options) -> Passed:
-    """Run the filter without gate and robust weights; spans in which the blocks would lose their digits are carried as the factor."""
+def _in_registers(problem: Problem, options: Options) -> Passed:
+    """Run the filter of attitude and bias, without a gate."""
     record, events, every = problem.record, problem.events, options.every
-    out = _block_outputs(problem, options, judged=False)
-    written = out._replace(segments=out.segments[: options.segments])
-    body = _block_body(problem, options, _packed_states(problem.initial))
-    (edges, increments), measurements = problem.gyro, events.measurements
-    row, event = 0, 0
-    while True:
-        number = compiled(walk, covariance_form)(
-            edges[row * every :],
-            increments[row * every :],
-            after(measurements, event),
-            every,
-            body,
-            _rows_from(written, row),
-        )
-        if number >= 0:
-            break
-        row, event = row + int(body.good[0]), event + int(body.good[1])
-        if options.segments:
-            raise LostDigitsError(f"after {record.time[row * every]:g} s the covariance keeps no digits")
-        row, event = _span_in_factor(problem, options, body.states[0], out, row, event)
-        if row * every + every > len(increments):
-            number = 0
-            break
-    return _block_result(problem, options, out, body.states[0], int(number))
-
-
-def after(measurements: Measurements, first: int, last: int | None = None) -> Measurements:
-    """Return the measurements from number ``first`` to ``last`` in order of time."""
-    own = slice(first, last)
-    return measurements._replace(
-        time=measurements.time[own], place=measurements.place[own], sensor=measurements.sensor[own]
-    )
-
-
-def _rows_from(out: covariance_form.Outputs, row: int) -> covariance_form.Outputs:
-    """Return the outputs from a row on."""
-    kept = {name: getattr(out, name)[row:] for name in ("attitude", "bias", "variance", "covariance")}
-    return out._replace(**kept)
-
-
-def _block_result(
-    problem: Problem,
-    options: Options,
-    out: covariance_form.Outputs,
-    end: Array,
-    number: int,
-    weight: Array | None = None,
-    events: Sequence[Event] = (),
-    memory: GateMemory | None = None,
-) -> Passed:
-    """Return the result of a run from its outputs and its packed end state."""
+    rows = len(record.increments) // every + 1
+    shapes = (rows, 4), (rows, 3), (rows, 6), (rows if options.full_covariance else 0, 21)
+    written = side_by_side(*((shape, float) for shape in (*shapes, _innovations(events, judged=False))))
+    (segments,) = side_by_side(((options.segments + 1 if options.segments else 0, 32), float))
+    out = six_states.Outputs._make((*written, segments[: options.segments]))
+    initial = problem.initial
+    state = pack(initial.attitude, initial.bias, initial.covariance)
+    body = six_states.Body(state, *problem.variances)
+    number = compiled(walk, six_states)(*problem.gyro, events.measurements, every, body, out)
+    if number < 0:
+        raise TooPreciseError()
     if options.segments:
-        out.segments[number, :4] = 0.0
-        out.segments[number, 4:] = end
-    innovations = innovations_by_sensor(problem.events, out.innovation, weight)
+        segments[number, :4] = 0.0
+        segments[number, 4:] = state
+    innovations = innovations_by_sensor(events, out.innovation, None)
     estimate = Estimate(
-        time=problem.record.time[:: options.every],
+        time=record.time[::every],
         attitude=out.attitude,
         bias=out.bias,
         variance=out.variance,
         covariance=covariance_matrices(out.covariance) if options.full_covariance else None,
         innovations=innovations,
-        skipped=skipped_too(problem.events, innovations),
-        events=in_order([*gaps(problem.record), *events]),
+        skipped=skipped_too(events, innovations),
+        events=in_order(gaps(record)),
     )
     return Passed(
         estimate=estimate,
-        make_end=lambda: State(attitude=end[:4], bias=end[4:7], covariance=covariance_matrices(end[7:]), gate=memory),
-        segments=out.segments[: number + 1],
-    )
-
-
-def _judged_in_blocks(problem: Problem, options: Options) -> Passed:
-    """Run the filter with a gate, robust weights or anisotropic noise; with the factor for the whole record if digits would be lost."""
-    body = _block_body(problem, options, _packed_states(problem.initial))
-    judge = Judge(problem, options)
-    out = _block_outputs(problem, options, judged=True)
-    written = judge.outputs(out._replace(segments=out.segments[: options.segments]))
-    restart = covariance_form.Restart(bias_variance=restart_bias_variance(options.gate, problem.initial))
-    number, recovered, locked = compiled(walk, gate, covariance_form)(
-        *problem.gyro,
-        problem.events.measurements,
-        options.every,
-        judge.body(body, restart),
-        written,
-    )
-    if number < 0:
-        if options.segments:
-            raise LostDigitsError("the covariance keeps no digits")
-        return _in_factor(problem, options)
-    states = body.states
-    candidate = None
-    if judge.memory[gate_rules.CANDIDATE]:
-        candidate = Candidate(
-            attitude=states[1, :4], others=states[1, 4:7], covariance=covariance_matrices(states[1, 7:])
-        )
-    return _block_result(
-        problem,
-        options,
-        out,
-        states[0],
-        int(number),
-        written.weight,
-        judge.events(written, recovered, locked),
-        judge.remembered(candidate),
+        make_end=lambda: State(
+            attitude=state[:4], bias=state[4:7], covariance=definite(covariance_matrices(state[7:]))
+        ),
+        segments=segments[: number + 1],
     )
 
 
@@ -483,12 +349,16 @@ class Judge:
         sensors = problem.events.sensors
         self.memory, self.counters = remembered(options.gate, problem.initial.gate, sensors)
 
-    def body(self, form: covariance_form.Body | root_form.Body, restart: Any) -> gate.Body:
-        """Return the body of the walk, with the gate around a form."""
+    def body(self, form: structure.Body) -> gate.Body:
+        """Return the body of the walk, with the gate around a filter."""
+        start = self.start()
+        restart = gate.Restart(
+            restart_bias_variance(self.gate, self.problem.initial), start.values, start.covariance, start.start
+        )
         return gate.Body(form=form, options=self.options, restart=restart, standing=self.counters, memory=self.memory)
 
-    def outputs(self, form: covariance_form.Outputs | root_form.Outputs) -> gate.Outputs:
-        """Return arrays for the outputs of the gate in addition to the form's.
+    def outputs(self, form: structure.Outputs) -> gate.Outputs:
+        """Return arrays for the outputs of the gate in addition to the filter's.
 
         A recovery or a lock-out needs two refusals, except the first recovery, whose other refusals may lie in the part before, and a
         lock-out that continues.
@@ -579,102 +449,100 @@ def restart_states(state: State, error_states: tuple[ErrorStates, ...]) -> tuple
     return state.values, P
 
 
-# ----------------------------------------------------------------------------------------------------------------- the triangular factor
+# ------------------------------------------------------------------------------------------------------------- the filter of N error states
 
 
-def model_arrays(model: Model, variances: tuple[float, float]) -> root_form.Model:
-    """Return noise and error states as the kernels' arguments."""
-    same = {name: getattr(model, name) for name in root_form.Model._fields[2:]}
-    return root_form.Model(*variances, **{**same, "force_f": tuple(model.force_f.tolist())})
+def instance_of(model: Model) -> ModuleType:
+    """Return the kernels of the filter for the structure of a model."""
+    return machine.instance(filter_kernels, STRUCTURE=model.structure)
 
 
-def scratch(model: Model) -> root_form.Scratch:
-    """Return work space for the kernels."""
-    m, width = model.states, padded(6 + model.states)
-    return root_form.Scratch(
-        rows=np.zeros((3, 3, width)),
-        lines=np.zeros((root_form.LINES, width)),
-        steps=np.zeros((2, 2, 6 + m, 4)),
-        links=np.empty((len(model.chains), LINKS)),
-        six=np.empty((6, 6)),
+def kernel_model(model: Model, variances: tuple[float, float]) -> structure.Model:
+    """Return the numbers of a model, and σ_v² and σ_u², as the kernels' arguments."""
+    return structure.Model(
+        *variances,
+        numbers=model.numbers,
+        decay=model.decay,
+        chains=model.chains,
+        last=model.last,
+        limit=model.limit,
+        force_f=tuple(model.force_f.tolist()),
     )
 
 
-def factor_body(problem: Problem, units: Mapping[str, float], *, together: bool = False) -> root_form.Body:
+def filter_body(problem: Problem, units: Mapping[str, float]) -> structure.Body:
     """Return the filter as the kernels' arguments."""
-    model, initial = problem.model, problem.initial
-    size = 6 + model.states
-    rows = size + max(model.noise_rows, size + 1)
-    attitude, x, F = np.zeros((2, 4)), np.zeros((2, size - 3)), np.zeros((2, rows, padded(size)))
-    attitude[0], x[0] = initial.attitude, np.concatenate([initial.bias, initial.values[model.order]])
-    F[0, :size, :size] = modelling.triangle(initial, model)
+    model, initial, kernels = problem.model, problem.initial, instance_of(problem.model)
+    x, P = np.zeros((2, kernels.N + 1)), np.zeros((2, kernels.N, kernels.W))
+    x[0] = np.concatenate([initial.attitude, initial.bias, initial.values])
+    P[0, :, : kernels.N] = initial.covariance
     if initial.gate is not None and initial.gate.candidate is not None:
-        one = initial.gate.candidate
-        attitude[1], x[1] = one.attitude, np.concatenate([one.others[:3], one.others[3:][model.order]])
-        F[1, :size, :size] = modelling.triangle(one, model)
-    return root_form.Body(
-        model=model_arrays(model, problem.variances),
-        attitude=attitude,
+        candidate = initial.gate.candidate
+        x[1] = np.concatenate([candidate.attitude, candidate.others])
+        P[1, :, : kernels.N] = candidate.covariance
+    return structure.Body(
+        model=kernel_model(model, problem.variances),
         x=x,
-        F=F,
+        P=P.reshape(2, -1),
+        coefficients=np.zeros(kernels.SET * max(len(model.last), 1)),
+        dt=np.zeros(1),
+        work=np.zeros(kernels.LINES * kernels.LINE),
+        shape=model.shape,
         length=lengths(problem.record, problem.events, model, units),
         turning=turns(problem),
-        scratch=scratch(model),
-        together=together and not len(model.chains),
-        sharpness=np.inf,
-        least_share=0.0,
-        check=CHECK_INTERVALS,
+        offsets=model.offsets,
     )
 
 
-def _in_factor(problem: Problem, options: Options) -> Passed:
-    """Run the filter with the triangular factor of its covariance."""
+def segment_width(model: Model) -> int:
+    """Return the numbers of a stored prediction, with seven that are not used."""
+    n = model.structure.n
+    return 5 + n + n * (n + 1) // 2 + WIDTH - 1
+
+
+def _run(problem: Problem, options: Options) -> Passed:
+    """Run the filter of any number of error states, with or without a gate."""
     record, events, model, every = problem.record, problem.events, problem.model, options.every
-    size, rows = 6 + model.states, len(record.increments) // every + 1
+    kernels, rows = instance_of(model), len(record.increments) // every + 1
+    n = kernels.N
     units = unit_sigmas(record, model, problem.initial.unit_sigma)
-    body = factor_body(problem, units, together=options.together)
+    body = filter_body(problem, units)
     whole_rows = rows if options.whole_bias else 0
-    kept = size if options.error_state_covariance else 6
-    stands = np.tri(size, dtype=bool)
-    stands[:6, :6] = stands[6 : model.loose, : model.loose] = True
-    end = 5 + size + int(np.sum(stands))
-    (stored,) = side_by_side(((options.segments + 1 if options.segments else 0, end + WIDTH - 1), float))
+    kept = n if options.error_state_covariance else 6
     shapes = (
-        (rows, 4),
-        (rows, size - 3),
-        (rows, size),
+        (rows, n + 1),
+        (rows, n),
         (rows if options.full_covariance and not options.whole_bias else 0, kept, kept),
         (whole_rows, 6),
         (whole_rows if options.full_covariance else 0, 6, 6),
         _innovations(events, judged=options.judged) if options.outliers is None else (len(events.time), 9),
+        (options.segments + 1 if options.segments else 0, segment_width(model)),
     )
-    written = side_by_side(*((shape, float) for shape in shapes))
-    out = root_form.Outputs._make((*written, stored[: options.segments]))
+    *written, stored = side_by_side(*((shape, float) for shape in shapes))
+    out = structure.Outputs._make((*written, stored[: options.segments]))
     judge = Judge(problem, options)
     weight, happened = None, []
     arguments = *problem.gyro, events.measurements, every
     if options.judged:
-        restart = restart_in_factor(judge)
         judged = judge.outputs(out)
-        number, recovered, locked = compiled(walk, gate, root_form)(*arguments, judge.body(body, restart), judged)
+        number, recovered, locked = compiled(walk, gate, kernels)(*arguments, judge.body(body), judged)
         weight, happened = judged.weight, judge.events(judged, recovered, locked)
     else:
+        bodies: tuple[ModuleType, ...] = (kernels,)
         if options.outliers is not None:
             body, weight = body._replace(outliers=options.outliers), out.innovation[:, 6:]
-        bodies = (root_form,) if options.outliers is None else (likelihood_outliers, root_form)
+            bodies = (likelihood_outliers, kernels)
         number = compiled(walk, *bodies)(*arguments, body, out)
-    if number < 0:  # the following rows are not written
-        raise RuntimeError("the triangular factor lost its last digits; please report this with the record")
+    if number < 0:
+        raise TooPreciseError()
     if options.segments:
         stored[number, :4] = 0.0
-        stored[number, 4:8] = body.attitude[0]
-        stored[number, 8 : 5 + size] = body.x[0]
-        stored[number, 5 + size : end] = body.F[0, :size, :size][stands]
+        stored[number, 4 : 5 + n] = body.x[0]
+        stored[number, 5 + n : -(WIDTH - 1)] = body.P[0].reshape(n, -1)[np.triu_indices(n)]
     innovations = innovations_by_sensor(events, out.innovation, weight)
+    covariance = out.covariance if len(out.covariance) else None
     estimate = replace(
-        factor_estimate(
-            problem, every, out.attitude, out.x, out.variance, out.covariance if len(out.covariance) else None
-        ),
+        estimate_of(problem, every, out.x, out.variance, covariance),
         innovations=innovations,
         skipped=skipped_too(events, innovations),
         events=in_order([*gaps(record), *happened]),
@@ -686,167 +554,86 @@ def _in_factor(problem: Problem, options: Options) -> Passed:
             variance=out.whole_variance,
             covariance=out.whole_covariance if options.full_covariance else None,
         )
-    candidate = candidate_in_factor(body, model) if judge.memory[gate_rules.CANDIDATE] else None
-    memory = judge.remembered(candidate)
+    memory = judge.remembered(candidate_of(body, model) if judge.memory[gate_rules.CANDIDATE] else None)
     return Passed(
         estimate=estimate,
-        make_end=lambda: end_in_factor(body, model, memory, units),
+        make_end=lambda: state_of(body, model, memory, units),
         segments=stored[: number + 1],
     )
 
 
-def restart_in_factor(judge: Judge) -> root_form.Restart:
-    """Return the initial state of a restart candidate."""
-    problem, first = judge.problem, judge.start()
-    model = problem.model
-    return root_form.Restart(
-        bias_sigma=np.sqrt(restart_bias_variance(judge.gate, problem.initial)),
-        values=first.values[model.order],
-        root=modelling.lower_root(first.covariance[np.ix_(model.order, model.order)]),
-        time=first.start,
-        fresh=np.empty((3 * model.states + 6, padded(3 + model.states))),
-    )
+class TooPreciseError(InputError):
+    """A measurement is so much more precise than the state that a covariance in double precision has too few digits left."""
+
+    def __init__(self) -> None:
+        ratio = np.sqrt(structure.MAX_PRECISION)
+        super().__init__(
+            f"a measurement is more than {ratio:.0e} times as precise as the state, and its update would leave the covariance with no "
+            "digits left in double precision; give the initial state a smaller sigma, or the measurement a larger one. If both are right, "
+            "the filter has diverged before: the errors of the start are many times their sigmas"
+        )
 
 
 def whole_bias(model: Model, x: Array) -> Array:
-    """Return the whole gyro bias (rows, 3) from the kernels' bias and error states (rows, 3 + m)."""
-    offsets = model.gyro[:, :3] * (model.gyro_use & OFFSET > 0)[:, None]
-    return np.asarray(x[:, :3] + x[:, 3:] @ offsets)
+    """Return the whole gyro bias (rows, 3) from q, bias and error states (rows, 7 + m)."""
+    return np.asarray(x[:, 4:7] + x[:, 7:] @ model.offsets)
 
 
-def outside(body: root_form.Body, model: Model, i: int) -> tuple[Array, Array, Array, Array]:
-    """Return attitude, bias, values and factor of state i in the order of the declarations."""
-    size = 6 + model.states
-    root = body.F[i, :size][:, np.argsort(model.whole_order)]
-    return body.attitude[i], body.x[i, :3], body.x[i, 3:][np.argsort(model.order)], root
+def covariance_at(body: structure.Body, i: int) -> Array:
+    """Return the covariance (n, n) of state i."""
+    n = body.x.shape[1] - 1
+    return definite(np.array(body.P[i].reshape(n, -1)[:, :n]))
 
 
-def candidate_in_factor(body: root_form.Body, model: Model) -> Candidate:
+def definite(P: Array) -> Array:
+    """Return a covariance; if rounding has made it indefinite, with smaller correlations."""
+    sigma = np.sqrt(np.diag(P))
+    least = float(np.linalg.eigvalsh(P / np.outer(sigma, sigma))[0])
+    if least > 0.0:
+        return P
+    return np.where(np.eye(len(P), dtype=bool), P, (1.0 - 4.0 * abs(least) - 1e-14) * P)
+
+
+def candidate_of(body: structure.Body, model: Model) -> Candidate:
     """Return the restart candidate."""
-    attitude, bias, values, root = outside(body, model, 1)
-    return Candidate(attitude=attitude, others=np.concatenate([bias, values]), covariance=root.T @ root, factor=root)
+    return Candidate(attitude=body.x[1, :4], others=body.x[1, 4:], covariance=covariance_at(body, 1))
 
 
-def end_in_factor(body: root_form.Body, model: Model, memory: GateMemory | None, units: Mapping[str, float]) -> State:
-    """Return the state at the end."""
-    attitude, bias, values, root = outside(body, model, 0)
-    if not model.states:
-        return State(attitude=attitude, bias=bias, covariance=_reported(root.T @ root), gate=memory)
+def state_of(body: structure.Body, model: Model, memory: GateMemory | None, units: Mapping[str, float]) -> State:
+    """Return the state of the filter."""
     return State(
-        attitude=attitude,
-        bias=bias,
-        values=values,
-        covariance=root.T @ root,
-        factor=root,
+        attitude=body.x[0, :4],
+        bias=body.x[0, 4:7],
+        values=body.x[0, 7:],
+        covariance=covariance_at(body, 0),
         gate=memory,
         unit_sigma=units,
     )
 
 
-def factor_estimate(
-    problem: Problem, every: int, attitude: Array, x: Array, variance: Array, P: Array | None
-) -> Estimate:
-    """Return the estimate from arrays in the kernels' order, (b, c) and P, in the order of the declarations.
+def estimate_of(problem: Problem, every: int, x: Array, variance: Array, P: Array | None) -> Estimate:
+    """Return the estimate from arrays (rows, …) of q, bias and error states, of their variances, and of covariances.
 
     P is (rows, n, n), or (rows, 6, 6) of attitude and bias only.
     """
-    model = problem.model
-    if P is not None and not model.states:
-        P = _reported(P)
-    back = np.argsort(model.whole_order)
-    whole = P
-    if P is not None and P.shape[1] > 6 and np.any(np.diff(back) != 1):
-        whole = P[:, back[:, None], back]
-    found = {}
-    for one, place in spans(problem.error_states):
-        own = back[6:][place]
-        found[one.name] = ErrorStateEstimate(
-            components=tuple(one.components),
-            units=tuple(one.units),
-            values=_columns(x, own - 3),
-            variance=_columns(variance, own),
+    states = {
+        block.name: ErrorStateEstimate(
+            components=tuple(block.components),
+            units=tuple(block.units),
+            values=x[:, 7 + place.start : 7 + place.stop],
+            variance=variance[:, 6 + place.start : 6 + place.stop],
         )
+        for block, place in spans(problem.error_states)
+    }
     return Estimate(
         time=problem.record.time[::every],
-        attitude=attitude,
-        bias=x[:, :3],
+        attitude=x[:, :4],
+        bias=x[:, 4:7],
         variance=variance[:, :6],
-        covariance=None if whole is None else whole[:, :6, :6],
-        error_states=found,
-        whole_covariance=whole if whole is not None and whole.shape[1] > 6 else None,
+        covariance=None if P is None else P[:, :6, :6],
+        error_states=states,
+        whole_covariance=P if P is not None and P.shape[1] > 6 else None,
     )
-
-
-def _columns(values: Array, which: np.ndarray) -> Array:
-    """Return columns of an array, without a copy if they are adjacent."""
-    if np.all(np.diff(which) == 1):
-        return values[:, which[0] : which[0] + len(which)]
-    return values[:, which]
-
-
-def _reported(P: Array) -> Array:
-    """Return covariances (..., n, n) with correlations reduced so that rounding cannot make them indefinite."""
-    return np.where(np.eye(P.shape[-1], dtype=bool), P, SHRINK * P)
-
-
-def _span_in_factor(
-    problem: Problem, options: Options, state: Array, out: covariance_form.Outputs, row: int, event: int
-) -> tuple[int, int]:
-    """Continue from a row of the outputs and a measurement with the factor until the blocks keep enough digits, or to the end.
-
-    ``state`` (28,) is the state at the row, replaced by that at the returned row, or after the last row by the end state. Returns the row
-    and the number of measurements processed up to it.
-    """
-    events, every = problem.events, options.every
-    (edges, increments), measurements = problem.gyro, events.measurements
-    last = len(increments) // every
-    start = State(attitude=state[:4], bias=state[4:7], covariance=np.eye(6))
-    body = factor_body(replace(problem, initial=start), {})
-    body.F[0, :6, :6] = _singular_triangle(covariance_matrices(state[7:]))
-    span = max(1, FIRST_SPAN // every)
-    while True:
-        to_row = min(row + span, last)
-        begin, end = row * every, len(increments) if to_row == last else to_row * every
-        beyond = int(np.searchsorted(events.time, edges[end], side="right"))
-        rows = slice(row, to_row + 1)
-        whole = np.empty((to_row - row + 1 if options.full_covariance else 0, 6, 6))
-        written = root_form.Outputs(
-            attitude=out.attitude[rows],
-            x=out.bias[rows],
-            variance=out.variance[rows],
-            covariance=whole,
-            whole_variance=np.empty((0, 6)),
-            whole_covariance=np.empty((0, 6, 6)),
-            innovation=out.innovation,
-            segments=np.empty((0, 32)),
-        )
-        compiled(walk, root_form)(
-            edges[begin : end + 1],
-            increments[begin:end],
-            after(measurements, event, beyond),
-            every,
-            body,
-            written,
-        )
-        if len(whole):
-            out.covariance[rows] = covariance_blocks(_reported(whole))
-        row, event = to_row, beyond
-        span *= 2
-        F = modelling.lower(body.F[0, :6, :6])
-        if end == len(increments) or np.all(np.diag(F) ** 2 >= HEALTHY_SHARE * np.sum(F**2, axis=0)):
-            break
-    state[:4], state[4:7] = body.attitude[0], body.x[0]
-    state[7:] = covariance_blocks(_reported(F.T @ F))
-    return row, event
-
-
-def _singular_triangle(P: Array) -> Array:
-    """Return F, lower triangular, with ``P = Fᵀ F``, for a covariance that may be singular."""
-    sigma = np.sqrt(np.diag(P))
-    scale = np.where(sigma > 0.0, sigma, 1.0)
-    values, vectors = np.linalg.eigh(P / np.outer(scale, scale))
-    root = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T * sigma
-    return np.asarray(np.linalg.qr(root[:, ::-1], mode="r"))[::-1, ::-1].copy()
 
 
 def turns(problem: Problem) -> Array:

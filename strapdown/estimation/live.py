@@ -1,7 +1,7 @@
 """The compiled filter for data in real time: :class:`LiveFilter`.
 
-Each gyro interval is treated as a record by :mod:`strapdown.kernels.walk`, with the state in the same arrays from one to the next. The
-covariance is carried as its triangular factor, which never loses its digits. If measurements may be late, the filter keeps the state before
+Each gyro interval is treated as a record by :mod:`strapdown.kernels.walk`, with the state in the same arrays from one to the next. If
+measurements may be late, the filter keeps the state before
 each interval of its look-back, returns to the interval of a late measurement, and repeats from there.
 """
 
@@ -23,11 +23,10 @@ from strapdown.estimation import forward
 from strapdown.estimation.error_states import ErrorStates
 from strapdown.estimation.forward import Judge, Options, gate_events
 from strapdown.estimation.gating import Gate, Robust
-from strapdown.estimation.schedule import KIND_CODES
 from strapdown.estimation.states import ProcessNoise, State, check_arguments
-from strapdown.kernels import gate, gate_rules, root_form
+from strapdown.kernels import gate, gate_rules, structure
 from strapdown.kernels.machine import compiled, read_only
-from strapdown.kernels.measurement import Measurements
+from strapdown.kernels.measurement import KIND_CODES, Measurements
 from strapdown.kernels.walk import walk
 from strapdown.records import LARGEST_TURN, Event, ImuRecord, Innovations
 from strapdown.vectors import KINDS, VectorMeasurements, VectorSensor, need_level, triad
@@ -74,9 +73,9 @@ class LiveFilter:
 
     Notes
     -----
-    For the samples of a record, the estimate equals that of :func:`strapdown.estimation.run`: bit for bit with error states, otherwise to
-    rounding, because without them a record is filtered with the covariance instead of its factor. Late measurements within the look-back
-    give the same bits as those in order. A filter is not thread-safe and cannot be copied; start another one from its :meth:`state`.
+    For the samples of a record, the estimate equals that of :func:`strapdown.estimation.run`: bit for bit with error states or a gate,
+    otherwise to rounding, because without them the state of a record stays in registers. Late measurements within the look-back give the
+    same bits as those in order. A filter is not thread-safe and cannot be copied; start another one from its :meth:`state`.
 
     Examples
     --------
@@ -131,19 +130,20 @@ class LiveFilter:
     def _prepare(self) -> None:
         """Make the arrays that the kernels work on, and load the kernel."""
         sensors, model = len(self._sensors), self._problem.model
-        body, judge = forward.factor_body(self._problem, {}), self._judge
+        body, judge = forward.filter_body(self._problem, {}), self._judge
+        kernels = forward.instance_of(model)
         # All that changes lies in one array, of which a copy is a snapshot. Continuing lock-outs are the last rows of the array in which
         # the kernel reports new ones.
         slots = np.zeros((sensors, 4))
-        parts = [slots, body.attitude, body.x, body.F, judge.counters, judge.memory, np.zeros((sensors, 2))]
+        parts = [slots, body.x, body.P, judge.counters, judge.memory, np.zeros((sensors, 2))]
         sizes = np.cumsum([0, *(part.size for part in parts)])
         whole = np.zeros(4 * MOST + sizes[-1])
         self._state = whole[4 * MOST :]
         views = [self._state[a:b].reshape(part.shape) for a, b, part in zip(sizes, sizes[1:], parts, strict=False)]
         for view, part in zip(views, parts, strict=True):
             view[...] = part
-        self._slots, attitude, x, F, judge.counters, judge.memory, self._counts = views
-        self._body = body._replace(attitude=attitude, x=x, F=F, length=np.ones(MOST))
+        self._slots, x, P, judge.counters, judge.memory, self._counts = views
+        self._body = body._replace(x=x, P=P, length=np.ones(MOST))
         self._edges, self._increment = np.full(2, self._time), np.zeros(3)
         self._gyro_stores: Any = self._edges.data, self._increment.data
         self._at = _Slots(anisotropic=not all(one.row.isotropic for one in self._sensors.values()))
@@ -153,9 +153,8 @@ class LiveFilter:
         self._innovation, self._weight = np.zeros((MOST, 6)), np.ones(MOST)
         self._weights: Any = self._weight.data
         self._recoveries, self._lock_outs = np.zeros((MOST, 4)), whole[: 4 * (MOST + sensors)].reshape(-1, 4)
-        out: Any = root_form.Outputs(
-            attitude=np.empty((1, 4)),
-            x=np.empty((1, size - 3)),
+        out: Any = structure.Outputs(
+            x=np.empty((1, size + 1)),
             variance=np.empty((1, size)),
             covariance=np.empty((0, size, size)),
             whole_variance=np.empty((0, 6)),
@@ -164,11 +163,11 @@ class LiveFilter:
             segments=np.empty((0, 0)),
         )
         self._given: Any = self._body
-        dispatcher = compiled(walk, root_form)
+        dispatcher = compiled(walk, kernels)
         if self._judged:
             out = gate.Outputs(form=out, weight=self._weight, recoveries=self._recoveries, lock_outs=self._lock_outs)
-            self._given = judge.body(self._body, forward.restart_in_factor(judge))
-            dispatcher = compiled(walk, gate, root_form)
+            self._given = judge.body(self._body)
+            dispatcher = compiled(walk, gate, kernels)
         self._out = out
         self._arguments = functools.cache(self._new_arguments)
         # The dispatcher's type inference for sixty arrays takes longer than the update itself.
@@ -356,23 +355,22 @@ class LiveFilter:
     @property
     def attitude(self) -> Array:
         """Attitude q_fb (4,), scalar first."""
-        return np.array(self._body.attitude[0])
+        return np.array(self._body.x[0, :4])
 
     @property
     def bias(self) -> Array:
         """Gyro bias (3,), rad/s, body axes."""
-        return np.array(self._body.x[0, :3])
+        return np.array(self._body.x[0, 4:7])
 
     @property
     def values(self) -> Array:
         """Error states (m,), in the order of their declarations."""
-        return forward.outside(self._body, self._problem.model, 0)[2]
+        return np.array(self._body.x[0, 7:])
 
     @property
     def covariance(self) -> Array:
         """P (6 + m, 6 + m) of the errors (δθ, δb, δc)."""
-        root = forward.outside(self._body, self._problem.model, 0)[3]
-        return np.asarray(root.T @ root)
+        return forward.covariance_at(self._body, 0)
 
     @property
     def events(self) -> tuple[Event, ...]:
@@ -415,8 +413,8 @@ class LiveFilter:
             Attitude, bias, error states and covariance at ``time``, and the gate's state.
         """
         model, memory = self._problem.model, self._judge.memory
-        candidate = forward.candidate_in_factor(self._body, model) if memory[gate_rules.CANDIDATE] else None
-        return copy.deepcopy(forward.end_in_factor(self._body, model, self._judge.remembered(candidate), {}))
+        candidate = forward.candidate_of(self._body, model) if memory[gate_rules.CANDIDATE] else None
+        return copy.deepcopy(forward.state_of(self._body, model, self._judge.remembered(candidate), {}))
 
     def __reduce__(self) -> Any:
         """Raise an error: a copy would share the arrays of the compiled kernel."""

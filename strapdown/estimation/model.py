@@ -1,24 +1,19 @@
-"""Error states as the kernels' arrays, and the states in both orders.
-
-The external order is attitude, bias, then the error states in the order of their declarations. In the kernels the states that change come
-before the constant ones, which then cost the prediction almost nothing (:mod:`strapdown.kernels.triangle`).
-"""
+"""Declarations of error states as the structure and the numbers of the compiled filter."""
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
+from strapdown import quaternion
 from strapdown.checks import Array, InputError, array, one_of
 from strapdown.estimation.error_states import Effect, ErrorStates, check, spans
-from strapdown.estimation.states import Candidate, State, check_arguments
-from strapdown.kernels import error_state_step
+from strapdown.estimation.states import State, check_arguments
 from strapdown.kernels.chains import CHAIN, chain_start
-from strapdown.kernels.error_state_step import CARRIED, FIXED, FORCE, LEVER, OFFSET, SCALE
+from strapdown.kernels.measurement import KIND_CODES
+from strapdown.kernels.structure import GyroState, Sensor, SensorState, Structure
 
 MAX_DECAY = 0.5
 """Maximum λ dt of one step, for a well conditioned backward step; 0.1 for states that enter the gyro, where Gauss's rule is exact."""
@@ -61,161 +56,180 @@ def begin(initial: State, blocks: tuple[ErrorStates, ...]) -> State:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Model:
-    """Declarations of error states as arrays, in the kernels' order."""
+    """Declarations of error states in the form of the kernels: their structure, and its numbers."""
 
-    order: np.ndarray
-    """External index of each of the kernels' error states (m,)."""
+    structure: Structure
+    numbers: Array
+    """Values of the entries of the structure that are neither 0 nor 1."""
+    shape: np.ndarray
+    """Index in the sensors of the structure of each sensor."""
     decay: Array
-    density: Array
+    """λ of each state (m,), 1/s."""
     chains: Array
-    """Coupling of each state to the next, PSD that drives a chain (then not in ``density``), and for x components of vectors that are
-    carried the number of states to the next component (m, 3); no rows if there are neither chains nor carried states."""
-    changing: int
-    """Number of leading states that decay, are driven, belong to a chain or are carried."""
+    """Coupling of each state to the next, and PSD of its driving noise (m, 2)."""
+    last: np.ndarray
+    """Last error state of the chain of each set of coefficients."""
     limit: float
     """Longest step, s."""
-    gyro: Array
-    gyro_use: np.ndarray
-    sensors: Array
-    sensor_use: np.ndarray
+    offsets: Array
+    """Effect of each state on the gyro as an offset (m, 3)."""
     force_f: Array
     """Specific force for the gyro's sensitivity to it (3,), m/s²; zero: not used."""
+    levers: np.ndarray
+    """Which sensors have a lever arm among the states (sensors,), bool."""
     varying: frozenset[str] = frozenset()
     """Sensors with effects that are constant in the sensor's own unit."""
 
     @property
-    def levers(self) -> np.ndarray:
-        """Which sensors have a lever arm among the states (sensors,), bool."""
-        return np.asarray((self.sensor_use & LEVER > 0).any(axis=1))
-
-    @property
     def states(self) -> int:
         """Number of error states."""
-        return len(self.order)
+        return len(self.decay)
 
-    @property
-    def loose(self) -> int:
-        """Number of leading rows of the factor that a correction leaves non-triangular (:func:`strapdown.kernels.root_form.loose`)."""
-        return 6 + self.changing if len(self.chains) else 3
-
-    @property
-    def noise_rows(self) -> int:
-        """Number of rows of process noise of a step."""
-        chained = sum(int(k - chain_start(self.chains, k) + 1) for k in np.flatnonzero(self.chains[:, 1]))
-        return 6 + int(np.sum(self.density > 0.0)) + chained
-
-    @property
-    def whole_order(self) -> np.ndarray:
-        """External index of each of the kernels' states (6 + m,)."""
-        return np.concatenate([np.arange(6), 6 + self.order])
+    def turning_matrix(self, before: Array, after: Array) -> Array:
+        """Return the matrix (n, n) by which a correction of the attitude from one q_fb to another transforms the other states."""
+        T = np.eye(self.structure.n)
+        for v in self.structure.vectors:
+            turn = quaternion.multiply(after, quaternion.conjugate(before))
+            T[np.ix_(v, v)] = quaternion.to_matrix(turn)
+        return T
 
 
 def _stack(blocks: Sequence[ErrorStates], name: str, shape: tuple[int, ...]) -> Array:
-    return np.concatenate([array(f"{one.name}: {name}", getattr(one, name), (one.size, *shape)) for one in blocks])
+    parts = [array(f"{one.name}: {name}", getattr(one, name), (one.size, *shape)) for one in blocks]
+    return np.concatenate([np.empty((0, *shape)), *parts])
 
 
-def assemble(blocks: tuple[ErrorStates, ...], kinds: Mapping[str, str]) -> Model:
-    """Return the model of error states for the named sensors of the given kinds."""
-    if not blocks:
-        return _empty(len(kinds))
+class _Numbers:
+    """Entries of a structure, and the array of the numbers to which they refer."""
+
+    def __init__(self) -> None:
+        self.values: list[float] = []
+
+    def entries(self, numbers: Array) -> tuple[int | tuple[int], ...]:
+        """Return the entry of each number."""
+        return tuple(self._entry(float(x)) for x in np.ravel(numbers))
+
+    def _entry(self, x: float) -> int | tuple[int]:
+        if x in (0.0, 1.0):
+            return int(x)
+        if x not in self.values:
+            self.values.append(x)
+        return (self.values.index(x),)
+
+
+def assemble(blocks: tuple[ErrorStates, ...], kinds: Mapping[str, str], *, isotropic: bool = True) -> Model:
+    """Return the model of error states for the named sensors of the given kinds.
+
+    ``isotropic``: whether one σ gives the noise of each sensor, or three variances that of an attitude.
+    """
     decay, density = _stack(blocks, "decay", ()), _stack(blocks, "density", ())
     for name, values in (("decay", decay), ("density", density)):
         if np.any(values < 0.0):
             raise InputError(f"{name} of error state {int(np.argmax(values < 0.0))} is negative; give zero or more")
-    scales, forces = (_stack(blocks, name, (3, 3)).reshape(-1, 9) for name in ("gyro_scale", "gyro_force"))
-    gyro = np.concatenate([_stack(blocks, "gyro_offset", (3,)), scales + forces], axis=1)
-    force_f = _force(blocks, np.any(scales != 0.0, axis=1) & np.any(forces != 0.0, axis=1))
-    seen = _on_sensors(blocks, kinds, len(decay))
+    offsets = _stack(blocks, "gyro_offset", (3,))
+    scales, forces = _stack(blocks, "gyro_scale", (3, 3)), _stack(blocks, "gyro_force", (3, 3))
+    force_f = _force(blocks, np.any(scales != 0.0, axis=(1, 2)) & np.any(forces != 0.0, axis=(1, 2)))
     feed = _feeds(blocks)
-    fed = np.append(False, feed != 0.0)[: len(feed)]
-    linked = (feed != 0.0) | fed
-    moves = (decay > 0.0) | (density > 0.0) | linked | seen.bound
-    order = np.argsort(~moves, kind="stable")
-    gyro_use = _uses(gyro[:, :3], scales) + FORCE * np.any(forces != 0.0, axis=1)
-    if np.any(linked & (gyro_use != 0)):
+    linked = (feed != 0.0) | np.append(False, feed != 0.0)[: len(feed)]
+    entering = np.any(offsets != 0.0, axis=1)
+    of_the_gyro = entering | np.any(scales != 0.0, axis=(1, 2)) | np.any(forces != 0.0, axis=(1, 2))
+    if np.any(linked & of_the_gyro):
         raise InputError(
-            f"error state {int(np.argmax(linked & (gyro_use != 0)))} belongs to a chain and enters the gyro; give it a feed of 0, or no "
+            f"error state {int(np.argmax(linked & of_the_gyro))} belongs to a chain and enters the gyro; give it a feed of 0, or no "
             "effect on the gyro"
         )
-    chains = np.stack([feed, np.where(fed, density, 0.0), seen.stride], axis=1)
-    quickened = np.where(gyro_use & OFFSET, 5.0, 1.0)
-    fastest = float(np.max(decay * quickened, initial=0.0))
+    numbers = _Numbers()
+    chains, last, sets = _chains(decay, density, feed)
+    gyro = tuple(
+        GyroState(
+            state=6 + k,
+            offset=numbers.entries(offsets[k]),
+            decay=sets.get(k, -1) if entering[k] else -1,
+            scale=numbers.entries(scales[k]),
+            force=numbers.entries(forces[k]),
+        )
+        for k in np.flatnonzero(of_the_gyro).tolist()
+    )
+    sensors, vectors, varying = _on_sensors(blocks, kinds, numbers, isotropic=isotropic)
+    shapes = tuple(dict.fromkeys(sensors))
+    fastest = float(np.max(decay * np.where(entering, 5.0, 1.0), initial=0.0))
     return Model(
-        order=order,
-        decay=decay[order],
-        density=np.where(fed, 0.0, density)[order],
-        chains=chains[order] if np.any(linked | seen.bound) else np.empty((0, 3)),
-        changing=int(np.sum(moves)),
+        structure=Structure(6 + len(decay), gyro, chains, vectors, shapes),
+        numbers=np.array(numbers.values or [0.0]),
+        shape=np.array([shapes.index(sensor) for sensor in sensors], np.int64),
+        decay=decay,
+        chains=np.stack([feed, density], axis=1),
+        last=last,
         limit=MAX_DECAY / fastest if fastest > 0.0 else np.inf,
-        gyro=np.ascontiguousarray(gyro[order]),
-        gyro_use=gyro_use[order],
-        sensors=np.ascontiguousarray(seen.sensors[:, order]),
-        sensor_use=np.ascontiguousarray(seen.use[:, order]),
+        offsets=offsets,
         force_f=force_f,
-        varying=seen.varying,
+        levers=np.array([any(state.lever for state in sensor.states) for sensor in sensors], bool),
+        varying=varying,
     )
 
 
-class _Seen(NamedTuple):
-    """Effects of the states on the sensors and their use as in :class:`Model`, in the external order."""
+def _chains(
+    decay: Array, density: Array, feed: Array
+) -> tuple[tuple[tuple[tuple[int, ...], int], ...], np.ndarray, dict[int, int]]:
+    """Return chains and their sets of coefficients, the last state of each set, and the set of each single state.
 
-    sensors: Array
-    use: np.ndarray
-    stride: Array
-    """The last column of a model's chains."""
-    bound: np.ndarray
-    """Which states are carried (m,), bool."""
-    varying: frozenset[str]
+    Chains with the same numbers share a set.
+    """
+    chains: list[tuple[tuple[int, ...], int]] = []
+    last: list[int] = []
+    sets: dict[tuple[tuple[float, ...], ...], int] = {}
+    single: dict[int, int] = {}
+    k = 0
+    while k < len(decay):
+        end = k
+        while feed[end] != 0.0:
+            end += 1
+        if end > k or decay[k] > 0.0 or density[k] > 0.0:
+            key = tuple(zip(*(values[k : end + 1].tolist() for values in (decay, density, feed)), strict=True))
+            if key not in sets:
+                sets[key] = len(last)
+                last.append(end)
+            chains.append((tuple(range(6 + k, 7 + end)), sets[key]))
+            if end == k:
+                single[k] = sets[key]
+        k = end + 1
+    return tuple(chains), np.array(last, np.int64), single
 
 
-def _on_sensors(blocks: Sequence[ErrorStates], kinds: Mapping[str, str], states: int) -> _Seen:
-    sensors = np.zeros((len(kinds), states, 15))
-    carried, levered = np.zeros((2, len(kinds), states), bool)
-    stride, bound = np.zeros(states), np.zeros(states, bool)
+def _on_sensors(
+    blocks: Sequence[ErrorStates], kinds: Mapping[str, str], numbers: _Numbers, *, isotropic: bool
+) -> tuple[list[Sensor], tuple[tuple[int, int, int], ...], frozenset[str]]:
+    """Return each sensor with the states that enter it, the vectors of carried states, and the sensors whose effects vary."""
+    states: dict[str, list[SensorState]] = {name: [] for name in kinds}
+    vectors: dict[tuple[int, int, int], None] = {}
     varying = set()
-    names = list(kinds)
     for block, own in spans(blocks):
         for sensor, effect in block.effects.items():
-            one_of(f"{block.name}: sensor", sensor, names)
+            one_of(f"{block.name}: sensor", sensor, list(kinds))
             if kinds[sensor] == "attitude" and (effect.offset_f is not None or effect.scale is not None):
                 raise InputError(
                     f"{block.name}: {sensor} gives whole attitudes, for which only an offset_b can be estimated; "
                     "use VectorBias for its mounting"
                 )
             _check_lever(block, sensor, kinds[sensor], effect)
-            place = names.index(sensor), own
-            sensors[place] = _numbers(block, effect)
-            carried[place] = effect.carried
-            if effect.carried and effect.offset_f is not None:
+            carried = effect.carried and effect.offset_f is not None
+            if carried:
                 _check_carried(block, effect)
-                stride[own.start : own.start + block.size // 3] = block.size // 3
-                bound[own] = True
-            levered[place] = effect.lever is not None
+                third = block.size // 3
+                for k in range(6 + own.start, 6 + own.start + third):
+                    vectors[(k, k + third, k + 2 * third)] = None
+            for k, row in enumerate(_numbers(block, effect)):
+                if np.any(row):
+                    offset, fixed, scale = (
+                        numbers.entries(row[part]) for part in (slice(3), slice(3, 6), slice(6, 15))
+                    )
+                    states[sensor].append(
+                        SensorState(6 + own.start + k, offset, effect.lever is not None, fixed, carried, scale)
+                    )
             if effect.varying and kinds[sensor] in ("direction", "heading"):
                 varying.add(sensor)
-    use = _uses(sensors[..., :3], sensors[..., 6:], sensors[..., 3:6])
-    use += (LEVER - OFFSET) * (levered & (use & OFFSET > 0))
-    use += CARRIED * (carried & (use & FIXED > 0))
-    return _Seen(sensors, use, stride, bound, frozenset(varying))
-
-
-@functools.cache
-def _empty(sensors: int) -> Model:
-    """Return the model of a filter without error states."""
-    none, unused = np.empty(0), np.empty(0, np.int64)
-    return Model(
-        order=unused,
-        decay=none,
-        density=none,
-        chains=np.empty((0, 3)),
-        changing=0,
-        limit=np.inf,
-        gyro=np.empty((0, 12)),
-        gyro_use=unused,
-        sensors=np.empty((sensors, 0, 15)),
-        sensor_use=np.empty((sensors, 0), np.int64),
-        force_f=np.zeros(3),
-    )
+    sensors = [Sensor(KIND_CODES[kind], isotropic, tuple(sorted(states[name]))) for name, kind in kinds.items()]
+    return sensors, tuple(sorted(vectors)), frozenset(varying)
 
 
 def _feeds(blocks: tuple[ErrorStates, ...]) -> Array:
@@ -283,45 +297,6 @@ def _numbers(block: ErrorStates, effect: Effect) -> Array:
             given = array(f"{block.name}: {name}", value, (block.size, *shape)).reshape(block.size, -1)
             rows[:, place : place + given.shape[1]] = given
     return rows
-
-
-def _uses(offset: Array, scale: Array, fixed: Array | None = None) -> np.ndarray:
-    bits = OFFSET * np.any(offset != 0.0, axis=-1) + SCALE * np.any(scale != 0.0, axis=-1)
-    if fixed is not None:
-        bits = bits + FIXED * np.any(fixed != 0.0, axis=-1)
-    return np.asarray(bits, np.int64)
-
-
-def lower_root(P: Array) -> Array:
-    """Return F, lower triangular, with ``P = Fᵀ F``."""
-    return np.ascontiguousarray(np.linalg.cholesky(P[::-1, ::-1])[::-1, ::-1].T)
-
-
-def triangle(state: State | Candidate, model: Model) -> Array:
-    """Return F, lower triangular, with ``P = Fᵀ F`` in the kernels' order."""
-    order = model.whole_order
-    if state.factor is None:
-        return lower_root(state.covariance[np.ix_(order, order)])
-    root = state.factor[:, order]
-    if np.array_equal(root[:, model.loose :], np.tril(root)[:, model.loose :]):  # unchanged, bit for bit
-        return np.ascontiguousarray(root)
-    return lower(root)
-
-
-def lower(root: Array) -> Array:
-    """Return the lower triangle F with the same ``Fᵀ F``."""
-    if np.array_equal(root, np.tril(root)):
-        return root
-    return np.ascontiguousarray(np.asarray(np.linalg.qr(root[:, ::-1], mode="r"))[::-1, ::-1])
-
-
-def turning_matrix(chains: Array, size: int, before: Array, after: Array) -> Array:
-    """Return the matrix (size, size) by which a correction of the attitude from one q_fb to another transforms the states."""
-    T = np.eye(size)
-    if len(chains):
-        # Rotate the columns of the rows of the identity: this gives Tᵀ row by row.
-        error_state_step.turn_columns(chains, error_state_step.fixed_turn(tuple(before), tuple(after)), T, size)
-    return T.T
 
 
 def aged_prior(

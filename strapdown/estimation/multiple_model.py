@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 
 from strapdown import estimation, quaternion, records, vectors
 from strapdown.checks import Array, InputError, array, count, fraction
-from strapdown.estimation.forward import after, gaps, gate_options, in_order
+from strapdown.estimation.forward import gaps, gate_options, in_order
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.schedule import Schedule, innovations_by_sensor, joined, schedule
 from strapdown.estimation.states import (
@@ -323,7 +323,7 @@ def _walked(
         room=np.empty(40),
     )
     rows, at, used = compiled(walk, hypotheses_kernel)(
-        edges, increments, after(events.measurements, first + 1), 1, body, out
+        edges, increments, _after(events.measurements, first + 1), 1, body, out
     )
     used += first + 1
     processed = np.zeros(len(events.time), bool)
@@ -338,6 +338,12 @@ def _walked(
         innovations=innovations_by_sensor(events, out.innovation, out.share if options.doubted else None, processed),
     )
     return _Walked(estimate, kept, angles, out.weights[:rows], weight, at, used)
+
+
+def _after(measurements: measurement.Measurements, first: int) -> measurement.Measurements:
+    """Return the measurements from number ``first`` on, in order of time."""
+    time, place, sensor = (getattr(measurements, name)[first:] for name in ("time", "place", "sensor"))
+    return measurements._replace(time=time, place=place, sensor=sensor)
 
 
 def _from_time(record: ImuRecord, time: float) -> tuple[Array, Array, int]:

@@ -14,15 +14,9 @@ from strapdown.checks import Array, InputError
 from strapdown.estimation.memory import side_by_side
 from strapdown.kernels import measurement
 from strapdown.kernels.machine import compiled, read_only
+from strapdown.kernels.measurement import KIND_CODES
 from strapdown.records import Estimate, Innovations
 from strapdown.vectors import KINDS, VectorMeasurements, triad
-
-KIND_CODES = {
-    "direction": measurement.DIRECTION,
-    "vector": measurement.VECTOR,
-    "heading": measurement.HEADING,
-    "attitude": measurement.ATTITUDE,
-}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -2,8 +2,8 @@
 
 A Rauch–Tung–Striebel smoother on the manifold (Rauch, Tung & Striebel 1965; Särkkä 2013, section 8.2) over the stored states of the
 filter. Each correction of the attitude moves the filter's tangent space and its covariance; the backward pass carries covariances from
-one tangent space to the next by the Jacobians of the rotation vector (:mod:`strapdown.kernels.smoother_step`, with the triangular factor
-:mod:`strapdown.kernels.root_smoother`). To first order in the errors this is the least-squares estimate over the whole record.
+one tangent space to the next by the Jacobians of the rotation vector (:mod:`strapdown.kernels.smoother`, for six states
+:mod:`strapdown.kernels.smoother_loop`). To first order in the errors this is the least-squares estimate over the whole record.
 
 After a recovery of a gate, the states before and after are two trajectories (:mod:`strapdown.estimation.recovery_segments`), smoothed
 separately:
@@ -18,7 +18,6 @@ No information crosses a recovery, not even about the bias, for which the candid
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -29,17 +28,26 @@ from strapdown.checks import Array, InputError, count
 from strapdown.estimation import forward, recovery_segments
 from strapdown.estimation import model as modelling
 from strapdown.estimation.error_states import ErrorStates
-from strapdown.estimation.forward import LostDigitsError, Options, Problem
+from strapdown.estimation.forward import Options, Problem
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.memory import side_by_side
 from strapdown.estimation.recovery_segments import Break, Rerun
-from strapdown.estimation.states import GateMemory, ProcessNoise, State, check_arguments, covariance_matrices
-from strapdown.kernels import root_smoother, smoother_loop
+from strapdown.estimation.states import (
+    GateMemory,
+    ProcessNoise,
+    State,
+    check_arguments,
+    covariance_blocks,
+    covariance_matrices,
+)
+from strapdown.kernels import smoother, smoother_loop, structure
+from strapdown.kernels.lane_values import WIDTH
 from strapdown.kernels.machine import compiled
 from strapdown.records import Estimate, Event, ImuRecord
 
-MIN_SMOOTHED = {"blocks": 1e-9, "factor": 1e-25}
-"""Minimum smoothed variance, relative to what one interval adds, at which backward passes in either form keep enough digits."""
+MIN_SMOOTHED = 1e-11
+"""Minimum smoothed variance, relative to what one interval adds, at which backward passes keep enough digits."""
+UPPER = np.triu_indices(6)
 
 
 def smooth(
@@ -82,8 +90,7 @@ def smooth(
     Notes
     -----
     Memory for the filter's states: 256 bytes per gyro interval and per measurement; with error states 8 (n (n + 1)/2 + n + 5), for n states
-    in total. A record without error states whose covariance would lose its digits is smoothed with its triangular factor, a dozen times
-    as slow.
+    in total.
     """
     problem = forward.prepared(record, process_noise, initial, error_states)
     options = Options(
@@ -93,14 +100,9 @@ def smooth(
         gate=gate,
         robust=robust,
     )
-    if not problem.model.states:
-        with contextlib.suppress(LostDigitsError):
-            estimate = _Smoother(problem, options, _BlockForm(problem)).smoothed()
-            if _digits_lost(problem, estimate, MIN_SMOOTHED["blocks"]) is None:
-                return estimate
-        options = replace(options, factor=True)
-    estimate = _Smoother(problem, options, _FactorForm(problem)).smoothed()
-    lost = _digits_lost(problem, estimate, MIN_SMOOTHED["factor"])
+    form = _ManyStates(problem) if problem.model.states else _SixStates(problem)
+    estimate = _Smoother(problem, options, form).smoothed()
+    lost = _digits_lost(problem, estimate, MIN_SMOOTHED)
     if lost is not None:
         raise InputError(
             f"the smoothed variances at {record.time[lost]:g} s have no digits left: the sigmas of the start and the process noise of an "
@@ -152,8 +154,7 @@ def relinearized_start(
     for _ in range(count("passes", passes)):
         whole = smooth(record, process_noise, state, problem.error_states)
         # The prior moves to the new tangent space: exp(a + ε) = exp(a) ⊗ exp(J_r(a) ε).
-        back = np.argsort(model.whole_order)
-        carry = modelling.turning_matrix(model.chains, len(back), state.attitude, whole.attitude[0])[np.ix_(back, back)]
+        carry = model.turning_matrix(state.attitude, whole.attitude[0])
         a = quaternion.log(quaternion.multiply(quaternion.conjugate(state.attitude), whole.attitude[0]))
         carry[:3, :3] = kinematics.right_jacobian(a)
         state = State(
@@ -172,7 +173,7 @@ class _Smoother:
 
     problem: Problem
     options: Options
-    form: _BlockForm | _FactorForm
+    form: _SixStates | _ManyStates
 
     def smoothed(self) -> Estimate:
         """Return the estimate at every edge."""
@@ -266,8 +267,8 @@ class _Smoother:
 
 
 @dataclass(frozen=True, eq=False)
-class _BlockForm:
-    """Backward passes over states with the covariance in blocks."""
+class _SixStates:
+    """Backward passes over attitude and bias."""
 
     problem: Problem
 
@@ -292,6 +293,9 @@ class _BlockForm:
 
         ``starts``: index of the segment that starts at each stop.
         """
+        if segments.shape[1] > 32:  # of a filter with a gate: the triangle of P by rows, not its blocks
+            order = covariance_blocks(_places())
+            segments = np.concatenate([segments[:, :11], segments[:, 11 + order]], axis=1)
         if len(segments) < smoother_loop.FEWEST_ROWS:
             short = smoother_loop.FEWEST_ROWS - len(segments)
             segments = np.concatenate([segments, np.tile(segments[-1], (short, 1))])
@@ -305,36 +309,56 @@ class _BlockForm:
         )
 
 
+def _places() -> np.ndarray:
+    """Return the place of each element of P (6, 6) in its upper triangle by rows."""
+    places = np.zeros((6, 6), np.intp)
+    places[UPPER] = np.arange(21)
+    return np.maximum(places, places.T)
+
+
 @dataclass(frozen=True, eq=False)
-class _FactorForm:
-    """Backward passes over states with the covariance as its triangular factor."""
+class _ManyStates:
+    """Backward passes over attitude, bias and error states."""
 
     problem: Problem
 
     def outputs(self, edges: int, options: Options) -> list[Array]:
         """Return arrays for the smoothed states."""
-        size = 6 + self.problem.model.states
-        kept = size if options.error_state_covariance else 6
+        n = self.problem.model.structure.n
+        kept = n if options.error_state_covariance else 6
         whole = (edges if options.full_covariance else 0, kept, kept)
-        shapes = (edges, 4), (edges, size - 3), (edges, size), whole
+        shapes = (edges, n + 1), (edges, n), whole
         return side_by_side(*((shape, float) for shape in shapes))
 
     def estimate(self, outputs: Sequence[Array], options: Options) -> Estimate:
         """Return the smoothed states as an estimate."""
-        attitude, x, variance, P = outputs
-        return forward.factor_estimate(self.problem, 1, attitude, x, variance, P if options.full_covariance else None)
+        x, variance, P = outputs
+        return forward.estimate_of(self.problem, 1, x, variance, P if options.full_covariance else None)
 
     def go_back(self, segments: Array, starts: np.ndarray, first: int, outputs: Sequence[Array]) -> None:
         """Smooth from the filtered state at the last stop back to stop ``first``, and write all rows between.
 
         ``starts``: index of the segment that starts at each stop.
         """
-        model = self.problem.model
-        compiled(root_smoother.smooth_augmented)(
-            segments,
-            starts,
-            first,
-            forward.model_arrays(model, self.problem.variances),
-            root_smoother.workspace(model.states, model.noise_rows, len(model.chains)),
-            root_smoother.Outputs(*outputs),
+        kernels = forward.instance_of(self.problem.model)
+        model = forward.kernel_model(self.problem.model, self.problem.variances)
+        n = kernels.N
+        states, matrices = np.zeros((4, n + 1)), np.zeros((4, n * kernels.W + WIDTH))
+        noisy = np.array(kernels.NOISY, np.int64)
+        others = (
+            np.zeros(n * kernels.NOISY_WIDTH),
+            np.zeros(3 * kernels.W),
+            np.zeros(2 * n),
+            np.zeros(kernels.SET * max(len(model.last), 1)),
         )
+        space = smoother.Workspace._make((*states, *matrices, *others, noisy, len(noisy)))
+        models = smoother.Models(model, *(_with_noise_times(factor, model) for factor in (-1.0, 0.0)))
+        compiled(smoother.smooth_back, kernels)(segments, starts, first, models, space, smoother.Outputs(*outputs))
+
+
+def _with_noise_times(factor: float, model: structure.Model) -> structure.Model:
+    """Return a model with its process noise times a factor."""
+    chains = model.chains * [1.0, factor]
+    return model._replace(
+        angle_variance=factor * model.angle_variance, rate_variance=factor * model.rate_variance, chains=chains
+    )

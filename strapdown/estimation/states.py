@@ -69,8 +69,6 @@ class Candidate:
     """Gyro bias and error states (n − 3,)."""
     covariance: Array
     """P (n, n)."""
-    factor: Array | None = None
-    """R with ``P = Rᵀ R``, if the filter carries it."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -106,8 +104,6 @@ class State:
         P of the errors (δθ, δb, δc), with δθ in the body frame: rad², rad²/s, (rad/s)², …
     values : ndarray (m,), default empty
         Error states c, in the order of their declarations.
-    factor : ndarray (6 + m, 6 + m), optional
-        A root R of P, ``P = Rᵀ R``, if the filter has one; it may keep digits that are lost in P itself.
     gate : GateMemory, optional
         State of a gate at the end of a part of a record.
     unit_sigma : mapping of str to float, default empty
@@ -119,7 +115,6 @@ class State:
     bias: Array
     covariance: Array
     values: Array = field(default_factory=lambda: np.empty(0))
-    factor: Array | None = None
     gate: GateMemory | None = None
     unit_sigma: Mapping[str, float] = field(default_factory=dict)
 
@@ -132,13 +127,7 @@ class State:
         units = {name: positive(f"unit_sigma[{name!r}]", sigma) for name, sigma in self.unit_sigma.items()}
         object.__setattr__(self, "unit_sigma", units)
         size = 6 + len(values)
-        if self.factor is None:
-            object.__setattr__(self, "covariance", covariance("covariance", self.covariance, size))
-            return
-        root, P = array("factor", self.factor, (size, size)), array("covariance", self.covariance, (size, size))
-        sigma = np.linalg.norm(root, axis=0)
-        if not np.all(sigma > 0.0) or np.any(np.abs(root.T @ root - P) > 1e-9 * np.outer(sigma, sigma)):
-            raise InputError("factor is no root of covariance; leave it out")
+        object.__setattr__(self, "covariance", covariance("covariance", self.covariance, size))
 
 
 def initial_state(

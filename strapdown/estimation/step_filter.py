@@ -29,19 +29,15 @@ from strapdown.checks import (
 )
 from strapdown.estimation import model as modelling
 from strapdown.estimation.error_states import ErrorStates
-from strapdown.estimation.forward import model_arrays
-from strapdown.estimation.schedule import KIND_CODES
+from strapdown.estimation.forward import kernel_model
 from strapdown.estimation.states import ProcessNoise, State, check_arguments
 from strapdown.estimation.temperature import need_none
-from strapdown.kernels import chains, error_state_step, sensor_rows
+from strapdown.kernels import filter, machine, structure
 from strapdown.kernels.measurement import has_heading
 from strapdown.kernels.rotation import rotation_matrix
 from strapdown.kernels.walk import step_within, turn_squared
 from strapdown.records import LARGEST_TURN
 from strapdown.vectors import need_level, need_unit, triad
-
-NO_LEVER = (0.0,) * 9
-"""Matrix by which a lever arm enters a measurement, if there is none."""
 
 
 class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
@@ -112,7 +108,7 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         self._vertical: dict[str, int] = {}
         self._kinds: dict[str, str] = {}
         self._motion = self._model("", "vector")
-        self._sensor_models: dict[str, modelling.Model] = {}
+        self._sensor_models: dict[tuple[str, str], modelling.Model] = {}
 
     def _sensors_of_states(self, names: tuple[str, ...]) -> tuple[str, ...]:
         """Return the only sensors accepted in updates; empty: any. Error states of other sensors are refused."""
@@ -125,23 +121,13 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         """Return the error states as arrays, in the order of their declarations, with their effects on one sensor only."""
         need_none(self.error_states, "this filter")
         kinds = {name: "vector" for block in self.error_states for name in block.effects} | {sensor: kind}
-        model = modelling.assemble(self.error_states, kinds)
+        model = modelling.assemble(self.error_states, kinds, isotropic=False)
         if model.levers.any() or model.varying:
             raise InputError(
                 "lever arms, and effects relative to a varying field magnitude, need the whole record; use estimation.run for them"
             )
-        back, here = np.argsort(model.order), [list(kinds).index(sensor)]
-        return replace(
-            model,
-            order=np.arange(len(back)),
-            decay=model.decay[back],
-            density=model.density[back],
-            chains=model.chains[back] if len(model.chains) else model.chains,
-            gyro=model.gyro[back],
-            gyro_use=model.gyro_use[back],
-            sensors=model.sensors[here][:, back],
-            sensor_use=model.sensor_use[here][:, back],
-        )
+        here = model.structure.sensors[model.shape[list(kinds).index(sensor)]]
+        return replace(model, structure=model.structure._replace(sensors=(here,)))
 
     @property
     def skipped(self) -> dict[str, int]:
@@ -212,24 +198,25 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
 
     def _sub_step(self, part: Array, dt: float) -> None:
         """Propagate over an increment at constant rate, with the kernels' functions."""
-        white = self.process_noise.angle_random_walk**2, self.process_noise.rate_random_walk**2
-        model, m, n = model_arrays(self._motion, white), len(self.values), len(self.x)
-        q, phi, x = tuple(self.attitude.tolist()), tuple(part.tolist()), np.concatenate([self.bias, self.values])
-        top, factor = np.zeros((n, 4)), np.empty(m)
-        attitude, _, rate, D = error_state_step.move(q, x, dt, phi, model, top, factor)
-        # Rows 0 to n become Φᵀ, the rows after them N with Q = Nᵀ N.
-        rows = np.zeros((n + self._motion.noise_rows, n))
-        rows[:n] = np.eye(n)
-        error_state_step.carry(rows, n, 0, top, factor, m)
-        noise = np.zeros((n, 4))
-        error_state_step.step_noise(noise, dt, rate, D, model)
-        row = error_state_step.fill_noise(rows, n, noise, n)
-        links = np.empty((len(model.chains), chains.LINKS))
-        chains.step_chains(rows, n, row, x, dt, model.decay, model.chains, links)
-        self.F, self.Q = rows[:n].T.copy(), rows[n:].T @ rows[n:]
+        kernels, model = machine.instance(filter, STRUCTURE=self._motion.structure), self._numbers()
+        x, phi, n = np.concatenate([self.attitude, self.bias, self.values]), tuple(part.tolist()), len(self.x)
+        coefficients = np.zeros(kernels.SET * max(len(model.last), 1))
+        kernels.fill_coefficients(coefficients, dt, model)
+        top, Q = np.zeros((3, kernels.W)), np.zeros((n, kernels.W))
+        kernels.write_transition(x, phi, dt, model, coefficients, top.reshape(-1), 0.0)
+        kernels.advance(x, Q.reshape(-1), phi, dt, model, coefficients, 0.0)
+        self.F, self.Q = np.eye(n), Q[:, :n]
+        self.F[:3] = top[:, :n]
+        for states, g in kernels.STRUCTURE.chains:
+            self.F[np.ix_(states, states)] = kernels.chain_matrix(coefficients, g, len(states))
         super().predict()
-        self.values = x[3:]
-        self.attitude = quaternion.normalize(np.array(attitude))
+        self.values = x[7:]
+        self.attitude = quaternion.normalize(x[:4])
+
+    def _numbers(self) -> structure.Model:
+        """Return the numbers of the model as the kernels' arguments."""
+        variances = self.process_noise.angle_random_walk**2, self.process_noise.rate_random_walk**2
+        return kernel_model(self._motion, variances)
 
     # ---------------------------------------------------------------------------------------------------------------- updates
 
@@ -436,34 +423,30 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         before = self.attitude
         self.attitude = quaternion.normalize(quaternion.multiply(before, quaternion.exp(correction[:3])))
         self.bias, self.values = self.bias + correction[3:6], self.values + correction[6:]
-        if len(self._motion.chains):
-            T = modelling.turning_matrix(self._motion.chains, len(P), before, self.attitude)
-            self.values, P = T[6:, 6:] @ self.values, T @ P @ T.T
+        T = self._motion.turning_matrix(before, self.attitude)
+        self.values, P = T[6:, 6:] @ self.values, T @ P @ T.T
         self.P = P
         self.P_post = P.copy()
 
     def _sensor_model(self, sensor: str, kind: str) -> modelling.Model:
-        if not self.error_states:
-            return self._motion
-        if sensor not in self._sensor_models:
-            self._sensor_models[sensor] = self._model(sensor, kind)
-        return self._sensor_models[sensor]
+        key = (sensor if self.error_states else "", kind)
+        if key not in self._sensor_models:
+            self._sensor_models[key] = self._model(*key)
+        return self._sensor_models[key]
 
     def _rows(self, measurement: _Measurement, sensor: str) -> tuple[Array, Array, Array]:
         """Return residual (d,), H (d, n) and noise (d, d) of a measurement, from the kernels' function."""
-        model, others = self._sensor_model(sensor, measurement.kind), np.concatenate([self.bias, self.values])
-        H = np.zeros((3, len(self.x)))
-        value = measurement.frame[:4] if measurement.kind == "attitude" else (*measurement.z, 0.0)
-        given = KIND_CODES[measurement.kind], value, measurement.frame, measurement.length
-        effects = 0, model.sensors, model.sensor_use, NO_LEVER
-        d, y, axes, _ = sensor_rows.fill_rows(tuple(self.attitude.tolist()), others, H, *given, *effects, 0.0)
+        model, x = self._sensor_model(sensor, measurement.kind), np.concatenate([self.attitude, self.bias, self.values])
+        kernels = machine.instance(filter, STRUCTURE=model.structure)
+        measured = structure.Measured(measurement.z, measurement.frame, (), measurement.length, (0.0,) * 9)
+        rows, y, axes, _, _ = kernels.rows_and_axes(0, x, measured, model.numbers, 0.0)
         T = np.array(axes)
-        return np.array(y[:d]), H[:d], (T @ measurement.noise @ T.T)[:d, :d]
+        return np.array(y), np.array(rows, np.float64), (T @ measurement.noise @ T.T)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Measurement:
-    """A measurement as the arguments of :func:`strapdown.kernels.sensor_rows.fill_rows`."""
+    """A measurement as the arguments of :func:`strapdown.kernels.filter.rows_and_axes`."""
 
     kind: str
     z: tuple[float, ...]

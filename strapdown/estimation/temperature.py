@@ -10,7 +10,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -67,19 +66,18 @@ def shifted(state: State, own: slice, change: float) -> State:
     J = np.eye(6 + len(state.values))
     J[3:6, columns] = change * np.eye(3)
 
-    def turned(P: Array, root: Array | None) -> dict[str, Any]:
-        if root is None:
-            return {"covariance": J @ P @ J.T}
-        after = root @ J.T
-        return {"covariance": after.T @ after, "factor": after}
-
     memory = state.gate
     if memory is not None and memory.candidate is not None:
-        one = memory.candidate
-        others = J[3:, 3:] @ one.others
-        memory = replace(memory, candidate=replace(one, others=others, **turned(one.covariance, one.factor)))
+        candidate = memory.candidate
+        memory = replace(
+            memory,
+            candidate=replace(
+                candidate, others=J[3:, 3:] @ candidate.others, covariance=J @ candidate.covariance @ J.T
+            ),
+        )
     bias = state.bias + change * state.values[own]
-    return replace(state, bias=bias, gate=memory, **turned(state.covariance, state.factor))
+    P = J @ state.covariance @ J.T
+    return replace(state, bias=bias, gate=memory, covariance=0.5 * (P + P.T))
 
 
 def at_mean(record: ImuRecord, mean: float, slope: Array) -> tuple[ImuRecord, Array]:

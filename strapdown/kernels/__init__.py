@@ -1,7 +1,12 @@
 """Kernels: plain scalar Python, one mathematical operation per function, on scalars and tuples of scalars.
 
-They do not check their input; the public modules do. No module here imports numba: :mod:`strapdown.kernels.machine` compiles a kernel when
-it is first needed. The same source runs as plain Python (in tests), as a compiled loop over one record, and on the lanes of SIMD vectors,
-one record per lane. For that a kernel has no branches that depend on the data, calls no ``math`` function that the lanes lack (``sqrt`` is
-:func:`strapdown.kernels.algebra.square_root`), and creates no arrays.
+They do not check their input; the public modules do. :mod:`strapdown.kernels.machine` compiles a kernel when it is first needed. Of the
+modules here only those that compile import numba: ``machine``, ``cache``, ``compiler``, ``tracing``, ``packed`` and ``lanes``. The same
+source runs as plain Python (in tests and in the step-by-step filter), as a compiled loop over one record, and on the lanes of SIMD vectors,
+one record per lane. A function for lanes has no branches that depend on the data, calls no function of ``math`` that the lanes lack
+(``sqrt`` is :func:`strapdown.kernels.algebra.square_root`), and creates no arrays; others say that they are for scalars only.
+
+- One loop over a record, with the functions of a *body*: ``walk``.
+- Bodies: ``filter`` (N error states, gated by ``gate``; several runs by ``filter_lanes``), ``six_states``, ``likelihood``, ``hypotheses``.
+- A module whose sizes are known while compiling is a template: :func:`strapdown.kernels.machine.instance` makes a copy with its constants.
 """

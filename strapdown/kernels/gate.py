@@ -1,7 +1,6 @@
-"""A gate and robust weights around a filter: a body of :mod:`strapdown.kernels.walk` over either form of the covariance.
+"""A gate and robust weights around the filter of :mod:`strapdown.kernels.filter`: a body of :mod:`strapdown.kernels.walk`.
 
-The consequences of refusals are in :mod:`strapdown.kernels.gate_rules`. The form (:mod:`strapdown.kernels.covariance_form` or
-:mod:`strapdown.kernels.root_form`) defines the functions in ``OPEN``. Row 0 of its states is the filter, row 1 the restart candidate, if
+The consequences of refusals are in :mod:`strapdown.kernels.gate_rules`. Row 0 of the states is the filter, row 1 the restart candidate, if
 there is one; both are processed by the same code.
 """
 
@@ -13,14 +12,14 @@ from typing import NamedTuple
 import numpy as np
 
 from strapdown.kernels.algebra import add, factored, matrix_times_vector, scale, solved
-from strapdown.kernels.covariance_form import (
+from strapdown.kernels.filter import (
     attitude_covariance,
     attitude_of,
     become,
     bias_at,
     correct,
-    digits_left,
     innovation_covariance,
+    judge,
     keep_row,
     linearised,
     load,
@@ -69,13 +68,14 @@ from strapdown.kernels.measurement import (
     HEADING,
     KIND,
     degrees_of_freedom,
-    frame_of,
     has_heading,
-    noise_of,
     store_innovations,
     value_of,
 )
 from strapdown.kernels.rotation import moved, quaternion_multiply, rotation_matrix
+from strapdown.kernels.structure import MAX_PRECISION
+from strapdown.kernels.structure import Body as Filter
+from strapdown.kernels.structure import Outputs as FilterOutputs
 from strapdown.kernels.walk import step_within, turn_squared
 
 OPEN = (
@@ -85,7 +85,6 @@ OPEN = (
     "attitude_of",
     "bias_at",
     "step_limit",
-    "digits_left",
     "propagate",
     "store_prediction",
     "attitude_covariance",
@@ -99,12 +98,10 @@ OPEN = (
     "set_attitude",
     "start_candidate",
     "widen",
+    "judge",
     "keep_row",
 )
-"""Functions that a form defines; in this module those of :mod:`strapdown.kernels.covariance_form`."""
-
-LENIENT = 1e3
-"""Factor on the loss of digits of the covariance allowed for a candidate, which starts with a very large covariance."""
+"""Functions of the instance of the filter; in this module those of six states."""
 
 
 class Options(NamedTuple):
@@ -126,13 +123,25 @@ class Options(NamedTuple):
     """σ of the first candidate's attitude, rad."""
 
 
-class Body(NamedTuple):
-    """A filter in one form, with its gate."""
+class Restart(NamedTuple):
+    """Initial values of a restart candidate."""
 
-    form: NamedTuple
+    bias_variance: np.ndarray
+    """Increase of the variance of the bias (3,), (rad/s)²."""
+    values: np.ndarray
+    """Error states (m,) at ``time``."""
+    covariance: np.ndarray
+    """Their covariance (m, m)."""
+    time: float
+
+
+class Body(NamedTuple):
+    """A filter with its gate."""
+
+    form: Filter
     options: Options
-    restart: NamedTuple
-    """Initial values of a candidate of the form."""
+    restart: Restart
+    """Initial values of a candidate."""
     standing: np.ndarray
     """Counters of each sensor (sensors, ``STANDING``); at return, their final values."""
     memory: np.ndarray
@@ -142,7 +151,7 @@ class Body(NamedTuple):
 class Outputs(NamedTuple):
     """Outputs of a run in addition to those of the form."""
 
-    form: NamedTuple
+    form: FilterOutputs
     weight: np.ndarray
     """Weight of each measurement (events,), by place; 0: refused."""
     recoveries: np.ndarray
@@ -155,22 +164,13 @@ class Outputs(NamedTuple):
 
 
 def begin(body):
-    """Return the numbers of states, lock-outs, recoveries and segments, and whether digits are lost."""
+    """Return the numbers of states, lock-outs, recoveries and segments, and whether a measurement was too precise."""
     # From an array, and not literals: numba would compile the body for that type too.
     none = 0 * len(body.memory)
     running = none + 1
     if body.memory[CANDIDATE] > 0.0:
         running = none + 2
-    return running, none, none, none, lost_digits(running, body)
-
-
-def lost_digits(running, body):
-    """Return whether any covariance has lost its digits."""
-    lost = False
-    for i in range(running):
-        least = body.form.least_share if i == 0 else body.form.least_share / LENIENT
-        lost = lost or not digits_left(body.form, i) >= least
-    return lost
+    return running, none, none, none, running < 0
 
 
 def largest_turn(running, part, dt, body):
@@ -209,10 +209,12 @@ def update(state, e, now, measured, body, out):
     i = 0
     while i < running:
         passes = int(memory[PASSES]) if i == 0 else WIDE_PASSES
-        outcome, weight, innovation, variance, share = judged_update(form, i, e, measured, passes, options)
-        least_noise = 1.0 / form.sharpness if i == 0 else 1.0 / (form.sharpness * LENIENT)
-        lost = lost or (form.sharpness < math.inf and not share >= least_noise)
+        if passes == 1:
+            outcome, weight, innovation, variance, far = judge(form.shape[sensor], form, measured, e, options, 0.0)
+        else:
+            outcome, weight, innovation, variance, far = iterated_update(form, i, e, measured, passes, options)
         if i == 0:
+            lost = lost or far
             out.weight[place] = weight
             store_innovations(out.form.innovation, place, innovation, variance)
             lock_outs, start = judge_filter(
@@ -240,23 +242,20 @@ def update(state, e, now, measured, body, out):
 
 
 def keep(state, row, e, body, out):
-    """Write a row; every ``check`` rows, check that the covariances have enough digits."""
-    running, lock_outs, recoveries, segments, lost = state
+    """Write a row."""
     keep_row(body.form, load(body.form, 0), row, out.form)
-    if row % body.form.check == 0:
-        lost = lost or lost_digits(running, body)
-    return running, lock_outs, recoveries, segments, lost
+    return state
 
 
 def stopped(state):
-    """Return whether a covariance has lost its digits."""
+    """Return whether a measurement was too precise for double precision."""
     return state[4]
 
 
 def finish(state, row, e, body):
-    """Return the numbers of segments (−1: a covariance has lost its digits), recoveries and lock-outs."""
-    running, lock_outs, recoveries, segments, lost = state
-    if lost or lost_digits(running, body):
+    """Return the numbers of segments (−1: a measurement was too precise), recoveries and lock-outs."""
+    _, lock_outs, recoveries, segments, lost = state
+    if lost:
         segments = -1
     return segments, recoveries, lock_outs
 
@@ -264,37 +263,32 @@ def finish(state, row, e, body):
 # ---------------------------------------------------------------------------------------------------------- one measurement, tested first
 
 
-def judged_update(form, i, e, measured, passes, options):
+def iterated_update(form, i, e, measured, passes, options):
     """Test a measurement with state i, and update if its NIS does not exceed the threshold and a direction is within 90° of the predicted.
 
-    If ``passes`` is above one, the update is relinearised at its own result, at most that number of times, while the correction exceeds
-    ``RELINEARIZED``. Rows are transformed to the tangent space of the prior, and the final covariance to that of the estimate
+    The update is relinearised at its own result, at most ``passes`` times, while the correction exceeds ``RELINEARIZED``. Rows are
+    transformed to the tangent space of the prior, and the final covariance to that of the estimate
     (:func:`strapdown.kernels.iterated_update.tangent_at`). If the result exceeds the threshold and the attitude is nearly unknown, the
     update is repeated from 120° to either side about the least certain axis.
 
-    If ``passes`` is above one, a heading is skipped while the tilt, on which its row depends, is unknown. The heading of a vertical vector
-    is undefined: it is always skipped, with an innovation of NaN.
+    A heading is skipped while the tilt, on which its row depends, is unknown; that of a vertical vector is undefined, with an innovation of
+    NaN.
 
-    Returns ``ACCEPTED``, ``REFUSED`` or ``PASSED_OVER``, the weight, and independent innovations (3,) with their variances (3,) under the
-    nominal noise, from the last linearisation or, without convergence, from the first. The last value is the smallest ratio of measurement
-    noise to innovation variance of an accepted measurement; its inverse is the loss of precision of the covariance.
+    Returns ``ACCEPTED``, ``REFUSED`` or ``PASSED_OVER``, the weight, independent innovations (3,) with their variances (3,) under the
+    nominal noise, from the last linearisation or, without convergence, from the first, and whether it was too precise for double precision.
     """
     place = measured.place[e]
     sensor = measured.sensor[e]
     kind = measured.series[sensor, KIND]
     z = value_of(measured, place, sensor)
-    frame = frame_of(measured, place, sensor)
-    noise = noise_of(measured, place, sensor, kind, z)
     degrees = degrees_of_freedom(kind)
     threshold = options.thresholds[degrees - 1]
     state = load(form, i)
     q = attitude_of(state)
     R = rotation_matrix(q)
     if kind == HEADING and not has_heading(R, z):
-        return PASSED_OVER, 0.0, (math.nan, 0.0, 0.0), (1.0, 1.0, 1.0), 1.0
-    A = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    if passes > 1:
-        A = attitude_covariance(form, i, state)
+        return PASSED_OVER, 0.0, (math.nan, 0.0, 0.0), (1.0, 1.0, 1.0), False
+    A = attitude_covariance(form, i, state)
     unknown = A[0] + A[3] + A[5] >= UNKNOWN
     tolerance = SETTLED if unknown else RELINEARIZED
     now_q = q
@@ -306,7 +300,7 @@ def judged_update(form, i, e, measured, passes, options):
     done = 1
     trials = 0
     while True:
-        rows, y, p, variance, far, along = linearised(form, i, e, now_q, q, M, z, frame, noise, kind, sensor, prior)
+        rows, y, p, variance, far, along = linearised(form, i, e, now_q, q, M, measured, kind, sensor, prior)
         S = innovation_covariance(form, i, state, rows)
         F = factored((S[0] + variance[0], S[1], S[2], S[3] + variance[1], S[4], S[5] + variance[2]))
         innovation = (y[0] - p[0], y[1] - p[1], y[2] - p[2])
@@ -316,8 +310,6 @@ def judged_update(form, i, e, measured, passes, options):
         accepted = e1 * e1 * F[3] + e2 * e2 * F[4] + e3 * e3 * F[5] <= threshold
         if kind == DIRECTION and along < 0.0 and threshold < math.inf:
             accepted = False  # more than 90° from the predicted one, which the transverse rows cannot detect
-        if passes == 1:
-            break
         if done == 1 and trials == 0:
             first_e = (e1, e2, e3)
             first_F = F
@@ -343,25 +335,24 @@ def judged_update(form, i, e, measured, passes, options):
         relinearise(form, i, q, old_q, now_q, prior, fresh)
         done += 1
     weight = 0.0
-    share = 1.0
+    lost = False
     outcome = REFUSED
-    if kind == HEADING and passes > 1 and tilt_variance(R, A) > UNKNOWN_TILT:
+    if kind == HEADING and tilt_variance(R, A) > UNKNOWN_TILT:
         outcome = PASSED_OVER
     elif accepted:
         outcome = ACCEPTED
         weight = 1.0
-        share = min(F[3] * variance[0], F[4] * variance[1], F[5] * variance[2])
+        lost = min(F[3] * variance[0], F[4] * variance[1], F[5] * variance[2]) < 1.0 / MAX_PRECISION
         if options.robust > 0:
             parameter, numerator = options.parameters[degrees - 1, 0], options.parameters[degrees - 1, 1]
             weight = robust_weight(options.robust, parameter, numerator, options.iterations, S, innovation, variance)
         state, taken = correct(form, i, state, rows, innovation, scale(1.0 / weight, variance))
-        if passes > 1:
-            taken = add(prior, matrix_times_vector(M, taken))
-            state = turn_tangent(form, i, state, M)
-            A = attitude_covariance(form, i, state)
+        taken = add(prior, matrix_times_vector(M, taken))
+        state = turn_tangent(form, i, state, M)
+        A = attitude_covariance(form, i, state)
         new_q, G = moved(now_q, taken)
-        if passes > 1 and A[0] + A[3] + A[5] > KNOWN:
+        if A[0] + A[3] + A[5] > KNOWN:
             _, G = seen_from(taken, A)
         state = turn_tangent(form, i, state, G)
         save(form, i, set_attitude(form, i, state, new_q, q))
-    return outcome, weight, (e1, e2, e3), (1.0 / F[3], 1.0 / F[4], 1.0 / F[5]), share
+    return outcome, weight, (e1, e2, e3), (1.0 / F[3], 1.0 / F[4], 1.0 / F[5]), lost

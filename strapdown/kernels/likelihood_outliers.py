@@ -1,4 +1,4 @@
-"""Update for measurements with outliers: for :mod:`strapdown.kernels.likelihood` and :mod:`.root_form`.
+"""Update for measurements with outliers: for :mod:`strapdown.kernels.likelihood` and :mod:`strapdown.kernels.filter`.
 
 The noise of a measurement is normal with its variance or, with probability ε, with ``spread`` times that (Tukey 1960). The update is made
 with both; the likelihood is that of the mixture, and the filter continues with mean and covariance of the mixture (generalised
@@ -10,12 +10,13 @@ from __future__ import annotations
 import math
 
 from strapdown.kernels.algebra import full, scale, subtract
-from strapdown.kernels.lane_values import WIDTH, load, store
+from strapdown.kernels.filter import LINES, PRIOR, ROWS, STEP, apply_step, clear_step, take_row, write
+from strapdown.kernels.lane_values import WIDTH, load
 from strapdown.kernels.likelihood import FOUND, WIDE, WORK, deviance_of, updated, variance_of
 from strapdown.kernels.measurement import KIND, VECTOR
-from strapdown.kernels.root_form import PRIOR, ROWS, STEP, loose
-from strapdown.kernels.root_form import WORK as LINE
-from strapdown.kernels.triangle import take_rows, triangularise
+
+OPEN = ("apply_step", "clear_step", "take_row", "write")
+"""Functions of the instance of the filter."""
 
 
 def mixed(share, nis, product, wide, wide_product):
@@ -95,34 +96,51 @@ def weigh(span, number, body, out):
             out.information[span, j, m] += room[WORK + j] * room[WORK + m]
 
 
-# -------------------------------------------------------------------------------------------------------------------------- the factor
+# ------------------------------------------------------------------------------------------------------------------------- one filter
 
 
-def take(form, place, rows, y, variance, out):
-    """Update the factor with both noises and replace it by that of the mixture; write the outputs of :class:`.Options`."""
-    scratch, (share, spread), F = form.scratch, form.outliers, form.F[0]
-    H, step, other, work = scratch.rows[0], scratch.lines[STEP], scratch.lines[PRIOR], scratch.lines[ROWS:]
-    size, width, first = len(form.x[0]) + 3, F.shape[1], loose(form.model)
-    G = F[size:]
-    for c in range(0, size * width, WIDTH):
-        store(G, c, load(F, c))
-    e, s = take_rows(F, size, first, H, rows, y, variance, step, work)
-    far, wide = take_rows(G, size, first, H, rows, y, scale(spread, variance), other, work)
-    nis = wide_nis = own = 0.0
-    product = wide_product = 1.0
+def take(shape, body, measured, e, innovation, like):
+    """Update with both noises and replace the state by the mixture; write the outputs of :class:`strapdown.estimation.forward.Options`."""
+    x, P, Q, work, (share, spread) = body.x[0], body.P[0], body.P[1], body.work, body.outliers
+    n = len(x) - 1
+    width, line = len(P) // n, len(work) // LINES
+    rows, _, _ = write(shape, x, body, measured, e, like)
+    at = measured.place[e]
+    for i in range(n * width):
+        Q[i] = P[i]
+    wide_nis, wide_product, _ = taken(Q, work, rows, line, n, spread, False)
+    for i in range(n):
+        work[line * PRIOR + i] = work[line * STEP + i]
+    nis, product, noise = taken(P, work, rows, line, n, 1.0, True)
     for r in range(rows):
-        nis, product = nis + e[r] * e[r] / s[r], product * s[r]
-        wide_nis, wide_product = wide_nis + far[r] * far[r] / wide[r], wide_product * wide[r]
-        own += variance[r] / (s[r] * rows)
+        innovation[at, 2 * r] = work[line * (ROWS + r) + n]
+        innovation[at, 2 * r + 1] = work[line * (ROWS + r) + n + 1]
     value, w = mixed(share, nis, product, wide_nis, wide_product)
-    out.innovation[place, 6], out.innovation[place, 7], out.innovation[place, 8] = value, w, own
-    # (1 − w) P₀ + w P₁ + w (1 − w) d dᵀ: factors and d stacked by rows.
-    for c in range(0, width, WIDTH):
-        d = load(other, c) - load(step, c)
-        store(step, c, load(step, c) + w * d)
-        store(G, size * width + c, math.sqrt(w * (1.0 - w)) * d)
-    for c in range(0, size * width, WIDTH):
-        store(F, c, math.sqrt(1.0 - w) * load(F, c))
-        store(G, c, math.sqrt(w) * load(G, c))
-    triangularise(F, size, first, size, 2 * size + 1, 0, 0, scratch.lines[LINE])
-    return e, s
+    innovation[at, 6], innovation[at, 7], innovation[at, 8] = value, w, noise / rows
+    for i in range(n):
+        d = work[line * PRIOR + i] - work[line * STEP + i]
+        work[line * PRIOR + i] = d
+        work[line * STEP + i] += w * d
+    for i in range(n):
+        for j in range(n):
+            d = w * (1.0 - w) * work[line * PRIOR + i] * work[line * PRIOR + j]
+            P[width * i + j] = P[width * i + j] + w * (Q[width * i + j] - P[width * i + j]) + d
+    apply_step(x, P, work, like)
+    return False
+
+
+def taken(P, work, rows, line, n, factor, replaces):
+    """Update P and the step with the rows in the work space, their variances times a factor; return NIS, determinant and noise ratios.
+
+    If ``replaces``, the residuals and variances in the work space become the innovations and theirs.
+    """
+    clear_step(work, 0.0)
+    nis, product, noise = 0.0, 1.0, 0.0
+    for r in range(rows):
+        place = line * (ROWS + r) + n
+        variance = factor * work[place + 1]
+        error, s = take_row(P, work, ROWS + r, work[place], variance, 0.0)
+        nis, product, noise = nis + error * error / s, product * s, noise + variance / s
+        if replaces:
+            work[place], work[place + 1] = error, s
+    return nis, product, noise

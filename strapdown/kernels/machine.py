@@ -13,10 +13,11 @@ from __future__ import annotations
 import functools
 import hashlib
 import platform
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Hashable
 from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -72,6 +73,9 @@ def _defined(name: str, value: FunctionType, function: FunctionType, parts: tupl
             return found
     if name in function.__globals__.get("REPLACEABLE", ()):
         return value
+    for module in parts:  # the default of another module
+        if name in vars(module).get("REPLACEABLE", ()):
+            return cast(FunctionType, getattr(module, name))
     names = ", ".join(module.__name__ for module in parts) or "nothing"
     raise TypeError(f"{function.__module__} leaves {name} open, and {names} does not define it")
 
@@ -178,6 +182,21 @@ def compiled(function: Callable[..., Any], *parts: ModuleType) -> Any:
     except (RuntimeError, OSError):  # no writable directory for a cache: compile in every process
         dispatcher._compiler.py_func = twin()
     return dispatcher
+
+
+@functools.cache
+def instance(module: ModuleType, **constants: Hashable) -> ModuleType:
+    """Return a copy of a kernel module with other values of constants that it reads from its globals while it is imported.
+
+    These constants are known while its functions are compiled, like the parameters of a template. Equal constants give the same copy.
+    """
+    digest = hashlib.sha256(repr(sorted(constants.items())).encode()).hexdigest()[:16]
+    copy = ModuleType(f"{module.__name__}_{digest}", module.__doc__)
+    copy.__file__ = module.__file__
+    copy.__dict__.update(constants)
+    sys.modules[copy.__name__] = copy  # numba looks there for the module of a function that it reads from its cache
+    exec(compile(Path(str(module.__file__)).read_text(), str(module.__file__), "exec"), copy.__dict__)
+    return copy
 
 
 def read_only(array: np.ndarray) -> np.ndarray:

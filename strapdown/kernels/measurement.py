@@ -30,6 +30,8 @@ HEADING = 2
 ATTITUDE = 3
 """Kind: a whole attitude, three degrees of freedom. Its frame holds the quaternion in its first four numbers, its value the three
 variances."""
+KIND_CODES = {"direction": DIRECTION, "vector": VECTOR, "heading": HEADING, "attitude": ATTITUDE}
+"""Codes of the kinds by their names."""
 
 VERTICAL = 1e-24
 """Minimum squared horizontal part of a vector with a heading: of a unit vector at a picoradian from the vertical."""

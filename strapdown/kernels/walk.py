@@ -13,7 +13,7 @@ from strapdown.kernels.measurement import vector_at
 from strapdown.kernels.series import LARGEST_ANGLE, SQUARED_RANGE
 
 OPEN = ("begin", "keep", "longest_step", "predict", "update", "finish")
-REPLACEABLE = ("stopped",)
+REPLACEABLE = ("stopped", "increment_over")
 
 
 MAX_TURN = 1e6
@@ -53,6 +53,13 @@ def keep(state, row, e, body, out):
     """Write the state at a stored edge to a row of the outputs and return it; e measurements have been processed."""
 
 
+def increment_over(increments, k, body):
+    """Return the increment of interval k; zero for the interval before the first edge."""
+    if k < 0:
+        return (0.0, 0.0, 0.0)
+    return vector_at(increments, k)
+
+
 def stopped(state):
     """Return whether the walk ends here; by default it continues to the end."""
     return False
@@ -78,7 +85,7 @@ def walk(edges, increments, measured, every, body, out):
     now = edges[0]
     end = now
     whole = 1.0
-    theta = (0.0, 0.0, 0.0)
+    theta = increment_over(increments, k, body)
     countdown = 0
     row = none
     # One pass predicts to the next measurement or edge, updates with a measurement there, and closes an interval that ends there.
@@ -112,5 +119,5 @@ def walk(edges, increments, measured, every, body, out):
             if k < len(increments):
                 end = edges[k + 1]
                 whole = end - now
-                theta = vector_at(increments, k)
+                theta = increment_over(increments, k, body)
     return finish(state, row, e, body)

@@ -27,7 +27,9 @@ def bound_of(plan: Plan) -> Array | None:
     if plan.setup.estimator == MEKF or np.any(given.attitude_error) or np.any(given.bias_error):
         return None
     attitude_sigma, bias_sigma = initial_sigmas(given, plan.setup)
-    chosen = replace(FilterSetup.for_scenario(plan.scenario), attitude_sigma=attitude_sigma, bias_sigma=bias_sigma)
+    chosen = replace(
+        FilterSetup.for_scenario(plan.scenario, states=False), attitude_sigma=attitude_sigma, bias_sigma=bias_sigma
+    )
     try:
         return covariance.analyse(plan.scenario, chosen, epochs=plan.epochs).cramer_rao
     except InputError:

@@ -13,6 +13,15 @@ Colours are those of Okabe and Ito, distinguishable with colour vision deficienc
 - ``tuning``: Likelihood slices, and statistics before and after tuning.
 """
 
+from strapdown.checks import InputError
+
+try:
+    import matplotlib as _matplotlib  # noqa: F401
+except ValueError as error:
+    raise InputError(
+        f"matplotlib cannot be loaded ({error}); correct the environment variable MPLBACKEND, or its configuration file"
+    ) from error
+
 from strapdown.plots.allan import allan_overview
 from strapdown.plots.budget import error_budget
 from strapdown.plots.coning import coning_consistency as coning_consistency

@@ -68,9 +68,20 @@ def drift_by_algorithm(drifts: Sequence[Drift], ax: Axes | None = None) -> Axes:
     return ax
 
 
+MAX_COLUMNS = 5
+"""Maximum number of algorithms beside each other in a figure; more go into further rows."""
+
+
 def coning_errors(outcomes: Sequence[FilterOutcome]) -> Figure:
     """Draw the errors about the cone's axis with the filter's ±3σ for each integration algorithm: attitude above, bias below."""
-    figure, axes = new_figure(2, len(outcomes), size=(3.1 * len(outcomes), 5.2), sharex=True, squeeze=False)
+    rows = -(-len(outcomes) // MAX_COLUMNS)
+    columns = -(-len(outcomes) // rows)
+    figure, grid = new_figure(2 * rows, columns, size=(3.1 * columns, 5.2 * rows), sharex=True, squeeze=False)
+    # Attitude above bias, in as many pairs of rows as needed: (2, columns of all rows).
+    axes = np.stack([np.concatenate(grid[0::2]), np.concatenate(grid[1::2])])
+    for ax in axes[:, len(outcomes) :].ravel():
+        ax.set_visible(False)
+    axes = axes[:, : len(outcomes)]
     for j, outcome in enumerate(outcomes):
         s = outcome.statistics
         for ax, state, unit in ((axes[0, j], 2, ARCSECOND), (axes[1, j], 5, DEGREE_PER_HOUR)):
@@ -84,8 +95,9 @@ def coning_errors(outcomes: Sequence[FilterOutcome]) -> Figure:
         axes[0, j].set_xlabel("")
     for row in axes:
         match_scales(row)
-    axes[0, 0].set_ylabel("attitude error, arcsec")
-    axes[1, 0].set_ylabel("bias error, °/h")
+    for first in range(0, len(outcomes), columns):
+        axes[0, first].set_ylabel("attitude error, arcsec")
+        axes[1, first].set_ylabel("bias error, °/h")
     legend_below(figure, [axes[0, 0]])
     figure.suptitle(
         "Errors about the cone's axis. The integration drift is a constant rate, which the filter estimates as gyro bias."

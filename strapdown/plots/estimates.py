@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogFormatter, MultipleLocator
+from matplotlib.ticker import LogLocator, MultipleLocator, NullLocator
 from numpy.typing import NDArray
 
 from strapdown import quaternion
 from strapdown.checks import Array
-from strapdown.consistency import ReferenceErrors, errors
+from strapdown.consistency import errors
 from strapdown.plots.decimation import BAND_COLUMNS, decimated, envelope, extreme_rows
 from strapdown.plots.style import (
     AXES,
@@ -136,7 +136,9 @@ def estimate_overview(estimate: Estimate, *, title: str = "", fixed_frame: str =
     axes[4].set_title(words, loc="right", fontsize="small")
     if total.max() > 5.0 * total[settled].max():  # a large initial σ would make the rest unreadable
         axes[4].set_yscale("log")
-        axes[4].yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(2.0, 0.5)))
+        axes[4].yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=8))
+        axes[4].yaxis.set_major_formatter("{x:g}")
+        axes[4].yaxis.set_minor_locator(NullLocator())
     else:
         axes[4].set_ylim(bottom=0.0)
     axes[4].set_xlabel("time, s")
@@ -180,31 +182,48 @@ def states_over_time(estimate: Estimate, *, title: str = "") -> Figure:
     return figure
 
 
-def recording_errors(time: Array, errors: ReferenceErrors, movement: np.ndarray | None = None) -> Figure:
-    """Draw total, heading and inclination errors, rad, relative to a reference over time, s; the tested ``movement`` is shaded."""
-    figure, ax = new_figure(size=(9.0, 4.0))
-    mask = np.zeros(len(time), int) if movement is None else movement.astype(int)
-    inside = np.flatnonzero(np.diff(np.concatenate([[0], mask, [0]])))
-    for k, (first, last) in enumerate(inside.reshape(-1, 2)):
-        ax.axvspan(
-            time[first],
-            time[last - 1],
-            color=ink(),
-            alpha=0.07,
-            linewidth=0,
-            label="movement (judged)" if k == 0 else None,
-        )
-    for name, label, color, width in (
-        ("total", "total", ink(), 1.8),
-        ("heading", "heading, about the vertical", BLUE, 0.8),
-        ("inclination", "inclination, error of the vertical", VERMILION, 0.8),
-    ):
-        ax.plot(*decimated(time, getattr(errors, name) / DEGREE), color=color, linewidth=width, label=label)
-    ax.set_ylim(bottom=0.0)
-    ax.set_xlim(time[0], time[-1])
-    ax.set_xlabel("time, s")
-    ax.set_ylabel("error relative to the reference, °")
-    legend_above(ax)
+def recording_errors(estimate: Estimate, reference: Array, movement: np.ndarray | None = None) -> Figure:
+    """Draw the errors of an estimate relative to a reference about the axes of the fixed frame, with the filter's ±3σ.
+
+    Parameters
+    ----------
+    estimate : Estimate
+        Attitude with its covariance, or its variance about the body axes.
+    reference : ndarray (n, 4)
+        Reference q_fb at the times of the estimate; rows of NaN are unknown.
+    movement : ndarray (n,) of bool, optional
+        Samples that are judged, shaded.
+
+    Returns
+    -------
+    Figure
+        Heading error above, the two errors of the vertical below: a rotation vector in the fixed frame, from estimate to reference.
+    """
+    known = np.asarray(np.isfinite(reference).all(axis=1))
+    error = np.full((len(known), 3), np.nan)
+    error[known] = quaternion.log(quaternion.multiply(reference[known], quaternion.conjugate(estimate.attitude[known])))
+    turn = quaternion.to_matrix(estimate.attitude)
+    if estimate.covariance is None:
+        sigma = np.sqrt(np.einsum("nij,nj->ni", turn**2, estimate.variance[:, :3]))
+    else:
+        sigma = np.sqrt(np.einsum("nij,njk,nik->ni", turn, estimate.covariance[:, :3, :3], turn))
+    figure, axes = new_figure(3, 1, size=(9.0, 6.6), sharex=True)
+    mask = np.zeros(len(known), int) if movement is None else movement.astype(int)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask, [0]])))
+    for ax, axis, name in zip(axes, (2, 0, 1), ("heading", "vertical, about x", "vertical, about y"), strict=True):
+        for k, (first, last) in enumerate(edges.reshape(-1, 2)):
+            words = "movement (judged)" if k == 0 else None
+            ax.axvspan(*estimate.time[[first, last - 1]], color=ink(), alpha=0.07, linewidth=0, label=words)
+        errors_in_envelope(estimate.time, error[None, :, axis] / DEGREE, sigma[:, axis] / DEGREE, ax)
+        settled = slice(len(known) // 20, None)
+        largest = np.nanmax(np.abs(error[settled, axis]), initial=0.0)
+        reach = max(1.2 * largest, min(3.6 * np.median(sigma[settled, axis]), 6.0 * largest)) / DEGREE
+        ax.set_ylim(-reach, reach)
+        ax.set_ylabel(f"{name}, °")
+        if ax is not axes[-1]:
+            ax.set_xlabel("")
+    figure.suptitle("Error relative to the reference, axes of the fixed frame")
+    legend_below(figure, axes, ncols=4)
     return figure
 
 

@@ -150,8 +150,8 @@ def state_unit(state: int, value: Array) -> tuple[str, float]:
 
 
 def fan(statistics: Statistics, state: int, ax: Axes | None = None) -> Axes:
-    """Draw quantiles of |error| of a ``state`` (0 to 5) over the runs, and those predicted by the filter."""
-    ax = axes_or_new(ax)
+    """Draw quantiles of |error| of a ``state`` (0 to 5) over the runs, and those predicted by the filter; new axes have the legend."""
+    alone, ax = ax is None, axes_or_new(ax)
     shares = ((0.99, 2.5758), (0.9, 1.6449), (0.5, 0.6745))
     settled = max(1, len(statistics.time) // 20)
     quantiles = [statistics.error_quantile(share)[:, state] for share, _ in shares]
@@ -182,7 +182,8 @@ def fan(statistics: Statistics, state: int, ax: Axes | None = None) -> Axes:
     ax.set_xlim(statistics.time[0], statistics.time[-1])
     ax.set_xlabel("time, s")
     ax.set_ylabel(f"|{STATES[state]} error|, {unit}")
-    legend_above(ax, ncols=2)
+    if alone:
+        legend_above(ax, ncols=2)
     return ax
 
 

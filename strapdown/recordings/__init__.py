@@ -3,6 +3,9 @@
 A recording has point samples of rate, specific force and magnetic field of a device, on one time axis. :mod:`strapdown.ahrs`
 estimates attitude from it.
 
+Own HDF5 files have a digest, MCAP and Parquet checksums, which are verified: a changed bit is noticed. CSV, TUM, ULog, ROS 1 bags and
+SQLite have none: one changed bit of a sample is another sample.
+
 - ``formats``: The table of formats; :func:`read` by content, :func:`write` by file extension.
 - ``body_axes``: Axes and signs that differ from the package's: :func:`with_axes`.
 - ``columns``, ``delimited``, ``dataframes``: Tables: roles of columns; CSV and TSV; Parquet, pandas and xarray.
@@ -18,7 +21,6 @@ estimates attitude from it.
 from __future__ import annotations
 
 # Names imported "as" themselves and not listed in __all__ are for use within the package only.
-from strapdown.recordings import unit_calibration as unit_calibration
 from strapdown.recordings.body_axes import SENSORS as SENSORS
 from strapdown.recordings.body_axes import axes_matrix as axes_matrix
 from strapdown.recordings.body_axes import with_axes as with_axes

@@ -1,4 +1,4 @@
-"""Recordings as columns in memory or in Parquet. Libraries: ``pandas``, ``xarray``, ``pyarrow``.
+"""Recordings as columns in memory or in Parquet. Libraries: ``pandas``, ``polars``, ``xarray``, ``pyarrow``.
 
 Roles and units of the columns are found from their names (:mod:`strapdown.recordings.columns`); a column's unit may also be its
 attribute ``units`` (xarray) or the metadata ``unit`` of its field (Parquet). A time column, or an index named time, may contain dates:
@@ -31,12 +31,13 @@ def from_table(
     columns: Mapping[str, str] | None = None,
     gyro_alone: bool = False,
 ) -> Recording:
-    """Return the recording of a pandas ``DataFrame``, an xarray ``Dataset``, or a mapping of names to arrays.
+    """Return the recording of a data frame, an xarray ``Dataset``, a structured array, or a mapping of names to arrays.
 
     Parameters
     ----------
-    table : DataFrame, Dataset or mapping of str to array_like
-        Columns named as those of a CSV file; arrays (n, 3) of a mapping or a Dataset hold x, y and z.
+    table : DataFrame, Table, Dataset, structured array or mapping of str to array_like
+        Columns named as those of a CSV file, of pandas, polars, pyarrow or another library with ``__arrow_c_stream__``; arrays (n, 3) of a
+        mapping, a structured array or a Dataset hold x, y and z.
     source : str, default "table"
         Name of the recording, for messages.
     units : mapping of str to str, optional
@@ -104,6 +105,14 @@ def _columns(source: str, table: Any) -> dict[str, NDArray[np.generic]]:
     """Return names, with their units if the table declares them, and arrays."""
     if hasattr(table, "data_vars"):
         return _of_dataset(table)
+    if hasattr(table, "__arrow_c_stream__") and not hasattr(table, "index"):
+        return _of_arrow(library("pyarrow", f"{source} of {type(table).__module__.partition('.')[0]}").table(table))
+    if isinstance(table, np.ndarray):
+        if table.dtype.names is None:
+            raise InputError(
+                f"{source} is an array without names of columns; give a structured array or arrays by name"
+            )
+        table = {name: table[name] for name in table.dtype.names}
     found: dict[str, NDArray[np.generic]] = {}
     if hasattr(table, "columns"):  # a DataFrame
         index = table.index
@@ -181,11 +190,16 @@ def read_parquet(
         flat = [k for k, entry in enumerate(schema) if _is_number(entry.type)]
         reading.Unpacked(file, file.stat().st_size).take(8 * rows * len(flat))
         table = content.read([schema[k].name for k in flat], use_threads=False)
+    return from_table(_of_arrow(table), source=file.name, units=units, columns=columns, gyro_alone=gyro_alone)
+
+
+def _of_arrow(table: Any) -> dict[str, NDArray[np.generic]]:
+    """Return the columns of an Arrow table, with units from the metadata of their fields; nulls are NaN or NaT."""
     found: dict[str, NDArray[np.generic]] = {}
     for entry, chunks in zip(table.schema, table.columns, strict=True):
         unit = (entry.metadata or {}).get(b"unit", b"").decode()
         found[f"{entry.name} [{unit}]" if unit else entry.name] = np.asarray(chunks.to_numpy())
-    return from_table(found, source=file.name, units=units, columns=columns, gyro_alone=gyro_alone)
+    return found
 
 
 def _is_number(kind: Any) -> bool:

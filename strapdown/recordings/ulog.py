@@ -2,9 +2,9 @@
 
 ``sensor_combined``: gyro rad/s and specific force m/s², in the body axes of the vehicle, forward, right, down (so at rest and level the
 specific force is (0, 0, −9.81)). In addition ``vehicle_magnetometer`` (Gauss; for old logs the field in ``sensor_combined``) is read at the
-nearest stamps, and as reference ``vehicle_attitude``, the vehicle's estimate, which PX4 gives from body to North-East-Down and which is
-transformed to East-North-Up here; its North is true North if the vehicle had a position. Body axes are unchanged. Numbers are single
-precision. The clock counts µs from the start of the machine.
+nearest stamps, and as reference ``vehicle_attitude_groundtruth`` of a simulator, else ``vehicle_attitude``, the vehicle's estimate. PX4
+gives them from body to North-East-Down, and they are transformed to East-North-Up here; its North is true North if the vehicle had a
+position. Body axes are unchanged. Numbers are single precision. The clock counts µs from the start of the machine.
 
 For a damaged or truncated log, the complete messages are read.
 """
@@ -31,6 +31,8 @@ from strapdown.records import outputs
 from strapdown.records.recording import Recording, at_nearest, field_in, interpolated, relative_time, with_gyro
 
 UNIT, FIELD, ATTITUDE = "sensor_combined", "vehicle_magnetometer", "vehicle_attitude"
+TRUTH = "vehicle_attitude_groundtruth"
+"""Attitude of a simulator, which is the reference if there is one."""
 NO_SAMPLE = 0x7FFFFFFF
 """``accelerometer_timestamp_relative`` if there is no new sample."""
 HEADER, TAIL = 16, 1 << 17
@@ -44,7 +46,7 @@ LATE = 0.5
 def read_ulog(path: str | os.PathLike[str], *, topic: str = "") -> Recording:
     """Read the inertial unit of a flight log."""
     file = Path(path)
-    log = opened(file, [UNIT, FIELD, ATTITUDE])
+    log = opened(file, [UNIT, FIELD, ATTITUDE, TRUTH])
     data = {one.name if one.multi_id == 0 else f"{one.name}:{one.multi_id}": one.data for one in log.data_list}
     units = [name for name in data if name.startswith(UNIT) and len(data[name]["timestamp"])]
     if not units:
@@ -82,11 +84,13 @@ def read_ulog(path: str | os.PathLike[str], *, topic: str = "") -> Recording:
         own["magnetic_field"] = field
     if "magnetic_field" in own:
         own["magnetic_unit"] = "G"
-    if ATTITUDE in data and len(data[ATTITUDE]["timestamp"]) > 1:
-        at, kept, words = in_order(ATTITUDE, data[ATTITUDE]["timestamp"])
-        ned = quaternion.normalize(columns(data[ATTITUDE], "q", 4)[kept])
+    reference = next((name for name in (TRUTH, ATTITUDE) if name in data and len(data[name]["timestamp"]) > 1), None)
+    if reference is not None:
+        at, kept, words = in_order(reference, data[reference]["timestamp"])
+        ned = quaternion.normalize(columns(data[reference], "q", 4)[kept])
         own["true_attitude"] = interpolated(time, (at * 1000 - epoch) / 1e9, outputs.to_ned(ned))
-        remarks += [f"Reference: {ATTITUDE}, the vehicle's estimate.", *words]
+        whose = "that of the simulator" if reference == TRUTH else "the vehicle's estimate"
+        remarks += [f"Reference: {reference}, {whose}.", *words]
     return with_gyro(
         source=file.name, time=time, rate=rate, specific_force=force, epoch_ns=epoch, remarks=tuple(remarks), **own
     )

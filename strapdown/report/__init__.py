@@ -5,6 +5,8 @@
 - ``estimates``: The page of one estimate.
 - ``campaigns``: The page of a Monte Carlo.
 - ``tunings``: The page of a tuning.
+- ``conings``: The page of a coning study.
+- ``comparisons``: The page of two estimates.
 """
 
 from __future__ import annotations
@@ -18,8 +20,8 @@ from typing import Any
 from strapdown import records
 from strapdown.checks import InputError
 from strapdown.files import write_json, written_beside
-from strapdown.files.reading import existing_file, from_file
-from strapdown.report import campaigns, estimates, tunings
+from strapdown.files.reading import existing_file, from_file, json_file
+from strapdown.report import campaigns, comparisons, conings, estimates, tunings
 
 __all__ = [
     "write",
@@ -29,6 +31,7 @@ _WRITERS: dict[str, Callable[[Path, float], tuple[str, dict[str, Any]]]] = {
     "strapdown estimate": estimates.report,
     "strapdown montecarlo": campaigns.report,
     "strapdown tuning": tunings.report,
+    "strapdown coning": conings.report,
 }
 
 
@@ -43,16 +46,22 @@ class Report:
 
 
 def write(
-    result: str | os.PathLike[str], out: str | os.PathLike[str] | None = None, *, probability: float = 0.99
+    result: str | os.PathLike[str],
+    out: str | os.PathLike[str] | None = None,
+    *,
+    other: str | os.PathLike[str] | None = None,
+    probability: float = 0.99,
 ) -> Report:
     """Write the report of a result file, and its statistics as JSON beside it, atomically.
 
     Parameters
     ----------
     result : path
-        HDF5 file of an estimate or a Monte Carlo, or the JSON of a tuning.
+        HDF5 file of an estimate or a Monte Carlo, or the JSON of a tuning or of a coning study.
     out : path, optional
         The page. Default: ``result`` with the suffix .html.
+    other : path, optional
+        A second estimate of the same motion: the page has both, and their difference.
     probability : float
         Probability that no test rejects a consistent filter.
 
@@ -66,14 +75,27 @@ def write(
     target = source.with_suffix(".html") if out is None else Path(out)
     if target.suffix.lower() not in (".html", ".htm"):
         raise InputError(f"out is {target}; give a file with the suffix .html")
-    kind = "strapdown tuning" if source.suffix.lower() == ".json" else records.read_attributes(source)["kind"]
+    kind = _kind(source)
     if kind not in _WRITERS:
         known = ", ".join(name.removeprefix("strapdown ") for name in _WRITERS)
         raise InputError(f"{source} holds: {kind.removeprefix('strapdown ')}; reports are available for: {known}")
     with from_file(source):  # errors while drawing invalid numbers name the file
-        content, statistics = _WRITERS[kind](source, probability)
+        if other is None:
+            content, statistics = _WRITERS[kind](source, probability)
+        else:
+            existing_file(Path(other))
+            if {kind, _kind(Path(other))} != {"strapdown estimate"}:
+                raise InputError(f"{source} and {other}: only two estimates can be compared; give their HDF5 files")
+            content, statistics = comparisons.report(source, Path(other))
     beside = target.with_suffix(".report.json")  # not .json, which other commands write beside their results
     with written_beside(target) as temporary:
         temporary.write_text(content, encoding="utf-8", errors="backslashreplace")  # a name may not be UTF-8
     write_json(beside, statistics)
     return Report(page=target, statistics=beside, verdict=str(statistics["judgement"]["verdict"]))
+
+
+def _kind(source: Path) -> str:
+    if source.suffix.lower() != ".json":
+        return str(records.read_attributes(source)["kind"])
+    content = json_file(source)
+    return "strapdown coning" if isinstance(content, dict) and "integration" in content else "strapdown tuning"

@@ -69,12 +69,12 @@
         axes: [{ ...axis, label: named ? undefined : content.x, ...names }, { ...axis, label: content.unit, size: 70 }],
         series: [
           { label: content.x, value: named ? (u, value) => content.ticks[value] ?? "–" : shown },
-          ...content.series.map((one) => ({
+          ...content.series.map((one, k) => ({
             label: one.label,
             stroke: colour(one.colour),
             width: one.band || named ? 0 : 1.5, // the edges of a band would alias into a grey bar over the errors
             dash: one.dash ? [6, 4] : undefined,
-            points: { show: one.band ? false : named ? true : undefined, size: named ? 9 : undefined, fill: named ? colour(one.colour) : undefined },
+            points: { show: one.band ? false : named ? true : undefined, size: named ? Math.max(5, 12 - 3 * k) : undefined, fill: named ? colour(one.colour) : undefined },
             value: shown,
           })),
         ],

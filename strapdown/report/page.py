@@ -12,13 +12,15 @@ import re
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from strapdown.checks import Array
+from strapdown.checks import Array, InputError
+from strapdown.files import reading
 from strapdown.plots import style
 from strapdown.plots.decimation import extreme_rows
 from strapdown.plots.estimates import wraps
@@ -121,6 +123,30 @@ def _image(draw: Callable[[], Figure], theme: str) -> tuple[str, bool]:
         drawn = draw()
         drawn.savefig(buffer, format="png", dpi=_DOTS_PER_INCH)
     return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode(), drawn.get_figwidth() > _WIDE
+
+
+LARGEST_FIGURE = 50_000_000
+"""Maximum size of a figure that is included in the page, bytes."""
+
+_KINDS = {"png": ("image/png", b"\x89PNG\r\n\x1a\n"), "svg": ("image/svg+xml", b"<?xml")}
+"""Media type and first bytes of the image formats that a page can show."""
+
+
+def stored_figure(stem: Path, caption: str) -> str:
+    """Return the section of a figure that a command wrote beside its result, or the name of its PDF; empty if there is none."""
+    pdf = stem.with_name(f"{stem.name}.pdf")
+    if pdf.exists():
+        return section(caption, paragraph(f"In {pdf.name}, beside the result; draw it as PNG or SVG to see it here."))
+    for suffix, (kind, first) in _KINDS.items():
+        path = stem.with_name(f"{stem.name}.{suffix}")
+        if path.exists():
+            found = reading.content(path, link=False, maximum=LARGEST_FIGURE)
+            if not found.startswith(first):
+                raise InputError(f"{path} is not a {suffix.upper()} file; remove it, or draw it again")
+            data = base64.b64encode(found).decode()
+            image = f'<img src="data:{kind};base64,{data}" alt="{text(caption)}">'
+            return section(caption, f'<figure class=wide><div class="scroll" tabindex="0">{image}</div></figure>')
+    return ""
 
 
 def chart(

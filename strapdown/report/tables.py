@@ -56,8 +56,13 @@ def to_csv(table: Table) -> str:
     stream = io.StringIO()
     writer = csv.writer(stream)
     writer.writerow(table.columns)
-    writer.writerows([["" if _empty(cell) else cell for cell in row] for row in table.cells()])
+    writer.writerows([["" if _empty(cell) else _no_formula(cell) for cell in row] for row in table.cells()])
     return stream.getvalue()
+
+
+def _no_formula(cell: Value) -> Value:
+    """Return a cell, text that a spreadsheet would run as a formula behind an apostrophe: names may come from a file of someone else."""
+    return f"'{cell}" if isinstance(cell, str) and cell.startswith(("=", "+", "-", "@", "\t", "\r")) else cell
 
 
 def to_latex(table: Table) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import math
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -18,9 +17,6 @@ BOUNDS = (
     "each statistic may be slightly outside its bounds"
 )
 """Note below NIS and a verdict on the held-out data."""
-
-LARGEST_FIGURE = 50_000_000
-"""Maximum size of a figure that is included in the page, bytes."""
 
 
 class _Table(BaseModel):
@@ -115,7 +111,7 @@ def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
     if held:
         parts.append(page.section("Held-out data", *_held_out(held)))
     drawn = {name: caption for name, caption in _FIGURES.items() if held or name != "heldout"}
-    parts += [_image(path.with_name(f"{path.stem}-{name}"), caption) for name, caption in drawn.items()]
+    parts += [page.stored_figure(path.with_name(f"{path.stem}-{name}"), caption) for name, caption in drawn.items()]
     making = [page.provenance({"records": ", ".join(content["records"]), "units of the JSON": content["units"]})]
     if toml.exists():
         making += [page.paragraph(f"The filter, {toml.name}:"), page.code(reading.text(toml, link=False))]
@@ -232,26 +228,3 @@ def _held_out(held: dict[str, Any]) -> list[str]:
         )
     head = ("filter", "log-likelihood per innovation", "NIS", "99 % bounds", "ANEES per state", "attitude RMS, rad")
     return [page.table(head, rows, numbers=5), page.paragraph(f"{BOUNDS}.", faint=True)]
-
-
-_KINDS = {"png": ("image/png", b"\x89PNG\r\n\x1a\n"), "svg": ("image/svg+xml", b"<?xml")}
-"""Media type and first bytes of the image formats that a page can show."""
-
-
-def _image(stem: Path, caption: str) -> str:
-    """Return a figure that the tuning wrote beside its result, or the name of its PDF; empty if there is none."""
-    pdf = stem.with_name(f"{stem.name}.pdf")
-    if pdf.exists():
-        return page.section(
-            caption, page.paragraph(f"In {pdf.name}, beside the result; tune with --format png or svg to see it here.")
-        )
-    for suffix, (kind, first) in _KINDS.items():
-        path = stem.with_name(f"{stem.name}.{suffix}")
-        if path.exists():
-            found = reading.content(path, link=False, maximum=LARGEST_FIGURE)
-            if not found.startswith(first):
-                raise InputError(f"{path} is not a {suffix.upper()} file; remove it, or tune again")
-            data = base64.b64encode(found).decode()
-            image = f'<img src="data:{kind};base64,{data}" alt="{page.text(caption)}">'
-            return page.section(caption, f'<figure class=wide><div class="scroll" tabindex="0">{image}</div></figure>')
-    return ""

@@ -109,16 +109,19 @@ class FilterSetup(ByValue):
 
     @classmethod
     def for_scenario(
-        cls, scenario: Scenario, *, attitude_sigma: float | None = None, states: bool | Sequence[str] | None = False
+        cls, scenario: Scenario, *, attitude_sigma: float | None = None, states: bool | Sequence[str] | None = None
     ) -> FilterSetup:
-        """Return the filter setup that matches a scenario: the noise of its gyro, and the σ of its sensors.
+        """Return the filter setup that matches a scenario: the noise of its gyro, the σ of its sensors, and states for its errors.
 
         Parameters
         ----------
         scenario : Scenario
             Scenario whose gyro, sensors and motion determine the setup.
-        attitude_sigma, states : optional
+        attitude_sigma : optional
             As for :meth:`for_record`.
+        states : bool, None or sequence of str, default None
+            As for :meth:`for_record`. None: with error states if an error is specified that the filter would not model without them, so
+            that the filter is consistent; False: attitude and bias only.
 
         Returns
         -------

@@ -26,7 +26,7 @@ from strapdown.vectors import VectorMeasurements
 
 _BIAS = np.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])
 """1 for the bias, 0 for the attitude."""
-WHOLE_BIAS: dict[str, Any] = {"whole_bias": True, "together": True}
+WHOLE_BIAS: dict[str, Any] = {"whole_bias": True}
 """Options of the filter by which the reported bias includes the drifts."""
 
 MAX_MEMORY = 8e9
@@ -151,7 +151,7 @@ def run_together(
     The filter must be one for which :func:`runs_at_once` is above 1. A record's estimate is bit for bit independent of the other records,
     and agrees with that of :func:`run` to rounding.
     """
-    from strapdown.estimation import together
+    from strapdown.estimation import in_lanes
 
     states = setup.states
     assert states is not None
@@ -160,8 +160,8 @@ def run_together(
         for record, initial in zip(records, initials, strict=True)
     ]
     options = forward.Options(every=every, full_covariance=True, **WHOLE_BIAS)
-    found = together.run(problems, every, lambda problem: forward.filtered(problem, options).estimate)
-    return [_reported(one, states, initial) for one, initial in zip(found, initials, strict=True)]
+    estimates = in_lanes.run(problems, every, lambda problem: forward.filtered(problem, options).estimate)
+    return [_reported(estimate, states, initial) for estimate, initial in zip(estimates, initials, strict=True)]
 
 
 def _run_other(
@@ -300,7 +300,7 @@ def state_of_whole_bias(initial: State, error_states: tuple[ErrorStates, ...], f
     turn[3:6, 6:] = -_offsets(error_states)
     sigma = np.sqrt(np.diag(plain.covariance))
     root = (turn @ (sigma[:, None] * np.linalg.cholesky(plain.covariance / np.outer(sigma, sigma)))).T
-    return replace(plain, covariance=root.T @ root, factor=root)
+    return replace(plain, covariance=root.T @ root)
 
 
 def _offsets(error_states: tuple[ErrorStates, ...]) -> Array:

@@ -1,0 +1,314 @@
+"""The fixed-interval smoother for any number of error states: Rauch–Tung–Striebel on the manifold, backward over the filter's segments.
+
+The gain is that of :mod:`strapdown.kernels.smoother_step`, where its reasons are: with the process noise of a step referred to its start,
+``Q̄ = Φ⁻¹ Q Φ⁻ᵀ``, it is ``G = N Φ⁻¹``, ``N = I − Q̄ (P + Q̄)⁻¹``, and the covariance is a sum, ``G P_s Gᵀ + N Q̄``, in which nothing of the
+size of P is subtracted. The later covariance is transformed to the tangent space at the predicted attitude before the step, and the result
+to that at the smoothed attitude after it; so are states that rotate with the attitude.
+
+The functions in ``OPEN`` are those of an instance of :mod:`strapdown.kernels.filter`. Matrices are stored by rows, padded to a multiple of
+eight columns.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from strapdown.kernels.filter import (
+    advance,
+    apply_transition,
+    fill_coefficients,
+    fixed_turn,
+    gather_noisy_columns,
+    predict_state,
+    rotate_vectors,
+    rows_of_noisy,
+    rows_to_noisy,
+    scale_noisy_row,
+    scale_row,
+    scatter_noisy_columns,
+    subtract_noisy_row,
+    subtract_row,
+    turn_attitude,
+    turn_vectors,
+    write_transition,
+)
+from strapdown.kernels.lane_values import WIDTH, load, spread, store
+from strapdown.kernels.rotation import inverse_right_jacobian, logarithm, moved, quaternion_multiply
+from strapdown.kernels.structure import Model
+
+OPEN = (
+    "advance",
+    "apply_transition",
+    "fill_coefficients",
+    "gather_noisy_columns",
+    "predict_state",
+    "rotate_vectors",
+    "rows_of_noisy",
+    "rows_to_noisy",
+    "scale_noisy_row",
+    "scale_row",
+    "scatter_noisy_columns",
+    "subtract_noisy_row",
+    "subtract_row",
+    "turn_attitude",
+    "turn_vectors",
+    "write_transition",
+)
+CALLED = ("factorise", "solve", "subtract_products", "load_segment")
+
+
+class Models(NamedTuple):
+    """Numbers of the model: those of the filter, those with noise of negative variance, and those without noise."""
+
+    forward: Model
+    backward: Model
+    quiet: Model
+
+
+class Workspace(NamedTuple):
+    """State at the end of a segment, and work space, for n states; matrices are by rows, padded, with eight numbers more."""
+
+    x: np.ndarray
+    """Filtered state at the start of the segment (n + 1,)."""
+    predicted: np.ndarray
+    """Predicted state at its end, and a copy that is propagated back (n + 1,)."""
+    after: np.ndarray
+    later_x: np.ndarray
+    """Smoothed state."""
+    P: np.ndarray
+    """Filtered covariance at the start of the segment; then the Cholesky factor of P + Q̄."""
+    Q: np.ndarray
+    """Q̄"""
+    work: np.ndarray
+    later_P: np.ndarray
+    """Smoothed covariance."""
+    gain: np.ndarray
+    """(P + Q̄)⁻¹ Q̄, with columns for the states with process noise."""
+    top: np.ndarray
+    """Rows of the attitude of Φ⁻¹ (3 × padded width)."""
+    error: np.ndarray
+    """Smoothed error relative to the predicted state, then to the filtered one (n,), and as many numbers more."""
+    coefficients: np.ndarray
+    states: np.ndarray
+    """States with process noise."""
+    noisy: int
+    """Their number."""
+
+
+class Outputs(NamedTuple):
+    """Arrays that the passes write, a row an edge."""
+
+    x: np.ndarray
+    """q, b and c (edges, n + 1)."""
+    variance: np.ndarray
+    covariance: np.ndarray
+    """(edges, m, m) for the first m states, or (0, m, m)."""
+
+
+def load_segment(segments, k, x, P, width):
+    """Read state and upper triangle of the covariance of row k of the segments; what is below the diagonal is not defined."""
+    n = len(x) - 1
+    for i in range(n + 1):
+        x[i] = segments[k, 4 + i]
+    at = 5 + n + k * segments.shape[1]
+    for i in range(n):
+        for j in range(i, n, WIDTH):
+            store(
+                P, width * i + j, load(segments, at + j - i)
+            )  # the excess is in the next row, which is written after it
+        at += n - i
+
+
+def mirror(P, n, width):
+    """Copy the upper triangle of a matrix to the lower one."""
+    for i in range(n):
+        for j in range(i + 1, n):
+            P[width * j + i] = P[width * i + j]
+
+
+def factorise(A, n, width):
+    """Replace the upper triangle of A by its Cholesky factor U, ``A = Uᵀ U``; the diagonal holds the reciprocals of U's."""
+    for j in range(n):
+        inverted = 1.0 / math.sqrt(A[width * j + j])
+        scale_row(A, j, inverted)
+        for i in range(j + 1, n):
+            subtract_row(A, i, A, j, A[width * j + i])
+        A[width * j + j] = inverted
+
+
+def solve(U, B, n, width):
+    """Replace B, with columns for the states with process noise, by the solution X of ``Uᵀ U X = B``."""
+    for k in range(n):
+        scale_noisy_row(B, k, U[width * k + k])
+        for i in range(k + 1, n):
+            subtract_noisy_row(B, i, k, U[width * k + i])
+    for k in range(n - 1, -1, -1):
+        scale_noisy_row(B, k, U[width * k + k])
+        for i in range(k):
+            subtract_noisy_row(B, i, k, U[width * i + k])
+
+
+def subtract_products(gain, A, B, n, noisy):
+    """Subtract gainᵀ A from B, which has a row for each of the ``noisy`` states with process noise."""
+    width = len(gain) // n
+    for k in range(n):
+        for r in range(noisy):
+            subtract_row(B, r, A, k, gain[width * k + r])
+
+
+def fill_zeros(A):
+    """Set a matrix, whose size is a multiple of eight, to zero."""
+    for i in range(0, len(A), WIDTH):
+        store(A, i, spread(0.0))
+
+
+def step_back(segments, k, models, space):
+    """Propagate the smoothed state from the end of segment k back to its start.
+
+    A step back in time has the transition Φ⁻¹ and, for noise of negative variance, the process noise Q̄ = Φ⁻¹ Q Φ⁻ᵀ.
+    """
+    x, predicted, after, P, Q, gain, work = (
+        space.x,
+        space.predicted,
+        space.after,
+        space.P,
+        space.Q,
+        space.gain,
+        space.work,
+    )
+    later_x, later_P, error, coefficients = space.later_x, space.later_P, space.error, space.coefficients
+    n, width, noisy = len(x) - 1, len(space.top) // 3, space.noisy
+    load_segment(segments, k, x, P, width)
+    dt = segments[k, 0]
+    part, back = (segments[k, 1], segments[k, 2], segments[k, 3]), (-segments[k, 1], -segments[k, 2], -segments[k, 3])
+    for i in range(n + 1):
+        predicted[i] = x[i]
+    fill_coefficients(coefficients, dt, models.forward)
+    predict_state(predicted, part, dt, models.forward, coefficients, 0.0)
+    relative_error(predicted, later_x, later_P, error)
+    fill_zeros(Q)
+    fill_coefficients(coefficients, -dt, models.backward)
+    write_transition(predicted, back, -dt, models.backward, coefficients, space.top, 0.0)
+    apply_error(error, space.top, coefficients)
+    copy_state(predicted, after)
+    advance(after, Q, back, -dt, models.backward, coefficients, 0.0)
+    fill_coefficients(coefficients, -dt, models.quiet)
+    copy_state(predicted, after)
+    advance(after, later_P, back, -dt, models.quiet, coefficients, 0.0)
+    for i in range(0, n * width, WIDTH):
+        store(P, i, load(P, i) + load(Q, i))
+    factorise(P, n, width)
+    gather_noisy_columns(Q, gain)
+    solve(P, gain, n, width)
+    reduce_error(error, gain, space.states, n)
+    # N (Y Nᵀ + Q̄), Y the later covariance at the start: only rows and columns of states with noise differ from those of Y.
+    rows_of_noisy(later_P, work)
+    subtract_products(gain, later_P, work, n, noisy)
+    scatter_noisy_columns(work, later_P)
+    for i in range(0, n * width, WIDTH):
+        store(later_P, i, load(later_P, i) + load(Q, i))
+    rows_of_noisy(later_P, work)
+    subtract_products(gain, later_P, work, n, noisy)
+    rows_to_noisy(work, later_P)
+    correct_filtered(x, error, later_x, later_P)
+
+
+def copy_state(x, y):
+    """Copy a state to y."""
+    for i in range(len(x)):
+        y[i] = x[i]
+
+
+def apply_error(error, top, coefficients):
+    """Apply the transition to an error."""
+    apply_transition(error, top, coefficients, 0.0)
+
+
+def reduce_error(error, gain, states, n):
+    """Replace the error by N times it; ``states`` are those with process noise."""
+    width = len(gain) // n
+    for r in range(len(states)):
+        t = 0.0
+        for k in range(n):
+            t += gain[width * k + r] * error[k]
+        error[n + r] = error[states[r]] - t
+    for r in range(len(states)):
+        error[states[r]] = error[n + r]
+
+
+def relative_error(predicted, later_x, later_P, error):
+    """Write the smoothed error relative to the predicted state, and transform the smoothed covariance to the tangent space there.
+
+    exp(a) ⊗ exp(ε) = exp(a + J_r(a)⁻¹ ε).
+    """
+    q = (predicted[0], predicted[1], predicted[2], predicted[3])
+    later_q = (later_x[0], later_x[1], later_x[2], later_x[3])
+    a = logarithm(quaternion_multiply((q[0], -q[1], -q[2], -q[3]), later_q))
+    turn_attitude(later_P, inverse_right_jacobian(a))
+    A = fixed_turn(later_q, q)
+    rotate_vectors(later_x, 1, A)
+    turn_vectors(later_P, A)
+    error[0], error[1], error[2] = a
+    for i in range(3, len(later_x) - 1):
+        error[i] = later_x[1 + i] - predicted[1 + i]
+
+
+def correct_filtered(x, error, later_x, later_P):
+    """Write the filtered state corrected by the error, and transform the covariance to the tangent space there."""
+    q = (x[0], x[1], x[2], x[3])
+    new_q, J = moved(q, (error[0], error[1], error[2]))
+    for i, value in enumerate(new_q):
+        later_x[i] = value
+    for i in range(3, len(x) - 1):
+        later_x[1 + i] = x[1 + i] + error[i]
+    turn_attitude(later_P, J)
+    A = fixed_turn(q, new_q)
+    rotate_vectors(later_x, 1, A)
+    turn_vectors(later_P, A)
+
+
+def smooth_back(segments, starts, first, models, space, out):
+    """Go back from the filtered state at the last edge to edge ``first``, and write all between.
+
+    Parameters
+    ----------
+    segments : array (rows, numbers)
+        The filter's predictions, the last row the end state.
+    starts : array (edges,)
+        Row that starts at each edge.
+    first : int
+    models : Models
+    space : Workspace
+    out : Outputs
+    """
+    n = len(space.x) - 1
+    width = len(space.top) // 3
+    edge = len(starts) - 1
+    s = starts[edge]
+    load_segment(segments, s, space.later_x, space.later_P, width)
+    mirror(space.later_P, n, width)
+    while True:
+        while edge >= first and starts[edge] == s:
+            write_smoothed(out, edge, space.later_x, space.later_P, n, width)
+            edge -= 1
+        if edge < first:
+            break
+        s -= 1
+        step_back(segments, s, models, space)
+
+
+def write_smoothed(out, edge, x, P, n, width):
+    """Write a smoothed state to the row of an edge; of the covariance the mean of both triangles."""
+    for i in range(n + 1):
+        out.x[edge, i] = x[i]
+    for i in range(n):
+        out.variance[edge, i] = P[width * i + i]
+    if edge < len(out.covariance):
+        for i in range(out.covariance.shape[1]):
+            for j in range(i, out.covariance.shape[2]):
+                value = 0.5 * (P[width * i + j] + P[width * j + i])
+                out.covariance[edge, i, j] = value
+                out.covariance[edge, j, i] = value

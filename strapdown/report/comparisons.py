@@ -1,0 +1,133 @@
+"""The page of two estimates of the same motion: overlay and difference."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from strapdown import quaternion, records
+from strapdown.checks import Array, InputError
+from strapdown.plots.estimates import angle_labels
+from strapdown.plots.style import AXES
+from strapdown.records import Estimate
+from strapdown.report import page
+from strapdown.units import DEGREE, angle_unit, rate_unit
+
+_COLOURS = ("--a", "--b", "--c")
+
+
+def report(first: Path, second: Path) -> tuple[str, dict[str, Any]]:
+    """Return the page and the statistics for two estimate files; the second is interpolated at the times of the first."""
+    a, b = records.read_estimate(first), records.read_estimate(second)
+    names = (first.name, second.name) if first.name != second.name else (str(first), str(second))
+    inside = (a.time >= b.time[0]) & (a.time <= b.time[-1])
+    if not inside.any():
+        spans = " and ".join(
+            f"{of} covers {one.time[0]:g} to {one.time[-1]:g} s" for of, one in ((first, a), (second, b))
+        )
+        raise InputError(f"{spans}; give estimates of the same time")
+    time = a.time[inside]
+    attitude, sigma, bias = a.attitude[inside], a.sigma[inside], a.bias[inside]
+    other, other_sigma, other_bias = _at(b, time)
+    difference = quaternion.log(quaternion.multiply(quaternion.conjugate(attitude), other))
+    angle = np.linalg.norm(difference, axis=1)
+    statistics = {
+        "sources": list(names),
+        "epochs": len(time),
+        "attitude_difference_rms_rad": float(np.sqrt(np.mean(angle**2))),
+        "attitude_difference_maximum_rad": float(angle.max()),
+        "attitude_difference_rms_by_axis_rad": np.sqrt(np.mean(difference**2, axis=0)).tolist(),
+        "judgement": {"verdict": f"RMS difference of attitude {np.sqrt(np.mean(angle**2)) / DEGREE:.4g}°"},
+    }
+    charts = _angles(time, (attitude, other), names, str(records.read_attributes(first).get("fixed_frame", "")))
+    charts += _differences("Attitude", time, difference, (sigma[:, :3], other_sigma[:, :3]), names, angle_unit)
+    if a.has_bias and b.has_bias:
+        charts += _differences(
+            "Gyro bias", time, other_bias - bias, (sigma[:, 3:], other_sigma[:, 3:]), names, rate_unit
+        )
+        statistics["bias_difference_rms_by_axis_rad_per_s"] = np.sqrt(
+            np.mean((other_bias - bias) ** 2, axis=0)
+        ).tolist()
+    truth = records.read_truth(first)
+    if truth is not None:
+        charts += _errors(time, truth.attitude[inside], (attitude, other), names)
+    content = page.page(
+        f"Two estimates: {names[0]}, {names[1]}",
+        f"{len(time)} epochs from {time[0]:g} to {time[-1]:g} s; the second is interpolated at the times of the first",
+        page.section("Key numbers", _numbers(difference, angle, (sigma, other_sigma), names)),
+        page.section("Over time", page.beside_body(charts, time, attitude)),
+    )
+    return content, statistics
+
+
+def _at(estimate: Estimate, time: Array) -> tuple[Array, Array, Array]:
+    """Return attitude, σ and bias of an estimate at times within its own; the attitude by rotation at constant rate between two epochs."""
+    k = np.clip(np.searchsorted(estimate.time, time, side="right") - 1, 0, len(estimate.time) - 2)
+    share = (time - estimate.time[k]) / (estimate.time[k + 1] - estimate.time[k])
+    start, end = estimate.attitude[k], estimate.attitude[k + 1]
+    step = quaternion.log(quaternion.multiply(quaternion.conjugate(start), end))
+    attitude = quaternion.multiply(start, quaternion.exp(share[:, None] * step))
+    between = lambda rows: rows[k] + share[:, None] * (rows[k + 1] - rows[k])  # noqa: E731
+    return attitude, between(estimate.sigma), between(estimate.bias)
+
+
+def _angles(time: Array, attitudes: tuple[Array, Array], names: tuple[str, str], fixed_frame: str) -> list[str]:
+    euler = [quaternion.to_rotation(q).as_euler("ZYX", degrees=True)[:, ::-1] for q in attitudes]
+    return [
+        page.chart(
+            label,
+            "angle, °",
+            time,
+            [
+                page.Series(label=name, value=angles[:, k], colour=_COLOURS[j], wraps=True, dash=j == 1)
+                for j, (name, angles) in enumerate(zip(names, euler, strict=True))
+            ],
+        )
+        for k, label in enumerate(angle_labels(fixed_frame))
+    ]
+
+
+def _differences(
+    what: str, time: Array, difference: Array, sigmas: tuple[Array, Array], names: tuple[str, str], unit_of: Any
+) -> list[str]:
+    """Return a chart of each axis of a difference, with ±3σ of the first estimate as a band and of the second as lines."""
+    settled = slice(len(time) // 20, None)
+    unit, size = unit_of(3.0 * np.maximum(*sigmas)[settled])
+    charts = []
+    for k, axis in enumerate(AXES):
+        first, second = (3.0 * sigma[:, k] / size for sigma in sigmas)
+        series = (
+            page.Series(label=f"+3σ of {names[0]}", value=first, colour="--faint", band=True),
+            page.Series(label="−3σ", value=-first, colour="--faint", band=True),
+            page.Series(label=f"+3σ of {names[1]}", value=second, colour="--b", dash=True),
+            page.Series(label="−3σ ", value=-second, colour="--b", dash=True),
+            page.Series(label="difference, second minus first", value=difference[:, k] / size, colour="--a"),
+        )
+        reach = 1.3 * max(float(np.abs(one[settled]).max()) for one in (first, second, difference[:, k] / size))
+        title, label = f"{what} {axis}, difference", f"{what.lower()} {axis}, {unit}"
+        charts.append(page.chart(title, label, time, series, reach=reach))
+    return charts
+
+
+def _errors(time: Array, truth: Array, attitudes: tuple[Array, Array], names: tuple[str, str]) -> list[str]:
+    errors = [quaternion.angle_between(attitude, truth) / DEGREE for attitude in attitudes]
+    series = [
+        page.Series(label=name, value=error, colour=_COLOURS[j], dash=j == 1)
+        for j, (name, error) in enumerate(zip(names, errors, strict=True))
+    ]
+    return [page.chart("Total attitude error relative to the truth", "error, °", time, series)]
+
+
+def _numbers(difference: Array, angle: Array, sigmas: tuple[Array, Array], names: tuple[str, str]) -> str:
+    unit, size = angle_unit(np.sqrt(np.mean(difference**2, axis=0)))
+    rms = lambda x: page.number(float(np.sqrt(np.mean(x**2)) / size))  # noqa: E731
+    named = [(axis, difference[:, k], [sigma[:, k] for sigma in sigmas]) for k, axis in enumerate(AXES)]
+    named.append(("total", angle, [np.linalg.norm(sigma[:, :3], axis=1) for sigma in sigmas]))
+    rows = [
+        (f"{name}, {unit}", rms(value), page.number(float(np.abs(value).max() / size)), *map(rms, spreads))
+        for name, value, spreads in named
+    ]
+    head = ("attitude", "RMS difference", "largest", *(f"σ of {name}" for name in names))
+    return page.table(head, rows, numbers=4)

@@ -1,0 +1,285 @@
+"""Calibration by hand: errors with σ, the file, and its use by the estimator."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import strapdown as sd
+from sims import calibration as study
+from sims import hand_held
+from strapdown import ahrs, calibration, quaternion
+from strapdown.calibration import SensorErrors, UnitCalibration, intervals, with_gyro_states
+from strapdown.checks import InputError
+from strapdown.consistency import reference_errors
+from strapdown.recordings import Recording
+from strapdown.records import ErrorStateEstimate
+
+MATRIX = np.array([[0.02, 0.004, -0.003], [0.0, -0.015, 0.002], [0.005, 0.0, 0.01]])
+SETS = Path(__file__).parents[2] / "shared" / "data" / "sassari"
+
+
+@pytest.fixture(scope="module")
+def turned():
+    """A unit, its recording with pauses, and its calibration."""
+    unit = study.drawn_unit(3)
+    recording = study.simulated(unit, 3, 0, 60.0)
+    return unit, recording, sd.calibrate(recording)
+
+
+def spoiled(run: int) -> Recording:
+    """A simulated hand whose gyro has the same matrix in each recording."""
+    one = hand_held.simulated(3, run, 40.0)
+    return dataclasses.replace(one, rate=one.rate @ (np.eye(3) + MATRIX).T)
+
+
+# ------------------------------------------------------------------------------------------------------------------ the estimate
+
+
+def normalised(unit, found):
+    """Errors of a calibration over their σ."""
+    pairs = zip(unit.entries(), found.entries(), found.sigma.entries(), strict=True)
+    return np.array([(b - a) / s for (_, _, a), (_, _, b), (_, _, s) in pairs])
+
+
+def test_every_error_is_found_within_its_sigma(turned):
+    unit, _, found = turned
+    z = normalised(unit, found)
+    assert np.abs(z).max() < 4.0
+    assert 0.6 < np.sqrt(np.mean(z**2)) < 1.4
+    # and the σ are small: thousandths of the matrices, hundredths of m/s², of the field and of ms
+    assert found.sigma.gyro_matrix.max() < 4e-3
+    assert found.sigma.accelerometer_bias.max() < 0.03
+    assert found.sigma.hard_iron.max() < 0.02 * np.linalg.norm(study.FIELD_F)
+    assert found.sigma.magnetometer_delay < 1e-3
+
+
+@pytest.mark.slow
+def test_95_of_100_intervals_contain_the_truth():
+    result = study.main(units=30)
+    z = np.concatenate([(result.errors[n] / result.sigma[n]).ravel() for n in result.errors])
+    assert 0.93 < np.mean(np.abs(z) < 1.96) < 0.97
+    assert 0.9 < np.sqrt(np.mean(z**2)) < 1.1
+
+
+def test_a_unit_without_magnetometer_is_calibrated_too(turned):
+    unit, recording, _ = turned
+    found = sd.calibrate(dataclasses.replace(recording, magnetic_field=None, magnetic_unit=""))
+    assert not found.sigma.magnetometer_matrix.any()
+    for name in ("gyro_bias", "gyro_matrix", "accelerometer_bias", "accelerometer_matrix"):
+        error = np.abs(getattr(found, name) - getattr(unit, name))
+        assert np.all(error < 4.0 * getattr(found.sigma, name)), name
+    assert found.sigma.accelerometer_bias.max() < 0.05
+
+
+def test_two_recordings_give_smaller_sigma_than_one(turned):
+    unit, recording, first = turned
+    both = sd.calibrate([recording, study.simulated(unit, 3, 1, 60.0)])
+    assert np.abs(normalised(unit, both)).max() < 4.0
+    for name in ("gyro_matrix", "accelerometer_bias", "magnetometer_matrix"):
+        ratio = np.sqrt(np.mean(getattr(both.sigma, name) ** 2) / np.mean(getattr(first.sigma, name) ** 2))
+        assert 0.2 < ratio < 0.8, name
+
+
+def test_a_gap_does_not_spoil_it(turned):
+    unit, recording, _ = turned
+    kept = (recording.time < 21.0) | (recording.time > 26.0)
+    names = ("time", "rate", "specific_force", "magnetic_field", "true_attitude", "movement")
+    cut = dataclasses.replace(recording, **{name: getattr(recording, name)[kept] for name in names})
+    assert np.abs(normalised(unit, sd.calibrate(cut))).max() < 4.0
+
+
+def test_missing_motion_is_said():
+    unit = study.drawn_unit(4)
+    recording = study.simulated(unit, 4, 0, 30.0)
+    still = recording.time < 3.4
+    rest = dataclasses.replace(
+        recording,
+        **{
+            name: np.tile(getattr(recording, name)[still], (6, 1))
+            for name in ("rate", "specific_force", "magnetic_field", "true_attitude")
+        },
+        time=np.arange(6 * still.sum()) / study.RATE,
+        movement=None,
+    )
+    found = sd.calibrate(rest)
+    text = " ".join(found.remarks)
+    for words in ("Turn about x", "Turn about y", "Turn about z", "Rest with", "into all attitudes"):
+        assert words in text
+    # at rest nothing is learnt of the gyro's matrix: σ is that of the prior
+    assert np.all(found.sigma.gyro_matrix > 0.9 * 0.02)
+    assert found.sigma.gyro_bias.max() < np.radians(0.05)
+    assert "gyro scale x" in str(found)
+    assert "Rest with" in str(found)
+
+
+def test_the_prediction_has_the_derivatives_of_its_differences(turned):
+    _, recording, _ = turned
+    gathered = intervals.gathered([recording])
+    random = np.random.default_rng(5)
+    x = 0.02 * random.standard_normal(12)
+    own = 0.02 * random.standard_normal(13)
+    own[12] = 5e-3
+    bias = np.tile(x[:3], (len(gathered.node), 1))
+
+    def predicted(x, own, rows=slice(60, 80)):
+        errors = intervals.Errors(x[3:].reshape(3, 3), own[:3], own[3:12].reshape(3, 3), own[12], *[np.zeros(3)] * 3)
+        errors = errors._replace(magnetometer_matrix=np.zeros((3, 3)), magnetometer_delay=0.0)
+        return intervals.predicted(gathered, errors, np.broadcast_to(x[:3], bias.shape)), rows
+
+    base, rows = predicted(x, own)
+    for k in range(12):
+        step = np.zeros(12)
+        step[k] = 1e-6
+        more, less = predicted(x + step, own)[0], predicted(x - step, own)[0]
+        turn = np.swapaxes(less.turn, 1, 2) @ more.turn
+        vector = np.stack([turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]], axis=1) / 2e-6
+        np.testing.assert_allclose(vector[rows], base.turn_by[rows, :, k], atol=2e-6)
+        slope = (more.force.value - less.force.value)[rows] / 2e-6
+        np.testing.assert_allclose(slope, base.force.by_turn[rows, :, k], atol=3e-5)
+    for k in range(13):
+        step = np.zeros(13)
+        step[k] = 1e-6
+        slope = (predicted(x, own + step)[0].force.value - predicted(x, own - step)[0].force.value)[rows] / 2e-6
+        np.testing.assert_allclose(slope, base.force.by_own[rows, :, k], atol=3e-5)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda one: [], "at least one recording"),
+        (lambda one: [one.time], "recordings"),
+        (lambda one: dataclasses.replace(one, specific_force=None), "no accelerometer"),
+        (lambda one: [one, dataclasses.replace(one, magnetic_unit="mG")], "one unit for all"),
+        (lambda one: hand_held.simulated(1, 0, 3.0), "needs at least 10 s"),
+    ],
+)
+def test_recordings_that_cannot_be_calibrated_are_refused(turned, change, words):
+    with pytest.raises(InputError, match=words):
+        sd.calibrate(change(turned[1]))
+
+
+# -------------------------------------------------------------------------------------------------------------- the use of a file
+
+
+def test_samples_are_corrected(turned):
+    unit, recording, _ = turned
+    known = UnitCalibration(**{**vars(unit), "magnetic_unit": "mG"})
+    known = dataclasses.replace(known, hard_iron=10.0 * known.hard_iron)  # 1 µT is 10 mG
+    clean = known.applied(recording)
+    ideal = study.simulated(SensorErrors(magnetometer_delay=study.DELAY), 3, 0, 60.0)
+    for name in ("rate", "specific_force", "magnetic_field"):
+        # the same noise, but for the sensor's matrix
+        assert np.abs(getattr(clean, name) - getattr(ideal, name)).max() < 0.3 * np.ptp(getattr(ideal, name)) * 0.05
+    with pytest.raises(InputError, match="declare the unit"):
+        dataclasses.replace(known, magnetic_unit="").applied(recording)
+
+
+def test_an_estimate_with_the_calibration_is_better(turned):
+    unit, _, found = turned
+    second = study.simulated(unit, 3, 2, 30.0, pauses=False)
+    error = study.attitude_error(second, found)
+    assert error < np.radians(0.5)
+    assert error < 0.1 * study.attitude_error(second, None)
+
+
+def test_what_one_estimate_shows_serves_the_next():
+    first = ahrs.estimate(
+        spoiled(0), dataclasses.replace(ahrs.HAND_HELD, gyro_scale_sigma=0.02), latency=0.0, smooth=True
+    ).calibration
+    # The simulated gyro has 0.3 % of its own, drawn anew in each recording.
+    assert np.abs(first.gyro_matrix - MATRIX).max() < 0.02
+    assert np.sqrt(np.mean((first.gyro_matrix - MATRIX) ** 2)) < 3.0 * np.hypot(first.gyro_scale_sigma, 3e-3)
+    known = dataclasses.replace(
+        first, sigma=SensorErrors(gyro_matrix=np.full((3, 3), max(first.gyro_scale_sigma, 3e-3)))
+    )
+    errors = []
+    for one in (None, known):
+        found = ahrs.estimate(spoiled(2), latency=0.0, calibration=one)
+        errors.append(reference_errors(found.estimate.attitude, found.recording.true_attitude).rms()["inclination"])
+    assert errors[1] < 0.5 * errors[0]
+
+
+def test_corrections_of_the_gyro_follow_one_another(turned):
+    known = UnitCalibration(gyro_matrix=MATRIX, accelerometer_bias=[0.1, 0.2, 0.3])
+    values = np.array([[0.0] * 9, [1e-3, 2e-3, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1e-3]])
+    block = ErrorStateEstimate(
+        components=("x", "xy", "xz", "yx", "y", "yz", "zx", "zy", "z"),
+        units=("1",) * 9,
+        values=values,
+        variance=1e-8 * np.arange(18.0).reshape(2, 9),
+    )
+    after = with_gyro_states(known, block, 0.011, "next")
+    further = np.array([[1e-3, 2e-3, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, -1e-3]])
+    # what the filter sees after the correction by MATRIX is off by `further`: the gyro itself by both
+    np.testing.assert_allclose(np.eye(3) + after.gyro_matrix, (np.eye(3) + MATRIX) @ (np.eye(3) + further), atol=1e-15)
+    assert after.gyro_scale_sigma == pytest.approx(np.sqrt(13e-8))
+    assert (after.magnetometer_delay, after.source) == (0.011, "next")
+    np.testing.assert_array_equal(after.accelerometer_bias, known.accelerometer_bias)
+
+
+def test_a_file_gives_it_back(turned, tmp_path):
+    found = turned[2]
+    path = tmp_path / "calibration.toml"
+    calibration.write(found, path)
+    again = calibration.read(path)
+    assert list(again.entries()) == list(found.entries())
+    assert list(again.sigma.entries()) == list(found.sigma.entries())
+    assert (again.source, again.magnetic_unit) == (found.source, "uT")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("gyro_matrix = [[1.0, 0.0], [0.0, 1.0]]", r"\(3, 3\)"),
+        ("gyro_matrix = [[1.0,0.0,0.0],[0.0,1.0,0.0],[0.0,0.0,1.0]]", "give M of I"),
+        ("magnetometer_matrix = [[-1.0,0.0,0.0],[0.0,0.0,0.0],[0.0,0.0,0.0]]", "singular"),
+        ("gyro_bais_deg_per_s = [0.0, 0.0, 0.0]", "did you mean 'gyro_bias_deg_per_s'"),
+        ("magnetic_unit = 'gauss'", "give one of T"),
+        ("[calibration.sigma]\nhard_iron = [1.0, -1.0, 1.0]", "negative"),
+        ("sigma = 1e-3", "must be a table"),
+        ("[other]", ""),
+    ],
+)
+def test_a_wrong_file_is_refused(tmp_path, text, words):
+    path = tmp_path / "calibration.toml"
+    path.write_text(f"[calibration]\n{text}\n" if words else f"{text}\n")
+    with pytest.raises(InputError, match=words or "no table"):
+        calibration.read(path)
+
+
+def test_a_known_delay_of_the_magnetometer_is_used_from_the_start():
+    known = UnitCalibration(magnetometer_delay=0.011)
+    found = ahrs.estimate(hand_held.simulated(1, 0, 4.0), calibration=known)
+    np.testing.assert_array_equal(found.delays.field, np.full(len(found.recording.time), 0.011))
+
+
+# -------------------------------------------------------------------------------------------------------------- recorded units
+
+
+@pytest.mark.slow
+def test_recorded_units_err_less_in_fast_motion_when_calibrated_in_slow():
+    """The board of Caruso et al. (2021): with VQF, so that nothing else of this package counts."""
+    vqf = pytest.importorskip("vqf")
+    if not SETS.is_dir():
+        pytest.skip(f"needs the recordings of the Sassari set in {SETS}")
+    errors = []
+    for unit in ("AP1", "SH1", "XS1"):
+        found = sd.calibrate(sd.read(SETS / f"slow_v4_{unit}.hdf5"))
+        fast = sd.read(SETS / f"fast_v4_{unit}.hdf5")
+        for one in (fast, found.applied(fast)):
+            samples = (np.ascontiguousarray(x) for x in (one.rate, one.specific_force, one.magnetic_field))
+            q = vqf.VQF(0.01).updateBatch(*samples)["quat9D"]
+            errors.append(rms_without_heading_offset(q, fast))
+    before, after = np.mean(np.reshape(errors, (3, 2)), axis=0)
+    assert after < 0.85 * before
+
+
+def rms_without_heading_offset(q, recording):
+    """RMS of the total error over the movement, after one constant rotation about the vertical."""
+    rows = recording.movement & np.isfinite(recording.true_attitude).all(axis=1)
+    error = quaternion.multiply(q[rows], quaternion.conjugate(recording.true_attitude[rows]))
+    offset = np.angle(np.mean(np.exp(2j * np.arctan2(error[:, 3], error[:, 0]))))
+    turned = quaternion.multiply([np.cos(offset / 2), 0.0, 0.0, -np.sin(offset / 2)], error)
+    return np.sqrt(np.mean((2.0 * np.arccos(np.minimum(np.abs(turned[:, 0]), 1.0))) ** 2))
