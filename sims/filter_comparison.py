@@ -35,7 +35,7 @@ import numpy as np
 
 import strapdown
 from strapdown import ahrs, consistency, covariance, montecarlo, quaternion, recordings, scenarios, vectors
-from strapdown.ahrs import HAND_HELD
+from strapdown.ahrs import HAND_HELD, AhrsParameters
 from strapdown.checks import Array
 from strapdown.consistency import alignment, reference_errors
 from strapdown.estimation import State, filters, setup
@@ -349,14 +349,14 @@ def main(
 
 def ours(recording: Recording, gain: float) -> tuple[Array, Array]:
     """Return the stamps and attitudes of ``strapdown estimate``."""
-    chosen = replace(HAND_HELD, velocity_from_record=False, velocity_sigma=HAND_HELD.velocity_sigma / gain)
+    chosen = replace(HAND_HELD, velocity_sigma=HAND_HELD.velocity_sigma / gain)
     found = ahrs.estimate(recording, chosen)
     return found.recording.time, found.estimate.attitude
 
 
 def complementary(recording: Recording, gain: float) -> tuple[Array, Array]:
     """Return the stamps and attitudes of this package's complementary filter (Mahony's), with the same measurements as the MEKF."""
-    found = ahrs.estimate(recording, ahrs.MOTIONS["any"])
+    found = ahrs.estimate(recording, AhrsParameters())
     noise = HAND_HELD.setup.process_noise
     factor = 8.0 * gain  # fixed gains must also allow for disturbances
     scaled = ProcessNoise(

@@ -235,7 +235,7 @@ def estimate_recording(
     *,
     noise: GyroSpec | NoiseFit | ProcessNoise | None = None,
     temperature: BiasOverTemperature | None = None,
-    motion: str = ahrs.motions.AUTO,
+    motion: str = "hand",
     walks: bool = False,
     full_covariance: bool | None = None,
     gate: Gate | None = None,
@@ -248,9 +248,8 @@ def estimate_recording(
     ``temperature``: the gyro's bias over temperature, which is subtracted first; ``walks``: model the error of its slope as a random walk.
     ``options`` are those of :func:`strapdown.ahrs.estimate`.
     """
-    begun = ahrs.begin(source)
-    kind, odds = ahrs.motions.chosen(begun, motion)
-    parameters = ahrs.MOTIONS[kind]
+    ahrs.need_accelerometer(source)
+    parameters = ahrs.of_motion(motion, magnetometer=source.magnetic_field is not None, smooth=smooth)
     if isinstance(noise, ProcessNoise):
         parameters = dataclasses.replace(
             parameters, angle_random_walk=noise.angle_random_walk, rate_random_walk=noise.rate_random_walk
@@ -260,10 +259,9 @@ def estimate_recording(
         parameters, temperature = with_gyro_noise(parameters, spec), temperature or spec.temperature
     if temperature is not None:
         source, parameters = ahrs.without_temperature(source, parameters, temperature, walks=walks or smooth)
-        begun = ahrs.begin(source)
     known = source.true_attitude is not None
     result = ahrs.estimate(
-        begun,
+        source,
         parameters,
         gate=gate,
         robust=robust,
@@ -279,9 +277,9 @@ def estimate_recording(
         origin=Origin(source=used.source),
         truth=truth,
         fixed_frame=fixed_frame(used),
-        motion=kind,
+        motion=motion,
         smoothed=smooth,
-        remarks=remarks(result, kind, odds),
+        remarks=remarks(result, motion),
         details={
             **{f"parameter.{name}": value for name, value in vars(result.parameters).items()},
             "latency": result.delays.last_gyro,
@@ -309,7 +307,7 @@ def estimate(
     """Estimate attitude and gyro bias with a multiplicative extended Kalman filter, as the command ``strapdown estimate`` does.
 
     For a simulated record, the filter matches the scenario and is initialised from the first measurements. For a recording, the
-    accelerometer gives the vertical and the magnetometer the heading (:mod:`strapdown.ahrs`), from the first interval at rest on.
+    accelerometer gives the vertical and the magnetometer the heading (:mod:`strapdown.ahrs`), from the first sample on.
 
     Parameters
     ----------
@@ -329,9 +327,9 @@ def estimate(
         Reject measurements beyond this quantile of χ² (such as 0.999), and recover from a lost attitude.
     robust : Robust or {"huber", "student"}, optional
         Weight measurements by the size of their innovations.
-    motion : {"auto", "hand", "vehicle", "any"}, optional
-        For a recording: model of the motion, with states for the gyro's scale factors. ``"hand"``: bounded velocity; ``"vehicle"``:
-        acceleration that lasts for seconds; ``"auto"``, the default: that of higher likelihood; ``"any"``: white noise, without states.
+    motion : {"hand", "vehicle", "vessel", "any"}, optional
+        For a recording: model of the motion. ``"hand"``, the default: bounded velocity, as of a hand, a person or a small aircraft;
+        ``"vehicle"``: acceleration that lasts for seconds; ``"vessel"``: bounded position, as on waves; ``"any"``: white noise.
     latency : float, optional
         For a recording: delay of the gyro's samples, s. Default: half a sample interval.
     calibration : UnitCalibration, optional
@@ -373,7 +371,7 @@ def estimate(
         return estimate_recording(
             source,
             noise=noise,
-            motion=motion or ahrs.motions.AUTO,
+            motion=motion or "hand",
             latency=latency,
             calibration=calibration,
             gate=gate,

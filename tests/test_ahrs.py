@@ -9,15 +9,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-import strapdown
 from sims import hand_held
 from strapdown import ahrs, consistency, estimation, quaternion
-from strapdown.ahrs import AhrsParameters, estimating, motions
+from strapdown.ahrs import AhrsParameters, headings, regions, starting
 from strapdown.checks import InputError
 from strapdown.consistency import reference_errors
 from strapdown.estimation import setup
-from strapdown.estimation.error_states import BoundedVelocity
-from strapdown.recordings import Recording, hard_iron, read, sensor_delays, sensor_faults
+from strapdown.recordings import Recording, hard_iron, read, sensor_delays
 from strapdown.records import Estimate, Innovations, Truth
 from strapdown.units import DEGREE
 
@@ -86,7 +84,7 @@ def rows_of(recording: Recording, rows: slice | np.ndarray) -> Recording:
 @pytest.fixture(params=ahrs.MOTIONS)
 def parameters(request) -> AhrsParameters:
     """The filter's model of each motion."""
-    return ahrs.MOTIONS[request.param]
+    return ahrs.of_motion(request.param, magnetometer=True)
 
 
 # ---------------------------------------------------------------------------------------------------- known truth
@@ -110,10 +108,15 @@ def test_a_gyro_bias_is_found(parameters):
 
 @pytest.mark.parametrize(("motion", "bound"), [("any", 1.0), ("hand", 1.1)])
 def test_sensor_noise_is_filtered(motion, bound):
-    assert worst(ahrs.estimate(recording(noise=1.0), ahrs.MOTIONS[motion]), after=5.0)["total"] < bound
+    assert (
+        worst(ahrs.estimate(recording(noise=1.0), ahrs.of_motion(motion, magnetometer=True)), after=5.0)["total"]
+        < bound
+    )
 
 
-def test_without_a_magnetometer_the_inclination_is_as_good(parameters):
+@pytest.mark.parametrize("motion", ahrs.MOTIONS)
+def test_without_a_magnetometer_the_inclination_is_as_good(motion):
+    parameters = ahrs.of_motion(motion, magnetometer=False)
     result = ahrs.estimate(dataclasses.replace(recording(), magnetic_field=None), parameters, latency=0.0)
     assert worst(result)["inclination"] < 0.01
     # the heading starts anywhere, and keeps its error
@@ -129,7 +132,8 @@ def test_a_disturbed_field_turns_the_heading_only(parameters):
     field[2000:3000] = plain.magnetic_field[2000:3000] @ Rotation.from_rotvec([0.3, 0.9, 0.2]).as_matrix()
     disturbed = ahrs.estimate(dataclasses.replace(plain, magnetic_field=field), parameters, latency=0.0)
     assert worst(disturbed)["heading"] > 0.05
-    assert worst(disturbed)["inclination"] < 0.1
+    # by the bias that it feigns; a vehicle's vertical is bound least
+    assert worst(disturbed)["inclination"] < (0.1 if parameters.velocity_sigma < 2.0 else 0.25)
 
 
 def test_how_the_unit_is_mounted_and_the_unit_of_the_field_do_not_matter():
@@ -163,8 +167,10 @@ def test_half_the_rate_gives_the_same_within_the_trapezoid_rule(parameters):
     plain = recording(60.0, bias=(0.005, 0.0, 0.0), noise=0.0)
     half = rows_of(plain, slice(None, None, 2))
     whole, sparse = (ahrs.estimate(one, parameters, latency=0.0).estimate for one in (plain, half))
-    assert quaternion.angle_between(whole.attitude[::2], sparse.attitude).max() < 0.05 * DEGREE
-    np.testing.assert_allclose(whole.sigma[::2][100:], sparse.sigma[100:], rtol=0.03)
+    # Spans at rest end a sample apart, and the bias is measured there.
+    later = slice(120, None)
+    assert quaternion.angle_between(whole.attitude[::2][later], sparse.attitude[later]).max() < 0.05 * DEGREE
+    np.testing.assert_allclose(whole.sigma[::2][500:], sparse.sigma[500:], rtol=0.04)
 
 
 def test_a_heading_stands_at_the_end_of_its_interval():
@@ -201,23 +207,29 @@ def test_a_disturbance_of_the_field_is_seen_in_its_strength_and_dip(smooth, monk
 
 
 @pytest.mark.parametrize("smooth", [False, True])
-def test_iron_attached_to_the_unit_is_taken_off_while_it_is_there(smooth, monkeypatch):
-    """A magnet on the unit from the end of its rest to 45 s, 40 % of the field and so nearly its level part."""
+def test_hard_iron_is_estimated_as_the_unit_turns(smooth, monkeypatch):
+    """5 % of the field, more than the stationary σ of 4 %."""
+    iron = np.array([1.5, -1.0, 1.8])
     plain = recording(75.0, noise=0.3)
-    there = (plain.time > 101.5) & (plain.time < 145.0)
-    field = plain.magnetic_field + np.where(there[:, None], [12.0, -8.0, 14.0], 0.0)
-    attached = dataclasses.replace(plain, magnetic_field=field)
-    found = ahrs.estimate(attached, latency=0.0, smooth=smooth)
-    assert worst(found)["heading"] < (0.8 if smooth else 1.8)
-    assert np.linalg.norm(found.hard_iron) < 3.0  # of 20, half a time constant of its memory after it was removed
-    if not smooth:
-        assert not found.hard_iron.any()  # a thousandth of the field is none, and not reported
-    during = ahrs.estimate(rows_of(attached, plain.time <= 145.0), latency=0.0, smooth=smooth)
-    np.testing.assert_allclose(during.hard_iron, [12.0, -8.0, 14.0], atol=1.0)
+    shifted = dataclasses.replace(plain, magnetic_field=plain.magnetic_field + iron)
+    found = ahrs.estimate(shifted, latency=0.0, smooth=smooth)
+    np.testing.assert_allclose(found.hard_iron, iron, atol=0.7)
+    without = dataclasses.replace(ahrs.HAND_HELD, hard_iron_sigma=0.0)
     monkeypatch.setattr(hard_iron, "FEIGNED", 1e9)
-    as_it_is = ahrs.estimate(attached, latency=0.0, smooth=smooth)
-    sigma = [np.median(one.record.vectors[1].sigma[100:280]) for one in (found, as_it_is)]
-    assert sigma[0] < 0.3 * sigma[1]  # and the heading keeps its weight meanwhile
+    as_it_is = ahrs.estimate(shifted, without, latency=0.0, smooth=smooth)
+    assert not as_it_is.hard_iron.any()
+    assert worst(found, after=30.0)["heading"] < 0.7 * worst(as_it_is, after=30.0)["heading"]
+
+
+def test_running_medians_are_those_of_numpy():
+    """Of the values up to each, at a stride; with room for 128 they are those to within a few of 1,000 ranks."""
+    values = np.random.default_rng(8).standard_normal((1000, 2))
+    median = headings._usual(values, headings.MEDIAN_INTERVAL, causal=True)
+    expected = [np.median(values[: k + 1], axis=0) for k in range(len(values))]
+    np.testing.assert_allclose(median, expected, atol=1e-15)
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(headings, "MEDIAN_SAMPLES", 128)
+        np.testing.assert_allclose(headings._usual(values, headings.MEDIAN_INTERVAL, causal=True), expected, atol=0.25)
 
 
 def test_the_steeper_the_field_the_less_it_says():
@@ -225,32 +237,52 @@ def test_the_steeper_the_field_the_less_it_says():
     flat = recording(20.0)
     there = [0.0, 50.0, 0.0]
     level = dataclasses.replace(flat, magnetic_field=quaternion.rotate(quaternion.conjugate(flat.true_attitude), there))
-    sigma = [
-        np.median(ahrs.prepare(one, slice(0, 200), ahrs.HAND_HELD).record.vectors[1].sigma[20:40])
-        for one in (flat, level)
-    ]
+    sigma = [np.median(ahrs.prepare(one, ahrs.HAND_HELD).record.vectors[1].sigma[:12]) for one in (flat, level)]
     assert sigma[1] / sigma[0] == pytest.approx(np.cos(DIP), rel=0.05)
 
 
 # ---------------------------------------------------------------------------------------------------- the start
 
 
-def test_start_is_triad_of_the_quiet_second():
+def begun(recording: Recording, parameters: AhrsParameters = ahrs.HAND_HELD) -> estimation.State:
+    """The state at the first sample."""
+    return ahrs.start(recording, sensor_delays.gyro_attitude(recording), parameters)
+
+
+def test_start_is_triad_of_the_first_sample():
     plain = recording()
-    state = ahrs.start(plain, ahrs.quiet_span(plain), AhrsParameters())
+    state = begun(plain, AhrsParameters())
     assert float(quaternion.angle_between(state.attitude, plain.true_attitude[0])) < 1e-9
     np.testing.assert_array_equal(state.bias, np.zeros(3))
     assert np.sqrt(state.covariance[5, 5]) == pytest.approx(0.5 * DEGREE)
 
 
-def test_iron_is_taken_off_the_field_that_the_start_is_made_of():
+def test_the_first_valid_samples_are_turned_back_to_the_first_stamp():
+    moving = recording().since(600)
+    late = {}
+    for name, missing in (("specific_force", 20), ("magnetic_field", 50)):
+        late[name] = getattr(moving, name).copy()
+        late[name][:missing] = np.nan
+    state = begun(dataclasses.replace(moving, **late))
+    assert np.linalg.norm(moving.rate[0]) > 0.5
+    assert float(quaternion.angle_between(state.attitude, moving.true_attitude[0])) < 1e-3
+
+
+def test_the_sigma_of_the_start_says_how_it_moves():
+    """At rest that of the parameters; with a rate or a specific force that is not gravity's, more."""
     plain = recording()
-    quiet, iron = ahrs.quiet_span(plain), np.array([3.0, -4.0, 2.0])
-    wanted = ahrs.start(plain, quiet, AhrsParameters()).attitude
-    shifted = dataclasses.replace(plain, magnetic_field=plain.magnetic_field + iron)
-    # The unit hardly turns in the quiet second: its mean field holds all of the iron.
-    assert quaternion.angle_between(ahrs.start(shifted, quiet, AhrsParameters(), iron).attitude, wanted) < 2e-3
-    assert quaternion.angle_between(ahrs.start(shifted, quiet, AhrsParameters()).attitude, wanted) > 2e-2
+    rest = begun(plain)
+    up = quaternion.to_matrix(rest.attitude)[2]
+    P = rest.covariance[:3, :3]
+    level = np.linalg.svd(up[None])[2][1]
+    assert np.sqrt(level @ P @ level) == pytest.approx(3.0 * DEGREE, rel=0.01)
+    assert np.sqrt(up @ P @ up) == pytest.approx(
+        np.sqrt((3.0 * DEGREE) ** 2 + ((np.sin(DIP) * 3.0 * DEGREE) ** 2 + 0.1**2) / np.cos(DIP) ** 2), rel=0.01
+    )
+    turning = dataclasses.replace(plain, rate=plain.rate + np.array([2.0, 0.0, 0.0]))
+    assert np.sqrt(level @ begun(turning).covariance[:3, :3] @ level) == pytest.approx(0.2, rel=0.05)
+    pushed = dataclasses.replace(plain, specific_force=1.3 * plain.specific_force)
+    assert np.sqrt(level @ begun(pushed).covariance[:3, :3] @ level) == pytest.approx(0.3, rel=0.05)
 
 
 def test_quiet_span_is_the_first_quiet_second():
@@ -262,11 +294,36 @@ def test_quiet_span_is_the_first_quiet_second():
     later = dataclasses.replace(
         recording(noise=0.1), rate=shaken + 1e-4 * np.random.default_rng(2).standard_normal(shaken.shape)
     )
-    span = ahrs.quiet_span(later)
-    assert span == slice(round(RATE), 2 * round(RATE))
-    result = ahrs.estimate(later)
-    assert result.recording.time[0] == later.time[span.start]
-    assert len(result.estimate.time) == len(result.recording.time)
+    assert ahrs.quiet_span(later) == slice(round(RATE), 2 * round(RATE))
+
+
+@pytest.mark.parametrize("smooth", [False, True])
+def test_every_sample_has_an_attitude_wherever_the_rest_is(smooth):
+    """A recording that begins in motion, with a gyro bias, and rests at its end: smoothed, the rest serves all of it."""
+    bias = np.array([3.0, -2.0, 1.5]) * DEGREE
+    moving = recording(40.0, bias=tuple(bias), noise=0.3).since(800)
+    n = round(3.0 * RATE)
+    random = np.random.default_rng(12)
+    last = {
+        name: np.tile(quaternion.rotate(quaternion.conjugate(moving.true_attitude[-1]), fixed), (n, 1))
+        for name, fixed in (
+            ("specific_force", [0.0, 0.0, 9.81]),
+            ("magnetic_field", [0.0, 50.0 * np.cos(DIP), -50.0 * np.sin(DIP)]),
+        )
+    }
+    whole = dataclasses.replace(
+        moving,
+        time=np.append(moving.time, moving.time[-1] + np.arange(1, n + 1) / RATE),
+        rate=np.vstack([moving.rate, bias + 1e-3 * random.standard_normal((n, 3))]),
+        **{name: np.vstack([getattr(moving, name), samples]) for name, samples in last.items()},
+        true_attitude=np.vstack([moving.true_attitude, np.tile(moving.true_attitude[-1], (n, 1))]),
+    )
+    found = ahrs.estimate(whole, latency=0.0, smooth=smooth)
+    np.testing.assert_array_equal(found.estimate.time, whole.time)
+    np.testing.assert_allclose(found.estimate.bias[-1], bias, atol=0.1 * DEGREE)
+    if smooth:
+        assert worst(found)["total"] < 2.0
+        np.testing.assert_allclose(found.initial.bias, bias, atol=0.15 * DEGREE)
 
 
 def test_a_steady_turn_is_not_rest():
@@ -290,12 +347,11 @@ def test_stamps_in_milliseconds_and_dead_sensors_are_reported():
     slow = dataclasses.replace(whole, time=1e3 * whole.time)
     with pytest.raises(InputError, match=r"hold one sample, 5 s is the mean interval; .* in ms or us, say so"):
         ahrs.estimate(slow)
-    for name, sensor in (("specific_force", "accelerometer"), ("magnetic_field", "magnetometer")):
-        for value, seconds, words in ((0.0, 3.0, "is zero over"), (np.nan, 1.2, "has no valid sample in")):
-            dead = getattr(whole, name).copy()
-            dead[: round(seconds * RATE)] = value
-            with pytest.raises(InputError, match=f"known truth: the {sensor} {words} the first quiet second"):
-                ahrs.estimate(dataclasses.replace(whole, **{name: dead}))
+    for name in ("specific_force", "magnetic_field"):
+        with pytest.raises(InputError, match=f"known truth: {name} is 0 in every row"):
+            ahrs.estimate(dataclasses.replace(whole, **{name: np.zeros_like(whole.rate)}))
+    with pytest.raises(InputError, match="known truth has no accelerometer samples"):
+        ahrs.estimate(dataclasses.replace(whole, specific_force=np.full_like(whole.rate, np.nan)))
 
 
 @pytest.mark.parametrize("name", [field.name for field in dataclasses.fields(AhrsParameters)])
@@ -324,34 +380,83 @@ def quiet_second(rate, noise=1e-3, turn=(0.0, 0.0, 0.0), field=True, length=3.0)
     )
 
 
-def bias_of(recording: Recording) -> tuple[np.ndarray, float]:
-    """Bias and its σ, °/s, of the first second."""
-    bias, sigma = ahrs.resting_bias(recording, slice(0, round(RATE)), ahrs.HAND_HELD)
-    return bias / DEGREE, sigma / DEGREE
+def rests_of(recording: Recording) -> starting.Rests:
+    """Spans at rest, as the filter finds them."""
+    return starting.rests(recording, ahrs.HAND_HELD)
 
 
 @pytest.mark.parametrize("rate", [(0.3, -0.2, 0.1), (4.0, -3.0, 2.0)])
-def test_the_mean_rate_at_rest_is_the_bias_however_large(rate):
-    bias, sigma = bias_of(quiet_second(rate))
-    assert 0.05 < sigma < 0.08
-    np.testing.assert_allclose(bias, rate, atol=3.0 * sigma)
-    # beside a prior of 0.5, a measurement of 0.05
-    assert np.linalg.norm(bias) < np.linalg.norm(rate)
+def test_the_mean_rate_at_rest_measures_the_bias_however_large(rate):
+    found = rests_of(quiet_second(rate))
+    np.testing.assert_array_equal(found.last, [199, 399, 599])
+    assert np.all((found.sigma > 0.05 * DEGREE) & (found.sigma < 0.08 * DEGREE))
+    np.testing.assert_allclose(found.rate, np.tile(rate, (3, 1)) * DEGREE, atol=3.0 * found.sigma.max())
+    result = ahrs.estimate(quiet_second(rate))
+    np.testing.assert_allclose(result.estimate.bias[-1], np.array(rate) * DEGREE, atol=0.15 * DEGREE)
 
 
-@pytest.mark.parametrize(("turn", "field"), [((0.0, 0.0, 8.0), True), ((6.0, -4.0, 0.0), False)])
-def test_a_steady_turn_is_no_bias(turn, field):
-    bias, sigma = bias_of(quiet_second(turn, turn=turn, field=field))
-    assert np.linalg.norm(bias) < 0.1
-    assert 0.45 < sigma < 0.5
+@pytest.mark.parametrize(
+    ("turn", "field"), [((0.0, 0.0, 8.0), True), ((6.0, -4.0, 0.0), False), ((0.0, 1.0, 0.0), False)]
+)
+def test_a_steady_turn_is_no_rest(turn, field):
+    assert len(rests_of(quiet_second(turn, turn=turn, field=field)).last) == 0
 
 
-def test_a_moving_hand_gives_no_bias():
+def test_a_moving_hand_and_a_gap_are_no_rest():
     plain = quiet_second((0.0, 0.0, 0.0))
     swing = 20.0 * DEGREE * np.sin(2.0 * np.pi * 0.7 * plain.time)[:, None] * np.array([1.0, 0.0, 0.5])
-    bias, sigma = bias_of(dataclasses.replace(plain, rate=plain.rate + swing))
-    assert np.linalg.norm(bias) < 0.05
-    assert 0.49 < sigma < 0.5
+    assert len(rests_of(dataclasses.replace(plain, rate=plain.rate + swing)).last) == 0
+    gap = dataclasses.replace(plain, time=plain.time + np.where(plain.time > 1.5, 1.0, 0.0))
+    np.testing.assert_array_equal(rests_of(gap).last, [199, 599])
+
+
+def test_a_long_rest_is_measured_until_it_says_no_more_than_is_known():
+    """In closed form: of σ equal to that of the prior the first is used; then it takes r/q seconds until the bias has drifted as far."""
+    n = 1000
+    time = np.arange(n, dtype=float)
+    found = starting.Rests(np.arange(1, n), np.zeros((n - 1, 3)), np.full(n - 1, 1e-3))
+    parameters = dataclasses.replace(ahrs.HAND_HELD, bias_sigma=1e-3 + 1e-9, rate_random_walk=1e-4)
+    kept = starting.informative(found, time, parameters).last
+    assert kept[0] == 1
+    assert kept[1] - 1 == pytest.approx(50, abs=1)  # ½σ² + q t = σ²
+
+
+def test_a_measurement_of_the_bias_is_that_of_a_kalman_filter():
+    """Against the information form: P⁻¹ grows by 1/σ² of the bias alone, and the reset turns the attitude's axes."""
+    random = np.random.default_rng(4)
+    root = 0.01 * random.standard_normal((8, 8))
+    state = estimation.State(
+        attitude=quaternion.normalize(random.standard_normal(4)),
+        bias=np.zeros(3),
+        covariance=root @ root.T,
+        values=np.zeros(2),
+    )
+    rate, sigma = np.array([0.02, -0.01, 0.03]), 5e-3
+    found = starting.with_rate_at_rest(state, rate, sigma)
+    H = np.eye(8)[3:6]
+    expected = np.linalg.inv(np.linalg.inv(state.covariance) + H.T @ H / sigma**2)
+    change = expected @ H.T @ rate / sigma**2
+    np.testing.assert_allclose(found.bias, change[3:6], atol=1e-12)
+    np.testing.assert_allclose(found.values, change[6:], atol=1e-12)
+    turned = quaternion.log(quaternion.multiply(quaternion.conjugate(state.attitude), found.attitude))
+    np.testing.assert_allclose(turned, change[:3], atol=1e-12)
+    reset = np.eye(8)
+    reset[:3, :3] -= 0.5 * np.cross(np.eye(3), change[:3])
+    np.testing.assert_allclose(found.covariance, reset @ expected @ reset.T, rtol=1e-3, atol=1e-9)
+
+
+def test_all_rests_are_combined_as_they_drift():
+    """Two rests of one σ: the bias at the first sample by least squares over the values of a random walk."""
+    time = np.array([0.0, 10.0, 40.0])
+    found = starting.Rests(np.array([1, 2]), np.array([[1e-3] * 3, [4e-3] * 3]), np.array([1e-3, 2e-3]))
+    parameters = dataclasses.replace(ahrs.HAND_HELD, bias_sigma=1.0, rate_random_walk=2e-4)
+    plain = recording()
+    state = starting.with_all_rests(begun(plain, parameters), found, time, parameters)
+    q = 2e-4**2
+    noise = np.array([[1e-6 + 10.0 * q, 10.0 * q], [10.0 * q, 4e-6 + 40.0 * q]])
+    weights = np.linalg.solve(noise, np.ones(2))
+    np.testing.assert_allclose(state.bias, weights @ found.rate / weights.sum(), rtol=1e-4)
+    np.testing.assert_allclose(np.diag(state.covariance)[3:6], 1.0 / weights.sum(), rtol=1e-4)
 
 
 # ---------------------------------------------------------------------------------------------------- what moves it
@@ -377,11 +482,12 @@ def driven(duration: float = 60.0) -> Recording:
 
 
 def test_acceleration_that_lasts_is_a_vehicles_and_does_not_pass_for_tilt():
-    """A filter that bounds the velocity takes the curves for tilt; that of a vehicle does not, and is chosen."""
+    """A filter that bounds the velocity by a hand's takes the curves for tilt; that of a vehicle does not."""
     car = driven()
-    name, odds = motions.chosen(car)
-    assert (name, odds > 500.0) == ("vehicle", True)
-    own, hand = (worst(ahrs.estimate(car, ahrs.MOTIONS[one]), after=10.0)["inclination"] for one in ("vehicle", "hand"))
+    own, hand = (
+        worst(ahrs.estimate(car, ahrs.of_motion(one, magnetometer=True)), after=10.0)["inclination"]
+        for one in ("vehicle", "hand")
+    )
     assert own < 3.5 < 3.0 * own < hand
 
 
@@ -395,72 +501,42 @@ def test_a_vibrating_machine_needs_no_set_of_its_own():
         quaternion.conjugate(plain.true_attitude), shaken
     )
     machine = dataclasses.replace(plain, specific_force=force)
-    assert motions.chosen(machine)[0] == "hand"
     hand, white = (
-        worst(ahrs.estimate(machine, ahrs.MOTIONS[one], latency=0.0), after=5.0)["inclination"]
+        worst(ahrs.estimate(machine, ahrs.of_motion(one, magnetometer=True), latency=0.0), after=5.0)["inclination"]
         for one in ("hand", "any")
     )
     assert 0.05 < hand < 0.3 < white < 2.0
 
 
-@pytest.mark.parametrize("run", range(3))
-def test_a_hand_is_a_hand_however_it_was_recorded(run):
-    """Clipped, with dropouts, without a magnetometer or rest, with a bias that nothing shows, and at rest alone."""
-    plain = hand_held.simulated(5, run, 60.0)
-    limit = 0.5 * np.abs(plain.rate).max()
-    faulty = {
-        "too short": hand_held._rows(plain, np.arange(len(plain.time)) < 2.0 * hand_held.RATE),
-        "clipped at half": dataclasses.replace(plain, rate=np.clip(plain.rate, -limit, limit)),
-        "bias without rest": recording(60.0, bias=(1.5 * DEGREE, 0.0, 0.0), noise=1.0).since(1000),
-        "at rest": quiet_second((0.0, 0.0, 0.0), length=60.0),
-    }
-    for words, one in {"plain": plain, **faulty, **hand_held.modified(plain)}.items():
-        assert motions.chosen(one)[0] == "hand", words
-    assert motions.chosen(plain)[1] > 30.0
-    assert motions.chosen(plain, "any") == ("any", np.inf)
-
-
-def test_the_quiet_second_and_the_faults_of_a_recording_are_found_once(monkeypatch):
-    plain, found = recording(), []
-    once = strapdown.estimate(plain)
-    real = sensor_faults.find
-    monkeypatch.setattr(sensor_faults, "find", lambda one: found.append(one) or real(one))
-    begun = ahrs.begin(plain)
-    assert ahrs.begin(begun) is begun
-    assert begun.recording is plain
-    assert motions.chosen(begun)[0] == "hand"
-    np.testing.assert_array_equal(ahrs.estimate(begun).estimate.attitude, once.attitude)
-    assert len(found) == 1
-    strapdown.estimate(plain)
-    assert len(found) == 2
-
-
-@pytest.mark.parametrize("name", ["hand", "vehicle"])
-def test_the_change_of_mean_acceleration_is_that_of_the_bounded_velocity(name):
-    """``(v(2T) − 2 v(T) + v(0))/T`` by the transition of the process over T and its stationary covariance."""
-    own = dataclasses.replace(ahrs.MOTIONS[name], velocity_sigma=1.7)
-    block = BoundedVelocity(
-        sensor="accelerometer",
-        velocity_sigma=1.7,
-        velocity_time=own.velocity_time,
-        acceleration_time=own.acceleration_time,
+def on_waves(duration: float = 60.0) -> Recording:
+    """A vessel on waves of 0.1 Hz, two metres of heave and sway, that rolls by 10°."""
+    time = np.arange(round(duration * RATE)) / RATE
+    w = 0.2 * np.pi
+    roll = 10.0 * DEGREE * np.sin(w * time + 0.4)
+    attitude = START * Rotation.from_rotvec(roll[:, None] * [1.0, 0.0, 0.0])
+    acceleration = -(w**2) * 2.0 * np.stack([np.sin(w * time), 0.3 * np.cos(w * time), np.cos(w * time)], axis=1)
+    random = np.random.default_rng(9)
+    white = random.standard_normal((3, len(time), 3))
+    rate = 10.0 * DEGREE * w * np.cos(w * time + 0.4)
+    return Recording(
+        source="on waves",
+        time=time,
+        rate=rate[:, None] * [1.0, 0.0, 0.0] + 2e-3 * white[0],
+        specific_force=attitude.inv().apply(acceleration + np.array([0.0, 0.0, 9.81])) + 0.02 * white[1],
+        magnetic_field=attitude.inv().apply([0.0, 20.0, -43.0]) + 0.3 * white[2],
+        true_attitude=np.roll(attitude.as_quat(), 1, axis=-1),
     )
-    first = block.units.index("m/s")
-    P, T = block.covariance, motions.SPAN
-    at = [(block.transition(t) @ P)[first, first] for t in (0.0, T, 2.0 * T)]
-    assert motions._change(own) == pytest.approx((6.0 * at[0] - 8.0 * at[1] + 2.0 * at[2]) / T**2, rel=1e-9)
 
 
-def test_all_trials_of_broad_are_of_a_hand(broad):
-    names, odds = zip(*(motions.chosen(trial(file)) for file in broad.glob("*.hdf5")), strict=True)
-    assert set(names) == {"hand"}
-    assert min(odds) > 100.0
+def test_the_acceleration_of_a_vessel_on_waves_does_not_pass_for_tilt():
+    waves = on_waves()
+    own, hand = (
+        worst(ahrs.estimate(waves, ahrs.of_motion(one, magnetometer=True)), after=20.0)["inclination"]
+        for one in ("vessel", "hand")
+    )
+    assert own < 0.75 * hand
 
 
-# ---------------------------------------------------------------------------------------------------- latency
-
-
-@functools.cache
 def late(gyro: float = 0.0, field: float = 0.0, bias: tuple[float, ...] = (0.0, 0.0, 0.0)) -> Recording:
     """Half a minute of brisk motion; gyro and accelerometer show what was ``gyro`` s ago, the magnetometer ``field`` s more."""
     time = np.arange(round(30.0 * RATE)) / RATE
@@ -551,7 +627,7 @@ def test_a_sample_is_the_mean_of_its_interval_where_no_latency_is_given():
     """A gyro that integrates gives what was half a sample ago."""
     found = ahrs.estimate(late(gyro=0.5 / RATE))
     assert found.delays.last_gyro == pytest.approx(0.5 / RATE)
-    assert worst(found)["total"] < 0.2
+    assert worst(found, after=1.0)["total"] < 0.2  # at first with the error of one sample
     assert found.delays.sigma > ahrs.estimate(late(), latency=0.0).delays.sigma
 
 
@@ -582,7 +658,7 @@ def test_the_gyros_bias_is_taken_off_the_way_to_a_stamp_and_over_the_delay():
     found, late_by, far = (ahrs.estimate(plain, latency=one) for one in (0.0, 0.02, 0.5))
     used, q = found.recording, found.estimate.attitude
     seen = found.estimate.bias
-    assert np.abs(seen - bias).max() < 0.2 * DEGREE
+    assert np.abs(seen - bias)[used.time > used.time[0] + 1.1].max() < 0.2 * DEGREE
     # from each step's stamp on, a sample at a time, by SciPy
     turn = 0.5 * (used.rate[1:] + used.rate[:-1]) - seen[:-1]
     by_gyro = Rotation.from_rotvec(turn * np.diff(used.time)[:, None])
@@ -629,7 +705,7 @@ def test_beliefs_are_a_setup_that_goes_through_its_file(parameters):
 
 
 def test_what_a_filter_cannot_estimate_is_part_of_sigma():
-    """A timing error of 2 ms along the rate, and iron of 1.2 % over the level part of the field about the vertical."""
+    """A timing error of 2 ms along the rate, and iron of 0.4 % over the level part of the field about the vertical."""
     given, assumed = (ahrs.estimate(late(), latency=one, full_covariance=True) for one in (0.0025, None))
     rate = given.recording.rate
     along = rate / np.linalg.norm(rate, axis=1, keepdims=True)
@@ -641,7 +717,7 @@ def test_what_a_filter_cannot_estimate_is_part_of_sigma():
         late(), dataclasses.replace(ahrs.HAND_HELD, iron_sigma=0.0), latency=0.0025, full_covariance=True
     )
     difference = given.estimate.covariance[:, :3, :3] - without.estimate.covariance[:, :3, :3]
-    np.testing.assert_allclose(np.trace(difference, axis1=1, axis2=2), (0.012 / np.cos(DIP)) ** 2, rtol=0.02)
+    np.testing.assert_allclose(np.trace(difference, axis1=1, axis2=2), (0.004 / np.cos(DIP)) ** 2, rtol=0.02)
 
 
 @pytest.mark.parametrize("smooth", [False, True])
@@ -665,7 +741,15 @@ def test_between_two_steps_the_attitudes_covariance_is_turned_with_the_unit(smoo
 
 def test_the_level_of_the_acceleration_scales_the_tilt_alone():
     """The filter's covariance in fixed axes, its first two rows and columns by one factor."""
-    unit = dataclasses.replace(ahrs.HAND_HELD, iron_sigma=0.0)
+    unit = dataclasses.replace(
+        ahrs.HAND_HELD,
+        iron_sigma=0.0,
+        rest_bias_sigma=0.0,
+        tilt_sigma=0.0,
+        tilt_by_field=0.0,
+        heading_share=1.0,
+        heading_by_field=0.0,
+    )
     found = ahrs.estimate(recording(noise=1.0), unit, latency=0.0, full_covariance=True)
     own = found.parameters.setup
     blocks = own.states.blocks({one.sensor: one.kind for one in found.record.vectors})
@@ -744,7 +828,7 @@ def test_sigma_holds_on_broad_trials(broad):
 def test_the_inclinations_sigma_is_neither_too_small_nor_too_large(broad, smooth):
     """The 95 % regions of the inclination, as recorded, over slow and fast motion."""
     held = [score(file, smooth).coverage[2] for file in sorted(broad.glob("*.hdf5"))]
-    assert 0.92 < np.mean(held) < 0.985, held
+    assert 0.92 < np.mean(held) < 0.995, held
     assert min(held) > 0.8, held
 
 
@@ -762,36 +846,21 @@ def test_the_level_of_the_acceleration_and_the_innovations_variance_by_it():
         innovations={"accelerometer": seen},
     )
     uncertain = np.arange(steps) == 2999
-    level = estimating._level(still, uncertain)
+    level = regions.acceleration_level(still, uncertain)
     since = np.minimum(time, np.where(time >= time[3000], time - time[3000], np.inf))
-    np.testing.assert_allclose(level, np.exp(-since / estimating.LEVEL_TIME), rtol=1e-9)
-    variance = estimating._innovations(still, level)["accelerometer"].variance
-    own = estimating.OWN_SHARE
+    np.testing.assert_allclose(level, np.exp(-since / regions.LEVEL_TIME), rtol=1e-9)
+    variance = regions.scaled_innovations(still, level)["accelerometer"].variance
+    own = regions.OWN_SHARE
     np.testing.assert_allclose(variance[:, 0], 2.0 * (own + (1.0 - own) * level[:-1]), rtol=1e-12)
     moved = dataclasses.replace(seen, innovation=np.full((steps, 3), np.sqrt(2.0)))
     as_modelled = dataclasses.replace(still, innovations={"accelerometer": moved})
-    np.testing.assert_allclose(estimating._level(as_modelled, uncertain), 1.0, rtol=1e-12)
-
-
-def test_the_velocity_of_a_hand_is_that_which_the_recording_shows():
-    """A sine of 3 m/s² along one axis over ten of sixty seconds: its RMS over the three axes is 3/√6, whatever the rest and its turns."""
-    plain = recording(60.0, noise=0.0)
-    since = plain.time - plain.time[0]
-    push = np.where((since > 20.0) & (since < 30.0), 3.0 * np.sin(2.0 * np.pi * since), 0.0)
-    inverse = quaternion.conjugate(plain.true_attitude)
-    force = plain.specific_force + quaternion.rotate(inverse, push[:, None] * np.array([0.6, 0.0, 0.8]))
-    moved = dataclasses.replace(plain, specific_force=force)
-    expected = 3.0 / np.sqrt(6.0) * np.sqrt(ahrs.HAND_HELD.velocity_time * ahrs.HAND_HELD.acceleration_time)
-    assert ahrs.estimate(moved, latency=0.0).parameters.velocity_sigma == pytest.approx(expected, rel=0.05)
-    assert ahrs.estimate(plain, latency=0.0).parameters.velocity_sigma == 0.1
-    own = dataclasses.replace(ahrs.HAND_HELD, velocity_from_record=False, velocity_sigma=0.7)
-    assert ahrs.estimate(moved, own, latency=0.0).parameters == own
+    np.testing.assert_allclose(regions.acceleration_level(as_modelled, uncertain), 1.0, rtol=1e-12)
 
 
 def test_innovations_of_broad_are_as_large_as_their_variance_says(broad):
-    """NIS per degree of freedom; between 0.005 and 0.35 with one motion for all."""
+    """NIS per degree of freedom, scaled by the level of the acceleration, with one motion for all."""
     found = [score(file, False).nis[0] for file in sorted(broad.glob("*.hdf5"))]
-    assert 0.2 < min(found) < max(found) < 0.9, found
+    assert 0.05 < min(found) < max(found) < 0.9, found
 
 
 def test_an_estimate_is_judged_by_the_reference_kept_beside_it(tmp_path):
@@ -830,5 +899,6 @@ def test_a_disturbed_field_leaves_the_heading_of_a_recording(broad):
     turned = heading[-50:].mean() - heading[:50].mean()
     up = quaternion.to_matrix(found.attitude[-1])[2]
     sigma = np.sqrt(up @ found.covariance[-1, :3, :3] @ up)
-    assert abs((turned + np.pi) % (2.0 * np.pi) - np.pi) < 3.0 * DEGREE
-    assert 2.0 * DEGREE < sigma < 6.0 * DEGREE
+    off = abs((turned + np.pi) % (2.0 * np.pi) - np.pi)
+    assert off < 4.5 * DEGREE
+    assert off < 3.0 * sigma < 60.0 * DEGREE

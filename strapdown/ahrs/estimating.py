@@ -6,14 +6,23 @@ import functools
 import itertools
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from strapdown import estimation
-from strapdown.ahrs.parameters import HAND_HELD, AhrsParameters
+from strapdown.ahrs import regions
+from strapdown.ahrs.parameters import AhrsParameters, of_motion
 from strapdown.ahrs.preparing import Prepared, prepare
-from strapdown.ahrs.starting import Begun, begin
+from strapdown.ahrs.starting import (
+    Rests,
+    informative,
+    need_accelerometer,
+    rests,
+    samples_in_span,
+    with_all_rests,
+    with_rate_at_rest,
+)
 from strapdown.calibration import UnitCalibration, with_gyro_states
 from strapdown.checks import Array
 from strapdown.estimation.gating import Gate, Robust
@@ -21,19 +30,11 @@ from strapdown.estimation.memory import side_by_side
 from strapdown.estimation.schedule import joined
 from strapdown.kernels import recording_steps
 from strapdown.kernels.machine import compiled, read_only
-from strapdown.recordings import Recording, sensor_delays
-from strapdown.recordings.hard_iron import low_pass
+from strapdown.recordings import Recording, sensor_delays, sensor_faults
 from strapdown.recordings.sensor_delays import Delays
 from strapdown.recordings.sensor_faults import Faults
-from strapdown.records import ErrorStateEstimate, Estimate, ImuRecord, Innovations, cut
+from strapdown.records import ErrorStateEstimate, Estimate, ImuRecord, cut
 from strapdown.records.recording import sampled
-
-LEVEL_TIME = 5.0
-"""Time constant of the average that gives the level of the acceleration, s."""
-OWN_SHARE = 0.1
-"""Share of the modelled variance of the tilt or an innovation that comes from the sensor's errors, whatever the acceleration's level."""
-ACCELERATION_SHARE = 0.7
-"""Share of the tilt variance that is proportional to the root of that level, as the steady-state variance is to σ of the acceleration."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -43,7 +44,7 @@ class AhrsEstimate:
     Parameters
     ----------
     recording : Recording
-        The recording from its first quiet second on, clipped gyro samples restored.
+        The recording, clipped gyro samples restored.
     estimate : Estimate
         Attitude and gyro bias at the stamps of the recording. The covariance of the tilt and the variance of the accelerometer's
         innovations follow the level of the acceleration up to each stamp; the covariance includes timing errors and constant iron,
@@ -53,13 +54,15 @@ class AhrsEstimate:
     initial : State
         Initial state of the filter.
     parameters : AhrsParameters
-        Parameters of the filter, with the velocity found from the recording.
+        Parameters of the filter.
     delays : Delays
         Delays of the sensors' samples, s, for which the estimate is corrected.
     faults : Faults
         Faults found in the samples, such as clipping and truncation, and the variance that they add.
+    rests : Rests
+        Spans at rest whose mean rates were used as measurements of the gyro's bias.
     hard_iron : ndarray (3,)
-        Hard iron subtracted from the magnetometer's samples at the end, body axes, in their unit; 0: none was found.
+        Hard iron of the magnetometer at the end, body axes, in the unit of its samples.
     calibration : UnitCalibration or None
         Calibration of the unit found from the recording, for its next recording; None if the filter has no states for it.
     """
@@ -71,13 +74,14 @@ class AhrsEstimate:
     parameters: AhrsParameters
     delays: Delays
     faults: Faults
+    rests: Rests
     hard_iron: Array
     calibration: UnitCalibration | None
 
 
 def estimate(
-    recording: Recording | Begun,
-    parameters: AhrsParameters = HAND_HELD,
+    recording: Recording,
+    parameters: AhrsParameters | None = None,
     *,
     latency: float | None = None,
     calibration: UnitCalibration | None = None,
@@ -86,15 +90,14 @@ def estimate(
     full_covariance: bool = False,
     smooth: bool = False,
 ) -> AhrsEstimate:
-    """Return attitude and gyro bias at the time stamps of a recording, from its first quiet second on.
+    """Return attitude and gyro bias at every time stamp of a recording.
 
     Parameters
     ----------
-    recording : Recording or Begun
-        Samples of a gyro, an accelerometer and optionally a magnetometer. The result of :func:`strapdown.ahrs.begin` can be given
-        instead, for example one that :func:`strapdown.ahrs.motions.chosen` has used.
-    parameters : AhrsParameters
-        The filter's model of the unit and of its motion.
+    recording : Recording
+        Samples of a gyro, an accelerometer and optionally a magnetometer.
+    parameters : AhrsParameters, optional
+        The filter's model of the unit and of its motion. Default: that of a unit in the hand, with or without a magnetometer.
     latency : float, optional
         Delay of the gyro's and the accelerometer's samples, s: the group delay of the sensors; 0: point samples at their stamps. By
         default each sample is treated as the mean over the interval before its stamp, so its delay is half the interval. The delay of
@@ -113,16 +116,20 @@ def estimate(
     Returns
     -------
     AhrsEstimate
-        Without ``smooth``, each row depends only on the samples up to its stamp, except for the choice of the quiet second and, with
-        ``velocity_from_record``, for the velocity: both are from the whole recording.
+        Without ``smooth``, each row depends only on the samples up to its stamp; the faults of the samples (clipping, truncation, length
+        of gaps) are found in the whole recording.
 
     Raises
     ------
     InputError
-        If there is no accelerometer, a sensor has no valid sample in the quiet second, or the recording is too short.
+        If there is no accelerometer, a sensor has no valid sample, or the recording is too short.
     """
-    _, quiet, faults = begin(recording)
+    need_accelerometer(recording)
+    samples_in_span(recording)  # rejects a recording that is too short
+    faults = sensor_faults.find(recording)
     used = faults.recording
+    if parameters is None:
+        parameters = of_motion("hand", magnetometer=used.magnetic_field is not None, smooth=smooth)
     field_delay = None
     if calibration is not None:
         used, field_delay = calibration.applied(used), calibration.magnetometer_delay or None
@@ -130,10 +137,15 @@ def estimate(
             parameters = replace(parameters, gyro_scale_sigma=calibration.gyro_scale_sigma)
     turned = sensor_delays.gyro_attitude(used)
     delays = sensor_delays.find(used, latency, field_delay, causal=not smooth, turned=turned)
-    prepared = prepare(used, quiet, parameters, delays.field, causal=not smooth, turned=turned)
-    parameters = parameters.matched(prepared.acceleration)
-    filtered = _run(prepared, parameters, faults.turn_variance, gate, robust, smooth)
-    found = _at_stamps(filtered, used, prepared, parameters, delays, faults.turn_variance, smooth, full_covariance)
+    prepared = prepare(used, parameters, delays.field, causal=not smooth, turned=turned)
+    at_rest = rests(used, parameters)
+    if smooth:
+        prepared = prepared._replace(initial=with_all_rests(prepared.initial, at_rest, used.time, parameters))
+    else:
+        at_rest = informative(at_rest, used.time, parameters)
+    options = _Options(gate, robust, smooth, full_covariance)
+    filtered = _run(prepared, parameters, faults.turn_variance, at_rest, options)
+    found = _at_stamps(filtered, used, prepared, parameters, delays, faults.turn_variance, options)
     scale = filtered.error_states.get("gyro scale")
     return AhrsEstimate(
         recording=used,
@@ -144,42 +156,65 @@ def estimate(
         parameters=parameters,
         delays=delays,
         faults=faults,
-        hard_iron=prepared.iron,
+        rests=at_rest,
+        hard_iron=_iron_at_end(filtered, prepared),
     )
 
 
+def _iron_at_end(filtered: Estimate, prepared: Prepared) -> Array:
+    """Return the hard iron at the end (3,), body axes, in the unit of the field: that subtracted and that of the filter's states."""
+    if prepared.field is None:
+        return np.zeros(3)
+    iron = prepared.field.iron[-1]
+    states = filtered.error_states.get("magnetometer disturbance")
+    return np.asarray(iron if states is None else iron + states.values[-1] * prepared.field.usual[-1, 0])
+
+
+class _Options(NamedTuple):
+    """Options of a run."""
+
+    gate: Gate | None
+    robust: Robust | None
+    smooth: bool
+    full_covariance: bool
+
+
 def _run(
-    prepared: Prepared,
-    parameters: AhrsParameters,
-    turn_variance: Array,
-    gate: Gate | None,
-    robust: Robust | None,
-    smooth: bool,
+    prepared: Prepared, parameters: AhrsParameters, turn_variance: Array, at_rest: Rests, options: _Options
 ) -> Estimate:
     """Return the filter's or the smoother's estimate at the steps.
 
     If the rotation over some sample intervals is uncertain (``turn_variance`` (n,), rad², is positive), the record is run in parts. The
     angle random walk of each part is that of the gyro plus that variance spread over the part. Each part is smoothed separately, because
-    samples after an interval of unknown rotation have little information about the attitude before it.
+    samples after an interval of unknown rotation have little information about the attitude before it. The filter's run is divided after
+    each span at rest too, where its bias is corrected; the smoother's initial state includes all of them.
     """
-    record, own = prepared.record, parameters.setup
+    record, own, smooth = prepared.record, parameters.setup, options.smooth
     kinds = {series.sensor: series.kind for series in record.vectors}
     blocks = () if own.states is None else own.states.blocks(kinds)
     extra = _over_steps(turn_variance, prepared.edge)
     change = np.flatnonzero(np.diff(extra > 0.0)) + 1
-    bounds = [0, *change.tolist(), len(extra)]
+    rested = np.searchsorted(prepared.edge, [] if smooth else at_rest.last)
+    bounds = np.unique([0, *change, *rested, len(extra)]).tolist()
     state = prepared.initial
     parts: list[Estimate] = []
-    options: dict[str, Any] = {"full_covariance": True, "error_state_covariance": False, "gate": gate, "robust": robust}
+    shared: dict[str, Any] = {
+        "full_covariance": True,
+        "error_state_covariance": False,
+        "gate": options.gate,
+        "robust": options.robust,
+    }
     for first, last in itertools.pairwise(bounds):
         part = record if len(bounds) == 2 else cut(record, first, last)
         walk = parameters.angle_random_walk**2 + float(np.sum(extra[first:last])) / (part.time[-1] - part.time[0])
         noise = replace(own.process_noise, angle_random_walk=float(np.sqrt(walk)))
         end = state
         if not smooth or last < len(extra):
-            found, end = estimation.run_part(part, noise, state, blocks, **options)
+            found, end = estimation.run_part(part, noise, state, blocks, **shared)
         if smooth:
-            found = estimation.smooth(part, noise, state, blocks, **options)
+            found = estimation.smooth(part, noise, state, blocks, **shared)
+        for k in np.flatnonzero(rested == last):
+            end = with_rate_at_rest(end, at_rest.rate[k], float(at_rest.sigma[k]))
         state = end
         parts.append(found)
     return joined(parts)
@@ -197,25 +232,26 @@ def _at_stamps(
     parameters: AhrsParameters,
     delays: Delays,
     turn_variance: Array,
-    smooth: bool,
-    full_covariance: bool,
+    options: _Options,
 ) -> Estimate:
     """Return the estimate at the recording's stamps: propagated by the gyro from the step before each stamp, and over the gyro's delay."""
     edge, n = prepared.edge, len(used.time)
     attitude, bias, variance = side_by_side(*(((n, width), float) for width in (4, 3, 6)))
-    (P,) = side_by_side(((n if full_covariance else 0, 6, 6), float))
+    (P,) = side_by_side(((n if options.full_covariance else 0, 6, 6), float))
     late = np.broadcast_to(delays.gyro, used.time.shape)
-    ahead = -sensor_delays.turn_over(used, -late) if smooth else used.rate * late[:, None]
-    level = _level(filtered, _over_steps(turn_variance, edge) > 0.0)
-    tilt = np.sqrt(OWN_SHARE + ACCELERATION_SHARE * np.sqrt(level))
+    ahead = -sensor_delays.turn_over(used, -late) if options.smooth else used.rate * late[:, None]
+    level = regions.acceleration_level(filtered, _over_steps(turn_variance, edge) > 0.0)
+    tilt, floor, heading = regions.scales(filtered, parameters, level, causal=not options.smooth)
     assert filtered.covariance is not None
-    iron = 0.0 if prepared.dip is None else (parameters.iron_sigma / np.cos(prepared.dip)) ** 2
-    at_steps = (filtered.attitude, filtered.bias, filtered.variance, filtered.covariance, tilt)
+    iron = np.zeros(len(edge))
+    if prepared.field is not None:
+        iron[1:] = (parameters.iron_sigma / np.cos(prepared.field.usual[:, 1])) ** 2
+        iron[0] = iron[1]
+    at_steps = (filtered.attitude, filtered.bias, filtered.variance, filtered.covariance, tilt, floor, heading, iron)
     compiled(recording_steps.carry_to_stamps)(
         recording_steps.Steps(edge, *map(read_only, at_steps)),
         recording_steps.Stamps(*map(read_only, (used.time, used.rate, prepared.turned, late, ahead))),
         delays.sigma**2,
-        iron,
         recording_steps.Carried(attitude, bias, variance, P),
     )
     row = functools.partial(np.repeat, np.arange(len(edge)), np.diff(edge, append=n))
@@ -225,8 +261,8 @@ def _at_stamps(
         attitude=attitude,
         bias=bias,
         variance=variance,
-        covariance=P if full_covariance else None,
-        innovations=_innovations(filtered, level),
+        covariance=P if options.full_covariance else None,
+        innovations=regions.scaled_innovations(filtered, level),
         skipped={
             name: len(samples) - int(np.count_nonzero(sampled(samples)))
             for name, samples in sensors.items()
@@ -252,26 +288,3 @@ class _OfRows(Mapping[str, ErrorStateEstimate]):
 
     def __len__(self) -> int:
         return len(self.states)
-
-
-def _level(filtered: Estimate, uncertain: np.ndarray) -> Array:
-    """Return the level (k + 1,) of the acceleration up to each edge of the steps: its variance, relative to that modelled.
-
-    The same model serves slow and fast motion, so most motion is slower than modelled. The level is set to 1 at the start, without a
-    measurement, and in steps whose rotation is ``uncertain`` (k,).
-    """
-    seen = filtered.innovations["accelerometer"]
-    nis = np.ones((len(filtered.time), 1))
-    nis[np.searchsorted(filtered.time, seen.time), 0] = np.where(np.isfinite(seen.nis), seen.nis / 3.0, 1.0)
-    step = float(np.median(np.diff(filtered.time))) / LEVEL_TIME
-    begin = np.append(0, np.flatnonzero(uncertain) + 1)
-    nis[begin] = 1.0
-    return np.concatenate([low_pass(part, step) for part in np.split(nis, begin[1:])])[:, 0]
-
-
-def _innovations(filtered: Estimate, level: Array) -> dict[str, Innovations]:
-    """Return the innovations; the variance of the accelerometer's is scaled, as that of the tilt, by the level before each."""
-    own = filtered.innovations["accelerometer"]
-    before = level[np.searchsorted(filtered.time, own.time) - 1]
-    share = OWN_SHARE + (1.0 - OWN_SHARE) * before
-    return {**filtered.innovations, "accelerometer": replace(own, variance=own.variance * share[:, None])}

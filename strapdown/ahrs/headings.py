@@ -1,7 +1,8 @@
 """Heading measurements from a magnetometer.
 
-Iron in the unit and in the surroundings disturbs the heading, and the magnitude and the dip of the field too. The noise of the heading is
-computed from their deviation, and is larger for a steeper field.
+Iron in the surroundings disturbs the heading, and the magnitude and the dip of the field too. The noise of the heading is computed from
+their deviation from what is usual, and from the change of the whole field in the frame fixed by the gyro; it is larger for a steeper field.
+Much iron in the unit is subtracted (:mod:`strapdown.recordings.hard_iron`); the rest of it has states in the filter.
 """
 
 from __future__ import annotations
@@ -13,6 +14,8 @@ import numpy as np
 from strapdown import quaternion
 from strapdown.ahrs.parameters import AhrsParameters
 from strapdown.checks import Array, lengths
+from strapdown.kernels import recording_steps
+from strapdown.kernels.machine import compiled
 from strapdown.recordings import hard_iron
 from strapdown.recordings.hard_iron import low_pass
 from strapdown.vectors import VectorMeasurements
@@ -20,6 +23,16 @@ from strapdown.vectors import VectorMeasurements
 NORTH = np.array([0.0, 1.0, 0.0])
 VERTICAL_TIME = 1.0
 """Time constant of the low-pass filter for the vertical from which the field's dip is measured, s."""
+MEDIAN_INTERVAL = 0.3
+"""Interval of the values of which running medians are computed, s."""
+MEDIAN_SAMPLES = 1024
+"""Number of those values that are kept; above it every other one is dropped, and the interval doubled."""
+OWN_IRON = 1.5
+"""Iron up to this multiple of the σ of the filter's states for it is left to them."""
+IRON_DEVIATION = 0.025
+"""Increase of the deviation, relative to the magnitude, at which iron is no longer subtracted."""
+MAX_DIP = np.radians(80.0)
+"""Maximum dip for which the noise of the heading is computed, rad."""
 
 
 class FieldSteps(NamedTuple):
@@ -32,44 +45,84 @@ class FieldSteps(NamedTuple):
     length: Array
     """Duration that the field's samples of each step cover, s; 0: none (k,)."""
     force: Array
-    """Specific force (k, 3)."""
+    """Specific force (k, 3); without samples that of the step before."""
     at_edge: Array
     """Attitude by the gyro at the steps' edges (k + 1, 4)."""
     time: Array
     """Time there, s (k + 1,)."""
-    start: int
-    """Number of steps in the quiet second."""
 
 
-def measured(steps: FieldSteps, parameters: AhrsParameters, *, causal: bool) -> tuple[VectorMeasurements, float, Array]:
-    """Return the heading measurements, the dip at the start, and the hard iron subtracted (k, 3), body axes, in the unit of the field."""
+class Headings(NamedTuple):
+    """Heading measurements, and what was found of the field."""
+
+    vectors: VectorMeasurements
+    usual: Array
+    """Usual magnitude, in the field's unit, and dip, rad, at each step (k, 2)."""
+    iron: Array
+    """Hard iron subtracted at each step (k, 3), body axes, in the field's unit."""
+
+
+def measured(steps: FieldSteps, parameters: AhrsParameters, *, causal: bool) -> Headings:
+    """Return the heading measurements. ``causal``: from the steps up to each; otherwise from all."""
     known = steps.length > 0.0
-    first = known & (np.arange(len(known)) < steps.start)
-    first = first if first.any() else known
     interval = float(np.median(np.diff(steps.time)))
-    memory = interval / parameters.field_memory
+    field = held(steps.field, known)
     vertical = _vertical(steps.force, interval)
-    level = _strength_and_dip(steps.field, vertical)
-    reference = level[first].mean(axis=0)
-    as_measured = _deviation(level, reference, known, memory)
-    iron = hard_iron.find(steps.field, steps.frame, steps.time[1:], known, reference[0], causal=causal)
-    field = steps.field
+    as_measured = _look(field, vertical, parameters, interval, causal=causal)
+    seen = as_measured
+    iron = hard_iron.find(steps.field, steps.frame, steps.time[1:], known, float(seen.usual[0, 0]), causal=causal)
     if iron.any():
-        # Iron may have been attached or removed: it is subtracted only where that does not increase the deviation of magnitude and dip.
-        without = _deviation(
-            _strength_and_dip(field - quaternion.rotate(steps.frame, iron), vertical), reference, known, memory
-        )
-        odds = np.clip((as_measured - without) / (2.0 * parameters.field_deviation**2), -50.0, 0.0)
+        # Iron may have been attached or removed: it is subtracted only where that does not increase the deviation of the field.
+        without = _look(field - quaternion.rotate(steps.frame, iron), vertical, parameters, interval, causal=causal)
+        odds = np.clip((as_measured.deviation - without.deviation) / (2.0 * IRON_DEVIATION**2), -50.0, 0.0)
         iron *= (2.0 / (1.0 + np.exp(-odds)))[:, None]
-        iron[lengths(iron) < hard_iron.NEGLIGIBLE * reference[0]] = 0.0
+        left = (OWN_IRON * parameters.hard_iron_sigma * seen.usual[0, 0]) ** 2 / np.maximum(
+            np.sum(iron**2, axis=1), 1e-30
+        )
+        iron *= np.maximum(1.0 - left, 0.0)[:, None]
+        iron[lengths(iron) < hard_iron.NEGLIGIBLE * seen.usual[0, 0]] = 0.0
         field = field - quaternion.rotate(steps.frame, iron)
-        level = _strength_and_dip(field, vertical)
-        reference = level[first].mean(axis=0)
-    deviation = _deviation(level, reference, known, memory)
-    dip = float(reference[1])
-    noise = (parameters.field_disturbance / np.cos(dip)) ** 2 * (1.0 + deviation / parameters.field_deviation**2)
-    direction = np.where(known[:, None], field / level[:, :1], 0.0)
-    return _gathered(steps, direction, steps.length / noise, parameters.heading_interval), dip, iron
+        seen = _look(field, vertical, parameters, interval, causal=causal)
+    steep = np.minimum(np.abs(seen.usual[:, 1]), MAX_DIP)
+    noise = (parameters.field_disturbance / np.cos(steep)) ** 2 * (1.0 + seen.deviation / parameters.field_deviation**2)
+    direction = np.where(known[:, None], field / seen.strength[:, None], 0.0)
+    return Headings(_gathered(steps, direction, steps.length / noise, parameters.heading_interval), seen.usual, iron)
+
+
+class _Look(NamedTuple):
+    """Magnitude of a field (k,), its usual magnitude and dip (k, 2), and its square deviation from what is usual, low-passed (k,)."""
+
+    strength: Array
+    usual: Array
+    deviation: Array
+
+
+def _look(field: Array, vertical: Array, parameters: AhrsParameters, interval: float, *, causal: bool) -> _Look:
+    level = _strength_and_dip(field, vertical)
+    usual = _usual(level, interval, causal=causal)
+    change = field - _mean_over(field, interval / parameters.field_change_time, causal=causal)
+    square = (
+        (level[:, 0] / usual[:, 0] - 1.0) ** 2
+        + (level[:, 1] - usual[:, 1]) ** 2
+        + np.sum(change**2, axis=1) / usual[:, 0] ** 2
+    )
+    return _Look(level[:, 0], usual, low_pass(square[:, None], interval / parameters.field_memory)[:, 0])
+
+
+def _usual(level: Array, interval: float, *, causal: bool) -> Array:
+    """Return the medians of magnitude and dip (k, 2), of the rows up to each or of all."""
+    if not causal:
+        return np.broadcast_to(np.median(level, axis=0), level.shape)
+    median = np.empty_like(level)
+    every = max(1, round(MEDIAN_INTERVAL / interval))
+    compiled(recording_steps.running_median)(np.ascontiguousarray(level), every, np.empty((2, MEDIAN_SAMPLES)), median)
+    return median
+
+
+def _mean_over(values: Array, share: float, *, causal: bool) -> Array:
+    """Return the low-passed rows (k, 3), from the rows up to each or on both sides; ``share``: interval over time constant."""
+    before = low_pass(values, share)
+    return before if causal else 0.5 * (before + low_pass(values[::-1], share)[::-1])
 
 
 def _gathered(steps: FieldSteps, direction: Array, information: Array, heading_interval: float) -> VectorMeasurements:
@@ -94,7 +147,7 @@ def _gathered(steps: FieldSteps, direction: Array, information: Array, heading_i
 def _vertical(force: Array, interval: float) -> Array:
     """Return the vertical (k, 3) from specific force passed twice through a low-pass filter."""
     share = interval / VERTICAL_TIME
-    vertical = low_pass(low_pass(_held(force, np.asarray(force.any(axis=1))), share), share)
+    vertical = low_pass(low_pass(force, share), share)
     return np.asarray(vertical / lengths(vertical)[:, None])
 
 
@@ -107,13 +160,7 @@ def _strength_and_dip(field: Array, vertical: Array) -> Array:
     )
 
 
-def _deviation(level: Array, reference: Array, known: np.ndarray, memory: float) -> Array:
-    """Return the square deviation of magnitude (relative) and dip (rad) from the start, low-passed (k,); ``memory``: step/time constant."""
-    square = (level[:, 0] / reference[0] - 1.0) ** 2 + (level[:, 1] - reference[1]) ** 2
-    return low_pass(_held(square[:, None], known), memory)[:, 0]
-
-
-def _held(values: Array, known: np.ndarray) -> Array:
+def held(values: Array, known: np.ndarray) -> Array:
     """Return rows (k, …) with each unknown row replaced by the last known one before it, or by the first known one."""
     last = np.maximum.accumulate(np.where(known, np.arange(len(values)), -1))
     return np.asarray(values[np.where(last < 0, int(np.argmax(known)), last)])

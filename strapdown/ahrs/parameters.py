@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from strapdown import estimation
-from strapdown.checks import instance, non_negative, positive
+from strapdown.checks import non_negative, one_of, positive
 from strapdown.estimation.setup import FilterSetup
 from strapdown.estimation.setup.states import SensorStates, States
 from strapdown.units import DEGREE
-
-MIN_VELOCITY = 0.1
-"""Minimum σ of the velocity, m/s: a unit that appears at rest in a recording may have been moved slowly."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,20 +25,27 @@ class AhrsParameters:
     Parameters
     ----------
     angle_random_walk : float, default 3e-3
-        Angle random walk σ_v, rad/√s; includes scale-factor and alignment errors of a moving unit.
+        Angle random walk σ_v, rad/√s; includes errors of a moving gyro that have no states.
     rate_random_walk : float, default 1e-5
         Rate random walk σ_u, rad/s/√s.
     specific_force_noise : float, default 0.6
         Noise density of the part of the acceleration that has no states, each component, m/s²/√Hz.
     field_disturbance : float, default 0.05
-        Noise density across the field, relative to its magnitude, 1/√Hz, while magnitude and dip are those at the start. The noise
-        density of the heading, rad/√Hz, is this divided by the cosine of the dip.
-    field_deviation : float, default 0.025
-        Deviation of the field's magnitude (relative) and dip (rad), as a root sum of squares, that doubles the variance of that noise.
+        Noise density across the field, relative to its magnitude, 1/√Hz, of a field that does not change. The noise density of the
+        heading, rad/√Hz, is this divided by the cosine of the dip.
+    field_deviation : float, default 0.05
+        Deviation of the field, relative to its magnitude, that doubles the variance of that noise. It is the root sum of squares of the
+        deviations of its magnitude and dip from their medians so far, and of the whole field, in the frame fixed by the gyro, from its
+        mean over ``field_change_time``.
     field_memory : float, default 0.5
-        Time constant of the average of that deviation, s: a field that momentarily has the expected magnitude and dip may still be
-        disturbed.
-    iron_sigma : float, default 0.012
+        Time constant of the average of that square deviation, s: a field that momentarily is as expected may still be disturbed.
+    field_change_time : float, default 10.0
+        Time constant of the mean from which the whole field deviates, s.
+    hard_iron_sigma : float, default 0.0
+        Stationary σ of the unit's hard iron, each component, relative to the magnitude of the field; 0: no states.
+    hard_iron_time : float, default 30.0
+        Correlation time of the hard iron, s.
+    iron_sigma : float, default 0.004
         σ of a constant, unobservable disturbance of the field, relative to its magnitude. It is part of the reported σ and is not
         estimated.
     step : float, default 0.03
@@ -49,20 +53,28 @@ class AhrsParameters:
     heading_interval : float, default 0.15
         Interval of the heading measurements, s.
     attitude_sigma : float, default 3°
-        σ of the initial attitude error, each axis, rad.
+        σ of the initial attitude of a unit at rest, each axis, rad.
     bias_sigma : float, default 0.5 °/s
         σ of the initial gyro bias, each axis, rad/s.
     rest_bias_sigma : float, default 0.0
-        σ of the mean rate of the quiet second as an estimate of the bias, each axis, rad/s; 0: the bias starts at zero.
+        σ of the mean rate of a second at rest as a measurement of the bias, each axis, rad/s; 0: not measured.
     velocity_sigma : float, default 0.0
         σ of the velocity of the unit, each component, m/s; 0: no states, all its acceleration is white.
-    velocity_from_record : bool, default False
-        Whether ``velocity_sigma`` is computed from the acceleration of the recording (:attr:`strapdown.ahrs.Prepared.acceleration`);
-        the value given here is then used only without a recording.
     velocity_time : float, default 0.3
         Time constant of that velocity, s.
     acceleration_time : float, default 0.1
         Time constant of the acceleration, s.
+    position_time : float, default 0.0
+        Time constant of the position, s; 0: the position is not bounded.
+    accelerometer_bias_sigma : float, default 0.0
+        σ of a constant bias of the accelerometer, each component, m/s²; 0: no states.
+    tilt_sigma : float, default 0.0
+        σ of a horizontal error of the accelerometer, m/s², that is part of the reported σ of the tilt and is not estimated.
+    tilt_by_field : float, default 0.0
+        σ of a further such error, m/s², where the field is disturbed as along the path of a phone indoors
+        (:mod:`strapdown.ahrs.regions`): the units that are carried so are those of phones.
+    heading_share, heading_by_field : float, default 1.0, 0.0
+        Reported variance of the heading relative to that of the filter: in a clean field, and in addition in such a field.
     gyro_scale_sigma : float, default 0.0
         σ of each of the gyro's scale factor errors, dimensionless, and misalignments, rad; 0: no states.
     gyro_temperature_sigma : float or tuple (3,), default 0.0
@@ -73,60 +85,63 @@ class AhrsParameters:
     rate_random_walk: float = 1e-5
     specific_force_noise: float = 0.6
     field_disturbance: float = 0.05
-    field_deviation: float = 0.025
+    field_deviation: float = 0.05
     field_memory: float = 0.5
-    iron_sigma: float = 0.012
+    field_change_time: float = 10.0
+    hard_iron_sigma: float = 0.0
+    hard_iron_time: float = 30.0
+    iron_sigma: float = 0.004
     step: float = 0.03
     heading_interval: float = 0.15
     attitude_sigma: float = 3.0 * DEGREE
     bias_sigma: float = 0.5 * DEGREE
     rest_bias_sigma: float = 0.0
     velocity_sigma: float = 0.0
-    velocity_from_record: bool = False
     velocity_time: float = 0.3
     acceleration_time: float = 0.1
+    position_time: float = 0.0
+    accelerometer_bias_sigma: float = 0.0
+    tilt_sigma: float = 0.0
+    tilt_by_field: float = 0.0
+    heading_share: float = 1.0
+    heading_by_field: float = 0.0
     gyro_scale_sigma: float = 0.0
     gyro_temperature_sigma: float | tuple[float, ...] = 0.0
 
     def __post_init__(self) -> None:
         """Check every field."""
-        may_be_zero = ("iron_sigma", "rate_random_walk", "rest_bias_sigma", "velocity_sigma", "gyro_scale_sigma")
+        may_be_zero = (
+            "accelerometer_bias_sigma",
+            "gyro_scale_sigma",
+            "hard_iron_sigma",
+            "iron_sigma",
+            "heading_by_field",
+            "position_time",
+            "rate_random_walk",
+            "rest_bias_sigma",
+            "tilt_by_field",
+            "tilt_sigma",
+            "velocity_sigma",
+        )
         for axis in np.atleast_1d(self.gyro_temperature_sigma):
             non_negative("gyro_temperature_sigma", float(axis))
-        instance("velocity_from_record", self.velocity_from_record, bool, "give true or false")
-        for name in set(self.__dataclass_fields__) - {"gyro_temperature_sigma", "velocity_from_record"}:
+        for name in set(self.__dataclass_fields__) - {"gyro_temperature_sigma"}:
             check = non_negative if name in may_be_zero else positive
             check(name, getattr(self, name))
-
-    def matched(self, acceleration: float) -> AhrsParameters:
-        """Return the parameters for a unit moved with this acceleration.
-
-        The acceleration of a bounded velocity has σ ``velocity_sigma / √(velocity_time acceleration_time)``.
-
-        Parameters
-        ----------
-        acceleration : float
-            RMS of each component, m/s².
-
-        Returns
-        -------
-        AhrsParameters
-            With the ``velocity_sigma`` of that acceleration if ``velocity_from_record`` is set, otherwise unchanged.
-        """
-        if not self.velocity_from_record:
-            return self
-        sigma = acceleration * math.sqrt(self.velocity_time * self.acceleration_time)
-        return replace(self, velocity_sigma=max(sigma, MIN_VELOCITY))
 
     @property
     def setup(self) -> FilterSetup:
         """Setup of the filter with this model."""
-        sensors = {}
+        force: dict[str, Any] = {}
         if self.velocity_sigma > 0.0:
-            sensors["accelerometer"] = SensorStates(
-                velocity_sigma=self.velocity_sigma,
-                velocity_time=self.velocity_time,
-                acceleration_time=self.acceleration_time,
+            names = ("velocity_sigma", "velocity_time", "acceleration_time", "position_time")
+            force = {name: getattr(self, name) for name in names}
+        if self.accelerometer_bias_sigma > 0.0:
+            force["bias_sigma"] = self.accelerometer_bias_sigma
+        sensors = {"accelerometer": SensorStates(**force)} if force else {}
+        if self.hard_iron_sigma > 0.0:
+            sensors["magnetometer"] = SensorStates(
+                correlated_sigma=self.hard_iron_sigma, correlation_time=self.hard_iron_time
             )
         states = States(
             gyro_scale_sigma=self.gyro_scale_sigma,
@@ -145,17 +160,57 @@ class AhrsParameters:
 
 
 HAND_HELD = AhrsParameters(
+    angle_random_walk=2e-3,
+    rate_random_walk=1.5e-4,
     specific_force_noise=0.06,
+    field_disturbance=0.025,
+    hard_iron_sigma=0.04,
+    bias_sigma=2.0 * DEGREE,
     rest_bias_sigma=0.05 * DEGREE,
-    velocity_sigma=1.0,
-    velocity_from_record=True,
-    gyro_scale_sigma=2e-3,
+    velocity_sigma=0.7,
+    accelerometer_bias_sigma=0.02,
+    tilt_sigma=0.06,
+    tilt_by_field=0.7,
+    heading_share=0.1,
+    heading_by_field=1.2,
+    gyro_scale_sigma=3e-3,
 )
-"""A unit in the hand: its velocity is bounded, with σ found from the recording; because its rotations are large, the gyro's scale factors
-and misalignments are states."""
-VEHICLE = replace(
-    HAND_HELD, specific_force_noise=0.15, field_disturbance=0.1, velocity_time=10.0, acceleration_time=2.0
+"""A unit with a magnetometer in the hand, on a person or a small aircraft: its velocity is bounded. Chosen on the development halves of
+BROAD, RepoIMU, Sassari, OxIOD and the phones of PerCom 2017 (``benchmarks/recordings.py``)."""
+HAND_HELD_SMOOTHED = replace(
+    HAND_HELD, velocity_sigma=1.0, gyro_scale_sigma=4e-3, field_disturbance=0.02, tilt_sigma=0.055
 )
-"""A unit in a car, a boat or an aircraft: its acceleration lasts for seconds and could be mistaken for tilt, and iron is near."""
-MOTIONS = {"hand": HAND_HELD, "vehicle": VEHICLE, "any": AhrsParameters()}
-"""Parameters by kind of motion."""
+"""The same for the smoother, which weighs acceleration that lasts over all the time before and after. Chosen on the same recordings."""
+HAND_HELD_WITHOUT_MAGNETOMETER = replace(
+    HAND_HELD,
+    rate_random_walk=1e-5,
+    specific_force_noise=0.3,
+    hard_iron_sigma=0.0,
+    bias_sigma=0.25 * DEGREE,
+    velocity_sigma=3.0,
+    velocity_time=1.0,
+    accelerometer_bias_sigma=0.0,
+    tilt_sigma=0.08,
+    gyro_scale_sigma=5e-3,
+)
+"""Such a unit without a magnetometer. Acceleration that lasts, in body axes too, would otherwise be taken for a bias of the gyro about the
+vertical, which nothing else shows. Chosen on the same recordings, without their magnetometers, and on those of EuRoC and TUM-VI."""
+_VEHICLE = {"specific_force_noise": 0.15, "velocity_sigma": 8.0, "velocity_time": 10.0, "acceleration_time": 2.0}
+_VESSEL = {"velocity_sigma": 3.0, "velocity_time": 10.0, "acceleration_time": 2.0, "position_time": 10.0}
+MOTIONS: dict[str, tuple[AhrsParameters, AhrsParameters]] = {
+    "hand": (HAND_HELD, HAND_HELD_WITHOUT_MAGNETOMETER),
+    "vehicle": (
+        replace(HAND_HELD, field_disturbance=0.1, **_VEHICLE),
+        replace(HAND_HELD_WITHOUT_MAGNETOMETER, **_VEHICLE),
+    ),
+    "vessel": (replace(HAND_HELD, **_VESSEL), replace(HAND_HELD_WITHOUT_MAGNETOMETER, **_VESSEL)),
+    "any": (AhrsParameters(), AhrsParameters()),
+}
+"""Parameters by kind of motion, with a magnetometer and without: of a hand, the default; of a vehicle on a road or a large aircraft, whose
+acceleration lasts for seconds and could be mistaken for tilt; of a vessel on waves, whose position is bounded; of any unit, white noise."""
+
+
+def of_motion(motion: str, *, magnetometer: bool, smooth: bool = False) -> AhrsParameters:
+    """Return the parameters of a kind of motion, with a magnetometer or without, for the filter or the smoother."""
+    found = MOTIONS[one_of("motion", motion, MOTIONS)][0 if magnetometer else 1]
+    return HAND_HELD_SMOOTHED if smooth and found is HAND_HELD else found

@@ -16,11 +16,11 @@ from strapdown.kernels import recording_steps
 from strapdown.kernels.machine import compiled, read_only
 from strapdown.recordings import Recording, gyro_temperature, sensor_delays
 from strapdown.records import ImuRecord
+from strapdown.units import STANDARD_GRAVITY
 from strapdown.vectors import VectorMeasurements
 
-UP = np.array([0.0, 0.0, 1.0])
-LIVELY_SPAN = 5.0
-"""Duration of the spans whose RMS acceleration is compared, s; the largest value describes the motion."""
+GRAVITY = np.array([0.0, 0.0, STANDARD_GRAVITY])
+"""Specific force at rest, m/s², fixed frame. An accelerometer's deviation from it is an error of its scale or bias."""
 
 
 class Prepared(NamedTuple):
@@ -33,17 +33,12 @@ class Prepared(NamedTuple):
     """Sample at which each step ends, preceded by the first sample (k + 1,)."""
     turned: Array
     """Attitude from the gyro only at every sample, identity at the first one (n, 4)."""
-    dip: float | None
-    """Angle of the field below the horizontal at the start, rad; None without a magnetometer."""
-    iron: Array
-    """Hard iron subtracted from the field at the end, body axes, in its unit (3,)."""
-    acceleration: float
-    """Largest acceleration over any :data:`LIVELY_SPAN`, RMS of each component, m/s²."""
+    field: headings.Headings | None
+    """What was found of the field; None without a magnetometer."""
 
 
 def prepare(
     recording: Recording,
-    quiet: slice,
     parameters: AhrsParameters,
     field_delay: Array | float = 0.0,
     *,
@@ -52,14 +47,13 @@ def prepare(
 ) -> Prepared:
     """Return the record that the filter runs on, and its initial state.
 
-    ``recording`` begins with the samples ``quiet``, from which gravity and the field at the start are computed. ``field_delay`` is that of
-    the magnetometer's samples relative to the gyro's, s, one number or one per sample; each is rotated forward by the gyro. ``causal``:
-    hard iron is found only from the samples up to each step; otherwise from all samples, for the initial state too. ``turned`` (n, 4):
-    attitude from the gyro only, if already computed.
+    ``field_delay`` is that of the magnetometer relative to the gyro, s, one number or one per sample; each sample is rotated forward
+    by the gyro. ``causal``: a heading's noise depends only on the samples up to it. ``turned`` (n, 4): attitude from the gyro only, if
+    already computed.
     """
-    at_rest = starting.means_at_first(recording, quiet)  # first, because it rejects a sensor without samples
     if turned is None:
         turned = sensor_delays.gyro_attitude(recording)
+    initial = starting.start(recording, turned, parameters)  # first, because it rejects a sensor without samples
     edge = edges(recording.time, parameters.step)
     time = recording.time[edge]
     at_edge = turned[edge]
@@ -73,11 +67,11 @@ def prepare(
             kind="vector",
             time=time[1:][shown],
             vector_b=quaternion.rotate(quaternion.conjugate(at_edge[1:]), force)[shown],
-            reference_f=starting.norm(at_rest[0]) * UP,
+            reference_f=GRAVITY,
             sigma=parameters.specific_force_noise / np.sqrt(number[shown] * interval),
         )
     ]
-    dip, irons = None, np.zeros((1, 3))
+    found = None
     if recording.magnetic_field is not None:
         frame = turned
         if np.any(field_delay):
@@ -89,19 +83,17 @@ def prepare(
             field=field,
             frame=frame[(edge[:-1] + edge[1:] + 1) // 2],
             length=number * interval,
-            force=force,
+            force=headings.held(force, shown),
             at_edge=at_edge,
             time=time,
-            start=int(np.searchsorted(edge[1:], quiet.stop)),
         )
-        heading, dip, irons = headings.measured(samples, parameters, causal=causal)
-        vectors.append(heading)
+        found = headings.measured(samples, parameters, causal=causal)
+        vectors.append(found.vectors)
     turn = quaternion.log(quaternion.multiply(quaternion.conjugate(at_edge[:-1]), at_edge[1:]))
     known = recording.temperature is not None and bool(np.isfinite(recording.temperature).all())
     temperature = recording.temperature[edge] if known and recording.temperature is not None else None
     record = ImuRecord(time=time, increments=turn, vectors=tuple(vectors), temperature=temperature)
-    initial = starting.start(recording, quiet, parameters, irons[0], at_rest)
-    return Prepared(record, initial, edge, turned, dip, irons[-1], liveliest(force, shown, parameters.step))
+    return Prepared(record, initial, edge, turned, found)
 
 
 def without_temperature(
@@ -130,16 +122,3 @@ def averages(samples: Array, frame: Array, edge: Array) -> tuple[Array, Array]:
     total, number = np.empty((len(edge) - 1, 3)), np.empty(len(edge) - 1)
     compiled(recording_steps.average_samples)(read_only(samples), read_only(frame), edge, total, number)
     return total / np.maximum(number, 1.0)[:, None], number
-
-
-def liveliest(force: Array, shown: np.ndarray, step: float) -> float:
-    """Return the largest RMS deviation, each component, of the specific force (k, 3) from its mean over spans of :data:`LIVELY_SPAN`.
-
-    In the frame fixed by the integrated gyro gravity is constant, so any variation above the sensor's noise is acceleration.
-    """
-    own = force[shown]
-    spans = max(1, len(own) // round(LIVELY_SPAN / step))
-    number = np.array([len(part) for part in np.array_split(own, spans)])[:, None]
-    begin = np.cumsum(number) - number[:, 0]
-    apart = own - np.repeat(np.add.reduceat(own, begin) / number, number[:, 0], axis=0)
-    return float(np.sqrt(np.max(np.mean(np.add.reduceat(apart**2, begin) / number, axis=1))))

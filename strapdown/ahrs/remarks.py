@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from strapdown.ahrs.estimating import AhrsEstimate
 from strapdown.recordings import Recording, gaps
 from strapdown.recordings.sensor_faults import stuck_words
-from strapdown.units import DEGREE
 
 
 def fixed_frame(recording: Recording) -> str:
@@ -17,15 +14,14 @@ def fixed_frame(recording: Recording) -> str:
     return "z up, heading arbitrary (no magnetometer)"
 
 
-def remarks(result: AhrsEstimate, motion: str, odds: float) -> tuple[str, ...]:
-    """Return the remarks on an estimate with a model of the motion, whose log-likelihood is larger by ``odds`` than the other's."""
+def remarks(result: AhrsEstimate, motion: str) -> tuple[str, ...]:
+    """Return the remarks on an estimate with the model of a motion."""
     used, delays = result.recording, result.delays
     sentences = [
-        f"{used.source}: {len(used.time)} samples over {used.time[-1] - used.time[0]:.1f} s, initialised in "
-        f"{'the quiet second' if _rested(result) else 'its quietest second, which is not at rest,'} from {used.time[0]:.2f} s.",
+        f"{used.source}: {len(used.time)} samples over {used.time[-1] - used.time[0]:.1f} s.",
         *used.remarks,
         f"Fixed frame: {fixed_frame(used)}.",
-        _model(motion, odds, result),
+        _model(motion, result),
         *delays.words,
         *(f"{one}." for one in result.faults.words),
         *stuck_words(used),
@@ -33,7 +29,7 @@ def remarks(result: AhrsEstimate, motion: str, odds: float) -> tuple[str, ...]:
     if result.hard_iron.any():
         iron = ", ".join(f"{value:.3g}" for value in result.hard_iron)
         unit = used.magnetic_unit or "(unit of the magnetometer)"
-        sentences.append(f"Hard iron of ({iron}) {unit}, body axes, at the end, is subtracted.")
+        sentences.append(f"Hard iron of ({iron}) {unit}, body axes, is estimated at the end.")
     sentences += [f"{gap_words(gaps(used.time))}.", used.left_out_words]
     for sensor, number in result.estimate.skipped.items():
         if number:
@@ -49,29 +45,19 @@ def gap_words(found: list[tuple[float, float]]) -> str:
     return f"Gaps between stamps: {len(found)}, the longest {length:.3g} s after {begin:.3f} s"
 
 
-def _rested(result: AhrsEstimate) -> bool:
-    """Return whether the gyro bias was estimated at the start, if the filter is initialised with it."""
-    p = result.parameters
-    return p.rest_bias_sigma == 0.0 or bool(result.initial.covariance[3, 3] <= (0.5 * p.bias_sigma) ** 2)
-
-
-def _model(moved_by: str, odds: float, result: AhrsEstimate) -> str:
-    """Return a description of the motion model and of the initial gyro bias."""
-    if moved_by == "any":
-        return "Motion: any, its acceleration modelled as white noise."
-    bias, sigma = result.initial.bias / DEGREE, np.sqrt(result.initial.covariance[3, 3]) / DEGREE
+def _model(moved_by: str, result: AhrsEstimate) -> str:
+    """Return a description of the motion model and of the spans at rest."""
     parameters = result.parameters
-    shown = " (from the recording)" if parameters.velocity_from_record else ""
-    likelier = (
-        f" (log-likelihood larger by {odds:.0f} than for a {'hand' if moved_by == 'vehicle' else 'vehicle'})"
-        if odds < np.inf
-        else ""
-    )
     words = (
-        f"Motion: of a {moved_by}{likelier}, velocity σ {parameters.velocity_sigma:.2g} m/s{shown}, correlation time "
-        f"{parameters.velocity_time:g} s. "
-        f"Initial gyro bias: {', '.join(f'{value:.3g}' for value in bias)} °/s, σ {sigma:.2g} °/s"
+        f"Motion: of a {moved_by}, velocity σ {parameters.velocity_sigma:.2g} m/s, correlation time "
+        f"{parameters.velocity_time:g} s."
     )
-    if not _rested(result):
-        return f"{words}: no second is quiet enough to estimate it, so the heading may drift at first."
-    return f"{words}, from that second."
+    if parameters.velocity_sigma == 0.0:
+        words = "Motion: any, its acceleration modelled as white noise."
+    if parameters.rest_bias_sigma == 0.0:
+        return words
+    number, time = len(result.rests.last), result.recording.time
+    if number == 0:
+        return f"{words} No second is quiet enough to measure the gyro's bias, so the heading may drift at first."
+    at = ", ".join(f"{time[last]:.2f}" for last in result.rests.last[:4]) + (", …" if number > 4 else "")
+    return f"{words} The gyro's bias is measured at rest, in {number} second{'s' if number > 1 else ''}, until {at} s."

@@ -1,20 +1,33 @@
-"""Initial state of the filter of a recording: attitude, gyro bias and their σ from the first quiet second."""
+"""Initial state of the filter of a recording from its first samples, and the gyro's bias measured while the unit is at rest."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
-from strapdown import coning, estimation, quaternion
+from strapdown import estimation, kinematics, quaternion
 from strapdown.ahrs.parameters import AhrsParameters
 from strapdown.checks import Array, InputError, lengths
-from strapdown.recordings import Recording, sensor_faults
-from strapdown.recordings.sensor_faults import Faults
+from strapdown.recordings import Recording
+from strapdown.units import DEGREE, STANDARD_GRAVITY
 from strapdown.vectors import wahba
 
 QUIET_SPAN = 1.0
-"""Duration of the quiet span from which the filter is initialised, s."""
+"""Duration of the spans in which rest is looked for, s."""
+TENTHS = 10
+"""Number of parts of such a span whose mean rates are compared."""
+MAX_REST_SIGMA = 1.0 * DEGREE
+"""Maximum σ, rad/s, of the mean rate of a span as a measurement of the bias."""
+TURNING_RATE = 0.3 * DEGREE
+"""Mean rate, rad/s, above which vertical and field are examined for a rotation with it."""
+SWING_TIME = 0.1
+"""Time, s, over which a rate at the start is assumed to accelerate the unit: it adds to σ of the tilt."""
+MAX_TILT_SIGMA = 0.7
+"""Maximum σ of the initial tilt, rad."""
+FIRST_HEADING = 0.1
+"""σ of the first sample of the field, relative to its magnitude, which a disturbance has that later ones show."""
 
 
 def need_accelerometer(recording: Recording) -> None:
@@ -26,40 +39,13 @@ def need_accelerometer(recording: Recording) -> None:
         )
 
 
-class Begun(NamedTuple):
-    """A recording with its first quiet second and its faults, which every use of it needs."""
-
-    recording: Recording
-    quiet: slice
-    """Samples of the first quiet second, counted from its first sample."""
-    faults: Faults
-    """Faults of the samples from the quiet second on."""
-
-
-def begin(recording: Recording | Begun) -> Begun:
-    """Return the recording with its first quiet second and the faults from there on; a ``Begun`` is returned unchanged.
+def samples_in_span(recording: Recording) -> int:
+    """Return the number of samples in a span of :data:`QUIET_SPAN`.
 
     Raises
     ------
     InputError
-        If there is no accelerometer, or the recording is too short.
-    """
-    if isinstance(recording, Begun):
-        return recording
-    need_accelerometer(recording)
-    span = quiet_span(recording)
-    faults = sensor_faults.find(recording.since(span.start))
-    need_accelerometer(faults.recording)  # it may have had samples before the quiet second alone
-    return Begun(recording, slice(0, span.stop - span.start), faults)
-
-
-def quiet_span(recording: Recording) -> slice:
-    """Return the samples of the first quiet second: the first whose measure of motion is at most twice that of the quietest.
-
-    Raises
-    ------
-    InputError
-        If the recording is shorter than a second, or its first second holds one sample.
+        If the recording is shorter, or its first second holds one sample.
     """
     length = int(np.searchsorted(recording.time, recording.time[0] + QUIET_SPAN))
     lasts = recording.time[-1] - recording.time[0]
@@ -72,6 +58,18 @@ def quiet_span(recording: Recording) -> slice:
             f"{recording.source}: its first {QUIET_SPAN:g} s hold one sample, {lasts / (len(recording.time) - 1):.3g} s is the mean "
             "interval; if its stamps are in ms or us, say so (--time-unit, or units={'time': 'ms'})"
         )
+    return length
+
+
+def quiet_span(recording: Recording) -> slice:
+    """Return the samples of the first quiet second: the first whose measure of motion is at most twice that of the quietest.
+
+    Raises
+    ------
+    InputError
+        As :func:`samples_in_span`.
+    """
+    length = samples_in_span(recording)
     blocks = len(recording.time) // length
     axes = recording.rate[: blocks * length].T.copy().reshape(3, blocks, length)
     mean = axes.mean(axis=2)
@@ -82,96 +80,146 @@ def quiet_span(recording: Recording) -> slice:
     return slice(first * length, (first + 1) * length)
 
 
-def start(
-    recording: Recording,
-    quiet: slice,
-    parameters: AhrsParameters,
-    iron: Array | float = 0.0,
-    means: tuple[Array, float, Array | None] | None = None,
-) -> estimation.State:
-    """Return the state at the first of the quiet samples: attitude by TRIAD from the mean vertical and field, any heading without a field.
+def first_vector(samples: Array, turned: Array, source: str, sensor: str) -> Array:
+    """Return the first valid sample (3,) of a sensor in the body axes of the first row; ``turned``: attitude by the gyro (n, 4).
 
-    The acceleration that remains in the frame fixed by the integrated gyro is added to σ. ``iron`` (3,) is the hard iron to be subtracted
-    from the field, body axes. If ``rest_bias_sigma`` is positive, the bias is that of :func:`resting_bias`. ``means``: those of
-    :func:`means_at_first`, if already computed.
+    Raises
+    ------
+    InputError
+        If there is none, or all are zero.
     """
-    force, spread, field = means_at_first(recording, quiet) if means is None else means
-    # Without a magnetometer the heading is arbitrary: any horizontal direction will do.
-    across = np.eye(3)[np.argmin(np.abs(force))] if field is None else field - iron
-    bias, bias_sigma = np.zeros(3), parameters.bias_sigma
-    if parameters.rest_bias_sigma > 0.0:
-        bias, bias_sigma = resting_bias(recording, quiet, parameters)
-    return estimation.initial_state(
-        wahba.from_vertical_and_heading(force, across),
-        bias=bias,
-        attitude_sigma=float(np.hypot(parameters.attitude_sigma, spread / norm(force))),
-        bias_sigma=bias_sigma,
-    )
+    size = lengths(samples)
+    valid = np.isfinite(size) & (size > 0.0)
+    if not valid.any():
+        state = "is zero and gives no direction" if np.isfinite(size).any() else "has no valid sample"
+        raise InputError(
+            f"{source}: the {sensor} {state}; cut the recording to a part where it has, or leave its columns out"
+        )
+    k = int(np.argmax(valid))
+    return np.asarray(quaternion.rotate(turned[k], samples[k]))
 
 
-def means_at_first(recording: Recording, quiet: slice) -> tuple[Array, float, Array | None]:
-    """Return means of the quiet samples in the body axes of the first, and reject a sensor without samples there.
+def start(recording: Recording, turned: Array, parameters: AhrsParameters) -> estimation.State:
+    """Return the state at the first sample: attitude by TRIAD from the first specific force and field, any heading without a field.
 
-    They are the specific force (3,), the norm of its standard deviation, and the field (3,), None without a magnetometer. The means are
-    formed in the frame fixed by the integrated gyro.
+    σ of the tilt includes the deviation of the specific force from gravity and the motion that the first rate implies; that of the
+    heading includes the tilt, because the field dips, and a disturbance of the field. The bias is zero with σ ``bias_sigma``.
     """
-    turn = 0.5 * (recording.rate[quiet][1:] + recording.rate[quiet][:-1]) * np.diff(recording.time[quiet])[:, None]
-    turned = coning.integrate(turn)
-
-    def still(samples: Array) -> Array:
-        known = np.isfinite(samples[quiet]).all(axis=1)
-        return quaternion.rotate(turned[known], samples[quiet][known])
-
     assert recording.specific_force is not None
-    force, field = still(recording.specific_force), recording.magnetic_field
-    mean = _mean(force, recording.source, "accelerometer")
-    across = None if field is None else _mean(still(field), recording.source, "magnetometer")
-    return mean, norm(force.std(axis=0)), across
+    force = first_vector(recording.specific_force, turned, recording.source, "accelerometer")
+    moved = float(np.linalg.norm(force)) / STANDARD_GRAVITY - 1.0
+    swing = SWING_TIME * float(np.linalg.norm(recording.rate[0]))
+    tilt = min(float(np.linalg.norm([parameters.attitude_sigma, moved, swing])), MAX_TILT_SIGMA)
+    P = np.diag(np.repeat([tilt**2, parameters.bias_sigma**2], 3))
+    across = np.eye(3)[np.argmin(np.abs(force))]
+    if recording.magnetic_field is not None:
+        across = first_vector(recording.magnetic_field, turned, recording.source, "magnetometer")
+    attitude = wahba.from_vertical_and_heading(force, across)
+    if recording.magnetic_field is not None:
+        up = force / np.linalg.norm(force)
+        sine = float(up @ across) / float(np.linalg.norm(across))
+        level = max(1.0 - sine**2, 0.07)  # a field steeper than 75° has hardly a heading
+        P[:3, :3] += np.outer(up, up) * ((sine * tilt) ** 2 + FIRST_HEADING**2) / level
+    return estimation.State(attitude=attitude, bias=np.zeros(3), covariance=P)
 
 
-def resting_bias(recording: Recording, quiet: slice, parameters: AhrsParameters) -> tuple[Array, float]:
-    """Return the gyro bias (3,), rad/s, and its σ: the mean rate of the quiet samples weighted with the prior, 0 with ``bias_sigma``.
+class Rests(NamedTuple):
+    """Measurements of the gyro's bias: the mean rates of spans at rest."""
 
-    σ of the mean rate is the root sum of squares of ``rest_bias_sigma`` and the spread of the rate between tenths of the samples, which is
-    motion of the hand. If the mean rate exceeds 3 σ of the prior and the vertical and the field rotate with it, it is added to σ as motion.
+    last: np.ndarray
+    """Last sample of each span (m,)."""
+    rate: Array
+    """Mean rate (m, 3), rad/s."""
+    sigma: Array
+    """σ of each axis (m,), rad/s."""
+
+
+NO_REST = Rests(np.empty(0, np.intp), np.empty((0, 3)), np.empty(0))
+
+
+def rests(recording: Recording, parameters: AhrsParameters) -> Rests:
+    """Return the spans in which the unit hardly moves.
+
+    σ of the mean rate is the root sum of squares of ``rest_bias_sigma`` and the spread of the rate between tenths of the span, which is
+    motion of the hand. Spans with which the vertical or the field rotates are left out: a steady turn is no bias.
     """
-    rate, prior = recording.rate[quiet], parameters.bias_sigma
-    mean = rate.mean(axis=0)
-    tenths = np.array([part.mean(axis=0) for part in np.array_split(rate, min(10, len(rate)))])
-    sigma = float(np.hypot(parameters.rest_bias_sigma, norm(tenths.std(axis=0))))
-    if norm(mean) > 3.0 * prior and _turns(recording, quiet, mean):
-        sigma = float(np.hypot(sigma, norm(mean)))
-    share = prior**2 / (prior**2 + sigma**2)
-    return share * mean, float(np.sqrt(share)) * sigma
+    if parameters.rest_bias_sigma == 0.0:
+        return NO_REST
+    length = samples_in_span(recording)
+    parts = min(TENTHS, length)
+    part = length // parts
+    length = parts * part
+    n = len(recording.time) // length
+    tenths = recording.rate[: n * length].reshape(n, parts, part, 3).mean(axis=2)
+    mean = tenths.mean(axis=1)
+    sigma = np.hypot(parameters.rest_bias_sigma, np.sqrt(np.sum((tenths - mean[:, None]) ** 2, axis=(1, 2)) / parts))
+    last = np.arange(length - 1, n * length, length)
+    steady = recording.time[last] - recording.time[last - length + 1] < 1.5 * QUIET_SPAN  # no gap
+    used = np.flatnonzero(steady & (sigma < MAX_REST_SIGMA))
+    turning = lengths(mean[used]) > TURNING_RATE
+    used = np.array(
+        [
+            k
+            for k, doubtful in zip(used, turning, strict=True)
+            if not (doubtful and _turns(recording, slice(last[k] - length + 1, last[k] + 1), mean[k]))
+        ],
+        np.intp,
+    )
+    return Rests(last[used], mean[used], sigma[used])
 
 
-def _turns(recording: Recording, quiet: slice, rate: Array) -> bool:
+def _turns(recording: Recording, span: slice, rate: Array) -> bool:
     """Return whether vertical and field rotate at more than half this rate from the first half of the samples to the second."""
     expected, seen = [], []
     for samples in (recording.specific_force, recording.magnetic_field):
-        known = np.empty((0, 3)) if samples is None else samples[quiet][np.isfinite(samples[quiet]).all(axis=1)]
-        if len(known) > 1:
-            first, second = (half.mean(axis=0) / norm(known.mean(axis=0)) for half in np.array_split(known, 2))
+        known = np.empty((0, 3)) if samples is None else samples[span][np.isfinite(samples[span]).all(axis=1)]
+        if len(known) > 1 and np.any(mean := known.mean(axis=0)):
+            first, second = (half.mean(axis=0) / np.linalg.norm(mean) for half in np.array_split(known, 2))
             seen.append(second - first)
             expected.append(-0.5 * QUIET_SPAN * np.cross(rate, 0.5 * (first + second)))
     e, s = np.ravel(expected), np.ravel(seen)
     return bool(s @ e > 0.5 * (e @ e))
 
 
-def _mean(samples: Array, source: str, sensor: str) -> Array:
-    """Return the mean of samples (k, 3) of the quiet second, which must not be zero."""
-    if len(samples) == 0:
-        raise InputError(
-            f"{source}: the {sensor} has no valid sample in the first quiet second; cut the recording to a part where it has"
-        )
-    mean = np.asarray(samples.mean(axis=0))
-    if norm(mean) == 0.0:
-        raise InputError(
-            f"{source}: the {sensor} is zero over the first quiet second and gives no direction; cut the recording to a part where it does"
-        )
-    return mean
+def informative(found: Rests, time: Array, parameters: AhrsParameters) -> Rests:
+    """Return those spans whose σ is below that of the bias by the spans before: a long rest is measured once, and again as it drifts."""
+    variance, before, kept = parameters.bias_sigma**2, time[0], []
+    for k, (last, sigma) in enumerate(zip(found.last, found.sigma, strict=True)):
+        drifted = variance + parameters.rate_random_walk**2 * (time[last] - before)
+        if sigma**2 < drifted:
+            variance, before = 1.0 / (1.0 / drifted + 1.0 / sigma**2), time[last]
+            kept.append(k)
+    return Rests(found.last[kept], found.rate[kept], found.sigma[kept])
 
 
-def norm(vector: Array) -> float:
-    """Return the length of a vector."""
-    return float(np.linalg.norm(vector))
+def with_rate_at_rest(state: estimation.State, rate: Array, sigma: float) -> estimation.State:
+    """Return the state corrected by a measurement of the gyro's bias (3,) with σ, rad/s."""
+    P = np.asarray(state.covariance)
+    K = np.linalg.solve(P[3:6, 3:6] + sigma**2 * np.eye(3), P[3:6]).T
+    change = K @ (rate - state.bias)
+    left = np.eye(len(P))
+    left[:, 3:6] -= K
+    P = left @ P @ left.T + sigma**2 * K @ K.T
+    reset = np.eye(len(P))
+    reset[:3, :3] = kinematics.right_jacobian(change[:3])
+    P = reset @ P @ reset.T
+    return replace(
+        state,
+        attitude=quaternion.normalize(quaternion.multiply(state.attitude, quaternion.exp(change[:3]))),
+        bias=state.bias + change[3:6],
+        values=state.values + change[6:],
+        covariance=0.5 * (P + P.T),
+    )
+
+
+def with_all_rests(state: estimation.State, found: Rests, time: Array, parameters: AhrsParameters) -> estimation.State:
+    """Return the state at the first sample with the bias that all spans at rest show, from the last one back, as it drifts."""
+    if len(found.last) == 0:
+        return state
+    walk = parameters.rate_random_walk**2
+    mean, information, after = np.zeros(3), 0.0, time[found.last[-1]]
+    for last, rate, sigma in zip(found.last[::-1], found.rate[::-1], found.sigma[::-1], strict=True):
+        information = information / (1.0 + information * walk * (after - time[last]))
+        total = information + sigma**-2
+        mean, information, after = (information * mean + sigma**-2 * rate) / total, total, time[last]
+    return with_rate_at_rest(state, mean, float(np.sqrt(1.0 / information + walk * (after - time[0]))))

@@ -452,7 +452,7 @@ def _estimate_recording(
     from strapdown.gyro import read_spec
     from strapdown.gyro import temperature as thermal
 
-    motion = one_of("--motion", options.motion or ahrs.motions.AUTO, (ahrs.motions.AUTO, *ahrs.MOTIONS))
+    motion = one_of("--motion", options.motion or "hand", ahrs.MOTIONS)
     late = None if options.latency is None else 1e-3 * non_negative("--latency", options.latency, unit="ms")
     carried = None if options.calibration is None else calibration.read(options.calibration)
     warm = None if options.temperature is None else thermal.read(options.temperature)

@@ -90,6 +90,12 @@ class Steps(NamedTuple):
     """(k, 6, 6)"""
     tilt: np.ndarray
     """Factor (k,) on the σ of the tilt."""
+    floor: np.ndarray
+    """Variance (k,) of the tilt in addition, rad²."""
+    heading: np.ndarray
+    """Factor (k,) on the σ of the rotation about the vertical."""
+    iron: np.ndarray
+    """Variance (k,) of that rotation in addition, rad²."""
 
 
 class Stamps(NamedTuple):
@@ -121,10 +127,10 @@ def block_at(P, first):
     return tuple(P[i, first + j] for i in range(3) for j in range(3))
 
 
-def carry_to_stamps(steps, stamps, timing, iron, out):
+def carry_to_stamps(steps, stamps, timing, out):
     """Propagate the estimate at each step with the gyro to the stamps before the next step, and over their delay.
 
-    The covariance includes a timing error of variance ``timing``, s², along the rate, and ``iron``, rad², about the vertical.
+    The covariance includes a timing error of variance ``timing``, s², along the rate.
     """
     for k in range(len(steps.edge)):
         first = steps.edge[k]
@@ -136,10 +142,10 @@ def carry_to_stamps(steps, stamps, timing, iron, out):
         P = steps.covariance[k]
         R = rotation_matrix(begin)
         xx, xy, xz, yy, yz, zz = times_transpose_upper(multiply(R, block_at(P, 0)), R)
-        s = steps.tilt[k]
-        fixed = full((s * s * xx, s * s * xy, s * xz, s * s * yy, s * yz, zz))
+        s, h, floor, iron = steps.tilt[k], steps.heading[k], steps.floor[k], steps.iron[k]
+        fixed = full((s * s * xx + floor, s * s * xy, s * h * xz, s * s * yy + floor, s * h * yz, h * h * zz))
         across = multiply(R, block_at(P, 3))
-        across = scale(s, across[:3]) + scale(s, across[3:6]) + across[6:]
+        across = scale(s, across[:3]) + scale(s, across[3:6]) + scale(h, across[6:])
         for n in range(first, last):
             late = stamps.time[n] - stamps.time[first] + stamps.late[n]
             v = combine(1.0, vector_at(stamps.ahead, n), -late, bias)
@@ -173,3 +179,38 @@ def low_pass(values, share, result):
         for i in range(len(values)):
             y += share * (values[i, j] - y)
             result[i, j] = y
+
+
+def running_median(values, every, ordered, result):
+    """Write the median of the rows of ``values`` (k, 2) up to each, by column, of every ``every``-th row.
+
+    ``ordered`` (2, capacity) is scratch. Where it is full, every other value is dropped in order of size, which keeps the median, and the
+    stride is doubled.
+    """
+    capacity = ordered.shape[1]
+    for c in range(values.shape[1]):
+        count, stride, median = 0, every, values[0, c]
+        for i in range(len(values)):
+            if i % stride == 0:
+                if count == capacity:
+                    count = capacity // 2
+                    for k in range(count):
+                        ordered[c, k] = 0.5 * (ordered[c, 2 * k] + ordered[c, 2 * k + 1])
+                    stride *= 2
+                value, k = values[i, c], count
+                while k > 0 and ordered[c, k - 1] > value:
+                    ordered[c, k] = ordered[c, k - 1]
+                    k -= 1
+                ordered[c, k] = value
+                count += 1
+                median = 0.5 * (ordered[c, (count - 1) // 2] + ordered[c, count // 2])
+            result[i, c] = median
+
+
+def running_mean(values, share, start, weight, mean):
+    """Write the mean (k,) of ``values`` up to each, with exponential forgetting by ``share`` a value, from ``start`` of this weight."""
+    total = start * weight
+    for i in range(len(values)):
+        total = (1.0 - share) * total + values[i]
+        weight = (1.0 - share) * weight + 1.0
+        mean[i] = total / weight

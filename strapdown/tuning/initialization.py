@@ -9,7 +9,6 @@ import numpy as np
 
 from strapdown import ahrs, estimation
 from strapdown.ahrs import AhrsParameters
-from strapdown.ahrs.starting import need_accelerometer
 from strapdown.checks import InputError
 from strapdown.estimation import setup
 from strapdown.estimation.setup import FilterSetup
@@ -21,12 +20,12 @@ from strapdown.tuning.parameters import SCALE
 
 
 def recording_setup(parameters: AhrsParameters | None = None) -> FilterSetup:
-    """Return the setup of the filter that :func:`strapdown.ahrs.estimate` runs. Default: that of ``ahrs.MOTIONS["any"]``."""
-    return (parameters or ahrs.MOTIONS["any"]).setup
+    """Return the setup of the filter that :func:`strapdown.ahrs.estimate` runs. Default: that of ``AhrsParameters()``."""
+    return (parameters or AhrsParameters()).setup
 
 
 def recording_case(recording: Recording, parameters: AhrsParameters | None = None) -> Case:
-    """Return a recording as filtered by :func:`strapdown.ahrs.estimate`: from its first quiet second, with its reference.
+    """Return a recording as filtered by :func:`strapdown.ahrs.estimate`: with its reference.
 
     Delays between sensors are not compensated.
 
@@ -35,7 +34,7 @@ def recording_case(recording: Recording, parameters: AhrsParameters | None = Non
     recording : Recording
         Recording with an accelerometer.
     parameters : AhrsParameters, optional
-        Default: ``ahrs.MOTIONS["any"]``.
+        Default: ``AhrsParameters()``.
 
     Returns
     -------
@@ -47,16 +46,14 @@ def recording_case(recording: Recording, parameters: AhrsParameters | None = Non
     InputError
         If there is no accelerometer, or the recording is too short.
     """
-    need_accelerometer(recording)
-    span = ahrs.quiet_span(recording)
-    used = recording.since(span.start)
-    prepared = ahrs.prepare(used, slice(0, span.stop - span.start), parameters or ahrs.MOTIONS["any"])
+    ahrs.need_accelerometer(recording)
+    prepared = ahrs.prepare(recording, parameters or AhrsParameters())
     return Case(
         record=prepared.record,
         initial=prepared.initial,
-        name=used.source,
-        true_attitude=None if used.true_attitude is None else used.true_attitude[prepared.edge],
-        judged=None if used.movement is None else used.movement[prepared.edge],
+        name=recording.source,
+        true_attitude=None if recording.true_attitude is None else recording.true_attitude[prepared.edge],
+        judged=None if recording.movement is None else recording.movement[prepared.edge],
     )
 
 

@@ -1,0 +1,89 @@
+"""The reported covariance: the filter's own, scaled by what the recording shows so far of the motion and the field.
+
+One model serves slow and fast motion, good and poor units, clean and disturbed fields, so the filter's own σ is right on average only. Its
+innovations show how far a recording differs from it. The scales were chosen so that the 95 %
+regions hold on the development halves of eight sets (``benchmarks/recordings.py``); the estimate does not depend on them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from strapdown.ahrs.parameters import AhrsParameters
+from strapdown.checks import Array
+from strapdown.kernels import recording_steps
+from strapdown.kernels.machine import compiled, read_only
+from strapdown.recordings.hard_iron import low_pass
+from strapdown.records import Estimate, Innovations
+from strapdown.units import STANDARD_GRAVITY
+
+LEVEL_TIME = 5.0
+"""Time constant of the average that gives the level of the acceleration, s."""
+OWN_SHARE = 0.1
+"""Share of the modelled variance of an innovation that comes from the sensor's errors, whatever the acceleration's level."""
+TILT_SHARES = (0.007, 0.048)
+"""Shares of the tilt variance that do not depend on that level, and that are proportional to its root, as the steady-state variance is to σ
+of the acceleration."""
+MAX_BY_FIELD = 0.3
+"""Maximum σ of the accelerometer's error computed from the level of the field's disturbance, m/s²."""
+FIELD_LEVEL = 0.02
+"""Mean NIS of the magnetometer in a field disturbed as that along the path of a phone indoors."""
+MAX_HEADING = 30.0
+"""Maximum factor on the variance of the heading."""
+FIRST_LEVEL = (0.01, 15.0)
+"""Mean NIS of the magnetometer assumed at first, and the number of measurements that weigh as much."""
+FIELD_MEMORY = 60.0
+"""Time constant with which that mean forgets, s."""
+
+
+def acceleration_level(filtered: Estimate, uncertain: np.ndarray) -> Array:
+    """Return the level (k + 1,) of the acceleration up to each edge of the steps: its variance, relative to that modelled.
+
+    The same model serves slow and fast motion, so most motion is slower than modelled. The level is set to 1 at the start, without a
+    measurement, and in steps whose rotation is ``uncertain`` (k,).
+    """
+    seen = filtered.innovations["accelerometer"]
+    nis = np.ones((len(filtered.time), 1))
+    nis[np.searchsorted(filtered.time, seen.time), 0] = np.where(np.isfinite(seen.nis), seen.nis / 3.0, 1.0)
+    step = float(np.median(np.diff(filtered.time))) / LEVEL_TIME
+    begin = np.append(0, np.flatnonzero(uncertain) + 1)
+    nis[begin] = 1.0
+    return np.concatenate([low_pass(part, step) for part in np.split(nis, begin[1:])])[:, 0]
+
+
+def scaled_innovations(filtered: Estimate, level: Array) -> dict[str, Innovations]:
+    """Return the innovations; the variance of the accelerometer's is scaled by the level of the acceleration before each."""
+    own = filtered.innovations["accelerometer"]
+    before = level[np.searchsorted(filtered.time, own.time) - 1]
+    share = OWN_SHARE + (1.0 - OWN_SHARE) * before
+    return {**filtered.innovations, "accelerometer": replace(own, variance=own.variance * share[:, None])}
+
+
+def scales(filtered: Estimate, parameters: AhrsParameters, level: Array, *, causal: bool) -> tuple[Array, Array, Array]:
+    """Return the factor on σ of the tilt, the variance that is added to it, rad², and the factor on σ of the heading (k + 1,) each.
+
+    ``level`` is that of the acceleration. ``causal``: from the measurements before each step, otherwise from all.
+    """
+    field = field_level(filtered, parameters, causal=causal) / FIELD_LEVEL
+    error = parameters.tilt_sigma**2 + np.minimum(parameters.tilt_by_field * field**2, MAX_BY_FIELD) ** 2
+    heading = np.minimum(parameters.heading_share + parameters.heading_by_field * field**1.5, MAX_HEADING)
+    if "magnetometer" not in filtered.innovations:
+        heading = np.ones(len(field))
+    return np.sqrt(TILT_SHARES[0] + TILT_SHARES[1] * np.sqrt(level)), error / STANDARD_GRAVITY**2, np.sqrt(heading)
+
+
+def field_level(filtered: Estimate, parameters: AhrsParameters, *, causal: bool) -> Array:
+    """Return the mean NIS of the magnetometer (k + 1,) up to each step, or of all; without a magnetometer 0."""
+    seen = filtered.innovations.get("magnetometer")
+    if seen is None or len(seen.time) == 0:
+        return np.zeros(len(filtered.time))
+    nis = np.where(np.isfinite(seen.nis), seen.nis, 0.0)
+    if not causal:
+        return np.full(len(filtered.time), float(nis.mean()))
+    first, weight = FIRST_LEVEL
+    mean = np.empty(len(nis))
+    share = parameters.heading_interval / FIELD_MEMORY
+    compiled(recording_steps.running_mean)(read_only(nis), share, first, weight, mean)
+    return np.asarray(np.append(first, mean)[np.searchsorted(seen.time, filtered.time, side="right")])
