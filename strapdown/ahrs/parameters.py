@@ -172,13 +172,13 @@ HAND_HELD = AhrsParameters(
     tilt_sigma=0.06,
     tilt_by_field=0.7,
     heading_share=0.1,
-    heading_by_field=1.2,
+    heading_by_field=0.8,
     gyro_scale_sigma=3e-3,
 )
 """A unit with a magnetometer in the hand, on a person or a small aircraft: its velocity is bounded. Chosen on the development halves of
 BROAD, RepoIMU, Sassari, OxIOD and the phones of PerCom 2017 (``benchmarks/recordings.py``)."""
 HAND_HELD_SMOOTHED = replace(
-    HAND_HELD, velocity_sigma=1.0, gyro_scale_sigma=4e-3, field_disturbance=0.02, tilt_sigma=0.055
+    HAND_HELD, velocity_sigma=1.0, gyro_scale_sigma=4e-3, field_disturbance=0.02, tilt_sigma=0.045
 )
 """The same for the smoother, which weighs acceleration that lasts over all the time before and after. Chosen on the same recordings."""
 HAND_HELD_WITHOUT_MAGNETOMETER = replace(
