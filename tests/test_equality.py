@@ -31,33 +31,33 @@ def dataclasses_of_the_package() -> Iterator[type]:
         )
 
 
-def dummy(hint: Any) -> Any:  # noqa: PLR0911
+def dummy(hint: Any, above: tuple[type, ...] = ()) -> Any:  # noqa: PLR0911
     """A value of a type; of several alternatives the one that is hardest to compare."""
     origin, arguments = typing.get_origin(hint) or hint, typing.get_args(hint)
     if origin is np.ndarray or hint is Any:
         return np.arange(3.0)
     if origin in (types.UnionType, typing.Union):
-        made = [dummy(one) for one in arguments if one is not type(None)]
+        made = [dummy(one, above) for one in arguments if one is not type(None)]
         return next((one for one in made if isinstance(one, np.ndarray | dict | list)), made[0])
     if origin is tuple:
-        return tuple(dummy(one) for one in arguments if one is not Ellipsis)
+        return tuple(dummy(one, above) for one in arguments if one is not Ellipsis)
     if origin in (dict, collections.abc.Mapping):
-        return {"key": dummy(arguments[1])}
+        return {"key": dummy(arguments[1], above)}
     if origin is collections.abc.Sequence:  # all make a tuple of it
-        return (dummy(arguments[0]),)
+        return (dummy(arguments[0], above),)
     if origin is list:
-        return [dummy(arguments[0])]
+        return [dummy(arguments[0], above)]
     if dataclasses.is_dataclass(origin):
-        return filled(origin)
+        return "a tree ends" if origin in above else filled(origin, above)
     return 1.0 if origin in (int, float) else "text"
 
 
-def filled(kind: type) -> Any:
+def filled(kind: type, above: tuple[type, ...] = ()) -> Any:
     """An instance whose fields hold values of their types, unchecked."""
     made = object.__new__(kind)
     hints = typing.get_type_hints(kind, localns=FOR_CHECKERS)
     for field in dataclasses.fields(kind):
-        object.__setattr__(made, field.name, dummy(hints[field.name]))
+        object.__setattr__(made, field.name, dummy(hints[field.name], (*above, kind)))
     return made
 
 

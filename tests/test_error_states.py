@@ -325,7 +325,7 @@ def rows_at(face, sensor, kind, reference, z, transverse):
 
 @pytest.mark.parametrize(
     ("prior", "sigma", "bound"),
-    [(1.0, 5e-6, 1e-6), (10.0, 1e-6, 1e-3)],
+    [(1.0, 5e-6, 1e-6), (3.0, 1e-6, 1e-3)],
     ids=["1 arcsecond", "anywhere, 0.2 arcseconds"],
 )
 def test_two_directions_and_a_diffuse_prior_give_the_closed_form(prior, sigma, bound):
@@ -337,7 +337,7 @@ def test_two_directions_and_a_diffuse_prior_give_the_closed_form(prior, sigma, b
 
 
 def test_what_needs_more_digits_than_a_covariance_has_is_refused():
-    with pytest.raises(InputError, match=r"more than 1e\+08 times as precise as the state"):
+    with pytest.raises(InputError, match=r"more than 7e\+06 times as precise as the state"):
         diffuse(1e3, 1e-6)
 
 
@@ -410,7 +410,7 @@ def test_the_covariance_stays_positive_definite(sharpness):
     record = ImuRecord(time=edges, increments=increments, vectors=tuple(sensors))
     options = {"every": 100, "full_covariance": True}
     if sharpness < 1e-8:
-        with pytest.raises(InputError, match=r"more than 1e\+08 times as precise as the state"):
+        with pytest.raises(InputError, match=r"more than 7e\+06 times as precise as the state"):
             estimation.run(record, NOISE, start(error=(0.0, 0.0, 0.0)), OPTIONS["all"], **options)
         return
     P = estimation.run(record, NOISE, start(error=(0.0, 0.0, 0.0)), OPTIONS["all"], **options).whole_covariance

@@ -285,7 +285,7 @@ def test_a_simulated_unit_goes_through_allan_and_its_table_into_the_filter(succe
     off = np.abs(estimate.bias - np.array([360.0, 0.0, -360.0]) * DEGREE_PER_HOUR)[:, :2]
     assert (off < 4.0 * estimate.sigma[:, 3:5]).all()
     assert off[estimate.time > estimate.time[0] + 1.1].max() < 9e-4  # 0.05 °/s, σ of a second at rest
-    assert estimate.sigma[-1, 3] < 5e-4
+    assert estimate.sigma[-1, 3] < 6e-4
 
 
 def through_a_bag(folder, seed: int, others: float) -> tuple[np.ndarray, list[bool]]:

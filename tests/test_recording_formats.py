@@ -114,7 +114,7 @@ def test_arrays_by_name_are_a_recording():
     recording = sd.read({"time": np.arange(4.0), "gyro [deg/s]": values, "acc": values}, units={"accelerometer": "g"})
     np.testing.assert_allclose(recording.rate, np.radians(values), rtol=1e-15)
     np.testing.assert_allclose(recording.specific_force, values * 9.80665, rtol=1e-15)
-    with pytest.raises(InputError, match=r"path is 3, .*give a path, a DataFrame"):
+    with pytest.raises(InputError, match=r"path is 3, .*give a path, a data frame"):
         sd.read(3)
     with pytest.raises(InputError, match=r"table: column gz has shape \(2,\), the first \(3,\)"):
         recordings.from_table({**columns, "gz": np.zeros(2)}, units={"gyro": "rad/s"})

@@ -83,7 +83,7 @@ class Prior(NamedTuple):
     sigma: Array
 
 
-@dataclass
+@dataclass(eq=False)
 class Unknowns:
     """Sensor errors (m,), attitudes (n, 3, 3) and the other unknowns of the nodes (n, 9 or 12)."""
 
@@ -128,7 +128,7 @@ def unpacked(x: Array) -> Errors:
     )
 
 
-@dataclass
+@dataclass(eq=False)
 class _Equations:
     """Weighted residuals and their sparse derivatives, by kind."""
 

@@ -42,7 +42,7 @@ COMMANDS: dict[str, dict[str, tuple[str, ...]]] = {
         "calibrate": (
             "calibrating",
             "strapdown calibrate turned.csv --gyro-unit deg/s --accelerometer-unit g",
-            "strapdown estimate walk.csv --calibration calibration.toml",
+            "strapdown calibrate slow.h5 fast.h5 --out calibration.toml",
         ),
         "convert": ("conversion", "strapdown convert walk.bag walk.csv"),
     },

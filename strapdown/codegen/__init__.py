@@ -92,12 +92,13 @@ def export(
     program = design.program_of(setup, _sensors_of(sensors), single=precision == "single")
     origin = _origin(setup, precision)
     made = c.files(program, origin, single=precision == "single") if to == "c" else javascript.files(program, origin)
-    paths = []
-    for name, text in made.items():
-        path = Path(folder) / name
+    paths = [Path(folder) / name for name in made]
+    for path in paths:
+        if path.is_dir():
+            raise InputError(f"{path} is a folder, but a file of that name must be written; choose another folder")
+    for path, text in zip(paths, made.values(), strict=True):
         with written_beside(path) as temporary:
             temporary.write_text(text, encoding="utf-8")
-        paths.append(path)
     return tuple(paths)
 
 

@@ -56,7 +56,7 @@ SYMBOLS = {
 """The unit that each ending of a key stands for."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Key:
     """One quantity of a table."""
 
@@ -73,7 +73,7 @@ class Key:
     """A value that the parser accepts."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Section:
     """One table of the file, of one type."""
 
