@@ -12,11 +12,15 @@ from typing import Any
 
 WIDTH = 88
 """Characters that fit into a line of a page."""
+CANNOT_TELL = 'strapdown() { command strapdown "$@" || [ $? -eq 3 ]; }\n'
+"""A verdict that the data cannot tell is no failure of a cell."""
 
 
 def bash(line: str, cell: str) -> None:
     """Run a cell in Bash until a command fails; print what it wrote."""
     options = [] if "--no-raise-error" in line else ["-e", "-o", "pipefail"]
+    if options:
+        cell = CANNOT_TELL + cell
     # stderr holds progress bars; cells that show an error redirect it.
     done = subprocess.run(["bash", *options, "-c", cell], capture_output=True, text=True, check=False)
     print("\n".join(_wrapped(row.rstrip()) for row in done.stdout.splitlines()))

@@ -303,7 +303,7 @@ def test_the_verdict_on_a_satellite_says_no_more_than_one_record_shows(run, succ
     parts = json.loads((tmp_path / "check.json").read_text())["parts"]
     errors = {one["of"]: one["detectable_error"] for one in parts}
     assert errors["attitude"] < 1.5
-    assert errors["bias"] is None or errors["bias"] > 10.0
+    assert errors["bias"] is None or errors["bias"] > 1.5
 
 
 def test_the_default_filter_of_a_satellite_passes_and_says_why_it_has_states(run, succeeds, satellite, tmp_path):

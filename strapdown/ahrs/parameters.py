@@ -193,7 +193,7 @@ HAND_HELD_WITHOUT_MAGNETOMETER = replace(
     tilt_sigma=0.08,
     gyro_scale_sigma=5e-3,
 )
-"""Such a unit without a magnetometer. Acceleration that lasts, in body axes too, would otherwise be taken for a bias of the gyro about the
+"""Such a unit without a magnetometer. Acceleration that lasts, in body axes too, would otherwise be modelled as gyro bias about the
 vertical, which nothing else shows. Chosen on the same recordings, without their magnetometers, and on those of EuRoC and TUM-VI."""
 _VEHICLE = {"specific_force_noise": 0.15, "velocity_sigma": 8.0, "velocity_time": 10.0, "acceleration_time": 2.0}
 _VESSEL = {"velocity_sigma": 3.0, "velocity_time": 10.0, "acceleration_time": 2.0, "position_time": 10.0}
