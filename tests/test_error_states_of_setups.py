@@ -126,7 +126,7 @@ def test_bad_tables_are_refused_with_their_place(table, words):
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: FilterSetup(process_noise=NOISE, bias_sigma=1e-5, states={}), "it must be states.States"),
+        (lambda: FilterSetup(process_noise=NOISE, bias_sigma=1e-5, states={}), "states is {}, not of class States"),
         (lambda: States(sensors={"mag": {}}), "must be SensorStates"),
         (lambda: setup.run(simulated(), chosen(States(sensors={"map": SensorStates(bias_sigma=1.0)})), None), "'mag'"),
         (lambda: WHOLE.chosen(("gyro.scael",)), "did you mean 'gyro.scale'"),

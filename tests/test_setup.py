@@ -92,6 +92,12 @@ def test_no_sigma_may_be_zero(change):
         dataclasses.replace(SETUP, **change)
 
 
+@pytest.mark.parametrize(("name", "value"), [("integration", "four-sample"), ("process_noise", 1e-4)])
+def test_a_part_of_another_class_is_refused_by_name(name, value):
+    with pytest.raises(InputError, match=f"{name} is .*, not of class"):
+        dataclasses.replace(SETUP, **{name: value})
+
+
 def test_a_sigma_beyond_half_a_turn_is_refused_of_angles_alone():
     wide = dataclasses.replace(SETUP, sigma={"star": (1e-4, 3.2, 1e-4)})
     for kind in ("direction", "heading", "attitude"):

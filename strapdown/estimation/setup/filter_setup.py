@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from strapdown import coning, units
-from strapdown.checks import InputError, one_of, positive
+from strapdown.checks import InputError, instance, one_of, positive
 from strapdown.estimation import filters
 from strapdown.estimation.filters.own import Own, OwnFilter, as_own
 from strapdown.estimation.gating import Gate, Robust
@@ -86,8 +86,10 @@ class FilterSetup(ByValue):
 
     def __post_init__(self) -> None:
         """Check every number."""
-        if self.states is not None and not isinstance(self.states, States):
-            raise InputError(f"states is {self.states!r}; it must be states.States, or None")
+        instance("process_noise", self.process_noise, ProcessNoise, "give the random walks of the gyro")
+        instance("integration", self.integration, coning.Algorithm, 'give one of coning.ALGORITHMS["name"]')
+        if self.states is not None:
+            instance("states", self.states, States, "or None")
         positive("attitude_sigma", self.attitude_sigma, unit="rad")
         positive("bias_sigma", self.bias_sigma, unit="rad/s")
         positive("measurement_sigma_factor", self.measurement_sigma_factor)
