@@ -24,6 +24,7 @@ sys.path[:0] = [str(DOCS.parent), str(DOCS)]
 
 import command_server  # noqa: E402
 import formula_font  # noqa: E402
+from coning_page import bundle  # noqa: E402
 
 import strapdown  # noqa: E402
 
@@ -91,7 +92,9 @@ numpydoc_class_members_toctree = False
 
 html_theme = "furo"
 html_title = "strapdown"
-html_static_path = ["_static"]
+_scripts = tempfile.TemporaryDirectory()
+bundle.write(Path(_scripts.name))
+html_static_path = ["_static", _scripts.name]
 html_css_files = ["strapdown.css"]
 html_js_files = ["copy.js"]
 html_copy_source = False

@@ -1,0 +1,115 @@
+"""Look at the built documentation in headless Chromium: ``python docs/check_browser.py docs/_build``.
+
+The interactive filter of the page on coning must draw, follow its sliders, reach the verdict that is right, and draw 30 times a second; on
+this page and the first no script may fail and nothing may be wider than a phone. Without Chromium the script says so and ends well.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+FRAME = 1000.0 / 30.0
+MAX_BYTES = 150_000
+
+# All at once, before the browser writes down the page: what waits for the next frame is done at once.
+PROBE = """<script>
+const found = {errors: []};
+addEventListener("error", (event) => found.errors.push(String(event.message)));
+addEventListener("load", () => {
+  const root = document.getElementById("coning-interactive");
+  if (root) {
+    window.requestAnimationFrame = (draw) => { draw(performance.now()); return 0; };
+    const set = (name, value) => {
+      const control = root.querySelector(`[name=${name}]`);
+      control.value = value;
+      control.dispatchEvent(new Event(name === "algorithm" ? "change" : "input", {bubbles: true}));
+      return root.dataset.verdict;
+    };
+    found.better = set("algorithm", "four-sample");
+    found.first = set("algorithm", "one-sample");
+    found.small = set("angle", 0);
+    found.before = Number(root.dataset.drawn);
+    found.drawn = Array.from({length: 40}, (_, k) => {
+      const begin = performance.now();
+      set("angle", 5 * k);
+      return performance.now() - begin;
+    });
+    found.redrawn = Number(root.dataset.drawn) - found.before;
+    found.ink = Array.from(root.querySelectorAll("canvas"), (canvas) => {
+      const pixels = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data;
+      return pixels.some((value) => value > 0);
+    });
+  }
+  found.overflow = document.documentElement.scrollWidth - innerWidth;
+  document.title = "FOUND " + JSON.stringify(found);
+});
+</script></head>"""
+
+
+def opened(chromium: str, page: Path, width: int, copy: Path) -> dict[str, Any]:
+    """Return what the probe reports of a page in a window of this width."""
+    content = page.read_text(encoding="utf-8")
+    probe = page.with_name(f"probe-{page.name}")  # beside the page, for its relative links
+    probe.write_text(content.replace("</head>", PROBE, 1), encoding="utf-8")
+    options = ["--headless", "--no-sandbox", "--no-first-run", "--disable-gpu", f"--user-data-dir={copy}"]
+    options += ["--disable-background-networking", "--enable-logging=stderr", f"--window-size={width},900"]
+    try:
+        command = [chromium, *options, "--dump-dom", probe.resolve().as_uri()]
+        shown = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+    finally:
+        probe.unlink()
+    title = re.search(r"<title>FOUND (\{.*?\})</title>", shown.stdout)
+    if title is None:
+        raise SystemExit(f"{page}: the probe did not end; standard error of the browser:\n{shown.stderr[-2000:]}")
+    found: dict[str, Any] = json.loads(title.group(1).replace("&quot;", '"').replace("&amp;", "&"))
+    return found
+
+
+def faults(found: dict[str, Any], width: int) -> list[str]:
+    """Return what is wrong with a page."""
+    wrong = [f"a script failed: {error}" for error in found["errors"]]
+    if found["overflow"] > 0:
+        wrong.append(f"the page is {found['overflow']} pixels wider than the window of {width}")
+    if "first" in found:
+        if found["first"] != "not consistent":
+            wrong.append(f"one sample a step: the verdict is {found['first']!r}, not 'not consistent'")
+        for name in ("better", "small"):
+            if not found[name].startswith("cannot tell"):
+                wrong.append(f"{name}: the verdict is {found[name]!r}, not 'cannot tell'")
+        if not all(found["ink"]) or len(found["ink"]) != 3:
+            wrong.append(f"drawings are empty: {found['ink']}")
+        if found["redrawn"] != len(found["drawn"]):
+            wrong.append(f"{found['redrawn']} drawings for {len(found['drawn'])} moves of a slider")
+        quick = sorted(found["drawn"])[len(found["drawn"]) // 4]  # the machine may have other work
+        if quick > FRAME:
+            wrong.append(f"a drawing takes {quick:.0f} ms, more than {FRAME:.0f}")
+    return wrong
+
+
+def main() -> int:
+    """Check the pages and print what is wrong."""
+    built = Path(sys.argv[1] if len(sys.argv) > 1 else "docs/_build")
+    size = (built / "_static/coning.js").stat().st_size
+    wrong = [f"coning.js has {size} bytes, more than {MAX_BYTES}"] if size > MAX_BYTES else []
+    chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    if chromium is None:
+        print("no Chromium on this machine: the pages were not looked at in a browser")
+    else:
+        with tempfile.TemporaryDirectory() as folder:
+            for name in ("index.html", "guide/coning.html"):
+                for width in (1280, 500):  # the least width of a headless window
+                    found = opened(chromium, built / name, width, Path(folder))
+                    wrong += [f"{name}, {width} pixels: {fault}" for fault in faults(found, width)]
+    print("\n".join(wrong) if wrong else f"coning.js has {size} bytes; pages as they should be")
+    return int(bool(wrong))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
