@@ -160,3 +160,13 @@ def test_control_characters_of_names_do_not_reach_the_terminal(capsys):
     assert not {code for code in said if code not in "\t\n" and (ord(code) < 32 or 127 <= ord(code) < 160)}
     assert said.startswith("star\N{REPLACEMENT CHARACTER}]0;title")
     assert said.endswith(": 1\n[red]2\n")
+
+
+def test_nor_do_those_of_a_table(capsys):
+    from strapdown.cli import terminal
+    from strapdown.results import Listing
+
+    terminal.show_listing(Listing("run \x1b[2K", ("sensor\x1b[1A", "test"), [("star\x1b]0;x\x07", "pass")], [], left=2))
+    said = capsys.readouterr().out
+    assert "star\N{REPLACEMENT CHARACTER}]0;x\N{REPLACEMENT CHARACTER}" in said
+    assert not {code for code in said if code != "\n" and ord(code) < 32}

@@ -116,7 +116,7 @@ def counted(number: int, what: str) -> str:
 
 def table(title: str, *columns: str, left: int = 1) -> Table:
     """Print the title and return an empty table, its first ``left`` columns text and the others numbers."""
-    console.print(Text(title, style="bold"))
+    console.print(title, style="bold")
     result = Table(box=box.SIMPLE_HEAD, header_style="", pad_edge=False, padding=(0, 1, 0, 0))
     for k, column in enumerate(columns):
         result.add_column(column, justify="left" if k < left else "right", no_wrap=k > 0 or left == 1)
@@ -137,7 +137,8 @@ def show_listing(listing: Listing, title: str | None = None, *, notes: bool = Fa
     rows = table(title or listing.title, *listing.columns, left=listing.left)
     styles = {"pass": "green", "FAIL": "red", "likely": "red"}
     for row in listing.rows:
-        rows.add_row(*(Text(cell, style=styles.get(cell, "")) for cell in row))
+        # Only plain strings are cleared of control characters.
+        rows.add_row(*(Text(cell, style=styles[cell]) if cell in styles else cell for cell in row))
     show(rows)
     say(*(listing.notes if notes else ()))
 
