@@ -1,11 +1,13 @@
 """The reference: every public name is documented as numpydoc wants it, and every example in it runs."""
 
+import ast
 import doctest
 import functools
 import importlib
 import inspect
 import pkgutil
 import re
+import types
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -141,6 +143,33 @@ def test_the_checks_are_those_of_numpydoc() -> None:
 def test_every_public_name_is_documented(module: str) -> None:
     faults = _undocumented(module)
     assert not faults, "\n".join(faults)
+
+
+def _stated(kind: str) -> Any:
+    """Return the default in the type of a documented parameter, if it is a literal."""
+    stated = re.search(r"default (.+)$", kind)
+    try:
+        return ast.literal_eval(stated.group(1)) if stated else inspect.Parameter.empty
+    except (SyntaxError, ValueError):  # words, or a value with its unit
+        return inspect.Parameter.empty
+
+
+@pytest.mark.parametrize("module", list(_modules()))
+def test_documented_defaults_are_those_of_the_signature(module: str) -> None:
+    wrong = []
+    for name, value in _callables(module):
+        if not callable(value) or _in_protocol(name) or (inspect.isclass(value) and issubclass(value, Exception)):
+            continue
+        parameters = inspect.signature(value).parameters
+        for names, (kind, _) in _Reference(name).doc_all_parameters.items():
+            default = parameters[names].default if names in parameters else inspect.Parameter.empty
+            stated = _stated(kind)
+            several = isinstance(stated, tuple) and not isinstance(default, tuple)  # of parameters documented together
+            if inspect.Parameter.empty in (stated, default) or several or default == "":  # "": a name that is derived
+                continue
+            if isinstance(default, float | int | str | tuple | types.NoneType) and default != stated:
+                wrong.append(f"{name}: {names} is {default!r} by default, and documented as {stated!r}")
+    assert not wrong, "\n".join(wrong)
 
 
 def _with_examples() -> list[str]:
