@@ -8,7 +8,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
 
-from strapdown import estimation, motion, quaternion, scenarios, vectors
+from strapdown import estimation, motion, quaternion, records, scenarios, vectors
 from strapdown.checks import InputError
 from strapdown.gyro import GyroSpec
 from strapdown.motion import orbit
@@ -23,6 +23,11 @@ FIELD = np.array([2e-5, 1e-5, -4e-5])
 def rotation(body, time):
     """Return the rotation from body to fixed frame by SciPy."""
     return Rotation.from_quat(np.roll(body.attitude(time), -1, axis=-1))
+
+
+def rotation_angles(q):
+    """Return the rotation vector of a quaternion by SciPy."""
+    return Rotation.from_quat(np.roll(q, -1)).as_rotvec()
 
 
 def observe(sensor, body=CONE, end=50.0, seed=1):
@@ -406,6 +411,32 @@ def test_the_dipole_has_no_divergence_and_no_curl_and_points_north_at_the_equato
 def test_a_field_without_a_direction_is_reported(field, kind):
     with pytest.raises(InputError, match=r"compass: .*field_f is zero, which has no direction"):
         vectors.Magnetometer(name="compass", field_f=np.array(field), sigma=1e-7, rate=1.0, kind=kind)
+
+
+def test_a_measured_heading_corrects_the_angle_about_the_vertical_alone():
+    """Of a level body at rest, the update is that of one scalar; the third sample is missing."""
+    prior, sigma = 0.05, 0.02
+    heading = np.array([0.2802, 0.2803, np.nan])
+    series = vectors.VectorMeasurements.from_headings("gnss", [1.0, 2.0, 3.0], heading, sigma, axis_b=[0.0, 2.0, 0.0])
+    record = records.ImuRecord(time=np.arange(5.0), increments=np.zeros((4, 3)), vectors=(series,))
+    noise = estimation.ProcessNoise(angle_random_walk=1e-12, rate_random_walk=0.0)
+    yaw = 0.28 - np.pi / 2  # of body x; y is π/2 ahead
+    start = estimation.initial_state(quaternion.exp(np.array([0.0, 0.0, yaw])), attitude_sigma=prior, bias_sigma=1e-12)
+    estimate = estimation.run(record, noise, start)
+    information = 1.0 / prior**2 + 2.0 / sigma**2
+    expected = 0.28 + (2e-4 + 3e-4) / sigma**2 / information
+    np.testing.assert_allclose(rotation_angles(estimate.attitude[-1]), [0.0, 0.0, expected - np.pi / 2], atol=1e-9)
+    np.testing.assert_allclose(estimate.variance[-1, :3], [prior**2, prior**2, 1.0 / information], rtol=1e-6)
+    assert estimate.skipped == {"gnss": 1}
+
+
+def test_the_axis_and_angles_of_headings_are_checked():
+    with pytest.raises(InputError, match="gnss: axis_b"):
+        vectors.VectorMeasurements.from_headings("gnss", [1.0], [0.3], 0.1, axis_b=[0.0, 0.0, 0.0])
+    with pytest.raises(InputError, match="gnss: heading"):
+        vectors.VectorMeasurements.from_headings("gnss", [1.0, 2.0], [0.3, np.inf], 0.1)
+    with pytest.raises(InputError, match="gnss: vector_b has shape"):
+        vectors.VectorMeasurements.from_headings("gnss", [1.0, 2.0], [0.3], 0.1)
 
 
 def test_masked_measurements_are_missing_ones():

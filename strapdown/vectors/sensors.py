@@ -174,6 +174,49 @@ class VectorMeasurements:
         for name, value in store.items():
             object.__setattr__(self, name, value)
 
+    @classmethod
+    def from_headings(
+        cls,
+        sensor: str,
+        time: ArrayLike,
+        heading: ArrayLike,
+        sigma: ArrayLike,
+        *,
+        axis_b: ArrayLike = (1.0, 0.0, 0.0),
+    ) -> VectorMeasurements:
+        """Return measured headings of a body axis, such as those of a two-antenna receiver or a gyrocompass.
+
+        Parameters
+        ----------
+        sensor : str
+            Name of the sensor.
+        time : array_like (m,)
+            Times of measurement, s, increasing.
+        heading : array_like (m,)
+            Angle of the horizontal part of the axis about fixed z, from fixed x, right-handed, rad: in north-east-down axes the compass
+            heading, in east-north-up axes π/2 minus it. NaN: missing.
+        sigma : float or array_like (m,)
+            Standard deviation of the heading, rad.
+        axis_b : array_like (3,), default (1.0, 0.0, 0.0)
+            The axis, body frame.
+
+        Returns
+        -------
+        VectorMeasurements
+            A series of kind ``"heading"``: the axis is known in the body, and its direction in the fixed frame is measured.
+
+        Examples
+        --------
+        >>> VectorMeasurements.from_headings("gnss", [0.0, 1.0], [0.0, 0.1], 0.01).kind
+        'heading'
+        """
+        angle = array(f"{sensor}: heading", heading, ("m",), allow_nan=True)
+        missing = np.isnan(angle)
+        axis = np.where(missing[:, None], np.nan, _direction(f"{sensor}: axis_b", axis_b))
+        known = np.where(missing, 0.0, angle)
+        level = np.stack([np.cos(known), np.sin(known), np.zeros(len(known))], axis=1)
+        return cls(sensor=sensor, kind="heading", time=time, vector_b=axis, reference_f=level, sigma=sigma)  # type: ignore[arg-type]
+
     def _noise(self, m: int, missing: np.ndarray) -> dict[str, Array]:
         """Return sigma (m,), and sigma_axes (m, 3) and covariance (m, 3, 3) if they are given."""
         found: dict[str, Array] = {}
