@@ -85,7 +85,9 @@ def begun(record, option):
 
 
 @pytest.mark.parametrize("states", STATES)
-@pytest.mark.parametrize("option", OPTIONS)
+@pytest.mark.parametrize(
+    "option", ["plain", *(pytest.param(one, marks=pytest.mark.slow) for one in OPTIONS if one != "plain")]
+)
 def test_measurements_at_common_stamps_are_processed_as_the_record_s(states, option):
     record, given, blocks = record_of(1.2 if states != "none" else 2.0), OPTIONS[option], STATES[states]
     initial = begun(record, option)
@@ -284,7 +286,9 @@ UNBIASED = (error_states.VectorBias(sensor="up", bias_sigma=1e-3),)
 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("options", VERTICAL_OPTIONS, ids=["plain", "gate", "robust"])
-@pytest.mark.parametrize("blocks", [(), UNBIASED], ids=["no states", "states"])
+@pytest.mark.parametrize(
+    "blocks", [(), (error_states.VectorBias(sensor="north", bias_sigma=1e-3),)], ids=["no states", "states"]
+)
 def test_both_faces_skip_a_vertical_heading_and_a_missing_sample_alike(blocks, options):
     """One heading in two is measured of a vertical vector; the run is that of the record without them, and says how many."""
     time = 0.1 * np.arange(1.0, 9.0)
