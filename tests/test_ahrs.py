@@ -81,7 +81,11 @@ def rows_of(recording: Recording, rows: slice | np.ndarray) -> Recording:
     return dataclasses.replace(recording, **{name: getattr(recording, name)[rows] for name in names})
 
 
-@pytest.fixture(params=ahrs.MOTIONS)
+MOTIONS = [pytest.param(one, marks=pytest.mark.slow if one == "vessel" else []) for one in ahrs.MOTIONS]
+"""The filter of a vessel takes 12 s to compile: that it serves on waves is in the default run."""
+
+
+@pytest.fixture(params=MOTIONS)
 def parameters(request) -> AhrsParameters:
     """The filter's model of each motion."""
     return ahrs.of_motion(request.param, magnetometer=True)
@@ -114,7 +118,7 @@ def test_sensor_noise_is_filtered(motion, bound):
     )
 
 
-@pytest.mark.parametrize("motion", ahrs.MOTIONS)
+@pytest.mark.parametrize("motion", MOTIONS)
 def test_without_a_magnetometer_the_inclination_is_as_good(motion):
     parameters = ahrs.of_motion(motion, magnetometer=False)
     result = ahrs.estimate(dataclasses.replace(recording(), magnetic_field=None), parameters, latency=0.0)
@@ -206,7 +210,7 @@ def test_a_disturbance_of_the_field_is_seen_in_its_strength_and_dip(smooth, monk
     assert worst(ahrs.estimate(disturbed(15.0), plain, latency=0.0, smooth=smooth))["heading"] > 6.0
 
 
-@pytest.mark.parametrize("smooth", [False, True])
+@pytest.mark.parametrize("smooth", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_hard_iron_is_estimated_as_the_unit_turns(smooth, monkeypatch):
     """5 % of the field, more than the stationary σ of 4 %."""
     iron = np.array([1.5, -1.0, 1.8])

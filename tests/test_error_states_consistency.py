@@ -147,7 +147,7 @@ def judged(case: str, blocks, number: int, duration: float, *, smoothed=False, k
     return consistency.Verdict(mean=mean, degrees=len(kept), runs=number, probability=0.99)
 
 
-def quick_or_slow(cases, quick=("gyro scale", "hard iron", "gyro drift")) -> list:
+def quick_or_slow(cases, quick=("gyro scale", "hard iron", "acceleration", "gyro drift")) -> list:
     """Mark the cases slow whose states no other test compiles, which takes 3 to 7 s each."""
     return [pytest.param(case, marks=[] if case in quick else pytest.mark.slow) for case in cases]
 
@@ -197,7 +197,9 @@ BROKEN = {
 }
 
 
-@pytest.mark.parametrize("how", quick_or_slow(BROKEN, ("a prior too narrow", "a drift too small")))
+@pytest.mark.parametrize(
+    "how", quick_or_slow(BROKEN, ("a prior too narrow", "a correlation too short", "a drift too small"))
+)
 def test_it_is_not_with_the_block_broken(how):
     case, block = BROKEN[how]
     assert not judged(case, (block,), 40, 12.0).consistent
