@@ -397,6 +397,7 @@ def test_an_update_keeps_its_digits_however_sharp_the_measurement(sharpness, bou
     assert np.max(np.abs(correlation(P[:, :n] - expected, sigma))) < bound
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sharpness", [1e-9, 1e-6, 1.0, 1e3])
 def test_the_covariance_stays_positive_definite(sharpness):
     """Ten thousand predictions and updates whose σ is so many times the prior's; one of 1e-9 is refused."""
@@ -798,7 +799,7 @@ def test_a_start_that_is_moved_takes_its_covariance_along(option):
     np.testing.assert_allclose(after.covariance, J @ before.covariance @ J.T, rtol=1e-12, atol=1e-20)
 
 
-@pytest.mark.parametrize("option", ["none", "gyro scale"])
+@pytest.mark.parametrize("option", ["none", pytest.param("gyro scale", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("angle", [0.9, 1.1, 3.0])
 def test_a_correction_of_any_size_carries_attitude_and_covariance(angle, option):
     """A measured attitude: the Kalman gain in closed form, and the right Jacobian of the correction."""

@@ -626,6 +626,7 @@ def test_the_step_face_says_what_it_took():
 # ------------------------------------------------------------------------------------------------------------------------- setups
 
 
+@pytest.mark.slow
 def test_a_setup_with_states_and_a_gate_recovers_and_reports_the_whole_bias(tmp_path):
     """Drifts beside the bias, and hard iron; the setup from its file. Events are in order of time, those of gaps among them."""
     one = without_gyro(made("hard iron", 4, duration=20.0), 8.0, 8.5)

@@ -342,8 +342,8 @@ def record_of(
     return ImuRecord(time=edges, increments=increments, vectors=series), truth
 
 
-QUICK = ("velocity", "equal times", "times far apart", "position")
-"""Options of two structures, which other tests use too. Each of the rest is compiled for itself, the largest in 15 s."""
+QUICK = ("velocity", "equal times", "times far apart")
+"""Options of one structure, that of most tests here. Each of the rest is compiled for itself, the largest in 15 s."""
 
 
 @pytest.mark.parametrize(
@@ -534,7 +534,10 @@ def _as_estimated(states: np.ndarray, true_attitude: np.ndarray, attitude: np.nd
     return np.swapaxes(quaternion.rotate(turn[:, None], vectors), 1, 2).reshape(len(states), -1)
 
 
-@pytest.mark.parametrize(("poles", "smoothed"), [("velocity", False), ("velocity", True), ("position", False)])
+@pytest.mark.parametrize(
+    ("poles", "smoothed"),
+    [("velocity", False), ("velocity", True), pytest.param("position", False, marks=pytest.mark.slow)],
+)
 def test_the_filter_is_consistent_on_what_it_models(poles, smoothed):
     """Five epochs and four parts: bounds of 99.9 % each, so that all twenty hold in 98 of 100 tries."""
     found = judged(poles, "bounded velocity", 24, 6.0, smoothed)
@@ -671,6 +674,7 @@ def test_a_setup_runs_it():
     )
 
 
+@pytest.mark.slow
 def test_the_command_line_takes_it_from_a_filter_file(succeeds):
     """As a user would: a simulated record, a filter file whose accelerometer has the states."""
     scenario = dataclasses.replace(scenarios.load_scenario("hand-held"), duration=8.0)

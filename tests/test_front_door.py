@@ -252,6 +252,7 @@ def test_tune_is_that_of_the_command(succeeds, tmp_path):
     assert sd.estimation.setup.read_setup(tmp_path / "filter.toml") == call.setup
 
 
+@pytest.mark.slow
 def test_states_are_those_of_the_scenarios_sensors_too():
     faults = sd.vectors.Faults(correlated_sigma=1e-4, correlation_time=20.0)
     first, second = scenario(20.0).sensors

@@ -666,7 +666,7 @@ def test_what_makes_no_sense_is_refused():
         ("direction", "covariance"),
         ("vector", "sigma_axes"),
         ("vector", "covariance"),
-        ("attitude", "covariance"),
+        pytest.param("attitude", "covariance", marks=pytest.mark.slow),
     ],
 )
 def test_noise_by_axis_is_its_largest_until_they_are_one_and_then_what_it_is(kind, noise):

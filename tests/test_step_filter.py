@@ -84,9 +84,13 @@ def begun(record, option):
     return initial_state(attitude, attitude_sigma=1e-2 if option == "lost" else 0.1, bias_sigma=3e-3)
 
 
-@pytest.mark.parametrize("states", STATES)
 @pytest.mark.parametrize(
-    "option", ["plain", *(pytest.param(one, marks=pytest.mark.slow) for one in OPTIONS if one != "plain")]
+    ("option", "states"),
+    [
+        pytest.param(option, states, marks=[] if (option, states) == ("plain", "none") else pytest.mark.slow)
+        for option in OPTIONS
+        for states in STATES
+    ],
 )
 def test_measurements_at_common_stamps_are_processed_as_the_record_s(states, option):
     record, given, blocks = record_of(1.2 if states != "none" else 2.0), OPTIONS[option], STATES[states]

@@ -143,7 +143,7 @@ def test_without_outliers_it_is_the_likelihood_of_all_kinds_of_measurement(state
     ("kind", "states"),
     [
         # With states each kind takes 4 s to compile.
-        pytest.param(kind, states, id=f"{kind}-{name}", marks=pytest.mark.slow if states and kind != 1 else [])
+        pytest.param(kind, states, id=f"{kind}-{name}", marks=pytest.mark.slow if states else [])
         for kind in range(4)
         for name, states in (("plain", None), ("states", STATES))
     ],
