@@ -206,10 +206,9 @@ def test_few_campaigns_of_a_right_filter_are_called_wrong():
     assert found.count("consistent") >= 18  # and 160 runs suffice
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("plan", "seconds"),
-    [(satellite, 100.0), pytest.param(coloured, 50.0, marks=pytest.mark.slow)],
-    ids=["flicker and scale", "coloured tracker"],
+    ("plan", "seconds"), [(satellite, 100.0), (coloured, 50.0)], ids=["flicker and scale", "coloured tracker"]
 )
 def test_few_runs_of_a_filter_with_states_are_called_wrong(plan, seconds):
     """More than two of thirty have a probability of 0.003 at the nominal 1 %, and of 0.96 at 20 %."""

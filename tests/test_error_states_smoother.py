@@ -479,7 +479,9 @@ def jumped(lost: float, blocks) -> tuple[ImuRecord, estimation.State]:
     return ImuRecord(time=time, increments=turns, vectors=tuple(series)), initial
 
 
-@pytest.mark.parametrize("blocks", [(), (WALKING, COLOURED)], ids=["none", "states"])
+@pytest.mark.parametrize(
+    "blocks", [pytest.param((), marks=pytest.mark.slow), (WALKING, COLOURED)], ids=["none", "states"]
+)
 @pytest.mark.parametrize(("lost", "since"), [(0.0, 3), (0.5, 15)])
 def test_a_trajectory_begins_with_its_candidate(lost, since, blocks):
     """From its start on it is the least-squares trajectory of what was measured from there on, and of what the candidate started from:

@@ -536,7 +536,9 @@ def test_it_goes_on_as_the_filter_once_it_is_one(probability, options):
 
 
 @pytest.mark.parametrize("robust", [Robust(), Robust(kind="huber")], ids=["Student", "Huber"])
-@pytest.mark.parametrize("kind", ["direction", "vector", pytest.param("heading", marks=pytest.mark.slow), "attitude"])
+@pytest.mark.parametrize(
+    "kind", ["direction", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("vector", "heading")), "attitude"]
+)
 def test_for_small_errors_its_weights_are_the_plain_filters(kind, robust, monkeypatch):
     """A bank of one hypothesis, its attitude measured first, and then measurements of one kind; it is reported at the end of the record."""
     random = np.random.default_rng(12)

@@ -291,7 +291,9 @@ UNBIASED = (error_states.VectorBias(sensor="up", bias_sigma=1e-3),)
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("options", VERTICAL_OPTIONS, ids=["plain", "gate", "robust"])
 @pytest.mark.parametrize(
-    "blocks", [(), (error_states.VectorBias(sensor="north", bias_sigma=1e-3),)], ids=["no states", "states"]
+    "blocks",
+    [(), pytest.param((error_states.VectorBias(sensor="north", bias_sigma=1e-3),), marks=pytest.mark.slow)],
+    ids=["no states", "states"],
 )
 def test_both_faces_skip_a_vertical_heading_and_a_missing_sample_alike(blocks, options):
     """One heading in two is measured of a vertical vector; the run is that of the record without them, and says how many."""

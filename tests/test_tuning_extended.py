@@ -249,6 +249,7 @@ def test_a_state_that_nothing_shows_is_not_identified():
     assert found["acc.correlated_sigma"].identified
 
 
+@pytest.mark.slow
 def test_hard_iron_is_tuned_from_several_records():
     """σ of a bias drawn anew for every record, from eight of them: 24 draws, known to 1/√48."""
     sigma = 3e-6
@@ -315,6 +316,7 @@ def test_the_smallest_error_of_a_filter_with_states_then_the_scale_of_its_innova
     assert list(tuning.values_of(found.setup, names, []).values()) == pytest.approx([found[n].value for n in names])
 
 
+@pytest.mark.slow
 def test_a_plan_knows_that_one_record_has_three_draws_of_a_hard_iron():
     """Standard error of ln σ from three numbers of a normal distribution of mean zero: 1/√6, however long the record is."""
     scenario = swaying(20.0, hard_iron=np.full(3, 3e-6))

@@ -125,7 +125,9 @@ CHAINS = States(sensors={"up": SensorStates(velocity_sigma=0.1, velocity_time=3.
 
 
 @pytest.mark.parametrize(
-    "states", [None, STATES, pytest.param(CHAINS, marks=pytest.mark.slow)], ids=["plain", "states", "chains"]
+    "states",
+    [None, *(pytest.param(states, marks=pytest.mark.slow) for states in (STATES, CHAINS))],
+    ids=["plain", "states", "chains"],
 )
 def test_without_outliers_it_is_the_likelihood_of_all_kinds_of_measurement(states):
     one, chosen = every_kind(), dataclasses.replace(KINDS, states=states)
