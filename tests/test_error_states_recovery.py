@@ -44,7 +44,7 @@ CASES: dict[str, tuple[tuple[str, ...], tuple[error_states.ErrorStates, ...]]] =
     "mounting": (("tracker", "star"), (error_states.VectorBias(sensor="tracker", bias_sigma=0.02),)),
 }
 """Which sensors measure, and the states."""
-QUICK = ("hard iron", "biased heading")
+QUICK = ("hard iron", "biased heading", "chains")
 """Cases of the default run; with a gate each takes 6 to 10 s to compile."""
 
 
@@ -173,7 +173,7 @@ def assert_consistent(case: str, mean, runs: int) -> None:
 
 
 def quick_or_slow(cases) -> list:
-    return [pytest.param(case, marks=[] if case in (*QUICK, "chains") else pytest.mark.slow) for case in cases]
+    return [pytest.param(case, marks=[] if case in QUICK else pytest.mark.slow) for case in cases]
 
 
 RUNS = [40, pytest.param(400, marks=pytest.mark.slow)]
