@@ -30,7 +30,7 @@ BROAD = Path(__file__).resolve().parents[1] / ".." / "shared" / "data" / "broad"
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--slow", action="store_true", help="run the statistical studies too, which take minutes")
+    parser.addoption("--slow", action="store_true", help="run statistical studies and further variants too")
     parser.addoption("--attack-files", type=int, help="number of damaged files that tests/attack makes")
     parser.addoption("--attack-seed", type=int, default=1, help="seed of the damage")
     parser.addoption("--soak", type=int, help="steps of the filter that tests/attack/test_soak.py takes")

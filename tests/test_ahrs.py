@@ -81,7 +81,11 @@ def rows_of(recording: Recording, rows: slice | np.ndarray) -> Recording:
     return dataclasses.replace(recording, **{name: getattr(recording, name)[rows] for name in names})
 
 
-@pytest.fixture(params=ahrs.MOTIONS)
+MOTIONS = [pytest.param(one, marks=pytest.mark.slow if one == "vessel" else []) for one in ahrs.MOTIONS]
+"""The filter of a vessel takes 12 s to compile."""
+
+
+@pytest.fixture(params=MOTIONS)
 def parameters(request) -> AhrsParameters:
     """The filter's model of each motion."""
     return ahrs.of_motion(request.param, magnetometer=True)
@@ -114,7 +118,7 @@ def test_sensor_noise_is_filtered(motion, bound):
     )
 
 
-@pytest.mark.parametrize("motion", ahrs.MOTIONS)
+@pytest.mark.parametrize("motion", MOTIONS)
 def test_without_a_magnetometer_the_inclination_is_as_good(motion):
     parameters = ahrs.of_motion(motion, magnetometer=False)
     result = ahrs.estimate(dataclasses.replace(recording(), magnetic_field=None), parameters, latency=0.0)
@@ -206,14 +210,26 @@ def test_a_disturbance_of_the_field_is_seen_in_its_strength_and_dip(smooth, monk
     assert worst(ahrs.estimate(disturbed(15.0), plain, latency=0.0, smooth=smooth))["heading"] > 6.0
 
 
-@pytest.mark.parametrize("smooth", [False, True])
-def test_hard_iron_is_estimated_as_the_unit_turns(smooth, monkeypatch):
-    """5 % of the field, more than the stationary σ of 4 %."""
-    iron = np.array([1.5, -1.0, 1.8])
+IRON = np.array([1.5, -1.0, 1.8])
+"""5 % of the field, more than the stationary σ of 4 %."""
+
+
+def with_iron() -> Recording:
     plain = recording(75.0, noise=0.3)
-    shifted = dataclasses.replace(plain, magnetic_field=plain.magnetic_field + iron)
+    return dataclasses.replace(plain, magnetic_field=plain.magnetic_field + IRON)
+
+
+@pytest.mark.parametrize("smooth", [False, True])
+def test_hard_iron_is_estimated_as_the_unit_turns(smooth):
+    found = ahrs.estimate(with_iron(), latency=0.0, smooth=smooth)
+    np.testing.assert_allclose(found.hard_iron, IRON, atol=0.7)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("smooth", [False, True])
+def test_the_heading_is_better_for_it(smooth, monkeypatch):
+    shifted = with_iron()
     found = ahrs.estimate(shifted, latency=0.0, smooth=smooth)
-    np.testing.assert_allclose(found.hard_iron, iron, atol=0.7)
     without = dataclasses.replace(ahrs.HAND_HELD, hard_iron_sigma=0.0)
     monkeypatch.setattr(hard_iron, "FEIGNED", 1e9)
     as_it_is = ahrs.estimate(shifted, without, latency=0.0, smooth=smooth)
@@ -528,6 +544,7 @@ def on_waves(duration: float = 60.0) -> Recording:
     )
 
 
+@pytest.mark.slow
 def test_the_acceleration_of_a_vessel_on_waves_does_not_pass_for_tilt():
     waves = on_waves()
     own, hand = (

@@ -76,7 +76,7 @@ def three_hours(shape: str, K: float, runs: int):
     return T, x, dt, np.sqrt(np.linalg.inv(information)[1, 1])
 
 
-@pytest.mark.parametrize(("shape", "K"), [("exponential", 3e-6), ("line", 3e-7)])
+@pytest.mark.parametrize(("shape", "K"), [pytest.param("exponential", 3e-6, marks=pytest.mark.slow), ("line", 3e-7)])
 def test_sigma_of_the_slope_is_not_smaller_because_the_walk_is_not_seen(shape, K):
     """σ over that with known noise: with one estimate of the walk, zero in some records, its minimum was 0.2 and its median 0.67."""
     T, x, dt, known = three_hours(shape, K, 60)

@@ -73,6 +73,7 @@ def test_a_unit_without_magnetometer_is_calibrated_too(turned):
     assert found.sigma.accelerometer_bias.max() < 0.05
 
 
+@pytest.mark.slow
 def test_two_recordings_give_smaller_sigma_than_one(turned):
     unit, recording, first = turned
     both = sd.calibrate([recording, study.simulated(unit, 3, 1, 60.0)])
@@ -82,6 +83,7 @@ def test_two_recordings_give_smaller_sigma_than_one(turned):
         assert 0.2 < ratio < 0.8, name
 
 
+@pytest.mark.slow
 def test_a_gap_does_not_spoil_it(turned):
     unit, recording, _ = turned
     kept = (recording.time < 21.0) | (recording.time > 26.0)

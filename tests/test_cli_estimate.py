@@ -523,6 +523,7 @@ def test_a_recording_that_is_not_what_it_says_is_doubted(run, succeeds, recordin
     assert f"See `strapdown doctor {recording}`." in said
 
 
+@pytest.mark.slow
 def test_gate_robust_weights_and_observability_of_a_recording(succeeds, recording, tmp_path):
     options = ("--gate", 0.999, "--robust", "student", "--observability")
     succeeds("estimate", recording, "--out", tmp_path / "out", *options)

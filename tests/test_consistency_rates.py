@@ -156,6 +156,7 @@ def satellite(duration=300.0):
     return montecarlo.Plan(scenario=scenario, setup=chosen, epochs=50, individuals=True)
 
 
+@pytest.mark.slow
 def test_the_bias_is_consistent_from_the_first_second():
     """A filter that takes the initial bias for that of its states has a NEES of 1.24: the fast part of flicker is not in them."""
     runs = montecarlo.run_plan(satellite(5.0), runs=300, threads=1)
@@ -205,6 +206,7 @@ def test_few_campaigns_of_a_right_filter_are_called_wrong():
     assert found.count("consistent") >= 18  # and 160 runs suffice
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("plan", "seconds"), [(satellite, 100.0), (coloured, 50.0)], ids=["flicker and scale", "coloured tracker"]
 )

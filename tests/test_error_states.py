@@ -102,7 +102,7 @@ SPUN = motion.ConstantRate(rate=(40.0, -30.0, 35.0))
 """1.2 rad a sample: sub-steps."""
 
 
-QUICK = ("none", "gyro scale", "gyro drift", "hard iron", "two frames", "mounting of whole attitudes", "all")
+QUICK = ("none", "hard iron", "two frames", "all")
 """Options whose filters are compiled in the default run; each takes seconds."""
 
 
@@ -397,6 +397,7 @@ def test_an_update_keeps_its_digits_however_sharp_the_measurement(sharpness, bou
     assert np.max(np.abs(correlation(P[:, :n] - expected, sigma))) < bound
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sharpness", [1e-9, 1e-6, 1.0, 1e3])
 def test_the_covariance_stays_positive_definite(sharpness):
     """Ten thousand predictions and updates whose σ is so many times the prior's; one of 1e-9 is refused."""
@@ -421,7 +422,7 @@ def test_the_covariance_stays_positive_definite(sharpness):
 
 @pytest.mark.parametrize("option", ["all", "a foreign block"])
 def test_a_split_run_is_the_whole_run_to_the_bit(option):
-    record, blocks = record_of(), OPTIONS[option]
+    record, blocks = record_of(anisotropic=option == "all"), OPTIONS[option]
     whole, end = estimation.run_part(record, NOISE, start(), blocks, full_covariance=True)
     first, middle = estimation.run_part(records.cut(record, 0, 77), NOISE, start(), blocks, full_covariance=True)
     rest = records.cut(record, 77, len(record.increments))
@@ -432,7 +433,7 @@ def test_a_split_run_is_the_whole_run_to_the_bit(option):
     assert np.array_equal(last.covariance, end.covariance)
 
 
-@pytest.mark.parametrize("gate", [None, Gate()], ids=["plain", "gate"])
+@pytest.mark.parametrize("gate", [None, pytest.param(Gate(), marks=pytest.mark.slow)], ids=["plain", "gate"])
 def test_effects_in_the_sensors_own_unit_keep_it_from_part_to_part(gate):
     """A field four times as strong in the first half: the second part goes on in the first's unit, as the whole in that unit to the bit."""
     record = record_of()
@@ -502,7 +503,8 @@ def reference_smoother(record, initial, blocks):
                     face.update_attitude(s.attitude[row], s.sigma_axes[row], s.sensor)
                 else:
                     update = getattr(face, f"update_{s.kind}")
-                    update(s.vector_b[row], s.references_f[row], s.sigma[row], s.sensor)
+                    noise = {"covariance": s.covariances[row]} if s.anisotropic else {"sigma": s.sigma[row]}
+                    update(s.vector_b[row], s.references_f[row], sensor=s.sensor, **noise)
         filtered.append((face.attitude, face.bias, face.values.copy(), face.P.copy()))
         at_edge.append(now in record.time)
     rows = [filtered[-1]]
@@ -525,9 +527,17 @@ def reference_smoother(record, initial, blocks):
     return [np.array(column) for column in zip(*kept, strict=True)]
 
 
-@pytest.mark.parametrize("option", ["gyro drift", "two frames", "mounting of whole attitudes", "all"])
+@pytest.mark.parametrize(
+    "option",
+    [
+        pytest.param("gyro drift", marks=pytest.mark.slow),
+        "two frames",
+        pytest.param("mounting of whole attitudes", marks=pytest.mark.slow),
+        "all",
+    ],
+)
 def test_the_smoother_is_the_textbook_one(option):
-    record, blocks = record_of(duration=1.5, rate=25.0), OPTIONS[option]
+    record, blocks = record_of(duration=1.5, rate=25.0, anisotropic=option == "all"), OPTIONS[option]
     # A wrong start, so that corrections are tenths of a radian and a missing Jacobian shows.
     initial = start(error=(0.2, -0.1, 0.15))
     initial = dataclasses.replace(initial, covariance=np.diag([0.04] * 3 + [1e-5] * 3))
@@ -543,7 +553,7 @@ def test_the_smoother_is_the_textbook_one(option):
 
 def test_the_rows_that_are_kept_do_not_change_the_filter():
     """Every eighth edge alone is what it is among all, to the bit."""
-    record, blocks = record_of(SPUN, duration=1.0), OPTIONS["all"]
+    record, blocks = record_of(SPUN, duration=1.0, anisotropic=True), OPTIONS["all"]
     whole, rare = (
         estimation.run(record, NOISE, start(SPUN), blocks, full_covariance=True, every=every) for every in (1, 8)
     )
@@ -553,6 +563,7 @@ def test_the_rows_that_are_kept_do_not_change_the_filter():
         assert np.array_equal(rare.error_states[block.name].values, whole.error_states[block.name].values[::8])
 
 
+@pytest.mark.slow
 def test_a_gap_of_many_correlation_times_does_no_harm():
     """What a coloured noise was before the gap says nothing of what it is after it; the steps within are bounded."""
     record = record_of()
@@ -751,8 +762,9 @@ def _laid_out_otherwise(record):
 
 def test_the_kernels_are_compiled_once_for_a_structure():
     """The kernels see arrays of one layout: neither that of the record nor the numbers of the declarations compiles them again."""
-    record, wide = record_of(duration=0.5), dataclasses.replace(OPTIONS["hard iron"][0], bias_sigma=9e-6)
+    wide = dataclasses.replace(OPTIONS["hard iron"][0], bias_sigma=9e-6)
     for blocks, others in (((), ()), (OPTIONS["hard iron"], (wide,)), (OPTIONS["all"], OPTIONS["all"])):
+        record = record_of(duration=0.5, anisotropic=blocks is OPTIONS["all"])
         model = forward.prepared(record, NOISE, start(), blocks).model
         assert model.structure == forward.prepared(record, NOISE, start(), others).model.structure
         estimation.smooth(record, NOISE, start(), blocks)
@@ -787,7 +799,7 @@ def test_a_start_that_is_moved_takes_its_covariance_along(option):
     np.testing.assert_allclose(after.covariance, J @ before.covariance @ J.T, rtol=1e-12, atol=1e-20)
 
 
-@pytest.mark.parametrize("option", ["none", "gyro scale"])
+@pytest.mark.parametrize("option", ["none", pytest.param("gyro scale", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("angle", [0.9, 1.1, 3.0])
 def test_a_correction_of_any_size_carries_attitude_and_covariance(angle, option):
     """A measured attitude: the Kalman gain in closed form, and the right Jacobian of the correction."""

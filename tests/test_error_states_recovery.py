@@ -44,6 +44,8 @@ CASES: dict[str, tuple[tuple[str, ...], tuple[error_states.ErrorStates, ...]]] =
     "mounting": (("tracker", "star"), (error_states.VectorBias(sensor="tracker", bias_sigma=0.02),)),
 }
 """Which sensors measure, and the states."""
+QUICK = ("hard iron", "biased heading", "chains")
+"""Cases of the default run; with a gate each takes 6 to 10 s to compile."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -170,6 +172,10 @@ def assert_consistent(case: str, mean, runs: int) -> None:
         assert_inside(mean[:, part], degrees, runs, 0.9999)
 
 
+def quick_or_slow(cases) -> list:
+    return [pytest.param(case, marks=[] if case in QUICK else pytest.mark.slow) for case in cases]
+
+
 RUNS = [40, pytest.param(400, marks=pytest.mark.slow)]
 
 
@@ -177,7 +183,7 @@ RUNS = [40, pytest.param(400, marks=pytest.mark.slow)]
 
 
 @pytest.mark.parametrize("runs", RUNS)
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", quick_or_slow(CASES))
 def test_a_lost_start_is_recovered_from_and_all_states_are_consistent(case, runs):
     def make(run):
         one = made(case, run)
@@ -195,7 +201,7 @@ def test_a_lost_start_is_recovered_from_and_all_states_are_consistent(case, runs
 
 
 @pytest.mark.parametrize("runs", RUNS)
-@pytest.mark.parametrize("case", ["all", "mounting"])
+@pytest.mark.parametrize("case", quick_or_slow(["all", "mounting"]))
 def test_a_turn_in_a_gap_of_the_gyro_is_recovered_from(case, runs):
     """20 s of calibration, then 2 s without a gyro: the attitude is off by up to half a turn, and all else is as it was."""
     recovered, mean = judged(
@@ -560,10 +566,10 @@ WALKING = error_states.VectorBias(sensor="mag", bias_sigma=1e-6, rate_random_wal
 HELD = error_states.BoundedVelocity(
     sensor="acc", velocity_time=2.0, velocity_sigma=0.1, acceleration_sigma=0.3, position_time=9.0, strength=1.0
 )
-FACES = {**CASES, "hard iron that walks": (("mag", "acc"), (WALKING,)), "chains": (("mag", "acc"), (IRON, HELD))}
+FACES = {**CASES, "hard iron that walks": (("mag", "acc"), (WALKING,)), "chains": (("mag", "acc"), (WALKING, HELD))}
 
 
-@pytest.mark.parametrize("case", FACES)
+@pytest.mark.parametrize("case", quick_or_slow(FACES))
 def test_both_faces_recover_alike(case):
     one = made(case if case in CASES else "hard iron", 3, duration=1.6)
     assert_recover_alike(one.record, lost(one.initial, 3), FACES[case][1], Robust())
@@ -620,6 +626,7 @@ def test_the_step_face_says_what_it_took():
 # ------------------------------------------------------------------------------------------------------------------------- setups
 
 
+@pytest.mark.slow
 def test_a_setup_with_states_and_a_gate_recovers_and_reports_the_whole_bias(tmp_path):
     """Drifts beside the bias, and hard iron; the setup from its file. Events are in order of time, those of gaps among them."""
     one = without_gyro(made("hard iron", 4, duration=20.0), 8.0, 8.5)
@@ -641,6 +648,7 @@ def test_a_setup_with_states_and_a_gate_recovers_and_reports_the_whole_bias(tmp_
     assert np.all(np.abs(iron.values[-1] - one.truth[IRON.name]) < 4.5 * iron.sigma[-1])
 
 
+@pytest.mark.slow
 def test_a_lever_arm_recovers():
     one = made("hard iron", 5, duration=6.0)
     states = States(sensors={"mag": SensorStates(bias_sigma=1e-6), "acc": SensorStates(lever_arm_sigma=0.05)})

@@ -100,7 +100,13 @@ def test_the_states_are_those_that_the_errors_call_for(name):
     assert missing == (("the gyro's quantisation",) if name == "hand-held" else ())
 
 
-@pytest.mark.parametrize("name", CALLED_FOR)
+COMPILED = ("coning", "rest", "slew-vibration", "tumbling-satellite")
+"""Scenarios whose filters no other test compiles, which takes 2 to 5 s each."""
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow if name in COMPILED else []) for name in CALLED_FOR]
+)
 def test_nis_and_anees_are_inside_their_bounds(name):
     scenario = scenarios.load_scenario(name)
     scenario = dataclasses.replace(scenario, duration=LENGTH.get(name, scenario.duration))

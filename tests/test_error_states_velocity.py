@@ -342,9 +342,20 @@ def record_of(
     return ImuRecord(time=edges, increments=increments, vectors=series), truth
 
 
+QUICK = ("velocity", "equal times", "times far apart")
+"""Options of one structure, that of most tests here. Each of the rest is compiled for itself, the largest in 15 s."""
+
+
 @pytest.mark.parametrize(
     ("option", "kind"),
-    [*((option, "vector") for option in BLOCKS), ("position", "direction"), ("among others", "direction")],
+    [
+        pytest.param(option, kind, marks=[] if option in QUICK else pytest.mark.slow)
+        for option, kind in (
+            *((option, "vector") for option in BLOCKS),
+            ("position", "direction"),
+            ("among others", "direction"),
+        )
+    ],
 )
 def test_both_faces_agree(option, kind):
     """At times of their own too, so that every step has another length."""
@@ -410,7 +421,7 @@ def least_squares(record: ImuRecord, block: error_states.BoundedVelocity) -> tup
     return (covariance @ right).reshape(edges, n), np.diag(covariance).reshape(edges, n)
 
 
-@pytest.mark.parametrize("poles", ["velocity", "position"])
+@pytest.mark.parametrize("poles", ["velocity", pytest.param("position", marks=pytest.mark.slow)])
 def test_the_smoother_is_one_least_squares_problem(poles):
     """Of a body at rest but for what the block says, where all is linear: tiny motions, so that nothing of second order is left."""
     small = 1e-5
@@ -523,7 +534,10 @@ def _as_estimated(states: np.ndarray, true_attitude: np.ndarray, attitude: np.nd
     return np.swapaxes(quaternion.rotate(turn[:, None], vectors), 1, 2).reshape(len(states), -1)
 
 
-@pytest.mark.parametrize(("poles", "smoothed"), [("velocity", False), ("velocity", True), ("position", False)])
+@pytest.mark.parametrize(
+    ("poles", "smoothed"),
+    [("velocity", False), ("velocity", True), pytest.param("position", False, marks=pytest.mark.slow)],
+)
 def test_the_filter_is_consistent_on_what_it_models(poles, smoothed):
     """Five epochs and four parts: bounds of 99.9 % each, so that all twenty hold in 98 of 100 tries."""
     found = judged(poles, "bounded velocity", 24, 6.0, smoothed)
@@ -534,6 +548,7 @@ def test_the_filter_is_consistent_on_what_it_models(poles, smoothed):
         assert np.all((low < anees) & (anees < high)), (part, anees, low, high)
 
 
+@pytest.mark.slow
 def test_other_models_of_the_acceleration_are_worse():
     """As many runs: what lasts of first-order noise passes for tilt, white noise as large gives up what the velocity bounds, and without
     any the filter follows each push.
@@ -659,6 +674,7 @@ def test_a_setup_runs_it():
     )
 
 
+@pytest.mark.slow
 def test_the_command_line_takes_it_from_a_filter_file(succeeds):
     """As a user would: a simulated record, a filter file whose accelerometer has the states."""
     scenario = dataclasses.replace(scenarios.load_scenario("hand-held"), duration=8.0)
@@ -728,6 +744,7 @@ def test_a_simulated_hand_is_better_known_by_its_bounded_velocity():
     assert found["bounded"] < 0.95 * found["coloured"], found
 
 
+@pytest.mark.slow
 def test_a_gyro_of_wrong_scale_is_better_known_by_states_for_it():
     """The simulated gyro's are 0.3 %; turned in haste here, so that they count; the means of three."""
     total: dict[float, list[float]] = {0.0: [], 2e-3: []}

@@ -165,11 +165,7 @@ def sources(name):
 
 @pytest.mark.parametrize(
     "name",
-    [
-        name if name in ("gate", "drift") else pytest.param(name, marks=pytest.mark.slow)
-        for name in CASES
-        if name != "precise"
-    ],
+    [name if name == "gate" else pytest.param(name, marks=pytest.mark.slow) for name in CASES if name != "precise"],
 )
 def test_program_equals_the_compiled_filter(name):
     record, setup, start = case(name)

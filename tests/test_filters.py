@@ -837,7 +837,12 @@ EVERY_CASE += [(name, *case) for name in (*comparison.EXTENDED, "usque") for cas
 
 
 @pytest.mark.parametrize(
-    ("name", "kind", "form"), [one for one in EVERY_CASE if one[1:] in SHARPEST or one[0] in comparison.EXTENDED[2:]]
+    ("name", "kind", "form"),
+    [
+        pytest.param(*one, marks=[] if one[1:] in SHARPEST else pytest.mark.slow)
+        for one in EVERY_CASE
+        if one[1:] in SHARPEST or one[0] in comparison.EXTENDED[2:]
+    ],
 )
 def test_consistent_for_every_kind(name, kind, form):
     """ANEES inside its two-sided bounds (99.9 % each); above them when the noise is modelled at a third of what it is."""

@@ -172,11 +172,13 @@ def test_monte_carlo_verdict():
     ("options", "keywords"),
     [
         ((), {}),
-        (("--gate", "0.99", "--robust", "huber"), {"gate": 0.99, "robust": "huber"}),
+        pytest.param(
+            ("--gate", "0.99", "--robust", "huber"), {"gate": 0.99, "robust": "huber"}, marks=pytest.mark.slow
+        ),
         (("--states",), {"states": True}),
         (("--no-states",), {"states": False}),
         (("--state", "gyro.scale"), {"states": ["gyro.scale"]}),
-        (("--smooth", "--variances"), {"smooth": True, "full_covariance": False}),
+        pytest.param(("--smooth", "--variances"), {"smooth": True, "full_covariance": False}, marks=pytest.mark.slow),
     ],
 )
 def test_estimate_of_a_record_is_that_of_the_command(succeeds, tmp_path, options, keywords):
@@ -250,6 +252,7 @@ def test_tune_is_that_of_the_command(succeeds, tmp_path):
     assert sd.estimation.setup.read_setup(tmp_path / "filter.toml") == call.setup
 
 
+@pytest.mark.slow
 def test_states_are_those_of_the_scenarios_sensors_too():
     faults = sd.vectors.Faults(correlated_sigma=1e-4, correlation_time=20.0)
     first, second = scenario(20.0).sensors

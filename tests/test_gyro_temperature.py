@@ -285,9 +285,12 @@ def test_lost_samples_and_locked_out_sensors():
     scattered = replace(record.vectors[0], attitude=random / np.linalg.norm(random, axis=1)[:, None])
     start = estimation.initial_state([1.0, 0, 0, 0], attitude_sigma=0.001, bias_sigma=1e-4)
     noise = estimation.ProcessNoise(angle_random_walk=1e-5, rate_random_walk=1e-7)
-    block = error_states.GyroTemperature(slope_sigma=1e-5)
+    blocks = (
+        error_states.GyroScale(scale_sigma=1e-4, misalignment_sigma=np.zeros((3, 3))),
+        error_states.GyroTemperature(slope_sigma=1e-5),
+    )
     locked = replace(record, vectors=(scattered,))
-    found = estimation.run(locked, noise, start, (block,), gate=Gate(probability=0.999, recovery=None))
+    found = estimation.run(locked, noise, start, blocks, gate=Gate(probability=0.999, recovery=None))
     assert [event.kind for event in found.events] == ["lock-out"]
     assert found.events[0].value == 400
 

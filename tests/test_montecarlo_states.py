@@ -124,13 +124,12 @@ def bits(estimate):
     return b"".join(np.ascontiguousarray(one).tobytes() for one in (*own, *innovations, *states))
 
 
-QUICK = ("gyro, star tracker", "heading")
-"""Models whose filters are compiled in the default run; each takes seconds."""
+def quick_or_slow(names) -> list:
+    """Mark all models slow but that of a heading: the filter of each, and its lanes, take 6 to 9 s to compile."""
+    return [pytest.param(name, marks=[] if name == "heading" else pytest.mark.slow) for name in names]
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[] if name in QUICK else pytest.mark.slow) for name in MODELS]
-)
+@pytest.mark.parametrize("name", quick_or_slow(MODELS))
 def test_each_run_is_what_the_filter_alone_makes_of_it(name, monkeypatch):
     """Errors, σ, correlations, NIS and error states, to 1e-8 of σ; none is left to the filter of one record."""
     filtered, found = in_lanes._filtered, []
@@ -161,7 +160,7 @@ def test_each_run_is_what_the_filter_alone_makes_of_it(name, monkeypatch):
                 assert np.allclose(mine.variance, state.variance, rtol=1e-8, atol=0.0)
 
 
-@pytest.mark.parametrize("name", ["gyro, star tracker", "heading"])
+@pytest.mark.parametrize("name", quick_or_slow(["gyro, star tracker", "heading"]))
 def test_a_run_has_the_same_bits_whatever_runs_beside_it(name):
     """Full groups, short ones, runs in another order, and beside one that is lost or has other times, noise or references."""
     records, initials = runs(name, 9)
@@ -198,17 +197,24 @@ def test_a_run_has_the_same_bits_whatever_runs_beside_it(name):
     "states",
     [
         None,
-        States(sensors={"accelerometer": SensorStates(velocity_time=1.0, velocity_sigma=0.1, acceleration_sigma=0.5)}),
-        States(sensors={"magnetometer": SensorStates(correlated_sigma=0.01, correlation_time=5.0, frame="fixed")}),
+        pytest.param(
+            States(
+                sensors={"accelerometer": SensorStates(velocity_time=1.0, velocity_sigma=0.1, acceleration_sigma=0.5)}
+            ),
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            States(sensors={"magnetometer": SensorStates(correlated_sigma=0.01, correlation_time=5.0, frame="fixed")}),
+            marks=pytest.mark.slow,
+        ),
     ],
     ids=["of the scenario", "chain", "fixed axes"],
 )
 def test_lanes_keep_the_digits_of_measurements_far_more_precise_than_the_state(states):
     """Joseph's form in some lanes only: the same as alone, and no bit of a neighbour changes."""
-    name = "heading" if states else "gyro, star tracker"
-    chosen = plan(name).setup
+    chosen = plan("heading").setup
     chosen = replace(chosen, states=states) if states else chosen
-    records, initials = runs(name, 3)
+    records, initials = runs("heading", 3)
     vague = replace(initials[0], covariance=np.diag([0.3, 0.3, 0.3, *np.diag(initials[0].covariance)[3:]]))
     alone = [bits(setup.run_together([r], chosen, [i], 50)[0]) for r, i in zip(records, initials, strict=True)]
     mixed = setup.run_together(records, chosen, [vague, *initials[1:]], 50)
@@ -237,7 +243,7 @@ def test_statistics_do_not_depend_on_chunks_and_threads_and_a_replay_is_the_run(
     "fault", [{"sampling_jitter": 1e-4}, {"drop_probability": 0.02}], ids=lambda fault: next(iter(fault))
 )
 def test_runs_whose_times_differ_are_filtered_one_by_one(fault):
-    one = plan("gyro, star tracker")
+    one = plan("heading")
     one = replace(one, scenario=replace(one.scenario, gyro=replace(GYRO, **fault)))
     found = scalar.run_chunk(one, 0, 2)
     for run in range(2):
@@ -249,6 +255,7 @@ def test_runs_whose_times_differ_are_filtered_one_by_one(fault):
         assert np.array_equal(montecarlo.replay(one, run).estimate.attitude, each.attitude)
 
 
+@pytest.mark.slow
 def test_the_filter_with_states_is_as_good_as_it_says():
     """Over individuals, whose errors are drawn as the states assume: ANEES inside its bounds, and outside with the states left out."""
     scenario = replace(plan("heading").scenario, duration=10.0)

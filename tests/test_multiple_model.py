@@ -451,7 +451,7 @@ def test_wild_first_directions_do_not_mislead_it(number, size, option):
     assert_inside(np.mean(nees, axis=0) / 6.0, 6, 12, 0.999)
 
 
-@pytest.mark.parametrize("headings", [0, 6])
+@pytest.mark.parametrize("headings", [0, pytest.param(6, marks=pytest.mark.slow)])
 def test_a_wild_first_attitude_is_no_attitude_yet(headings):
     """One hypothesis is not accepted before a second attitude has been measured, which shows that one of them lies off. Headings between
     the two, which fit a tilt as well, do not speak against the second: they are no directions to doubt.
@@ -536,7 +536,9 @@ def test_it_goes_on_as_the_filter_once_it_is_one(probability, options):
 
 
 @pytest.mark.parametrize("robust", [Robust(), Robust(kind="huber")], ids=["Student", "Huber"])
-@pytest.mark.parametrize("kind", ["direction", "vector", "heading", "attitude"])
+@pytest.mark.parametrize(
+    "kind", ["direction", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("vector", "heading")), "attitude"]
+)
 def test_for_small_errors_its_weights_are_the_plain_filters(kind, robust, monkeypatch):
     """A bank of one hypothesis, its attitude measured first, and then measurements of one kind; it is reported at the end of the record."""
     random = np.random.default_rng(12)
@@ -666,7 +668,7 @@ def test_what_makes_no_sense_is_refused():
         ("direction", "covariance"),
         ("vector", "sigma_axes"),
         ("vector", "covariance"),
-        ("attitude", "covariance"),
+        pytest.param("attitude", "covariance", marks=pytest.mark.slow),
     ],
 )
 def test_noise_by_axis_is_its_largest_until_they_are_one_and_then_what_it_is(kind, noise):

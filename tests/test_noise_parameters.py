@@ -227,6 +227,7 @@ def test_the_bias_over_temperature_is_subtracted_and_its_error_becomes_a_walk():
         from_table({k: v for k, v in given.items() if k != "bias_rad_per_s"}, "file: gyro")
 
 
+@pytest.mark.slow
 def test_a_simulated_unit_goes_through_allan_and_its_table_into_the_filter(succeeds, tmp_path):
     """Round trip: the scenario's polynomial lies inside the intervals, and the filter that reads the table finds the turn-on bias."""
     rest = """

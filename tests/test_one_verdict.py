@@ -37,7 +37,13 @@ def agree(result, file: Path) -> dict:
 SCENARIOS = [name for name in sd.scenarios.SCENARIOS if name != "rest"]  # which has no sensor besides the gyro
 
 
-@pytest.mark.parametrize("name", SCENARIOS)
+QUICK = ("two-stars", "spin", "ship", "hand-held", "earth-observer")
+"""The other scenarios take 3 to 10 s each: they are long, or their filter has a structure of its own to compile."""
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[] if name in QUICK else pytest.mark.slow) for name in SCENARIOS]
+)
 def test_a_scenario_by_every_way(name, tmp_path):
     source = sd.write(sd.simulate(name, seed=5), tmp_path / "record.h5")
     assert run("estimate", source, "--out", tmp_path / "out") == 0
@@ -49,7 +55,11 @@ def test_a_scenario_by_every_way(name, tmp_path):
 
 
 @pytest.mark.skipif(not TRIALS, reason="the BROAD trials are not here")
-@pytest.mark.parametrize("trial", TRIALS, ids=lambda path: path.stem[:2])
+@pytest.mark.parametrize(
+    "trial",
+    [pytest.param(path, marks=[] if path in (TRIALS[0], TRIALS[-1]) else pytest.mark.slow) for path in TRIALS],
+    ids=lambda path: path.stem[:2],
+)
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_a_recording_with_a_reference_by_every_way(trial, tmp_path):
     assert run("estimate", trial, "--out", tmp_path / "out") == 0
@@ -64,7 +74,7 @@ def test_a_recording_with_a_reference_by_every_way(trial, tmp_path):
 
 
 def test_a_smoothed_and_a_gated_estimate_by_every_way(tmp_path):
-    source = sd.write(sd.simulate("hand-held", seed=5), tmp_path / "record.h5")
+    source = sd.write(sd.simulate("spin", seed=5), tmp_path / "record.h5")
     for name, flags, options in (
         ("smooth", ("--smooth",), {"smooth": True}),
         ("gate", ("--gate", "0.99"), {"gate": 0.99}),

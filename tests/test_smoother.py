@@ -228,7 +228,9 @@ def assert_same(one: Estimate, other: Estimate, tolerance: float) -> None:
     assert np.max(np.abs(one.covariance - other.covariance) / scale) < tolerance
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow if name in ("rest", "directions") else []) for name in CASES]
+)
 def test_equals_the_fixed_side_reference(name: str) -> None:
     # A wide prior and a wrong start, so that corrections are tenths of a radian and a missing Jacobian shows in the first digits.
     case = dataclasses.replace(CASES[name], duration=4.0, attitude_sigma=0.2, bias_sigma=0.02)

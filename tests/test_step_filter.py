@@ -84,8 +84,14 @@ def begun(record, option):
     return initial_state(attitude, attitude_sigma=1e-2 if option == "lost" else 0.1, bias_sigma=3e-3)
 
 
-@pytest.mark.parametrize("states", STATES)
-@pytest.mark.parametrize("option", OPTIONS)
+@pytest.mark.parametrize(
+    ("option", "states"),
+    [
+        pytest.param(option, states, marks=[] if (option, states) == ("plain", "none") else pytest.mark.slow)
+        for option in OPTIONS
+        for states in STATES
+    ],
+)
 def test_measurements_at_common_stamps_are_processed_as_the_record_s(states, option):
     record, given, blocks = record_of(1.2 if states != "none" else 2.0), OPTIONS[option], STATES[states]
     initial = begun(record, option)
@@ -284,7 +290,11 @@ UNBIASED = (error_states.VectorBias(sensor="up", bias_sigma=1e-3),)
 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("options", VERTICAL_OPTIONS, ids=["plain", "gate", "robust"])
-@pytest.mark.parametrize("blocks", [(), UNBIASED], ids=["no states", "states"])
+@pytest.mark.parametrize(
+    "blocks",
+    [(), pytest.param((error_states.VectorBias(sensor="north", bias_sigma=1e-3),), marks=pytest.mark.slow)],
+    ids=["no states", "states"],
+)
 def test_both_faces_skip_a_vertical_heading_and_a_missing_sample_alike(blocks, options):
     """One heading in two is measured of a vertical vector; the run is that of the record without them, and says how many."""
     time = 0.1 * np.arange(1.0, 9.0)

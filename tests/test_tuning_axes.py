@@ -216,6 +216,7 @@ def test_a_magnetometer_is_recovered_though_its_axes_mix_in_every_innovation(kin
     assert np.mean(np.square(ratios)) < 2.5, ratios
 
 
+@pytest.mark.slow
 def test_the_command_tunes_the_axes_of_a_record(succeeds, tmp_path):
     path, out, first = tmp_path / "star.h5", tmp_path / "tuned.toml", tmp_path / "first.toml"
     scenario = tracked(60.0)

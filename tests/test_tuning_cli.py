@@ -164,6 +164,7 @@ def test_tune_gives_the_filter_states_for_what_the_record_specifies(run, tmp_pat
     assert names == ["gyro.arw", "gyro.scale_sigma"]
 
 
+@pytest.mark.slow
 def test_a_filter_with_states_and_a_gate_is_tuned_against_the_truth(run, succeeds, tmp_path, scaled):
     first, out = tmp_path / "first.toml", tmp_path / "states.toml"
     record = recordfiles.read_record(scaled)
@@ -178,6 +179,7 @@ def test_a_filter_with_states_and_a_gate_is_tuned_against_the_truth(run, succeed
     assert run(*given)[1].count("--truth tunes the filter with its gate and weights") == 1
 
 
+@pytest.mark.slow
 def test_outliers_beside_optional_states(succeeds, tmp_path):
     out = tmp_path / "states.toml"
     faults = vectors.Faults(outlier_probability=0.1, outlier_scale=10.0)

@@ -234,6 +234,7 @@ def test_a_coloured_sensor_is_recovered_within_its_intervals_over_many_seeds():
     assert np.all((np.mean(ratios**2, axis=0) > 0.65) & (np.mean(ratios**2, axis=0) < 1.5)), np.mean(ratios**2, axis=0)
 
 
+@pytest.mark.slow
 def test_a_state_that_nothing_shows_is_not_identified():
     """At rest the scale of a quiet gyro is multiplied by nothing, and its σ makes no difference. (Of a noisy one the noise is.)"""
     quiet = gyro.GyroSpec(angle_random_walk=1e-6, rate_random_walk=1e-9, turn_on_bias_sigma=1e-6)
@@ -248,6 +249,7 @@ def test_a_state_that_nothing_shows_is_not_identified():
     assert found["acc.correlated_sigma"].identified
 
 
+@pytest.mark.slow
 def test_hard_iron_is_tuned_from_several_records():
     """σ of a bias drawn anew for every record, from eight of them: 24 draws, known to 1/√48."""
     sigma = 3e-6
@@ -280,6 +282,7 @@ def attitude_rms(cases, chosen: setup.FilterSetup) -> float:
     return float(np.sqrt(np.mean(squares)))
 
 
+@pytest.mark.slow
 def test_the_smallest_error_of_a_filter_with_states_then_the_scale_of_its_innovations():
     """The least of the RMS error by a search over ordinary runs; the scale by the closed form, the root of the mean of e²/s."""
     scenario = swaying(15.0)
@@ -313,6 +316,7 @@ def test_the_smallest_error_of_a_filter_with_states_then_the_scale_of_its_innova
     assert list(tuning.values_of(found.setup, names, []).values()) == pytest.approx([found[n].value for n in names])
 
 
+@pytest.mark.slow
 def test_a_plan_knows_that_one_record_has_three_draws_of_a_hard_iron():
     """Standard error of ln σ from three numbers of a normal distribution of mean zero: 1/√6, however long the record is."""
     scenario = swaying(20.0, hard_iron=np.full(3, 3e-6))

@@ -124,7 +124,11 @@ CHAINS = States(sensors={"up": SensorStates(velocity_sigma=0.1, velocity_time=3.
 """Two an axis, one of which drives the other."""
 
 
-@pytest.mark.parametrize("states", [None, STATES, CHAINS], ids=["plain", "states", "chains"])
+@pytest.mark.parametrize(
+    "states",
+    [None, *(pytest.param(states, marks=pytest.mark.slow) for states in (STATES, CHAINS))],
+    ids=["plain", "states", "chains"],
+)
 def test_without_outliers_it_is_the_likelihood_of_all_kinds_of_measurement(states):
     one, chosen = every_kind(), dataclasses.replace(KINDS, states=states)
     names = ("gyro.arw", "sun.sigma", "up.sigma", "north.sigma", "tracker.sigma")
@@ -137,8 +141,15 @@ def test_without_outliers_it_is_the_likelihood_of_all_kinds_of_measurement(state
     assert objective.minus_log(same)[0] == pytest.approx(plain.minus_log(point)[0], rel=1e-12)
 
 
-@pytest.mark.parametrize("states", [None, STATES], ids=["plain", "states"])
-@pytest.mark.parametrize("kind", range(4))
+@pytest.mark.parametrize(
+    ("kind", "states"),
+    [
+        # With states each kind takes 4 s to compile.
+        pytest.param(kind, states, id=f"{kind}-{name}", marks=pytest.mark.slow if states else [])
+        for kind in range(4)
+        for name, states in (("plain", None), ("states", STATES))
+    ],
+)
 def test_of_one_measurement_it_is_the_sum_of_both_likelihoods(kind, states):
     whole, chosen = every_kind(), dataclasses.replace(KINDS, states=states)
     series = whole.record.vectors[kind]
@@ -153,6 +164,7 @@ def test_of_one_measurement_it_is_the_sum_of_both_likelihoods(kind, states):
     assert -objective.minus_log(objective.start)[0] == pytest.approx(expected, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_the_filter_of_no_states_and_noise_given_by_axis_has_the_plain_mixture():
     one = every_kind()
     names = ("gyro.arw", "up.sigma", "tracker.sigma")
@@ -202,7 +214,7 @@ def correlated(duration: float) -> scenarios.Scenario:
     return dataclasses.replace(plain, sensors=tuple(dataclasses.replace(one, faults=faults) for one in plain.sensors))
 
 
-@pytest.mark.parametrize("states", [False, True], ids=["plain", "states"])
+@pytest.mark.parametrize("states", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["plain", "states"])
 def test_the_information_is_the_scatter_of_the_score(states):
     """At the truth, over independent records: the collapse of the mixture to one normal costs little."""
     chosen, free, made = BELIEVED, FREE, scenario(300.0)
@@ -320,7 +332,7 @@ def test_at_the_threshold_an_outlier_is_as_likely_as_none():
         assert probability == pytest.approx(chi2.cdf(thresholds["star"][0], degrees), rel=1e-12)
 
 
-@pytest.mark.parametrize("states", [None, States()], ids=["lanes", "runs"])
+@pytest.mark.parametrize("states", [None, pytest.param(States(), marks=pytest.mark.slow)], ids=["lanes", "runs"])
 def test_the_share_of_its_own_noise_in_an_innovation_is_that_of_the_filter(states):
     one = every_kind()
     objective = tuning.contaminated_likelihood(
