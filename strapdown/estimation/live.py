@@ -20,14 +20,15 @@ from numpy.typing import ArrayLike
 
 from strapdown.checks import Array, InputError, array, finite, non_negative, one_of, positive, unit_quaternions
 from strapdown.estimation import forward
+from strapdown.estimation import model as modelling
 from strapdown.estimation.error_states import ErrorStates
 from strapdown.estimation.forward import Judge, Options, gate_events
 from strapdown.estimation.gating import Gate, Robust
-from strapdown.estimation.states import ProcessNoise, State, check_arguments
+from strapdown.estimation.states import ProcessNoise, State, check_arguments, covariance_matrices, pack
 from strapdown.kernels import gate, gate_rules, six_states, structure
 from strapdown.kernels import live as kernel
 from strapdown.kernels.argument_tables import packed
-from strapdown.kernels.machine import compiled, read_only
+from strapdown.kernels.machine import address_of, compiled, read_only
 from strapdown.kernels.measurement import KIND_CODES, Measurements
 from strapdown.kernels.walk import walk
 from strapdown.records import Event, ImuRecord, Innovations
@@ -193,11 +194,8 @@ class LiveFilter:
         place = np.arange(most, dtype=np.uint32)
         measured = Measurements(*(read_only(one) for one in (time, place, sensor, value, sigma, noise, series, frame)))
         arguments = read_only(edges), read_only(increment.reshape(1, 3)), measured, 1 << 30, body, out
-        walking = dispatcher.overloads, tuple(map(dispatcher.typeof_pyval, arguments))
-        dispatcher.compile(walking[1])
-        compilation = walking[0][walking[1]]
         return kernel.Live(
-            address=compilation.library.get_pointer_to_function(compilation.fndesc.llvm_func_name),
+            address=address_of(dispatcher, arguments),
             arguments=arguments,
             result=(0,) * results,
             holds=int(self.look_back > 0.0),
@@ -490,6 +488,36 @@ class LiveFilter:
         model, memory = self._problem.model, self._judge.memory
         candidate = forward.candidate_of(self._body, model) if memory[gate_rules.CANDIDATE] else None
         return copy.deepcopy(forward.state_of(self._body, model, self._judge.remembered(candidate), {}))
+
+    def begin(self, state: State, time: float) -> None:
+        """Continue from another state, of six or all states, at another time.
+
+        Parameters
+        ----------
+        state : State
+            State, without a gate's.
+        time : float
+            Its time, s.
+        """
+        state = modelling.begin(state, self._problem.error_states)
+        if self._whole:
+            n = len(state.covariance)
+            self._body.x[0] = np.concatenate([state.attitude, state.bias, state.values])
+            self._body.P[0].reshape(n, -1)[:, :n] = state.covariance
+        else:
+            self._body.state[:] = pack(state.attitude, state.bias, state.covariance)
+        self._time = self._arrays.clock[0] = finite("time", time, unit="s")
+
+    @property
+    def arrays(self) -> tuple[kernel.Live, Array, Array, Array]:
+        """Arrays of the kernel; attitude, bias and error states; the numbers of P, and the place in them of each element (6, 6)."""
+        numbers = self._body.P[0] if self._whole else self._body.state[7:]
+        place = np.arange(len(numbers), dtype=np.int64)
+        n = len(self._x) - 1
+        places = (
+            place.reshape(n, -1)[:6, :6] if self._whole else covariance_matrices(place.astype(float)).astype(np.int64)
+        )
+        return self._arrays, self._x, numbers, np.ascontiguousarray(places)
 
     def __reduce__(self) -> Any:
         """Raise an error: a copy would share the arrays of the compiled kernel."""

@@ -40,7 +40,7 @@ def call(typing: Any, address: Any, arguments: Any, like: Any) -> Any:
 
     def lower(target: Any, builder: Any, signature: Any, values: Any) -> Any:
         convention, given = target.call_conv, list(arguments)
-        result = like if len(like) > 1 else like[0]
+        result = like if len(like) > 1 else like[0] if len(like) else types.none
         kind = convention.get_function_type(result, given)
         parts = cgutils.unpack_tuple(builder, values[1], len(given))
         returned = cgutils.alloca_once(builder, kind.args[0].pointee)
@@ -50,7 +50,7 @@ def call(typing: Any, address: Any, arguments: Any, like: Any) -> Any:
         builder.call(function, [returned, error, *flat])  # kernels raise nothing
         packer = target.data_model_manager[result]
         value = packer.from_return(builder, builder.load(returned))
-        return value if len(like) > 1 else target.make_tuple(builder, like, [value])
+        return value if len(like) > 1 else target.make_tuple(builder, like, [value] * len(like))
 
     return like(address, arguments, like), lower
 

@@ -33,5 +33,5 @@ def unpacked(kind, table):
 def call(address, arguments, like):
     """Return the numbers that the compiled kernel at an address returns, called with a tuple of arguments. Compiled only.
 
-    ``like`` is a tuple of as many integers.
+    ``like`` is a tuple of as many integers, empty for one that returns nothing.
     """

@@ -185,6 +185,14 @@ def compiled(function: Callable[..., Any], *parts: ModuleType) -> Any:
     return dispatcher
 
 
+def address_of(dispatcher: Any, arguments: tuple[Any, ...]) -> int:
+    """Return the address of a compiled function's machine code for arguments of these types."""
+    types = tuple(map(dispatcher.typeof_pyval, arguments))
+    dispatcher.compile(types)
+    compilation = dispatcher.overloads[types]
+    return int(compilation.library.get_pointer_to_function(compilation.fndesc.llvm_func_name))
+
+
 @functools.cache
 def instance(module: ModuleType, **constants: Hashable) -> ModuleType:
     """Return a copy of a kernel module with other values of constants that it reads from its globals while it is imported.
