@@ -2,7 +2,7 @@
 
 Each gets the same samples one at a time, as lists or arrays, whichever is faster for it: gyro, accelerometer, magnetometer. The filters
 differ in their states and purpose; the table compares only their run time. smsfusion and AttiPy use a heading in place of the
-magnetometer. The time that numba needs to determine the types of the kernel's arguments and to unpack them is measured too.
+magnetometer. `LiveAhrs` updates its 21 states every 30 ms, with the mean of three samples.
 """
 
 from __future__ import annotations

@@ -264,6 +264,8 @@ def test_missing_and_vertical_are_skipped():
     live.update(0.05, up=(0.0, 0.0, 1.0))
     assert live.late == 1
     assert same(live.state(), alone.state())
+    live.update(0.1, north=(0.0, 0.0, 1.0), up=(0.0, 0.0, 1.0))
+    assert live.skipped == {"north": 3, "up": 2, "tracker": 1}
 
 
 @pytest.mark.parametrize(
