@@ -15,6 +15,7 @@ from strapdown.ahrs.parameters import HAND_HELD_WITHOUT_MAGNETOMETER, AhrsParame
 from strapdown.ahrs.preparing import GRAVITY
 from strapdown.checks import Array, InputError, non_negative, positive
 from strapdown.estimation.forward import TooPreciseError
+from strapdown.estimation.live import arrays_of, restart
 from strapdown.kernels import live_imu as kernel
 from strapdown.kernels import recording_steps
 from strapdown.kernels.argument_tables import packed
@@ -118,7 +119,7 @@ class LiveAhrs:
         self._found = k.Carried(*(np.full((2, *shape), np.nan) for shape in ((4,), (3,), (6,), (6, 6))))
         steps.floor[:] = parameters.tilt_sigma**2 / STANDARD_GRAVITY**2
         steps.iron[:] = 0.0
-        live, state, numbers, places = self._filter.arrays
+        live, state, numbers, places = arrays_of(self._filter)
         carried = (
             k.Steps(steps.edge, *map(read_only, steps[1:])),
             k.Stamps(*map(read_only, stamps)),
@@ -223,7 +224,7 @@ class LiveAhrs:
                 rate=np.array([sample[0], sample[0]]),
                 specific_force=np.array([sample[1], sample[1]]),
             )
-            self._filter.begin(starting.start(first, np.array([[1.0, 0.0, 0.0, 0.0]] * 2), self.parameters), time)
+            restart(self._filter, starting.start(first, np.array([[1.0, 0.0, 0.0, 0.0]] * 2), self.parameters), time)
             self._rested = time
             self._take(self._kind, self._table, kernel.START)
         if code:
@@ -237,7 +238,7 @@ class LiveAhrs:
             self._find_rest()
         if code & kernel.STEP and self._rests:
             for rate, sigma in self._rests:
-                self._filter.begin(starting.with_rate_at_rest(self._filter.state(), rate, sigma), self._call[0])
+                restart(self._filter, starting.with_rate_at_rest(self._filter.state(), rate, sigma), self._call[0])
             self._rests.clear()
 
     def _find_rest(self) -> None:

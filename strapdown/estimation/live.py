@@ -69,7 +69,8 @@ class LiveFilter:
 
     See Also
     --------
-    StepFilter : The same filter on filterpy, two hundred times slower, for inspection of its steps.
+    LiveAhrs : The same for an IMU, with what :func:`strapdown.estimate` does with its recording.
+    StepFilter : The same filter on filterpy, five hundred times slower, for inspection of its steps.
 
     Notes
     -----
@@ -489,39 +490,30 @@ class LiveFilter:
         candidate = forward.candidate_of(self._body, model) if memory[gate_rules.CANDIDATE] else None
         return copy.deepcopy(forward.state_of(self._body, model, self._judge.remembered(candidate), {}))
 
-    def begin(self, state: State, time: float) -> None:
-        """Continue from another state, of six or all states, at another time.
-
-        Parameters
-        ----------
-        state : State
-            State, without a gate's.
-        time : float
-            Its time, s.
-        """
-        state = modelling.begin(state, self._problem.error_states)
-        if self._whole:
-            n = len(state.covariance)
-            self._body.x[0] = np.concatenate([state.attitude, state.bias, state.values])
-            self._body.P[0].reshape(n, -1)[:, :n] = state.covariance
-        else:
-            self._body.state[:] = pack(state.attitude, state.bias, state.covariance)
-        self._time = self._arrays.clock[0] = finite("time", time, unit="s")
-
-    @property
-    def arrays(self) -> tuple[kernel.Live, Array, Array, Array]:
-        """Arrays of the kernel; attitude, bias and error states; the numbers of P, and the place in them of each element (6, 6)."""
-        numbers = self._body.P[0] if self._whole else self._body.state[7:]
-        place = np.arange(len(numbers), dtype=np.int64)
-        n = len(self._x) - 1
-        places = (
-            place.reshape(n, -1)[:6, :6] if self._whole else covariance_matrices(place.astype(float)).astype(np.int64)
-        )
-        return self._arrays, self._x, numbers, np.ascontiguousarray(places)
-
     def __reduce__(self) -> Any:
         """Raise an error: a copy would share the arrays of the compiled kernel."""
         raise TypeError("a LiveFilter cannot be copied or pickled; start another one from its state()")
+
+
+def restart(live: LiveFilter, state: State, time: float) -> None:
+    """Continue a filter without gate and look-back from another state, of six or of all states, at another time, s."""
+    state, body = modelling.begin(state, live._problem.error_states), live._body
+    if live._whole:
+        n = len(state.covariance)
+        body.x[0] = np.concatenate([state.attitude, state.bias, state.values])
+        body.P[0].reshape(n, -1)[:, :n] = state.covariance
+    else:
+        body.state[:] = pack(state.attitude, state.bias, state.covariance)
+    live._time = live._arrays.clock[0] = time
+
+
+def arrays_of(live: LiveFilter) -> tuple[kernel.Live, Array, Array, Array]:
+    """Return the kernel's arrays; attitude, bias and error states; the numbers of P, and the place in them of its first elements (6, 6)."""
+    numbers = live._body.P[0] if live._whole else live._body.state[7:]
+    place = np.arange(len(numbers), dtype=np.float64)
+    n = len(live._x) - 1
+    places = place.reshape(n, -1)[:6, :6] if live._whole else covariance_matrices(place)
+    return live._arrays, live._x, numbers, np.ascontiguousarray(places, np.int64)
 
 
 class _Interval(NamedTuple):
