@@ -10,8 +10,8 @@ Tasks
     ``monte_carlo``, ``covariance_analysis``, ``allan_deviation``, ``fit_noise``, ``calibrate``, ``export``, ``initial_state``
 Classes
     ``Scenario``, ``GyroSpec``, ``VectorSensor``, ``FilterSetup``, ``ProcessNoise``, ``Gate``, ``Robust``; ``LiveFilter`` and
-    ``StepFilter`` filter sample by sample, compiled and on filterpy. Every function raises ``InputError`` on bad input; the message names
-    the value, its place and the remedy. A section *Raises* lists further conditions.
+    ``StepFilter`` filter sample by sample, compiled and on filterpy, ``LiveAhrs`` as ``estimate`` does a recording. Every function raises
+    ``InputError`` on bad input; the message names the value, its place and the remedy. A section *Raises* lists further conditions.
 Submodules
     Each has its own ``__all__``; public below them are ``estimation.error_states``, ``estimation.filters``,
     ``estimation.multiple_model``, ``estimation.setup``, ``montecarlo.campaign``, ``montecarlo.cluster``, ``montecarlo.coning_study`` and
@@ -60,6 +60,7 @@ if TYPE_CHECKING:
         units,
         vectors,
     )
+    from strapdown.ahrs import LiveAhrs
     from strapdown.calibration import calibrate
     from strapdown.checks import InputError
     from strapdown.codegen import export
@@ -90,6 +91,7 @@ __all__ = [
     "Gate",
     "GyroSpec",
     "InputError",
+    "LiveAhrs",
     "LiveFilter",
     "ProcessNoise",
     "Robust",
@@ -141,6 +143,7 @@ _HOMES = {
     "Gate": "estimation",
     "GyroSpec": "gyro",
     "InputError": "checks",
+    "LiveAhrs": "ahrs",
     "LiveFilter": "estimation",
     "ProcessNoise": "estimation",
     "Robust": "estimation",

@@ -863,7 +863,7 @@ def test_the_level_of_the_acceleration_and_the_innovations_variance_by_it():
         innovations={"accelerometer": seen},
     )
     uncertain = np.arange(steps) == 2999
-    level = regions.acceleration_level(still, uncertain)
+    level = regions.acceleration_level(still, uncertain, interval)
     since = np.minimum(time, np.where(time >= time[3000], time - time[3000], np.inf))
     np.testing.assert_allclose(level, np.exp(-since / regions.LEVEL_TIME), rtol=1e-9)
     variance = regions.scaled_innovations(still, level)["accelerometer"].variance
@@ -871,7 +871,7 @@ def test_the_level_of_the_acceleration_and_the_innovations_variance_by_it():
     np.testing.assert_allclose(variance[:, 0], 2.0 * (own + (1.0 - own) * level[:-1]), rtol=1e-12)
     moved = dataclasses.replace(seen, innovation=np.full((steps, 3), np.sqrt(2.0)))
     as_modelled = dataclasses.replace(still, innovations={"accelerometer": moved})
-    np.testing.assert_allclose(regions.acceleration_level(as_modelled, uncertain), 1.0, rtol=1e-12)
+    np.testing.assert_allclose(regions.acceleration_level(as_modelled, uncertain, interval), 1.0, rtol=1e-12)
 
 
 def test_innovations_of_broad_are_as_large_as_their_variance_says(broad):

@@ -28,6 +28,7 @@ DRAWING = ("plots", "report")
 PRINTING = ("cli", "__main__")
 MACHINES = (
     "kernels.machine",
+    "kernels.addresses",
     "kernels.cache",
     "kernels.lanes",
     "kernels.packed",

@@ -21,7 +21,7 @@ import strapdown as sd
 from strapdown import results
 
 NAMES = {
-    *("FilterSetup", "Gate", "GyroSpec", "InputError", "LiveFilter", "ProcessNoise", "Robust", "Scenario"),
+    *("FilterSetup", "Gate", "GyroSpec", "InputError", "LiveAhrs", "LiveFilter", "ProcessNoise", "Robust", "Scenario"),
     *(
         "StepFilter",
         "VectorSensor",

@@ -241,7 +241,6 @@ def parts_used() -> set[tuple[str, ...]]:
 def test_every_body_of_the_walk_is_listed_here():
     assert parts_used() == {
         ("six_states",),
-        ("kernels",),
         ("gate", "kernels"),
         ("filter_lanes", "kernels"),
         ("*bodies",),

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from strapdown.ahrs import check_conventions as check_conventions
 from strapdown.ahrs.estimating import AhrsEstimate, estimate
+from strapdown.ahrs.live import LiveAhrs
 from strapdown.ahrs.parameters import HAND_HELD as HAND_HELD
 from strapdown.ahrs.parameters import HAND_HELD_WITHOUT_MAGNETOMETER as HAND_HELD_WITHOUT_MAGNETOMETER
 from strapdown.ahrs.parameters import MOTIONS, AhrsParameters
@@ -24,5 +25,6 @@ __all__ = [
     "MOTIONS",
     "AhrsEstimate",
     "AhrsParameters",
+    "LiveAhrs",
     "estimate",
 ]

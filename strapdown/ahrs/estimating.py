@@ -240,7 +240,8 @@ def _at_stamps(
     (P,) = side_by_side(((n if options.full_covariance else 0, 6, 6), float))
     late = np.broadcast_to(delays.gyro, used.time.shape)
     ahead = -sensor_delays.turn_over(used, -late) if options.smooth else used.rate * late[:, None]
-    level = regions.acceleration_level(filtered, _over_steps(turn_variance, edge) > 0.0)
+    interval = max(parameters.step, float(np.median(np.diff(used.time))))
+    level = regions.acceleration_level(filtered, _over_steps(turn_variance, edge) > 0.0, interval)
     tilt, floor, heading = regions.scales(filtered, parameters, level, causal=not options.smooth)
     assert filtered.covariance is not None
     iron = np.zeros(len(edge))

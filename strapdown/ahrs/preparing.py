@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from strapdown import estimation, quaternion
+from strapdown import estimation
 from strapdown.ahrs import headings, starting
 from strapdown.ahrs.parameters import AhrsParameters
 from strapdown.checks import Array
@@ -54,19 +54,20 @@ def prepare(
     if turned is None:
         turned = sensor_delays.gyro_attitude(recording)
     initial = starting.start(recording, turned, parameters)  # first, because it rejects a sensor without samples
-    edge = edges(recording.time, parameters.step)
-    time = recording.time[edge]
-    at_edge = turned[edge]
     interval = float(np.median(np.diff(recording.time)))
+    edge = edges(recording.time, parameters.step, interval)
+    time = recording.time[edge]
     assert recording.specific_force is not None
-    force, number = averages(recording.specific_force, turned, edge)
+    total, number = sums(recording.specific_force, turned, edge)
+    force, turn = np.empty((2, len(edge) - 1, 3))
+    compiled(recording_steps.end_steps)(read_only(turned), edge, total, number, force, turn)
     shown = number > 0
     vectors = [
         VectorMeasurements(
             sensor="accelerometer",
             kind="vector",
             time=time[1:][shown],
-            vector_b=quaternion.rotate(quaternion.conjugate(at_edge[1:]), force)[shown],
+            vector_b=force[shown],
             reference_f=GRAVITY,
             sigma=parameters.specific_force_noise / np.sqrt(number[shown] * interval),
         )
@@ -78,18 +79,18 @@ def prepare(
             frame = np.empty_like(turned)
             over = sensor_delays.turn_over(recording, field_delay)
             compiled(recording_steps.turn_back)(read_only(turned), read_only(over), frame)
-        field, number = averages(recording.magnetic_field, frame, edge)
+        fixed_force = total / np.maximum(number, 1.0)[:, None]
+        total, number = sums(recording.magnetic_field, frame, edge)
         samples = headings.FieldSteps(
-            field=field,
+            field=total / np.maximum(number, 1.0)[:, None],
             frame=frame[(edge[:-1] + edge[1:] + 1) // 2],
             length=number * interval,
-            force=headings.held(force, shown),
-            at_edge=at_edge,
+            force=headings.held(fixed_force, shown),
+            at_edge=turned[edge],
             time=time,
         )
         found = headings.measured(samples, parameters, causal=causal)
         vectors.append(found.vectors)
-    turn = quaternion.log(quaternion.multiply(quaternion.conjugate(at_edge[:-1]), at_edge[1:]))
     known = recording.temperature is not None and bool(np.isfinite(recording.temperature).all())
     temperature = recording.temperature[edge] if known and recording.temperature is not None else None
     record = ImuRecord(time=time, increments=turn, vectors=tuple(vectors), temperature=temperature)
@@ -110,15 +111,18 @@ def without_temperature(
     return used, replace(parameters, rate_random_walk=float(np.hypot(parameters.rate_random_walk, walk)))
 
 
-def edges(time: Array, step: float) -> np.ndarray:
-    """Return the samples at which steps end (k + 1,): the first, the last before each multiple of ``step``, s, and the last of all."""
-    bins = np.floor((time - time[0]) / step + 1e-6)
-    inner = np.flatnonzero(bins[1:] != bins[:-1])
-    return np.concatenate([[0], inner[inner > 0], [len(time) - 1]])
+def edges(time: Array, step: float, interval: float) -> np.ndarray:
+    """Return the samples at which steps end (k + 1,): the first, the last before each multiple of ``step``, s, and the last of all.
+
+    A sample is known to be the last from the usual interval, s, after which the next one is expected.
+    """
+    bins = np.floor((time + interval - time[0]) / step + 1e-6)
+    inner = np.flatnonzero(bins[1:] != bins[:-1]) + 1
+    return np.concatenate([[0], inner[inner < len(time) - 1], [len(time) - 1]])
 
 
-def averages(samples: Array, frame: Array, edge: Array) -> tuple[Array, Array]:
-    """Return the mean of each step's samples, rotated by ``frame`` (n, 4), as (k, 3), and their number; 0 if there are none."""
+def sums(samples: Array, frame: Array, edge: Array) -> tuple[Array, Array]:
+    """Return the sum of each step's samples, rotated by ``frame`` (n, 4), as (k, 3), and their number."""
     total, number = np.empty((len(edge) - 1, 3)), np.empty(len(edge) - 1)
     compiled(recording_steps.average_samples)(read_only(samples), read_only(frame), edge, total, number)
-    return total / np.maximum(number, 1.0)[:, None], number
+    return total, number

@@ -38,19 +38,18 @@ FIELD_MEMORY = 60.0
 """Time constant with which that mean forgets, s."""
 
 
-def acceleration_level(filtered: Estimate, uncertain: np.ndarray) -> Array:
+def acceleration_level(filtered: Estimate, uncertain: np.ndarray, interval: float) -> Array:
     """Return the level (k + 1,) of the acceleration up to each edge of the steps: its variance, relative to that modelled.
 
     The same model serves slow and fast motion, so most motion is slower than modelled. The level is set to 1 at the start, without a
-    measurement, and in steps whose rotation is ``uncertain`` (k,).
+    measurement, and in steps whose rotation is ``uncertain`` (k,). ``interval``: that of the steps, s.
     """
     seen = filtered.innovations["accelerometer"]
     nis = np.ones((len(filtered.time), 1))
     nis[np.searchsorted(filtered.time, seen.time), 0] = np.where(np.isfinite(seen.nis), seen.nis / 3.0, 1.0)
-    step = float(np.median(np.diff(filtered.time))) / LEVEL_TIME
     begin = np.append(0, np.flatnonzero(uncertain) + 1)
     nis[begin] = 1.0
-    return np.concatenate([low_pass(part, step) for part in np.split(nis, begin[1:])])[:, 0]
+    return np.concatenate([low_pass(part, interval / LEVEL_TIME) for part in np.split(nis, begin[1:])])[:, 0]
 
 
 def scaled_innovations(filtered: Estimate, level: Array) -> dict[str, Innovations]:
@@ -71,7 +70,9 @@ def scales(filtered: Estimate, parameters: AhrsParameters, level: Array, *, caus
     heading = np.minimum(parameters.heading_share + parameters.heading_by_field * field**1.5, MAX_HEADING)
     if "magnetometer" not in filtered.innovations:
         heading = np.ones(len(field))
-    return np.sqrt(TILT_SHARES[0] + TILT_SHARES[1] * np.sqrt(level)), error / STANDARD_GRAVITY**2, np.sqrt(heading)
+    tilt = np.empty(len(level))
+    compiled(recording_steps.tilt_factors)(read_only(level), TILT_SHARES, tilt)
+    return tilt, error / STANDARD_GRAVITY**2, np.sqrt(heading)
 
 
 def field_level(filtered: Estimate, parameters: AhrsParameters, *, causal: bool) -> Array:

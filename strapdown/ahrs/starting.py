@@ -145,51 +145,71 @@ def rests(recording: Recording, parameters: AhrsParameters) -> Rests:
     """
     if parameters.rest_bias_sigma == 0.0:
         return NO_REST
-    length = samples_in_span(recording)
-    parts = min(TENTHS, length)
-    part = length // parts
+    samples_in_span(recording)  # rejects a recording that is too short
+    parts, part = rest_length(float(np.median(np.diff(recording.time))))
     length = parts * part
     n = len(recording.time) // length
-    tenths = recording.rate[: n * length].reshape(n, parts, part, 3).mean(axis=2)
-    mean = tenths.mean(axis=1)
-    sigma = np.hypot(parameters.rest_bias_sigma, np.sqrt(np.sum((tenths - mean[:, None]) ** 2, axis=(1, 2)) / parts))
+    mean, sigma = mean_rates(recording.rate[: n * length].reshape(n, parts, part, 3), parameters)
     last = np.arange(length - 1, n * length, length)
-    steady = recording.time[last] - recording.time[last - length + 1] < 1.5 * QUIET_SPAN  # no gap
-    used = np.flatnonzero(steady & (sigma < MAX_REST_SIGMA))
-    turning = lengths(mean[used]) > TURNING_RATE
+    vectors = (recording.specific_force, recording.magnetic_field)
     used = np.array(
         [
             k
-            for k, doubtful in zip(used, turning, strict=True)
-            if not (doubtful and _turns(recording, slice(last[k] - length + 1, last[k] + 1), mean[k]))
+            for k in np.flatnonzero(sigma < MAX_REST_SIGMA)
+            if is_rest(recording.time, vectors, slice(last[k] - length + 1, last[k] + 1), mean[k])
         ],
         np.intp,
     )
     return Rests(last[used], mean[used], sigma[used])
 
 
-def _turns(recording: Recording, span: slice, rate: Array) -> bool:
-    """Return whether vertical and field rotate at more than half this rate from the first half of the samples to the second."""
+def rest_length(interval: float) -> tuple[int, int]:
+    """Return the number of parts of a span in which rest is looked for, and of samples of a part, at this interval of the samples, s."""
+    length = max(2, round(QUIET_SPAN / interval))
+    parts = min(TENTHS, length)
+    return parts, length // parts
+
+
+def mean_rates(rate: Array, parameters: AhrsParameters) -> tuple[Array, Array]:
+    """Return the mean rates (n, 3) of spans (n, parts, samples, 3), and their σ (n,) as measurements of the bias at rest."""
+    tenths = rate.mean(axis=2)
+    mean = tenths.mean(axis=1)
+    spread = np.sum((tenths - mean[:, None]) ** 2, axis=(1, 2)) / rate.shape[1]
+    return mean, np.hypot(parameters.rest_bias_sigma, np.sqrt(spread))
+
+
+def is_rest(time: Array, vectors: tuple[Array | None, ...], span: slice, rate: Array) -> bool:
+    """Return whether a span has no gap, and vertical and field do not rotate at more than half its mean rate."""
+    if not time[span][-1] - time[span][0] < 1.5 * QUIET_SPAN:
+        return False
+    if not lengths(rate) > TURNING_RATE:
+        return True
     expected, seen = [], []
-    for samples in (recording.specific_force, recording.magnetic_field):
+    for samples in vectors:
         known = np.empty((0, 3)) if samples is None else samples[span][np.isfinite(samples[span]).all(axis=1)]
         if len(known) > 1 and np.any(mean := known.mean(axis=0)):
             first, second = (half.mean(axis=0) / np.linalg.norm(mean) for half in np.array_split(known, 2))
             seen.append(second - first)
             expected.append(-0.5 * QUIET_SPAN * np.cross(rate, 0.5 * (first + second)))
     e, s = np.ravel(expected), np.ravel(seen)
-    return bool(s @ e > 0.5 * (e @ e))
+    return not s @ e > 0.5 * (e @ e)
 
 
 def informative(found: Rests, time: Array, parameters: AhrsParameters) -> Rests:
     """Return those spans whose σ is below that of the bias by the spans before: a long rest is measured once, and again as it drifts."""
     variance, before, kept = parameters.bias_sigma**2, time[0], []
     for k, (last, sigma) in enumerate(zip(found.last, found.sigma, strict=True)):
-        drifted = variance + parameters.rate_random_walk**2 * (time[last] - before)
-        if sigma**2 < drifted:
-            variance, before = 1.0 / (1.0 / drifted + 1.0 / sigma**2), time[last]
+        measured = bias_variance(variance, time[last] - before, sigma, parameters)
+        if measured is not None:
+            variance, before = measured, time[last]
             kept.append(k)
     return Rests(found.last[kept], found.rate[kept], found.sigma[kept])
+
+
+def bias_variance(variance: float, since: float, sigma: float, parameters: AhrsParameters) -> float | None:
+    """Return the variance of the bias after a measurement with σ, a time since the last one; None if σ is above that of the bias."""
+    drifted = variance + parameters.rate_random_walk**2 * since
+    return float(1.0 / (1.0 / drifted + 1.0 / sigma**2)) if sigma**2 < drifted else None
 
 
 def with_rate_at_rest(state: estimation.State, rate: Array, sigma: float) -> estimation.State:

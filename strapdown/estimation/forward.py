@@ -233,16 +233,10 @@ def filtered(problem: Problem, options: Options) -> Passed:
     slopes = temperature.slopes(problem.error_states)
     if slopes is not None:
         passed = _over_temperature(problem, options, slopes)
-    elif (
-        problem.model.states
-        or options.judged
-        or options.whole_bias
-        or options.outliers
-        or problem.events.noise is not None
-    ):
-        passed = _run(problem, options)
-    else:
+    elif fits_registers(problem, options):
         passed = _in_registers(problem, options)
+    else:
+        passed = _run(problem, options)
     attitude = passed.estimate.attitude
     if not np.isfinite(attitude[-1]).all():  # NaN persists
         end = problem.record.time[options.every * int(np.argmin(np.isfinite(attitude).all(axis=1)))]
@@ -251,6 +245,12 @@ def filtered(problem: Problem, options: Options) -> Passed:
             "times their sigmas"
         )
     return passed
+
+
+def fits_registers(problem: Problem, options: Options) -> bool:
+    """Return whether the filter is that of attitude and bias in registers."""
+    more = problem.model.states or options.judged or options.whole_bias or options.outliers
+    return not more and problem.events.noise_by_axis is None
 
 
 def _over_temperature(problem: Problem, options: Options, slopes: slice) -> Passed:
@@ -307,9 +307,8 @@ def _in_registers(problem: Problem, options: Options) -> Passed:
     written = side_by_side(*((shape, float) for shape in (*shapes, _innovations(events, judged=False))))
     (segments,) = side_by_side(((options.segments + 1 if options.segments else 0, 32), float))
     out = six_states.Outputs._make((*written, segments[: options.segments]))
-    initial = problem.initial
-    state = pack(initial.attitude, initial.bias, initial.covariance)
-    body = six_states.Body(state, *problem.variances)
+    body = body_in_registers(problem)
+    state = body.state
     number = compiled(walk, six_states)(*problem.gyro, events.measurements, every, body, out)
     if number < 0:
         raise TooPreciseError()
@@ -329,11 +328,20 @@ def _in_registers(problem: Problem, options: Options) -> Passed:
     )
     return Passed(
         estimate=estimate,
-        make_end=lambda: State(
-            attitude=state[:4], bias=state[4:7], covariance=definite(covariance_matrices(state[7:]))
-        ),
+        make_end=lambda: state_of_numbers(state),
         segments=segments[: number + 1],
     )
+
+
+def body_in_registers(problem: Problem) -> six_states.Body:
+    """Return the filter of attitude and bias as the kernels' arguments."""
+    initial = problem.initial
+    return six_states.Body(pack(initial.attitude, initial.bias, initial.covariance), *problem.variances)
+
+
+def state_of_numbers(state: Array) -> State:
+    """Return the state from the 28 numbers of a kernel."""
+    return State(attitude=state[:4], bias=state[4:7], covariance=definite(covariance_matrices(state[7:])))
 
 
 # ------------------------------------------------------------------------------------------------------------------------------- a gate

@@ -1,46 +1,46 @@
 """The compiled filter for data in real time: :class:`LiveFilter`.
 
-Each gyro interval is treated as a record by :mod:`strapdown.kernels.walk`, with the state in the same arrays from one to the next. If
-measurements may be late, the filter keeps the state before
-each interval of its look-back, returns to the interval of a late measurement, and repeats from there.
+Each gyro interval is treated as a record by :mod:`strapdown.kernels.live`, with the state in the same arrays from one to the next. If
+measurements may be late, the filter keeps the state before each interval of its look-back, returns to the interval of a late measurement,
+and repeats from there.
 """
 
 from __future__ import annotations
 
 import copy
-import functools
 import math
+import sys
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from dataclasses import replace
+from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from strapdown.checks import Array, InputError, array, finite, non_negative, one_of, positive, unit_quaternions
 from strapdown.estimation import forward
+from strapdown.estimation import model as modelling
 from strapdown.estimation.error_states import ErrorStates
 from strapdown.estimation.forward import Judge, Options, gate_events
 from strapdown.estimation.gating import Gate, Robust
-from strapdown.estimation.states import ProcessNoise, State, check_arguments
-from strapdown.kernels import gate, gate_rules, structure
-from strapdown.kernels.machine import compiled, read_only
+from strapdown.estimation.states import ProcessNoise, State, check_arguments, covariance_matrices, pack
+from strapdown.kernels import gate, gate_rules, six_states, structure
+from strapdown.kernels import live as kernel
+from strapdown.kernels.argument_tables import packed
+from strapdown.kernels.machine import address_of, compiled, read_only
 from strapdown.kernels.measurement import KIND_CODES, Measurements
 from strapdown.kernels.walk import walk
-from strapdown.records import LARGEST_TURN, Event, ImuRecord, Innovations
+from strapdown.records import Event, ImuRecord, Innovations
 from strapdown.vectors import KINDS, VectorMeasurements, VectorSensor, need_level, triad
-from strapdown.vectors.sensors import UNIT_TOLERANCE
 
 MOST = 64
 """Maximum number of measurements within one gyro interval."""
-UNIT = 2.0 * UNIT_TOLERANCE
-"""A measured direction whose squared length differs from 1 by less than this is used without normalisation, as in a record."""
 UPPER = np.triu_indices(3)
 
 
 class LiveFilter:
-    """Multiplicative extended Kalman filter for one sample at a time, compiled: a few microseconds per sample.
+    """Multiplicative extended Kalman filter for one sample at a time, compiled: about two microseconds per sample.
 
     Parameters
     ----------
@@ -69,13 +69,14 @@ class LiveFilter:
 
     See Also
     --------
-    StepFilter : The same filter on filterpy, two hundred times slower, for inspection of its steps.
+    LiveAhrs : The same for an IMU, with what :func:`strapdown.estimate` does with its recording.
+    StepFilter : The same filter on filterpy, five hundred times slower, for inspection of its steps.
 
     Notes
     -----
-    For the samples of a record, the estimate equals that of :func:`strapdown.estimation.run`: bit for bit with error states or a gate,
-    otherwise to rounding, because without them the state of a record stays in registers. Late measurements within the look-back give the
-    same bits as those in order. A filter is not thread-safe and cannot be copied; start another one from its :meth:`state`.
+    For the samples of a record, the estimate equals that of :func:`strapdown.estimation.run` bit for bit: the same machine code is called
+    for each interval. Late measurements within the look-back give the same bits as those in order. A filter is not thread-safe and cannot
+    be copied; start another one from its :meth:`state`.
 
     Examples
     --------
@@ -104,7 +105,7 @@ class LiveFilter:
         self._time = finite("time", time, unit="s")
         self.look_back = non_negative("look_back", look_back, unit="s")
         series = [template(one, self._time) for one in sensors]
-        self._sensors = {one.sensor: _Sensor.of(one, place) for place, one in enumerate(series)}
+        self._sensors = {one.sensor: one for one in series}
         if len(self._sensors) < len(series):
             raise InputError(f"sensors has a name twice: {', '.join(one.sensor for one in series)}")
         # The kernels process each interval as a record; this one, without rotation, defines its arrays.
@@ -114,70 +115,113 @@ class LiveFilter:
             raise InputError(
                 "lever arms, and effects relative to a varying field magnitude, need the whole record; use estimation.run for them"
             )
-        self._judge = Judge(self._problem, Options(gate=gate, robust=robust))
-        self._judged = gate is not None or robust is not None
-        self._prepare()
-        self._headings = {one.place for one in self._sensors.values() if one.kind == "heading"}
-        self._missing = dict.fromkeys(self._sensors, 0)
+        options = Options(gate=gate, robust=robust)
+        self._judge, self._judged = Judge(self._problem, options), options.judged
+        self._writers = {one.sensor: (float(place), one.kind == "attitude") for place, one in enumerate(series)}
+        self._prepare(options)
         self._closed: tuple[Event, ...] = ()
-        self._last: Sequence[_Measured] = ()
         self._intervals: deque[_Interval] = deque()
         self.late = 0
         self.repeated = 0
         if self.look_back:
-            self._process(self._time, None, ())
+            self._keep(self._time, 0)
 
-    def _prepare(self) -> None:
-        """Make the arrays that the kernels work on, and load the kernel."""
-        sensors, model = len(self._sensors), self._problem.model
-        body, judge = forward.filter_body(self._problem, {}), self._judge
-        kernels = forward.instance_of(model)
+    def _prepare(self, options: Options) -> None:
+        """Make the arrays that the kernels work on, and load the kernels."""
+        judge, model = self._judge, self._problem.model
+        sensors, kernels = len(self._sensors), forward.instance_of(model)
+        most = max(MOST, sensors)
+        self._whole = not forward.fits_registers(self._problem, options)
+        filter_: Any = (
+            forward.filter_body(self._problem, {}) if self._whole else forward.body_in_registers(self._problem)
+        )
         # All that changes lies in one array, of which a copy is a snapshot. Continuing lock-outs are the last rows of the array in which
         # the kernel reports new ones.
-        slots = np.zeros((sensors, 4))
-        parts = [slots, body.x, body.P, judge.counters, judge.memory, np.zeros((sensors, 2))]
+        own = [filter_.x, filter_.P] if self._whole else [filter_.state]
+        parts = [np.zeros((sensors, 4)), judge.counters, judge.memory, np.zeros((sensors, 2)), *own]
         sizes = np.cumsum([0, *(part.size for part in parts)])
-        whole = np.zeros(4 * MOST + sizes[-1])
-        self._state = whole[4 * MOST :]
+        memory = np.zeros(4 * most + sizes[-1])
+        self._state = memory[4 * most :]
         views = [self._state[a:b].reshape(part.shape) for a, b, part in zip(sizes, sizes[1:], parts, strict=False)]
         for view, part in zip(views, parts, strict=True):
             view[...] = part
-        self._slots, x, P, judge.counters, judge.memory, self._counts = views
-        self._body = body._replace(x=x, P=P, length=np.ones(MOST))
-        self._edges, self._increment = np.full(2, self._time), np.zeros(3)
-        self._gyro_stores: Any = self._edges.data, self._increment.data
-        self._at = _Slots(anisotropic=not all(one.row.isotropic for one in self._sensors.values()))
-        series = [[0, 0, 0, KIND_CODES[one.kind], 0, 1] for one in self._sensors.values()]
-        self._series = read_only(np.array(series, np.int64).reshape(-1, 6))
-        size = 6 + model.states
-        self._innovation, self._weight = np.zeros((MOST, 6)), np.ones(MOST)
-        self._weights: Any = self._weight.data
-        self._recoveries, self._lock_outs = np.zeros((MOST, 4)), whole[: 4 * (MOST + sensors)].reshape(-1, 4)
-        out: Any = structure.Outputs(
-            x=np.empty((1, size + 1)),
-            variance=np.empty((1, size)),
-            covariance=np.empty((0, size, size)),
-            whole_variance=np.empty((0, 6)),
-            whole_covariance=np.empty((0, 6, 6)),
-            innovation=self._innovation,
-            segments=np.empty((0, 0)),
-        )
-        self._given: Any = self._body
-        dispatcher = compiled(walk, kernels)
-        if self._judged:
+        self._slots, judge.counters, judge.memory, self._counts, *own = views
+        self._recoveries, self._lock_outs = np.zeros((most, 4)), memory[: 4 * (most + sensors)].reshape(-1, 4)
+        self._innovation, self._weight = np.zeros((most, 6)), np.ones(most)
+        length, size = np.ones(most), 6 + model.states
+        body: Any
+        out: Any
+        if self._whole:
+            self._x: Array = own[0][0]
+            body = filter_._replace(x=own[0], P=own[1], length=length)
+            out = structure.Outputs(
+                x=np.empty((1, size + 1)),
+                variance=np.empty((1, size)),
+                covariance=np.empty((0, size, size)),
+                whole_variance=np.empty((0, 6)),
+                whole_covariance=np.empty((0, 6, 6)),
+                innovation=self._innovation,
+                segments=np.empty((0, 0)),
+            )
+        else:
+            self._x = own[0][:7]
+            body = filter_._replace(state=own[0])
+            rows = [np.empty((rows, width)) for rows, width in ((1, 4), (1, 3), (1, 6), (0, 21))]
+            out = six_states.Outputs._make([*rows, self._innovation, np.empty((0, 32))])
+        self._body = body
+        if options.judged:
             out = gate.Outputs(form=out, weight=self._weight, recoveries=self._recoveries, lock_outs=self._lock_outs)
-            self._given = judge.body(self._body)
-            dispatcher = compiled(walk, gate, kernels)
-        self._out = out
-        self._arguments = functools.cache(self._new_arguments)
-        # The dispatcher's type inference for sixty arrays takes longer than the update itself.
-        self._kernel = dispatcher.compile(tuple(map(dispatcher.typeof_pyval, self._arguments(0, 1))))
+            body = judge.body(body)
+        bodies = (gate, kernels) if options.judged else (kernels if self._whole else six_states,)
+        self._arrays = self._live(compiled(walk, *bodies), body, out, length, 3 if options.judged else 1)
+        # Writing to a memory view takes half the time of writing to an array.
+        self._call: Any = self._arrays.call.data
+        self._report: Any = self._arrays.report.data
+        self._table = packed(self._arrays)
+        dispatcher = compiled(kernel.step)
+        self._kind = dispatcher.typeof_pyval(self._arrays)
+        types = dispatcher.typeof_pyval(self._kind), *map(dispatcher.typeof_pyval, (self._table, 0, 0))
+        self._step = dispatcher.compile(types)
 
-    def _new_arguments(self, number: int, intervals: int) -> tuple[Any, ...]:
-        """Return the kernel's arguments for this number of measurements and zero or one interval."""
-        edges = read_only(self._edges[: intervals + 1])
-        increments = read_only(self._increment.reshape(1, 3)[:intervals])
-        return edges, increments, self._at.measurements(number, self._series), 1 << 30, self._given, self._out
+    def _live(self, dispatcher: Any, body: Any, out: Any, length: Array, results: int) -> kernel.Live:
+        """Return the kernel's arrays."""
+        sensors, most = list(self._sensors.values()), len(length)
+        declared = np.array([_row(one, place) for place, one in enumerate(sensors)]).reshape(-1, kernel.ROW)
+        series = np.array([[0, 0, 0, KIND_CODES[one.kind], 0, 1] for one in sensors], np.int64).reshape(-1, 6)
+        noisy = most if any(one.anisotropic for one in sensors) else 0
+        edges, increment = np.full(2, self._time), np.zeros(3)
+        time, sensor, value = np.zeros(most), np.zeros(most, np.uint8), np.zeros(3 * most)
+        sigma, noise, frame = np.ones(most), np.zeros((noisy, 6)), np.zeros((most, 9))
+        place = np.arange(most, dtype=np.uint32)
+        measured = Measurements(*(read_only(one) for one in (time, place, sensor, value, sigma, noise, series, frame)))
+        arguments = read_only(edges), read_only(increment.reshape(1, 3)), measured, 1 << 30, body, out
+        return kernel.Live(
+            address=address_of(dispatcher, arguments),
+            arguments=arguments,
+            result=(0,) * results,
+            holds=int(self.look_back > 0.0),
+            call=np.zeros(kernel.FIRST + kernel.STRIDE * len(sensors)),
+            clock=np.full(1, self._time),
+            edges=edges,
+            increment=increment,
+            time=time,
+            sensor=sensor,
+            value=value,
+            sigma=sigma,
+            noise=noise,
+            frame=frame,
+            length=length,
+            rows=np.zeros((most, kernel.ROW)),
+            declared=declared,
+            state=self._state,
+            before=self._state.copy(),
+            counts=self._counts,
+            missing=np.zeros(len(sensors)),
+            missing_now=np.zeros(len(sensors)),
+            innovation=self._innovation,
+            weight=self._weight,
+            report=np.zeros(6, np.int64),
+        )
 
     # ---------------------------------------------------------------------------------------------------------------------- updates
 
@@ -208,131 +252,157 @@ class LiveFilter:
             Reference of a sensor's measurement in this call, instead of the declared one.
         **measured : array_like (3,) or (4,)
             Measured vector of each sensor, by name, body axes; for kind ``"attitude"`` the quaternion q_fb. The length of a direction or
-            heading is ignored. None or NaN: missing.
+            heading is ignored, but not zero. None or NaN: missing.
 
         Raises
         ------
         InputError
-            If a sensor is unknown, a number infinite, or a time out of order. The filter is then unchanged.
+            If a sensor is unknown, a number infinite, a direction zero, a measurement too precise for double precision, or a time out of
+            order. The filter is then unchanged.
         """
-        now = self._time
-        if not math.isfinite(time):
-            raise InputError(f"time is {time} s; give the time of the sample")
-        increment = None
-        if gyro is not None or delta_theta is not None:
-            increment = self._increment_to(time, gyro, delta_theta)
-        elif time > now:
-            raise InputError(f"time is {time:.9g} s, after the filter's {now:.9g} s; give the gyro sample up to it")
-        events = self._events(time, measured, sigma, reference_f)
-        if increment is not None and time > now:
-            self._process(time, increment, events)
+        if sigma or reference_f:
+            self._update_as(time, gyro, delta_theta, sigma or {}, reference_f or {}, measured)
             return
-        self.repeated += increment is not None
-        if events and not self.look_back and time == now:
-            self._process(now, None, events)
-        elif events:
-            self._go_back(time, events)
-
-    def _increment_to(self, time: float, gyro: ArrayLike | None, delta_theta: ArrayLike | None) -> _Three:
-        """Return the gyro's increment up to a time."""
-        dt = time - self._time
-        if dt < 0.0:
-            raise InputError(f"time is {time:.9g} s, before the filter's {self._time:.9g} s; give samples in order")
-        if gyro is not None and delta_theta is not None:
+        call, turn, at = self._call, kernel.NO_TURN, kernel.FIRST
+        name: str = "time"
+        given: Any = time
+        try:
+            call[0] = time
+            if gyro is not None:
+                name, given, turn = "gyro", gyro, kernel.RATE
+                call[1], call[2], call[3] = given.tolist() if type(given) is np.ndarray else given
+            if delta_theta is not None:
+                name, given, turn = "delta_theta", delta_theta, turn + kernel.INCREMENT
+                call[1], call[2], call[3] = given.tolist() if type(given) is np.ndarray else given
+            for name, given in measured.items():
+                call[at], whole = self._writers[name]
+                if given is None:
+                    call[at + 1] = math.nan
+                elif whole:
+                    call[at + 1], call[at + 2], call[at + 3], call[at + 4] = _quaternion(name, given)
+                else:
+                    call[at + 1], call[at + 2], call[at + 3] = given.tolist() if type(given) is np.ndarray else given
+                at += kernel.STRIDE
+        except KeyError:
+            one_of("sensor", name, self._sensors)
+        except (TypeError, ValueError, OverflowError):
+            raise InputError(
+                f"{name} is {given!r}; give {'one number' if name == 'time' else 'three numbers'}"
+            ) from None
+        if turn > kernel.INCREMENT:
             raise InputError("both gyro and delta_theta are given; give the rate or its integral")
-        name = "delta_theta" if gyro is None else "gyro"
-        given = _three(name, delta_theta if gyro is None else gyro)
-        if given is None:
-            raise InputError(f"{name} has a NaN; omit the sample; the next one then covers both intervals")
-        x, y, z = given
-        if gyro is not None:
-            x, y, z = x * dt, y * dt, z * dt
-        if not max(abs(x), abs(y), abs(z)) <= LARGEST_TURN:
-            raise InputError(f"{name} is {given}, too large for the rotation between two samples; check the unit")
-        return x, y, z
+        code = self._step(self._kind, self._table, len(measured), turn)
+        if code < 0:
+            self._refuse(code, ("delta_theta", delta_theta) if gyro is None else ("gyro", gyro), measured)
+        if turn != kernel.NO_TURN:
+            now, self._time = self._time, call[0]
+            if self._time == now:
+                self.repeated += 1
+            elif self.look_back:
+                self._keep(now, self._report[kernel.LAST])
+        if code == kernel.REPORT:
+            self._take_report()
+        elif code == kernel.PENDING:
+            self._go_back(call[0])
 
-    def _events(
+    def _update_as(
         self,
         time: float,
+        gyro: ArrayLike | None,
+        delta_theta: ArrayLike | None,
+        sigma: Mapping[str, float],
+        reference: Mapping[str, ArrayLike],
         measured: dict[str, Any],
-        sigma: Mapping[str, float] | None,
-        reference: Mapping[str, ArrayLike] | None,
-    ) -> list[_Measured]:
-        """Return the measurements of a call in the order of the sensors, without missing ones."""
-        sensors = self._sensors
-        if sigma or reference or not measured.keys() <= sensors.keys():
-            for name in (*measured, *(sigma or ()), *(reference or ())):
-                one_of("sensor", name, sensors)
-            changed = {*(sigma or ()), *(reference or ())}
-            sensors = sensors | {
-                name: sensors[name].changed((sigma or {}).get(name), (reference or {}).get(name)) for name in changed
-            }
-        events, missing = [], []
-        for name, value in measured.items():
-            event = None if value is None else sensors[name].measured(time, value)
-            if event is None:
-                missing.append(name)
-            else:
-                events.append(event)
-        for name in missing:  # only after all of them have passed the checks
-            self._missing[name] += 1
-        if len(events) > 1:
-            events.sort(key=_order)
-        return events
+    ) -> None:
+        """Update with another σ or reference of some sensors."""
+        for name in (*measured, *sigma, *reference):
+            one_of("sensor", name, self._sensors)
+        declared = self._arrays.declared
+        kept = declared.copy()
+        try:
+            for name in {*sigma, *reference}:
+                place = int(self._writers[name][0])
+                declared[place] = _row(_changed(self._sensors[name], sigma.get(name), reference.get(name)), place)
+            self.update(time, gyro, delta_theta=delta_theta, **measured)
+        finally:
+            declared[:] = kept
 
-    def _go_back(self, time: float, events: list[_Measured]) -> None:
-        """Update with measurements of the past, and repeat the later intervals."""
-        past = self._intervals
-        later: list[_Interval] = []
+    def _refuse(self, code: int, gyro: tuple[str, Any], measured: dict[str, Any]) -> NoReturn:
+        """Raise the error for a sample that the kernel refuses."""
+        time, now, (name, given) = self._call[0], self._time, gyro
+        if code == kernel.TOO_PRECISE:
+            raise forward.TooPreciseError()
+        if code in (kernel.INFINITE, kernel.NO_DIRECTION):
+            name = list(self._sensors)[self._report[kernel.CULPRIT]]
+            given = measured[name]
+        raise InputError(
+            {
+                kernel.NO_TIME: f"time is {time} s; give the time of the sample",
+                kernel.AHEAD: f"time is {time:.9g} s, after the filter's {now:.9g} s; give the gyro sample up to it",
+                kernel.BEHIND: f"time is {time:.9g} s, before the filter's {now:.9g} s; give samples in order",
+                kernel.NO_GYRO: f"{name} has a NaN; omit the sample; the next one then covers both intervals",
+                kernel.INFINITE_GYRO: f"{name} is {given}; give finite numbers",
+                kernel.LARGE_GYRO: f"{name} is {given}, too large for the rotation between two samples; check the unit",
+                kernel.INFINITE: f"{name} is {given}; give finite numbers, or NaN for a missing measurement",
+                kernel.NO_DIRECTION: f"{name} is {given}, which has no direction; give NaN for a missing measurement",
+            }[code]
+        )
+
+    def _keep(self, start: float, number: int) -> None:
+        """Store the last interval while a measurement may still arrive in it."""
+        past, arrays, oldest = self._intervals, self._arrays, self._time - self.look_back - 4.0 * math.ulp(self._time)
+        while past and past[0].end < oldest:
+            past.popleft()
+        rows, increment, before = arrays.rows[:number].copy(), arrays.increment.copy(), arrays.before.copy()
+        past.append(_Interval(start, self._time, increment, rows, before, self._closed))
+
+    def _go_back(self, time: float) -> None:
+        """Update with the measurements in the rows, which are of the past, and repeat the later intervals."""
+        past, number = self._intervals, self._report[kernel.NUMBER]
         # A measurement at the start of an interval belongs to the one before.
         if not past or time < past[0].start or time == past[0].start < past[0].end:
-            self.late += len(events)
+            self.late += number
             return
-        while len(past) > 1 and past[-1].start >= time:
-            later.append(past.pop())
-        here = past.pop()
-        if len(here.events) + len(events) > MOST:
-            past.extend([here, *reversed(later)])
-            raise InputError(f"there are more than {MOST} measurements in one gyro interval; give gyro samples between")
-        (self._state[:], self._closed), self._time = here.before, here.start
-        self._process(here.end, here.increment, sorted([*here.events, *events], key=_order))
-        for one in reversed(later):
-            self._process(one.end, one.increment, one.events)
+        first = len(past) - 1
+        while first > 0 and past[first].start >= time:
+            first -= 1
+        here, state, closed = past[first], self._state.copy(), self._closed
+        rows = np.concatenate([here.rows, self._arrays.rows[:number]])
+        rows = rows[np.lexsort((rows[:, kernel.SENSOR], rows[:, kernel.TIME]))]
+        if len(rows) > len(self._weight):
+            raise InputError(
+                f"there are more than {len(self._weight)} measurements in one gyro interval; give gyro samples between"
+            )
+        self._intervals = deque(past[k] for k in range(first))
+        self._state[:], self._closed = here.before, here.closed
+        try:
+            for one in (here._replace(rows=rows), *(past[k] for k in range(first + 1, len(past)))):
+                self._repeat(one)
+        except InputError:
+            self._intervals, self._closed, self._time, self._state[:] = past, closed, past[-1].end, state
+            self._arrays.clock[0] = self._time
+            raise
 
-    def _process(self, end: float, increment: _Three | None, events: Sequence[_Measured]) -> None:
-        """Walk over an interval from the present state, and store it while a measurement may still arrive in it."""
-        number = len(events)
-        if number > MOST:
-            raise InputError(f"there are more than {MOST} measurements in one gyro interval; give gyro samples between")
-        if self.look_back:
-            past, oldest = self._intervals, end - self.look_back - 4.0 * math.ulp(end)
-            while past and past[0].end < oldest:
-                past.popleft()
-            past.append(_Interval(self._time, end, increment, events, (self._state.copy(), self._closed)))
-        edges, turn = self._gyro_stores
-        edges[0], edges[1] = self._time, end
-        if increment is not None:
-            turn[0], turn[1], turn[2] = increment
-        if number:
-            self._at.fill(events, self._body.length)
-        result = self._kernel(*self._arguments(number, 0 if increment is None else 1))
-        self._time = end
-        self._last = events
-        if number and (self._judged or self._headings):
-            self._count(events)
-        if self._judged and (result[1] or result[2]):
-            self._report(*result[1:])
+    def _repeat(self, one: _Interval) -> None:
+        """Process an interval again."""
+        arrays, number = self._arrays, len(one.rows)
+        arrays.clock[0], self._call[0], arrays.increment[:], arrays.rows[:number] = (
+            one.start,
+            one.end,
+            one.increment,
+            one.rows,
+        )
+        code = self._step(self._kind, self._table, number, kernel.AGAIN)
+        if code == kernel.TOO_PRECISE:
+            raise forward.TooPreciseError()
+        self._time = one.end
+        self._keep(one.start, number)
+        if code == kernel.REPORT:
+            self._take_report()
 
-    def _count(self, events: Sequence[_Measured]) -> None:
-        """Count refused measurements and headings of vertical vectors."""
-        for k, (_, sensor, *_) in enumerate(events):
-            if sensor in self._headings and math.isnan(self._innovation[k, 0]):
-                self._counts[sensor, 1] += 1.0
-            elif self._judged and self._weights[k] == 0.0:
-                self._counts[sensor, 0] += 1.0
-
-    def _report(self, recovered: int, locked: int) -> None:
+    def _take_report(self) -> None:
         """Store the events that the gate reports."""
+        recovered, locked = self._report[1], self._report[2]
         self._closed += self._reported(self._recoveries[:recovered], self._slots[:0])
         opened = self._judge.counters[:, gate_rules.REPORTED]
         for k, row in enumerate(self._lock_outs[:locked]):
@@ -340,7 +410,7 @@ class LiveFilter:
             self._closed += self._reported(self._recoveries[:0], self._slots[sensor : sensor + 1])
             self._slots[sensor] = row
             if opened[sensor] == k:  # if it continues, the kernel finds it in that row
-                opened[sensor] = MOST + sensor
+                opened[sensor] = len(self._weight) + sensor
 
     def _reported(self, recoveries: Array, lock_outs: Array) -> tuple[Event, ...]:
         return tuple(gate_events(recoveries, lock_outs, tuple(self._sensors)))
@@ -355,22 +425,24 @@ class LiveFilter:
     @property
     def attitude(self) -> Array:
         """Attitude q_fb (4,), scalar first."""
-        return np.array(self._body.x[0, :4])
+        return np.array(self._x[:4])
 
     @property
     def bias(self) -> Array:
         """Gyro bias (3,), rad/s, body axes."""
-        return np.array(self._body.x[0, 4:7])
+        return np.array(self._x[4:7])
 
     @property
     def values(self) -> Array:
         """Error states (m,), in the order of their declarations."""
-        return np.array(self._body.x[0, 7:])
+        return np.array(self._x[7:])
 
     @property
     def covariance(self) -> Array:
         """P (6 + m, 6 + m) of the errors (δθ, δb, δc)."""
-        return forward.covariance_at(self._body, 0)
+        if self._whole:
+            return forward.covariance_at(self._body, 0)
+        return forward.state_of_numbers(self._body.state).covariance
 
     @property
     def events(self) -> tuple[Event, ...]:
@@ -386,18 +458,18 @@ class LiveFilter:
     @property
     def skipped(self) -> dict[str, int]:
         """Number of measurements of each sensor that were missing, or headings of a vertical vector."""
-        return {n: self._missing[n] + int(k) for n, k in zip(self._sensors, self._counts[:, 1], strict=True)}
+        return dict(zip(self._sensors, map(int, self._arrays.missing + self._counts[:, 1]), strict=True))
 
     @property
     def innovations(self) -> dict[str, Innovations]:
         """Innovations of the measurements in the last gyro interval, by sensor."""
-        found = {}
+        found, number = {}, self._report[kernel.LAST]
         for place, (name, sensor) in enumerate(self._sensors.items()):
-            rows = [k for k, one in enumerate(self._last) if one[1] == place]
+            rows = np.flatnonzero(self._arrays.sensor[:number] == place)
             part = self._innovation[rows, : 2 * KINDS[sensor.kind]]
-            if rows:
+            if len(rows):
                 found[name] = Innovations(
-                    time=np.array([self._last[k][0] for k in rows]),
+                    time=self._arrays.time[rows],
                     innovation=part[:, 0::2],
                     variance=part[:, 1::2],
                     weight=self._weight[rows] if self._judged else None,
@@ -412,6 +484,8 @@ class LiveFilter:
         State
             Attitude, bias, error states and covariance at ``time``, and the gate's state.
         """
+        if not self._whole:
+            return forward.state_of_numbers(self._body.state.copy())
         model, memory = self._problem.model, self._judge.memory
         candidate = forward.candidate_of(self._body, model) if memory[gate_rules.CANDIDATE] else None
         return copy.deepcopy(forward.state_of(self._body, model, self._judge.remembered(candidate), {}))
@@ -421,91 +495,41 @@ class LiveFilter:
         raise TypeError("a LiveFilter cannot be copied or pickled; start another one from its state()")
 
 
-# ----------------------------------------------------------------------------------------------------------- measurements, one by one
-
-_Three = tuple[float, float, float]
-
-
-class _Row(NamedTuple):
-    """Data of a measurement for the kernels, except its value."""
-
-    frame: tuple[float, ...]
-    """Triad of the reference by rows (9), or the measured quaternion and zeros."""
-    length: float
-    """Length of the reference of a whole vector; else 1."""
-    sigma: float
-    """σ over that length."""
-    noise: tuple[float, ...]
-    """Upper triangle of the covariance in body axes over the squared length (6)."""
-    variances: _Three
-    """Variances of the body axes; the value of an attitude."""
-    isotropic: bool
-    """Whether σ, or for an attitude the variances of the axes, define the noise completely."""
+def restart(live: LiveFilter, state: State, time: float) -> None:
+    """Continue a filter without gate and look-back from another state, of six or of all states, at another time, s."""
+    state, body = modelling.begin(state, live._problem.error_states), live._body
+    if live._whole:
+        n = len(state.covariance)
+        body.x[0] = np.concatenate([state.attitude, state.bias, state.values])
+        body.P[0].reshape(n, -1)[:, :n] = state.covariance
+    else:
+        body.state[:] = pack(state.attitude, state.bias, state.covariance)
+    live._time = live._arrays.clock[0] = time
 
 
-_Measured = tuple[float, int, _Three, _Row]
-"""A measurement: time, index of its sensor, value and further data."""
+def arrays_of(live: LiveFilter) -> tuple[kernel.Live, Array, Array, Array]:
+    """Return the kernel's arrays; attitude, bias and error states; the numbers of P, and the place in them of its first elements (6, 6)."""
+    numbers = live._body.P[0] if live._whole else live._body.state[7:]
+    place = np.arange(len(numbers), dtype=np.float64)
+    n = len(live._x) - 1
+    places = place.reshape(n, -1)[:6, :6] if live._whole else covariance_matrices(place)
+    return live._arrays, live._x, numbers, np.ascontiguousarray(places, np.int64)
 
 
-def _order(one: _Measured) -> tuple[float, int]:
-    return one[0], one[1]
+class _Interval(NamedTuple):
+    """A gyro sample and the measurements in it; with a look-back, the first has no duration."""
+
+    start: float
+    end: float
+    increment: Array
+    rows: Array
+    before: Array
+    """State before it."""
+    closed: tuple[Event, ...]
+    """Closed events before it."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Sensor:
-    """Declaration of a sensor."""
-
-    name: str
-    kind: str
-    place: int
-    reference_f: Array
-    covariance: Array
-    sigma: float
-    row: _Row
-
-    @staticmethod
-    def of(series: VectorMeasurements, place: int) -> _Sensor:
-        reference, noise, sigma = series.references_f[0], series.covariances[0], float(series.sigma[0])
-        row = _row(series.kind, reference, noise, not series.anisotropic, sigma)
-        return _Sensor(series.sensor, series.kind, place, reference, noise, sigma, row)
-
-    def changed(self, sigma: float | None, reference: ArrayLike | None) -> _Sensor:
-        """Return the sensor with another σ or reference."""
-        r = self.reference_f
-        if reference is not None:
-            given = _three(f"{self.name}: reference_f", reference)
-            if given is None or not any(given):
-                raise InputError(f"{self.name}: reference_f is {reference}; give a direction")
-            r = np.array(given if self.kind == "vector" else _unit(given))
-            if self.kind == "heading":
-                need_level(f"{self.name}: reference_f", r)
-        s, covariance = self.sigma, self.covariance
-        if sigma is not None:
-            s = positive(f"{self.name}: sigma", sigma)
-            covariance = s**2 * np.eye(3)
-        return replace(self, row=_row(self.kind, r, covariance, self.row.isotropic, s))
-
-    def measured(self, time: float, value: Any) -> _Measured | None:
-        """Return a measurement; None if it is missing, or a direction of length zero."""
-        row = self.row
-        if self.kind == "attitude":
-            q = np.asarray(value, np.float64)
-            if q.shape == (4,) and np.isnan(q).any():
-                return None
-            frame = (*unit_quaternions(self.name, array(self.name, q, (4,))).tolist(), 0.0, 0.0, 0.0, 0.0, 0.0)
-            return time, self.place, row.variances, row._replace(frame=frame)
-        z = _three(self.name, value)
-        if z is None:
-            return None
-        if self.kind == "vector":
-            return time, self.place, (z[0] / row.length, z[1] / row.length, z[2] / row.length), row
-        x, y, w = z
-        squared = x * x + y * y + w * w
-        if not -UNIT < squared - 1.0 < UNIT:
-            if squared == 0.0:
-                return None
-            z = _unit(z)
-        return time, self.place, z, row
+# ----------------------------------------------------------------------------------------------------------- what the sensors declare
 
 
 def template(sensor: VectorSensor | VectorMeasurements, time: float) -> VectorMeasurements:
@@ -523,89 +547,44 @@ def template(sensor: VectorSensor | VectorMeasurements, time: float) -> VectorMe
     return replace(sensor.taken(slice(0, 1)), time=np.array([time]), arrival=None)
 
 
-def _row(kind: str, reference_f: Array, covariance: Array, isotropic: bool, sigma: float) -> _Row:
-    """Return the row of a measurement with this noise."""
-    length = float(np.linalg.norm(reference_f)) if kind == "vector" else 1.0
-    x, y, z = np.diag(covariance).tolist()
-    return _Row(
-        frame=(0.0,) * 9 if kind == "attitude" else tuple(triad(reference_f).ravel().tolist()),
-        length=length,
-        sigma=sigma / length,
-        noise=tuple((covariance / np.square(length))[UPPER].tolist()),
-        variances=(x, y, z),
-        isotropic=isotropic,
-    )
+def _changed(series: VectorMeasurements, sigma: float | None, reference: ArrayLike | None) -> VectorMeasurements:
+    """Return one measurement of a sensor with another σ or reference."""
+    name, changes = series.sensor, dict[str, Any]()
+    if reference is not None:
+        r = array(f"{name}: reference_f", reference, (3,))
+        if not r.any():
+            raise InputError(f"{name}: reference_f is {reference}; give a direction")
+        if series.kind != "vector":
+            r = r / np.linalg.norm(r / np.abs(r).max()) / np.abs(r).max()
+        if series.kind == "heading":
+            need_level(f"{name}: reference_f", r)
+        changes["reference_f"] = r
+    if sigma is not None:
+        s = positive(f"{name}: sigma", sigma)
+        if not sys.float_info.min <= s * s < math.inf:
+            raise InputError(f"{name}: sigma is {s:g}, whose square is beyond double precision; check the unit")
+        changes |= {"sigma": np.array([s]), "sigma_axes": None, "covariance": None}
+    return replace(series, **changes)
 
 
-def _three(name: str, value: Any) -> _Three | None:
-    """Return three numbers, or None if one is NaN."""
-    try:
-        x, y, z = value.tolist() if isinstance(value, np.ndarray) else value
-        total = x + y + z
-        if math.isfinite(total):
-            return x, y, z
-        infinite = math.isinf(x) or math.isinf(y) or math.isinf(z)
-    except (TypeError, ValueError):
-        raise InputError(f"{name} is {value!r}; give three numbers") from None
-    if infinite:
-        raise InputError(f"{name} is {value}; give finite numbers, or NaN for a missing measurement")
-    return None
+def _row(series: VectorMeasurements, place: int) -> list[float]:
+    """Return a measurement for the kernel, as far as its sensor declares it."""
+    reference, covariance = series.references_f[0], series.covariances[0]
+    length = float(np.linalg.norm(reference)) if series.kind == "vector" else 1.0
+    attitude = series.kind == "attitude"
+    return [
+        *(0.0, float(place)),
+        *(np.diag(covariance) if attitude else np.zeros(3)),
+        *(np.zeros(9) if attitude else triad(reference).ravel()),
+        float(series.sigma[0]) / length,
+        *(covariance / np.square(length))[UPPER],
+        length,
+    ]
 
 
-def _unit(vector: _Three) -> _Three:
-    x, y, z = vector
-    norm = math.hypot(x, y, z)
-    return x / norm, y / norm, z / norm
-
-
-class _Interval(NamedTuple):
-    """A gyro sample and the measurements in it; with a look-back, the first has no duration."""
-
-    start: float
-    end: float
-    increment: _Three | None
-    events: Sequence[_Measured]
-    before: tuple[Array, tuple[Event, ...]]
-    """State and closed events before it."""
-
-
-class _Slots:
-    """Arrays of the measurements of an interval, one after the other, for the kernels."""
-
-    def __init__(self, *, anisotropic: bool) -> None:
-        self.time, self.sigma = np.zeros(MOST), np.ones(MOST)
-        self.sensor = np.zeros(MOST, np.uint8)
-        self.value, self.frame = np.zeros(3 * MOST), np.zeros((MOST, 9))
-        self.noise = np.zeros((MOST if anisotropic else 0, 6))
-        self.place = np.arange(MOST, dtype=np.uint32)
-        # Writing to a memory view takes half the time of writing to an array.
-        self.stores: Any = self.time.data, self.sensor.data, self.value.data
-        self.rows: list[_Row | None] = [None] * MOST
-        """Data of the last measurement in each slot, except its value."""
-
-    def measurements(self, number: int, series: np.ndarray) -> Measurements:
-        """Return the first measurements as the kernels' arguments."""
-        return Measurements(
-            time=read_only(self.time[:number]),
-            place=read_only(self.place[:number]),
-            sensor=read_only(self.sensor[:number]),
-            value=read_only(self.value),
-            sigma=read_only(self.sigma),
-            noise=read_only(self.noise),
-            series=series,
-            triads=read_only(self.frame),
-        )
-
-    def fill(self, events: Sequence[_Measured], length: Array) -> None:
-        """Write measurements, and to ``length`` the divisors of their effects."""
-        (times, sensors, value), rows = self.stores, self.rows
-        for k, (time, sensor, z, row) in enumerate(events):
-            times[k] = time
-            sensors[k] = sensor
-            i = 3 * k
-            value[i], value[i + 1], value[i + 2] = z
-            if rows[k] is not row:
-                rows[k] = row
-                self.frame[k], self.sigma[k], length[k] = row.frame, row.sigma, row.length
-                if len(self.noise):
-                    self.noise[k] = row.noise
+def _quaternion(name: str, value: Any) -> list[float]:
+    """Return a measured quaternion; NaN if it is missing."""
+    q = np.asarray(value, np.float64)
+    if q.shape == (4,) and np.isnan(q).any():
+        return [math.nan] * 4
+    return list(unit_quaternions(name, array(name, q, (4,))).tolist())

@@ -58,7 +58,7 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
 
     See Also
     --------
-    LiveFilter : The same filter compiled, two hundred times faster, with a gate, robust weights and late measurements.
+    LiveFilter : The same filter compiled, five hundred times faster, with a gate, robust weights and late measurements.
 
     Notes
     -----

@@ -15,6 +15,7 @@ import hashlib
 import platform
 import sys
 from collections.abc import Callable, Hashable
+from importlib import import_module
 from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
 from typing import Any, cast
@@ -22,6 +23,8 @@ from typing import Any, cast
 import numpy as np
 
 PACKAGE = __package__
+INTRINSIC = {f"{PACKAGE}.lane_values": f"{PACKAGE}.lanes", f"{PACKAGE}.argument_tables": f"{PACKAGE}.addresses"}
+"""Modules whose functions are compiled by instructions of their own, which the other module writes."""
 
 
 @functools.cache
@@ -137,10 +140,8 @@ def helper(function: FunctionType, parts: tuple[ModuleType, ...] = ()) -> Any:
     from strapdown.kernels.compiler import HelperCompiler
     from strapdown.kernels.tracing import traced
 
-    if function.__module__ == f"{PACKAGE}.lane_values":
-        from strapdown.kernels.lanes import INTRINSICS
-
-        return INTRINSICS[function.__name__]
+    if function.__module__ in INTRINSIC:
+        return import_module(INTRINSIC[function.__module__]).INTRINSICS[function.__name__]
     called = function.__name__ in function.__globals__.get("CALLED", ())
     # It is not called from Python or C: without the two wrappers it compiles in two thirds of the time.
     options = {"forceinline": not called, "no_cpython_wrapper": True, "no_cfunc_wrapper": True, **_options()}
@@ -182,6 +183,14 @@ def compiled(function: Callable[..., Any], *parts: ModuleType) -> Any:
     except (RuntimeError, OSError):  # no writable directory for a cache: compile in every process
         dispatcher._compiler.py_func = twin()
     return dispatcher
+
+
+def address_of(dispatcher: Any, arguments: tuple[Any, ...]) -> int:
+    """Return the address of a compiled function's machine code for arguments of these types."""
+    types = tuple(map(dispatcher.typeof_pyval, arguments))
+    dispatcher.compile(types)
+    compilation = dispatcher.overloads[types]
+    return int(compilation.library.get_pointer_to_function(compilation.fndesc.llvm_func_name))
 
 
 @functools.cache

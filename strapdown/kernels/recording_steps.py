@@ -15,10 +15,26 @@ from strapdown.kernels.algebra import (
     symmetric_minus_outer,
     times_transpose_upper,
     transpose,
+    transpose_times_vector,
 )
+from strapdown.kernels.integration import large_exponential
 from strapdown.kernels.measurement import quaternion_at, vector_at
-from strapdown.kernels.rotation import moved, quaternion_multiply, rotation_matrix, unit
+from strapdown.kernels.rotation import logarithm, moved, quaternion_multiply, renormalized, rotation_matrix, unit
 from strapdown.kernels.state import store_row
+
+
+def follow_gyro(time, rate, attitude):
+    """Write the attitude (n, 4) from the gyro only at each stamp, from that at the first one, by the trapezoidal rule."""
+    q = quaternion_at(attitude, 0)
+    for i in range(1, len(time)):
+        half = 0.5 * (time[i] - time[i - 1])
+        turn = (
+            half * (rate[i - 1, 0] + rate[i, 0]),
+            half * (rate[i - 1, 1] + rate[i, 1]),
+            half * (rate[i - 1, 2] + rate[i, 2]),
+        )
+        q = renormalized(quaternion_multiply(q, large_exponential(turn)))
+        store_row(attitude, i, q)
 
 
 def average_samples(samples, frame, edge, total, number):
@@ -41,6 +57,16 @@ def average_samples(samples, frame, edge, total, number):
             count += 1
         total[i, 0], total[i, 1], total[i, 2] = sx, sy, sz
         number[i] = count
+
+
+def end_steps(attitude, edge, total, number, mean, turn):
+    """Write the mean of the samples of each step in the axes of the body at its end, and the rotation vector over it (k, 3)."""
+    for i in range(len(edge) - 1):
+        begin, end = quaternion_at(attitude, edge[i]), quaternion_at(attitude, edge[i + 1])
+        count = max(number[i], 1.0)
+        fixed = (total[i, 0] / count, total[i, 1] / count, total[i, 2] / count)
+        store_row(mean, i, transpose_times_vector(rotation_matrix(end), fixed))
+        store_row(turn, i, logarithm(quaternion_multiply((begin[0], -begin[1], -begin[2], -begin[3]), end)))
 
 
 def turn_over(time, rate, late, sums, turn):
@@ -170,6 +196,12 @@ def carry_to_stamps(steps, stamps, timing, out):
                         out.covariance[n, i, 3 + j] = mixed[3 * i + j]
                         out.covariance[n, 3 + j, i] = mixed[3 * i + j]
                         out.covariance[n, 3 + i, 3 + j] = P[3 + i, 3 + j]
+
+
+def tilt_factors(level, shares, factor):
+    """Write the factor (k,) on the σ of the tilt at each level of the acceleration (k,)."""
+    for i in range(len(level)):
+        factor[i] = math.sqrt(shares[0] + shares[1] * math.sqrt(level[i]))
 
 
 def low_pass(values, share, result):

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from strapdown import coning, quaternion
+from strapdown import quaternion
 from strapdown.checks import Array, InputError, non_negative
 from strapdown.kernels import recording_steps
 from strapdown.kernels.machine import compiled, read_only
-from strapdown.records.recording import Recording, increments, sampled
+from strapdown.records.recording import Recording, sampled
 
 FIELD_SPAN = 0.2
 """Time difference over which the change of the field, in the frame fixed by the integrated gyro, is fitted for the delay, s."""
@@ -131,7 +131,10 @@ def magnetometer_delay(recording: Recording) -> tuple[float, float]:
 
 def gyro_attitude(recording: Recording) -> Array:
     """Return the attitude (n, 4) from the gyro only at every sample, identity at the first one."""
-    return coning.integrate(increments(recording), coning.ALGORITHMS["one-sample"])
+    attitude = np.empty((len(recording.time), 4))
+    attitude[0] = 1.0, 0.0, 0.0, 0.0
+    compiled(recording_steps.follow_gyro)(read_only(recording.time), read_only(recording.rate), attitude)
+    return attitude
 
 
 def _evidence(recording: Recording, turned: Array) -> tuple[Array, Array, Array, Array]:

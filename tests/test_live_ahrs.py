@@ -1,0 +1,133 @@
+"""The live filter of an IMU against the online estimate of a recording of the same samples, bit for bit."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from strapdown import ahrs
+from strapdown.ahrs import HAND_HELD_WITHOUT_MAGNETOMETER, AhrsParameters, LiveAhrs
+from strapdown.checks import InputError
+from strapdown.randomness import generator
+from strapdown.recordings import Recording, read
+
+DRIFTING = replace(HAND_HELD_WITHOUT_MAGNETOMETER, rate_random_walk=1e-3)
+"""A gyro whose bias is measured in nearly every second at rest."""
+
+
+def swinging(duration=20.0, interval=0.01, jitter=0.0) -> Recording:
+    """A unit at rest, then swung about all axes, then tilted slowly, which is no rest."""
+    draw = generator(11, 0, "samples")
+    time = 50.0 + interval * np.arange(round(duration / interval))
+    time += jitter * draw.uniform(-0.5, 0.5, len(time))
+    since = time - time[0]
+    swing = np.where((since > 0.3 * duration) & (since < 0.7 * duration), 1.0, 0.0)
+    rate = swing[:, None] * np.stack([np.sin(3.0 * since), np.cos(2.0 * since), 0.5 * np.sin(since)], axis=1)
+    tilt = np.radians(0.6) * np.maximum(since - 0.7 * duration, 0.0)
+    rate[since >= 0.7 * duration, 0] += np.radians(0.6)
+    up = np.stack([0.5 * swing * np.sin(since), np.sin(tilt), np.cos(tilt)], axis=1)
+    rate += np.array([2e-3, -1e-3, 5e-4]) + draw.normal(0.0, 1e-3, rate.shape)
+    return Recording(
+        source="swinging", time=time, rate=rate, specific_force=9.81 * up + draw.normal(0.0, 0.05, up.shape)
+    )
+
+
+def with_missing(recording: Recording) -> Recording:
+    """The recording without some samples of the accelerometer, for single stamps and for whole steps of the filter."""
+    force = recording.specific_force.copy()
+    force[7::11] = np.nan
+    force[300:340] = 0.0
+    return replace(recording, specific_force=force)
+
+
+def rows_live(recording: Recording, **options) -> tuple[np.ndarray, ...]:
+    live = LiveAhrs(interval=float(np.median(np.diff(recording.time))), **options)
+    rows = []
+    for time, rate, force in zip(recording.time, recording.rate, recording.specific_force, strict=True):
+        live.update(time, rate, force)
+        rows.append((live.attitude, live.bias, live.variance, live.covariance))
+    assert live.time == recording.time[-1]
+    return tuple(map(np.array, zip(*rows, strict=True)))
+
+
+def need_equal(recording: Recording, parameters: AhrsParameters | None = None, **options) -> ahrs.AhrsEstimate:
+    """Require the same bits in each row but the last; return the estimate of the recording."""
+    found = ahrs.estimate(replace(recording, magnetic_field=None), parameters, full_covariance=True, **options)
+    live = rows_live(found.recording, parameters=parameters, **options)
+    rows = found.estimate
+    for mine, its in zip(live, (rows.attitude, rows.bias, rows.variance, rows.covariance), strict=True):
+        np.testing.assert_array_equal(mine[:-1], its[:-1])
+    return found
+
+
+@pytest.mark.parametrize("parameters", [None, DRIFTING, AhrsParameters()], ids=["hand", "drifting", "six states"])
+def test_each_sample_gives_the_row_of_the_recording(parameters):
+    found = need_equal(with_missing(swinging()), parameters)
+    assert (len(found.rests.last) > 3) == (parameters is DRIFTING)
+    assert found.rests.last.max(initial=0) < 600  # neither the swing nor the slow turn is a rest
+    assert not found.faults.words
+
+
+def test_stamps_that_jitter_and_a_known_delay():
+    need_equal(swinging(interval=1.0 / 286.0, jitter=1e-3), latency=0.003)
+
+
+def test_a_row_of_a_recording_depends_on_the_samples_up_to_it_alone():
+    whole = swinging()
+    half = replace(whole, **{name: getattr(whole, name)[:1000] for name in ("time", "rate", "specific_force")})
+    first, second = (ahrs.estimate(one).estimate for one in (half, whole))
+    np.testing.assert_array_equal(first.attitude[:-1], second.attitude[:999])
+    np.testing.assert_array_equal(first.variance[:-1], second.variance[:999])
+
+
+def test_recordings_in_the_hand_and_of_an_aircraft(broad):
+    need_equal(read(broad / "07_undisturbed_fast_rotation_B.hdf5"))
+    aircraft = broad.parent / "euroc" / "V1_02_medium.hdf5"
+    if not aircraft.exists():
+        pytest.skip("the shared recordings of EuRoC are absent")
+    need_equal(read(aircraft))
+
+
+def test_it_starts_at_the_first_specific_force():
+    live = LiveAhrs(interval=0.01, latency=0.0)
+    live.update(1.0, (0.0, 0.0, 0.1))
+    live.update(1.01, (0.0, 0.0, 0.1), (0.0, 0.0, 0.0))
+    assert np.isnan(live.attitude).all()
+    live.update(1.02, [0.0, 0.0, 0.1], [0.0, 9.81 * np.sin(0.3), 9.81 * np.cos(0.3)])
+    assert 2.0 * np.arctan2(live.attitude[1], live.attitude[0]) == pytest.approx(0.3)
+    assert live.time == 1.02
+
+
+@pytest.mark.parametrize(
+    ("sample", "message"),
+    [
+        ((np.nan, (0, 0, 0), (0, 0, 9.8)), "time is nan s"),
+        ((0.3, (0, 0, 0), (0, 0, 9.8)), "time is 0.3 s, not after the last sample"),
+        ((0.31, (0, np.nan, 0), (0, 0, 9.8)), "gyro has a NaN"),
+        ((0.31, (0, 1e5, 0), (0, 0, 9.8)), r"give finite numbers, rates in rad/s"),
+        ((0.31, (0, 0, 0), (0, 0, np.inf)), r"give finite numbers"),
+        ((0.31, (0, 0), (0, 0, 9.8)), r"gyro is \(0, 0\); give three numbers"),
+        ((0.31, (0, 0, 0), "abc"), r"accelerometer is 'abc'; give three numbers"),
+        ((10**400, (0, 0, 0), (0, 0, 9.8)), r"time is 1000+; give one number"),
+    ],
+)
+def test_bad_samples_are_refused_and_leave_the_filter_as_it_was(sample, message):
+    one, other = LiveAhrs(interval=0.01), LiveAhrs(interval=0.01)
+    for k in range(31):
+        for live in (one, other):
+            live.update(0.01 * k, (0.1, 0.0, 0.2), (0.0, 1.0, 9.7))
+    with pytest.raises(InputError, match=message):
+        one.update(*sample)
+    for k in range(31, 50):
+        for live in (one, other):
+            live.update(0.01 * k, (0.1, 0.0, 0.2), (0.0, 1.0, 9.7))
+    np.testing.assert_array_equal(one.covariance, other.covariance)
+    np.testing.assert_array_equal(one.attitude, other.attitude)
+
+
+def test_samples_far_faster_than_declared_are_refused():
+    live = LiveAhrs(interval=0.01)
+    for k in range(14):
+        live.update(1e-4 * k, (0.1, 0.0, 0.2), (0.0, 1.0, 9.7))
+    with pytest.raises(InputError, match=r"far below 0.01 s, their usual interval"):
+        live.update(14e-4, (0.1, 0.0, 0.2), (0.0, 1.0, 9.7))
