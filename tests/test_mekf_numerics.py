@@ -68,11 +68,11 @@ def bound_of(sigma):
 
 
 def taken_or_refused(sigma, record, process, start, **options):
-    """Run the filter; return None if it refuses measurements of σ, below a millionth of the start's, for want of digits."""
+    """Run the filter; return None if it refuses measurements of σ, sharper than a tenth of an arcsecond, for want of digits."""
     try:
         estimate, end = estimation.run_part(record, process, start, full_covariance=True, **options)
     except InputError as error:
-        assert sigma < 1e-6, error  # noqa: PT017
+        assert sigma < 0.09 * ARCSECOND, error  # noqa: PT017
         assert re.match(REFUSED, str(error)), error  # noqa: PT017
         return None
     assert np.array_equal(np.diag(end.covariance)[:6], estimate.variance[-1])
@@ -334,8 +334,22 @@ MANY = (
         (1e-7, None, 1.0, 1e-3),
         (1e-3, 1e-9, 1.0, 1e-3),
         (ARCSECOND, None, 1.8, 1e-3),
+        (ARCSECOND, None, 3.0, 1e-3),
+        (0.1 * ARCSECOND, None, 1.8, 1e-3),
+        (0.1 * ARCSECOND, None, 3.0, 1e-3),
     ],
-    ids=["1 mrad", "1 arcsecond", "one of 1 arcsecond", "1 µrad", "0.1 µrad", "one of 1 nrad", "from anywhere"],
+    ids=[
+        "1 mrad",
+        "1 arcsecond",
+        "one of 1 arcsecond",
+        "1 µrad",
+        "0.1 µrad",
+        "one of 1 nrad",
+        "from anywhere",
+        "from 3 rad",
+        "0.1 arcsecond from anywhere",
+        "0.1 arcsecond from 3 rad",
+    ],
 )
 def test_variances_are_those_of_the_square_root(sigma, sharp, start_sigma, bound, states):
     """Every variance at every edge; within 60° and from an arcsecond on the estimate too, to as much of its σ."""
