@@ -453,7 +453,7 @@ def _path(scenario: Scenario, setup: FilterSetup, epochs: int) -> _Path:
             )
     states = setup.states
     if states is not None and np.any(states.gyro_temperature_sigma):
-        states = dataclasses.replace(states, gyro_temperature_sigma=())
+        states = dataclasses.replace(states, gyro_temperature_sigma=0.0)
     chosen = dataclasses.replace(setup, states=states)
     problem = prepared(record, chosen, initial_state(setup, attitude[0]))
     problem = dataclasses.replace(problem, model=_model(problem))
@@ -544,6 +544,8 @@ def _left_out(scenario: Scenario, setup: FilterSetup) -> tuple[str, ...]:
     found = [f"gyro {name.replace('_', ' ')}" for name in names if np.any(np.asarray(getattr(spec, name)) > 0.0)]
     if spec.temperature is not None:
         found.append("gyro bias over temperature")
+    if setup.states is not None and np.any(setup.states.gyro_temperature_sigma):
+        found.append("states for the gyro bias over temperature")
     found += [name for name in ("gate", "robust") if getattr(setup, name, None) is not None]
     return tuple(found)
 

@@ -523,6 +523,10 @@ def test_states_without_their_errors_are_a_filter_that_is_too_unsure():
     assert np.abs((found.filter_covariance - estimate.covariance) / scale).max() < 2e-3  # linear there, and here
     assert np.all(found.expected_nees[1:, 0] < 0.9)
     assert found.words.startswith("The filter will be pessimistic")
+    warm = dataclasses.replace(belief, states=dataclasses.replace(belief.states, gyro_temperature_sigma=1e-5))
+    without = covariance.analyse(exact, warm, epochs=4)
+    assert without.left_out == ("states for the gyro bias over temperature",)
+    np.testing.assert_array_equal(without.filter_covariance, found.filter_covariance)
 
 
 def quarter(belief):
