@@ -721,6 +721,20 @@ def test_a_scenario_without_sensors_is_dead_reckoning():
     assert found.rms[-1, 0] / ARCSECOND == pytest.approx(np.sqrt(expected) / ARCSECOND)
 
 
+def test_axes_of_a_gyro_may_differ():
+    """Without sensors and at rest, each axis by itself: white noise and random walk over one step a second or one in ten."""
+    arw, rrw, t = np.array([1e-5, 3e-5, 6e-5]), np.array([2e-6, 0.5e-6, 1e-6]), 100.0
+    spec = GyroSpec(angle_random_walk=arw, rate_random_walk=rrw)
+    for rate in (0.1, 1.0):
+        scenario = Scenario(motion=motion.rest(), gyro=spec, sensors=(), rate=rate, duration=t)
+        C = covariance.analyse(
+            scenario, BELIEF, initial_attitude_sigma=0.0, initial_bias_sigma=0.0, epochs=1
+        ).covariance[-1]
+        expected = np.diag([*(arw**2 * t + rrw**2 * t**3 / 3.0), *(rrw**2 * t)])
+        expected[[0, 1, 2], [3, 4, 5]] = expected[[3, 4, 5], [0, 1, 2]] = -0.5 * rrw**2 * t**2
+        np.testing.assert_allclose(C, expected, rtol=1e-9, atol=1e-24)
+
+
 # ------------------------------------------------------------------------------------------------------- the command line
 
 
