@@ -9,14 +9,16 @@ through the same gains source by source (Maybeck 1979, section 6.8; Gelb 1974, s
   a mean error;
 - errors outside the scenario may be *considered*: each with a standard deviation and a contribution (:class:`Consider`).
 
-Gates, robust updates and other operations that depend on the data are not included.
+The filter is the one that runs over records (:mod:`strapdown.kernels.filter`), with any error states; reported are attitude and whole bias.
+Gates, robust updates and other operations that depend on the data are not included, nor are states for a bias over temperature.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -24,11 +26,25 @@ import numpy as np
 
 from strapdown import coning, gyro, kinematics, quaternion, scenarios, units, vectors
 from strapdown.checks import Array, InputError, count, known_keys, non_negative
-from strapdown.estimation.setup import FilterSetup, modelled_record, need_mekf
-from strapdown.estimation.states import covariance_matrices
+from strapdown.estimation import forward
+from strapdown.estimation.forward import Problem
+from strapdown.estimation.model import Model, assemble
+from strapdown.estimation.schedule import Schedule
+from strapdown.estimation.setup import (
+    FilterSetup,
+    initial_state,
+    measured_motion,
+    modelled_record,
+    need_mekf,
+    prepared,
+    with_sigma,
+)
 from strapdown.gyro import GyroSpec, flicker
-from strapdown.kernels import covariance_loop
-from strapdown.kernels.machine import compiled
+from strapdown.kernels import analysis
+from strapdown.kernels.machine import compiled, read_only
+from strapdown.kernels.measurement import KIND_CODES, Measurements
+from strapdown.kernels.structure import Sensor
+from strapdown.kernels.walk import walk
 from strapdown.randomness import generator
 from strapdown.records import ImuRecord
 from strapdown.results import ByValue, Listed, Listing, figure
@@ -243,7 +259,8 @@ class Analysis(Listed):
         Raises
         ------
         InputError
-            If the filter's noise is not that of the scenario, or the scenario's is not white, so that the bound does not hold.
+            If the filter's noise is not that of the scenario, or the scenario's is not white, or the filter has error states, so that the
+            bound does not hold.
         """
         P = self.filter_covariance
         sigma = self.filter_sigma
@@ -252,7 +269,8 @@ class Analysis(Listed):
         if off.max() > 1e-6:
             raise InputError(
                 "the filter's noise is not that of the scenario, and the Cramér–Rao bound of attitude and bias assumes white noise and a "
-                "random walk of the bias, the same on each axis; analyse a matched filter, without flicker, correlated noise and outliers"
+                "random walk of the bias, the same on each axis; analyse a matched filter without error states, and a scenario without "
+                "flicker, correlated noise and outliers"
             )
         return P
 
@@ -288,26 +306,75 @@ class Analysis(Listed):
 # ------------------------------------------------------------------------------------------------------------- the trajectory
 
 
-class _Rows(NamedTuple):
-    """Scalar rows of measurements."""
+SHIFT = 1e-4
+"""Shift of a measurement for the derivative of its residuals by the noise, relative to the reference. They are linear to 1e-8, those of
+vectors without error."""
 
-    time: Array
-    h: Array
-    """Measurement matrix of each row for the attitude error (r, 3)."""
-    noise: Array
-    """Derivative of each row with respect to the sensor's noise, in the unit of its σ (r, 3)."""
-    filter_variance: Array
-    variance: Array
-    error: Array
-    """Innovation at the truth without noise (r,), due to the sensor's fixed errors."""
-    moving: Array
-    """Change of the row per second of delay, due to the motion of the reference (r,)."""
 
-    @staticmethod
-    def of(time: Array, h: Array, noise: Array, *numbers: Array | float) -> _Rows:
-        """Return the k rows of each measurement (m, k, 3) in sequence, with the numbers broadcast over them."""
-        each = (np.broadcast_to(one, h.shape[:2]).ravel() for one in numbers)
-        return _Rows(np.repeat(time, h.shape[1]), h.reshape(-1, 3), noise.reshape(-1, 3), *each)
+class _Path(NamedTuple):
+    """The true trajectory, divided at every gyro edge and measurement, and the filter along it."""
+
+    scenario: Scenario
+    problem: Problem
+    """The filter over the true rotations between the divisions, with measurements without noise."""
+    attitude: Array
+    """At the divisions (n + 1, 4)."""
+    interval: np.ndarray
+    """Gyro interval of each segment between them (n,)."""
+    kept: np.ndarray
+    """Gyro edges at the epochs."""
+    own: tuple[VectorMeasurements, ...]
+    """The measurements, without noise, with the σ of their sensors."""
+
+    @property
+    def stamps(self) -> Array:
+        """Times of the divisions (n + 1,), s."""
+        return self.problem.record.time
+
+    @property
+    def dt(self) -> Array:
+        """Durations of the segments (n,), s."""
+        return self.problem.record.intervals
+
+    @property
+    def phi(self) -> Array:
+        """True rotation vectors over the segments (n, 3), rad."""
+        return self.problem.record.increments
+
+    @property
+    def events(self) -> Schedule:
+        """The measurements in order of time."""
+        return self.problem.events
+
+    @property
+    def sensors(self) -> Sequence[Any]:
+        """Sensors of the scenario."""
+        return self.scenario.sensors
+
+    def shifted(self, axis: int, shift: float) -> Schedule:
+        """Return the measurements shifted along an axis of their noise: that of a heading pair is in fixed axes, in its reference."""
+        events, along = self.events, shift * np.eye(3)[axis]
+        values, triads = list(events.series_vector_b), events.triads.copy()
+        for i, (kind, sensor) in enumerate(zip(events.kinds, self.sensors, strict=True)):
+            first, moves = events.frames[i]
+            rows = slice(first, first + (len(events.series_time[i]) if moves else 1))
+            if kind == "attitude":
+                triads[rows, :4] = quaternion.multiply(triads[rows, :4], quaternion.exp(along))
+            elif isinstance(sensor, vectors.HeadingPair):
+                triads[rows, 6:8] += along[:2]
+            else:
+                values[i] = values[i] + along
+        return dataclasses.replace(events, series_vector_b=tuple(values), triads=triads)
+
+    def of_events(self, of: Callable[[VectorMeasurements, Any], Array]) -> Array:
+        """Return a number or vector of the measurements of each sensor (m, …) in order of time (events, …)."""
+        events = self.events
+        columns = [of(series, sensor) for series, sensor in zip(self.own, self.sensors, strict=True)]
+        out = np.empty((len(events.time), *columns[0].shape[1:]) if columns else 0)
+        for i, (series, column) in enumerate(zip(self.own, columns, strict=True)):
+            mine = events.sensor == i
+            out[mine] = column[np.searchsorted(series.time, events.time[mine])]
+        return out
 
 
 def _exact(sensor: Any) -> Any:
@@ -317,62 +384,10 @@ def _exact(sensor: Any) -> Any:
     return dataclasses.replace(sensor, **zero, faults=faults)
 
 
-def _rows(
-    sensor: Any, exact: VectorMeasurements, own: VectorMeasurements, held: VectorMeasurements, motion: Any
-) -> _Rows:
-    """Return the rows of a series: ``exact`` without noise, ``own`` with the sensor's σ, ``held`` with that of the filter."""
-    time = exact.time
-    m = len(time)
-    attitude = np.asarray(motion.attitude(time)).reshape(m, 4)
-    faults = sensor.faults
-    more = 1.0 - faults.outlier_probability + faults.outlier_probability * faults.outlier_scale**2
-    if own.attitude is not None:
-        if own.covariance is not None:
-            raise InputError(
-                f"{own.sensor}: noise correlated between body axes is not supported; point the boresight of the sensor along one"
-            )
-        assert own.sigma_axes is not None
-        assert held.sigma_axes is not None
-        assert exact.attitude is not None
-        h = noise = np.broadcast_to(np.eye(3), (m, 3, 3))
-        variance, filter_variance = own.sigma_axes**2, held.sigma_axes**2
-        error = quaternion.log(quaternion.multiply(quaternion.conjugate(attitude), exact.attitude)).reshape(m, 3)
-        return _Rows.of(time, h, noise, filter_variance, variance * more, error, 0.0)
-    R = quaternion.to_matrix(attitude)
-    reference = np.array(exact.references_f)
-    length = np.linalg.norm(reference, axis=1) if own.kind == "vector" else np.ones(m)
-    sigma, filter_sigma = own.sigma / length, held.sigma / length
-    scale = np.divide(sigma, sensor.sigma, out=np.zeros(m), where=sensor.sigma > 0.0)
-    if own.kind == "heading":
-        z_f = np.einsum("mij,mj->mi", R, exact.vector_b)
-        level = np.hypot(z_f[:, 0], z_f[:, 1])
-        tilt = -z_f[:, 2] / level**2
-        h = np.einsum("mij,mi->mj", R, np.stack([tilt * z_f[:, 0], tilt * z_f[:, 1], np.ones(m)], axis=1))[:, None]
-        across = np.stack([z_f[:, 1], -z_f[:, 0], np.zeros(m)], axis=1) / level[:, None]
-        # The noise of a heading pair is that of its baseline, in the fixed frame.
-        own_axes = -across if isinstance(sensor, vectors.HeadingPair) else np.einsum("mij,mi->mj", R, across)
-        noise = own_axes[:, None]
-        cosine = z_f[:, 0] * reference[:, 0] + z_f[:, 1] * reference[:, 1]
-        error = np.arctan2(z_f[:, 0] * reference[:, 1] - z_f[:, 1] * reference[:, 0], cosine)[:, None]
-        noise = noise * scale[:, None, None]
-        return _Rows.of(time, h, noise, filter_sigma[:, None] ** 2, sigma[:, None] ** 2 * more, error, 0.0)
-    frame = np.broadcast_to(vectors.triad(reference), (m, 3, 3))
-    basis = frame @ R
-    h = np.stack([-basis[:, 1], basis[:, 0]], axis=1)
-    z = exact.vector_b / length[:, None]
-    error = np.einsum("mij,mj->mi", basis[:, :2], z)
-    moving: Array | float = 0.0
-    if m > 1 and exact.reference_f.ndim == 2:
-        unit = reference / np.linalg.norm(reference, axis=1, keepdims=True)
-        moving = np.einsum("mij,mj->mi", frame[:, :2], np.gradient(unit, time, axis=0))
-    noise = basis[:, :2] * scale[:, None, None]
-    return _Rows.of(time, h, noise, filter_sigma[:, None] ** 2, sigma[:, None] ** 2 * more, error, moving)
-
-
-def _all_rows(scenario: Scenario, setup: FilterSetup) -> list[_Rows]:
+def _observed(scenario: Scenario) -> list[VectorMeasurements]:
+    """Return the measurements of each sensor without noise, with the σ of the sensor."""
     start, end = scenario.edges[0], scenario.edges[-1]
-    exact: list[VectorMeasurements] = []
-    own: list[VectorMeasurements] = []
+    found = []
     for sensor in scenario.sensors:
         kinds = (
             vectors.VectorSensor,
@@ -386,22 +401,75 @@ def _all_rows(scenario: Scenario, setup: FilterSetup) -> list[_Rows]:
             raise InputError(
                 f"{sensor.name} is a {type(sensor).__name__}, whose noise the analysis does not support; remove it"
             )
-        # The same seed for each, so that the same samples are lost.
-        for one, found in ((sensor, own), (_exact(sensor), exact)):
-            found.append(one.observe(scenario.motion, start, end, generator(scenario.seed, 0, sensor.name)))
-    step = dataclasses.replace(setup, integration=coning.ALGORITHMS["one-sample"])
-    record = ImuRecord(time=np.array([start, end]), increments=np.zeros((1, 3)), vectors=tuple(own))
-    held = modelled_record(record, step).vectors
-    for series in held:
-        if series.anisotropic:
-            raise InputError(
-                f"{series.sensor}: the analysis takes one sigma for a {series.kind}, not one per axis; give one number in [filter.sigma]"
-            )
+        # The same seed for both, so that the same samples are lost.
+        own, exact = (
+            one.observe(scenario.motion, start, end, generator(scenario.seed, 0, sensor.name))
+            for one in (sensor, _exact(sensor))
+        )
+        found.append(
+            dataclasses.replace(own, vector_b=exact.vector_b, attitude=exact.attitude, reference_f=exact.reference_f)
+        )
+    return found
+
+
+def _length(series: VectorMeasurements) -> Array:
+    """Return the length (m,) by which the measurements of a series are divided: that of the reference of whole vectors."""
+    return np.linalg.norm(series.references_f, axis=1) if series.kind == "vector" else np.ones(len(series.time))
+
+
+def _unit(series: VectorMeasurements, sensor: Any) -> Array:
+    """Return a unit of the sensor along the axes of the noise of each measurement (m,)."""
+    sigma = 0.0 if series.attitude is not None else sensor.sigma
+    one = np.ones(len(series.time))
+    return np.divide(series.sigma / _length(series), sigma, out=one, where=sigma > 0.0)
+
+
+def _noise(series: VectorMeasurements, sensor: Any) -> Array:
+    """Return the covariance of the white noise of each measurement (m, 6) along its axes, with that of outliers."""
+    faults = sensor.faults
+    more = 1.0 - faults.outlier_probability + faults.outlier_probability * faults.outlier_scale**2
+    whole = series.covariances * (more / _length(series) ** 2)[:, None, None]
+    return np.asarray(whole[:, *np.triu_indices(3)])
+
+
+def _path(scenario: Scenario, setup: FilterSetup, epochs: int) -> _Path:
+    """Return the trajectory of a scenario with the filter of a setup along it."""
+    need_mekf(setup, "the covariance analysis")
+    samples = setup.integration.samples
+    steps = (len(scenario.edges) - 1) // samples
+    if steps < count("epochs", epochs):
+        raise InputError(f"{steps} filter steps are fewer than {epochs} epochs; use fewer epochs, or a longer scenario")
+    edges = scenario.edges[: steps * samples + 1]  # like the filter, without an incomplete last step
+    own = _observed(scenario)
+    times = np.concatenate([np.empty(0), *(series.time for series in own)])
+    stamps = np.union1d(edges, times[(times >= edges[0]) & (times <= edges[-1])])
+    attitude = scenario.motion.attitude(stamps)
+    phi = quaternion.log(quaternion.multiply(quaternion.conjugate(attitude[:-1]), attitude[1:]))
+    record = with_sigma(ImuRecord(time=stamps, increments=phi, vectors=tuple(own)), setup)
+    for series in record.vectors:
         if not np.all(series.sigma > 0.0):
             raise InputError(
                 f"{series.sensor}: sigma is 0; a filter needs a noise greater than zero: give the sensor one, or [filter.sigma]"
             )
-    return [_rows(s, e, o, b, scenario.motion) for s, e, o, b in zip(scenario.sensors, exact, own, held, strict=True)]
+    states = setup.states
+    if states is not None and np.any(states.gyro_temperature_sigma):
+        states = dataclasses.replace(states, gyro_temperature_sigma=0.0)
+    chosen = dataclasses.replace(setup, states=states)
+    problem = prepared(record, chosen, initial_state(setup, attitude[0]))
+    problem = dataclasses.replace(problem, model=_model(problem))
+    if problem.model.levers.any():
+        # The angular acceleration is that of a run: how much it is smoothed depends on the gyro's noise.
+        motion = measured_motion(modelled_record(scenarios.simulate(scenario), chosen), chosen)
+        problem = dataclasses.replace(problem, motion=motion)
+    every = steps // epochs * samples
+    return _Path(
+        scenario=scenario,
+        problem=problem,
+        own=tuple(own),
+        attitude=attitude,
+        interval=np.clip(np.searchsorted(edges, stamps[:-1], side="right") - 1, 0, len(edges) - 2),
+        kept=np.arange(0, steps * samples + 1, every),
+    )
 
 
 # ------------------------------------------------------------------------------------------------------------------- errors
@@ -446,7 +514,6 @@ def _integration_rate(scenario: Scenario, setup: FilterSetup, stamps: Array, att
     Inside a step the error ``e(t) = Log(exp(−share φ) ⊗ q_true(t))`` from its start is exact; the result is the rate that generates it.
     """
     n = setup.integration.samples
-    need_mekf(setup, "the covariance analysis")
     edges = scenario.edges
     steps = (len(edges) - 1) // n
     turns = coning.rotation_vectors(scenario.motion.increments(edges[: steps * n + 1]), setup.integration)
@@ -477,12 +544,16 @@ def _left_out(scenario: Scenario, setup: FilterSetup) -> tuple[str, ...]:
     found = [f"gyro {name.replace('_', ' ')}" for name in names if np.any(np.asarray(getattr(spec, name)) > 0.0)]
     if spec.temperature is not None:
         found.append("gyro bias over temperature")
-    found += [name for name in ("gate", "robust", "states") if getattr(setup, name, None) is not None]
+    if setup.states is not None and np.any(setup.states.gyro_temperature_sigma):
+        found.append("states for the gyro bias over temperature")
+    found += [name for name in ("gate", "robust") if getattr(setup, name, None) is not None]
     return tuple(found)
 
 
-def _beyond_linear(attitude_sigma: float, columns: list[_Column], consider: Consider) -> list[str]:
-    """Return the errors that are too large for the analysis, in words."""
+def _beyond_linear(
+    attitude_sigma: float, columns: list[_Column], sizes: Sequence[float], consider: Consider
+) -> list[str]:
+    """Return the errors that are too large for the analysis, in words; ``sizes``: the largest error of a sensor by column, rad."""
     found = []
     if attitude_sigma > LARGEST_LINEAR:
         found.append(f"initial attitude, 1σ {attitude_sigma / DEGREE:.3g}°")
@@ -491,10 +562,9 @@ def _beyond_linear(attitude_sigma: float, columns: list[_Column], consider: Cons
     if consider.misalignment > LARGEST_LINEAR:
         found.append(f"misalignment, 1σ {consider.misalignment / DEGREE:.3g}°")
     largest: dict[str, float] = {}
-    for column in columns:
-        if column.rows is not None:
-            name = column.name.partition(",")[0]  # the largest over the axes of a considered error
-            largest[name] = max(largest.get(name, 0.0), float(np.abs(column.rows).max(initial=0.0)))
+    for column, size in zip(columns, sizes, strict=True):
+        name = column.name.partition(",")[0]  # the largest over the axes of a considered error
+        largest[name] = max(largest.get(name, 0.0), size)
     return found + [f"{name}, up to {size / DEGREE:.3g}°" for name, size in largest.items() if size > LARGEST_LINEAR]
 
 
@@ -503,79 +573,30 @@ def _axes(value: Any) -> Array:
 
 
 def _diagonal(attitude_sigma: float, bias_sigma: float) -> Array:
-    """Return the 21 numbers of a diagonal covariance."""
-    block = np.zeros(21)
-    block[[0, 3, 5]] = attitude_sigma**2
-    block[[15, 18, 20]] = bias_sigma**2
-    return block
-
-
-class _Path(NamedTuple):
-    """The trajectory divided at every gyro edge and measurement, and the rows of all sensors in order of time."""
-
-    stamps: Array
-    """Times of the divisions (n + 1,), s."""
-    attitude: Array
-    dt: Array
-    """Durations of the segments (n,), s."""
-    phi: Array
-    """True rotation vectors over the segments (n, 3), rad."""
-    interval: np.ndarray
-    """Gyro interval of each segment (n,)."""
-    rows: _Rows
-    sensor: np.ndarray
-    """Index of the sensor of each row."""
-    kept: np.ndarray
-    """Gyro edges at the epochs."""
-
-
-def _path(scenario: Scenario, setup: FilterSetup, epochs: int) -> _Path:
-    steps = (len(scenario.edges) - 1) // setup.integration.samples
-    if steps < count("epochs", epochs):
-        raise InputError(f"{steps} filter steps are fewer than {epochs} epochs; use fewer epochs, or a longer scenario")
-    edges = scenario.edges[: steps * setup.integration.samples + 1]  # like the filter, without an incomplete last step
-    parts = _all_rows(scenario, setup)
-    none = _Rows(np.empty(0), *np.empty((2, 0, 3)), *np.empty((4, 0)))
-    joined = [np.concatenate(part) for part in zip(none, *parts, strict=True)]
-    order = np.argsort(joined[0], kind="stable")[: np.sum(joined[0] <= edges[-1])]
-    rows = _Rows(*(np.ascontiguousarray(part[order]) for part in joined))
-    stamps = np.union1d(edges, rows.time)
-    attitude = scenario.motion.attitude(stamps)
-    every = steps // epochs * setup.integration.samples
-    return _Path(
-        stamps=stamps,
-        attitude=attitude,
-        dt=np.diff(stamps),
-        phi=quaternion.log(quaternion.multiply(quaternion.conjugate(attitude[:-1]), attitude[1:])),
-        interval=np.clip(np.searchsorted(edges, stamps[:-1], side="right") - 1, 0, len(edges) - 2),
-        rows=rows,
-        sensor=np.repeat(np.arange(len(parts)), [len(part.time) for part in parts])[order],
-        kept=np.arange(0, steps * setup.integration.samples + 1, every),
-    )
+    """Return a diagonal covariance of attitude and bias (6, 6)."""
+    return np.diag([attitude_sigma**2] * 3 + [bias_sigma**2] * 3)
 
 
 class _Random:
-    """Sources of random error, as the kernel takes them; the filter's model is the first."""
+    """Sources of random error, as the kernel takes them."""
 
-    def __init__(self, setup: FilterSetup) -> None:
-        noise = setup.process_noise
-        self.names = ["filter"]
-        self.angle = [np.full(3, noise.angle_random_walk**2)]
-        self.rate = [np.full(3, noise.rate_random_walk**2)]
-        self.sensor = [-2]
-        self.blocks = [_diagonal(setup.attitude_sigma, setup.bias_sigma)]
-        self.shapes: list[tuple[int, Array, Array, Array, Array]] = []
+    def __init__(self) -> None:
+        self.names: list[str] = []
+        self.angle: list[Array] = []
+        self.rate: list[Array] = []
+        self.initial: list[Array] = []
+        """Covariance of attitude and bias at the first edge (6, 6)."""
+        self.rates: list[tuple[int, Array, Array, Array, Array]] = []
         """Source, amplitude (3,), gains, poles and X g of each coloured bias."""
-        self.coloured: list[tuple[int, int, float, float]] = []
-        """Source, sensor, σ and correlation time of each coloured noise."""
+        self.noises: list[tuple[int, int, float, float]] = []
+        """Source, sensor, σ and correlation time of the noise of sensors; zero of white noise."""
 
-    def add(self, name: str, *, angle: Any = 0.0, rate: Any = 0.0, sensor: int = -1, block: Array | None = None) -> int:
-        """Add a source: white densities of angle and bias, or the noise of a sensor, or an initial covariance."""
+    def add(self, name: str, *, angle: Any = 0.0, rate: Any = 0.0, initial: Array | None = None) -> int:
+        """Add a source: white densities of angle and bias, or an initial covariance; return its index."""
         self.names.append(name)
         self.angle.append(_axes(angle))
         self.rate.append(_axes(rate))
-        self.sensor.append(sensor)
-        self.blocks.append(np.zeros(21) if block is None else block)
+        self.initial.append(np.zeros((6, 6)) if initial is None else initial)
         return len(self.names) - 1
 
     def add_gyro(self, spec: GyroSpec, sample_interval: float, samples: int) -> None:
@@ -589,49 +610,68 @@ class _Random:
         instability = _axes(spec.bias_instability)
         if np.any(instability > 0.0):
             shaping = flicker.shaping(samples)
-            projected = shaping.covariance @ shaping.gains
-            self.shapes.append((self.add("flicker"), instability, shaping.gains, shaping.poles, projected))
+            self._add_rate("flicker", instability, shaping.gains, shaping.poles, shaping.covariance @ shaping.gains)
         if np.isfinite(tau) and np.any(markov > 0.0):
             pole = np.array([np.exp(-sample_interval / tau)])
-            self.shapes.append(
-                (self.add("Gauss–Markov bias"), markov * np.sqrt(0.5 * tau), np.ones(1), pole, np.ones(1))
-            )
+            self._add_rate("Gauss–Markov bias", markov * np.sqrt(0.5 * tau), np.ones(1), pole, np.ones(1))
+
+    def _add_rate(self, name: str, amplitude: Array, gains: Array, poles: Array, power: Array) -> None:
+        source = self.add(name, initial=np.diag([0.0, 0.0, 0.0, *(amplitude**2 * (gains @ power))]))
+        self.rates.append((source, amplitude, gains, poles, power))
 
     def add_sensor(self, number: int, sensor: Any) -> None:
         """Add the noise terms of a sensor."""
-        self.add(sensor.name, sensor=number)
+        self.noises.append((self.add(sensor.name), number, 0.0, 0.0))
         faults = sensor.faults
         if faults.correlated_sigma > 0.0:
             source = self.add(f"{sensor.name}, correlated")
-            self.coloured.append((source, number, faults.correlated_sigma, faults.correlation_time))
+            self.noises.append((source, number, faults.correlated_sigma, faults.correlation_time))
 
-    def shaping(self) -> covariance_loop.Shapes:
-        """Return the coloured biases for the kernel, and give their sources the initial covariance.
+    def coloured_rates(self, n: int) -> analysis.Rates:
+        """Return the coloured biases for the kernel, for n states.
 
         The filter's initial bias differs by its prior from the *whole* true bias, so its initial bias error contains −f.
         """
-        number, most = len(self.shapes), max([1, *(len(gains) for _, _, gains, _, _ in self.shapes)])
+        number, most = len(self.rates), max([1, *(len(gains) for _, _, gains, _, _ in self.rates)])
         table = np.zeros((3, number, most))
-        amplitudes, cross = np.zeros((number, 3)), np.zeros((number, 6, 3, most))
-        for c, (source, amplitude, gains, poles, projected) in enumerate(self.shapes):
-            n = len(gains)
-            table[:, c, :n] = gains, poles, projected
+        amplitudes, cross = np.zeros((number, 3)), np.zeros((number, 3, most, n))
+        for c, (_, amplitude, gains, poles, power) in enumerate(self.rates):
+            m = len(gains)
+            table[:, c, :m] = gains, poles, power
             amplitudes[c] = amplitude
             for a in range(3):
-                cross[c, 3 + a, a, :n] = -(amplitude[a] ** 2) * projected
-            self.blocks[source][[15, 18, 20]] = amplitude**2 * (gains @ projected)
-        sources = np.array([source for source, *_ in self.shapes], np.int64)
-        return covariance_loop.Shapes(amplitudes, table[0], table[1], table[2], cross, sources)
+                cross[c, a, :m, 3 + a] = -(amplitude[a] ** 2) * power
+        sources = np.array([source for source, *_ in self.rates], np.int64)
+        return analysis.Rates(amplitudes, table[0], table[1], table[2], cross, sources)
+
+    def sensor_noises(self, n: int, start: float) -> analysis.Noises:
+        """Return the noises of sensors for the kernel, for n states."""
+        table, number = np.array(self.noises).reshape(-1, 4), len(self.noises)
+        return analysis.Noises(
+            sensor=table[:, 1].astype(np.int64),
+            sigma=table[:, 2].copy(),
+            time=table[:, 3].copy(),
+            cross=np.zeros((number, 3, n)),
+            source=table[:, 0].astype(np.int64),
+            last=np.full(number, start),
+        )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Column:
-    """A deterministic error: a rate error in each segment (n, 3), an error in each row (r,), a rate ramp (3,)."""
+    """A deterministic error of the gyro or of a sensor."""
 
     name: str
     rate: Array | None = None
-    rows: Array | None = None
+    """Error of the rate in each segment (n, 3), rad/s."""
     ramp: Array = field(default_factory=lambda: np.zeros(3))
+    """Ramp of the bias (3,), rad/s²."""
+    turn: Array | None = None
+    """Rotation of a sensor at each measurement (events, 3), rad."""
+    offset: Array | None = None
+    """Error in the unit of a sensor along the axes of its noise at each measurement (events, 3)."""
+    sensor: int = -1
+    """Sensor whose own errors the column is."""
 
 
 def _fixed_columns(scenario: Scenario, setup: FilterSetup, path: _Path) -> list[_Column]:
@@ -642,11 +682,7 @@ def _fixed_columns(scenario: Scenario, setup: FilterSetup, path: _Path) -> list[
         columns.append(_Column(name=f"integration ({setup.integration.name})", rate=integration))
     if np.any(_axes(scenario.gyro.rate_ramp) != 0.0):
         columns.append(_Column(name="rate ramp", ramp=_axes(scenario.gyro.rate_ramp)))
-    for i, sensor in enumerate(scenario.sensors):
-        mine = np.where(path.sensor == i, path.rows.error, 0.0)
-        if np.abs(mine).max(initial=0.0) > MIN_ERROR:
-            columns.append(_Column(name=f"{sensor.name} (fixed)", rows=mine))
-    return columns
+    return columns + [_Column(name=f"{sensor.name} (fixed)", sensor=i) for i, sensor in enumerate(scenario.sensors)]
 
 
 def _considered_columns(scenario: Scenario, consider: Consider, path: _Path) -> list[_Column]:
@@ -672,18 +708,32 @@ def _considered_columns(scenario: Scenario, consider: Consider, path: _Path) -> 
         for what, sigma, driver, where, i, j in entries
         if sigma > 0.0
     ]
-    names, rows = [sensor.name for sensor in scenario.sensors], path.rows
+    names = [sensor.name for sensor in scenario.sensors]
 
-    def of_sensor(name: str, what: str, error: Array) -> _Column:
-        return _Column(name=f"{name} {what}", rows=np.where(path.sensor == names.index(name), error, 0.0))
+    def at(name: str) -> Array:
+        """Return 1 for the measurements of a sensor (events, 1)."""
+        return np.asarray((path.events.sensor == names.index(name))[:, None], np.float64)
 
-    for what, of_axis, sizes in (("bias", rows.noise, consider.sensor_bias), ("mounting", rows.h, consider.mounting)):
-        for name, size in sizes.items():
-            columns += [of_sensor(name, f"{what}, {AXES[i]}", size * of_axis[:, i]) for i in axes]
+    for name, size in consider.sensor_bias.items():
+        columns += [_Column(name=f"{name} bias, {AXES[i]}", offset=size * at(name) * unit[i]) for i in axes]
+    for name, size in consider.mounting.items():
+        columns += [_Column(name=f"{name} mounting, {AXES[i]}", turn=size * at(name) * unit[i]) for i in axes]
     for name, size in consider.time_offset.items():
-        late = np.einsum("ri,ri->r", rows.h, scenario.motion.body_rate(rows.time)) + rows.moving
-        columns.append(of_sensor(name, "time offset", size * late))
+        late = size * at(name)
+        turn = late * scenario.motion.body_rate(path.events.time)
+        moving = path.of_events(lambda series, sensor: _moving(series, sensor, scenario))
+        columns.append(_Column(name=f"{name} time offset", turn=turn, offset=late * moving))
     return columns
+
+
+def _moving(series: VectorMeasurements, sensor: Any, scenario: Scenario) -> Array:
+    """Return the rate of the reference's direction in the unit of the sensor, body axes (m, 3), 1/s; zero of a heading."""
+    if series.reference_f.ndim < 2 or len(series.time) < 2 or series.kind not in ("direction", "vector"):
+        return np.zeros((len(series.time), 3))
+    direction = series.reference_f / np.linalg.norm(series.reference_f, axis=1, keepdims=True)
+    rate = np.gradient(direction, series.time, axis=0)
+    back = quaternion.conjugate(scenario.motion.attitude(series.time))
+    return np.asarray(quaternion.rotate(back, rate) / _unit(series, sensor)[:, None])
 
 
 # ------------------------------------------------------------------------------------------------------------------ analysis
@@ -705,7 +755,8 @@ def analyse(
     scenario : Scenario, str or path
         See :func:`strapdown.scenarios.simulate`.
     setup : FilterSetup, optional
-        Filter to analyse. Default: matched to the scenario (:meth:`strapdown.estimation.setup.FilterSetup.for_scenario`).
+        Filter to analyse, with its error states. Default: matched to the scenario
+        (:meth:`strapdown.estimation.setup.FilterSetup.for_scenario`).
     consider : Consider, optional
         Errors in addition to those of the scenario.
     initial_attitude_sigma, initial_bias_sigma : float, optional
@@ -735,7 +786,7 @@ def analyse(
     >>> print(found)  # doctest: +SKIP
     """
     scenario = scenarios.chosen(scenario)
-    setup = FilterSetup.for_scenario(scenario, states=False) if setup is None else setup
+    setup = FilterSetup.for_scenario(scenario) if setup is None else setup
     consider = Consider() if consider is None else consider
     _check_considered(scenario, consider)
     edges = scenario.edges
@@ -744,39 +795,58 @@ def analyse(
     _size("initial_attitude_sigma", attitude_sigma, unit="rad")
     _size("initial_bias_sigma", bias_sigma, unit="rad/s")
     path = _path(scenario, setup, epochs)
-    random = _Random(setup)
-    random.add("initial attitude", block=_diagonal(attitude_sigma, 0.0))
-    random.add("initial bias", block=_diagonal(0.0, bias_sigma))
+    random = _Random()
+    random.add("initial attitude", initial=_diagonal(attitude_sigma, 0.0))
+    random.add("initial bias", initial=_diagonal(0.0, bias_sigma))
     random.add_gyro(scenario.gyro, float(edges[1] - edges[0]), len(edges) - 1)
     for i, sensor in enumerate(scenario.sensors):
         random.add_sensor(i, sensor)
     fixed = _fixed_columns(scenario, setup, path)
     columns = [*fixed, *_considered_columns(scenario, consider, path)]
-    out = _propagated(path, edges, random, columns, len(fixed), len(scenario.sensors))
-    whole = covariance_matrices(out.blocks)
+    out = _propagated(scenario, path, random, columns, len(fixed))
+    sizes = _sizes(path, columns, out.residual)
+    real = [k for k, column in enumerate(fixed) if column.sensor < 0 or sizes[k] > MIN_ERROR]
+    fast = np.zeros((len(out.P), 6, 6))
+    if setup.states is not None:
+        fast[:] = np.diag([0.0] * 3 + [setup.states.gyro_fast_bias_sigma**2] * 3)
+        fast[0] *= -1.0  # the initial bias contains this part, so its error does not
     found = Analysis(
         time=edges[path.kept],
-        filter_covariance=whole[:, 0],
-        sources=tuple(random.names[1:]),
-        contributions=whole[:, 1:],
-        fixed=tuple(column.name for column in fixed),
-        fixed_errors=out.columns[:, : len(fixed)],
+        filter_covariance=out.P[:, 0] + fast,
+        sources=tuple(random.names),
+        contributions=out.P[:, 1:],
+        fixed=tuple(fixed[k].name for k in real),
+        fixed_errors=out.columns[:, real],
         considered=tuple(column.name for column in columns[len(fixed) :]),
         considered_errors=out.columns[:, len(fixed) :],
         expected_nis={
-            sensor.name: float(total / seen)
-            for sensor, (total, seen) in zip(scenario.sensors, out.nis, strict=True)
-            if seen > 0.0
+            sensor.name: float(total / rows)
+            for sensor, (total, rows) in zip(scenario.sensors, out.nis, strict=True)
+            if rows > 0.0
         },
         left_out=_left_out(scenario, setup),
         beyond_linear=(),
     )
-    beyond = _beyond_linear(attitude_sigma, columns, consider)
+    beyond = _beyond_linear(attitude_sigma, columns, sizes, consider)
     errors = found.rms[:, :3].max(axis=1)
     epoch = int(np.argmax(errors))
     if errors[epoch] > LARGEST_LINEAR:
         beyond.append(f"the attitude error itself, {errors[epoch] / DEGREE:.3g}° at {found.time[epoch]:.6g} s")
     return dataclasses.replace(found, beyond_linear=tuple(beyond))
+
+
+def _sizes(path: _Path, columns: Sequence[_Column], residual: Array) -> list[float]:
+    """Return the largest error of a measurement by each column, rad; 0 for errors of the gyro."""
+    unit = path.of_events(_unit)
+    sizes = []
+    for column in columns:
+        size = 0.0
+        if column.sensor >= 0:
+            size = float(np.abs(residual[path.events.sensor == column.sensor]).max(initial=0.0))
+        for error in (column.turn, None if column.offset is None else column.offset * unit[:, None]):
+            size = max(size, 0.0 if error is None else float(np.abs(error).max(initial=0.0)))
+        sizes.append(size)
+    return sizes
 
 
 def _check_considered(scenario: Scenario, consider: Consider) -> None:
@@ -796,53 +866,95 @@ def _check_considered(scenario: Scenario, consider: Consider) -> None:
 
 
 def _propagated(
-    path: _Path, edges: Array, random: _Random, columns: list[_Column], fixed: int, sensors: int
-) -> covariance_loop.Outputs:
+    scenario: Scenario, path: _Path, random: _Random, columns: list[_Column], fixed: int
+) -> analysis.Outputs:
     """Propagate the covariance of each random source and each deterministic error through the filter's gains."""
-    rows, coloured = path.rows, random.coloured
-    with_rate = [k for k, column in enumerate(columns) if column.rate is not None]
-    place = np.full(len(columns), -1)
-    place[with_rate] = np.arange(len(with_rate))
-    column_rate = np.zeros((len(path.dt), len(with_rate), 3))
-    row_error = np.zeros((len(rows.time), len(columns)))
-    for k, column in enumerate(columns):
-        if column.rate is not None:
-            column_rate[:, place[k]] = column.rate
-        if column.rows is not None:
-            row_error[:, k] = column.rows
-
-    stations = np.searchsorted(path.stamps, edges[path.kept])
-    shapes = random.shaping()  # must precede reading of the blocks
-    new_sample = np.concatenate([[False], np.diff(path.interval) > 0])
-    row_bounds = np.append(np.searchsorted(rows.time, path.stamps, side="left"), len(rows.time))
-    out = covariance_loop.Outputs(
-        stations=stations,
-        blocks=np.empty((len(stations), len(random.names), 21)),
-        columns=np.empty((len(stations), len(columns), 6)),
-        nis=np.zeros((sensors, 2)),
+    problem, events, kept = path.problem, path.events, len(path.kept)
+    kernels = forward.instance_of(problem.model)
+    n, W, sources = kernels.N, kernels.W, len(random.names)
+    body = forward.filter_body(problem, forward.unit_sigmas(problem.record, problem.model, {}))
+    contributions = np.zeros((sources, n, W))
+    contributions[:, :6, :6] = random.initial
+    # Their arrays must outlive the kernel, which reads them by their addresses.
+    shifted = [path.shifted(axis, shift) for axis, shift in itertools.product(range(3), (SHIFT, -SHIFT))]
+    out = analysis.Outputs(
+        stations=np.searchsorted(path.stamps, scenario.edges[path.kept]),
+        P=np.empty((kept, 1 + sources, 6, 6)),
+        columns=np.empty((kept, len(columns), 6)),
+        residual=np.zeros((len(events.time), 3)),
+        nis=np.zeros((len(scenario.sensors), 2)),
     )
-    compiled(covariance_loop.run_covariance)(
-        covariance_loop.Path(path.dt, np.ascontiguousarray(path.phi), new_sample, row_bounds),
-        covariance_loop.Rows(
-            rows.h, rows.noise, rows.filter_variance, rows.variance, path.sensor, rows.time, row_error
-        ),
-        covariance_loop.White(*(np.array(of) for of in (random.angle, random.rate, random.sensor, random.blocks))),
-        shapes,
-        covariance_loop.Coloured(
-            sensor=np.array([number for _, number, _, _ in coloured], np.int64),
-            sigma=np.array([sigma for _, _, sigma, _ in coloured], np.float64),
-            time=np.array([tau for *_, tau in coloured], np.float64),
-            cross=np.zeros((len(coloured), 6, 3)),
-            source=np.array([source for source, *_ in coloured], np.int64),
-            seen=np.full(len(coloured), path.stamps[0]),
-        ),
-        covariance_loop.Columns(
-            rate=column_rate,
-            place=place,
-            ramp=np.array([column.ramp for column in columns]).reshape(-1, 3),
-            fixed=fixed,
-            value=np.zeros((len(columns), 6)),
+    compiled(walk, analysis, kernels)(
+        *problem.gyro,
+        _measurements(events),
+        1,
+        analysis.Body(
+            filter=body,
+            quiet=body.model._replace(angle_variance=0.0, rate_variance=0.0, chains=body.model.chains * [1.0, 0.0]),
+            coefficients=np.zeros_like(body.coefficients),
+            sources=analysis.Sources(np.array(random.angle), np.array(random.rate), contributions.reshape(sources, -1)),
+            rates=random.coloured_rates(n),
+            noises=random.sensor_noises(n, path.stamps[0]),
+            columns=_for_kernel(path, columns, fixed, n),
+            truth=path.attitude,
+            begins_sample=np.concatenate([[False], np.diff(path.interval) > 0, [False]]),
+            shifted=tuple(map(_measurements, shifted)),
+            shift=SHIFT,
+            noise=path.of_events(_noise).reshape(-1, 6),
+            unit=path.of_events(_unit),
+            x=np.zeros(n + 1),
+            top=np.zeros(3 * W),
+            weights=np.zeros((2, 3, 3)),
+            product=np.zeros(n),
+            error=np.zeros(n),
         ),
         out,
     )
     return out
+
+
+def _for_kernel(path: _Path, columns: Sequence[_Column], fixed: int, n: int) -> analysis.Columns:
+    """Return the deterministic errors for the kernel, for n states."""
+    with_rate = [k for k, column in enumerate(columns) if column.rate is not None]
+    place = np.full(len(columns), -1)
+    place[with_rate] = np.arange(len(with_rate))
+    rate = np.zeros((len(path.dt), len(with_rate), 3))
+    turn, offset = np.zeros((2, len(path.events.time), len(columns), 3))
+    for k, column in enumerate(columns):
+        if column.rate is not None:
+            rate[:, place[k]] = column.rate
+        if column.turn is not None:
+            turn[:, k] = column.turn
+        if column.offset is not None:
+            offset[:, k] = column.offset
+    return analysis.Columns(
+        rate=rate,
+        place=place,
+        ramp=np.array([column.ramp for column in columns]).reshape(-1, 3),
+        turn=turn,
+        offset=offset,
+        sensor=np.array([column.sensor for column in columns], np.int64),
+        fixed=fixed,
+        value=np.zeros((len(columns), n)),
+    )
+
+
+def _model(problem: Problem) -> Model:
+    """Return the model of a filter with a covariance for each measurement.
+
+    Without error states its structure has all kinds of sensors, so that it is compiled only once.
+    """
+    kinds = dict(zip(problem.events.sensors, problem.events.kinds, strict=True))
+    model = assemble(problem.error_states, kinds, isotropic=False)
+    if problem.error_states:
+        return model
+    sensors = tuple(Sensor(code, isotropic=False, states=()) for code in KIND_CODES.values())
+    shape = np.array([list(KIND_CODES).index(kind) for kind in problem.events.kinds], np.int64)
+    return dataclasses.replace(model, structure=model.structure._replace(sensors=sensors), shape=shape)
+
+
+def _measurements(events: Schedule) -> Measurements:
+    """Return measurements as the kernels' argument, with a covariance for each."""
+    noise = np.empty((len(events.time), 6))
+    noise[events.row] = events.body_noise
+    return events.measurements._replace(noise=read_only(noise))

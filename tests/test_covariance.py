@@ -10,7 +10,7 @@ from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
 from scipy.stats import chi2, norm
 from typer.testing import CliRunner
 
-from strapdown import cli, coning, consistency, covariance, estimation, montecarlo, motion, quaternion, vectors
+from strapdown import cli, coning, consistency, covariance, montecarlo, motion, quaternion, vectors
 from strapdown.checks import InputError
 from strapdown.covariance import Consider
 from strapdown.estimation import setup
@@ -97,10 +97,10 @@ def test_the_budget_of_a_matched_filter_adds_up_to_its_own_covariance(name):
     scenario = white(name, min(load_scenario(name).duration, 60.0))
     belief = setup.FilterSetup.for_scenario(scenario, states=False)
     found = covariance.analyse(scenario, belief, epochs=5)
-    assert np.allclose(found.covariance, found.filter_covariance, rtol=1e-7, atol=1e-24)
+    scale = found.filter_sigma[:, :, None] * found.filter_sigma[:, None, :]
+    assert np.abs((found.covariance - found.filter_covariance) / scale).max() < 1e-11
     assert np.allclose(found.filter_covariance, np.swapaxes(found.filter_covariance, 1, 2))
-    random = found.contributions.sum(axis=1)
-    assert np.allclose(random, found.filter_covariance, rtol=1e-7, atol=1e-24)
+    assert np.abs((found.contributions.sum(axis=1) - found.filter_covariance) / scale).max() < 1e-11
     for value in found.expected_nis.values():
         assert value == pytest.approx(1.0, abs=1e-4)
     names = {name for name, *_ in found.budget()}
@@ -421,9 +421,8 @@ def monte_carlo(scenario, belief, runs, epochs, seed=3):
     for run in range(runs):
         record = simulate(scenario, seed, run)
         used = setup.modelled_record(record, belief)
-        estimate = estimation.run(
-            used, belief.process_noise, montecarlo.start(record, belief, seed, run), every=every, full_covariance=True
-        )
+        start = montecarlo.start(record, belief, seed, run)
+        estimate = setup.run_modelled(used, belief, start, every=every, full_covariance=True)
         e = consistency.errors(estimate.attitude, estimate.bias, used.truth.attitude[::every], used.truth.bias[::every])
         errors.append(e)
         nees.append(consistency.nees(e, estimate.covariance))
@@ -454,6 +453,80 @@ def check_monte_carlo(scenario, belief, *, runs, epochs, probability=0.99):
 
 def test_every_source_together_agrees_with_monte_carlo():
     check_monte_carlo(everything(), BELIEF, runs=150, epochs=6)
+
+
+SLANTED = vectors.AttitudeSensor(
+    name="tracker", sigma_across=1e-4, sigma_about=1e-3, rate=0.5, boresight=(0.7071, 0.0, 0.7071)
+)
+
+
+@pytest.mark.parametrize(
+    "sigma", [{}, {"tracker": (2e-4, 1e-4, 6e-4), "mag": (1e-8, 2e-8, 3e-8)}], ids=["matched", "one σ an axis"]
+)
+def test_noise_correlated_between_body_axes_agrees_with_monte_carlo(sigma):
+    """A tracker whose boresight is no body axis, and a filter that models other σ about the axes of the body."""
+    mag = vectors.Magnetometer(name="mag", field_f=FIELD, sigma=1e-8, rate=1.0, kind="vector", phase=0.31)
+    gyro = GyroSpec(angle_random_walk=3e-5, rate_random_walk=1.5e-6)
+    scenario = Scenario(motion=TUMBLE, gyro=gyro, sensors=(SLANTED, mag), rate=10.0, duration=60.0)
+    found, _ = check_monte_carlo(scenario, dataclasses.replace(BELIEF, sigma=sigma), runs=150, epochs=4)
+    if not sigma:
+        scale = found.filter_sigma[:, :, None] * found.filter_sigma[:, None, :]
+        assert np.abs((found.covariance - found.filter_covariance) / scale).max() < 1e-11
+        assert found.expected_nis == pytest.approx({"tracker": 1.0, "mag": 1.0}, abs=1e-3)
+    else:
+        assert found.expected_nees[-1, 1] > 2.0  # the σ about its boresight is 1e-3
+
+
+def of_states(*, many):
+    """Hard iron and drift; with ``many``, scale factors, flicker and slow noise of a sensor too: errors that differ by run, or do not."""
+    iron = vectors.Magnetometer(
+        name="mag", field_f=FIELD, sigma=3e-8, rate=1.0, kind="vector", hard_iron=[5e-8, -8e-8, 3e-8]
+    )
+    slow = Faults(correlated_sigma=3e-4, correlation_time=15.0)
+    sun = vectors.VectorSensor(name="sun", reference_f=[1.0, 0.0, 0.2], sigma=2e-4, rate=1.0, faults=slow)
+    gyro = GyroSpec(angle_random_walk=1e-5, markov_noise=4e-6, markov_correlation_time=20.0, turn_on_bias_sigma=2e-5)
+    if many:
+        gyro = dataclasses.replace(gyro, scale_factor=np.array([2e-3, -1e-3, 1.5e-3]), bias_instability=2e-6)
+    sensors = (SLANTED, sun, iron) if many else (SLANTED, iron)
+    return Scenario(motion=TUMBLE, gyro=gyro, sensors=sensors, rate=10.0, duration=120.0 if many else 60.0)
+
+
+@pytest.mark.parametrize("many", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_a_filter_with_error_states_agrees_with_monte_carlo(many):
+    scenario = of_states(many=many)
+    belief = dataclasses.replace(FilterSetup.for_scenario(scenario), attitude_sigma=2e-3)
+    names = ("gyro.drift", "mag.bias", *(("gyro.scale", "sun.correlated") if many else ()))
+    assert set(belief.states.names) == set(names)
+    found, _ = check_monte_carlo(scenario, belief, runs=150, epochs=4)
+    plain = covariance.analyse(scenario, dataclasses.replace(belief, states=None), epochs=4)
+    assert found.rms[-1, :3].max() < 0.7 * plain.rms[-1, :3].max()  # what the states are for
+    assert covariance.analyse(scenario, epochs=4).sources == found.sources  # they are the default
+
+
+def test_states_without_their_errors_are_a_filter_that_is_too_unsure():
+    """The filter's covariance is that of the filter on a record without noise; of the errors it models, the scenario has none."""
+    scenario = of_states(many=False)
+    belief = dataclasses.replace(FilterSetup.for_scenario(scenario), attitude_sigma=2e-3)
+    exact = dataclasses.replace(
+        scenario,
+        gyro=dataclasses.replace(scenario.gyro, markov_noise=0.0),
+        sensors=tuple(
+            dataclasses.replace(one, hard_iron=np.zeros(3)) if hasattr(one, "hard_iron") else one
+            for one in scenario.sensors
+        ),
+    )
+    found = covariance.analyse(exact, belief, epochs=4)
+    record, every = simulate(scenario), 150
+    start = setup.initial_state(belief, record.truth.attitude[0], record.truth.bias[0])
+    estimate = setup.run(record, belief, start, every=every, full_covariance=True)
+    scale = estimate.sigma[:, :, None] * estimate.sigma[:, None, :]
+    assert np.abs((found.filter_covariance - estimate.covariance) / scale).max() < 2e-3  # linear there, and here
+    assert np.all(found.expected_nees[1:, 0] < 0.9)
+    assert found.words.startswith("The filter will be pessimistic")
+    warm = dataclasses.replace(belief, states=dataclasses.replace(belief.states, gyro_temperature_sigma=1e-5))
+    without = covariance.analyse(exact, warm, epochs=4)
+    assert without.left_out == ("states for the gyro bias over temperature",)
+    np.testing.assert_array_equal(without.filter_covariance, found.filter_covariance)
 
 
 def quarter(belief):
@@ -566,7 +639,7 @@ def test_initial_errors_may_differ_from_the_filters_model():
 
 def test_what_is_left_out_or_beyond_linear_is_reported():
     scenario = dataclasses.replace(load_scenario("hand-held"), duration=4.0)
-    found = covariance.analyse(scenario, epochs=2)
+    found = covariance.analyse(scenario, setup.FilterSetup.for_scenario(scenario, states=False), epochs=2)
     assert found.left_out == ("gyro rate resolution",)
     assert any("accelerometer" in one for one in found.beyond_linear)
     wide = covariance.analyse(
@@ -648,17 +721,36 @@ def test_a_scenario_without_sensors_is_dead_reckoning():
     assert found.rms[-1, 0] / ARCSECOND == pytest.approx(np.sqrt(expected) / ARCSECOND)
 
 
+def test_axes_of_a_gyro_may_differ():
+    """Without sensors and at rest, each axis by itself: white noise and random walk over one step a second or one in ten."""
+    arw, rrw, t = np.array([1e-5, 3e-5, 6e-5]), np.array([2e-6, 0.5e-6, 1e-6]), 100.0
+    spec = GyroSpec(angle_random_walk=arw, rate_random_walk=rrw)
+    for rate in (0.1, 1.0):
+        scenario = Scenario(motion=motion.rest(), gyro=spec, sensors=(), rate=rate, duration=t)
+        C = covariance.analyse(
+            scenario, BELIEF, initial_attitude_sigma=0.0, initial_bias_sigma=0.0, epochs=1
+        ).covariance[-1]
+        expected = np.diag([*(arw**2 * t + rrw**2 * t**3 / 3.0), *(rrw**2 * t)])
+        expected[[0, 1, 2], [3, 4, 5]] = expected[[3, 4, 5], [0, 1, 2]] = -0.5 * rrw**2 * t**2
+        np.testing.assert_allclose(C, expected, rtol=1e-9, atol=1e-24)
+
+
 # ------------------------------------------------------------------------------------------------------- the command line
 
 
 def test_the_command_prints_a_budget_and_writes_it(succeeds, tmp_path):
-    said = succeeds("covariance", "spin", "--epochs", 10, "--misalignment", 0.1, "--time-offset", "star=2")
+    options = ("--epochs", 10, "--misalignment", 0.1, "--time-offset", "star=2")
+    said = succeeds("covariance", "spin", "--no-states", *options)
+    assert "The filter has no state for the gyro's scale factor" in said
     for word in ("angle random walk", "gyro scale factor", "misalignment", "star time offset", "the filter's own σ"):
         assert word in said
     found = json.loads((tmp_path / "covariance-results" / "covariance.json").read_text(encoding="utf-8"))
     assert len(found["time_s"]) == 11
     direct = covariance.analyse(
-        load_scenario("spin"), consider=Consider(misalignment=1e-4, time_offset={"star": 2e-3}), epochs=10
+        load_scenario("spin"),
+        setup.FilterSetup.for_scenario(load_scenario("spin"), states=False),
+        consider=Consider(misalignment=1e-4, time_offset={"star": 2e-3}),
+        epochs=10,
     )
     assert np.allclose(np.array(found["rms"]["attitude_arcsec"]) * ARCSECOND, direct.rms[:, :3])
     assert np.allclose(found["expected_nees_per_state"]["bias"], direct.expected_nees[:, 2])

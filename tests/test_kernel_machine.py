@@ -28,6 +28,7 @@ from strapdown.estimation import forward, schedule
 from strapdown.estimation.model import assemble
 from strapdown.kernels import (
     algebra,
+    analysis,
     complementary,
     filter_lanes,
     gate,
@@ -216,6 +217,7 @@ BODIES = [
     (six_states,),
     (FILTER,),
     (gate, FILTER),
+    (analysis, FILTER),
     (filter_lanes, SEVERAL),
     (likelihood,),
     (likelihood_outliers, likelihood),
@@ -242,6 +244,7 @@ def test_every_body_of_the_walk_is_listed_here():
     assert parts_used() == {
         ("six_states",),
         ("gate", "kernels"),
+        ("analysis", "kernels"),
         ("filter_lanes", "kernels"),
         ("*bodies",),
         ("hypotheses_kernel",),

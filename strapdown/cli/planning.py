@@ -10,7 +10,7 @@ import numpy as np
 import typer
 
 from strapdown.checks import InputError, finite, non_negative
-from strapdown.cli.filters import filter_of_scenario
+from strapdown.cli.filters import default_words, filter_of_scenario
 from strapdown.cli.progress import progress_bar
 from strapdown.cli.terminal import (
     FORMAT,
@@ -109,6 +109,12 @@ def covariance(
         "--filter",
         help="TOML with a table named filter, as written by `strapdown tune`. Default: the filter that matches the scenario.",
     ),
+    states: bool | None = typer.Option(
+        None,
+        "--states/--no-states",
+        help="With or without a state for each error that the scenario specifies. Default: with, if there are such errors and no filter is "
+        "given.",
+    ),
     epochs: int = typer.Option(100, help="Number of epochs over the duration of the scenario."),
     out: Path = typer.Option(Path("covariance-results"), help="Folder for covariance.json and the figure."),
     form: FigureFormat = FORMAT,
@@ -126,8 +132,12 @@ def covariance(
     tables_folder(tables)
     writable("out", out / "covariance.json", out / f"budget.{form}", sources=(scenario, filter_file))
     considered = errors.considered(chosen.sensors)
+    if states is not None and filter_file:
+        raise InputError("--filter defines the complete filter with its states; leave --states and --no-states out")
     modelled = (
-        filter_of_scenario(filter_file, chosen) if filter_file else setup.FilterSetup.for_scenario(chosen, states=False)
+        filter_of_scenario(filter_file, chosen)
+        if filter_file
+        else setup.FilterSetup.for_scenario(chosen, states=states)
     )
     with progress_bar("covariance analysis"):
         found = analysis.analyse(
@@ -143,11 +153,11 @@ def covariance(
     console.print(f"{name}, {what}, integration {modelled.integration.name}.\n")
     listing = found.listing()
     show_listing(listing, f"{listing.title}, RMS", notes=True)
+    if states is None and not filter_file and modelled.states is not None:
+        console.print(default_words(modelled.states.names))
     missing = setup.unmodelled_errors(chosen.gyro, chosen.sensors, modelled.states, gravity_f=chosen.gravity_f)
-    if missing and filter_file is None:
-        console.print(
-            f"This filter estimates attitude and bias only. By default `estimate` and `montecarlo` add states for {', '.join(missing)}."
-        )
+    if missing and not filter_file:
+        console.print(f"The filter has no state for {', '.join(missing)}.")
     write_json(out / "covariance.json", _summary(name, found))
     title = f"{name}: predicted errors"
     figures = save_as({out / "budget": plots.error_budget(found, title=title)}, form)

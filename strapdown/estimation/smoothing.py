@@ -46,7 +46,7 @@ from strapdown.kernels.machine import compiled
 from strapdown.records import Estimate, Event, ImuRecord
 
 MIN_SMOOTHED = 1e-11
-"""Minimum smoothed variance, relative to what one interval adds, at which backward passes keep enough digits."""
+"""Minimum smoothed variance, relative to what a backward step subtracts, at which it keeps enough digits."""
 UPPER = np.triu_indices(6)
 
 
@@ -100,19 +100,22 @@ def smooth(
         gate=gate,
         robust=robust,
     )
-    form = _ManyStates(problem) if problem.model.states else _SixStates(problem)
-    estimate = _Smoother(problem, options, form).smoothed()
-    lost = _digits_lost(problem, estimate, MIN_SMOOTHED)
+    if not problem.model.states:
+        estimate = _Smoother(problem, options, _SixStates(problem)).smoothed()
+        if _digits_kept(problem, estimate):
+            return estimate
+    estimate = _Smoother(problem, options, _ManyStates(problem)).smoothed()
+    lost = _digits_lost(problem, estimate)
     if lost is not None:
         raise InputError(
-            f"the smoothed variances at {record.time[lost]:g} s have no digits left: the sigmas of the start and the process noise of an "
-            "interval differ by too many orders of magnitude; raise the smallest of them"
+            f"the smoothed variances at {record.time[lost]:g} s have no digits left: the attitude of the start is known too well for the "
+            "uncertainty of its bias; raise the smaller sigma"
         )
     return estimate
 
 
-def _digits_lost(problem: Problem, estimate: Estimate, share: float) -> int | None:
-    """Return the first edge at which the smoothed variances have lost their digits; None if there is none.
+def _digits_kept(problem: Problem, estimate: Estimate) -> bool:
+    """Return whether the smoothed variances of :mod:`strapdown.kernels.smoother_loop` have their digits.
 
     A backward step subtracts what the interval had added: the process noise, and at the start the uncertainty of the bias.
     """
@@ -122,15 +125,33 @@ def _digits_lost(problem: Problem, estimate: Estimate, share: float) -> int | No
     # If the minimum over all rows exceeds the limit of the longest interval, as nearly always, the check takes a tenth of the time.
     # It is NaN if a variance or an attitude is: the Jacobian of a correction that is NaN enters the covariance.
     longest, smallest = dt.max(), estimate.variance.min()
-    most = share * max(angle * longest + rate * longest**3 / 3.0 + start, rate * longest)
+    most = MIN_SMOOTHED * max(angle * longest + rate * longest**3 / 3.0 + start, rate * longest)
     if smallest > most:
-        return None
-    dt = np.append(dt, 0.0)
-    added = np.stack([angle * dt + rate * dt**3 / 3.0, rate * dt])
+        return True
+    added = np.stack([_added_angle(problem), np.append(rate * dt, 0.0)])
     added[0, 0] += start
     least = np.minimum.reduceat(estimate.variance[:, :6], [0, 3], axis=1).T
-    kept = ((least > share * added) & (least > 0.0)).all(axis=0)
+    return bool(((least > MIN_SMOOTHED * added) & (least > 0.0)).all())
+
+
+def _digits_lost(problem: Problem, estimate: Estimate) -> int | None:
+    """Return the first edge at which the smoothed variances of :mod:`strapdown.kernels.smoother` have lost their digits, or None.
+
+    A backward step subtracts the uncertainty of the bias of the start. What is left counts by the square of N, the share of the state in
+    the prediction: its smoothed variance over the noise of the interval, and at most 1.
+    """
+    least, added = estimate.variance[:, :3].min(axis=1), _added_angle(problem)
+    start = problem.record.intervals[0] ** 2 * np.diag(problem.initial.covariance)[3:6].max()
+    N = np.minimum(1.0, np.divide(least, added, out=np.ones(len(least)), where=added > 0.0))
+    kept = (least > MIN_SMOOTHED * start * N**2) & (estimate.variance > 0.0).all(axis=1)
     return None if kept.all() else int(np.argmin(kept))
+
+
+def _added_angle(problem: Problem) -> Array:
+    """Return the variance (edges,) that the noise of the interval after each edge adds to the attitude, rad²."""
+    angle, rate = problem.variances
+    dt = np.append(problem.record.intervals, 0.0)
+    return np.asarray(angle * dt + rate * dt**3 / 3.0)
 
 
 def relinearized_start(
@@ -343,10 +364,14 @@ class _ManyStates:
         kernels = forward.instance_of(self.problem.model)
         model = forward.kernel_model(self.problem.model, self.problem.variances)
         n = kernels.N
+        if segments.shape[1] == 32:  # of the filter of six states: the blocks of P, not its triangle by rows
+            order = np.argsort(covariance_blocks(_places()))
+            segments = np.concatenate([segments[:, :11], segments[:, 11 + order], np.zeros((len(segments), 7))], axis=1)
         states, matrices = np.zeros((4, n + 1)), np.zeros((4, n * kernels.W + WIDTH))
         noisy = np.array(kernels.NOISY, np.int64)
         others = (
             np.zeros(n * kernels.NOISY_WIDTH),
+            np.ones(len(noisy)),
             np.zeros(3 * kernels.W),
             np.zeros(2 * n),
             np.zeros(kernels.SET * max(len(model.last), 1)),

@@ -1,9 +1,10 @@
 """The fixed-interval smoother for any number of error states: Rauch–Tung–Striebel on the manifold, backward over the filter's segments.
 
 The gain is that of :mod:`strapdown.kernels.smoother_step`, where its reasons are: with the process noise of a step referred to its start,
-``Q̄ = Φ⁻¹ Q Φ⁻ᵀ``, it is ``G = N Φ⁻¹``, ``N = I − Q̄ (P + Q̄)⁻¹``, and the covariance is a sum, ``G P_s Gᵀ + N Q̄``, in which nothing of the
-size of P is subtracted. The later covariance is transformed to the tangent space at the predicted attitude before the step, and the result
-to that at the smoothed attitude after it; so are states that rotate with the attitude.
+``Q̄ = Φ⁻¹ Q Φ⁻ᵀ``, it is ``G = N Φ⁻¹``, ``N = I − Q̄ (P + Q̄)⁻¹ = P (P + Q̄)⁻¹``, and the covariance is a sum, ``G P_s Gᵀ + N Q̄``, in which
+nothing of the size of P is subtracted. A row of N is by the first form, or by the second if the variance of its state is smaller than that
+of the noise. The later covariance is transformed to the tangent space at the predicted attitude before the step, and the result to that at
+the smoothed attitude after it; so are states that rotate with the attitude.
 
 The functions in ``OPEN`` are those of an instance of :mod:`strapdown.kernels.filter`. Matrices are stored by rows, padded to a multiple of
 eight columns.
@@ -86,7 +87,9 @@ class Workspace(NamedTuple):
     later_P: np.ndarray
     """Smoothed covariance."""
     gain: np.ndarray
-    """(P + Q̄)⁻¹ Q̄, with columns for the states with process noise."""
+    """(P + Q̄)⁻¹ Q̄, with columns for the states with process noise; −(P + Q̄)⁻¹ P of those whose noise is larger."""
+    kept: np.ndarray
+    """1 for the columns of the first form, 0 for the others."""
     top: np.ndarray
     """Rows of the attitude of Φ⁻¹ (3 × padded width)."""
     error: np.ndarray
@@ -170,15 +173,8 @@ def step_back(segments, k, models, space):
 
     A step back in time has the transition Φ⁻¹ and, for noise of negative variance, the process noise Q̄ = Φ⁻¹ Q Φ⁻ᵀ.
     """
-    x, predicted, after, P, Q, gain, work = (
-        space.x,
-        space.predicted,
-        space.after,
-        space.P,
-        space.Q,
-        space.gain,
-        space.work,
-    )
+    x, predicted, after = space.x, space.predicted, space.after
+    P, Q, gain, kept, work = space.P, space.Q, space.gain, space.kept, space.work
     later_x, later_P, error, coefficients = space.later_x, space.later_P, space.error, space.coefficients
     n, width, noisy = len(x) - 1, len(space.top) // 3, space.noisy
     load_segment(segments, k, x, P, width)
@@ -198,21 +194,29 @@ def step_back(segments, k, models, space):
     fill_coefficients(coefficients, -dt, models.quiet)
     copy_state(predicted, after)
     advance(after, later_P, back, -dt, models.quiet, coefficients, 0.0)
+    gather_noisy_columns(Q, gain)
+    gather_small_columns(P, Q, gain, kept, space.states, n, width)
     for i in range(0, n * width, WIDTH):
         store(P, i, load(P, i) + load(Q, i))
     factorise(P, n, width)
-    gather_noisy_columns(Q, gain)
     solve(P, gain, n, width)
-    reduce_error(error, gain, space.states, n)
+    reduce_error(error, gain, kept, space.states, n)
     # N (Y Nᵀ + Q̄), Y the later covariance at the start: only rows and columns of states with noise differ from those of Y.
     rows_of_noisy(later_P, work)
+    scale_rows(work, kept)
     subtract_products(gain, later_P, work, n, noisy)
     scatter_noisy_columns(work, later_P)
     for i in range(0, n * width, WIDTH):
         store(later_P, i, load(later_P, i) + load(Q, i))
     rows_of_noisy(later_P, work)
+    scale_rows(work, kept)
     subtract_products(gain, later_P, work, n, noisy)
     rows_to_noisy(work, later_P)
+    for r in range(noisy):
+        if kept[r] == 0.0:  # in the other triangle the element would be a difference
+            k = space.states[r]
+            for i in range(n):
+                later_P[width * i + k] = later_P[width * k + i]
     correct_filtered(x, error, later_x, later_P)
 
 
@@ -227,14 +231,33 @@ def apply_error(error, top, coefficients):
     apply_transition(error, top, coefficients, 0.0)
 
 
-def reduce_error(error, gain, states, n):
+def gather_small_columns(P, Q, gain, kept, states, n, width):
+    """Write columns of −P, of its upper triangle, for the states whose variance is below their noise's."""
+    columns = len(gain) // n
+    for r in range(len(states)):
+        k = states[r]
+        kept[r] = 1.0
+        if P[width * k + k] < Q[width * k + k]:
+            kept[r] = 0.0
+            for i in range(n):
+                gain[columns * i + r] = -P[width * min(i, k) + max(i, k)]
+
+
+def scale_rows(A, factors):
+    """Multiply rows by 0 or 1."""
+    for r in range(len(factors)):
+        if factors[r] == 0.0:
+            scale_row(A, r, 0.0)
+
+
+def reduce_error(error, gain, kept, states, n):
     """Replace the error by N times it; ``states`` are those with process noise."""
     width = len(gain) // n
     for r in range(len(states)):
         t = 0.0
         for k in range(n):
             t += gain[width * k + r] * error[k]
-        error[n + r] = error[states[r]] - t
+        error[n + r] = kept[r] * error[states[r]] - t
     for r in range(len(states)):
         error[states[r]] = error[n + r]
 

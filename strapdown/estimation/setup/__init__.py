@@ -31,6 +31,7 @@ from strapdown.estimation.setup.running import initial_state, run, smooth
 from strapdown.estimation.setup.running import measured_motion as measured_motion
 from strapdown.estimation.setup.running import modelled_record as modelled_record
 from strapdown.estimation.setup.running import observability as observability
+from strapdown.estimation.setup.running import prepared as prepared
 from strapdown.estimation.setup.running import run_modelled as run_modelled
 from strapdown.estimation.setup.running import run_together as run_together
 from strapdown.estimation.setup.running import runs_at_once as runs_at_once

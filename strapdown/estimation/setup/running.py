@@ -121,7 +121,7 @@ def run_modelled(
     chosen = {"gate": setup.gate, "robust": setup.robust, **options}
     if setup.states is None:
         return estimation.run(record, setup.process_noise, initial, **chosen)
-    problem = replace(_prepared(record, setup, initial), motion=motion)
+    problem = replace(prepared(record, setup, initial), motion=motion)
     return _reported(forward.filtered(problem, forward.Options(**chosen, **WHOLE_BIAS)).estimate, setup.states, initial)
 
 
@@ -156,7 +156,7 @@ def run_together(
     states = setup.states
     assert states is not None
     problems = [
-        _prepared(modelled_record(record, setup), setup, initial)
+        prepared(modelled_record(record, setup), setup, initial)
         for record, initial in zip(records, initials, strict=True)
     ]
     options = forward.Options(every=every, full_covariance=True, **WHOLE_BIAS)
@@ -312,9 +312,10 @@ def _blocks(record: ImuRecord, states: States) -> tuple[ErrorStates, ...]:
     return states.blocks({series.sensor: series.kind for series in record.vectors})
 
 
-def _prepared(record: ImuRecord, setup: FilterSetup, initial: State) -> forward.Problem:
-    """Return a record prepared for the filter with the setup's error states."""
-    assert setup.states is not None
+def prepared(record: ImuRecord, setup: FilterSetup, initial: State) -> forward.Problem:
+    """Return a :func:`modelled_record` prepared for the filter with the setup's error states."""
+    if setup.states is None:
+        return forward.prepared(record, setup.process_noise, initial, ())
     blocks = _blocks(record, setup.states)
     start = state_of_whole_bias(initial, blocks, setup.states.gyro_fast_bias_sigma)
     return forward.prepared(record, setup.process_noise, start, blocks, driven=True)
