@@ -371,7 +371,7 @@ def test_an_inverted_accelerometer_is_warned_of():
     rate = 1e-3 * np.random.default_rng(2).standard_normal((n, 3))
     walk = sd.recordings.Recording(source="walk.csv", time=0.01 * np.arange(n), rate=rate, specific_force=force)
     with pytest.warns(
-        UserWarning, match=r"walk.csv: at rest the accelerometer reads -9.81 m/s² along z.*invert= in Python"
+        UserWarning, match=r"walk.csv: at rest the accelerometer reads -9.81 m/s² along z.*`invert='accelerometer'`"
     ):
         sd.estimate(walk)
 

@@ -288,7 +288,7 @@ def test_a_file_of_another_version_or_format_is_refused(tmp_path):
 def test_an_existing_file_is_not_written_over_by_mistake(tmp_path):
     path = tmp_path / "c.h5"
     path.write_text("the only copy of my thesis")
-    with pytest.raises(InputError, match="--resume"):
+    with pytest.raises(InputError, match="`resume=True`"):
         go(path, 8)
     assert path.read_text() == "the only copy of my thesis"
     with pytest.raises(InputError, match="cannot be read as HDF5"):

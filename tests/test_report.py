@@ -171,7 +171,9 @@ def test_without_truth_the_page_says_what_it_cannot_show(folder):
 
 def test_the_campaign_page_says_how_to_replay_its_worst_run(folder):
     statistics = json.loads((folder / "campaign.report.json").read_text())
-    assert f"campaign.h5 --replay {statistics['worst_runs'][0]}" in body(folder / "campaign.html")
+    assert f'sd.read("campaign.h5").plan, {statistics["worst_runs"][0]}' in html.unescape(
+        body(folder / "campaign.html")
+    )
 
 
 def test_the_campaign_page_says_what_the_filter_has_no_state_for(folder, scenario, filter_setup, tmp_path):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -11,7 +10,7 @@ import numpy as np
 import typer
 from rich.text import Text
 
-from strapdown.checks import InputError
+from strapdown.checks import Hint, InputError
 from strapdown.cli.filters import no_state_words
 from strapdown.cli.progress import progress_bar
 from strapdown.cli.reading import RECORDING_HELP, Layout
@@ -343,7 +342,9 @@ def doctor(
         )
         for one in found.candidates[:8]:
             rows.add_row(
-                re.sub(r" \([^()]*--[^()]*\)", "", one.words),  # without the options, which the verdict has
+                Hint.replaced(one.words, lambda hint: "")
+                .replace(" ()", "")
+                .replace("; )", ")"),  # hints are in the verdict
                 f"{one.score:.1f}",
                 *(f"{one.misfit[name]:.3f}" for name in names),
             )

@@ -22,16 +22,39 @@ from rich.progress import (
 )
 from rich.text import Text
 
+from strapdown.checks import Hint
+
 _CONTROL = dict.fromkeys((*range(9), *range(11, 32), *range(127, 160)), "�")
 """Control characters except tab and newline."""
 
 
+_OPTIONS = {
+    "initial": "--attitude or --from-truth",
+    "noise": "--gyro",
+    "priors": "--prior",
+    "estimator": "--filter",
+    "setup": "--filter",
+}
+"""Options whose names differ from those of the argument in Python."""
+
+
+def option(hint: Hint) -> str:
+    """Return the option for an argument of Python, with its value."""
+    flag = _OPTIONS.get(hint.argument, "--" + hint.argument.replace("_", "-"))
+    if hint.value is None or hint.value is True:
+        return flag
+    if hint.argument == "units":
+        return " ".join(f"--{name}-unit {unit}" for name, unit in hint.value.items())
+    parts = hint.value.items() if isinstance(hint.value, dict) else ()
+    return f"{flag} {','.join(f'{name}={value}' for name, value in parts) or hint.value}"
+
+
 class PlainConsole(Console):
-    """A console without control characters in its text: names of sensors and files may hold sequences that change a terminal."""
+    """A console that names options in hints, and shows no control characters: names of files may hold sequences that change a terminal."""
 
     def render_str(self, text: str, **options: Any) -> Text:
-        """Return a text with a mark in place of each control character."""
-        return super().render_str(text.translate(_CONTROL), **options)
+        """Return a text with options in its hints and a mark in place of each control character."""
+        return super().render_str(Hint.replaced(text, option).translate(_CONTROL), **options)
 
 
 errors = PlainConsole(stderr=True, markup=False, highlight=False)

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from strapdown import quaternion
-from strapdown.checks import Array, InputError, one_of
+from strapdown.checks import Array, Hint, InputError, one_of
 from strapdown.consistency.accuracy import Accuracy, accuracy_of
 from strapdown.consistency.alignment import (
     ALIGNED,
@@ -293,7 +293,7 @@ def _frame_words(chosen: str, found: Mapping[str, float]) -> str:
     if found[chosen] < DECIDED:
         return (
             f"the errors do not decide how the covariance is defined ({said}): it is read as {chosen}; "
-            "--error-frame (error_frame= in Python) names another"
+            f"{Hint('error_frame')} names another"
         )
     return f"the covariance is read as {chosen} ({said}, found from the errors)"
 

@@ -23,7 +23,7 @@ import numpy as np
 
 import strapdown
 from strapdown import scenarios
-from strapdown.checks import InputError, count, finite, one_of
+from strapdown.checks import Hint, InputError, count, finite, one_of
 from strapdown.estimation import setup
 from strapdown.files import locked, reading, set_attributes, whole_hdf5, written_beside
 from strapdown.montecarlo.engine import MACHINES, Chunks, Identity, Work, Workers, choose, identity, in_threads
@@ -221,8 +221,7 @@ def run(
     table = plan.to_table()
     if target.exists() and not resume and not overwrite:
         raise InputError(
-            f"{target} exists; continue it (--resume; resume=True in Python), overwrite it (--overwrite; overwrite=True), or choose "
-            "another name"
+            f"{target} exists; continue it ({Hint('resume', True)}), overwrite it ({Hint('overwrite', True)}), or choose another name"
         )
     chosen = choose(plan, machine)
     with locked(target):

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from strapdown import consistency, plots, records, workflows
-from strapdown.checks import Array, InputError
+from strapdown.checks import Array, Hint, InputError
 from strapdown.files import plain
 from strapdown.montecarlo import campaign, verdicts
 from strapdown.montecarlo.statistics import SUBSETS, Statistics
@@ -23,7 +23,7 @@ def report(path: Path, confidence_level: float) -> tuple[str, dict[str, Any]]:
     held = campaign.read(path)
     statistics = held.statistics
     if statistics is None:
-        raise InputError(f"{path} has no completed run yet; continue the campaign with --resume first")
+        raise InputError(f"{path} has no completed run yet; continue the campaign first, {Hint('resume', True)}")
     judgement = workflows.check(held, confidence_level=confidence_level)
     bound = verdicts.bound_of(held.plan)
     name = held.plan.scenario.name or "a scenario"
@@ -199,5 +199,5 @@ def _worst(statistics: Statistics, path: Path) -> str:
         "Worst runs",
         page.table(("run", "maximum NEES of the state (6 degrees of freedom)"), rows, numbers=2),
         page.paragraph("A run can be repeated by its number, bit for bit, with its record and estimate:"),
-        page.code(f"strapdown montecarlo {path.name} --replay {int(statistics.worst_run[0])}"),
+        page.code(f'run = sd.montecarlo.replay(sd.read("{path.name}").plan, {int(statistics.worst_run[0])})'),
     )

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from strapdown.checks import Array, InputError, count, known_keys, positive
+from strapdown.checks import Array, Hint, InputError, count, known_keys, positive
 from strapdown.estimation.setup import FilterSetup
 from strapdown.results import Listed, Listing, figure
 from strapdown.tuning.objective import REACH, Derivatives, Objective
@@ -225,14 +225,14 @@ class Tuning(Listed):
         if not all(one.identified for one in self.parameters):
             notes.append(
                 "For a parameter that is not identified these records give only an upper bound; the filter uses the value in the column "
-                "“after”, the mean below that bound. A prior can be given by --prior (priors= in Python)."
+                f"“after”, the mean below that bound. A prior can be given by {Hint('priors')}."
             )
         if self.misfit:
             remedy = (
                 "A common scale leaves the estimates unchanged; it makes σ correct on average, not at each time."
                 if self.parameters[0].name == SCALE
                 else "The maximum-likelihood filter may follow them and estimate worse. Tune only filter.scale, or against a truth "
-                "(--truth, --rmse), or try --spacing."
+                f"({Hint('truth', True)}, {Hint('rmse', True)}), or try {Hint('spacing')}."
             )
             notes.append(
                 "The innovations contradict any filter of this model: disturbances last over many samples, or vary. "
