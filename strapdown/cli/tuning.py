@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     from strapdown.estimation.setup import FilterSetup
     from strapdown.gyro import GyroSpec
     from strapdown.records import ImuRecord
-    from strapdown.scenarios import Scenario
     from strapdown.tuning import Case, Comparison, TunedGate, Tuning, Unmodelled
 
 
@@ -158,16 +157,6 @@ class _Search:
 
 
 @dataclass(frozen=True)
-class _Planning:
-    """Plan, before there are records."""
-
-    plan: bool = typer.Option(False, "--plan", help="Predict the uncertainty of each parameter for future records.")
-    length: str | None = typer.Option(
-        None, help="Durations of a record, s, separated by commas. Default: that of the scenario."
-    )
-
-
-@dataclass(frozen=True)
 class _Output:
     """Output."""
 
@@ -196,15 +185,11 @@ class _Found(NamedTuple):
 def tune(
     records: Annotated[
         list[Path],
-        typer.Argument(
-            help="Records (HDF5 of `strapdown simulate`) or recordings (BROAD HDF5, CSV), all of one unit; with --plan a "
-            "scenario: its name, its TOML file or a record simulated from it."
-        ),
+        typer.Argument(help="Records (HDF5 of `strapdown simulate`) or recordings (BROAD HDF5, CSV), all of one unit."),
     ],
     start: _Filter,
     goal: _Objective,
     search: _Search,
-    planning: _Planning,
     layout: Layout,
     output: _Output,
 ) -> None:
@@ -213,11 +198,6 @@ def tune(
 
     workers = count("threads", search.threads if search.threads is not None else os.cpu_count() or 1)
     chosen = start.setup()
-    if planning.plan:
-        _plan(records, chosen, start, planning.length, workers)
-        return
-    if planning.length is not None:
-        raise InputError("--length goes with --plan; leave it out")
     count("seed", search.seed, minimum=0)
     _check_files(records, start.filter_file, output)
     cases, before, gyros = _cases(records, chosen, start, layout)
@@ -458,43 +438,3 @@ def _report(found: _Found, paths: Sequence[Path], of: str) -> dict[str, Any]:
             for name, one in (("before", comparison.before), ("after", comparison.after))
         }
     return plain(content)  # type: ignore[no-any-return]
-
-
-def _plan(
-    sources: Sequence[Path], chosen: FilterSetup | None, start: _Filter, length: str | None, threads: int
-) -> None:
-    from strapdown import scenarios, tuning
-    from strapdown.estimation import setup
-    from strapdown.recordings import recordfiles
-
-    if len(sources) != 1:
-        raise InputError(f"--plan needs one scenario, but {len(sources)} are given; give one")
-    lengths = None if length is None else _numbers(length)
-    (source,) = sources
-    of_record = source.is_file() and recordfiles.is_record(source)
-    scenario = _scenario_of(source) if of_record else scenarios.load_scenario(source)
-    modelled = chosen or setup.FilterSetup.for_scenario(scenario, states=start.states)
-    wanted = start.names or list(tuning.default_names([scenarios.simulate(scenario)]))
-    with progress_bar("simulated records", 4) as advance:
-        found = tuning.plan(
-            scenario, modelled, wanted, lengths=lengths or [scenario.duration], threads=threads, progress=advance
-        )
-    show_listing(found.listing(), notes=True)
-
-
-def _scenario_of(path: Path) -> Scenario:
-    """Return the scenario that a record was simulated from."""
-    from strapdown.recordings import recordfiles
-
-    origin = recordfiles.read_record(path).origin
-    if origin is None or origin.scenario is None:
-        raise InputError(f"{path} does not contain its scenario; give the scenario's name or TOML file to --plan")
-    scenario: Scenario = origin.scenario
-    return scenario
-
-
-def _numbers(text: str) -> list[float]:
-    try:
-        return [float(part) for part in text.split(",")]
-    except ValueError:
-        raise InputError(f"--length is {text!r}; give seconds separated by commas, such as 600,1800") from None
