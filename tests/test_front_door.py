@@ -393,9 +393,7 @@ def test_covariance_analysis_is_that_of_the_matched_filter():
 
 
 def test_a_listing_is_aligned_text_and_escaped_html():
-    made = results.Listing(
-        "A < B", ("state", "", "σ"), [("x", "rad", "1.5"), ("long name", "", "12")], ["a note"], left=2
-    )
+    made = results.Table("A < B", ("state", "", "σ"), [("x", "rad", 1.5), ("long name", "", 12)], ["a note"], left=2)
     assert made.text.splitlines() == [
         "A < B",
         "state             σ",

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import typer
-from rich.text import Text
 
 from strapdown.checks import Hint, InputError
 from strapdown.cli.filters import no_state_words
@@ -23,16 +22,14 @@ from strapdown.cli.terminal import (
     put_json,
     say,
     show,
-    show_listing,
-    table,
     writable,
     written,
 )
 from strapdown.files import reading
+from strapdown.results import Column, Table
 
 if TYPE_CHECKING:
     from strapdown.consistency import Judgement
-    from strapdown.consistency.foreign import Checked
     from strapdown.estimation.setup import FilterSetup
     from strapdown.records import Estimate, ImuRecord
     from strapdown.tuning.diagnosis import Diagnosis
@@ -212,27 +209,18 @@ def _judged_foreign(result: Path, options: _Foreign, how: dict[str, Any]) -> tup
     say(*(f"Note: {remark}." for remark in found.remarks))
     if frame != options.error_frame:
         console.print(f"Note: the file declares that its covariance is of the {frame} error.")
-    show_listing(found.accuracy.listing(), notes=True)
-    _show_explanations(found)
+    show(found.accuracy.listing())
+    if found.explanations:
+        show(found.listing())
     if options.aligned is not None:
         aligned = replace(found.estimate, truth=found.truth, origin=Origin(source=own.source))
         workflows.write(replace(aligned, details={"truth": reference.source}), options.aligned)
     return found.judgement, content
 
 
-def _show_explanations(found: Checked) -> None:
-    if not found.explanations:
-        return
-    rows = table("Possible causes of the attitude errors", "cause", "size", "remaining NEES", "p-value", "", left=2)
-    for one in found.explanations:
-        mark = Text("likely", style="red") if one.likely else Text("no")
-        rows.add_row(one.name, one.value, f"{one.nees:.4g}", f"{one.p_value:.2g}", mark)
-    show(rows)
-
-
 def _show_statistics(judgement: Judgement) -> None:
     if judgement.findings:
-        show_listing(judgement.listing(), "Statistics of the filter and their bounds for a consistent filter")
+        show(judgement.listing(), "Statistics of the filter and their bounds for a consistent filter", notes=False)
         share = 100.0 * (1.0 - judgement.confidence_level)
         console.print(
             "Each p-value is for one statistic; bounds, pass and FAIL are for all together (a consistent filter fails with at most "
@@ -268,7 +256,7 @@ def _diagnosed(
         found = diagnosis.diagnose(
             accepted(held, estimate), chosen, initial, probability=judgement.confidence_level, judgement=judgement
         )
-    show_listing(found.listing(), "Causes by their effect on the likelihood")
+    show(found.listing(), "Causes by their effect on the likelihood", notes=False)
     content = {**found.summary(), "without_a_state": list(missing)}
     own = _not_of_the_search(chosen, estimate)
     if own:
@@ -331,24 +319,14 @@ def doctor(
     )
     if found.candidates:
         names = list(found.candidates[0].misfit)
-        rows = table(
-            "Explanations: score (log-likelihood) and misfit, 0 perfect, 1 unrelated, 2 opposite",
-            "explanation",
-            "score",
-            *(
-                name.replace("accelerometer", "acc").replace("magnetometer", "mag").replace(" and ", "–")
-                for name in names
-            ),
-        )
-        for one in found.candidates[:8]:
-            rows.add_row(
-                Hint.replaced(one.words, lambda hint: "")
-                .replace(" ()", "")
-                .replace("; )", ")"),  # hints are in the verdict
-                f"{one.score:.1f}",
-                *(f"{one.misfit[name]:.3f}" for name in names),
-            )
-        show(rows)
+        plain = lambda words: Hint.replaced(words, lambda hint: "").replace(" ()", "").replace("; )", ")")  # noqa: E731
+        columns = [Column("explanation"), Column("score", shown="{:.1f}".format)]
+        for name in names:  # hints are in the verdict
+            short = name.replace("accelerometer", "acc").replace("magnetometer", "mag").replace(" and ", "–")
+            columns.append(Column(short, shown="{:.3f}".format))
+        rows = [(plain(one.words), one.score, *(one.misfit[name] for name in names)) for one in found.candidates[:8]]
+        title = "Explanations: score (log-likelihood) and misfit, 0 perfect, 1 unrelated, 2 opposite"
+        show(Table(title, columns, rows))
     say(*(f"Note: {note}." for note in found.notes))
     put_json(json, found.summary())
     raise typer.Exit({"as declared": CONSISTENT, "wrong convention": NOT}.get(found.verdict, CANNOT_TELL))

@@ -19,7 +19,7 @@ from strapdown.cli.terminal import (
     command,
     console,
     scenario_named,
-    show_listing,
+    show,
     tables_folder,
     tables_written,
     writable,
@@ -141,8 +141,8 @@ def covariance(
     name = chosen.name or Path(scenario).stem
     what = "the filter given" if filter_file else "the filter that matches it"
     console.print(f"{name}, {what}, integration {modelled.integration.name}.\n")
-    listing = found.listing()
-    show_listing(listing, f"{listing.title}, RMS", notes=True)
+    budget = found.listing()
+    show(budget)
     missing = setup.unmodelled_errors(chosen.gyro, chosen.sensors, modelled.states, gravity_f=chosen.gravity_f)
     if missing and filter_file is None:
         console.print(
@@ -151,7 +151,7 @@ def covariance(
     write_json(out / "covariance.json", _summary(name, found))
     title = f"{name}: predicted errors"
     figures = save_as({out / "budget": plots.error_budget(found, title=title)}, form)
-    written(out / "covariance.json", *figures, *tables_written(tables, "covariance", found.budget()))
+    written(out / "covariance.json", *figures, *tables_written(tables, budget))
 
 
 def _summary(name: str, found: Any) -> dict[str, Any]:

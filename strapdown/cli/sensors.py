@@ -22,14 +22,13 @@ from strapdown.cli.terminal import (
     say,
     scenario_named,
     show,
-    show_listing,
-    table,
     tables_folder,
     tables_written,
     writable,
     written,
 )
 from strapdown.files import plain, usable_folder, write_json, written_beside
+from strapdown.results import Column, Table
 
 if TYPE_CHECKING:
     from strapdown import allan as identification
@@ -42,10 +41,9 @@ def scenarios() -> None:
     from strapdown.scenarios import builtin_rows
 
     rows = builtin_rows()
-    listing = table("Built-in scenarios: `strapdown simulate NAME`", "name", "s", "Hz", "gyro")
-    for row in rows:
-        listing.add_row(str(row["name"]), f"{row['duration_s']:g}", f"{row['rate_hz']:g}", str(row["gyro"]))
-    show(listing)
+    cells = [[row[key] for key in ("name", "duration_s", "rate_hz", "gyro")] for row in rows]
+    columns = ("name", Column("s", digits=6), Column("Hz", digits=6), "gyro")
+    show(Table("Built-in scenarios: `strapdown simulate NAME`", columns, cells))
     for row in rows:
         console.print(f"{row['name']}: {row['description']}")
 
@@ -246,7 +244,8 @@ def _identify(
             f"Because of gaps the fit uses {fit.samples} samples in segments of {shortest} or more; the deviation uses all samples."
         )
     rows = identification.table(fit)
-    show_listing(fit.listing(), f"Noise coefficients with {100.0 * fit.level:g} % intervals")
+    found = fit.listing()
+    show(found, f"Noise coefficients with {100.0 * fit.level:g} % intervals", notes=False)
     console.print("For a term not detected in this record, the last column is an upper bound.")
     with written_beside(out / specification) as temporary:
         temporary.write_text(_specification(fit, f"{recording.name}, {length}"), encoding="utf-8")
@@ -263,7 +262,7 @@ def _identify(
     }
     write_json(out / numbers, plain(content))
     paths += save_as({out / figure_name: figure}, output.form)
-    written(out / specification, out / numbers, *paths, *tables_written(output.tables, "allan", rows, sensor))
+    written(out / specification, out / numbers, *paths, *tables_written(output.tables, found))
     for warning in fit.warnings:
         console.print(f"warning: {warning}", highlight=False)
     if fit.warnings:
@@ -307,28 +306,13 @@ def _regressed(recording: Path, sensor: str, source: GyroSamples, order: int, ou
         source.values / scale, source.temperature, source.sample_interval, order=order
     )
     unit, stem = _UNITS[sensor]
-    found = fit.polynomial
-    listing = table(
-        f"Bias over temperature, T − {found.reference:.3f} °C",
-        "axis",
-        "power",
-        "unit",
-        "estimate",
-        "from",
-        "to",
-        left=3,
-    )
-    for (k, axis), value in np.ndenumerate(found.coefficients):
-        ends = (value - fit.reach[k, axis], value + fit.reach[k, axis]) if k else ()
-        said = f"{unit}/K{k if k > 1 else ''}" if k else unit
-        listing.add_row("xyz"[axis], str(k), said, *(f"{one:.4g}" for one in (value, *ends)))
-    show(listing)
+    show(fit.listing(unit))
     paths.append(out / _names(sensor)[3])
     with written_beside(paths[-1]) as temporary:
         text = _commented(
             [f"Bias over temperature by `strapdown allan` from {recording.name}, a polynomial in T - reference."]
         )
-        content = {sensor: {"temperature": to_table(found, stem)}}
+        content = {sensor: {"temperature": to_table(fit.polynomial, stem)}}
         temporary.write_text(text + "\n" + tomli_w.dumps(content), encoding="utf-8")
     return fit.left * scale
 

@@ -22,7 +22,7 @@ from strapdown.cli.terminal import (
     doubt,
     need_own,
     say,
-    show_listing,
+    show,
     tables_folder,
     tables_written,
     writable,
@@ -210,7 +210,7 @@ def tune(
             "and --truth tunes the filter with its gate and weights."
         )
     found = _tuned(cases, before, gyros, start, goal, search, workers)
-    show_listing(found.result.listing(), notes=True)
+    show(found.result.listing())
     if found.attitude_rms is not None:
         old, new = np.degrees(found.attitude_rms)
         console.print(f"RMS attitude error: {old:.4g}° before, {new:.4g}° after.")
@@ -365,7 +365,7 @@ def _print_gate(found: TunedGate) -> None:
 def _print_comparison(comparison: Comparison, *, truth: bool) -> None:
     from strapdown.report import tunings
 
-    show_listing(comparison.listing())
+    show(comparison.listing())
     console.print(f"{tunings.BOUNDS}.")
     for judgement in comparison.after.judgements[:1]:
         say(*("After:" + line[3:] for line in judgement.words.splitlines()[1:]))
@@ -392,6 +392,7 @@ def _write(found: _Found, paths: Sequence[Path], of: str, output: _Output) -> No
     report = out.with_suffix(".json")
     content = _report(found, paths, of)
     write_json(report, content)
+    tables = [one.listing() for one in (found.result, found.comparison) if one is not None]
     answer, reason, _ = tunings.verdict(content)
     console.print(f"{answer}: {reason}.")
     with progress_bar("figure of the likelihood"):
@@ -400,7 +401,7 @@ def _write(found: _Found, paths: Sequence[Path], of: str, output: _Output) -> No
         figures[places["heldout"]] = drawing.before_and_after(
             found.comparison, title="Held-out part of the first record"
         )
-    written(out, report, *save_as(figures, output.form), *tables_written(output.tables, "tuning", content))
+    written(out, report, *save_as(figures, output.form), *tables_written(output.tables, *tables))
 
 
 def _report(found: _Found, paths: Sequence[Path], of: str) -> dict[str, Any]:

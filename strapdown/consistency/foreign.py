@@ -36,6 +36,7 @@ from strapdown.consistency.manifold import whitened
 from strapdown.consistency.timeaverage import MIN_ROWS, effective_samples, time_average
 from strapdown.records import Estimate, Innovations, Truth
 from strapdown.records.outputs import euler_axes
+from strapdown.results import Column, Table
 from strapdown.units import DEGREE, DEGREE_PER_HOUR
 
 ERROR_FRAMES = ("body", "fixed", "euler")
@@ -96,6 +97,14 @@ class Checked:
     explanations: tuple[Explanation, ...]
     remarks: tuple[str, ...]
     accuracy: Accuracy
+
+    def listing(self) -> Table:
+        """Return the possible causes of the attitude errors as a table."""
+        rows = [
+            (one.name, one.value, one.nees, one.p_value, "likely" if one.likely else "no") for one in self.explanations
+        ]
+        columns = ("cause", "size", "remaining NEES", Column("p-value", digits=2), "")
+        return Table("Possible causes of the attitude errors", columns, rows, left=2)
 
     def summary(self) -> dict[str, Any]:
         """Return everything as plain values for JSON.

@@ -30,7 +30,7 @@ from strapdown.montecarlo.engine import MACHINES, Chunks, Identity, Work, Worker
 from strapdown.montecarlo.plan import Plan, from_table
 from strapdown.montecarlo.statistics import BINS, Statistics, merge
 from strapdown.records import CONVENTIONS, put
-from strapdown.results import Listed, Listing
+from strapdown.results import Listed, Table
 
 __all__ = [
     "Campaign",
@@ -123,10 +123,10 @@ class Campaign(Listed):
     arithmetic: str = ""
     seconds: float = 0.0
 
-    def listing(self) -> Listing:
+    def listing(self) -> Table:
         """Return the statistics of the finished runs as a table."""
         if self.statistics is None:
-            return Listing(f"Monte Carlo of {self.runs} runs, none of them finished", (), ())
+            return Table(f"Monte Carlo of {self.runs} runs, none of them finished", (), ())
         return self.statistics.listing()
 
     @property

@@ -46,7 +46,7 @@ from strapdown.consistency.judgement import (
 )
 from strapdown.montecarlo.plan import Plan
 from strapdown.records import Estimate, ImuRecord
-from strapdown.results import ByContent, Listed, Listing, figure
+from strapdown.results import ByContent, Listed, Table, figure
 
 Counts = NDArray[np.int64]
 
@@ -227,13 +227,13 @@ class Statistics(ByContent, Listed):
             runs=f"{self.runs} runs",
         )
 
-    def listing(self) -> Listing:
+    def listing(self) -> Table:
         """Return NEES and NIS per degree of freedom, and the errors at the end, as a table."""
         judgement = self.judge()
         rows = [
             (
                 f"{one.name} of {one.label}",
-                figure(one.value),
+                one.value,
                 f"{one.low:.4f} to {one.high:.4f}",
                 "FAIL" if one.rejected else "pass",
             )
@@ -255,7 +255,7 @@ class Statistics(ByContent, Listed):
         if self.failed:
             notes.append(f"{self.failed} runs failed: their errors or covariances are not finite")
         title = f"{self.runs} runs, per degree of freedom (1 expected); {100.0 * judgement.confidence_level:g} % bounds of all together"
-        return Listing(title, ("statistic", "value", "bounds", ""), rows, notes)
+        return Table(title, ("statistic", "value", "bounds", ""), rows, notes)
 
     @property
     def has_bias(self) -> bool:

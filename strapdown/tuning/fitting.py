@@ -18,7 +18,7 @@ import numpy as np
 
 from strapdown.checks import Array, Hint, InputError, count, known_keys, positive
 from strapdown.estimation.setup import FilterSetup
-from strapdown.results import Listed, Listing, figure
+from strapdown.results import Column, Listed, Table, figure
 from strapdown.tuning.objective import REACH, Derivatives, Objective
 from strapdown.tuning.parameters import RRW, SCALE, Prior, Unit, with_values
 
@@ -166,6 +166,10 @@ class Estimated:
         return f"{NOT_IDENTIFIED}: at most {figure(self.upper / self.unit.factor, 3)} {self.unit.name} (95 %)"
 
 
+ENDS = {"before": "before", "after": "after", "from": "lower_95", "to": "upper_95"}
+"""Headings of the values of a parameter in text and in files."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Tuning(Listed):
     """Result of a tuning.
@@ -212,12 +216,12 @@ class Tuning(Listed):
     composite: bool = False
     scale: Array | float = 1.0
 
-    def listing(self) -> Listing:
+    def listing(self) -> Table:
         """Return the parameters with their intervals, as a table."""
         rows = []
         for one in self.parameters:
-            values = [figure(x / one.unit.factor, 3) for x in (one.start, one.value, one.lower, one.upper)]
-            rows.append((one.name, one.unit.name, *values, one.words))
+            values = (x / one.unit.factor for x in (one.start, one.value, one.lower, one.upper))
+            rows.append((one.name, one.unit.name, *values, one.words, one.identified))
         notes = [
             f"{self.agreeing} of {len(self.starts)} searches ended at the best point; log-likelihood + "
             f"{self.before - self.after:.4g}."
@@ -238,8 +242,14 @@ class Tuning(Listed):
                 "The innovations contradict any filter of this model: disturbances last over many samples, or vary. "
                 + remedy
             )
-        columns = ("parameter", "unit", "before", "after", "from", "to", "")
-        return Listing("Tuned parameters with 95 % intervals", columns, rows, notes, left=2)
+        columns = (
+            Column("parameter", "name"),
+            Column("unit", "unit"),
+            *(Column(label, key, 3) for label, key in ENDS.items()),
+            Column(""),
+            Column(None, "identified"),
+        )
+        return Table("Tuned parameters with 95 % intervals", columns, rows, notes, left=2, name="parameters")
 
     def __getitem__(self, name: str) -> Estimated:
         """Return the parameter with this name."""
