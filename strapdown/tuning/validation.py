@@ -21,6 +21,8 @@ from strapdown.tuning.objective import Case, of_sensors
 from strapdown.units import DEGREE
 
 By = Literal["time", "record"]
+WORSE = 1.05
+"""An increase of the attitude error on the held-out data by more than this factor is reported."""
 MAX_ROWS = 20_000
 """Maximum number of states of a record that are judged."""
 MIN_ERRORS = 100
@@ -150,6 +152,29 @@ class Comparison(Listed):
         )
         rows = [("before", *self.before.row), ("after", *self.after.row)]
         return Table("On the data held out", columns, rows, name="held-out")
+
+    def summary(self) -> dict[str, Any]:
+        """Return the performance before and after as values for JSON."""
+        return {
+            name: {
+                "log_likelihood_per_innovation": one.log_likelihood,
+                "nis_per_degree": one.nis,
+                "nis_bounds": one.nis_bounds,
+                "anees_per_state": one.anees,
+                "attitude_rms_rad": one.attitude_rms,
+                "nees_per_state": {course.of: np.nanmean(course.mean) for course in one.nees},
+                "judgements": [judgement.summary() for judgement in one.judgements],
+            }
+            for name, one in (("before", self.before), ("after", self.after))
+        }
+
+    def advice(self, *, truth: bool) -> str:
+        """Return whether to keep the previous filter, in a sentence or empty; ``truth``: it was tuned against a truth."""
+        if not self.better and not truth:
+            return "On the held-out data the likelihood has decreased: keep the previous filter."
+        if self.after.attitude_rms > WORSE * self.before.attitude_rms:
+            return "On the held-out data the attitude error has increased: keep the previous filter."
+        return ""
 
     @property
     def better(self) -> bool:
