@@ -31,7 +31,7 @@ from strapdown import (
     units,
 )
 from strapdown.ahrs.remarks import fixed_frame, remarks
-from strapdown.checks import Array, InputError, count, instance
+from strapdown.checks import Array, Hint, InputError, count, instance
 from strapdown.consistency import Accuracy, Judgement
 from strapdown.consistency.accuracy import accuracy as accuracy_of_rows
 from strapdown.consistency.accuracy import accuracy_of
@@ -56,6 +56,7 @@ if TYPE_CHECKING:
     from strapdown.montecarlo.campaign import Campaign
     from strapdown.recordings import GyroSamples
     from strapdown.tuning import Prior, Tuning
+    from strapdown.tuning.diagnosis import Diagnosis
     from strapdown.tuning.procedure import Tuned
 
 __all__ = [
@@ -65,6 +66,7 @@ __all__ = [
     "allan_deviation",
     "check",
     "covariance_analysis",
+    "diagnose",
     "estimate",
     "estimate_record",
     "fit_noise",
@@ -583,6 +585,56 @@ def check(
         raise InputError("truth goes with an estimate; a Monte Carlo contains its own truth; leave it out")
     judgement: Judgement = statistics.judge(confidence_level=confidence_level, detectable_error=detectable_error)
     return judgement
+
+
+def diagnose(
+    result: Estimate, record: ImuRecord, *, setup: FilterSetup | None = None, judgement: Judgement | None = None
+) -> tuple[Diagnosis | None, str]:
+    """Search for the causes of an inconsistency, as ``strapdown check`` with a record does.
+
+    Parameters
+    ----------
+    result : Estimate
+        Result of :func:`estimate`.
+    record : ImuRecord
+        The record from which it was made.
+    setup : FilterSetup, optional
+        The filter that made it. Default: that of the estimate.
+    judgement : Judgement, optional
+        The verdict of :func:`check`, with which the causes are combined.
+
+    Returns
+    -------
+    diagnosis : Diagnosis or None
+        Causes, the most likely first, and the verdict from statistics and causes together; None if the filter has more states.
+    reason : str
+        Feature of the filter that the search does not support, so that only the statistics count; empty if there is none.
+    """
+    from strapdown.tuning import diagnosis
+    from strapdown.tuning.residual_checks import accepted
+
+    chosen = result.setup if setup is None else setup
+    if chosen is None:
+        raise InputError(f"the estimate does not contain its filter; give it, {Hint('setup')}")
+    unknown = sorted(set(result.innovations) - {series.sensor for series in record.vectors})
+    if unknown or not np.isin(result.time, record.time).all():
+        what = f"has no sensor {unknown[0]!r}" if unknown else "has other time stamps"
+        raise InputError(f"the record {what}; the estimate was made from another record")
+    if chosen.states is not None and chosen.states.names:
+        names = ", ".join(chosen.states.names)
+        return None, f"the search supports filters of attitude and bias only, and this one has the states {names}"
+    P = np.diag(result.variance[0]) if result.covariance is None else result.covariance[0]
+    initial = State(attitude=result.attitude[0], bias=result.bias[0], covariance=P)
+    judged = judgement or check(result)
+    # The verdict is on the filter with its gate, so measurements that it rejected are left out.
+    found = diagnosis.diagnose(
+        accepted(record, result), chosen, initial, probability=judged.confidence_level, judgement=judged
+    )
+    if chosen.robust is not None:
+        return found, "The filter weights measurements by their innovations, and the search for causes does not"
+    if any(event.kind == "recovery" for event in result.events):
+        return found, "The filter recovered from a lost attitude, and the search for causes does not"
+    return found, ""
 
 
 def _truth_at(result: Estimate, truth: Truth | ImuRecord | Recording | None) -> Truth | None:

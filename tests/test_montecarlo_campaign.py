@@ -341,14 +341,14 @@ def test_the_command_computes_prints_and_writes(command):
     assert "More runs (--runs, with --resume) are needed for a decision." in said
     assert "short: 30 runs, seed 4, machine: scalar." in said
     for words in (
-        "NEES of the attitude",
-        "NIS of sun sensor",
-        "NIS of star",
+        "NEES attitude",
+        "NIS sun sensor",
+        "NIS star",
         "Worst runs",
         "runs/s",
         "cannot tell: ",
     ):
-        assert words in said
+        assert words in " ".join(said.split())
     report = json.loads(Path("short-montecarlo.json").read_text())
     held = campaign.read("short-montecarlo.h5")
     assert report["runs"] == 30

@@ -266,6 +266,14 @@ def test_two_estimates_on_one_page(folder, tmp_path):
     np.testing.assert_allclose(numbers["bias_difference_rms_by_axis_rad_per_s"], bias, rtol=1e-9)
     charts = charts_of(body(written.page))
     assert [chart["title"] for chart in charts][-1] == "Total attitude error relative to the truth"
+    gaps = first.truth.attitude.copy()
+    gaps[:40] = np.nan
+    lost = dataclasses.replace(first, truth=dataclasses.replace(first.truth, attitude=gaps))
+    setup.write_estimate(tmp_path / "gaps.h5", lost)
+    written = report.write(tmp_path / "gaps.h5", tmp_path / "gaps.html", other=folder / "wrong.h5")
+    assert [chart["title"] for chart in charts_of(body(written.page))][
+        -1
+    ] == "Total attitude error relative to the truth"
     with pytest.raises(InputError, match="only two estimates can be compared"):
         report.write(folder / "right.h5", tmp_path / "page.html", other=folder / "campaign.h5")
     later = dataclasses.replace(second, time=second.time + 1e3)

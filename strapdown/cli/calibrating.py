@@ -9,7 +9,8 @@ import typer
 
 from strapdown.cli.progress import progress_bar
 from strapdown.cli.reading import RECORDING_HELP, Layout
-from strapdown.cli.terminal import command, doubt, need_own, show, writable, written
+from strapdown.cli.terminal import command, doubt, need_own, show, written
+from strapdown.files import writable
 
 
 @command

@@ -25,10 +25,9 @@ from strapdown.cli.terminal import (
     show,
     tables_folder,
     tables_written,
-    writable,
     written,
 )
-from strapdown.files import write_json
+from strapdown.files import writable, write_json
 
 if TYPE_CHECKING:
     from types import FrameType

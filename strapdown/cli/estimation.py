@@ -24,10 +24,9 @@ from strapdown.cli.terminal import (
     need_own,
     say,
     show,
-    writable,
     written,
 )
-from strapdown.files import usable_folder, write_json
+from strapdown.files import usable_folder, writable, write_json
 from strapdown.results import Table
 from strapdown.units import DEGREE, DEGREE_PER_HOUR, DEGREE_PER_HOUR_PER_ROOT_HOUR, DEGREE_PER_ROOT_HOUR
 

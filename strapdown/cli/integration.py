@@ -23,10 +23,9 @@ from strapdown.cli.terminal import (
     show,
     tables_folder,
     tables_written,
-    writable,
     written,
 )
-from strapdown.files import reading
+from strapdown.files import reading, writable
 from strapdown.units import DEGREE
 
 if TYPE_CHECKING:

@@ -24,10 +24,9 @@ from strapdown.cli.terminal import (
     show,
     tables_folder,
     tables_written,
-    writable,
     written,
 )
-from strapdown.files import plain, usable_folder, write_json, written_beside
+from strapdown.files import plain, usable_folder, writable, write_json, written_beside
 from strapdown.results import Column, Table
 
 if TYPE_CHECKING:
@@ -204,6 +203,7 @@ def _identify(
     """Identify the noise of one sensor; print and write the results."""
     from strapdown import allan as identification
     from strapdown import plots, recordings
+    from strapdown.allan import parameters
     from strapdown.plots.style import save_as
 
     out, (specification, numbers, figure_name, _) = output.out, _names(sensor, output.form)
@@ -248,7 +248,7 @@ def _identify(
     show(found, f"Noise coefficients with {100.0 * fit.level:g} % intervals", notes=False)
     console.print("For a term not detected in this record, the last column is an upper bound.")
     with written_beside(out / specification) as temporary:
-        temporary.write_text(_specification(fit, f"{recording.name}, {length}"), encoding="utf-8")
+        temporary.write_text(parameters.to_specification(fit, f"{recording.name}, {length}"), encoding="utf-8")
     content = {
         "source": recording.name,
         "sample_interval_s": fit.sample_interval,
@@ -269,7 +269,7 @@ def _identify(
         console.print(
             f"Cut the recording to an interval where the {sensor} is at rest, or exclude the band of a filter by --highest-frequency."
         )
-        console.print(f"warning: {_DISTRUST}, nor {specification}.", highlight=False)
+        console.print(f"warning: {parameters.DISTRUST}, nor {specification}.", highlight=False)
     return fit
 
 
@@ -295,6 +295,7 @@ def _regressed(recording: Path, sensor: str, source: GyroSamples, order: int, ou
     import tomli_w
 
     from strapdown.allan import temperature as allan_temperature
+    from strapdown.allan.parameters import commented
     from strapdown.gyro.temperature import to_table
 
     if source.temperature is None:
@@ -309,7 +310,7 @@ def _regressed(recording: Path, sensor: str, source: GyroSamples, order: int, ou
     show(fit.listing(unit))
     paths.append(out / _names(sensor)[3])
     with written_beside(paths[-1]) as temporary:
-        text = _commented(
+        text = commented(
             [f"Bias over temperature by `strapdown allan` from {recording.name}, a polynomial in T - reference."]
         )
         content = {sensor: {"temperature": to_table(fit.polynomial, stem)}}
@@ -321,51 +322,3 @@ _UNITS = {"gyro": ("rad/s", "rad_per_s"), "accelerometer": ("m/s²", "m_per_s2")
 """Unit of the samples of each sensor, in messages and in keys."""
 _LARGEST_RATE = 1e12
 """Maximum rate, rad/s, and sample rate, Hz: far beyond any gyro, and far below overflow of squares in the fit."""
-_DISTRUST = "do not trust these intervals"
-
-
-def _specification(fit: identification.NoiseFit, source: str) -> str:
-    """Return the text of gyro.toml, or of that of another sensor: the terms detected, and as comments bounds of the others and warnings."""
-    import tomli_w
-
-    from strapdown import allan as identification
-    from strapdown.allan import parameters as noise_parameters
-
-    sensor = fit.sensor
-    lines = [f"{sensor.capitalize()} noise by `strapdown allan` from {source}."]
-    lines += [f"WARNING: {warning}." for warning in fit.warnings]
-    if fit.warnings:
-        lines.append(f"WARNING: {_DISTRUST}, nor this file.")
-    text = _commented(lines) + "\n" + tomli_w.dumps(noise_parameters.to_toml(fit))
-    partly, wholly = [], []
-    for term, bound in identification.upper_bounds(fit).items():
-        key, factor = noise_parameters.key(sensor, term)
-        values = [bound] if isinstance(bound, float) else list(bound)
-        seen = fit.supported[:, fit.terms.index(term)]
-        if seen.any():
-            below = ", ".join(f"{'xyz'[k]} below {values[k] / factor:.4g}" for k in range(len(values)) if not seen[k])
-            partly.append(f"{key}: 0 where not detected, {below}.")
-        else:
-            shown = ", ".join(f"{value / factor:.4g}" for value in values)
-            wholly.append(f"{key} = {shown if len(values) == 1 else f'[{shown}]'}")
-    if partly or wholly:
-        text += "\n" + _commented(
-            [
-                f"Not detected in the record, so left out; the upper ends of their {100 * fit.level:g} % intervals:",
-                *partly,
-                *wholly,
-            ]
-        )
-    if sensor == "gyro":
-        text += "\n" + _commented(
-            [
-                "Add turn_on_bias_sigma_deg_per_hour from the data sheet: one recording has no information",
-                "about the variation of the bias between switch-ons, and filters then assume that it is near zero.",
-            ]
-        )
-    return text
-
-
-def _commented(lines: list[str]) -> str:
-    """Return lines as TOML comments, without the control characters that a file name may contain."""
-    return "".join(f"# {''.join(c if c.isprintable() else '?' for c in line)}\n" for line in lines)

@@ -20,10 +20,9 @@ from strapdown.cli.terminal import (
     show,
     tables_folder,
     tables_written,
-    writable,
     written,
 )
-from strapdown.files import usable_folder, write_json
+from strapdown.files import usable_folder, writable, write_json
 from strapdown.units import DEGREE
 
 if TYPE_CHECKING:

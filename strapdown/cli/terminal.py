@@ -19,7 +19,7 @@ from rich.text import Text
 
 from strapdown.checks import InputError
 from strapdown.cli.progress import PlainConsole, progress_bar
-from strapdown.files import json_text, output_file, usable_folder, write_json
+from strapdown.files import json_text, usable_folder, writable, write_json
 
 if TYPE_CHECKING:
     from strapdown.recordings import Recording
@@ -178,17 +178,6 @@ def _numbers(place: str, content: Any) -> Iterator[tuple[str, float]]:
             yield from _numbers(f"{place}[{k}]", value)
     elif isinstance(content, (int, float)) and not isinstance(content, bool):
         yield place, float(content)
-
-
-def writable(
-    option: str, *targets: Path, suffixes: tuple[str, ...] = (), sources: tuple[Path | str | None, ...] = ()
-) -> None:
-    """Raise an error for output files that cannot be written, before anything is computed."""
-    for target in targets:
-        if target.is_dir():
-            raise InputError(f"{option}: {target} is a folder, but a file of that name must be written; choose another")
-        read = [source for source in sources if source is not None]
-        output_file(option, target, suffixes or (target.suffix.lower(),), *read)
 
 
 def need_own(target: Path, command: str, own: Callable[[Path], bool]) -> None:

@@ -23,10 +23,9 @@ from strapdown.cli.terminal import (
     show,
     tables_folder,
     tables_written,
-    writable,
     written,
 )
-from strapdown.files import write_json, written_beside
+from strapdown.files import writable, write_json, written_beside
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -18,6 +18,8 @@ from strapdown.estimation.states import ProcessNoise, State
 from strapdown.records import ImuRecord
 from strapdown.results import Column, Listed, Table
 
+WEAKEST = 3
+"""Minimum number of directions in text: these, and all that are not observed."""
 NAMED = 0.25
 """Minimum component of a direction, relative to its largest, for a state to be named."""
 
@@ -104,8 +106,12 @@ class Observability(Listed):
             (f"{state}, {unit}", *sigmas, part)
             for state, unit, *sigmas, part in zip(self.states, self.units, *columns, self.unobserved, strict=True)
         ]
-        notes = ["singular value: direction, each state relative to its prior σ (and the remaining σ)"]
-        notes += [f"{self.singular_values[k]:14.3g}: {self.words(k)}" for k in reversed(range(len(self.states)))]
+        n = len(self.states)
+        notes = ["singular value: the weakest directions, each state relative to its prior σ (and the remaining σ)"]
+        notes += [
+            f"{self.singular_values[k]:14.3g}: {self.words(k)}"
+            for k in range(n - 1, min(self.rank, n - WEAKEST) - 1, -1)
+        ]
         title = f"{self.rank} of {len(self.states)} directions are observed (singular value {self.threshold:g} or more)"
         return Table(
             title,

@@ -10,7 +10,7 @@ import math
 import os
 import secrets
 import stat
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -142,17 +142,25 @@ def usable_folder(name: str, folder: str | os.PathLike[str]) -> None:
         raise InputError(f"{name} is {folder}, but there is no permission to write to {place}; choose another folder")
 
 
-def output_file(
-    name: str, path: str | os.PathLike[str], suffixes: tuple[str, ...], *sources: str | os.PathLike[str]
+def writable(
+    name: str,
+    *paths: str | os.PathLike[str],
+    suffixes: tuple[str, ...] = (),
+    sources: Sequence[str | os.PathLike[str] | None] = (),
 ) -> None:
-    """Reject an output file whose suffix is not in ``suffixes``, or that would replace a file that is read."""
-    target = Path(path)
-    if target.suffix.lower() not in suffixes:
-        raise InputError(f"{name} is {target}, but it is written as {' or '.join(suffixes)}; choose such a suffix")
-    for source in sources:
-        if target.exists() and Path(source).exists() and target.samefile(source):
-            raise InputError(f"{name} is {target}, the same file that is read; choose another name")
-    usable_folder(name, target.parent)
+    """Reject output files that cannot be written, before anything is computed.
+
+    A folder in the place of a file, a suffix that is not in ``suffixes``, or a file that is one of the ``sources`` that are read.
+    """
+    for target in map(Path, paths):
+        if target.is_dir():
+            raise InputError(f"{name}: {target} is a folder, but a file of that name must be written; choose another")
+        if suffixes and target.suffix.lower() not in suffixes:
+            raise InputError(f"{name} is {target}, but it is written as {' or '.join(suffixes)}; choose such a suffix")
+        for source in sources:
+            if source is not None and target.exists() and Path(source).exists() and target.samefile(source):
+                raise InputError(f"{name} is {target}, the same file that is read; choose another name")
+        usable_folder(name, target.parent)
 
 
 def plain(value: Any) -> Any:
