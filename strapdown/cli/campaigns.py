@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 import typer
 
 from strapdown.checks import InputError, count
@@ -294,16 +293,7 @@ def _print_result(campaign: Campaign) -> tuple[int, dict[str, Any], list[Table]]
     listed = tables(report)
     for one in listed:
         show(one)
-    refused = ", ".join(f"{part['refused']} of {part['sensor']}" for part in report["nis"] if part["refused"])
-    if refused:
-        console.print(f"The gate rejected {refused}.")
-    worst = ", ".join(
-        f"{part['run']} ({'failed' if part['largest_nees'] is None else format(part['largest_nees'], '.1f')})"
-        for part in report["worst_runs"][:5]
-    )
-    console.print(f"Worst runs, by maximum NEES of the state: {worst}. Use --replay to examine one.")
-    if report["failed_runs"]:
-        console.print(f"In {counted(report['failed_runs'], 'run')} the filter failed: no finite error or covariance.")
+    console.print("Use --replay to examine a run.")
     rate = ""
     if campaign.seconds > 0.0:
         rate = f" ({rate_text(campaign.statistics.runs / campaign.seconds)} runs/s, including compilation)"
@@ -316,17 +306,7 @@ def _print_result(campaign: Campaign) -> tuple[int, dict[str, Any], list[Table]]
         console.print("More runs (--runs, with --resume) are needed for a decision.")
     if judgement.unmodelled and campaign.plan.setup.states is None and campaign.plan.setup.estimator == MEKF:
         console.print("--states adds states for most of these errors to the filter.")
-    content = {
-        "plan": campaign.plan.to_table(),
-        "digest": campaign.plan.digest,
-        "machine": campaign.machine,
-        "lanes_do_not_serve": campaign.reason or None,
-        "chunk": campaign.chunk,
-        "version": campaign.version,
-        "seconds": campaign.seconds,
-        "judgement": judgement.summary(),
-        **report,
-    }
+    content = {**campaign.summary(), "judgement": judgement.summary(), **report}
     return status_of(judgement), content, listed
 
 
@@ -336,24 +316,17 @@ def _replayed(target: Path, run: int) -> list[Path]:
 
 
 def _replay(plan: Plan, run: int, machine: str, target: Path) -> None:
-    from strapdown import consistency, workflows
     from strapdown import montecarlo as engine
+    from strapdown import workflows
     from strapdown.recordings import recordfiles
 
     again = engine.replay(plan, run, machine=machine)
-    estimate, truth, paths = again.estimate, again.estimate.truth, _replayed(target, run)
-    recordfiles.write_record(paths[0], again.record, attributes=estimate.details)
-    workflows.write(estimate, paths[1])
-    size, states = (6, "six") if estimate.has_bias else (3, "three")
-    assert estimate.covariance is not None
-    assert truth is not None
-    error = consistency.errors(estimate.attitude, np.nan_to_num(estimate.bias), truth.attitude, truth.bias)[:, :size]
-    nees = consistency.nees(error, estimate.covariance[:, :size, :size])
-    # At the epochs of the statistics, as in the list of worst runs.
-    rows = np.searchsorted(estimate.time, plan.time + 1e-9, side="right") - 1
-    worst = int(rows[np.argmax(nees[rows])])
+    paths = _replayed(target, run)
+    recordfiles.write_record(paths[0], again.record, attributes=again.estimate.details)
+    workflows.write(again.estimate, paths[1])
+    nees, worst = again.largest_nees(plan.time)
     console.print(
         f"Run {run} of seed {plan.seed}, machine: {engine.choose(plan, machine)}. Its maximum NEES at the {plan.epochs} epochs of the "
-        f"campaign is {nees[worst]:.1f} ({states} states), at {estimate.time[worst]:g} s."
+        f"campaign is {nees:.1f} ({'six' if again.estimate.has_bias else 'three'} states), at {worst:g} s."
     )
     written(*paths)

@@ -208,7 +208,7 @@ def _sources(
     paths: Sequence[Path], chosen: FilterSetup | None, start: _Filter, layout: Layout
 ) -> tuple[list[ImuRecord | Recording], FilterSetup | None]:
     """Return the records, and the filter of the file; say what it does not model."""
-    from strapdown import recordings
+    from strapdown import ahrs, recordings
     from strapdown.cli.filters import filter_for, need_angles
     from strapdown.estimation.setup import FilterSetup
     from strapdown.recordings import recordfiles
@@ -220,6 +220,7 @@ def _sources(
                 raise InputError(f"{path} is a recording, which specifies no errors; --states is for simulated records")
             recording = recordings.read(path, **layout.options(path))
             say(recording.left_out_words)
+            ahrs.need_accelerometer(recording)
             doubt(recording, path)
             sources.append(recording)
             continue

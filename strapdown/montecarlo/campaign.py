@@ -129,6 +129,24 @@ class Campaign(Listed):
             return Table(f"Monte Carlo of {self.runs} runs, none of them finished", (), ())
         return self.statistics.listing()
 
+    def summary(self) -> dict[str, Any]:
+        """Return plan and provenance as plain values for JSON.
+
+        Returns
+        -------
+        dict
+            Plan with its digest, engine, chunk size, version and time; :func:`strapdown.montecarlo.summary` has the statistics.
+        """
+        return {
+            "plan": self.plan.to_table(),
+            "digest": self.plan.digest,
+            "machine": self.machine,
+            "lanes_do_not_serve": self.reason or None,
+            "chunk": self.chunk,
+            "version": self.version,
+            "seconds": self.seconds,
+        }
+
     @property
     def finished(self) -> bool:
         """Whether the statistics contain all runs."""

@@ -101,6 +101,17 @@ class Replay:
     estimate: Estimate
     """Estimate at every filter step, with full covariances."""
 
+    def largest_nees(self, epochs: ArrayLike) -> tuple[float, float]:
+        """Return the largest NEES of the states at these epochs (:attr:`Plan.time`), as in the list of worst runs, and its time, s."""
+        estimate, truth, size = self.estimate, self.estimate.truth, 6 if self.estimate.has_bias else 3
+        assert estimate.covariance is not None
+        assert truth is not None
+        error = consistency.errors(estimate.attitude, np.nan_to_num(estimate.bias), truth.attitude, truth.bias)
+        nees = consistency.nees(error[:, :size], estimate.covariance[:, :size, :size])
+        rows = np.searchsorted(estimate.time, np.asarray(epochs) + 1e-9, side="right") - 1
+        worst = int(rows[np.argmax(nees[rows])])
+        return float(nees[worst]), float(estimate.time[worst])
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Statistics(ByContent, Listed):

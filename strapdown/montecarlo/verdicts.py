@@ -123,6 +123,7 @@ def tables(summary: Mapping[str, Any]) -> list[Table]:
     number = lambda value: "-" if value is None else f"{value:.4g}" if value >= 1e3 else f"{value:.4f}"  # noqa: E731
     ranged = lambda value: "" if value is None else number(value)  # noqa: E731
     runs = f"{summary['runs']} runs"
+    refused = ", ".join(f"{part['refused']} of {part['sensor']}" for part in summary["nis"] if part["refused"])
     tests = [
         ("NEES", subset, part["anees"], part["least"], part["greatest"], *part["bounds"], part["consistent"])
         for subset, part in summary["nees"].items()
@@ -144,10 +145,20 @@ def tables(summary: Mapping[str, Any]) -> list[Table]:
             Column("", "consistent", shown=passed),
         ),
         tests,
+        [f"The gate rejected {refused}."] if refused else [],
         left=2,
         name="consistency",
     )
     last, coverage = summary["last_epoch"], summary["coverage"]
+    worst = ", ".join(
+        f"{part['run']} ({'failed' if part['largest_nees'] is None else format(part['largest_nees'], '.1f')})"
+        for part in summary["worst_runs"][:5]
+    )
+    failed = summary["failed_runs"]
+    notes = [f"Worst runs, by maximum NEES of the state: {worst}."]
+    if failed:
+        runs_failed = f"{failed} run{'s' if failed > 1 else ''}"
+        notes.append(f"In {runs_failed} the filter failed: no finite error or covariance.")
     sizes = ("mean_error", "rms_error", "sigma", *(f"error_quantile_{q:g}" for q in QUANTILES))
     labels = ("mean", "RMS", "filter's σ", *(f"{100.0 * q:g} %" for q in QUANTILES))
     errors = [
@@ -170,6 +181,7 @@ def tables(summary: Mapping[str, Any]) -> list[Table]:
         f"Fraction of the errors within kσ at the tested epochs, {runs}",
         (Column("of", "of"), *(Column(f"{k}σ", f"inside_{k}_sigma", shown=percent) for k in (1, 2, 3))),
         shares,
+        notes,
         name="coverage",
     )
     return [consistency, at_the_end, within]

@@ -238,7 +238,13 @@ class Tuning(Listed):
     attitude_rms: tuple[float, float] | None = None
 
     def summary(self) -> dict[str, Any]:
-        """Return everything as plain values for JSON, in SI units."""
+        """Return everything as plain values for JSON, in SI units.
+
+        Returns
+        -------
+        dict
+            Parameters with their intervals, objective, searches, errors not modelled, gate, and performance on held-out data.
+        """
         content: dict[str, Any] = {
             "parameters": [
                 {**vars(one), "note": one.words, "unit": one.unit.name, "si_per_unit": one.unit.factor}
