@@ -82,7 +82,20 @@ DISTRUST = "do not trust these intervals"
 
 
 def to_specification(fit: NoiseFit, source: str) -> str:
-    """Return the text of ``gyro.toml``, or that of another sensor: terms detected, and as comments bounds of the others and warnings."""
+    """Return the text of ``gyro.toml``, or that of another sensor: terms detected, and as comments bounds of the others and warnings.
+
+    Parameters
+    ----------
+    fit : NoiseFit
+        Coefficients of one sensor.
+    source : str
+        Description of the recording.
+
+    Returns
+    -------
+    str
+        TOML with comments.
+    """
     import tomli_w
 
     sensor = fit.sensor
