@@ -1,14 +1,11 @@
 """Reading recordings compared with iteration by the format's library: ns per message, and ratios. ``python benchmarks/recordings.py``.
 
-Each file contains only gyro and accelerometer, written by this package. rosbags yields raw messages, not decoded; pyulog decodes all of
-them.
+Each file contains only gyro and accelerometer, written by this package. rosbags yields raw messages, not decoded.
 """
 
 from __future__ import annotations
 
 import argparse
-import contextlib
-import io
 import json
 import tempfile
 import time
@@ -22,7 +19,7 @@ from strapdown.files import write_json
 from strapdown.kernels.machine import describe
 from strapdown.recordings import Recording, read, write
 
-ENDINGS = (".db3", ".mcap", ".bag", ".ulg")
+ENDINGS = (".db3", ".mcap", ".bag")
 
 
 def recording(n: int) -> Recording:
@@ -38,12 +35,6 @@ def recording(n: int) -> Recording:
 
 def iterate(path: Path) -> None:
     """Iterate over all messages by the library of the format."""
-    if path.suffix == ".ulg":
-        import pyulog
-
-        with contextlib.redirect_stdout(io.StringIO()):
-            pyulog.ULog(str(path))
-        return
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from strapdown import gyro, motion, scenarios, tuning, units, vectors
 from strapdown.estimation import setup
-from strapdown.tuning import Comparison, Plan, Tuning
+from strapdown.tuning import Comparison, Tuning
 
 FREE = ("gyro.arw", "gyro.rrw", "star 1.sigma", "star 2.sigma")
 
@@ -26,8 +26,6 @@ class Result:
     """True values, SI."""
     too_large: Tuning
     too_small: Tuning
-    plan: Plan
-    """Standard errors predicted without a record."""
     held_out: Comparison
     """The optimistic filter before and after tuning, on the end of the record."""
     record: scenarios.ImuRecord
@@ -63,7 +61,6 @@ def main(*, duration=1800.0, rate=20.0, wrong=30.0, starts=20, seed=1, out=None)
         duration=duration,
     )
     right = setup.FilterSetup.for_scenario(scenario, attitude_sigma=0.1 * units.DEGREE, states=False)
-    predicted = tuning.plan(scenario, right, FREE, lengths=[0.7 * duration], seed=seed)
     record = scenarios.simulate(scenario, seed)
     whole = tuning.record_case(record, right, seed=seed)
     (train,), test = tuning.split([whole], 0.3)
@@ -77,7 +74,6 @@ def main(*, duration=1800.0, rate=20.0, wrong=30.0, starts=20, seed=1, out=None)
         truth=truth,
         too_large=tuned["too large"],
         too_small=tuned["too small"],
-        plan=predicted,
         held_out=tuning.compare(test, before["too small"], tuned["too small"].setup),
         record=record,
     )
@@ -127,7 +123,7 @@ def searches(tuned, shown, ax, *, label):
 
 
 def values(result, ax):
-    """Draw tuned values relative to the truth with their intervals, and the predicted spread."""
+    """Draw tuned values relative to the truth with their intervals, and the spread of the Cramér–Rao bound."""
     from strapdown.plots.style import legend_above
 
     place = np.arange(len(FREE))
@@ -138,9 +134,14 @@ def values(result, ax):
         ax.errorbar(
             place + shift, ratio[0], (ratio[0] - ratio[1], ratio[2] - ratio[0]), fmt="o", ms=4, capsize=3, label=name
         )
-    half = 1.96 * result.plan.errors[0]
+    half = 1.96 * np.array([one.standard_error for one in result.too_small.parameters])
     ax.bar(
-        place, np.exp(half) - np.exp(-half), bottom=np.exp(-half), width=0.6, alpha=0.2, label="predicted, 95 % about 1"
+        place,
+        np.exp(half) - np.exp(-half),
+        bottom=np.exp(-half),
+        width=0.6,
+        alpha=0.2,
+        label="Cramér–Rao bound, 95 % about 1",
     )
     ax.axhline(1.0, lw=0.8, color="k")
     ax.set_xticks(place, FREE)

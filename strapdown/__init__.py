@@ -6,8 +6,8 @@
 >>> print(sd.check(estimate, record))  # is the filter consistent?  # doctest: +SKIP
 
 Tasks
-    ``simulate``, ``read``, ``read_attitudes``, ``write``, ``estimate``, ``smooth``, ``integrate``, ``check``, ``accuracy``, ``tune``,
-    ``monte_carlo``, ``covariance_analysis``, ``allan_deviation``, ``fit_noise``, ``calibrate``, ``export``, ``initial_state``
+    ``simulate``, ``read``, ``read_attitudes``, ``write``, ``estimate``, ``smooth``, ``integrate``, ``check``, ``diagnose``, ``accuracy``,
+    ``tune``, ``monte_carlo``, ``covariance_analysis``, ``allan_deviation``, ``fit_noise``, ``calibrate``, ``export``, ``initial_state``
 Classes
     ``Scenario``, ``GyroSpec``, ``VectorSensor``, ``FilterSetup``, ``ProcessNoise``, ``Gate``, ``Robust``; ``LiveFilter`` and
     ``StepFilter`` filter sample by sample, compiled and on filterpy, ``LiveAhrs`` as ``estimate`` does a recording. Every function raises
@@ -74,6 +74,7 @@ if TYPE_CHECKING:
         allan_deviation,
         check,
         covariance_analysis,
+        diagnose,
         estimate,
         fit_noise,
         integrate,
@@ -110,6 +111,7 @@ __all__ = [
     "consistency",
     "covariance",
     "covariance_analysis",
+    "diagnose",
     "estimate",
     "estimation",
     "export",
@@ -155,6 +157,7 @@ _HOMES = {
     "calibrate": "calibration",
     "check": "workflows",
     "covariance_analysis": "workflows",
+    "diagnose": "workflows",
     "estimate": "workflows",
     "export": "codegen",
     "fit_noise": "workflows",

@@ -6,10 +6,13 @@ the value, the place (name and index) and the remedy. Kernels do not check their
 
 from __future__ import annotations
 
+import ast
 import difflib
+import re
 import reprlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from types import EllipsisType
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -34,6 +37,35 @@ class InputError(ValueError):
         ...
     strapdown.checks.InputError: scenario 'two-star' is not known; did you mean 'two-stars'? ...
     """
+
+
+class Hint(NamedTuple):
+    """An argument to give, as part of a message: :func:`str` names it as in Python, and the command line its option.
+
+    Examples
+    --------
+    >>> f"the accelerometer is inverted: {Hint('invert', 'accelerometer')}; the delay may be given, {Hint('latency')}"
+    "the accelerometer is inverted: `invert='accelerometer'`; the delay may be given, `latency=`"
+    """
+
+    argument: str
+    value: Any = None
+    """Value to give; None: any."""
+
+    def __str__(self) -> str:
+        return f"`{self.argument}={'' if self.value is None else repr(self.value)}`"
+
+    @staticmethod
+    def replaced(text: str, shown: Callable[[Hint], str]) -> str:
+        """Return a message with another form of the hints in it."""
+
+        def replaced(match: re.Match[str]) -> str:
+            try:
+                return shown(Hint(match[1], ast.literal_eval(match[2] or "None")))
+            except (ValueError, SyntaxError):  # no hint, but a name from a file that looks like one
+                return match[0]
+
+        return re.sub(r"`(\w+)=([^`]*)`", replaced, text)
 
 
 OF_YOUR_OWN = "a filter of your own"

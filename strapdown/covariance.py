@@ -47,7 +47,7 @@ from strapdown.kernels.structure import Sensor
 from strapdown.kernels.walk import walk
 from strapdown.randomness import generator
 from strapdown.records import ImuRecord
-from strapdown.results import ByValue, Listed, Listing, figure
+from strapdown.results import ByValue, Column, Listed, Table
 from strapdown.scenarios import Scenario
 from strapdown.units import DEGREE
 from strapdown.vectors import VectorMeasurements
@@ -165,7 +165,7 @@ class Analysis(Listed):
     left_out: tuple[str, ...]
     beyond_linear: tuple[str, ...]
 
-    def listing(self) -> Listing:
+    def listing(self) -> Table:
         """Return the error budget at the last epoch as a table, the largest attitude error first, with the expected NEES and NIS."""
         rms, sigma = self.rms[-1], self.filter_sigma[-1]
         unit, size = units.angle_unit([*rms[:3], *sigma[:3]])
@@ -175,7 +175,8 @@ class Analysis(Listed):
             parts = np.sqrt(np.mean(six.reshape(2, 3) ** 2, axis=1))
             sources.append((name, kind, float(parts[0]), float(parts[1])))
         rows = [
-            (name, kind, figure(attitude / size, 3), figure(bias / rate, 3)) for name, kind, attitude, bias in sources
+            (name, kind, attitude / size, bias / rate, attitude / units.ARCSECOND, bias / units.DEGREE_PER_HOUR)
+            for name, kind, attitude, bias in sources
         ]
         state, attitude, bias = self.expected_nees[-1]
         nis = ", ".join(f"{sensor} {value:.3g}" for sensor, value in self.expected_nis.items())
@@ -187,8 +188,16 @@ class Analysis(Listed):
             *([f"Left out: {', '.join(self.left_out)}."] if self.left_out else []),
             *(f"Beyond linear: {one}; use a Monte Carlo (`strapdown montecarlo`)." for one in self.beyond_linear),
         ]
-        columns = ("source", "kind", f"attitude, {unit}", f"bias, {rate_name}")
-        return Listing(f"Error budget per axis at {self.time[-1]:.6g} s", columns, rows, notes, left=2)
+        columns = (
+            Column("source", "source"),
+            Column("kind", "kind"),
+            Column(f"attitude, {unit}", digits=3),
+            Column(f"bias, {rate_name}", digits=3),
+            Column(None, "attitude_arcsec"),
+            Column(None, "bias_deg_per_hour"),
+        )
+        title = f"Error budget per axis at {self.time[-1]:.6g} s, RMS"
+        return Table(title, columns, rows, notes, left=2, name="budget")
 
     @property
     def words(self) -> str:

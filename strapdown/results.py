@@ -13,33 +13,80 @@ import io
 import math
 import textwrap
 import types
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from html import escape
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-__all__ = ["ByContent", "ByValue", "Listed", "Listing", "equal", "figure"]
+__all__ = ["ByContent", "ByValue", "Column", "Listed", "Table", "equal", "figure"]
 
 WIDTH = 88
 """Maximum number of characters in a line of a title or a note."""
 
 
-class Listing(NamedTuple):
-    """A table of text with a title above and notes below."""
+Value = str | float | int | bool | None
+"""Content of a cell; None and NaN are empty."""
+
+
+class Column(NamedTuple):
+    """A column of a :class:`Table`."""
+
+    label: str | None
+    """Heading in text; None: the column is in files only."""
+    key: str | None = None
+    """Heading in CSV, a name with the unit; None: the column is in text only."""
+    digits: int = 4
+    """Number of significant digits in text."""
+    shown: Callable[[Any], str] | None = None
+    """Text of a value, if not a number with these digits."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Table:
+    """A table of values with a title and notes: text and HTML here, CSV and LaTeX in :mod:`strapdown.report.tables`."""
 
     title: str
-    columns: Sequence[str]
-    rows: Sequence[Sequence[str]]
+    columns: Sequence[Column | str]
+    """A text is the label of a column."""
+    rows: Sequence[Sequence[Any]]
+    """One value for each column."""
     notes: Sequence[str] = ()
     left: int = 1
-    """Number of leading columns with text; the others contain numbers."""
+    """Number of leading columns with text, in text; the others contain numbers."""
+    name: str = ""
+    """Name of its files without suffix."""
+
+    @property
+    def _labelled(self) -> list[tuple[int, Column]]:
+        columns = [Column(one) if isinstance(one, str) else one for one in self.columns]
+        return [(k, one) for k, one in enumerate(columns) if one.label is not None]
+
+    @property
+    def head(self) -> list[str]:
+        """Headings in text."""
+        return [str(one.label) for _, one in self._labelled]
+
+    @property
+    def cells(self) -> list[list[str]]:
+        """Rows as text."""
+        return [[_shown(row[k], one) for k, one in self._labelled] for row in self.rows]
+
+    @property
+    def keys(self) -> dict[str, int]:
+        """Headings in CSV, and the places of their columns."""
+        return {one.key: k for k, one in enumerate(self.columns) if isinstance(one, Column) and one.key is not None}
+
+    @property
+    def records(self) -> list[dict[str, Any]]:
+        """Rows by the keys of the columns."""
+        return [{key: row[k] for key, k in self.keys.items()} for row in self.rows]
 
     @property
     def text(self) -> str:
         """The table as lines of text."""
-        cells = [list(self.columns), *(list(row) for row in self.rows)]
-        widths = [max(len(row[k]) for row in cells) for k in range(len(self.columns))]
+        cells = [self.head, *self.cells]
+        widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
         lines = [
             "  ".join(
                 f"{cell:{'<' if k < self.left else '>'}{width}}"
@@ -68,10 +115,23 @@ class Listing(NamedTuple):
                 for side, cell in zip(sides, cells, strict=True)
             )
 
-        body = "".join(f"<tr>{row(cells, 'td')}</tr>" for cells in self.rows)
-        table = f"<table><thead><tr>{row(self.columns, 'th')}</tr></thead><tbody>{body}</tbody></table>"
+        body = "".join(f"<tr>{row(cells, 'td')}</tr>" for cells in self.cells)
+        table = f"<table><thead><tr>{row(self.head, 'th')}</tr></thead><tbody>{body}</tbody></table>"
         notes = "".join(f"<p>{escape(line)}</p>" for note in self.notes for line in note.splitlines())
         return f"<div><p><b>{escape(self.title)}</b></p>{table if self.rows else ''}{notes}</div>"
+
+
+def _shown(value: Value, column: Column) -> str:
+    """Return a value as text."""
+    if column.shown is not None:
+        return column.shown(value)
+    if isinstance(value, str):
+        return value
+    if isinstance(value, (bool, np.bool_)):
+        return "yes" if value else "no"
+    if value is None or not isinstance(value, (int, np.integer)):
+        return figure(value, column.digits)
+    return str(value)
 
 
 class Listed:
@@ -81,7 +141,7 @@ class Listed:
     --------
     >>> class Result(Listed):
     ...     def listing(self):
-    ...         return Listing("Errors", ("axis", "deg"), [("x", "0.1"), ("y", "12.3")])
+    ...         return Table("Errors", ("axis", "deg"), [("x", 0.1), ("y", 12.3)])
     >>> print(Result())
     Errors
     axis   deg
@@ -93,7 +153,7 @@ class Listed:
     _drawn_by: ClassVar[str] = ""
     """Name of the function of ``strapdown.plots`` whose figure a notebook shows below the table."""
 
-    def listing(self) -> Listing:
+    def listing(self) -> Table:
         """Return the result as a table."""
         raise NotImplementedError
 

@@ -31,7 +31,7 @@ from strapdown import (
     units,
 )
 from strapdown.ahrs.remarks import fixed_frame, remarks
-from strapdown.checks import Array, InputError, count, instance
+from strapdown.checks import Array, Hint, InputError, count, instance
 from strapdown.consistency import Accuracy, Judgement
 from strapdown.consistency.accuracy import accuracy as accuracy_of_rows
 from strapdown.consistency.accuracy import accuracy_of
@@ -56,6 +56,8 @@ if TYPE_CHECKING:
     from strapdown.montecarlo.campaign import Campaign
     from strapdown.recordings import GyroSamples
     from strapdown.tuning import Prior, Tuning
+    from strapdown.tuning.diagnosis import Diagnosis
+    from strapdown.tuning.procedure import Tuned
 
 __all__ = [
     "AttitudeHistory",
@@ -64,6 +66,7 @@ __all__ = [
     "allan_deviation",
     "check",
     "covariance_analysis",
+    "diagnose",
     "estimate",
     "estimate_record",
     "fit_noise",
@@ -584,6 +587,56 @@ def check(
     return judgement
 
 
+def diagnose(
+    result: Estimate, record: ImuRecord, *, setup: FilterSetup | None = None, judgement: Judgement | None = None
+) -> tuple[Diagnosis | None, str]:
+    """Search for the causes of an inconsistency, as ``strapdown check`` with a record does.
+
+    Parameters
+    ----------
+    result : Estimate
+        Result of :func:`estimate`.
+    record : ImuRecord
+        The record from which it was made.
+    setup : FilterSetup, optional
+        The filter that made it. Default: that of the estimate.
+    judgement : Judgement, optional
+        The verdict of :func:`check`, with which the causes are combined.
+
+    Returns
+    -------
+    diagnosis : Diagnosis or None
+        Causes, the most likely first, and the verdict from statistics and causes together; None if the filter has more states.
+    reason : str
+        Feature of the filter that the search does not support, so that only the statistics count; empty if there is none.
+    """
+    from strapdown.tuning import diagnosis
+    from strapdown.tuning.residual_checks import accepted
+
+    chosen = result.setup if setup is None else setup
+    if chosen is None:
+        raise InputError(f"the estimate does not contain its filter; give it, {Hint('setup')}")
+    unknown = sorted(set(result.innovations) - {series.sensor for series in record.vectors})
+    if unknown or not np.isin(result.time, record.time).all():
+        what = f"has no sensor {unknown[0]!r}" if unknown else "has other time stamps"
+        raise InputError(f"the record {what}; the estimate was made from another record")
+    if chosen.states is not None and chosen.states.names:
+        names = ", ".join(chosen.states.names)
+        return None, f"the search supports filters of attitude and bias only, and this one has the states {names}"
+    P = np.diag(result.variance[0]) if result.covariance is None else result.covariance[0]
+    initial = State(attitude=result.attitude[0], bias=result.bias[0], covariance=P)
+    judged = judgement or check(result)
+    # The verdict is on the filter with its gate, so measurements that it rejected are left out.
+    found = diagnosis.diagnose(
+        accepted(record, result), chosen, initial, probability=judged.confidence_level, judgement=judged
+    )
+    if chosen.robust is not None:
+        return found, "The filter weights measurements by their innovations, and the search for causes does not"
+    if any(event.kind == "recovery" for event in result.events):
+        return found, "The filter recovered from a lost attitude, and the search for causes does not"
+    return found, ""
+
+
 def _truth_at(result: Estimate, truth: Truth | ImuRecord | Recording | None) -> Truth | None:
     """Return the truth at the epochs of an estimate."""
     if truth is None or isinstance(truth, Truth):
@@ -731,7 +784,9 @@ def tune(
     *,
     setup: FilterSetup | None = None,
     free: Sequence[str] | None = None,
-    priors: Mapping[str, Prior] | None = None,
+    states: bool | None = None,
+    priors: Mapping[str, Prior] | GyroSpec | None = None,
+    holdout: float | None = None,
     starts: int = 4,
     seed: int = 0,
     threads: int | None = None,
@@ -748,8 +803,12 @@ def tune(
     free : sequence of str, optional
         Parameters to tune: ``"gyro.arw"``, ``"gyro.rrw"``, ``"SENSOR.sigma"``, …. Default: the two of the gyro and the σ of every sensor;
         for recordings without ``truth`` or ``rmse`` only ``"filter.scale"``.
-    priors : mapping of str to Prior, optional
-        Prior distributions of parameters, by name.
+    states : bool, optional
+        Whether the matched filter has an error state for each error that the record specifies. Default: if there are such errors.
+    priors : mapping of str to Prior, or GyroSpec, optional
+        Prior distributions of parameters, by name; or a gyro, for weak priors of its noise.
+    holdout : float, optional
+        Fraction of the data held out, for comparing the filter before and after tuning (``Tuning.comparison``).
     starts : int, default 4
         Number of searches: one from the initial filter, the others from random initial values.
     seed : int, default 0
@@ -757,12 +816,13 @@ def tune(
     threads : int, optional
         Number of threads. Default: one per core.
     **objective
-        Other objectives than the likelihood of the innovations: options of :func:`strapdown.tuning.tune`.
+        ``truth``, ``rmse``, ``gate``, ``spacing``, ``factor`` of :func:`strapdown.tuning.tune`; ``holdout_by`` "record" holds out
+        complete records.
 
     Returns
     -------
     Tuning
-        ``setup`` is the tuned filter, for :func:`estimate` and :func:`monte_carlo`.
+        ``setup`` is the tuned filter, for :func:`estimate` and :func:`monte_carlo`; ``words`` say what it does not model.
 
     Examples
     --------
@@ -770,36 +830,74 @@ def tune(
     >>> tuned = sd.tune(record, free=["gyro.arw", "star 1.sigma"])  # doctest: +SKIP
     >>> estimate = sd.estimate(record, setup=tuned.setup)  # doctest: +SKIP
     """
+    given = [sources] if isinstance(sources, (ImuRecord, Recording, str, os.PathLike)) else list(sources)
+    result = tuned(
+        given,
+        setup=setup,
+        free=free,
+        states=states,
+        priors=priors,
+        holdout=holdout,
+        starts=starts,
+        seed=seed,
+        threads=threads,
+        **objective,
+    )
+    for one in given:
+        if isinstance(one, Recording):
+            _doubt(one)
+    return result.tuning
+
+
+def tuned(
+    sources: Sequence[ImuRecord | Recording],
+    *,
+    names: Sequence[str] = (),
+    setup: FilterSetup | None = None,
+    free: Sequence[str] | None = None,
+    states: bool | None = None,
+    priors: Mapping[str, Prior] | GyroSpec | None = None,
+    holdout: float | None = None,
+    holdout_by: str = "time",
+    threads: int | None = None,
+    **options: Any,
+) -> Tuned:
+    """Return the tuning of :func:`tune` with its objective; ``names``: those of the sources, in messages."""
     from strapdown import tuning
 
-    given = [sources] if isinstance(sources, (ImuRecord, Recording, str, os.PathLike)) else list(sources)
-    if not given:
+    if not sources:
         raise InputError("sources is empty; give at least one record or recording")
-    for one in given:
+    labels = list(names) or [f"record {k}" if len(sources) > 1 else "" for k in range(len(sources))]
+    own, cases = setup is not None, []
+    for one, label in zip(sources, labels, strict=True):
         instance("sources", one, (ImuRecord, Recording), SOURCE)
-    tuning.one_gyro(
-        {
-            f"record {k}": one.origin.gyro
-            for k, one in enumerate(given)
-            if isinstance(one, ImuRecord) and one.origin and one.origin.gyro
-        }
-    )
-    cases = []
-    for one in given:
         if isinstance(one, ImuRecord):
-            setup = setup or setups.FilterSetup.for_record(one, states=None)
-            cases.append(tuning.record_case(one, setup))
+            setup = setup or setups.FilterSetup.for_record(one, states=states)
+            cases.append(tuning.record_case(one, setup, name=label))
         else:
             setup = setup or tuning.recording_setup()
             cases.append(tuning.recording_case(one))
-            _doubt(one)
     assert setup is not None
-    if any(isinstance(one, Recording) for one in given) and not (objective.get("truth") or objective.get("rmse")):
-        free, objective["spacing"] = tuning.by_innovations(
-            free, objective.get("spacing", 0.0), gate=objective.get("gate"), priors=priors
+    if not (options.get("truth") or options.get("rmse") or all(isinstance(one, ImuRecord) for one in sources)):
+        free, options["spacing"] = tuning.by_innovations(
+            free, options.get("spacing", 0.0), gate=options.get("gate"), priors=priors
         )
+    train, held = (tuple(cases), ()) if holdout is None else tuning.split(cases, holdout, holdout_by)  # type: ignore[arg-type]
+    wanted = [name for name in free or () if name not in tuning.GATED]
+    wanted = wanted or list(tuning.default_names([case.record for case in cases]))
+    if not own or any(name.startswith(("gyro.", "filter.")) for name in wanted):
+        specified = (
+            (label, one.origin) for label, one in zip(labels, sources, strict=True) if isinstance(one, ImuRecord)
+        )
+        tuning.one_gyro(
+            {label: origin.gyro for label, origin in specified if origin is not None and origin.gyro is not None}
+        )
+    if isinstance(priors, GyroSpec):
+        by_gyro = tuning.priors_from_gyro(priors, train[0].record)
+        priors = {name: prior for name, prior in by_gyro.items() if name in wanted}
+    gate = options.pop("gate", False) or any(name in tuning.GATED for name in free or ())
     workers = count("threads", threads if threads is not None else os.cpu_count() or 1)
-    return tuning.tune(cases, setup, free, priors=priors, starts=starts, seed=seed, threads=workers, **objective).tuning
+    return tuning.tune(train, setup, wanted, held=held, priors=priors, gate=gate, threads=workers, **options)
 
 
 # ---------------------------------------------------------------------------------------------------------------------- Allan

@@ -51,6 +51,42 @@ def test_the_scenario_at_rest_gives_its_preset_back(succeeds, tmp_path):
     assert "WARNING" not in text
 
 
+ACCELEROMETER = """
+seed = 3
+rate_hz = 50.0
+duration_s = 600.0
+
+[motion]
+type = "rest"
+
+[gyro]
+angle_random_walk_deg_per_sqrt_hour = 0.15
+
+[[sensors]]
+type = "accelerometer"
+name = "accelerometer"
+kind = "vector"
+sigma_m_per_s2 = 0.02
+rate_hz = 50.0
+"""
+
+
+def test_a_simulated_accelerometer_at_rest_gives_the_file_of_kalibr(succeeds, refusal, tmp_path):
+    (tmp_path / "rest.toml").write_text(ACCELEROMETER, encoding="utf-8")
+    succeeds("simulate", "rest.toml")
+    both = ("--sensor", "gyro", "--sensor", "accelerometer", "--kalibr")
+    succeeds("allan", "rest.h5", *both)
+    lines = (tmp_path / "allan-results" / "imu.yaml").read_text(encoding="utf-8").splitlines()
+    found = {
+        name: float(rest.split()[0]) for name, _, rest in (line.partition(": ") for line in lines) if rest[:1].isdigit()
+    }
+    assert found["accelerometer_noise_density"] == pytest.approx(0.02 / np.sqrt(50.0), rel=0.02)
+    assert found["gyroscope_noise_density"] == pytest.approx(0.15 * NOISE, rel=0.02)
+    (tmp_path / "unit.toml").write_text(ACCELEROMETER.replace('kind = "vector"\n', ""), encoding="utf-8")
+    succeeds("simulate", "unit.toml")
+    assert 'simulate it with kind = "vector"' in refusal("allan", "unit.h5", *both, "--out", "other")
+
+
 def test_terms_not_seen_are_left_out_and_bounded_in_comments(succeeds, tmp_path):
     walking = white()
     walking[:, 2] += np.cumsum(3e-5 * np.random.default_rng(2).standard_normal(20_000))

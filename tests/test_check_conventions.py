@@ -13,7 +13,8 @@ import strapdown as sd
 from strapdown import motion, quaternion, recordings, vectors
 from strapdown.ahrs import check_conventions
 from strapdown.ahrs.check_conventions import AXES, FRAMES
-from strapdown.checks import InputError
+from strapdown.checks import Hint, InputError
+from strapdown.cli.progress import option
 from strapdown.recordings import Recording
 from strapdown.units import STANDARD_GRAVITY
 
@@ -261,9 +262,9 @@ def test_doctor_ends_with_the_status_of_the_verdict(run, tmp_path, mistake, stat
     ("mistake", "words"),
     [
         ({}, ""),
-        ({"specific_force": np.eye(3) / STANDARD_GRAVITY}, "units={'accelerometer': 'g'} in Python"),
+        ({"specific_force": np.eye(3) / STANDARD_GRAVITY}, "`units={'accelerometer': 'g'}`"),
         ({"specific_force": np.eye(3) / 3.0}, "fits neither m/s² nor g"),
-        ({"rate": np.eye(3) * 180.0 / np.pi}, "units={'gyro': 'deg/s'} in Python"),
+        ({"rate": np.eye(3) * 180.0 / np.pi}, "`units={'gyro': 'deg/s'}`"),
         ({"rate": np.diag([-1.0, 1.0, 1.0])}, "axes of the gyro should be read as (−x, y, z)"),
         ({"magnetic_field": np.diag([-1.0, 1.0, 1.0])}, "axes of the magnetometer should be read as ("),
     ],
@@ -280,9 +281,10 @@ def test_python_warns_of_what_the_command_warns_of(run, mistake, words):
             warnings.simplefilter("always")
             use(walk)
         assert [
-            f"warning: {str(one.message).removeprefix('walk.csv: ')}. See `strapdown doctor walk.csv`." for one in found
+            f"warning: {Hint.replaced(str(one.message), option).removeprefix('walk.csv: ')}. See `strapdown doctor walk.csv`."
+            for one in found
         ] == said
-    assert all(words in line for line in said)
+    assert all(Hint.replaced(words, option) in line for line in said)
 
 
 @pytest.mark.parametrize("angle", [0.03, 0.1])

@@ -1,10 +1,9 @@
-"""Progress: lines off a terminal, a bar on one, what is compiled, and silence where it is asked for."""
+"""Progress: lines off a terminal, a bar on one, and silence where it is asked for."""
 
 import io
 import json
 import sys
 import time
-import types
 
 import pytest
 from rich.console import Console
@@ -81,31 +80,6 @@ def test_a_fault_ends_the_progress(said):
     assert len(lines_of(said)) == number
 
 
-def test_compiling_is_said_once_with_how_many_of_how_many(said, monkeypatch):
-    numba = pytest.importorskip("numba")
-    for name in ("_known", "_left"):  # what other tests compiled in this process
-        monkeypatch.setattr(progress._compiling, name, set())
-    monkeypatch.setattr(progress._compiling, "_begun", 0)
-    progress._compiling.listen()
-    module = "strapdown.kernels.none"  # as machine.compiled binds them: each function's globals are those that it names
-    source = {"__name__": module}
-    exec("def inner(x):\n    return x + 1.5\n\ndef outer(x):\n    return inner(x) * 2.0\n", source)
-    source["inner"] = numba.njit(source["inner"])
-    seen = []
-    started, finished = progress._compiling.started, progress._compiling.finished
-    progress._compiling.started = lambda one: (started(one), seen.append(progress._compiling.current))
-    progress._compiling.finished = lambda one: (finished(one), seen.append(progress._compiling.current))
-    try:
-        with progress.progress_bar("filtering"):
-            assert numba.njit(source["outer"])(1.0) == 5.0
-    finally:
-        del progress._compiling.started, progress._compiling.finished
-    assert [one.partition("compiling: ")[2].split(" of ")[0] for one in seen if one] == ["0", "0", "1"]
-    assert all(one.endswith(" functions") for one in seen if one)
-    assert seen[-1] == ""
-    assert lines_of(said)[:1] == ["compiling for this machine; the compiled code is cached for later runs"]
-
-
 def test_quiet_may_stand_anywhere(succeeds, monkeypatch):
     heard = []
     for arguments in (("scenarios", "--quiet"), ("--quiet", "scenarios"), ("scenarios",)):
@@ -128,28 +102,6 @@ def test_json_on_standard_output_is_all_that_is_there(run, tmp_path):
     assert "Drift about the third axis" in run("coning-budget", "--psd", "lines.csv", "--rate", 100)[1]
 
 
-def test_a_fault_ends_the_compiling():
-    class Function:
-        def __init__(self, calls):
-            self.py_func = types.FunctionType(compile("", "kernel", "exec"), dict(enumerate(calls)))
-            self.py_func.__module__ = "strapdown.kernels.none"
-
-    called = Function(())
-    kernel = Function((called,))
-    compiling = progress._Compiling()
-    compiling.started(kernel)
-    assert compiling.current == "compiling: 0 of 2 functions"
-    compiling.started(called)
-    compiling.finished(called)
-    assert compiling.current == "compiling: 1 of 2 functions"
-    compiling.finished(kernel)
-    assert compiling.current == ""
-    later = Function((Function(()),))
-    compiling.started(later)
-    compiling.finished(later)  # by a fault, before what it calls
-    assert compiling.current == ""
-
-
 def test_control_characters_of_names_do_not_reach_the_terminal(capsys):
     """Such as those that set its title, or hide the line before."""
     from strapdown.cli.progress import PlainConsole
@@ -164,9 +116,9 @@ def test_control_characters_of_names_do_not_reach_the_terminal(capsys):
 
 def test_nor_do_those_of_a_table(capsys):
     from strapdown.cli import terminal
-    from strapdown.results import Listing
+    from strapdown.results import Table
 
-    terminal.show_listing(Listing("run \x1b[2K", ("sensor\x1b[1A", "test"), [("star\x1b]0;x\x07", "pass")], [], left=2))
+    terminal.show(Table("run \x1b[2K", ("sensor\x1b[1A", "test"), [("star\x1b]0;x\x07", "pass")], left=2))
     said = capsys.readouterr().out
     assert "star\N{REPLACEMENT CHARACTER}]0;x\N{REPLACEMENT CHARACTER}" in said
     assert not {code for code in said if code != "\n" and ord(code) < 32}

@@ -203,7 +203,7 @@ def test_tables_of_other_shapes_and_numbers_are_refused(name, change, words):
 
 def test_catalogue_names_are_the_algorithms_names():
     assert all(ALGORITHMS[name].name == name for name in ALGORITHMS)
-    assert len(coning.algorithm_rows()) == len(ALGORITHMS)
+    assert len(coning.algorithm_table().rows) == len(ALGORITHMS)
     assert "two-sample" in ALGORITHMS
     assert "two-samples" not in ALGORITHMS
     with pytest.raises(InputError, match="did you mean 'two-sample'"):

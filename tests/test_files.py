@@ -5,6 +5,7 @@ import math
 import os
 import subprocess
 import sys
+from contextlib import nullcontext
 
 import pytest
 
@@ -157,7 +158,11 @@ def test_links_beside_an_output_do_not_lead_to_what_is_overwritten(tmp_path, nam
     make(victim, tmp_path / name)
     target = tmp_path / "out.h5"
     if name.endswith("lock"):
-        with pytest.raises(InputError, match=r"\.out\.h5\.lock is (a link|not a regular file)"), locked(target):
+        refused = make is os.symlink
+        with (
+            pytest.raises(InputError, match=r"\.out\.h5\.lock cannot be locked") if refused else nullcontext(),
+            locked(target),
+        ):
             pass
         assert not target.exists()
     else:
@@ -168,9 +173,9 @@ def test_links_beside_an_output_do_not_lead_to_what_is_overwritten(tmp_path, nam
 
 
 @POSIX
-def test_a_pipe_in_the_place_of_the_lock_is_refused_at_once(tmp_path):
+def test_a_pipe_in_the_place_of_the_lock_does_not_stop_the_program(tmp_path):
     os.mkfifo(tmp_path / ".out.h5.lock")
-    with pytest.raises(InputError, match=r"\.out\.h5\.lock is not a regular file"), locked(tmp_path / "out.h5"):
+    with locked(tmp_path / "out.h5"):
         pass
 
 

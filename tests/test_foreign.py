@@ -10,6 +10,7 @@ import pytest
 import scipy.stats
 from measured import waves
 from scipy.spatial.transform import Rotation
+from ulog_writer import message as ulog_message
 
 from sims import peer_judged
 from strapdown import cli, consistency, montecarlo, quaternion, recordings, report, scenarios, vectors
@@ -17,7 +18,7 @@ from strapdown.checks import InputError
 from strapdown.consistency import alignment, check_arrays, foreign
 from strapdown.estimation import setup
 from strapdown.gyro import GyroSpec
-from strapdown.recordings import attitudes, recordfiles, ulog
+from strapdown.recordings import attitudes, recordfiles
 from strapdown.recordings.attitudes import read_attitudes
 from strapdown.records import Truth
 from strapdown.records.outputs import euler, euler_axes, to_ned
@@ -434,10 +435,10 @@ def flight_log(path, run, old=True):
         "estimator_innovations": "uint64_t timestamp;float[3] gravity;float heading;",
         "estimator_innovation_variances": "uint64_t timestamp;float[3] gravity;float heading;",
     }
-    content = [b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0), ulog._message("B", bytes(40))]
-    content += [ulog._message("F", f"{name}:{text}".encode()) for name, text in layouts.items()]
-    content += [ulog._message("A", struct.pack("<BH", 0, k) + name.encode()) for k, name in enumerate(layouts)]
-    content.append(ulog._message("A", struct.pack("<BH", 1, 3) + b"estimator_states"))
+    content = [b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0), ulog_message("B", bytes(40))]
+    content += [ulog_message("F", f"{name}:{text}".encode()) for name, text in layouts.items()]
+    content += [ulog_message("A", struct.pack("<BH", 0, k) + name.encode()) for k, name in enumerate(layouts)]
+    content.append(ulog_message("A", struct.pack("<BH", 1, 3) + b"estimator_states"))
     ned = to_ned(e.attitude)
     xi = np.stack([attitudes._quaternion_columns(q) for q in ned])
     variances = np.einsum("mqi,mij,mqj->mq", 0.5 * xi, e.covariance[:, :3, :3], 0.5 * xi)
@@ -446,13 +447,13 @@ def flight_log(path, run, old=True):
         states, covariances = np.zeros(24), np.ones(number)
         states[:4], covariances[:4] = ned[k], variances[k] if old else 1e-4
         row = struct.pack("<QQ24f", stamp, stamp, *states) + struct.pack(f"<{number}fB", *covariances, number)
-        content.append(ulog._message("D", struct.pack("<H", 0) + row))
+        content.append(ulog_message("D", struct.pack("<H", 0) + row))
         level = struct.pack("<24f", 1.0, *np.zeros(23))
-        content.append(ulog._message("D", struct.pack("<H", 3) + row[:16] + level + row[16 + len(level) :]))
+        content.append(ulog_message("D", struct.pack("<H", 3) + row[:16] + level + row[16 + len(level) :]))
         if k % 10 == 0:
             values = np.append(0.1 * random.standard_normal(3), 0.02 * random.standard_normal())
-            content.append(ulog._message("D", struct.pack("<HQ4f", 1, stamp, *values)))
-            content.append(ulog._message("D", struct.pack("<HQ4f", 2, stamp, 0.01, 0.01, 0.01, 4e-4)))
+            content.append(ulog_message("D", struct.pack("<HQ4f", 1, stamp, *values)))
+            content.append(ulog_message("D", struct.pack("<HQ4f", 2, stamp, 0.01, 0.01, 0.01, 4e-4)))
     path.write_bytes(b"".join(content))
     return ned, variances
 
@@ -492,11 +493,11 @@ def test_a_flight_log_of_the_attitude_alone_is_turned_sorted_and_has_no_covarian
     """R from body axes to North-East-Down becomes M R from the same axes to East-North-Up."""
     pytest.importorskip("pyulog")
     ned = Rotation.from_rotvec(np.random.default_rng(3).standard_normal((4, 3)))
-    content = [b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0), ulog._message("B", bytes(40))]
-    content.append(ulog._message("F", b"vehicle_attitude:uint64_t timestamp;float[4] q;"))
-    content.append(ulog._message("A", struct.pack("<BH", 0, 0) + b"vehicle_attitude"))
+    content = [b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0), ulog_message("B", bytes(40))]
+    content.append(ulog_message("F", b"vehicle_attitude:uint64_t timestamp;float[4] q;"))
+    content.append(ulog_message("A", struct.pack("<BH", 0, 0) + b"vehicle_attitude"))
     for stamp, (x, y, z, w) in zip((7000, 3000, 5000, 5000), ned.as_quat(), strict=True):
-        content.append(ulog._message("D", struct.pack("<HQ4f", 0, stamp, w, x, y, z)))
+        content.append(ulog_message("D", struct.pack("<HQ4f", 0, stamp, w, x, y, z)))
     (tmp_path / "flight.ulg").write_bytes(b"".join(content))
     read = read_attitudes(tmp_path / "flight.ulg")
     assert read.stamps_ns.tolist() == [3_000_000, 5_000_000, 7_000_000]

@@ -374,7 +374,7 @@ def test_an_inverted_accelerometer_is_warned_of():
     rate = 1e-3 * np.random.default_rng(2).standard_normal((n, 3))
     walk = sd.recordings.Recording(source="walk.csv", time=0.01 * np.arange(n), rate=rate, specific_force=force)
     with pytest.warns(
-        UserWarning, match=r"walk.csv: at rest the accelerometer reads -9.81 m/s² along z.*invert= in Python"
+        UserWarning, match=r"walk.csv: at rest the accelerometer reads -9.81 m/s² along z.*`invert='accelerometer'`"
     ):
         sd.estimate(walk)
 
@@ -396,9 +396,7 @@ def test_covariance_analysis_is_that_of_the_matched_filter():
 
 
 def test_a_listing_is_aligned_text_and_escaped_html():
-    made = results.Listing(
-        "A < B", ("state", "", "σ"), [("x", "rad", "1.5"), ("long name", "", "12")], ["a note"], left=2
-    )
+    made = results.Table("A < B", ("state", "", "σ"), [("x", "rad", 1.5), ("long name", "", 12)], ["a note"], left=2)
     assert made.text.splitlines() == [
         "A < B",
         "state             σ",

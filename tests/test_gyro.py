@@ -517,7 +517,7 @@ def test_presets_go_from_consumer_to_navigation_grade():
     for name, preset in datasheets.PRESETS.items():
         assert preset.name == name
         assert preset.document
-        assert "arw" in preset.stated
+        assert "angle_random_walk_deg_per_sqrt_hour" in preset.stated
         assert not set(preset.stated) & set(preset.assumed)
         spec = preset.spec
         assert spec.bias_instability > 0.0

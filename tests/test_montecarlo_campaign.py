@@ -288,7 +288,7 @@ def test_a_file_of_another_version_or_format_is_refused(tmp_path):
 def test_an_existing_file_is_not_written_over_by_mistake(tmp_path):
     path = tmp_path / "c.h5"
     path.write_text("the only copy of my thesis")
-    with pytest.raises(InputError, match="--resume"):
+    with pytest.raises(InputError, match="`resume=True`"):
         go(path, 8)
     assert path.read_text() == "the only copy of my thesis"
     with pytest.raises(InputError, match="cannot be read as HDF5"):
@@ -341,14 +341,14 @@ def test_the_command_computes_prints_and_writes(command):
     assert "More runs (--runs, with --resume) are needed for a decision." in said
     assert "short: 30 runs, seed 4, machine: scalar." in said
     for words in (
-        "NEES of the attitude",
-        "NIS of sun sensor",
-        "NIS of star",
+        "NEES attitude",
+        "NIS sun sensor",
+        "NIS star",
         "Worst runs",
         "runs/s",
         "cannot tell: ",
     ):
-        assert words in said
+        assert words in " ".join(said.split())
     report = json.loads(Path("short-montecarlo.json").read_text())
     held = campaign.read("short-montecarlo.h5")
     assert report["runs"] == 30

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import two_stars
-from measured import errors, turn_to
+from measured import turn_to
 
 from sims import own_filter
 from strapdown import cli, consistency, covariance, estimation, montecarlo, motion, scenarios, tuning, vectors
@@ -110,7 +109,7 @@ def test_without_a_bias_the_attitude_alone_is_judged(own, tmp_path, capsys):
     assert "bias x" not in page
     assert "nan" not in json.dumps(numbers).lower()
     cli.app(["montecarlo", str(tmp_path / "own.h5")], standalone_mode=False)
-    assert "NEES of the attitude" in (output := capsys.readouterr().out)
+    assert "NEES attitude" in (output := " ".join(capsys.readouterr().out.split()))
     assert "bias" not in output
 
 
@@ -211,7 +210,7 @@ def test_a_filter_of_a_python_file_is_run_from_the_command_line(own, folder, cap
 
 def test_its_campaign_goes_on_and_is_replayed_where_the_code_is_given_again(folder):
     command("scene.toml", "--filter", "mine.py", "--runs", 5, "--out", "own.h5")
-    with pytest.raises(InputError, match=r"give it again: --filter mine.py:estimator"):
+    with pytest.raises(InputError, match=r"give it again, `estimator='mine.py:estimator'`"):
         command("own.h5", "--runs", 8, "--resume")
     command("own.h5", "--filter", "mine.py", "--runs", 8, "--resume")
     assert campaign.read(folder / "own.h5").statistics.runs == 8
@@ -380,67 +379,6 @@ def test_arrays_that_make_no_estimate_are_refused():
     ):
         with pytest.raises(InputError, match=message):
             Estimate.from_arrays(**{"time": time, "attitude": q, "covariance": P, **change})
-
-
-# ------------------------------------------------------------------------------------------------------------ tuning
-
-
-def tuned_like_the_package(values):
-    """The package's filter as a foreign one: two noises of the gyro and the σ of one sensor are its parameters."""
-
-    def run(record, initial):
-        chosen = tuning.with_values(two_stars.BELIEVED, values)
-        return setup.run(record, replace(chosen, gate=None), initial, full_covariance=True)
-
-    return run
-
-
-def test_its_parameters_are_tuned_to_those_of_the_package():
-    """The same likelihood, maximised without derivatives: the package's own optimum and errors of the fit."""
-    case = two_stars.case(seed=3)
-    free = ["gyro.arw", "star 1.sigma"]
-    start = {"gyro.arw": 2.0 * two_stars.ARW, "star 1.sigma": 0.5 * two_stars.SIGMAS[0]}
-    found = tuning.fit_own(tuned_like_the_package, [case], start)
-    other = tuning.fit(tuning.likelihood([case], two_stars.BELIEVED, free), starts=2)
-    for name in free:
-        assert found.values[name] == pytest.approx(other[name].value, rel=2e-3)
-        # The curvature itself beside its expectation.
-        assert found.relative_sigma[name] == pytest.approx(other[name].standard_error, rel=0.1)
-    assert 0.02 < found.relative_sigma["gyro.arw"] < 0.5
-    for name, true in zip(free, (two_stars.ARW, two_stars.SIGMAS[0]), strict=True):
-        assert abs(np.log(found.values[name] / true)) < 4.0 * found.relative_sigma[name]
-    again = found.estimator(case.record, case.initial)
-    np.testing.assert_allclose(
-        again.attitude, tuned_like_the_package(found.values)(case.record, case.initial).attitude, rtol=0, atol=0
-    )
-
-
-def test_it_is_tuned_against_a_truth_too():
-    """A filter right but for a factor on its covariance: the factor makes the mean of eᵀP⁻¹e/n one, in closed form."""
-    case = two_stars.case(seed=4)
-
-    def make(values):
-        def run(record, initial):
-            estimate = setup.run(record, two_stars.BELIEVED, initial, full_covariance=True)
-            return replace(estimate, covariance=values["factor"] * estimate.covariance)
-
-        return run
-
-    found = tuning.fit_own(make, [case], {"factor": 5.0}, measure="errors")
-    plain = make({"factor": 1.0})(case.record, case.initial)
-    truth = case.record.truth
-    error = errors(plain, truth)[1:]
-    assert found.values["factor"] == pytest.approx(consistency.nees(error, plain.covariance[1:]).mean() / 6.0, rel=1e-3)
-    rms = tuning.fit_own(tuned_like_the_package, [case], {"star 1.sigma": two_stars.SIGMAS[0]}, measure="rmse")
-    assert rms.value <= np.sqrt(np.mean(error[:, :3] ** 2)) * (1.0 + 1e-9)
-    for arguments, message in (
-        ((make, [], {"factor": 1.0}), "no record"),
-        ((make, [case], {}), "no parameter"),
-        ((make, [case], {"factor": -1.0}), "factor"),
-        ((lambda values: attitude_only, [case], {"x": 1.0}), "no innovations"),
-    ):
-        with pytest.raises(InputError, match=message):
-            tuning.fit_own(*arguments)
 
 
 # ------------------------------------------------------------------------------------------------- the Cramér–Rao bound

@@ -135,13 +135,13 @@ def test_the_doctor_says_it_at_the_top(run, succeeds, tmp_path):
 def test_without_a_field_both_explanations_are_named():
     down = with_samples(walk(field=False), specific_force=-np.eye(3))
     (words,) = check_conventions.at_rest(down)
-    assert "--invert accelerometer" in words
-    assert "--axes x,-y,-z" in words
+    assert "`invert='accelerometer'`" in words
+    assert "`axes='x,-y,-z'`" in words
 
 
 def test_an_inverted_magnetometer_shows_in_its_dip():
     (words,) = check_conventions.at_rest(with_samples(walk(), magnetic_field=-np.eye(3)))
-    assert "--invert magnetometer" in words
+    assert "`invert='magnetometer'`" in words
 
 
 @pytest.mark.parametrize("mounting", [(0.0, 0.0, 0.0), (30.0, 40.0, -30.0), (0.0, 0.0, 90.0), (10.0, -80.0, 0.0)])

@@ -127,7 +127,7 @@ def test_of_several_units_one_must_be_chosen(bag):
     path = bag("mcap", content)
     with pytest.raises(
         InputError,
-        match=r"several inertial units: /left/imu \(40 messages\), /right/imu \(20 messages\).*--topic /left/imu",
+        match=r"several inertial units: /left/imu \(40 messages\), /right/imu \(20 messages\).*`topic='/left/imu'`",
     ):
         read(path)
     with pytest.raises(InputError, match=r"topic '/right/im' is not known; did you mean '/right/imu'"):

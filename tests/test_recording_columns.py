@@ -121,7 +121,7 @@ ODD = "when,u1,u2,u3,f1,f2,f3,n1,n2,n3"
 
 def test_a_mapping_names_columns_and_units(table):
     path = table(ODD)
-    with pytest.raises(InputError, match=r"lacks time.*it has: when, u1.*--columns time="):
+    with pytest.raises(InputError, match=r"lacks time.*it has: when, u1.*`columns={'time': "):
         read(path)
     mapping = columns.parse_mapping("time=when[ms],gx=u3[dps],gy=u2,gz=u1,ax=f1[mg],ay=f2,az=f3")
     recording = read(path, columns=mapping)
@@ -151,7 +151,7 @@ def test_two_sensors_that_fit_are_refused_not_chosen(table):
     header = "time,gyro_x [dps],gyro_y,gyro_z,gyr_x,gyr_y,gyr_z,mx,my,mz"
     path = table(header)
     with pytest.raises(
-        InputError, match=r"the gyro may be that of gyro_x \[dps\] or gyr_x; select one, as in --columns gx="
+        InputError, match=r"the gyro may be that of gyro_x \[dps\] or gyr_x; select one, as in `columns={'gx': "
     ):
         read(path)
     chosen = read(path, columns={"gx": "gyr_x[deg/s]", "gy": "gyr_y", "gz": "gyr_z"})

@@ -341,8 +341,8 @@ def test_the_listing_of_an_estimate_has_sigma_at_its_end_and_at_its_start():
     sigma = np.arange(1.0, 10.0).reshape(3, 3)
     P = [np.diag(np.radians(np.append(one, one / 3600.0)) ** 2) for one in sigma]
     bias = np.radians([[0, 0, 0], [1, 1, 1], [10, -20, 30]]) / 3600.0
-    rows = Estimate.from_arrays([0.0, 1.0, 2.0], [[1, 0, 0, 0]] * 3, P, bias=bias).listing().rows
-    assert [row[1:] for row in rows] == [
+    rows = Estimate.from_arrays([0.0, 1.0, 2.0], [[1, 0, 0, 0]] * 3, P, bias=bias).listing().cells
+    assert [tuple(row[1:]) for row in rows] == [
         *[("°", "", last, first) for last, first in (("7", "1"), ("8", "2"), ("9", "3"))],
         *[
             ("°/h", value, last, first)

@@ -16,7 +16,8 @@ from typer.testing import CliRunner
 
 from strapdown import cli
 from strapdown.checks import InputError
-from strapdown.report.tables import Table, to_csv, to_latex, write
+from strapdown.report.tables import to_csv, to_latex, write
+from strapdown.results import Column, Table
 
 FEW = ("--free", "star 1.sigma", "--starts", 1)
 LATEX = next((path for name in ("pdflatex", "lualatex", "tectonic") if (path := shutil.which(name))), None)
@@ -27,6 +28,11 @@ CELLS = st.one_of(
     st.floats(),
     st.text(st.characters(blacklist_categories=("Cs", "Cc")), max_size=12).filter(lambda text: text != ""),
 )
+
+
+def keyed(keys, rows, title="c"):
+    """A table whose columns are in files too."""
+    return Table(title, [Column(key, key) for key in keys], rows, name="t")
 
 
 def read_back(text):
@@ -47,9 +53,7 @@ def tabular(text):
 @given(st.lists(st.tuples(CELLS, CELLS, CELLS), max_size=6))
 def test_csv_reads_back_to_the_bit(rows):
     keys = ("a", "b_deg", "c, d")
-    held = [dict(zip(keys, row, strict=True)) for row in rows]
-    table = Table(name="t", caption="c", columns=keys, rows=held)
-    head, found = read_back(to_csv(table))
+    head, found = read_back(to_csv(keyed(keys, rows)))
     assert head == list(keys)
     for row, given_row in zip(found, rows, strict=True):
         for text, value in zip(row, given_row, strict=True):
@@ -66,8 +70,7 @@ def test_csv_reads_back_to_the_bit(rows):
 @given(st.lists(st.tuples(CELLS, CELLS, CELLS), min_size=1, max_size=6))
 def test_latex_has_a_cell_for_each_value_and_nothing_unescaped(rows):
     keys = ("a", "b", "c")
-    held = [dict(zip(keys, row, strict=True)) for row in rows]
-    text = to_latex(Table(name="t", caption="50 % of\nall", columns=keys, rows=held))
+    text = to_latex(keyed(keys, rows, "50 % of\nall"))
     columns, head, found = tabular(text)
     assert (len(columns), head) == (3, list(keys))
     assert len(found) == len(rows)
@@ -81,9 +84,8 @@ def test_latex_has_a_cell_for_each_value_and_nothing_unescaped(rows):
 
 
 def test_latex_rounds_and_aligns():
-    rows = [{"name": "100 % of a_b", "drift_deg_per_hour": 1.23456e-8, "unit": "°/√h"}]
-    rows.append({"name": "c", "drift_deg_per_hour": -62.391, "unit": ""})
-    table = Table(name="t", caption="c", columns=("name", "drift_deg_per_hour", "unit"), rows=rows)
+    rows = [("100 % of a_b", 1.23456e-8, "°/√h"), ("c", -62.391, "")]
+    table = keyed(("name", "drift_deg_per_hour", "unit"), rows)
     columns, head, found = tabular(to_latex(table))
     assert columns == "lrl"
     assert head == ["name", r"drift, $^\circ$/h", "unit"]
@@ -237,7 +239,7 @@ def test_the_tables_compile(written, tmp_path):
 
 
 def test_a_folder_is_made_and_files_appear_whole(tmp_path):
-    table = Table(name="t", caption="c", columns=["a"], rows=[{"a": 1.0}])
+    table = keyed(["a"], [[1.0]])
     assert write([table], tmp_path / "new" / "folder") == [
         tmp_path / "new" / "folder" / f"t.{end}" for end in ("csv", "tex")
     ]
@@ -247,5 +249,5 @@ def test_a_folder_is_made_and_files_appear_whole(tmp_path):
 @pytest.mark.parametrize("name", ["=HYPERLINK(1)", "+1", "-2", "@x", "\tx"])
 def test_text_of_a_csv_is_no_formula(name):
     """A name of a sensor may come from a scenario of someone else."""
-    table = Table("one", "", ("sensor", "value"), ({"sensor": name, "value": -1.5},))
+    table = keyed(("sensor", "value"), [(name, -1.5)])
     assert read_back(to_csv(table))[1] == [[f"'{name}", "-1.5"]]

@@ -25,7 +25,7 @@ from strapdown.kernels import likelihood
 from strapdown.kernels.lane_values import WIDTH
 from strapdown.kernels.series import LARGEST_ANGLE
 from strapdown.records import ImuRecord
-from strapdown.tuning import fitting, innovations, parameters, planning
+from strapdown.tuning import fitting, innovations, parameters
 from strapdown.tuning.parameters import own_sigma
 from strapdown.vectors import VectorMeasurements
 
@@ -667,33 +667,6 @@ def test_the_first_measurements_show_where_it_starts():
     blind = dataclasses.replace(record, vectors=record.vectors[:1], truth=None)
     with pytest.raises(InputError, match="the first measurements do not give the attitude"):
         tuning.record_case(blind, KINDS)
-
-
-# ------------------------------------------------------------------------------------------------------ planning
-
-
-def test_a_plan_takes_records_of_just_the_lengths_asked_for(monkeypatch):
-    seen = []
-    monkeypatch.setattr(
-        planning, "likelihood", lambda cases, *rest: seen.append(cases[0].record) or likelihood(cases, *rest)
-    )
-    likelihood = tuning.likelihood
-    tuning.plan(scenario(duration=30.0), BELIEVED, FREE, lengths=[30.0, 7.5], records=1)
-    assert [record.time[-1] - record.time[0] for record in seen] == pytest.approx([7.5, 30.0], rel=1e-9)
-
-
-def test_a_plan_foretells_the_standard_errors():
-    chosen = scenario(duration=600.0)
-    planned = tuning.plan(chosen, BELIEVED, FREE, lengths=[600.0, 150.0], records=3)
-    assert planned.lengths.tolist() == [150.0, 600.0]
-    found = tuning.fit(tuning.likelihood([case(9, duration=600.0)], BELIEVED, FREE), starts=1, intervals=False)
-    np.testing.assert_allclose(planned.errors[1], [one.standard_error for one in found.parameters], rtol=0.35)
-    np.testing.assert_allclose((planned.errors[0] / planned.errors[1])[[0, 2, 3]], 2.0, rtol=0.1)
-    assert planned.errors[0, 1] > 2.0 * planned.errors[1, 1]  # a slow noise needs time to show at all
-    np.testing.assert_allclose(planned.needed(planned.errors[1] / 2.0), 2400.0)
-    np.testing.assert_allclose(planned.values, [ARW, RRW, 1e-4, 2e-4])
-    with pytest.raises(InputError, match="give a Scenario"):
-        tuning.plan(scenarios.simulate(chosen, 2), BELIEVED, FREE, lengths=[600.0])
 
 
 # ------------------------------------------------------------------------------------------------------ bad input

@@ -90,38 +90,15 @@ def test_tune_by_the_size_of_the_error(succeeds, tmp_path, record, wrong):
     assert setup.read_setup(out).process_noise.angle_random_walk == pytest.approx(values["gyro.arw"])
 
 
-def test_plan_says_how_long_a_record_is_needed(run, succeeds, tmp_path):
-    path = tmp_path / "two.toml"
-    path.write_text(scenarios.scenario_to_toml(dataclasses.replace(SCENARIO, duration=60.0)), encoding="utf-8")
-    said = succeeds("tune", "--plan", path, "--length", "30,60")
-    assert "10 % needs" in said
-    assert "star 2.sigma" in said
-    said = succeeds("tune", "--plan", path, "--free", "gyro.arw,star 1.sigma")
-    assert "60 s" in said
-    record = tmp_path / "two.h5"
-    succeeds("simulate", path, "--out", record)
-    assert run("tune", "--plan", record, "--free", "gyro.arw", "--free", "star 1.sigma")[:2] == (0, said)
-    assert not (tmp_path / "filter.toml").exists()
-
-
-def test_plan_takes_a_built_in_scenario_by_name(run):
-    status, said, complaint = run("tune", "two-stars", "--plan", "--length", "20", "--free", "gyro.arw")
-    assert (status, "gyro.arw" in said) == (0, True), complaint
-    status, _, complaint = run("tune", "two-star", "--plan")
-    assert (status, "did you mean 'two-stars'" in complaint) == (2, True)
-
-
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
         (("--free", "gyro.awr"), "did you mean 'gyro.arw'"),
-        (("--length", "100"), "--length goes with --plan"),
         (("--holdout", "1.5"), "between 0 and 1"),
         (("--holdout", "0.3", "--holdout-by", "week"), "holdout-by 'week'"),
         (("--out", "filter.json"), ".toml"),
         (("--truth", "--spacing", "1"), "leave it out"),
         (("--prior", "no-such-gyro"), "no-such-gyro"),
-        (("--plan", "--length", "100;300"), "seconds separated by commas"),
         (("--free", " , "), "names no parameter"),
         (("--truth", "--rmse"), "give one of them"),
     ],
@@ -196,11 +173,6 @@ def test_outliers_beside_optional_states(succeeds, tmp_path):
     assert found.gate.probability == pytest.approx(content["gate"]["probability"])
     held = content["held_out"]
     assert held["after"]["log_likelihood_per_innovation"] > held["before"]["log_likelihood_per_innovation"]
-
-
-def test_a_plan_of_a_filter_with_states_says_how_well_their_sizes_will_be_known(succeeds, scaled):
-    said = succeeds("tune", "--plan", scaled, "--states", "--free", "gyro.arw,gyro.scale_sigma")
-    assert "gyro.scale_sigma  ppm" in said
 
 
 @pytest.mark.parametrize("option", ["--columns", "--topic"])

@@ -316,22 +316,6 @@ def test_the_smallest_error_of_a_filter_with_states_then_the_scale_of_its_innova
     assert list(tuning.values_of(found.setup, names, []).values()) == pytest.approx([found[n].value for n in names])
 
 
-@pytest.mark.slow
-def test_a_plan_knows_that_one_record_has_three_draws_of_a_hard_iron():
-    """Standard error of ln σ from three numbers of a normal distribution of mean zero: 1/√6, however long the record is."""
-    scenario = swaying(20.0, hard_iron=np.full(3, 3e-6))
-    chosen = filter_setup(scenario)
-    planned = tuning.plan(scenario, chosen, ["mag.bias_sigma", "mag.sigma"], lengths=[10.0, 20.0], records=16)
-    np.testing.assert_allclose(planned.errors[:, 0], 1.0 / np.sqrt(6.0), rtol=0.05)
-    assert 0.006 < planned.scatter < 0.1  # of the draws; 0.003 of noise alone
-    # Of a σ three numbers five times a second: 1/√(2 n).
-    np.testing.assert_allclose(planned.errors[:, 1], 1.0 / np.sqrt(2.0 * 15.0 * planned.lengths), rtol=0.1)
-    assert planned.units[0].name == "rad, or the vector's unit"
-    # A longer record tells no more of the iron.
-    assert planned.needed().tolist() == [np.inf, pytest.approx(20.0 * (planned.errors[1, 1] / 0.1) ** 2)]
-    assert "more records" in str(planned)
-
-
 # ------------------------------------------------------------------------------------------------------------------------- held out
 
 FREE = {

@@ -27,7 +27,7 @@ import numpy as np
 
 from strapdown import coning, quaternion
 from strapdown.ahrs.starting import quiet_span
-from strapdown.checks import Array, InputError, lengths
+from strapdown.checks import Array, Hint, InputError, lengths
 from strapdown.records.recording import Recording, increments
 from strapdown.units import DEGREE, STANDARD_GRAVITY
 
@@ -61,7 +61,7 @@ FRAMES: dict[str, Array] = {
 
 def _unit(fault: str, taken: str, sensor: str, unit: str) -> str:
     """Return the description of a wrong unit, with its remedy."""
-    return f"{fault} ({taken}: --{sensor}-unit {unit}; units={{{sensor!r}: {unit!r}}} in Python)"
+    return f"{fault} ({taken}; {Hint('units', {sensor: unit})})"
 
 
 GYRO_UNITS: dict[str, float] = {
@@ -308,18 +308,18 @@ def at_rest(recording: Recording) -> list[str]:
             f"the field points {-dip / DEGREE:.0f}° upward by the accelerometer, as south of the magnetic equator only"
         )
         if upward > DOWN:
-            return [f"{field}; elsewhere the magnetometer is inverted (--invert magnetometer; invert= in Python)"]
+            return [f"{field}; elsewhere the magnetometer is inverted ({Hint('invert', 'magnetometer')})"]
         return [
             f"{reads}, and {field}; elsewhere the accelerometer is inverted, as those of iPhones "
-            "(--invert accelerometer; invert= in Python)"
+            f"({Hint('invert', 'accelerometer')})"
         ]
     if upward >= -DOWN:
         return []
     where = " south of the magnetic equator" if dip is not None and dip > MIN_DIP else ""
     return [
-        f"{reads}: the body's z axis points down (--axes x,-y,-z, axes= in Python, reads forward-right-down as forward-left-up; "
-        f"--frame ned keeps them and gives the output in North-East-Down), or the unit lies upside down, or{where} the accelerometer is "
-        "inverted (--invert accelerometer; invert= in Python)"
+        f"{reads}: the body's z axis points down ({Hint('axes', 'x,-y,-z')} reads forward-right-down as forward-left-up; "
+        f"{Hint('frame', 'ned')} keeps them and gives the output in North-East-Down), or the unit lies upside down, or{where} "
+        f"the accelerometer is inverted ({Hint('invert', 'accelerometer')})"
     ]
 
 
@@ -581,12 +581,11 @@ def _settings(name: str) -> tuple[tuple[str, ...], ...]:
 @functools.cache
 def _axes_change(name: str, k: int) -> str:
     if np.array_equal(AXES[k], -np.eye(3)):
-        return f"axes of the {name} are inverted" + (
-            f" (--invert {name}; invert= in Python)" if name != "whole unit" else ""
-        )
+        return f"axes of the {name} are inverted" + (f" ({Hint('invert', name)})" if name != "whole unit" else "")
     words = axes_words(AXES[k])
     option = words.replace("−", "-").replace(" ", "")
-    return f"axes of the {name} should be read as ({words}) (--axes {'' if name == 'whole unit' else f'{name}='}{option}; axes= in Python)"
+    hint = Hint("axes", option if name == "whole unit" else {name: option})
+    return f"axes of the {name} should be read as ({words}) ({hint})"
 
 
 # --------------------------------------------------------------------------------------------------------------- without a reference

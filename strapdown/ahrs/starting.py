@@ -9,7 +9,7 @@ import numpy as np
 
 from strapdown import estimation, kinematics, quaternion
 from strapdown.ahrs.parameters import AhrsParameters
-from strapdown.checks import Array, InputError, lengths
+from strapdown.checks import Array, Hint, InputError, lengths
 from strapdown.recordings import Recording
 from strapdown.units import DEGREE, STANDARD_GRAVITY
 from strapdown.vectors import wahba
@@ -56,7 +56,7 @@ def samples_in_span(recording: Recording) -> int:
     if length < 2:
         raise InputError(
             f"{recording.source}: its first {QUIET_SPAN:g} s hold one sample, {lasts / (len(recording.time) - 1):.3g} s is the mean "
-            "interval; if its stamps are in ms or us, say so (--time-unit, or units={'time': 'ms'})"
+            f"interval; if its stamps are in ms or us, say so ({Hint('units', {'time': 'ms'})})"
         )
     return length
 

@@ -32,7 +32,7 @@ from strapdown.allan.spectrum import flicker_covariance, inner
 from strapdown.checks import Array, InputError
 from strapdown.kernels.allan import accumulate, second_difference_sizes, second_difference_squares
 from strapdown.kernels.machine import compiled, read_only
-from strapdown.results import Listed, Listing, figure
+from strapdown.results import Column, Listed, Table
 
 TERMS = ("quantization", "angle_random_walk", "bias_instability", "rate_random_walk", "rate_ramp")
 """The noise terms, in the order of every array over terms; also the names of the gyro specification."""
@@ -108,21 +108,21 @@ class AllanDeviation(Listed):
     samples: int
     sample_interval: float
 
-    def listing(self) -> Listing:
+    def listing(self) -> Table:
         """Return the deviation at averaging times about a factor of three apart, SI, as a table."""
         wanted = np.geomspace(self.taus[0], self.taus[-1], 2 + round(2.0 * math.log10(self.taus[-1] / self.taus[0])))
         places = np.unique([int(np.argmin(np.abs(np.log(self.taus / tau)))) for tau in wanted])
         axes = "xyz"[: len(self.deviation)]
         rows = [
             (
-                figure(self.taus[i]),
-                *(figure(one[i]) for one in self.deviation),
-                figure(float(np.min(self.edf[:, i])), 3),
+                self.taus[i],
+                *(one[i] for one in self.deviation),
+                float(np.min(self.edf[:, i])),
             )
             for i in places
         ]
         title = f"Allan deviation ({self.estimator}), {self.samples} samples of {self.sample_interval:.6g} s, SI"
-        return Listing(title, ("τ, s", *axes, "degrees of freedom"), rows, left=0)
+        return Table(title, ("τ, s", *axes, Column("degrees of freedom", digits=3)), rows, left=0)
 
 
 def allan_deviation(

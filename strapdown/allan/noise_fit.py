@@ -41,7 +41,7 @@ from strapdown.allan.spectrum import (
     segment,
 )
 from strapdown.checks import Array, InputError
-from strapdown.results import Listed, Listing, figure
+from strapdown.results import Column, Listed, Table, figure
 
 SYMBOLS = dict(zip(TERMS, "QNBKR", strict=True))
 
@@ -158,15 +158,28 @@ class NoiseFit(Listed):
             if probability < MISFIT_PROBABILITY
         )
 
-    def listing(self) -> Listing:
+    def listing(self) -> Table:
         """Return the coefficients with their intervals, as a table."""
         rows = []
         for row in table(self):
-            seen = (figure(row["estimate"]), figure(row["lower"])) if row["supported"] else ("not detected", "")
-            what = f"{row['term']} ({row['symbol']})"
-            rows.append(("xyz"[row["axis"]], what, row["unit"], *seen, figure(row["upper"])))
+            term, seen = str(row["term"]).replace("_", " "), row["supported"]
+            values = (row["estimate"] if seen else None, row["lower"] if seen else None, row["upper"], seen)
+            rows.append(
+                ("xyz"[row["axis"]], f"{row['term']} ({row['symbol']})", term, row["symbol"], row["unit"], *values)
+            )
+        columns = (
+            Column("axis", "axis"),
+            Column("term"),
+            Column(None, "term"),
+            Column(None, "symbol"),
+            Column("unit", "unit"),
+            Column("estimate", "estimate", shown=lambda value: "not detected" if value is None else figure(value)),
+            Column("from", "lower", shown=lambda value: "" if value is None else figure(value)),
+            Column("to", "upper"),
+            Column(None, "supported"),
+        )
         title = f"Noise of the {self.sensor}, {self.samples} samples of {self.sample_interval:.6g} s, {100.0 * self.level:g} % intervals"
-        return Listing(title, ("axis", "term", "unit", "estimate", "from", "to"), rows, self.warnings, left=3)
+        return Table(title, columns, rows, self.warnings, left=3, name=f"{self.sensor}-noise")
 
 
 def fit_noise(

@@ -34,6 +34,7 @@ __all__ = [
     "to_kalibr",
     "to_matlab",
     "to_px4",
+    "to_specification",
     "to_toml",
 ]
 
@@ -74,6 +75,67 @@ def to_toml(fit: NoiseFit) -> dict[str, dict[str, Any]]:
         spec = gyro.GyroSpec(**{term: value * key(sensor, term)[1] for term, value in rounded.items()})
         return {sensor: gyro.to_table(spec)}
     return {sensor: {key(sensor, term)[0]: value.tolist() for term, value in rounded.items()}}
+
+
+DISTRUST = "do not trust these intervals"
+"""Warning for a record with other errors than the noise terms."""
+
+
+def to_specification(fit: NoiseFit, source: str) -> str:
+    """Return the text of ``gyro.toml``, or that of another sensor: terms detected, and as comments bounds of the others and warnings.
+
+    Parameters
+    ----------
+    fit : NoiseFit
+        Coefficients of one sensor.
+    source : str
+        Description of the recording.
+
+    Returns
+    -------
+    str
+        TOML with comments.
+    """
+    import tomli_w
+
+    sensor = fit.sensor
+    lines = [f"{sensor.capitalize()} noise by `strapdown allan` from {source}."]
+    lines += [f"WARNING: {warning}." for warning in fit.warnings]
+    if fit.warnings:
+        lines.append(f"WARNING: {DISTRUST}, nor this file.")
+    text = commented(lines) + "\n" + tomli_w.dumps(to_toml(fit))
+    partly, wholly = [], []
+    for term, bound in noise_fit.upper_bounds(fit).items():
+        name_of, factor = key(sensor, term)
+        values = [bound] if isinstance(bound, float) else list(bound)
+        seen = fit.supported[:, fit.terms.index(term)]
+        if seen.any():
+            below = ", ".join(f"{'xyz'[k]} below {values[k] / factor:.4g}" for k in range(len(values)) if not seen[k])
+            partly.append(f"{name_of}: 0 where not detected, {below}.")
+        else:
+            shown = ", ".join(f"{value / factor:.4g}" for value in values)
+            wholly.append(f"{name_of} = {shown if len(values) == 1 else f'[{shown}]'}")
+    if partly or wholly:
+        text += "\n" + commented(
+            [
+                f"Not detected in the record, so left out; the upper ends of their {100 * fit.level:g} % intervals:",
+                *partly,
+                *wholly,
+            ]
+        )
+    if sensor == "gyro":
+        text += "\n" + commented(
+            [
+                "Add turn_on_bias_sigma_deg_per_hour from the data sheet: one recording has no information",
+                "about the variation of the bias between switch-ons, and filters then assume that it is near zero.",
+            ]
+        )
+    return text
+
+
+def commented(lines: list[str]) -> str:
+    """Return lines as TOML comments, without the control characters that a file name may contain."""
+    return "".join(f"# {''.join(c if c.isprintable() else '?' for c in line)}\n" for line in lines)
 
 
 def largest(fit: NoiseFit, term: str) -> tuple[float, bool]:

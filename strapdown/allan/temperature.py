@@ -26,6 +26,7 @@ from strapdown.allan.deviation import TERMS
 from strapdown.allan.spectrum import bin_starts, mean_power
 from strapdown.checks import Array, InputError
 from strapdown.gyro.temperature import BiasOverTemperature
+from strapdown.results import Table
 
 __all__ = [
     "TemperatureFit",
@@ -66,6 +67,15 @@ class TemperatureFit(NamedTuple):
     polynomial: BiasOverTemperature
     reach: Array
     left: Array
+
+    def listing(self, unit: str) -> Table:
+        """Return the coefficients with their intervals as a table, given the unit of the samples."""
+        rows = []
+        for (k, axis), value in np.ndenumerate(self.polynomial.coefficients):
+            ends = (value - self.reach[k, axis], value + self.reach[k, axis]) if k else ("", "")
+            rows.append(("xyz"[axis], k, f"{unit}/K{k if k > 1 else ''}" if k else unit, value, *ends))
+        title = f"Bias over temperature, T − {self.polynomial.reference:.3f} °C"
+        return Table(title, ("axis", "power", "unit", "estimate", "from", "to"), rows, left=3)
 
 
 def fit_temperature(

@@ -16,7 +16,7 @@ from strapdown.checks import Array, InputError, array, finite
 from strapdown.files import tables, written_beside
 from strapdown.records import ErrorStateEstimate
 from strapdown.records.recording import MAGNETIC_UNITS, Recording
-from strapdown.results import Listed, Listing
+from strapdown.results import Column, Listed, Table
 
 AXES = ("x", "y", "z")
 MILLISECONDS: tables.Choice = (("ms", 1e-3), ("s", 1.0))
@@ -195,16 +195,16 @@ class UnitCalibration(SensorErrors, Listed):
             )
         return MAGNETIC_UNITS[own] / MAGNETIC_UNITS[other]
 
-    def listing(self) -> Listing:
+    def listing(self) -> Table:
         """Return the errors and their σ as a table, with the motion that is missing below."""
         rows = []
         for (name, axes, value), (_, _, sigma) in zip(self.entries(), self.sigma.entries(), strict=True):
             if sigma == 0.0:
                 continue
             words, unit, factor = printed(name, axes, self.magnetic_unit)
-            rows.append((words, unit, f"{value / factor:.4g}", f"{sigma / factor:.2g}"))
+            rows.append((words, unit, value / factor, sigma / factor))
         title = f"Calibration from {self.source or 'an unknown source'}"
-        return Listing(title, ("error", "unit", "value", "σ"), rows, self.remarks, left=2)
+        return Table(title, ("error", "unit", "value", Column("σ", digits=2)), rows, self.remarks, left=2)
 
 
 def _corrected(samples: Array, bias: Array, matrix: Array) -> Array:

@@ -9,7 +9,8 @@ import typer
 
 from strapdown.cli.progress import progress_bar
 from strapdown.cli.reading import RECORDING_HELP, Layout
-from strapdown.cli.terminal import command, doubt, need_own, show_listing, writable, written
+from strapdown.cli.terminal import command, doubt, need_own, show, written
+from strapdown.files import writable
 
 
 @command
@@ -37,6 +38,6 @@ def calibrate(
         doubt(source, path)
     with progress_bar("calibrating"):
         found = calibration.calibrate(sources, gravity=gravity)
-    show_listing(found.listing(), notes=True)
+    show(found.listing())
     calibration.write(found, out)
     written(out)

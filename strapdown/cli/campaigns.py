@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 import typer
 
 from strapdown.checks import InputError, count
@@ -23,14 +22,11 @@ from strapdown.cli.terminal import (
     given,
     scenario_named,
     show,
-    table,
     tables_folder,
     tables_written,
-    verdict,
-    writable,
     written,
 )
-from strapdown.files import write_json
+from strapdown.files import writable, write_json
 
 if TYPE_CHECKING:
     from types import FrameType
@@ -38,6 +34,7 @@ if TYPE_CHECKING:
     from strapdown.estimation.filters.own import Own
     from strapdown.montecarlo import Plan
     from strapdown.montecarlo.campaign import Campaign
+    from strapdown.results import Table
 
 _RUNS = 1000
 _CAMPAIGN_SUFFIXES = (".h5", ".hdf5")
@@ -127,14 +124,14 @@ def montecarlo(
         _replay(plan, output.replay, machine, target)
         return
     if held is not None and target == source and not (output.resume or output.overwrite):
-        status, content = _print_result(held)
+        status, _, listed = _print_result(held)
         if output.tables is not None:
-            written(*tables_written(output.tables, "montecarlo", content))
+            written(*tables_written(output.tables, *listed))
         raise typer.Exit(status)
     result = _computed(plan, target, source.stem, replace(computing, machine=machine), output)
-    status, content = _print_result(result)
+    status, content, listed = _print_result(result)
     write_json(target.with_suffix(".json"), content)
-    written(target, target.with_suffix(".json"), *tables_written(output.tables, "montecarlo", content))
+    written(target, target.with_suffix(".json"), *tables_written(output.tables, *listed))
     raise typer.Exit(status)
 
 
@@ -279,43 +276,24 @@ def _with_filter(held: Campaign, own: Own, source: Path) -> Campaign:
     return replace(held, plan=replace(held.plan, setup=replace(held.plan.setup, estimator=own)))
 
 
-def _print_result(campaign: Campaign) -> tuple[int, dict[str, Any]]:
-    """Print the statistics and the verdict of `strapdown check`; return the exit status and the content of the JSON file."""
+def _print_result(campaign: Campaign) -> tuple[int, dict[str, Any], list[Table]]:
+    """Print the statistics and the verdict of `strapdown check`; return the exit status, the content of the JSON file, and the tables."""
     from strapdown import workflows
     from strapdown.cli.judgement import status_of
     from strapdown.estimation.setup import MEKF
     from strapdown.montecarlo import summary
-    from strapdown.montecarlo.verdicts import bound_of
+    from strapdown.montecarlo.verdicts import bound_of, tables
 
     if campaign.statistics is None:
         raise InputError("no chunk of the campaign is completed; continue it with --resume")
     if not campaign.finished:
         console.print(f"{campaign.statistics.runs} of {campaign.runs} runs are completed.")
     report = summary(campaign.statistics, bound=bound_of(campaign.plan))
-    figure = lambda value: "-" if value is None else f"{value:.4g}" if value >= 1e3 else f"{value:.4f}"  # noqa: E731
     judgement = workflows.check(campaign)
-    rows = table(
-        f"Per degree of freedom; 1 for a consistent filter. NEES over {report['epochs_judged']} epochs",
-        *("", "mean", "minimum", "maximum", "from", "to", ""),
-    )
-    for subset, part in report["nees"].items():
-        values = (part["anees"], part["least"], part["greatest"], *part["bounds"])
-        rows.add_row(f"NEES of the {subset}", *map(figure, values), verdict(part["consistent"]))
-    for part in report["nis"]:
-        name = f"NIS of {part['sensor']}"
-        rows.add_row(name, figure(part["nis"]), "", "", *map(figure, part["bounds"]), verdict(part["consistent"]))
-    show(rows)
-    refused = ", ".join(f"{part['refused']} of {part['sensor']}" for part in report["nis"] if part["refused"])
-    if refused:
-        console.print(f"The gate rejected {refused}.")
-    _print_errors(report)
-    worst = ", ".join(
-        f"{part['run']} ({'failed' if part['largest_nees'] is None else format(part['largest_nees'], '.1f')})"
-        for part in report["worst_runs"][:5]
-    )
-    console.print(f"Worst runs, by maximum NEES of the state: {worst}. Use --replay to examine one.")
-    if report["failed_runs"]:
-        console.print(f"In {counted(report['failed_runs'], 'run')} the filter failed: no finite error or covariance.")
+    listed = tables(report)
+    for one in listed:
+        show(one)
+    console.print("Use --replay to examine a run.")
     rate = ""
     if campaign.seconds > 0.0:
         rate = f" ({rate_text(campaign.statistics.runs / campaign.seconds)} runs/s, including compilation)"
@@ -328,63 +306,8 @@ def _print_result(campaign: Campaign) -> tuple[int, dict[str, Any]]:
         console.print("More runs (--runs, with --resume) are needed for a decision.")
     if judgement.unmodelled and campaign.plan.setup.states is None and campaign.plan.setup.estimator == MEKF:
         console.print("--states adds states for most of these errors to the filter.")
-    return status_of(judgement), {
-        "plan": campaign.plan.to_table(),
-        "digest": campaign.plan.digest,
-        "machine": campaign.machine,
-        "lanes_do_not_serve": campaign.reason or None,
-        "chunk": campaign.chunk,
-        "version": campaign.version,
-        "seconds": campaign.seconds,
-        "judgement": judgement.summary(),
-        **report,
-    }
-
-
-def _print_errors(report: dict[str, Any]) -> None:
-    """Print the errors of the worst axis at the end, and the coverage."""
-    from strapdown.montecarlo.verdicts import QUANTILES
-
-    last = report["last_epoch"]
-    errors = table(
-        f"Errors at {last['time_s']:g} s, worst axis; fraction of the tested errors within kσ",
-        "",
-        "unit",
-        "RMS",
-        "filter's σ",
-        *(f"{100.0 * q:g} %" for q in QUANTILES),
-        "1σ",
-        "2σ",
-        "3σ",
-        left=2,
-    )
-    for name, unit, text in (("attitude", "arcsec", "arcsec"), ("bias", "deg_per_hour", "°/h")):
-        if name not in report["nees"]:  # a user's filter without a bias
-            continue
-        axis = int(np.argmax([np.inf if x is None else x for x in last[f"{name}_rms_error_{unit}"]]))
-        keys = ("rms_error", "sigma", *(f"error_quantile_{q:g}" for q in QUANTILES))
-        sizes = [last[f"{name}_{key}_{unit}"][axis] for key in keys]
-        large = name == "attitude" and (sizes[0] or 0.0) > 3600.0
-        if large:
-            sizes = [None if x is None else x / 3600.0 for x in sizes]
-        shares = ("-" if x is None else f"{100.0 * x:.2f} %" for x in report["coverage"][name])
-        errors.add_row(
-            f"{name} {'xyz'[axis]}", "°" if large else text, *("-" if x is None else f"{x:.4g}" for x in sizes), *shares
-        )
-    show(errors)
-    expected = ", ".join(f"{100.0 * share:.2f}" for share in report["coverage"]["expected"])
-    console.print(f"For a consistent filter, {expected} % of the errors are within 1, 2, 3 σ.")
-    if (efficiency := report.get("rms_over_root_cramer_rao_bound")) is not None:
-        low, high = efficiency["bounds_of_an_efficient_filter"]
-        ratios = "; ".join(
-            f"{name} {', '.join(f'{x:.3f}' for x in efficiency[name])}"
-            for name in ("attitude", "bias")
-            if name in efficiency
-        )
-        console.print(
-            f"RMS error divided by the root of the Cramér–Rao bound, by axis: {ratios} "
-            f"(at one epoch {low:.3f} to {high:.3f} for an efficient filter)."
-        )
+    content = {**campaign.summary(), "judgement": judgement.summary(), **report}
+    return status_of(judgement), content, listed
 
 
 def _replayed(target: Path, run: int) -> list[Path]:
@@ -393,24 +316,17 @@ def _replayed(target: Path, run: int) -> list[Path]:
 
 
 def _replay(plan: Plan, run: int, machine: str, target: Path) -> None:
-    from strapdown import consistency, workflows
     from strapdown import montecarlo as engine
+    from strapdown import workflows
     from strapdown.recordings import recordfiles
 
     again = engine.replay(plan, run, machine=machine)
-    estimate, truth, paths = again.estimate, again.estimate.truth, _replayed(target, run)
-    recordfiles.write_record(paths[0], again.record, attributes=estimate.details)
-    workflows.write(estimate, paths[1])
-    size, states = (6, "six") if estimate.has_bias else (3, "three")
-    assert estimate.covariance is not None
-    assert truth is not None
-    error = consistency.errors(estimate.attitude, np.nan_to_num(estimate.bias), truth.attitude, truth.bias)[:, :size]
-    nees = consistency.nees(error, estimate.covariance[:, :size, :size])
-    # At the epochs of the statistics, as in the list of worst runs.
-    rows = np.searchsorted(estimate.time, plan.time + 1e-9, side="right") - 1
-    worst = int(rows[np.argmax(nees[rows])])
+    paths = _replayed(target, run)
+    recordfiles.write_record(paths[0], again.record, attributes=again.estimate.details)
+    workflows.write(again.estimate, paths[1])
+    nees, worst = again.largest_nees(plan.time)
     console.print(
         f"Run {run} of seed {plan.seed}, machine: {engine.choose(plan, machine)}. Its maximum NEES at the {plan.epochs} epochs of the "
-        f"campaign is {nees[worst]:.1f} ({states} states), at {estimate.time[worst]:g} s."
+        f"campaign is {nees:.1f} ({'six' if again.estimate.has_bias else 'three'} states), at {worst:g} s."
     )
     written(*paths)

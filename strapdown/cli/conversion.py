@@ -9,7 +9,8 @@ import typer
 
 from strapdown.checks import InputError
 from strapdown.cli.reading import RECORDING_HELP, Layout
-from strapdown.cli.terminal import command, console, say, writable, written
+from strapdown.cli.terminal import command, console, say, written
+from strapdown.files import writable
 
 if TYPE_CHECKING:
     from strapdown.recordings import Recording

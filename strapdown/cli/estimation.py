@@ -24,12 +24,10 @@ from strapdown.cli.terminal import (
     need_own,
     say,
     show,
-    show_listing,
-    table,
-    writable,
     written,
 )
-from strapdown.files import usable_folder, write_json
+from strapdown.files import usable_folder, writable, write_json
+from strapdown.results import Table
 from strapdown.units import DEGREE, DEGREE_PER_HOUR, DEGREE_PER_HOUR_PER_ROOT_HOUR, DEGREE_PER_ROOT_HOUR
 
 if TYPE_CHECKING:
@@ -374,15 +372,15 @@ def _print_states(result: Any, record: ImuRecord) -> dict[str, Any]:
     from strapdown.plots.style import error_state_unit
 
     of_directions = tuple(f"{one.sensor} " for one in record.vectors if one.kind in ("direction", "heading"))
-    rows = table("Optional states at the end", "state", "", "unit", "value", "σ", "initial σ", left=3)
+    rows = []
     for name, block in result.error_states.items():
         for k, (component, unit) in enumerate(zip(block.components, block.units, strict=True)):
             word, size = error_state_unit(name, unit)
             if unit == "1" and name.startswith(of_directions):
                 word, size = "% of the vector", 0.01
             values = (block.values[-1, k], block.sigma[-1, k], block.sigma[0, k])
-            rows.add_row(name, component, word, *(f"{value / size:.4g}" for value in values))
-    show(rows)
+            rows.append((name, component, word, *(value / size for value in values)))
+    show(Table("Optional states at the end", ("state", "", "unit", "value", "σ", "initial σ"), rows, left=3))
     return _states(result)
 
 
@@ -495,7 +493,7 @@ def _estimate_recording(
         paths.append(_observability(out, source.source, run.record, parameters.setup, run.initial))
     if result.truth is not None:
         table = workflows.accuracy(result)
-        show_listing(table.listing(), notes=True)
+        show(table.listing())
         paths.append(out / "errors.json")
         write_json(paths[-1], {"source": source.source, **table.summary()})
     paths += _export(exports, result, source)

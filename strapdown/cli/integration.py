@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import typer
@@ -21,14 +21,12 @@ from strapdown.cli.terminal import (
     put_json,
     say,
     show,
-    table,
     tables_folder,
     tables_written,
-    writable,
     written,
 )
-from strapdown.files import reading
-from strapdown.units import DEGREE, DEGREE_PER_HOUR
+from strapdown.files import reading, writable
+from strapdown.units import DEGREE
 
 if TYPE_CHECKING:
     from strapdown.recordings import Recording
@@ -44,35 +42,15 @@ def algorithms(
     from strapdown import coning
 
     tables_folder(tables)
-    rows: list[dict[str, Any]] = [*coning.algorithm_rows()]
-    listing = table(
-        "Integration algorithms: drift under small coning is −C β² ω (ωh)^n",
-        "name",
-        "needs",
-        "N",
-        "order",
-        "n",
-        "C",
-        *(["ns/sample"] if time else []),
-        left=2,
-    )
-    with progress_bar("timing", len(rows)) as advance:
-        for row in rows:
-            cells = [str(row[key]) for key in ("name", "needs", "samples", "order", "drift order")]
-            cells.append(f"{row['drift constant']:.3g}")
-            if time:
-                row["ns_per_sample"] = coning.time_per_sample(str(row["name"])) * 1e9
-                cells.append(f"{row['ns_per_sample']:.1f}")
-            listing.add_row(*cells)
+    seconds = {}
+    with progress_bar("timing", len(coning.ALGORITHMS)) as advance:
+        for name in coning.ALGORITHMS if time else ():
+            seconds[name] = coning.time_per_sample(name)
             advance(1)
+    listing = coning.algorithm_table(seconds or None)
     show(listing)
-    console.print(
-        "Use increments if the gyro provides them. From rate samples (…-rate-K: K samples form one increment) an oscillation "
-        "appears too small by a fraction of order (ωh)^K, which lowers the drift order. matched-… were derived for this package.\n"
-        "matched-1-8-8 is the most accurate and needs 8 later samples; matched-4-11 runs in real time; four-sample is enough in most cases."
-    )
     if tables is not None:
-        written(*tables_written(tables, "algorithms", rows))
+        written(*tables_written(tables, listing))
 
 
 @command
@@ -150,25 +128,10 @@ def coning_budget(
         raise InputError(
             f"{psd} has an amplitude of {largest / DEGREE:.4g}°, but that of a vibration is below 90°; check the unit"
         )
-    rows: list[dict[str, Any]] = [
-        {
-            "algorithm": name,
-            "sample_rate_hz": r,
-            "drift_deg_per_hour": coning.vibration_drift(lines, name, r) / DEGREE_PER_HOUR,
-        }
-        for name in algorithm or coning.drift.BUDGETED
-        for r in rate
-    ]
-    listing = table(
-        f"Drift about the third axis caused by {len(lines)} vibration lines, °/h",
-        "algorithm",
-        *(f"{r:g} Hz" for r in rate),
-    )
-    for k in range(0, len(rows), len(rate)):
-        listing.add_row(rows[k]["algorithm"], *(f"{row['drift_deg_per_hour']:.4g}" for row in rows[k : k + len(rate)]))
+    listing = coning.vibration_table(lines, rate, algorithm)
     show(listing)
-    paths = tables_written(tables, "coning budget", rows)
+    paths = tables_written(tables, listing)
     if json is not None:
-        put_json(json, {"lines": len(lines), "budget": rows})
+        put_json(json, {"lines": len(lines), "budget": listing.records})
     if paths:
         written(*paths)

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 import typer
-from rich.text import Text
 
-from strapdown.checks import InputError
+from strapdown.checks import Hint, InputError
 from strapdown.cli.filters import no_state_words
 from strapdown.cli.progress import progress_bar
 from strapdown.cli.reading import RECORDING_HELP, Layout
@@ -24,18 +21,13 @@ from strapdown.cli.terminal import (
     put_json,
     say,
     show,
-    show_listing,
-    table,
-    writable,
     written,
 )
-from strapdown.files import reading
+from strapdown.files import reading, writable
+from strapdown.results import Column, Table
 
 if TYPE_CHECKING:
     from strapdown.consistency import Judgement
-    from strapdown.consistency.foreign import Checked
-    from strapdown.estimation.setup import FilterSetup
-    from strapdown.records import Estimate, ImuRecord
     from strapdown.tuning.diagnosis import Diagnosis
 
 CONSISTENT, NOT, CANNOT_TELL = 0, 1, 3
@@ -192,48 +184,21 @@ def _judged_foreign(result: Path, options: _Foreign, how: dict[str, Any]) -> tup
         return consistency.judge(estimate, **how), content
     reference = read_attitudes(options.truth, topic=options.truth_topic or "")
     console.print(f"Truth: {reference.source}, {len(reference.stamps_ns)} attitudes.")
-    # One clock may count from 1970 and the other from the boot of a machine: both relative to the first stamp, in integer ns.
-    origin = int(min(own.stamps_ns[0], reference.stamps_ns[0]))
-    frame = own.error_frame if options.error_frame == "find" and own.error_frame else options.error_frame
-    found = foreign.check_arrays(
-        own.seconds(origin),
-        own.attitude,
-        own.covariance,
-        reference.seconds(origin),
-        reference.attitude,
-        bias=own.bias,
-        true_bias=reference.bias,
-        innovations=own.innovations,
-        error_frame=frame,
-        align=options.align,
-        true_movement=reference.movement,
-        **how,
-    )
+    found = consistency.check_attitudes(own, reference, error_frame=options.error_frame, align=options.align, **how)
     content.update(found.summary())
     say(*(f"Note: {remark}." for remark in found.remarks))
-    if frame != options.error_frame:
-        console.print(f"Note: the file declares that its covariance is of the {frame} error.")
-    show_listing(found.accuracy.listing(), notes=True)
-    _show_explanations(found)
+    show(found.accuracy.listing())
+    if found.explanations:
+        show(found.listing())
     if options.aligned is not None:
         aligned = replace(found.estimate, truth=found.truth, origin=Origin(source=own.source))
         workflows.write(replace(aligned, details={"truth": reference.source}), options.aligned)
     return found.judgement, content
 
 
-def _show_explanations(found: Checked) -> None:
-    if not found.explanations:
-        return
-    rows = table("Possible causes of the attitude errors", "cause", "size", "remaining NEES", "p-value", "", left=2)
-    for one in found.explanations:
-        mark = Text("likely", style="red") if one.likely else Text("no")
-        rows.add_row(one.name, one.value, f"{one.nees:.4g}", f"{one.p_value:.2g}", mark)
-    show(rows)
-
-
 def _show_statistics(judgement: Judgement) -> None:
     if judgement.findings:
-        show_listing(judgement.listing(), "Statistics of the filter and their bounds for a consistent filter")
+        show(judgement.listing(), "Statistics of the filter and their bounds for a consistent filter", notes=False)
         share = 100.0 * (1.0 - judgement.confidence_level)
         console.print(
             "Each p-value is for one statistic; bounds, pass and FAIL are for all together (a consistent filter fails with at most "
@@ -245,66 +210,27 @@ def _diagnosed(
     result: Path, record: Path, filter_file: Path | None, judgement: Judgement
 ) -> tuple[dict[str, Any], Diagnosis | None]:
     """Print the causes found from a record; return them for JSON, and the diagnosis with the combined verdict, or None."""
-    from strapdown import estimation
-    from strapdown.estimation.setup import read_estimate
+    from strapdown import workflows
+    from strapdown.estimation.setup import read_estimate, read_setup
     from strapdown.estimation.setup.for_record import unmodelled_errors
     from strapdown.recordings import recordfiles
-    from strapdown.tuning import diagnosis
-    from strapdown.tuning.residual_checks import accepted
 
-    estimate = read_estimate(result)
-    chosen = _filter_of(result, estimate, filter_file)
-    held = recordfiles.read_record(record)
-    _need_same(result, estimate, record, held)
-    missing = unmodelled_errors(held.origin, chosen)
+    estimate, held = read_estimate(result), recordfiles.read_record(record)
+    chosen = estimate.setup if filter_file is None else read_setup(filter_file)
+    missing = () if chosen is None else unmodelled_errors(held.origin, chosen)
     say(*no_state_words(missing, chosen))
-    if chosen.states is not None and chosen.states.names:
-        reason = f"the search supports filters of attitude and bias only, and this one has the states {', '.join(chosen.states.names)}"
+    with progress_bar("searching for causes"), reading.from_file(record):
+        found, reason = workflows.diagnose(estimate, held, setup=chosen, judgement=judgement)
+    if found is None:
         console.print(f"Causes were not searched for: {reason}.")
         return {"not_looked_for": reason, "without_a_state": list(missing)}, None
-    P = np.diag(estimate.variance[0]) if estimate.covariance is None else estimate.covariance[0]
-    initial = estimation.State(attitude=estimate.attitude[0], bias=estimate.bias[0], covariance=P)
-    # The verdict is on the filter with its gate, so measurements that it rejected are left out.
-    with progress_bar("searching for causes"):
-        found = diagnosis.diagnose(
-            accepted(held, estimate), chosen, initial, probability=judgement.confidence_level, judgement=judgement
-        )
-    show_listing(found.listing(), "Causes by their effect on the likelihood")
+    show(found.listing(), "Causes by their effect on the likelihood", notes=False)
     content = {**found.summary(), "without_a_state": list(missing)}
-    own = _not_of_the_search(chosen, estimate)
-    if own:
-        console.print(f"{own}; therefore the verdict is based on the statistics only.")
+    if reason:
+        console.print(f"{reason}; therefore the verdict is based on the statistics only.")
         console.print(found.cause_words)
         return content, None
     return content, found
-
-
-def _filter_of(result: Path, estimate: Estimate, filter_file: Path | None) -> FilterSetup:
-    """Return the setup of an estimate, from a file or from the estimate itself."""
-    from strapdown.estimation import setup
-
-    if filter_file is not None:
-        return setup.read_setup(filter_file)
-    if estimate.setup is None:
-        raise InputError(f"{result} does not contain its filter; give --filter, a TOML file with the table [filter]")
-    return estimate.setup  # type: ignore[no-any-return]
-
-
-def _need_same(result: Path, estimate: Estimate, path: Path, record: ImuRecord) -> None:
-    """Raise an error if an estimate was not made from the record."""
-    unknown = sorted(set(estimate.innovations) - {series.sensor for series in record.vectors})
-    if unknown or not np.isin(estimate.time, record.time).all():
-        what = f"has no sensor {unknown[0]!r}" if unknown else "has other time stamps"
-        raise InputError(f"{path} {what}; {result} was made from another record")
-
-
-def _not_of_the_search(chosen: FilterSetup, estimate: Estimate) -> str:
-    """Return a feature of the filter that the search for causes does not support; empty if there is none."""
-    if chosen.robust is not None:
-        return "The filter weights measurements by their innovations, and the search for causes does not"
-    if any(event.kind == "recovery" for event in estimate.events):
-        return "The filter recovered from a lost attitude, and the search for causes does not"
-    return ""
 
 
 @command
@@ -332,22 +258,14 @@ def doctor(
     )
     if found.candidates:
         names = list(found.candidates[0].misfit)
-        rows = table(
-            "Explanations: score (log-likelihood) and misfit, 0 perfect, 1 unrelated, 2 opposite",
-            "explanation",
-            "score",
-            *(
-                name.replace("accelerometer", "acc").replace("magnetometer", "mag").replace(" and ", "–")
-                for name in names
-            ),
-        )
-        for one in found.candidates[:8]:
-            rows.add_row(
-                re.sub(r" \([^()]*--[^()]*\)", "", one.words),  # without the options, which the verdict has
-                f"{one.score:.1f}",
-                *(f"{one.misfit[name]:.3f}" for name in names),
-            )
-        show(rows)
+        plain = lambda words: Hint.replaced(words, lambda hint: "").replace(" ()", "").replace("; )", ")")  # noqa: E731
+        columns = [Column("explanation"), Column("score", shown="{:.1f}".format)]
+        for name in names:  # hints are in the verdict
+            short = name.replace("accelerometer", "acc").replace("magnetometer", "mag").replace(" and ", "–")
+            columns.append(Column(short, shown="{:.3f}".format))
+        rows = [(plain(one.words), one.score, *(one.misfit[name] for name in names)) for one in found.candidates[:8]]
+        title = "Explanations: score (log-likelihood) and misfit, 0 perfect, 1 unrelated, 2 opposite"
+        show(Table(title, columns, rows))
     say(*(f"Note: {note}." for note in found.notes))
     put_json(json, found.summary())
     raise typer.Exit({"as declared": CONSISTENT, "wrong convention": NOT}.get(found.verdict, CANNOT_TELL))

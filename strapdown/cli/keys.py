@@ -6,7 +6,8 @@ from typing import Annotated
 
 import typer
 
-from strapdown.cli.terminal import command, console, say, show, table
+from strapdown.cli.terminal import command, console, show
+from strapdown.results import Table
 
 
 @command
@@ -26,12 +27,21 @@ def keys(
         if section is None or not one.keys:
             console.print(f"{title}: {one.summary.replace('`', '')}")
             continue
-        rows = table(title, "key", "unit", "value", "default", "meaning", left=5)
-        for key in one.keys:
-            names = " or ".join((key.name, *key.others))
-            rows.add_row(names, key.unit, key.type, key.default.replace("`", ""), key.meaning.replace("`", ""))
-        say(one.summary.replace("`", ""))
-        show(rows)
+        rows = [
+            (
+                " or ".join((key.name, *key.others)),
+                key.unit,
+                key.type,
+                key.default.replace("`", ""),
+                key.meaning.replace("`", ""),
+            )
+            for key in one.keys
+        ]
+        show(
+            Table(
+                f"{title}: {one.summary.replace('`', '')}", ("key", "unit", "value", "default", "meaning"), rows, left=5
+            )
+        )
         console.print(f"Example:\n{reference.example(one)}")
     if section is None:
         console.print("The keys of one section: strapdown keys SECTION, such as gyro or coning.")

@@ -19,13 +19,12 @@ from strapdown.cli.terminal import (
     command,
     console,
     scenario_named,
-    show_listing,
+    show,
     tables_folder,
     tables_written,
-    writable,
     written,
 )
-from strapdown.files import usable_folder, write_json
+from strapdown.files import usable_folder, writable, write_json
 from strapdown.units import ARCSECOND, DEGREE, DEGREE_PER_HOUR, STANDARD_GRAVITY
 
 if TYPE_CHECKING:
@@ -151,8 +150,8 @@ def covariance(
     name = chosen.name or Path(scenario).stem
     what = "the filter given" if filter_file else "the filter that matches it"
     console.print(f"{name}, {what}, integration {modelled.integration.name}.\n")
-    listing = found.listing()
-    show_listing(listing, f"{listing.title}, RMS", notes=True)
+    budget = found.listing()
+    show(budget)
     if states is None and not filter_file and modelled.states is not None:
         console.print(default_words(modelled.states.names))
     missing = setup.unmodelled_errors(chosen.gyro, chosen.sensors, modelled.states, gravity_f=chosen.gravity_f)
@@ -161,7 +160,7 @@ def covariance(
     write_json(out / "covariance.json", _summary(name, found))
     title = f"{name}: predicted errors"
     figures = save_as({out / "budget": plots.error_budget(found, title=title)}, form)
-    written(out / "covariance.json", *figures, *tables_written(tables, "covariance", found.budget()))
+    written(out / "covariance.json", *figures, *tables_written(tables, budget))
 
 
 def _summary(name: str, found: Any) -> dict[str, Any]:

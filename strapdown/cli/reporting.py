@@ -8,7 +8,8 @@ from typing import Annotated
 import typer
 
 from strapdown.cli.progress import progress_bar
-from strapdown.cli.terminal import command, console, writable, written
+from strapdown.cli.terminal import command, console, written
+from strapdown.files import writable
 from strapdown.files.reading import existing_file
 
 

@@ -22,14 +22,12 @@ from strapdown.cli.terminal import (
     say,
     scenario_named,
     show,
-    show_listing,
-    table,
     tables_folder,
     tables_written,
-    writable,
     written,
 )
-from strapdown.files import plain, usable_folder, write_json, written_beside
+from strapdown.files import plain, usable_folder, writable, write_json, written_beside
+from strapdown.results import Column, Table
 
 if TYPE_CHECKING:
     from strapdown import allan as identification
@@ -42,10 +40,9 @@ def scenarios() -> None:
     from strapdown.scenarios import builtin_rows
 
     rows = builtin_rows()
-    listing = table("Built-in scenarios: `strapdown simulate NAME`", "name", "s", "Hz", "gyro")
-    for row in rows:
-        listing.add_row(str(row["name"]), f"{row['duration_s']:g}", f"{row['rate_hz']:g}", str(row["gyro"]))
-    show(listing)
+    cells = [[row[key] for key in ("name", "duration_s", "rate_hz", "gyro")] for row in rows]
+    columns = ("name", Column("s", digits=6), Column("Hz", digits=6), "gyro")
+    show(Table("Built-in scenarios: `strapdown simulate NAME`", columns, cells))
     for row in rows:
         console.print(f"{row['name']}: {row['description']}")
 
@@ -206,6 +203,7 @@ def _identify(
     """Identify the noise of one sensor; print and write the results."""
     from strapdown import allan as identification
     from strapdown import plots, recordings
+    from strapdown.allan import parameters
     from strapdown.plots.style import save_as
 
     out, (specification, numbers, figure_name, _) = output.out, _names(sensor, output.form)
@@ -246,10 +244,11 @@ def _identify(
             f"Because of gaps the fit uses {fit.samples} samples in segments of {shortest} or more; the deviation uses all samples."
         )
     rows = identification.table(fit)
-    show_listing(fit.listing(), f"Noise coefficients with {100.0 * fit.level:g} % intervals")
+    found = fit.listing()
+    show(found, f"Noise coefficients with {100.0 * fit.level:g} % intervals", notes=False)
     console.print("For a term not detected in this record, the last column is an upper bound.")
     with written_beside(out / specification) as temporary:
-        temporary.write_text(_specification(fit, f"{recording.name}, {length}"), encoding="utf-8")
+        temporary.write_text(parameters.to_specification(fit, f"{recording.name}, {length}"), encoding="utf-8")
     content = {
         "source": recording.name,
         "sample_interval_s": fit.sample_interval,
@@ -263,14 +262,14 @@ def _identify(
     }
     write_json(out / numbers, plain(content))
     paths += save_as({out / figure_name: figure}, output.form)
-    written(out / specification, out / numbers, *paths, *tables_written(output.tables, "allan", rows, sensor))
+    written(out / specification, out / numbers, *paths, *tables_written(output.tables, found))
     for warning in fit.warnings:
         console.print(f"warning: {warning}", highlight=False)
     if fit.warnings:
         console.print(
             f"Cut the recording to an interval where the {sensor} is at rest, or exclude the band of a filter by --highest-frequency."
         )
-        console.print(f"warning: {_DISTRUST}, nor {specification}.", highlight=False)
+        console.print(f"warning: {parameters.DISTRUST}, nor {specification}.", highlight=False)
     return fit
 
 
@@ -296,6 +295,7 @@ def _regressed(recording: Path, sensor: str, source: GyroSamples, order: int, ou
     import tomli_w
 
     from strapdown.allan import temperature as allan_temperature
+    from strapdown.allan.parameters import commented
     from strapdown.gyro.temperature import to_table
 
     if source.temperature is None:
@@ -307,28 +307,13 @@ def _regressed(recording: Path, sensor: str, source: GyroSamples, order: int, ou
         source.values / scale, source.temperature, source.sample_interval, order=order
     )
     unit, stem = _UNITS[sensor]
-    found = fit.polynomial
-    listing = table(
-        f"Bias over temperature, T − {found.reference:.3f} °C",
-        "axis",
-        "power",
-        "unit",
-        "estimate",
-        "from",
-        "to",
-        left=3,
-    )
-    for (k, axis), value in np.ndenumerate(found.coefficients):
-        ends = (value - fit.reach[k, axis], value + fit.reach[k, axis]) if k else ()
-        said = f"{unit}/K{k if k > 1 else ''}" if k else unit
-        listing.add_row("xyz"[axis], str(k), said, *(f"{one:.4g}" for one in (value, *ends)))
-    show(listing)
+    show(fit.listing(unit))
     paths.append(out / _names(sensor)[3])
     with written_beside(paths[-1]) as temporary:
-        text = _commented(
+        text = commented(
             [f"Bias over temperature by `strapdown allan` from {recording.name}, a polynomial in T - reference."]
         )
-        content = {sensor: {"temperature": to_table(found, stem)}}
+        content = {sensor: {"temperature": to_table(fit.polynomial, stem)}}
         temporary.write_text(text + "\n" + tomli_w.dumps(content), encoding="utf-8")
     return fit.left * scale
 
@@ -337,51 +322,3 @@ _UNITS = {"gyro": ("rad/s", "rad_per_s"), "accelerometer": ("m/s²", "m_per_s2")
 """Unit of the samples of each sensor, in messages and in keys."""
 _LARGEST_RATE = 1e12
 """Maximum rate, rad/s, and sample rate, Hz: far beyond any gyro, and far below overflow of squares in the fit."""
-_DISTRUST = "do not trust these intervals"
-
-
-def _specification(fit: identification.NoiseFit, source: str) -> str:
-    """Return the text of gyro.toml, or of that of another sensor: the terms detected, and as comments bounds of the others and warnings."""
-    import tomli_w
-
-    from strapdown import allan as identification
-    from strapdown.allan import parameters as noise_parameters
-
-    sensor = fit.sensor
-    lines = [f"{sensor.capitalize()} noise by `strapdown allan` from {source}."]
-    lines += [f"WARNING: {warning}." for warning in fit.warnings]
-    if fit.warnings:
-        lines.append(f"WARNING: {_DISTRUST}, nor this file.")
-    text = _commented(lines) + "\n" + tomli_w.dumps(noise_parameters.to_toml(fit))
-    partly, wholly = [], []
-    for term, bound in identification.upper_bounds(fit).items():
-        key, factor = noise_parameters.key(sensor, term)
-        values = [bound] if isinstance(bound, float) else list(bound)
-        seen = fit.supported[:, fit.terms.index(term)]
-        if seen.any():
-            below = ", ".join(f"{'xyz'[k]} below {values[k] / factor:.4g}" for k in range(len(values)) if not seen[k])
-            partly.append(f"{key}: 0 where not detected, {below}.")
-        else:
-            shown = ", ".join(f"{value / factor:.4g}" for value in values)
-            wholly.append(f"{key} = {shown if len(values) == 1 else f'[{shown}]'}")
-    if partly or wholly:
-        text += "\n" + _commented(
-            [
-                f"Not detected in the record, so left out; the upper ends of their {100 * fit.level:g} % intervals:",
-                *partly,
-                *wholly,
-            ]
-        )
-    if sensor == "gyro":
-        text += "\n" + _commented(
-            [
-                "Add turn_on_bias_sigma_deg_per_hour from the data sheet: one recording has no information",
-                "about the variation of the bias between switch-ons, and filters then assume that it is near zero.",
-            ]
-        )
-    return text
-
-
-def _commented(lines: list[str]) -> str:
-    """Return lines as TOML comments, without the control characters that a file name may contain."""
-    return "".join(f"# {''.join(c if c.isprintable() else '?' for c in line)}\n" for line in lines)

@@ -12,18 +12,18 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_type_hints
 
+import rich.table
 import typer
 from rich import box
-from rich.table import Table
 from rich.text import Text
 
 from strapdown.checks import InputError
 from strapdown.cli.progress import PlainConsole, progress_bar
-from strapdown.files import json_text, output_file, usable_folder, write_json
+from strapdown.files import json_text, usable_folder, writable, write_json
 
 if TYPE_CHECKING:
     from strapdown.recordings import Recording
-    from strapdown.results import Listing
+    from strapdown.results import Table
     from strapdown.scenarios import Scenario
 
 LARGEST_NUMBER = 1e30
@@ -114,53 +114,37 @@ def counted(number: int, what: str) -> str:
     return f"{number} {what}" if number == 1 else f"{number} {what}s"
 
 
-def table(title: str, *columns: str, left: int = 1) -> Table:
-    """Print the title and return an empty table, its first ``left`` columns text and the others numbers."""
-    console.print(title, style="bold")
-    result = Table(box=box.SIMPLE_HEAD, header_style="", pad_edge=False, padding=(0, 1, 0, 0))
-    for k, column in enumerate(columns):
-        result.add_column(column, justify="left" if k < left else "right", no_wrap=k > 0 or left == 1)
-    return result
-
-
-def show(rows: Table) -> None:
-    """Print a table; on a narrow terminal its lines wrap and are not cut off."""
+def show(table: Table, title: str | None = None, *, notes: bool = True) -> None:
+    """Print a table, optionally under another title; on a narrow terminal its lines wrap and are not cut off."""
+    console.print(title or table.title, style="bold")
+    rows = rich.table.Table(box=box.SIMPLE_HEAD, header_style="", pad_edge=False, padding=(0, 1, 0, 0))
+    for k, column in enumerate(table.head):
+        rows.add_column(column, justify="left" if k < table.left else "right", no_wrap=k > 0 or table.left == 1)
+    styles = {"pass": "green", "FAIL": "red", "likely": "red"}
+    for row in table.cells:
+        # Only plain strings are cleared of control characters.
+        rows.add_row(*(Text(cell, style=styles[cell]) if cell in styles else cell for cell in row))
     width, console.width = console.width, 1000
     try:
         console.print(rows, crop=False)
     finally:
         console.width = width
+    say(*(table.notes if notes else ()))
 
 
-def show_listing(listing: Listing, title: str | None = None, *, notes: bool = False) -> None:
-    """Print the table of a result, optionally under another title and with its notes."""
-    rows = table(title or listing.title, *listing.columns, left=listing.left)
-    styles = {"pass": "green", "FAIL": "red", "likely": "red"}
-    for row in listing.rows:
-        # Only plain strings are cleared of control characters.
-        rows.add_row(*(Text(cell, style=styles[cell]) if cell in styles else cell for cell in row))
-    show(rows)
-    say(*(listing.notes if notes else ()))
-
-
-def tables_written(folder: Path | None, study: str, *results: Any) -> list[Path]:
-    """Write the tables of a study to the folder of ``--tables``, if one is given, and return the files."""
+def tables_written(folder: Path | None, *tables: Table) -> list[Path]:
+    """Write tables to the folder of ``--tables``, if one is given, and return the files."""
     if folder is None:
         return []
-    from strapdown.report import tables
+    from strapdown.report.tables import write
 
-    return tables.write(tables.STUDIES[study](*results), folder)
+    return write(tables, folder)
 
 
 def tables_folder(folder: Path | None) -> None:
     """Raise an error if the folder of ``--tables`` cannot be written to, before anything is computed."""
     if folder is not None:
         usable_folder("--tables", folder)
-
-
-def verdict(good: bool) -> Text:
-    """Return "pass" or "FAIL", in colour on terminals that support it."""
-    return Text("pass", style="green") if good else Text("FAIL", style="red")
 
 
 def scenario_named(name: str) -> Scenario:
@@ -195,17 +179,6 @@ def _numbers(place: str, content: Any) -> Iterator[tuple[str, float]]:
             yield from _numbers(f"{place}[{k}]", value)
     elif isinstance(content, (int, float)) and not isinstance(content, bool):
         yield place, float(content)
-
-
-def writable(
-    option: str, *targets: Path, suffixes: tuple[str, ...] = (), sources: tuple[Path | str | None, ...] = ()
-) -> None:
-    """Raise an error for output files that cannot be written, before anything is computed."""
-    for target in targets:
-        if target.is_dir():
-            raise InputError(f"{option}: {target} is a folder, but a file of that name must be written; choose another")
-        read = [source for source in sources if source is not None]
-        output_file(option, target, suffixes or (target.suffix.lower(),), *read)
 
 
 def need_own(target: Path, command: str, own: Callable[[Path], bool]) -> None:

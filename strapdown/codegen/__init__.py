@@ -24,7 +24,7 @@ import strapdown
 from strapdown.checks import InputError, one_of
 from strapdown.codegen import c, design, javascript
 from strapdown.estimation.setup import FilterSetup, read_setup, to_toml
-from strapdown.files import usable_folder, written_beside
+from strapdown.files import usable_folder, writable, written_beside
 from strapdown.records import ImuRecord
 from strapdown.vectors import VectorMeasurements, VectorSensor
 
@@ -93,9 +93,7 @@ def export(
     origin = _origin(setup, precision)
     made = c.files(program, origin, single=precision == "single") if to == "c" else javascript.files(program, origin)
     paths = [Path(folder) / name for name in made]
-    for path in paths:
-        if path.is_dir():
-            raise InputError(f"{path} is a folder, but a file of that name must be written; choose another folder")
+    writable("folder", *paths)
     for path, text in zip(paths, made.values(), strict=True):
         with written_beside(path) as temporary:
             temporary.write_text(text, encoding="utf-8")

@@ -5,7 +5,7 @@ for some algorithms also from p before and f after it; attitude is propagated by
 *Quaternion differentiation*.
 
 - ``coefficients``: Derivation of the coefficients, in exact rationals.
-- ``algorithms``: :class:`Algorithm`, the catalogue :data:`ALGORITHMS`, and :func:`algorithm_rows`, its printed table.
+- ``algorithms``: :class:`Algorithm`, the catalogue :data:`ALGORITHMS`, and :func:`algorithm_table`, its printed table.
 - ``stepping``: :func:`integrate`, :func:`rotation_vectors`: from records to attitude.
 - ``drift``: :func:`predicted_coning_drift`, :func:`vibration_drift`: the drift due to coning and vibration.
 
@@ -16,13 +16,14 @@ package: :func:`strapdown.coning.coefficients.matched_correction`.
 """
 
 from strapdown.coning.algorithms import ALGORITHMS, Algorithm, read_algorithms
-from strapdown.coning.algorithms import algorithm_rows as algorithm_rows
+from strapdown.coning.algorithms import algorithm_table as algorithm_table
 from strapdown.coning.algorithms import named as named
 from strapdown.coning.drift import VibrationLine as VibrationLine
 from strapdown.coning.drift import predicted_coning_drift
 from strapdown.coning.drift import read_vibration as read_vibration
 from strapdown.coning.drift import small_angle_drift as small_angle_drift
 from strapdown.coning.drift import vibration_drift as vibration_drift
+from strapdown.coning.drift import vibration_table as vibration_table
 from strapdown.coning.stepping import increments_from_rates, integrate, rotation_vectors
 from strapdown.coning.stepping import time_per_sample as time_per_sample
 

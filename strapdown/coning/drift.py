@@ -13,7 +13,8 @@ from strapdown import checks
 from strapdown.checks import InputError
 from strapdown.coning.algorithms import Algorithm, named
 from strapdown.files import reading
-from strapdown.units import DEGREE
+from strapdown.results import Column, Table
+from strapdown.units import DEGREE, DEGREE_PER_HOUR
 
 
 def predicted_coning_drift(algorithm: str | Algorithm, angle: float, frequency: float, sample_interval: float) -> float:
@@ -161,3 +162,21 @@ def _number(name: str, field: str) -> float:
         return checks.finite(name, float(field))
     except ValueError:
         raise InputError(f"{name} is {field!r}, not a finite number") from None
+
+
+def vibration_table(
+    lines: Sequence[VibrationLine], sample_rates: Sequence[float], algorithms: Sequence[str] | None = None
+) -> Table:
+    """Return the drift due to a vibration spectrum as a table, for each algorithm and sample rate, Hz."""
+    rows = [
+        (name, rate, vibration_drift(lines, name, rate) / DEGREE_PER_HOUR)
+        for name in algorithms or BUDGETED
+        for rate in sample_rates
+    ]
+    columns = (
+        Column("algorithm", "algorithm"),
+        Column("sample rate, Hz", "sample_rate_hz", 6),
+        Column("drift, °/h", "drift_deg_per_hour"),
+    )
+    title = f"Drift about the third axis caused by {len(lines)} vibration lines"
+    return Table(title, columns, rows, name="coning-budget")

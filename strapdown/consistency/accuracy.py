@@ -16,7 +16,7 @@ from strapdown.checks import Array, InputError, array, increasing, positive
 from strapdown.consistency.alignment import ALIGNED, Alignment, Series, align_series, at_common_times, in_truth_frames
 from strapdown.files import plain
 from strapdown.records import Estimate, Truth
-from strapdown.results import Listed, Listing, figure
+from strapdown.results import Column, Listed, Table
 from strapdown.units import DEGREE
 
 KINDS = ("total", "heading", "inclination")
@@ -141,26 +141,35 @@ class Accuracy(Listed):
         sizes = self.given.get("all samples", {})
         return {kind: one.rms_over_sigma for kind, one in sizes.items() if math.isfinite(one.rms_over_sigma)}
 
-    def listing(self) -> Listing:
+    def listing(self) -> Table:
         """Return the errors as given and aligned, by span and part, in degrees."""
         rows = []
         for words, table in (("as given", self.given), ("aligned", self.aligned)):
             for span, sizes in table.items():
                 for kind, one in sizes.items():
-                    angles = (figure(x / DEGREE) for x in one[:3])
+                    angles = (x / DEGREE for x in one[:3])
                     share = "" if math.isnan(one.coverage) else f"{100.0 * one.coverage:.1f} %"
-                    ratio = "" if math.isnan(one.rms_over_sigma) else figure(one.rms_over_sigma, 3)
+                    ratio = "" if math.isnan(one.rms_over_sigma) else one.rms_over_sigma
                     rows.append((span, words, kind, *angles, share, ratio))
         notes = [
             "RMS, median and maximum of the angle of each part; RMS/σ per axis of the part, 1 for a consistent filter."
         ]
         if self.alignment is not None:
             notes.append(self.alignment.differences)
-        columns = ("over", "frames", "error", "RMS, °", "median, °", "maximum, °", "in 95 % region", "RMS/σ")
+        columns = (
+            "over",
+            "frames",
+            "error",
+            "RMS, °",
+            "median, °",
+            "maximum, °",
+            "in 95 % region",
+            Column("RMS/σ", digits=3),
+        )
         spans = ", ".join(
             f"{number} {'samples' if name == 'all samples' else f'of {name}'}" for name, number in self.samples.items()
         )
-        return Listing(f"Attitude error over {spans}", columns, rows, notes, left=3)
+        return Table(f"Attitude error over {spans}", columns, rows, notes, left=3)
 
     def summary(self) -> dict[str, Any]:
         """Return the errors as plain values for JSON, in degrees.

@@ -11,13 +11,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from strapdown import quaternion
-from strapdown.checks import Array, InputError, one_of
+from strapdown.checks import Array, Hint, InputError, one_of
 from strapdown.consistency.accuracy import Accuracy, accuracy_of
 from strapdown.consistency.alignment import (
     ALIGNED,
@@ -36,7 +36,11 @@ from strapdown.consistency.manifold import whitened
 from strapdown.consistency.timeaverage import MIN_ROWS, effective_samples, time_average
 from strapdown.records import Estimate, Innovations, Truth
 from strapdown.records.outputs import euler_axes
+from strapdown.results import Column, Table
 from strapdown.units import DEGREE, DEGREE_PER_HOUR
+
+if TYPE_CHECKING:
+    from strapdown.recordings.attitudes import Attitudes
 
 ERROR_FRAMES = ("body", "fixed", "euler")
 """Definitions of an attitude covariance: of δθ with ``q_true = q ⊗ exp(δθ)``; of δφ with ``q_true = exp(δφ) ⊗ q``, as ROS defines it for
@@ -96,6 +100,14 @@ class Checked:
     explanations: tuple[Explanation, ...]
     remarks: tuple[str, ...]
     accuracy: Accuracy
+
+    def listing(self) -> Table:
+        """Return the possible causes of the attitude errors as a table."""
+        rows = [
+            (one.name, one.value, one.nees, one.p_value, "likely" if one.likely else "no") for one in self.explanations
+        ]
+        columns = ("cause", "size", "remaining NEES", Column("p-value", digits=2), "")
+        return Table("Possible causes of the attitude errors", columns, rows, left=2)
 
     def summary(self) -> dict[str, Any]:
         """Return everything as plain values for JSON.
@@ -180,22 +192,82 @@ def check_arrays(
     >>> check_arrays(time, estimate, 0.5 * P, time, truth).judgement.verdict
     'not consistent'
     """
+    own = series_of("", time, attitude, covariance, bias)
+    theirs = series_of("true_", true_time, true_attitude, None, true_bias, true_movement)
+    how = {"confidence_level": confidence_level, "detectable_error": detectable_error}
+    return _checked(own, theirs, innovations or {}, error_frame, align, how)
+
+
+def check_attitudes(
+    own: Attitudes,
+    truth: Attitudes,
+    *,
+    error_frame: str = "find",
+    align: str | Iterable[str] = "auto",
+    confidence_level: float = 0.99,
+    detectable_error: float = DETECTABLE,
+) -> Checked:
+    """Return the verdict on the attitudes of a file against those of another, as ``strapdown check`` with a truth does.
+
+    Parameters
+    ----------
+    own, truth : Attitudes
+        Results of :func:`strapdown.read_attitudes`.
+    error_frame, align, confidence_level, detectable_error : optional
+        As for :func:`check_arrays`; "find" takes the definition of the covariance that the file declares, if it does.
+
+    Returns
+    -------
+    Checked
+        The verdict, with the alignment and the definition of the covariance that it rests on.
+    """
+    # One clock may count from 1970 and the other from the boot of a machine: both relative to the first stamp, in integer ns.
+    origin = int(min(own.stamps_ns[0], truth.stamps_ns[0]))
+    declared = own.error_frame if error_frame == "find" and own.error_frame else error_frame
+    checked = check_arrays(
+        own.seconds(origin),
+        own.attitude,
+        own.covariance,
+        truth.seconds(origin),
+        truth.attitude,
+        bias=own.bias,
+        true_bias=truth.bias,
+        innovations=own.innovations,
+        error_frame=declared,
+        align=align,
+        confidence_level=confidence_level,
+        detectable_error=detectable_error,
+        true_movement=truth.movement,
+    )
+    if declared == error_frame:
+        return checked
+    return replace(
+        checked, remarks=(*checked.remarks, f"the file declares that its covariance is of the {declared} error")
+    )
+
+
+def _checked(
+    own: Series,
+    theirs: Series,
+    innovations: Mapping[str, Innovations],
+    error_frame: str,
+    align: str | Iterable[str],
+    how: Mapping[str, Any],
+) -> Checked:
+    """Return the verdict on a history; ``how``: options of :func:`judge`."""
     if error_frame != "find":
         one_of("error_frame", error_frame, ERROR_FRAMES)
     wanted = _wanted(align)
-    own = series_of("", time, attitude, covariance, bias)
-    theirs = series_of("true_", true_time, true_attitude, None, true_bias, true_movement)
     if own.covariance is not None and (own.bias is None or theirs.bias is None):
         own = replace(own, bias=None, covariance=own.covariance[:, :3, :3])
     remarks: list[str] = []
-    own, alignment = align_series(own, theirs, wanted, remarks)
-    whole = own
-    own, truth = at_common_times(own, theirs, alignment.offset)
+    whole, alignment = align_series(own, theirs, wanted, remarks)
+    own, truth = at_common_times(whole, theirs, alignment.offset)
     remarks += alignment.words
     aligned = in_truth_frames(own.attitude, alignment)
     if own.covariance is None:
-        estimate = without_truth(own.time, aligned, innovations or {})
-        judged = judge(estimate, confidence_level=confidence_level, detectable_error=detectable_error)
+        estimate = without_truth(own.time, aligned, innovations)
+        judged = judge(estimate, **how)
         judgement = replace(judged, limits=tuple(limit for limit in judged.limits if limit != WITHOUT_TRUTH))
         chosen, found, explained = "", dict[str, float](), tuple[Explanation, ...]()
     else:
@@ -208,10 +280,11 @@ def check_arrays(
         body = quaternion.conjugate(quaternion.exp(alignment.body))
         turned = None if own.bias is None else quaternion.rotate(body, own.bias)
         estimate = Estimate.from_arrays(own.time, aligned, readings[chosen], bias=turned, innovations=innovations)
-        judgement = judge(estimate, truth, confidence_level=confidence_level, detectable_error=detectable_error)
+        judgement = judge(estimate, truth, **how)
         assert whole.covariance is not None
         whole = replace(whole, covariance=read_as(chosen, whole.covariance, whole.attitude))
-        explained = explanations(error, readings, chosen, found, truth, own.time, aligned, own.bias, confidence_level)
+        level = how["confidence_level"]
+        explained = explanations(error, readings, chosen, found, truth, own.time, aligned, own.bias, level)
     return Checked(
         judgement=judgement,
         estimate=estimate,
@@ -293,7 +366,7 @@ def _frame_words(chosen: str, found: Mapping[str, float]) -> str:
     if found[chosen] < DECIDED:
         return (
             f"the errors do not decide how the covariance is defined ({said}): it is read as {chosen}; "
-            "--error-frame (error_frame= in Python) names another"
+            f"{Hint('error_frame')} names another"
         )
     return f"the covariance is read as {chosen} ({said}, found from the errors)"
 

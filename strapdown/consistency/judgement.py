@@ -28,7 +28,7 @@ from strapdown.consistency.whiteness import (
 from strapdown.estimation.setup.for_record import unmodelled_errors
 from strapdown.files import plain
 from strapdown.records import Estimate, Truth
-from strapdown.results import Listed, Listing, figure
+from strapdown.results import Column, Listed, Table, figure
 
 Answer = Literal["consistent", "not consistent", "cannot tell"]
 
@@ -193,22 +193,30 @@ class Judgement(Listed):
         """Verdict and reason, as the terminal, the JSON file and the report print them."""
         return f"{self.verdict}: {self.reason}"
 
-    def listing(self) -> Listing:
+    def listing(self) -> Table:
         """Return the verdict and each statistic with its bounds, as a table."""
         rows = [
             (
                 one.name,
                 one.label,
-                figure(one.value),
+                one.value,
                 f"{figure(one.low)} to {figure(one.high)}" if math.isfinite(one.low) else "",
-                figure(one.p_value, 2),
-                figure(one.samples),
+                one.p_value,
+                float(one.samples),
                 "FAIL" if one.rejected else "pass",
             )
             for one in self.findings
         ]
-        columns = ("statistic", "of", "value", f"{100.0 * self.confidence_level:g} % bounds", "p-value", "samples", "")
-        return Listing(self.headline, columns, rows, [f"Note: {one}." for one in self.limits], left=2)
+        columns = (
+            "statistic",
+            "of",
+            "value",
+            f"{100.0 * self.confidence_level:g} % bounds",
+            Column("p-value", digits=2),
+            "samples",
+            "",
+        )
+        return Table(self.headline, columns, rows, [f"Note: {one}." for one in self.limits], left=2)
 
     @property
     def words(self) -> str:

@@ -16,8 +16,10 @@ from strapdown.estimation.error_states import AXES, ErrorStates
 from strapdown.estimation.smoothing import smooth
 from strapdown.estimation.states import ProcessNoise, State
 from strapdown.records import ImuRecord
-from strapdown.results import Listed, Listing
+from strapdown.results import Column, Listed, Table
 
+WEAKEST = 3
+"""Minimum number of directions in text: these, and all that are not observed."""
 NAMED = 0.25
 """Minimum component of a direction, relative to its largest, for a state to be named."""
 
@@ -96,18 +98,31 @@ class Observability(Listed):
         ]
         return " ".join(parts).removeprefix("+")
 
-    def listing(self) -> Listing:
+    def listing(self) -> Table:
         """Return the σ of each state, and each direction with its singular value, as a table."""
         prior = self.prior_sigma
         columns = (prior, self.start_sigma / prior, self.final_sigma / prior)
         rows = [
-            (f"{state}, {unit}", *(f"{value:.3g}" for value in sigmas), f"{part:.2f}")
+            (f"{state}, {unit}", *sigmas, part)
             for state, unit, *sigmas, part in zip(self.states, self.units, *columns, self.unobserved, strict=True)
         ]
-        notes = ["singular value: direction, each state relative to its prior σ (and the remaining σ)"]
-        notes += [f"{self.singular_values[k]:14.3g}: {self.words(k)}" for k in reversed(range(len(self.states)))]
+        n = len(self.states)
+        notes = ["singular value: the weakest directions, each state relative to its prior σ (and the remaining σ)"]
+        notes += [
+            f"{self.singular_values[k]:14.3g}: {self.words(k)}"
+            for k in range(n - 1, min(self.rank, n - WEAKEST) - 1, -1)
+        ]
         title = f"{self.rank} of {len(self.states)} directions are observed (singular value {self.threshold:g} or more)"
-        return Listing(title, ("state", "prior σ", "start/prior", "final/prior", "unobserved"), rows, notes)
+        return Table(
+            title,
+            (
+                "state",
+                *(Column(label, digits=3) for label in ("prior σ", "start/prior", "final/prior")),
+                Column("unobserved", shown="{:.2f}".format),
+            ),
+            rows,
+            notes,
+        )
 
     def summary(self) -> dict[str, Any]:
         """Return everything as plain values for JSON, in SI units.

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import contextlib
-import datetime
-import errno
 import hashlib
 import io
 import json
 import math
 import os
-import platform
 import secrets
 import stat
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 import numpy as np
 
@@ -71,7 +68,7 @@ def whole_hdf5(path: str | os.PathLike[str]) -> Iterator[Any]:
 
 @contextlib.contextmanager
 def locked(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Prevent other processes from writing the same output; if one is writing it already, raise an InputError that names it.
+    """Prevent other processes from writing the same output; if one is writing it already, raise an InputError.
 
     The lock is a file ``.NAME.lock`` in the folder of the output; it is released when the process ends in any way. Not on Windows.
     """
@@ -83,45 +80,24 @@ def locked(path: str | os.PathLike[str]) -> Iterator[None]:
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
     lock = target.with_name(f".{target.name}.lock")
-    while True:
-        with _own_file(lock) as handle:
-            try:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                handle.seek(0)
-                raise InputError(
-                    f"{target} is being written by {handle.read() or 'another process'}; wait for it, or choose another file"
-                ) from None
-            try:
-                if not os.path.samestat(os.fstat(handle.fileno()), os.stat(lock)):
-                    continue  # another process has removed the lock file in the meantime
-            except FileNotFoundError:
-                continue
-            try:
-                handle.truncate(0)
-                handle.write(
-                    f"process {os.getpid()} on {platform.node()} since {datetime.datetime.now():%Y-%m-%d %H:%M:%S}"
-                )
-                handle.flush()
-                yield
-            finally:
-                lock.unlink(missing_ok=True)
-            return
-
-
-def _own_file(lock: Path) -> TextIO:
-    """Open a lock file, which is created if necessary; a link or a pipe that another user may have put there is rejected."""
     try:
         handle = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK | os.O_NOFOLLOW, 0o666)
     except OSError as error:
-        if error.errno == errno.ELOOP:
-            raise InputError(f"{lock} is a link, which is not followed; remove it") from None
-        raise
-    status = os.fstat(handle)
-    if not stat.S_ISREG(status.st_mode) or status.st_nlink > 1:
+        raise InputError(f"{lock} cannot be locked ({error.strerror}); remove it") from None
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            held = os.path.samestat(os.fstat(handle), os.stat(lock))  # the process that held it may have removed it
+        except (BlockingIOError, FileNotFoundError):
+            held = False
+        if not held:
+            raise InputError(f"{target} is being written by another process; wait for it, or choose another file")
+        try:
+            yield
+        finally:
+            lock.unlink(missing_ok=True)
+    finally:
         os.close(handle)
-        raise InputError(f"{lock} is not a regular file of one name, as locks are; remove it")
-    return os.fdopen(handle, "r+", encoding="utf-8")
 
 
 def _user_block(content: bytes | memoryview) -> bytes:
@@ -166,17 +142,25 @@ def usable_folder(name: str, folder: str | os.PathLike[str]) -> None:
         raise InputError(f"{name} is {folder}, but there is no permission to write to {place}; choose another folder")
 
 
-def output_file(
-    name: str, path: str | os.PathLike[str], suffixes: tuple[str, ...], *sources: str | os.PathLike[str]
+def writable(
+    name: str,
+    *paths: str | os.PathLike[str],
+    suffixes: tuple[str, ...] = (),
+    sources: Sequence[str | os.PathLike[str] | None] = (),
 ) -> None:
-    """Reject an output file whose suffix is not in ``suffixes``, or that would replace a file that is read."""
-    target = Path(path)
-    if target.suffix.lower() not in suffixes:
-        raise InputError(f"{name} is {target}, but it is written as {' or '.join(suffixes)}; choose such a suffix")
-    for source in sources:
-        if target.exists() and Path(source).exists() and target.samefile(source):
-            raise InputError(f"{name} is {target}, the same file that is read; choose another name")
-    usable_folder(name, target.parent)
+    """Reject output files that cannot be written, before anything is computed.
+
+    A folder in the place of a file, a suffix that is not in ``suffixes``, or a file that is one of the ``sources`` that are read.
+    """
+    for target in map(Path, paths):
+        if target.is_dir():
+            raise InputError(f"{name}: {target} is a folder, but a file of that name must be written; choose another")
+        if suffixes and target.suffix.lower() not in suffixes:
+            raise InputError(f"{name} is {target}, but it is written as {' or '.join(suffixes)}; choose such a suffix")
+        for source in sources:
+            if source is not None and target.exists() and Path(source).exists() and target.samefile(source):
+                raise InputError(f"{name} is {target}, the same file that is read; choose another name")
+        usable_folder(name, target.parent)
 
 
 def plain(value: Any) -> Any:

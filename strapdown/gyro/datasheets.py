@@ -17,7 +17,7 @@ import numpy as np
 
 from strapdown.checks import Array, InputError, known_keys, one_of
 from strapdown.files import reading
-from strapdown.gyro.model import GyroSpec
+from strapdown.gyro.model import GyroSpec, from_table
 
 __all__ = [
     "PRESETS",
@@ -147,15 +147,15 @@ class Preset:
     """How the stated figures were verified."""
     rate: float
     """Typical sample rate, Hz."""
-    stated: Mapping[str, str]
-    """Figures of the data sheet, in its units."""
-    assumed: Mapping[str, str]
+    stated: Mapping[str, Any]
+    """Figures of the data sheet, with the units in the keys."""
+    assumed: Mapping[str, Any]
     """Figures that the data sheet does not give in this form; typical values for the grade."""
 
     @property
     def spec(self) -> GyroSpec:
         """The specification."""
-        return from_datasheet(**{**self.assumed, **self.stated})
+        return from_table({**self.assumed, **self.stated})
 
 
 PRESETS = {

@@ -1,4 +1,4 @@
-"""Bias of a gyro over temperature: the polynomial identified by ``strapdown allan --temperature``, used by simulator and filter."""
+"""Bias of a gyro over temperature: the polynomial identified by ``strapdown allan``, used by simulator and filter."""
 
 from __future__ import annotations
 
@@ -79,14 +79,14 @@ def to_table(warm: BiasOverTemperature, stem: str = STEM) -> dict[str, Any]:
 
 def from_table(table: Any, place: str = "temperature") -> BiasOverTemperature:
     """Return the polynomial of a table made by :func:`to_table`."""
-    table = tables.subtable(table, place, ", as written by `strapdown allan --temperature`")
+    table = tables.subtable(table, place, ", as written by `strapdown allan`")
     keys = [key for key in _keys(STEM, len(table)) if key == STEM or f"bias_{key}" in table]
     limits = ("reference_degc", "lowest_degc", "highest_degc")
     needed = [*limits, *(f"bias_{key}" for key in keys), *(f"sigma_{key}" for key in keys[1:])]
     known_keys(place, table, needed)
     missing = [key for key in needed if key not in table]
     if missing:
-        raise InputError(f"{place} lacks {', '.join(missing)}; `strapdown allan --temperature` writes a complete table")
+        raise InputError(f"{place} lacks {', '.join(missing)}; `strapdown allan` writes a complete table")
     reference, lowest, highest = (finite(f"{place}: {key}", table[key]) for key in limits)
     if not lowest <= reference <= highest:
         raise InputError(f"{place}: reference_degc is {reference:g}, outside lowest_degc to highest_degc")
@@ -104,12 +104,15 @@ def _keys(stem: str, number: int) -> list[str]:
     return [stem, f"{stem}_per_k", *(f"{stem}_per_k{k}" for k in range(2, number))][:number]
 
 
+WRITER = "`strapdown allan` writes one, with the order of the polynomial as its temperature option"
+
+
 def read(path: str | os.PathLike[str]) -> BiasOverTemperature:
     """Read the table ``[gyro.temperature]`` of a TOML file such as ``gyro-temperature.toml``."""
 
     def found(table: Mapping[str, Any], place: str) -> BiasOverTemperature:
         if "temperature" not in table:
-            raise InputError(f"{place} has no table [gyro.temperature]; `strapdown allan --temperature` writes one")
+            raise InputError(f"{place} has no table [gyro.temperature]; {WRITER}")
         return from_table(table["temperature"], f"{place}: temperature")
 
-    return tables.read(path, "gyro", "`strapdown allan --temperature` writes one", found)  # type: ignore[no-any-return]
+    return tables.read(path, "gyro", WRITER, found)  # type: ignore[no-any-return]

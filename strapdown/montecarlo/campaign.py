@@ -23,14 +23,14 @@ import numpy as np
 
 import strapdown
 from strapdown import scenarios
-from strapdown.checks import InputError, count, finite, one_of
+from strapdown.checks import Hint, InputError, count, finite, one_of
 from strapdown.estimation import setup
 from strapdown.files import locked, reading, set_attributes, whole_hdf5, written_beside
 from strapdown.montecarlo.engine import MACHINES, Chunks, Identity, Work, Workers, choose, identity, in_threads
 from strapdown.montecarlo.plan import Plan, from_table
 from strapdown.montecarlo.statistics import BINS, Statistics, merge
 from strapdown.records import CONVENTIONS, put
-from strapdown.results import Listed, Listing
+from strapdown.results import Listed, Table
 
 __all__ = [
     "Campaign",
@@ -123,11 +123,29 @@ class Campaign(Listed):
     arithmetic: str = ""
     seconds: float = 0.0
 
-    def listing(self) -> Listing:
+    def listing(self) -> Table:
         """Return the statistics of the finished runs as a table."""
         if self.statistics is None:
-            return Listing(f"Monte Carlo of {self.runs} runs, none of them finished", (), ())
+            return Table(f"Monte Carlo of {self.runs} runs, none of them finished", (), ())
         return self.statistics.listing()
+
+    def summary(self) -> dict[str, Any]:
+        """Return plan and provenance as plain values for JSON.
+
+        Returns
+        -------
+        dict
+            Plan with its digest, engine, chunk size, version and time; :func:`strapdown.montecarlo.summary` has the statistics.
+        """
+        return {
+            "plan": self.plan.to_table(),
+            "digest": self.plan.digest,
+            "machine": self.machine,
+            "lanes_do_not_serve": self.reason or None,
+            "chunk": self.chunk,
+            "version": self.version,
+            "seconds": self.seconds,
+        }
 
     @property
     def finished(self) -> bool:
@@ -221,8 +239,7 @@ def run(
     table = plan.to_table()
     if target.exists() and not resume and not overwrite:
         raise InputError(
-            f"{target} exists; continue it (--resume; resume=True in Python), overwrite it (--overwrite; overwrite=True), or choose "
-            "another name"
+            f"{target} exists; continue it ({Hint('resume', True)}), overwrite it ({Hint('overwrite', True)}), or choose another name"
         )
     chosen = choose(plan, machine)
     with locked(target):

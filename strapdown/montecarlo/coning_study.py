@@ -8,7 +8,7 @@ shows it.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -22,6 +22,7 @@ from strapdown.gyro import GyroSpec
 from strapdown.montecarlo import FilterSetup, Statistics
 from strapdown.montecarlo.statistics import SUBSETS
 from strapdown.motion import Coning, Harmonic, HarmonicRates, Motion, SpinRock, TorqueFree
+from strapdown.results import Column, Table
 from strapdown.scenarios import Scenario
 from strapdown.units import (
     ARCSECOND,
@@ -283,6 +284,94 @@ class ConingStudy:
             "filter": [outcome.summary() for outcome in self.outcomes],
             **({"own": [own_summary(one) for one in p.own]} if p.own else {}),
         }
+
+
+ROUNDING = 1e-6
+"""Drifts below this are rounding errors of the simulation, °/h."""
+
+
+def _drift(value: float | None) -> str:
+    if value is None:
+        return "no formula"
+    return f"{value:.4g}" if abs(value) > ROUNDING else "rounding"
+
+
+def tables(summary: Mapping[str, Any]) -> list[Table]:
+    """Return the tables of a study's :meth:`ConingStudy.summary`: one's own algorithms, if any, the drifts, and the filter with each.
+
+    They are those of the terminal, the files and the report.
+    """
+    drifts = [
+        Column("algorithm", "algorithm"),
+        Column("samples", "samples"),
+        Column("measured", "drift_deg_per_hour", shown=_drift),
+        Column("predicted", "predicted_deg_per_hour", shown=_drift),
+    ]
+    filters = [
+        Column("integration", "integration"),
+        Column("attitude RMS, arcsec", "attitude_rms_arcsec"),
+        Column("σ", "attitude_sigma_arcsec"),
+        Column("bias RMS, °/h", "bias_rms_deg_per_hour"),
+        Column("σ", "bias_sigma_deg_per_hour"),
+        Column("mean z, °/h", "bias_mean_z_deg_per_hour", 3),
+        Column("ANEES attitude", "anees_attitude"),
+        Column("ANEES bias", "anees_bias"),
+        Column("NIS", "nis"),
+        Column("verdict", "consistent", shown=lambda passed: "pass" if passed else "FAIL"),
+    ]
+    (low, high), (nis_low, nis_high) = (summary["filter"][0][f"{key}_bounds"] for key in ("anees_bias", "nis"))
+    note = (
+        "ANEES and NIS are per degree of freedom: 1 for a consistent filter. 99 % bounds: ANEES of attitude and of bias "
+        f"{low:.3f} to {high:.3f} at one epoch, NIS {nis_low:.4f} to {nis_high:.4f}."
+    )
+    outcomes = [{**row, "bias_mean_z_deg_per_hour": row["bias_mean_deg_per_hour"][2]} for row in summary["filter"]]
+    return [
+        _table("Drift of the integration, °/h about the cone's axis", drifts, summary["integration"], name="drift"),
+        _table(
+            "The same filter with each algorithm: RMS error and σ of the filter",
+            filters,
+            outcomes,
+            (note,),
+            name="filters",
+        ),
+    ]
+
+
+def own_table(own: Sequence[coning.Algorithm]) -> Table:
+    """Return the orders and drift constants of user-defined algorithms as a table, with the best for their numbers of increments."""
+    columns = (
+        Column("algorithm", "name"),
+        Column("samples", "samples"),
+        Column("order", "order"),
+        Column("n", "drift_order"),
+        Column("C", "drift_constant"),
+        Column("optimum n", "best_drift_order"),
+        Column("C for the same increments", "best_drift_constant"),
+    )
+    rows, notes = [], []
+    for one in own:
+        row, constant = own_summary(one), one.drift_constant
+        exact = f" = {constant}" if constant.denominator < SHOWN_DENOMINATOR else ""
+        rows.append({**row, "samples": one.samples, "drift_constant": f"{float(constant):.4g}{exact}"})
+        if one.drift_order < row["best_drift_order"] and abs(constant) < ROUNDED:
+            notes.append(
+                f"Note: the drift of {one.name} is of order (ωh)^{one.drift_order} with a small constant, as with rounded coefficients. "
+                "If they are rounded, give them as fractions or with all digits."
+            )
+    title = "Your own algorithms: drift under small coning is −C β² ω (ωh)^n, derived from the coefficients"
+    return _table(title, columns, rows, notes, name="own")
+
+
+SHOWN_DENOMINATOR = 10**7
+"""Drift constants with a smaller denominator are also shown as fractions."""
+ROUNDED = 1e-3
+"""A drift constant below this, in an order that the optimum coefficients cancel, is probably due to rounded coefficients."""
+
+
+def _table(
+    title: str, columns: Sequence[Column], rows: Sequence[Any], notes: Sequence[str] = (), *, name: str
+) -> Table:
+    return Table(title, columns, [[row[one.key] for one in columns] for row in rows], notes, name=name)
 
 
 def own_summary(algorithm: coning.Algorithm) -> dict[str, Any]:

@@ -46,7 +46,7 @@ from strapdown.consistency.judgement import (
 )
 from strapdown.montecarlo.plan import Plan
 from strapdown.records import Estimate, ImuRecord
-from strapdown.results import ByContent, Listed, Listing, figure
+from strapdown.results import ByContent, Listed, Table, figure
 
 Counts = NDArray[np.int64]
 
@@ -100,6 +100,17 @@ class Replay:
     """Initial state of the filter."""
     estimate: Estimate
     """Estimate at every filter step, with full covariances."""
+
+    def largest_nees(self, epochs: ArrayLike) -> tuple[float, float]:
+        """Return the largest NEES of the states at these epochs (:attr:`Plan.time`), as in the list of worst runs, and its time, s."""
+        estimate, truth, size = self.estimate, self.estimate.truth, 6 if self.estimate.has_bias else 3
+        assert estimate.covariance is not None
+        assert truth is not None
+        error = consistency.errors(estimate.attitude, np.nan_to_num(estimate.bias), truth.attitude, truth.bias)
+        nees = consistency.nees(error[:, :size], estimate.covariance[:, :size, :size])
+        rows = np.searchsorted(estimate.time, np.asarray(epochs) + 1e-9, side="right") - 1
+        worst = int(rows[np.argmax(nees[rows])])
+        return float(nees[worst]), float(estimate.time[worst])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -227,13 +238,13 @@ class Statistics(ByContent, Listed):
             runs=f"{self.runs} runs",
         )
 
-    def listing(self) -> Listing:
+    def listing(self) -> Table:
         """Return NEES and NIS per degree of freedom, and the errors at the end, as a table."""
         judgement = self.judge()
         rows = [
             (
                 f"{one.name} of {one.label}",
-                figure(one.value),
+                one.value,
                 f"{one.low:.4f} to {one.high:.4f}",
                 "FAIL" if one.rejected else "pass",
             )
@@ -255,7 +266,7 @@ class Statistics(ByContent, Listed):
         if self.failed:
             notes.append(f"{self.failed} runs failed: their errors or covariances are not finite")
         title = f"{self.runs} runs, per degree of freedom (1 expected); {100.0 * judgement.confidence_level:g} % bounds of all together"
-        return Listing(title, ("statistic", "value", "bounds", ""), rows, notes)
+        return Table(title, ("statistic", "value", "bounds", ""), rows, notes)
 
     @property
     def has_bias(self) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -13,6 +14,7 @@ from strapdown.estimation.setup import MEKF, FilterSetup
 from strapdown.files import plain
 from strapdown.montecarlo.plan import Plan, initial_sigmas
 from strapdown.montecarlo.statistics import COVERED, Counts, Statistics, judged_epochs
+from strapdown.results import Column, Table
 
 QUANTILES = (0.5, 0.95, 0.997)
 """Quantiles of the last epoch's errors in the summary."""
@@ -113,6 +115,90 @@ def summary(
         "consistent": statistics.failed == 0 and judgement.verdict != "not consistent",
     }
     return plain(table)  # type: ignore[no-any-return]
+
+
+def tables(summary: Mapping[str, Any]) -> list[Table]:
+    """Return the tables of a :func:`summary`: consistency, errors at the end, and coverage; those of terminal, files and report."""
+    passed = lambda good: "pass" if good else "FAIL"  # noqa: E731
+    number = lambda value: "-" if value is None else f"{value:.4g}" if value >= 1e3 else f"{value:.4f}"  # noqa: E731
+    ranged = lambda value: "" if value is None else number(value)  # noqa: E731
+    runs = f"{summary['runs']} runs"
+    refused = ", ".join(f"{part['refused']} of {part['sensor']}" for part in summary["nis"] if part["refused"])
+    tests = [
+        ("NEES", subset, part["anees"], part["least"], part["greatest"], *part["bounds"], part["consistent"])
+        for subset, part in summary["nees"].items()
+    ]
+    tests += [
+        ("NIS", part["sensor"], part["nis"], None, None, *part["bounds"], part["consistent"]) for part in summary["nis"]
+    ]
+    consistency = Table(
+        f"Per degree of freedom; 1 for a consistent filter. NEES over {summary['epochs_judged']} epochs; {runs}, bounds "
+        f"{100.0 * summary['confidence_level']:g} % together",
+        (
+            Column("", "statistic"),
+            Column("of", "of"),
+            Column("mean", "mean", shown=number),
+            Column("minimum", "least", shown=ranged),
+            Column("maximum", "greatest", shown=ranged),
+            Column("from", "lower_bound", shown=number),
+            Column("to", "upper_bound", shown=number),
+            Column("", "consistent", shown=passed),
+        ),
+        tests,
+        [f"The gate rejected {refused}."] if refused else [],
+        left=2,
+        name="consistency",
+    )
+    last, coverage = summary["last_epoch"], summary["coverage"]
+    worst = ", ".join(
+        f"{part['run']} ({'failed' if part['largest_nees'] is None else format(part['largest_nees'], '.1f')})"
+        for part in summary["worst_runs"][:5]
+    )
+    failed = summary["failed_runs"]
+    notes = [f"Worst runs, by maximum NEES of the state: {worst}."]
+    if failed:
+        runs_failed = f"{failed} run{'s' if failed > 1 else ''}"
+        notes.append(f"In {runs_failed} the filter failed: no finite error or covariance.")
+    sizes = ("mean_error", "rms_error", "sigma", *(f"error_quantile_{q:g}" for q in QUANTILES))
+    labels = ("mean", "RMS", "filter's σ", *(f"{100.0 * q:g} %" for q in QUANTILES))
+    errors = [
+        (f"{what} {axis}", words, *(last[f"{what}_{key}_{unit}"][k] for key in sizes))
+        for what, unit, words in (("attitude", "arcsec", "arcsec"), ("bias", "deg_per_hour", "°/h"))
+        if what in summary["nees"]  # not all filters estimate a bias
+        for k, axis in enumerate("xyz")
+    ]
+    at_the_end = Table(
+        f"Errors at {last['time_s']:g} s, {runs}; quantiles of the absolute error",
+        (Column("", "state"), Column("unit", "unit"), *map(Column, labels, sizes)),
+        errors,
+        _efficiency_words(summary),
+        left=2,
+        name="errors",
+    )
+    shares = [(what, *coverage[what]) for what in coverage if what == "expected" or what in summary["nees"]]
+    percent = lambda share: "-" if share is None else f"{100.0 * share:.2f} %"  # noqa: E731
+    within = Table(
+        f"Fraction of the errors within kσ at the tested epochs, {runs}",
+        (Column("of", "of"), *(Column(f"{k}σ", f"inside_{k}_sigma", shown=percent) for k in (1, 2, 3))),
+        shares,
+        notes,
+        name="coverage",
+    )
+    return [consistency, at_the_end, within]
+
+
+def _efficiency_words(summary: Mapping[str, Any]) -> tuple[str, ...]:
+    ratios = summary.get("rms_over_root_cramer_rao_bound")
+    if ratios is None:
+        return ()
+    low, high = ratios["bounds_of_an_efficient_filter"]
+    axes = "; ".join(
+        f"{name} {', '.join(f'{x:.3f}' for x in ratios[name])}" for name in ("attitude", "bias") if name in ratios
+    )
+    return (
+        f"RMS error divided by the root of the Cramér–Rao bound, by axis: {axes} (at one epoch {low:.3f} to {high:.3f} for an efficient "
+        "filter).",
+    )
 
 
 def _efficiency(statistics: Statistics, bound: Array, epochs: Counts) -> dict[str, Any]:

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from strapdown import quaternion
-from strapdown.checks import Array, InputError, array, one_of
+from strapdown.checks import Array, Hint, InputError, array, one_of
 from strapdown.files import reading
 from strapdown.recordings import bag_files, delimited, recordfiles, ros, trajectories, ulog
 from strapdown.recordings.broad import read_broad
@@ -76,7 +76,7 @@ def _read(file: Path, topic: str) -> Attitudes:
     if head.startswith(bag_files.MAGICS):
         return _bag(file, topic)
     if topic:
-        raise InputError(f"{file.name} is not a bag; leave --topic out")
+        raise InputError(f"{file.name} is not a bag; leave {Hint('topic')} out")
     if head.startswith(b"ULog"):
         return _ulog(file)
     if trajectories.is_tum(head + b"\n"):
@@ -300,9 +300,7 @@ def _topic(name: str, found: Mapping[str, ros.Topic], topic: str) -> str:
         return one_of(f"{name}: topic", topic, found)
     if len(found) > 1:
         listed = ", ".join(f"{t} ({c.kind.rpartition('/')[2]}, {len(c)} messages)" for t, c in found.items())
-        raise InputError(
-            f"{name} has several topics with orientations: {listed}; choose one by --topic (topic= in Python)"
-        )
+        raise InputError(f"{name} has several topics with orientations: {listed}; choose one by {Hint('topic')}")
     return next(iter(found))
 
 

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from strapdown.checks import Array, InputError, instance, known_keys, one_of
+from strapdown.checks import Array, Hint, InputError, instance, known_keys, one_of
 from strapdown.records.recording import (
     CLOCK_OFFSET,
     FORCE_UNITS,
@@ -116,7 +116,7 @@ def unit_of(group: str, text: str) -> str:
 
 
 def parse_mapping(text: str) -> dict[str, str]:
-    """Return the columns by role from a text ``time=timestamp,gx=gyro_x[dps],…``, the format of ``--columns``."""
+    """Return the columns by role from a text ``time=timestamp,gx=gyro_x[dps],…``, that of the command line."""
     found: dict[str, str] = {}
     for part in text.split(","):
         role, equals, name = part.partition("=")
@@ -161,7 +161,7 @@ def recording(
         if missing and (group in ("time", "gyro") or len(missing) < len(members)):
             raise InputError(
                 f"{source}: the header lacks {', '.join(missing)} (it has: {', '.join(one.name for one in columns)}); name the columns, as "
-                f"in --columns {missing[0]}=NAME,… (columns= in Python)"
+                f"in {Hint('columns', {missing[0]: 'NAME'})}"
             )
     present = {_group(role) for role in roles}
     chosen = _units(source, present, declared, units or {})
@@ -276,7 +276,7 @@ def _guess(source: str, group: str, columns: Sequence[Column]) -> tuple[tuple[in
         role = GROUPS[group][0]
         raise InputError(
             f"{source}: the {group} may be that of {said}; select one, as in "
-            f"--columns {role}={columns[whole[0][1][0][0]].name},… (columns= in Python)"
+            f"{Hint('columns', {role: columns[whole[0][1][0][0]].name})}"
         )
     if not whole:
         return None
@@ -346,7 +346,7 @@ def _units(
             raise InputError(
                 f"{source} does not declare the unit of its {group} columns; declare it in the header, as in "
                 f"{GROUPS[group][0]} [{next(iter(units))}], or by "
-                f"--{group}-unit ({', '.join(units)}; units= in Python)"
+                f"{Hint('units', {group: next(iter(units))})} ({', '.join(units)})"
             )
         if option and declared.get(group) and option != declared[group]:
             raise InputError(
@@ -399,5 +399,5 @@ def _need_time_unit(source: str, name: str, time: Array) -> None:
     if not USUAL_INTERVALS[0] <= usual <= USUAL_INTERVALS[1]:
         raise InputError(
             f"{source}: the stamps of {name} are {usual:g} apart, not plausible in seconds; declare the unit, as in {name} [us], or by "
-            f"--time-unit ({', '.join(TIME_UNITS)}; units= in Python)"
+            f"{Hint('units', {'time': 'us'})} ({', '.join(TIME_UNITS)})"
         )

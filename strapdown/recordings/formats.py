@@ -84,8 +84,6 @@ FORMATS: tuple[Format, ...] = (
         recognised=_starts(b"ULog\x01\x12\x35"),
         read="ulog:read_ulog",
         options=("topic",),
-        write="ulog:write_ulog",
-        lacks=("temperature", "movement"),
     ),
     Format(
         name="Parquet",

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from strapdown import quaternion
-from strapdown.checks import Array, InputError, one_of
+from strapdown.checks import Array, Hint, InputError, one_of
 from strapdown.files.extras import library
 from strapdown.recordings.bag_files import Add, Bag, Data, write_checksums
 from strapdown.records import Estimate
@@ -173,9 +173,7 @@ def _chosen(name: str, topics: Mapping[str, Topic], topic: str) -> str:
         what = f"no message of {IMU}" + (f" on {listed}" if units else "")
         raise InputError(f"{name} has {what}; give a bag of an inertial unit")
     if len(filled) > 1:
-        raise InputError(
-            f"{name} has several inertial units: {listed}; choose one, --topic {filled[0]} (topic= in Python)"
-        )
+        raise InputError(f"{name} has several inertial units: {listed}; choose one, {Hint('topic', filled[0])}")
     return filled[0]
 
 

@@ -117,6 +117,11 @@ def samples_of(
         return GyroSamples(
             values=content.increments, sample_interval=interval, kind="increments", temperature=temperature
         )
+    kinds = {series.sensor: series.kind for series in content.vectors}
+    if kinds.get(sensor, "vector") != "vector":
+        raise InputError(
+            f'{source}: the {sensor} of the record measures a {kinds[sensor]}, without its magnitude; simulate it with kind = "vector"'
+        )
     return _of_recording(formats.from_record(content, source), sensor, gaps)
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from strapdown import quaternion
-from strapdown.checks import Array, InputError, non_negative
+from strapdown.checks import Array, Hint, InputError, non_negative
 from strapdown.kernels import recording_steps
 from strapdown.kernels.machine import compiled, read_only
 from strapdown.records.recording import Recording, sampled
@@ -53,7 +53,7 @@ class Delays:
             f"Samples are assumed to be stamped {late:.3g} ms late."
             if self.given
             else f"Samples are assumed to be stamped {late:.3g} ms late, half a sample interval, σ {1e3 * self.sigma:.2g} ms; "
-            "if the delay is known, give --latency (latency= in Python; 0: point samples)."
+            f"if the delay is known, give {Hint('latency')} (0: point samples)."
         ]
         if field:
             side = "after" if field > 0.0 else "before"

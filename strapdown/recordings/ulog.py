@@ -14,7 +14,6 @@ from __future__ import annotations
 import contextlib
 import io
 import os
-import struct
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -25,10 +24,10 @@ from numpy.typing import NDArray
 
 from strapdown import quaternion
 from strapdown.checks import Array, InputError, one_of
-from strapdown.files import reading, written_beside
+from strapdown.files import reading
 from strapdown.files.extras import library
 from strapdown.records import outputs
-from strapdown.records.recording import Recording, at_nearest, field_in, interpolated, relative_time, with_gyro
+from strapdown.records.recording import Recording, at_nearest, interpolated, relative_time, with_gyro
 
 UNIT, FIELD, ATTITUDE = "sensor_combined", "vehicle_magnetometer", "vehicle_attitude"
 TRUTH = "vehicle_attitude_groundtruth"
@@ -191,78 +190,3 @@ def _beside(topic: str, rows: dict[str, Any], name: str, time: Array, epoch: int
     remarks.append(f"Topic {topic}: {len(stamps)} messages{f', {lost} of them beyond its stamps' if lost else ''}.")
     remarks += words
     return values
-
-
-_LAYOUTS: dict[str, list[tuple[str, str, int]]] = {
-    UNIT: [
-        ("float", "gyro_rad", 3),
-        ("int32_t", "accelerometer_timestamp_relative", 0),
-        ("float", "accelerometer_m_s2", 3),
-    ],
-    FIELD: [("uint64_t", "timestamp_sample", 0), ("float", "magnetometer_ga", 3)],
-    ATTITUDE: [("float", "q", 4)],
-}
-_TYPES = {"float": "<f4", "int32_t": "<i4", "uint64_t": "<u8"}
-
-
-def write_ulog(recording: Recording, path: str | os.PathLike[str]) -> None:
-    """Write a recording as a flight log: numbers in single precision, stamps in integer µs; body axes are unchanged."""
-    stamps = np.rint(recording.clock_ns / 1000).astype(np.int64)
-    if recording.specific_force is None:
-        raise InputError(
-            f"{recording.source} has no accelerometer, which {UNIT} of a flight log needs; choose another extension"
-        )
-    if stamps[0] < 0:
-        raise InputError(
-            f"{recording.source}: time begins at {recording.time[0]:g} s, and a log's clock has no negative times; shift it"
-        )
-    if np.any(np.diff(stamps) <= 0):
-        raise InputError(
-            f"{recording.source}: stamps are less than 1 µs apart, the resolution of a log's clock; choose another extension"
-        )
-    known = np.asarray(~np.isnan(recording.specific_force).any(axis=1))
-    topics: list[tuple[str, NDArray[np.int64], list[NDArray[Any]]]] = [
-        (
-            UNIT,
-            stamps,
-            [recording.rate, np.where(known, 0, NO_SAMPLE), np.nan_to_num(recording.specific_force)],
-        )
-    ]
-    if recording.magnetic_field is not None:
-        seen = ~np.isnan(recording.magnetic_field).any(axis=1)
-        topics.append((FIELD, stamps[seen], [stamps[seen], field_in("G", recording)[seen]]))
-    if recording.true_attitude is not None:
-        seen = ~np.isnan(recording.true_attitude).any(axis=1)
-        topics.append((ATTITUDE, stamps[seen], [outputs.to_ned(quaternion.normalize(recording.true_attitude[seen]))]))
-    content = [b"ULog\x01\x12\x35\x01" + struct.pack("<Q", int(stamps[0])), _message("B", bytes(40))]
-    for name, _, _ in topics:
-        fields = "".join(f"{kind}{f'[{size}]' if size else ''} {field};" for kind, field, size in _LAYOUTS[name])
-        content.append(_message("F", f"{name}:uint64_t timestamp;{fields}".encode()))
-    content += [
-        _message("A", struct.pack("<BH", 0, number) + name.encode()) for number, (name, _, _) in enumerate(topics)
-    ]
-    rows: list[tuple[int, bytes]] = []
-    for number, (name, at, values) in enumerate(topics):
-        rows += zip(at.tolist(), _rows(name, number, at, values), strict=True)
-    rows.sort(key=lambda row: row[0])
-    with written_beside(path) as temporary, open(temporary, "wb") as stream:
-        stream.writelines(content)
-        stream.writelines(row for _, row in rows)
-
-
-def _message(kind: str, content: bytes) -> bytes:
-    return struct.pack("<HB", len(content), ord(kind)) + content
-
-
-def _rows(name: str, number: int, stamps: NDArray[np.int64], values: list[NDArray[Any]]) -> list[bytes]:
-    """Return the data messages of a topic."""
-    fields: list[Any] = [("size", "<u2"), ("kind", "u1"), ("number", "<u2"), ("timestamp", "<u8")]
-    fields += [
-        (field, _TYPES[kind], (size,)) if size else (field, _TYPES[kind]) for kind, field, size in _LAYOUTS[name]
-    ]
-    table = np.zeros(len(stamps), np.dtype(fields))
-    table["size"], table["kind"], table["number"] = table.dtype.itemsize - 3, ord("D"), number
-    table["timestamp"] = stamps
-    for (_, field, _), column in zip(_LAYOUTS[name], values, strict=True):
-        table[field] = column
-    return [row.tobytes() for row in table]

@@ -25,7 +25,7 @@ from strapdown.checks import (
 from strapdown.records import outputs
 from strapdown.records.record import Origin, Truth
 from strapdown.records.recording import Recording
-from strapdown.results import ByContent, Listed, Listing, figure
+from strapdown.results import ByContent, Column, Listed, Table, figure
 from strapdown.units import DEGREE, DEGREE_PER_HOUR
 
 if TYPE_CHECKING:
@@ -246,19 +246,17 @@ class Estimate(ByContent, Listed):
     remarks: tuple[str, ...] = ()
     details: Mapping[str, Any] = field(default_factory=dict)
 
-    def listing(self) -> Listing:
+    def listing(self) -> Table:
         """Return σ at the start and at the end, the estimate at the end, and the innovations, as a table."""
-        rows: list[tuple[str, ...]] = []
+        rows: list[tuple[Any, ...]] = []
         for k in range(6):
             name, unit, size = ("attitude", "°", DEGREE) if k < 3 else ("gyro bias", "°/h", DEGREE_PER_HOUR)
-            value = "" if k < 3 else figure(self.bias[-1, k - 3] / size)
-            first, last = (figure(self.sigma[row, k] / size, 3) for row in (0, -1))
-            rows.append((f"{name} {'xyz'[k % 3]}", unit, value, last, first))
+            value = "" if k < 3 else self.bias[-1, k - 3] / size
+            rows.append((f"{name} {'xyz'[k % 3]}", unit, value, *self.sigma[[-1, 0], k] / size))
         for name, states in self.error_states.items():
             for k, (component, unit) in enumerate(zip(states.components, states.units, strict=True)):
-                ends = (figure(states.sigma[row, k], 3) for row in (-1, 0))
                 label = f"{name} {component.removeprefix(name.split()[-1]).strip()}".strip()
-                rows.append((label, unit, figure(states.values[-1, k]), *ends))
+                rows.append((label, unit, states.values[-1, k], *states.sigma[[-1, 0], k]))
         notes = [f"Attitude at the end, q_fb (w, x, y, z): {', '.join(f'{q:.6f}' for q in self.attitude[-1])}"]
         for sensor, one in self.innovations.items():
             if np.any(one.used):
@@ -267,9 +265,9 @@ class Estimate(ByContent, Listed):
                 notes.append(
                     f"{sensor}: {len(one.time)} measurements{gate}, mean NIS per degree of freedom {figure(nis, 3)}"
                 )
-        return Listing(
+        return Table(
             f"Estimate at {len(self.time)} epochs over {self.time[-1] - self.time[0]:.6g} s",
-            ("state", "unit", "at the end", "σ", "σ at the start"),
+            ("state", "unit", "at the end", Column("σ", digits=3), Column("σ at the start", digits=3)),
             rows,
             [*notes, *map(str, self.events)],
             left=2,

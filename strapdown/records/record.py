@@ -16,7 +16,7 @@ import numpy as np
 
 from strapdown import coning
 from strapdown.checks import Array, InputError, array, increasing, instance, unit_quaternions
-from strapdown.results import ByContent, Listed, Listing
+from strapdown.results import ByContent, Listed, Table
 from strapdown.vectors import VectorMeasurements
 
 if TYPE_CHECKING:
@@ -170,16 +170,16 @@ class ImuRecord(Listed):
             )
             object.__setattr__(self, "truth", truth)
 
-    def listing(self) -> Listing:
+    def listing(self) -> Table:
         """Return gyro and sensors with their numbers of samples, and the origin of the record, as a table."""
         span, count_ = self.time[-1] - self.time[0], len(self.increments)
-        rows = [("gyro", "increments", str(count_), f"{count_ / span:.4g}")]
-        rows += [(one.sensor, one.kind, str(len(one.time)), f"{len(one.time) / span:.4g}") for one in self.vectors]
+        rows = [("gyro", "increments", count_, count_ / span)]
+        rows += [(one.sensor, one.kind, len(one.time), len(one.time) / span) for one in self.vectors]
         notes = [f"Truth: {'attitude and gyro bias' if self.truth is not None else 'not known'}."]
         if self.origin is not None and self.origin.scenario is not None:
             name = self.origin.scenario.name or "a scenario"
             notes.append(f"Simulated: {name}, seed {self.origin.seed}, run {self.origin.run}.")
-        return Listing(f"Record over {span:.6g} s", ("sensor", "measures", "samples", "Hz"), rows, notes, left=2)
+        return Table(f"Record over {span:.6g} s", ("sensor", "measures", "samples", "Hz"), rows, notes, left=2)
 
     @functools.cached_property
     def intervals(self) -> Array:

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from strapdown import quaternion
 from strapdown.checks import Array, InputError, array, increasing, one_of
-from strapdown.results import Listed, Listing, figure
+from strapdown.results import Listed, Table
 from strapdown.units import DEGREE, STANDARD_GRAVITY
 
 RATE_UNITS = {"rad/s": 1.0, "deg/s": DEGREE, "mrad/s": 1e-3, "mdeg/s": 1e-3 * DEGREE}
@@ -130,7 +130,7 @@ class Recording(Listed):
         if self.movement is not None and np.shape(self.movement) != (n,):
             raise InputError(f"{self.source}: movement has shape {np.shape(self.movement)}, wanted ({n},)")
 
-    def listing(self) -> Listing:
+    def listing(self) -> Table:
         """Return each sensor with the magnitudes of its samples, which show a wrong unit, and the reader's remarks, as a table."""
         span = self.time[-1] - self.time[0]
         rows = []
@@ -141,10 +141,10 @@ class Recording(Listed):
         ):
             if values is not None:
                 size = np.linalg.norm(values[~np.isnan(values).any(axis=1)], axis=1)
-                ends = (figure(float(np.median(size))), figure(float(size.max()))) if len(size) else ("-", "-")
-                rows.append((name, unit, str(len(size)), *ends))
+                ends = (float(np.median(size)), float(size.max())) if len(size) else (None, None)
+                rows.append((name, unit, len(size), *ends))
         title = f"{self.source}: {len(self.time)} samples over {span:.6g} s, {(len(self.time) - 1) / span:.4g} Hz"
-        return Listing(title, ("sensor", "unit", "samples", "median size", "largest"), rows, self.remarks, left=2)
+        return Table(title, ("sensor", "unit", "samples", "median size", "largest"), rows, self.remarks, left=2)
 
     def since(self, first: int) -> Recording:
         """Return the recording from a given sample on.

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from strapdown import consistency, plots, records, workflows
-from strapdown.checks import Array, InputError
+from strapdown.checks import Array, Hint, InputError
 from strapdown.files import plain
 from strapdown.montecarlo import campaign, verdicts
 from strapdown.montecarlo.statistics import SUBSETS, Statistics
@@ -23,9 +23,15 @@ def report(path: Path, confidence_level: float) -> tuple[str, dict[str, Any]]:
     held = campaign.read(path)
     statistics = held.statistics
     if statistics is None:
-        raise InputError(f"{path} has no completed run yet; continue the campaign with --resume first")
+        raise InputError(f"{path} has no completed run yet; continue the campaign first, {Hint('resume', True)}")
     judgement = workflows.check(held, confidence_level=confidence_level)
     bound = verdicts.bound_of(held.plan)
+    numbers = verdicts.summary(statistics, confidence_level=confidence_level, bound=bound)
+    many = f"{statistics.failed} runs failed: their error or covariance was not finite at some epoch."
+    parts = [
+        part for one in verdicts.tables(numbers) for part in (page.paragraph(f"{one.title}:"), *findings.tabled(one))
+    ]
+    failed = [page.paragraph(many)] if statistics.failed else []
     name = held.plan.scenario.name or "a scenario"
     unfinished = "" if held.finished else f"; incomplete: {statistics.runs} of {held.runs} runs"
     content = page.page(
@@ -33,7 +39,7 @@ def report(path: Path, confidence_level: float) -> tuple[str, dict[str, Any]]:
         f"{statistics.runs} runs of {held.plan.scenario.duration:g} s, seed {held.plan.seed}, {len(statistics.time) - 1} epochs, machine: "
         f"{held.machine}{unfinished}; strapdown {held.version}",
         findings.verdict(judgement),
-        _numbers(statistics, bound, judgement),
+        page.section("Key numbers", *parts, *failed),
         findings.evidence(judgement),
         page.section("Over time", *_over_time(statistics, judgement, confidence_level)),
         page.section(
@@ -73,60 +79,6 @@ def _estimated(statistics: Statistics) -> tuple[str, ...]:
 def _over_bound(statistics: Statistics, bound: Array) -> Array:
     """Return the RMS error divided by the root of the Cramér–Rao bound, by epoch and estimated state."""
     return verdicts.efficiency(statistics, bound)[:, : len(_estimated(statistics))]
-
-
-def _numbers(statistics: Statistics, bound: Array | None, judgement: consistency.Judgement) -> str:
-    rows = []
-    for k, name in enumerate(_estimated(statistics)):
-        unit, size = state_unit(k, 3.0 * statistics.sigma[-1:, k // 3 * 3 : k // 3 * 3 + 3])
-        quantiles = [page.number(float(statistics.error_quantile(share)[-1, k] / size), 3) for share in (0.5, 0.95)]
-        rows.append(
-            (
-                f"{name}, {unit}",
-                page.number(float(statistics.sigma[-1, k] / size)),
-                page.number(float(statistics.rms_error[-1, k] / size)),
-                page.number(float(statistics.mean_error[-1, k] / size), 3),
-                *quantiles,
-                *(f"{100 * share:.1f}" for share in statistics.covered[-1, k]),
-                *(() if bound is None else (page.number(float(_over_bound(statistics, bound)[-1, k]), 3),)),
-            )
-        )
-    head = (
-        "at the end",
-        "σ of the filter",
-        "RMS error",
-        "mean error",
-        "median |error|",
-        "95 %",
-        "in 1σ, %",
-        "in 2σ, %",
-        "in 3σ, %",
-        *(() if bound is None else ("RMS / √Cramér–Rao bound",)),
-    )
-    nis = [
-        (one.of, f"{one.value:.4f}", f"{one.low:.4f}", f"{one.high:.4f}")
-        for one in judgement.findings
-        if one.name == "NIS"
-    ]
-    parts = [page.table(head, rows, numbers=len(head) - 1)]
-    if nis:
-        parts.append(
-            page.table(
-                (
-                    "sensor",
-                    "NIS per degree of freedom",
-                    "from",
-                    f"to ({100.0 * judgement.confidence_level:g} %, all tests)",
-                ),
-                nis,
-                numbers=3,
-            )
-        )
-    if statistics.failed:
-        parts.append(
-            page.paragraph(f"{statistics.failed} runs failed: their error or covariance was not finite at some epoch.")
-        )
-    return page.section("Key numbers", *parts)
 
 
 def _over_time(statistics: Statistics, judgement: consistency.Judgement, probability: float) -> list[str]:
@@ -199,5 +151,5 @@ def _worst(statistics: Statistics, path: Path) -> str:
         "Worst runs",
         page.table(("run", "maximum NEES of the state (6 degrees of freedom)"), rows, numbers=2),
         page.paragraph("A run can be repeated by its number, bit for bit, with its record and estimate:"),
-        page.code(f"strapdown montecarlo {path.name} --replay {int(statistics.worst_run[0])}"),
+        page.code(f'run = sd.montecarlo.replay(sd.read("{path.name}").plan, {int(statistics.worst_run[0])})'),
     )

@@ -113,7 +113,10 @@ def _differences(
 
 
 def _errors(time: Array, truth: Array, attitudes: tuple[Array, Array], names: tuple[str, str]) -> list[str]:
-    errors = [quaternion.angle_between(attitude, truth) / DEGREE for attitude in attitudes]
+    known = np.isfinite(truth).all(axis=1)  # a reference may have gaps
+    errors = [np.full(len(truth), np.nan) for _ in attitudes]
+    for error, attitude in zip(errors, attitudes, strict=True):
+        error[known] = quaternion.angle_between(attitude[known], truth[known]) / DEGREE
     series = [
         page.Series(label=name, value=error, colour=_COLOURS[j], dash=j == 1)
         for j, (name, error) in enumerate(zip(names, errors, strict=True))

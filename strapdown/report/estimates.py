@@ -50,7 +50,7 @@ def report(path: Path, confidence_level: float) -> tuple[str, dict[str, Any]]:
             else []
         ),
         _numbers(estimate, error),
-        *([] if table is None else [findings.listed(table.listing(), numbers=5)]),
+        *([] if table is None else [findings.listed(table.listing())]),
         findings.evidence(judgement),
         _over_time(estimate, truth, error),
         *[_sensor(name, one, confidence_level) for name, one in estimate.innovations.items()],

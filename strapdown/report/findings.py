@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 from strapdown.consistency import Judgement
 from strapdown.report import page
-from strapdown.results import Listing
+from strapdown.results import Table
 
 
 def verdict(judgement: Judgement) -> str:
@@ -14,34 +16,23 @@ def verdict(judgement: Judgement) -> str:
     )
 
 
-def listed(listing: Listing, *, numbers: int) -> str:
-    """Return the section of a table of a result, its last ``numbers`` columns numbers."""
-    notes = [page.paragraph(note, faint=True) for note in listing.notes]
-    return page.section(listing.title, page.table(listing.columns, listing.rows, numbers=numbers), *notes)
+def listed(table: Table) -> str:
+    """Return the section of a table of a result."""
+    return page.section(table.title, *tabled(table))
+
+
+def tabled(table: Table) -> list[str]:
+    """Return a table of a result and its notes, without its title."""
+    notes = (page.paragraph(note, faint=True) for note in table.notes)
+    return [page.table(table.head, table.cells, numbers=len(table.head) - table.left), *notes]
 
 
 def evidence(judgement: Judgement) -> str:
     """Return the section with all statistics, their bounds and their limitations."""
-    rows = [
-        (
-            "fail" if finding.rejected else "pass",
-            finding.name,
-            finding.of,
-            page.number(finding.value),
-            page.number(finding.low),
-            page.number(finding.high),
-            page.number(finding.p_value, 3),
-            page.number(finding.samples, 4 if finding.samples % 1.0 else 9),
-        )
-        for finding in judgement.findings
-    ]
-    head = ("", "statistic", "of", "value", "from", "to", "p-value", "samples")
-    marked = ["fail" if finding.rejected else "pass" for finding in judgement.findings]
     percent = 100.0 * judgement.confidence_level
     note = (
         f"Bounds, pass and fail are for all tests together: a consistent filter fails with at most {100.0 - percent:g} %. Each p-value is "
         "for one statistic. For correlated samples, the number is the effective number of independent samples."
     )
-    parts = [page.table(head, rows, numbers=5, marked=marked), page.paragraph(note, faint=True)]
-    parts += [page.paragraph(f"Limitation: {limit}.", faint=True) for limit in judgement.limits]
-    return page.section("Evidence", *parts)
+    table = judgement.listing()
+    return page.section("Evidence", *tabled(dataclasses.replace(table, notes=[note, *table.notes])))

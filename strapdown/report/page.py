@@ -80,6 +80,10 @@ def code(content: str) -> str:
     return f"<pre>{text(content)}</pre>"
 
 
+MARKS = {"pass": "pass", "FAIL": "fail", "likely": "fail"}
+"""Classes of cells by their text."""
+
+
 def table(head: Sequence[str], rows: Sequence[Sequence[Any]], *, numbers: int = 0, marked: Sequence[str] = ()) -> str:
     """Return a table, which scrolls horizontally on a narrow page.
 
@@ -92,8 +96,8 @@ def table(head: Sequence[str], rows: Sequence[Sequence[Any]], *, numbers: int = 
     for k, row in enumerate(rows):
         cells = []
         for j, cell in enumerate(row):
-            mark = marked[k] if j == 0 and k < len(marked) else ""
-            kind = ' class="number"' if j >= plain else f' class="{mark}"' if mark else ""
+            mark = MARKS.get(cell, "") or (marked[k] if j == 0 and k < len(marked) else "")
+            kind = f' class="{mark}"' if mark else ' class="number"' if j >= plain else ""
             cells.append(f"<td{kind}>{text(cell)}</td>")
         lines.append("<tr>" + "".join(cells) + "</tr>")
     kind = "scroll" if numbers else "wrap"

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from strapdown.checks import InputError
+from strapdown.checks import Hint, InputError
 from strapdown.consistency.judgement import INNOVATIONS
 from strapdown.files import reading
 from strapdown.report import page
@@ -116,7 +116,10 @@ def report(path: Path, confidence_level: float) -> tuple[str, dict[str, Any]]:
     making = [page.provenance({"records": ", ".join(content["records"]), "units of the JSON": content["units"]})]
     if toml.exists():
         making += [page.paragraph(f"The filter, {toml.name}:"), page.code(reading.text(toml, link=False))]
-    making += [page.paragraph("To use it:"), page.code(f"strapdown estimate RECORD.h5 --filter {toml.name}")]
+    making += [
+        page.paragraph("To use it:"),
+        page.code(f'estimate = sd.estimate(record, setup=sd.estimation.setup.read_setup("{toml.name}"))'),
+    ]
     parts.append(page.section("Provenance", *making))
     searches = content["searches"]
     subtitle = (
@@ -165,7 +168,7 @@ def verdict(content: dict[str, Any]) -> tuple[str, str, list[str]]:
 
 def _on_its_own_data(content: dict[str, Any]) -> tuple[str, str, list[str]]:
     examined = content.get("unmodelled", [])
-    prove = "--holdout validates a tuning on held-out data"
+    prove = f"{Hint('holdout')} validates a tuning on held-out data"
     details = [words for one in examined for words in one["words"]]
     if content.get("innovations_fit") is False or details:
         return "not consistent", f"the tuned filter does not agree with the data used for tuning; {prove}", details

@@ -183,8 +183,8 @@ def _gyro() -> Section:
     own = (replace(k, type=_TYPES[gyro.Axes]) if k.type == "list of 3" else k for k in _keys(gyro.GyroSpec, gyro.FORM))
     keys = (replace(preset, example=next(iter(datasheets.PRESETS))), *own)
     summary = (
-        "the gyro; what is left out is perfect. A bias over temperature is a table `[gyro.temperature]`, as `strapdown allan "
-        "--temperature` writes it to `gyro-temperature.toml`."
+        "the gyro; what is left out is perfect. A bias over temperature is a table `[gyro.temperature]`, as `strapdown allan` "
+        "writes it to `gyro-temperature.toml`."
     )
     return Section(group="gyro", header="[gyro]", summary=summary, keys=keys)
 

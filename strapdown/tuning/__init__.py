@@ -8,10 +8,8 @@
 - ``fitting``: The search from several starts, intervals, identifiability.
 - ``parameters``: Names, fields in a filter setup and units of the parameters; priors.
 - ``initialization``: Initial state of the filter on a record.
-- ``planning``: The Cramér–Rao bound for records to be made.
 - ``residual_checks``: Errors that the tuned filter does not model, such as a scale factor absorbed by the gyro's noise.
 - ``diagnosis``: Causes of an inconsistent filter: hypotheses ranked by likelihood.
-- ``own``: Tuning of a user-defined filter by the same objectives.
 - ``validation``: Held-out data, and the filter before and after tuning on them.
 
 >>> objective = tuning.likelihood([tuning.record_case(record, chosen)], chosen, ["gyro.arw", "star.sigma"])  # doctest: +SKIP
@@ -40,14 +38,11 @@ from strapdown.tuning.outliers import TunedGate as TunedGate
 from strapdown.tuning.outliers import contaminated_likelihood as contaminated_likelihood
 from strapdown.tuning.outliers import log_likelihood as log_likelihood
 from strapdown.tuning.outliers import tuned_gate as tuned_gate
-from strapdown.tuning.own import OwnTuning, fit_own
 from strapdown.tuning.parameters import Prior, priors_from_gyro
 from strapdown.tuning.parameters import default_names as default_names
 from strapdown.tuning.parameters import unit_of as unit_of
 from strapdown.tuning.parameters import values_of as values_of
 from strapdown.tuning.parameters import with_values as with_values
-from strapdown.tuning.planning import Plan as Plan
-from strapdown.tuning.planning import plan
 from strapdown.tuning.procedure import GATED as GATED
 from strapdown.tuning.procedure import tune
 from strapdown.tuning.residual_checks import Unmodelled as Unmodelled
@@ -58,14 +53,11 @@ from strapdown.tuning.validation import compare, split
 
 __all__ = [
     "Case",
-    "OwnTuning",
     "Prior",
     "Tuning",
     "compare",
     "fit",
-    "fit_own",
     "likelihood",
-    "plan",
     "priors_from_gyro",
     "record_case",
     "recording_case",

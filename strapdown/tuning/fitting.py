@@ -12,15 +12,21 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from strapdown.checks import Array, InputError, count, known_keys, positive
+from strapdown.checks import Array, Hint, InputError, count, known_keys, positive
 from strapdown.estimation.setup import FilterSetup
-from strapdown.results import Listed, Listing, figure
+from strapdown.files import plain
+from strapdown.results import Column, Listed, Table, figure
 from strapdown.tuning.objective import REACH, Derivatives, Objective
 from strapdown.tuning.parameters import RRW, SCALE, Prior, Unit, with_values
+
+if TYPE_CHECKING:  # the steps after a search, which import this module
+    from strapdown.tuning.outliers import TunedGate
+    from strapdown.tuning.residual_checks import Unmodelled
+    from strapdown.tuning.validation import Comparison
 
 LONGEST_STEP = 2.0
 """Maximum change of a log parameter in one step of the search."""
@@ -166,6 +172,10 @@ class Estimated:
         return f"{NOT_IDENTIFIED}: at most {figure(self.upper / self.unit.factor, 3)} {self.unit.name} (95 %)"
 
 
+ENDS = {"before": "before", "after": "after", "from": "lower_95", "to": "upper_95"}
+"""Headings of the values of a parameter in text and in files."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Tuning(Listed):
     """Result of a tuning.
@@ -197,6 +207,16 @@ class Tuning(Listed):
         Whether the objective is no full likelihood, so that intervals come from the scatter of its gradient (sandwich).
     scale : ndarray (p,) or float, default 1.0
         Factor applied to the parameters after the minimisation (:func:`rescaled`).
+    measure : str, default "likelihood"
+        What was minimised: "likelihood", "likelihood of the errors" or "rmse".
+    gate : TunedGate, optional
+        The gate, if outliers were modelled.
+    comparison : Comparison, optional
+        The filter before and after on held-out data.
+    unmodelled : tuple of Unmodelled
+        Tests of records for errors that the tuned filter does not model.
+    attitude_rms : tuple of float, optional
+        RMS attitude error before and after, rad, if it was minimised.
     """
 
     parameters: tuple[Estimated, ...]
@@ -211,13 +231,62 @@ class Tuning(Listed):
     agreeing: int
     composite: bool = False
     scale: Array | float = 1.0
+    measure: str = "likelihood"
+    gate: TunedGate | None = None
+    comparison: Comparison | None = None
+    unmodelled: tuple[Unmodelled, ...] = ()
+    attitude_rms: tuple[float, float] | None = None
 
-    def listing(self) -> Listing:
+    def summary(self) -> dict[str, Any]:
+        """Return everything as plain values for JSON, in SI units.
+
+        Returns
+        -------
+        dict
+            Parameters with their intervals, objective, searches, errors not modelled, gate, and performance on held-out data.
+        """
+        content: dict[str, Any] = {
+            "parameters": [
+                {**vars(one), "note": one.words, "unit": one.unit.name, "si_per_unit": one.unit.factor}
+                for one in self.parameters
+            ],
+            "units": "SI: rad, s, and the units of whole vectors; divide by si_per_unit for the unit of a parameter",
+            "objective": {
+                "name": self.measure,
+                "before": self.before,
+                "after": self.after,
+                "attitude_rms_rad": self.attitude_rms,
+            },
+            "searches": {"number": len(self.starts), "at_the_best_point": self.agreeing},
+            "innovations_fit": not self.misfit,
+            "unmodelled": [one.summary() for one in self.unmodelled],
+        }
+        if self.gate is not None:
+            content["gate"] = {
+                name: getattr(self.gate, name) for name in ("probability", "lower", "upper", "thresholds")
+            }
+        if self.comparison is not None:
+            content["held_out"] = self.comparison.summary()
+        return plain(content)  # type: ignore[no-any-return]
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """Sentences on what the parameters do not say: the RMS error minimised, the gate, errors that the filter does not model."""
+        found = []
+        if self.attitude_rms is not None:
+            before, after = np.degrees(self.attitude_rms)
+            found.append(f"RMS attitude error: {before:.4g}° before, {after:.4g}° after.")
+        if self.gate is not None:
+            found.append(self.gate.words)
+        worst = max(self.unmodelled, key=lambda one: one.severity, default=None)
+        return (*found, *(() if worst is None else worst.words))
+
+    def listing(self) -> Table:
         """Return the parameters with their intervals, as a table."""
         rows = []
         for one in self.parameters:
-            values = [figure(x / one.unit.factor, 3) for x in (one.start, one.value, one.lower, one.upper)]
-            rows.append((one.name, one.unit.name, *values, one.words))
+            values = (x / one.unit.factor for x in (one.start, one.value, one.lower, one.upper))
+            rows.append((one.name, one.unit.name, *values, one.words, one.identified))
         notes = [
             f"{self.agreeing} of {len(self.starts)} searches ended at the best point; log-likelihood + "
             f"{self.before - self.after:.4g}."
@@ -225,21 +294,27 @@ class Tuning(Listed):
         if not all(one.identified for one in self.parameters):
             notes.append(
                 "For a parameter that is not identified these records give only an upper bound; the filter uses the value in the column "
-                "“after”, the mean below that bound. A prior can be given by --prior (priors= in Python)."
+                f"“after”, the mean below that bound. A prior can be given by {Hint('priors')}."
             )
         if self.misfit:
             remedy = (
                 "A common scale leaves the estimates unchanged; it makes σ correct on average, not at each time."
                 if self.parameters[0].name == SCALE
                 else "The maximum-likelihood filter may follow them and estimate worse. Tune only filter.scale, or against a truth "
-                "(--truth, --rmse), or try --spacing."
+                f"({Hint('truth', True)}, {Hint('rmse', True)}), or try {Hint('spacing')}."
             )
             notes.append(
                 "The innovations contradict any filter of this model: disturbances last over many samples, or vary. "
                 + remedy
             )
-        columns = ("parameter", "unit", "before", "after", "from", "to", "")
-        return Listing("Tuned parameters with 95 % intervals", columns, rows, notes, left=2)
+        columns = (
+            Column("parameter", "name"),
+            Column("unit", "unit"),
+            *(Column(label, key, 3) for label, key in ENDS.items()),
+            Column(""),
+            Column(None, "identified"),
+        )
+        return Table("Tuned parameters with 95 % intervals", columns, rows, notes, left=2, name="parameters")
 
     def __getitem__(self, name: str) -> Estimated:
         """Return the parameter with this name."""

@@ -73,6 +73,18 @@ class TunedGate:
     share: Estimated
     scale: Estimated
 
+    @property
+    def words(self) -> str:
+        """The gate in a sentence, or why there is none."""
+        if self.gate is None:
+            why = "no outliers" if not self.share.identified else "noise of two sizes rather than outliers"
+            return f"The records show {why}; the filter's gate is unchanged."
+        thresholds = ", ".join(f"{value:.1f} of {name}" for name, value in self.thresholds.items())
+        return (
+            f"A measurement with a NIS above {thresholds} is more likely an outlier than noise. The gate accepts "
+            f"{100.0 * self.probability:.4g} % of valid measurements (95 %: {100.0 * self.lower:.4g} to {100.0 * self.upper:.4g})."
+        )
+
 
 def tuned_gate(objective: Likelihood, tuning: Tuning, *, draws: int = 2000) -> TunedGate:
     """Return the gate at the Bayes threshold, with its interval from those of share and scale."""

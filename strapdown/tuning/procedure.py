@@ -6,14 +6,18 @@ import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from strapdown.checks import InputError
 from strapdown.estimation.setup import FilterSetup
 from strapdown.tuning.errors import error_objective
 from strapdown.tuning.fitting import Tuning, fit, rescaled
 from strapdown.tuning.innovations import LaneLikelihood, Likelihood, likelihood
 from strapdown.tuning.objective import OUTLIERS, Case, Objective
-from strapdown.tuning.outliers import TunedGate, contaminated_likelihood, tuned_gate
+from strapdown.tuning.outliers import TunedGate, contaminated_likelihood, log_likelihood, tuned_gate
 from strapdown.tuning.parameters import Prior, default_names
+from strapdown.tuning.residual_checks import doubted, examined
+from strapdown.tuning.validation import compare
 
 GATED = ("gate.probability", *OUTLIERS)
 """Names of parameters that need a model of outliers."""
@@ -78,6 +82,7 @@ def tune(
     threads: int = 1,
     progress: Callable[[str], None] | None = None,
     gate: bool = False,
+    held: Sequence[Case] = (),
     **objective: Any,
 ) -> Tuned:
     """Tune a filter: the objective, the search, and with ``rmse`` the common scale of all σ, with ``gate`` the filter's gate.
@@ -94,6 +99,8 @@ def tune(
         As for :func:`fit`; the threads process records if there is one search at a time.
     gate : bool, default False
         Model outliers, and set the gate where an outlier is more likely.
+    held : sequence of Case, optional
+        Held-out data (:func:`split`), on which the filter before and after tuning are compared.
     **objective
         ``truth``, ``rmse``, ``spacing`` of :func:`objective_for`.
 
@@ -129,4 +136,22 @@ def tune(
     found = tuned_gate(made, result) if isinstance(made, Likelihood) and made.mixed else None
     if found is not None and found.gate is not None:
         result = dataclasses.replace(result, setup=dataclasses.replace(result.setup, gate=found.gate))
+    comparison = None
+    if held:
+        comparison = compare(held, setup, result.setup, threads=threads)
+        if isinstance(made, Likelihood) and made.mixed:  # the likelihood after tuning includes the gate
+            likely = log_likelihood(held, made, result)
+            comparison = dataclasses.replace(
+                comparison, after=dataclasses.replace(comparison.after, log_likelihood=likely)
+            )
+    tested = examined(cases, setup, result)
+    for one in sorted(tested, key=lambda one: one.severity)[-1:]:
+        result = doubted(result, one)
+    rms = None
+    if objective.get("rmse"):
+        rms = tuple(made.rms(np.stack([made.start, result.point - np.log(result.scale)])).tolist())  # type: ignore[attr-defined]
+    measure = ("rmse" if objective.get("rmse") else "likelihood") + (" of the errors" if objective.get("truth") else "")
+    result = dataclasses.replace(
+        result, measure=measure, gate=found, comparison=comparison, unmodelled=tested, attitude_rms=rms
+    )
     return Tuned(result, made, found)

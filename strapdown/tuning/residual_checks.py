@@ -14,18 +14,20 @@ not explain itself. A prior of ``PLAUSIBLE`` bounds θ if the rates are too smal
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from strapdown import estimation
-from strapdown.checks import Array
+from strapdown.checks import Array, Hint
 from strapdown.consistency import Judgement
 from strapdown.consistency.bounds import tail
 from strapdown.consistency.judgement import concluded
 from strapdown.estimation import setup
 from strapdown.estimation.setup import FilterSetup
+from strapdown.estimation.setup.for_record import unmodelled_errors
 from strapdown.estimation.states import ProcessNoise
 from strapdown.files import plain
 from strapdown.records import Estimate, ImuRecord, cut
@@ -73,6 +75,8 @@ class Unmodelled:
     scale_factor: ScaleFactor
     causes: tuple[Cause, ...] = ()
     """Likely causes, if a test in :data:`SHAPES` fails."""
+    missing: tuple[str, ...] = ()
+    """Errors that the record specifies and the filter has no state for."""
     probability: float
 
     @property
@@ -92,6 +96,11 @@ class Unmodelled:
     def suspected(self) -> bool:
         """Whether an error without a state in the filter is likely."""
         return self.moves_with_the_rate or bool(self.failed)
+
+    @property
+    def severity(self) -> tuple[bool, bool, int]:
+        """Order of several records by how much they contradict the filter."""
+        return self.moves_with_the_rate, self.suspected, len(self.failed)
 
     @property
     def words(self) -> tuple[str, ...]:
@@ -117,6 +126,11 @@ class Unmodelled:
             )
         if self.causes:
             sentences.append(f"Most likely cause: {self.causes[0].words}.")
+        if self.missing:
+            sentences.append(
+                f"The record specifies {', '.join(self.missing)}, for which the filter has no state: {Hint('states', True)} adds "
+                "states for most errors."
+            )
         return tuple(sentences)
 
     def summary(self) -> dict[str, Any]:
@@ -152,8 +166,25 @@ def unmodelled(case: Case, chosen: FilterSetup, *, probability: float = 0.99) ->
         judgement=judgement,
         scale_factor=scale_factor(setup.modelled_record(record, used), used.process_noise, initial),
         causes=causes,
+        missing=unmodelled_errors(record.origin, chosen),
         probability=probability,
     )
+
+
+MAX_EXAMINED = 4
+"""Maximum number of records examined for errors that the tuned filter does not model."""
+
+
+def examined(cases: Sequence[Case], before: FilterSetup, tuning: Tuning) -> tuple[Unmodelled, ...]:
+    """Return tests of each record for errors that the tuned filter does not model; none if its states model such errors already."""
+    series = [one for case in cases for one in case.record.vectors]
+    by_axis = any(  # the search for causes supports one σ per sample only
+        one.anisotropic or (one.kind != "attitude" and isinstance(tuning.setup.sigma.get(one.sensor), tuple))
+        for one in series
+    )
+    if before.states is not None or by_axis:
+        return ()
+    return tuple(unmodelled(case, tuning.setup) for case in cases[:MAX_EXAMINED])
 
 
 def seen(case: Case) -> ImuRecord:

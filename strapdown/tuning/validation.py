@@ -16,11 +16,13 @@ from strapdown.estimation import setup
 from strapdown.estimation.schedule import selected
 from strapdown.estimation.setup import FilterSetup
 from strapdown.records import Estimate, Innovations, Truth
-from strapdown.results import Listed, Listing, figure
+from strapdown.results import Column, Listed, Table, figure
 from strapdown.tuning.objective import Case, of_sensors
 from strapdown.units import DEGREE
 
 By = Literal["time", "record"]
+WORSE = 1.05
+"""An increase of the attitude error on the held-out data by more than this factor is reported."""
 MAX_ROWS = 20_000
 """Maximum number of states of a record that are judged."""
 MIN_ERRORS = 100
@@ -107,18 +109,21 @@ class Performance:
     """NEES over the time of the first record, of attitude and bias if their truth is known."""
 
     @property
-    def row(self) -> tuple[str, ...]:
+    def row(self) -> tuple[Any, ...]:
         """Row of the table :meth:`Comparison.listing`."""
         verdicts = [judgement.verdict for judgement in self.judgements]
-        anees = figure(self.anees, 3) if np.isfinite(self.anees) else "-"
+        anees = figure(self.anees, 3)
         if self.nees and not np.isfinite(self.anees):  # the reference has no bias
             anees = f"{figure(float(np.nanmean(self.nees[0].mean)), 3)} (attitude)"
         return (
-            f"{self.log_likelihood:.4f}",
-            f"{self.nis:.3f}",
+            self.log_likelihood,
+            self.nis,
             f"{self.nis_bounds[0]:.3f} to {self.nis_bounds[1]:.3f}",
+            *self.nis_bounds,
             anees,
-            figure(self.attitude_rms / DEGREE, 3),
+            self.anees,
+            self.attitude_rms / DEGREE,
+            self.attitude_rms,
             verdicts[0] if len(set(verdicts)) == 1 else f"{verdicts.count('consistent')} of {len(verdicts)} consistent",
         )
 
@@ -130,10 +135,46 @@ class Comparison(Listed):
     before: Performance
     after: Performance
 
-    def listing(self) -> Listing:
+    def listing(self) -> Table:
         """Return likelihood, NIS, ANEES, attitude error and verdict of both, as a table."""
-        columns = ("filter", "log likelihood", "NIS", "99 % bounds", "ANEES", "attitude RMS, °", "verdict")
-        return Listing("On the data held out", columns, [("before", *self.before.row), ("after", *self.after.row)])
+        columns = (
+            Column("filter", "filter"),
+            Column("log likelihood", "log_likelihood_per_innovation", shown="{:.4f}".format),
+            Column("NIS", "nis_per_degree", shown="{:.3f}".format),
+            Column("99 % bounds"),
+            Column(None, "nis_lower"),
+            Column(None, "nis_upper"),
+            Column("ANEES"),
+            Column(None, "anees_per_state"),
+            Column("attitude RMS, °", digits=3),
+            Column(None, "attitude_rms_rad"),
+            Column("verdict"),
+        )
+        rows = [("before", *self.before.row), ("after", *self.after.row)]
+        return Table("On the data held out", columns, rows, name="held-out")
+
+    def summary(self) -> dict[str, Any]:
+        """Return the performance before and after as values for JSON."""
+        return {
+            name: {
+                "log_likelihood_per_innovation": one.log_likelihood,
+                "nis_per_degree": one.nis,
+                "nis_bounds": one.nis_bounds,
+                "anees_per_state": one.anees,
+                "attitude_rms_rad": one.attitude_rms,
+                "nees_per_state": {course.of: np.nanmean(course.mean) for course in one.nees},
+                "judgements": [judgement.summary() for judgement in one.judgements],
+            }
+            for name, one in (("before", self.before), ("after", self.after))
+        }
+
+    def advice(self, *, truth: bool) -> str:
+        """Return whether to keep the previous filter, in a sentence or empty; ``truth``: it was tuned against a truth."""
+        if not self.better and not truth:
+            return "On the held-out data the likelihood has decreased: keep the previous filter."
+        if self.after.attitude_rms > WORSE * self.before.attitude_rms:
+            return "On the held-out data the attitude error has increased: keep the previous filter."
+        return ""
 
     @property
     def better(self) -> bool:

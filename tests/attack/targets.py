@@ -14,6 +14,7 @@ from typing import Any
 import damage
 import h5py
 import numpy as np
+from ulog_writer import write_ulog
 
 from strapdown import coning, gyro, montecarlo, quaternion, recordings, records, scenarios
 from strapdown.estimation import setup
@@ -134,7 +135,7 @@ def foreign(folder: Path) -> list[Target]:
             library = {"ulg": "pyulog", "parquet": "pyarrow"}.get(ending, "rosbags")
             if importlib.util.find_spec(library) is None:
                 continue
-            recordings.write(whole, path)
+            (write_ulog if ending == "ulg" else recordings.write)(whole, path)
             more = {
                 "ulg": (damage.replace_word,) * 3,
                 "db3": (damage.change_sqlite,) * 3,

@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from strapdown import quaternion
 from strapdown.checks import Array
 from strapdown.records import Estimate, Truth
-from strapdown.results import Listed, Listing, figure
+from strapdown.results import Column, Listed, Table
 from strapdown.units import DEGREE, DEGREE_PER_HOUR
 
 
@@ -58,18 +59,18 @@ class Comparison(Listed):
                 result[name]["bias_over_bound"] = _root_mean_square(((bias - estimate.bias) / least[:, 3:])[late])
         return result
 
-    def listing(self) -> Listing:
+    def listing(self) -> Table:
         """Return errors and the filter's σ, which should agree, as a table."""
         against = "error" if self.truth is not None else f"from {next(iter(self.estimates))}"
         found = self.summary()
-        rows: list[tuple[str, ...]] = []
+        rows: list[tuple[Any, ...]] = []
         for name, row in found.items():
             itself = self.truth is None and not rows  # no difference to report
             bias, bias_sigma = row["bias_error"] / DEGREE_PER_HOUR, row["bias_sigma"] / DEGREE_PER_HOUR
-            angle = "-" if itself else figure(row["attitude_error"] / DEGREE)
+            angle = None if itself else row["attitude_error"] / DEGREE
             numbers = (row["attitude_sigma"] / DEGREE, math.nan if itself else bias, bias_sigma, row["nis"])
-            over = [figure(row[key], 3) for key in ("attitude_over_bound", "bias_over_bound") if key in row]
-            rows.append((name, angle, *map(figure, numbers), *over))
+            over = [row[key] for key in ("attitude_over_bound", "bias_over_bound") if key in row]
+            rows.append((name, angle, *numbers, *over))
         bounded = self.bound is not None
         notes = [
             f"RMS over time and axes of the second half{'' if self.truth is None else '; error and σ should agree'}."
@@ -82,10 +83,9 @@ class Comparison(Listed):
             notes.append(
                 f"NIS per degree of freedom: 1 ± {2.0 * math.sqrt(2.0 / degrees):.3f} for a consistent filter."
             )
-        columns = ("filter", f"attitude {against}, °", "σ", f"bias {against}, °/h", "σ", "NIS")
-        return Listing(
-            "Filters over one record", (*columns, *(("error/√bound", "bias") if bounded else ())), rows, notes
-        )
+        columns: list[str | Column] = ["filter", f"attitude {against}, °", "σ", f"bias {against}, °/h", "σ", "NIS"]
+        columns += [Column("error/√bound", digits=3), Column("bias", digits=3)] if bounded else []
+        return Table("Filters over one record", columns, rows, notes)
 
 
 def _root_mean_square(values: Array) -> float:

@@ -33,7 +33,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from strapdown.checks import OF_YOUR_OWN, Array, InputError, array, increasing, instance
+from strapdown.checks import OF_YOUR_OWN, Array, Hint, InputError, array, increasing, instance
 from strapdown.estimation.states import State
 from strapdown.files import reading
 from strapdown.records import Estimate, ImuRecord
@@ -135,10 +135,9 @@ class Own:
     def __call__(self, record: ImuRecord, initial: State, *, times: Array | None = None) -> Estimate:
         """Run the filter over a record without its truth, and check the result; if ``times`` of edges are given, return only those."""
         if isinstance(self.given, Mapping):
-            again = f"--filter {self.table['file']}" if "file" in self.table else "--filter FILE.py:NAME"
             raise InputError(
-                f"{self.name} is a filter of your own, whose code is not in the result file; give it again: {again}, or in Python "
-                "replace(plan, setup=replace(plan.setup, estimator=…))"
+                f"{self.name} is a filter of your own, whose code is not in the result file; give it again, "
+                f"{Hint('estimator', self.table.get('file', 'FILE.py:NAME'))}, as in replace(plan, setup=replace(plan.setup, estimator=…))"
             )
         function = _function(_copied(self.given, self.name))
         try:

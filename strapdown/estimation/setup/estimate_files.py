@@ -164,27 +164,31 @@ def _place(group: Any, name: str) -> str:
     return f"{group.file.filename}: {f'{group.name}/{name}'.lstrip('/')}"
 
 
+def _need(place: str, value: Array, good: Any, remedy: str) -> Array:
+    """Return values, checked entry by entry; the error names the first that is not good."""
+    if not np.all(good):
+        index = tuple(int(i) for i in np.argwhere(~good)[0])
+        raise InputError(f"{place}{list(index)} is {value[index]:g}{remedy}")
+    return value
+
+
 def _above_zero(place: str, variance: Array) -> Array:
     """Return variances, checked to be positive."""
-    if np.any(variance <= 0.0):
-        index = tuple(int(i) for i in np.argwhere(variance <= 0.0)[0])
-        raise InputError(
-            f"{place}{list(index)} is {variance[index]:g}, and a variance must be greater than zero; the file is damaged, or a sensor had "
-            "no noise: give each a sigma above zero and repeat the estimate"
-        )
-    return variance
+    remedy = (
+        ", and a variance must be greater than zero; the file is damaged, or a sensor had no noise: give each a sigma above zero and "
+        "repeat the estimate"
+    )
+    return _need(place, variance, variance > 0.0, remedy)
 
 
 def _biases(group: Any, name: str, rows: int) -> Array:
     """Return gyro biases (rows, 3), checked not to exceed :data:`LARGEST_BIAS`."""
     value = _numbers(group, name, (rows, 3))
-    if np.any(np.abs(value) > LARGEST_BIAS):
-        index = tuple(int(i) for i in np.argwhere(np.abs(value) > LARGEST_BIAS)[0])
-        raise InputError(
-            f"{_place(group, name)}{list(index)} is {value[index]:g} rad/s, more than any gyro has; the file is damaged or its filter "
-            "diverged: repeat the estimate, and check its initial state and the gyro's unit"
-        )
-    return value
+    remedy = (
+        " rad/s, more than any gyro has; the file is damaged or its filter diverged: repeat the estimate, and check its initial state and "
+        "the gyro's unit"
+    )
+    return _need(_place(group, name), value, np.abs(value) <= LARGEST_BIAS, remedy)
 
 
 def _attitudes(group: Any, name: str, rows: int) -> Array:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from strapdown import coning, units
-from strapdown.checks import InputError, instance, one_of, positive
+from strapdown.checks import Hint, InputError, instance, one_of, positive
 from strapdown.estimation import filters
 from strapdown.estimation.filters.own import Own, OwnFilter, as_own
 from strapdown.estimation.gating import Gate, Robust
@@ -191,7 +191,7 @@ class FilterSetup(ByValue):
         spec = spec or origin.gyro
         if spec is None:
             raise InputError(
-                "the record does not specify its gyro; give the gyro's noise (--gyro; noise= in Python) or a filter (--filter; setup=)"
+                f"the record does not specify its gyro; give the gyro's noise, {Hint('noise')}, or a filter, {Hint('setup')}"
             )
         walk = np.max(np.square(spec.bias_instability) * np.log(1e3)) / np.pi  # flicker over three decades of time
         tau = spec.markov_correlation_time

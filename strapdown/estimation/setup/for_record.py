@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from strapdown import estimation
-from strapdown.checks import InputError
+from strapdown.checks import Hint, InputError
 from strapdown.estimation import multiple_model, setup
 from strapdown.estimation.setup import FilterSetup
 from strapdown.estimation.states import State
@@ -18,7 +18,7 @@ from strapdown.vectors.wahba import InconsistentError
 UNEVEN = 2.0
 """Ratio of the largest to the smallest σ of an attitude above which both are reported."""
 
-REMEDY = "give the initial attitude (--attitude, or --from-truth; initial= in Python)"
+REMEDY = f"give the initial attitude, {Hint('initial')}"
 
 
 def unmodelled_errors(origin: Origin | None, chosen: FilterSetup | None) -> tuple[str, ...]:
@@ -53,7 +53,7 @@ def start(record: ImuRecord, chosen: FilterSetup) -> Start:
         # With a sensor's errors among the states, the filter can estimate them.
         if chosen.states is None:
             raise InputError(
-                f"{problem}; if a sensor has a bias, give the filter its state (--states; states=True in Python); or {REMEDY}"
+                f"{problem}; if a sensor has a bias, give the filter its state, {Hint('states', True)}; or {REMEDY}"
             ) from None
         return _by_multiple_models(record, chosen, problem, f"{problem[:1].upper()}{problem[1:]}")
     except InputError as error:
@@ -103,9 +103,7 @@ def _sigma_words(state: State) -> str:
 def drawn_start(record: ImuRecord, chosen: FilterSetup) -> Start:
     """Return the true initial state with errors drawn from the setup's σ, by seed and run of the record's ``origin``."""
     if record.truth is None:
-        raise InputError(
-            "a start drawn about the truth (--from-truth) needs a record with its truth; this one has none"
-        )
+        raise InputError("a start drawn about the truth needs a record with its truth; this one has none")
     origin = record.origin or Origin()
     words = "Started from the truth with errors drawn from the filter's σ."
     return Start(setup.drawn_state(chosen, record, origin.seed or 0, origin.run or 0), words)

@@ -9,7 +9,7 @@ from typing import Any
 from strapdown.checks import Array
 from strapdown.consistency import Finding, Judgement
 from strapdown.files import plain
-from strapdown.results import Listed, Listing, figure
+from strapdown.results import Listed, Table
 
 LIKELIER = math.log(20.0)
 """Minimum difference in ln p to prefer one of two causes: odds of 20 to 1, "strong" evidence (Kass & Raftery 1995)."""
@@ -80,14 +80,14 @@ class Diagnosis(Listed):
     judgement: Judgement
     probability: float
 
-    def listing(self) -> Listing:
+    def listing(self) -> Table:
         """Return the causes considered, the most likely first, as a table."""
         rows = [
-            (one.name, one.of, figure(one.gain), figure(one.log_p), "likely" if one in self.causes else "no")
+            (one.name, one.of, one.gain, one.log_p, "likely" if one in self.causes else "no")
             for one in self.considered[:8]
         ]
         notes = self.words.splitlines()
-        return Listing("Causes by what they would explain", ("cause", "of", "gain", "ln p", ""), rows, notes, left=2)
+        return Table("Causes by what they would explain", ("cause", "of", "gain", "ln p", ""), rows, notes, left=2)
 
     @property
     def alternatives(self) -> tuple[Cause, ...]:
