@@ -15,6 +15,7 @@ import pytest
 from measured import waves
 from two_stars import stars
 
+import strapdown as sd
 from strapdown import coning, consistency, estimation, motion, quaternion, records, scenarios, units, vectors
 from strapdown.checks import InputError
 from strapdown.estimation import setup
@@ -334,6 +335,10 @@ def test_check_names_a_wrong_axis_on_the_command_line(run, tmp_path):
     causes = json.loads((tmp_path / "check.json").read_text())["diagnosis"]["causes"]
     assert causes[0]["name"] == "wrong convention"
     assert causes[0]["significant"]
+    found, reason = sd.diagnose(sd.read("out/estimate.h5"), sd.read("record.h5"))
+    assert reason == ""
+    saved = json.loads((tmp_path / "check.json").read_text())["diagnosis"]
+    assert saved == {**json.loads(json.dumps(found.summary())), "without_a_state": []}
 
 
 # ------------------------------------------------------------------------------------------------------------- one of these causes

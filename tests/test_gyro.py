@@ -510,6 +510,44 @@ def test_sheet_figures_reach_their_fields():
     assert spec.turn_on_bias_sigma == pytest.approx(3.0 * units.DEGREE_PER_HOUR, rel=1e-15)
 
 
+STATED = {
+    "mpu-9250": {"arw": "0.01 deg/s/sqrt(Hz)", "range": "250 deg/s"},
+    "bmi088": {"arw": "0.014 deg/s/sqrt(Hz)", "range": "2000 deg/s"},
+    "adis16470": {"arw": "0.008 deg/s/sqrt(Hz)", "bias_instability": "8 deg/h", "range": "2000 deg/s"},
+    "adis16467-1": {
+        "arw": "0.15 deg/sqrt(h)",
+        "bias_instability": "2 deg/h",
+        "range": "125 deg/s",
+        "misalignment": "0.05 deg",
+    },
+    "stim300": {
+        "arw": "0.15 deg/sqrt(h)",
+        "bias_instability": "0.5 deg/h",
+        "range": "400 deg/s",
+        "scale_factor": "500 ppm",
+        "misalignment": "1 mrad",
+        "g_sensitivity": "1 deg/h/g",
+    },
+    "hg4930": {
+        "arw": "0.04 deg/sqrt(h)",
+        "bias_instability": "0.25 deg/h",
+        "turn_on_bias": "7 deg/h",
+        "range": "200 deg/s",
+    },
+    "dsp-1760": {"arw": "0.012 deg/sqrt(h)", "bias_instability": "0.05 deg/h", "range": "490 deg/s"},
+    "hg9900": {"arw": "0.002 deg/sqrt(h)", "turn_on_bias": "0.0035 deg/h", "scale_factor": "5 ppm"},
+}
+"""Figures of the data sheets in their own units."""
+
+
+@pytest.mark.parametrize("name", datasheets.PRESETS)
+def test_the_stated_figures_of_a_preset_are_those_of_its_sheet(name):
+    sheet, stated = datasheets.from_datasheet(**STATED[name]), gyro.model.from_table(datasheets.preset(name).stated)
+    for field, value in vars(sheet).items():
+        if isinstance(value, (float, np.ndarray)):
+            np.testing.assert_allclose(getattr(stated, field), value, rtol=1e-14, err_msg=field)
+
+
 def test_presets_go_from_consumer_to_navigation_grade():
     walks = [preset.spec.angle_random_walk for preset in datasheets.PRESETS.values()]
     assert len(walks) >= 6

@@ -64,6 +64,35 @@ def test_tune_writes_the_filter_the_report_and_the_figures(succeeds, tmp_path, r
         assert (out.parent / name).stat().st_size > 10_000
 
 
+@pytest.mark.parametrize(("flags", "options"), [(("--holdout", 0.3), {"holdout": 0.3}), (("--gate",), {"gate": True})])
+def test_the_command_and_python_give_the_same(succeeds, tmp_path, record, wrong, flags, options):
+    shared = ("--filter", wrong, "--free", "star 1.sigma", "--starts", 1, "--threads", 1)
+    succeeds("tune", record, *shared, *flags, "-o", tmp_path / "tuned.toml")
+    content = json.loads((tmp_path / "tuned.json").read_text())
+    start = setup.read_setup(wrong)
+    found = sd.tune(sd.read(record), setup=start, free=["star 1.sigma"], starts=1, threads=1, **options)
+    assert found.setup == setup.read_setup(tmp_path / "tuned.toml")
+    for one in (content, summary := found.summary()):
+        for tested in one["unmodelled"]:
+            tested.pop("record")  # the command names the file
+            tested.pop("words")
+    assert content == {"records": [record.name], **json.loads(json.dumps(summary))}
+
+
+def test_states_are_added_to_a_filter_without_them(succeeds, run, tmp_path):
+    """Its own message advises it: a scale factor of 500 ppm at 3 °/s is no white noise."""
+    spec = dataclasses.replace(SCENARIO.gyro, scale_factor=np.full(3, 2e-3))
+    path = tmp_path / "scaled.h5"
+    recordfiles.write_record(path, scenarios.simulate(dataclasses.replace(SCENARIO, gyro=spec), 1))
+    options = ("--free", "star 1.sigma", "--starts", 1)
+    said = succeeds("tune", path, *options, "-o", tmp_path / "plain.toml")
+    assert "for which the filter has no state: --states adds states for most errors." in " ".join(said.split())
+    succeeds("tune", path, "--filter", tmp_path / "plain.toml", "--states", *options, "-o", tmp_path / "scaled.toml")
+    assert setup.read_setup(tmp_path / "scaled.toml").states.names == ("gyro.scale",)
+    again = ("--filter", tmp_path / "scaled.toml", "--states")
+    assert "leave --states out" in run("tune", path, *again)[2]
+
+
 def test_tune_against_the_truth_and_with_a_prior(succeeds, tmp_path, record, wrong):
     out = tmp_path / "tuned.toml"
     said = succeeds("tune", record, "--truth", "--free", "gyro.arw,star 2.sigma", "--starts", 1, "-o", out)

@@ -185,29 +185,18 @@ def allan_deviation(
     deviation = np.empty((record.shape[1], len(multiples)))
     edf = np.empty_like(deviation)
     alphas = np.empty(deviation.shape, dtype=int)
-    phase, lanes = np.empty(samples + 1), np.empty(512)
+    phase = np.empty(samples + 1)
     for axis in range(record.shape[1]):
         rate = read_only(record[:, axis])
         compiled(accumulate)(rate, float(np.mean(rate)), phase)
         # If the first τ has few averages, the power law before it is that of the longest τ with many.
         alpha = _power_law(phase, max(1, min(int(multiples[0]), samples // _MANY_BLOCKS)), 0)
         for i, m in enumerate(int(m) for m in multiples):
-            alpha = _power_law(phase, m, alpha)
-            alphas[axis, i] = alpha
+            alpha = alphas[axis, i] = _power_law(phase, m, alpha)
             edf[axis, i] = equivalent_degrees_of_freedom(alpha, samples, m, estimator)
-            if estimator == "robust":
-                deviation[axis, i] = _median_deviation(phase, m, alpha)
-                edf[axis, i] *= _MEDIAN_EFFICIENCY
-        if estimator == "overlapping":
-            squares = np.empty(len(multiples))
-            compiled(second_difference_squares)(phase, multiples, lanes, np.empty(len(multiples)), squares)
-            deviation[axis] = np.sqrt(squares / (2.0 * (samples + 1 - 2 * multiples))) / multiples
-        elif estimator == "modified":
-            summed = np.empty(samples + 2)
-            compiled(accumulate)(read_only(phase), float(np.mean(phase)), summed)
-            deviation[axis] = [math.sqrt(_third_differences(summed, int(m)) / 2.0) / m**2 for m in multiples]
-        elif estimator == "hadamard":
-            deviation[axis] = [math.sqrt(_third_differences(phase, int(m)) / 6.0) / m for m in multiples]
+        deviation[axis] = _deviation(phase, multiples, alphas[axis], estimator)
+    if estimator == "robust":
+        edf *= _MEDIAN_EFFICIENCY
     deviation *= scale
     from scipy.stats import chi2
 
@@ -223,6 +212,22 @@ def allan_deviation(
         samples=samples,
         sample_interval=dt,
     )
+
+
+def _deviation(phase: Array, multiples: NDArray[np.int64], alphas: NDArray[np.int64], estimator: str) -> Array:
+    """Return the deviation of one axis at each multiple of the sample interval, times that interval."""
+    samples = len(phase) - 1
+    if estimator == "robust":
+        return np.array([_median_deviation(phase, int(m), int(a)) for m, a in zip(multiples, alphas, strict=True)])
+    if estimator == "overlapping":
+        squares = np.empty(len(multiples))
+        compiled(second_difference_squares)(phase, multiples, np.empty(512), np.empty(len(multiples)), squares)
+        return np.asarray(np.sqrt(squares / (2.0 * (samples + 1 - 2 * multiples))) / multiples)
+    if estimator == "hadamard":
+        return np.array([math.sqrt(_third_differences(phase, int(m)) / 6.0) / m for m in multiples])
+    summed = np.empty(samples + 2)
+    compiled(accumulate)(read_only(phase), float(np.mean(phase)), summed)
+    return np.array([math.sqrt(_third_differences(summed, int(m)) / 2.0) / m**2 for m in multiples])
 
 
 def _order(estimator: str) -> int:

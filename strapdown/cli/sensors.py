@@ -206,7 +206,7 @@ def _identify(
     from strapdown.allan import parameters
     from strapdown.plots.style import save_as
 
-    out, (specification, numbers, figure_name, _) = output.out, _names(sensor, output.form)
+    out, (specification, _, figure_name, _) = output.out, _names(sensor, output.form)
     source = recordings.read_samples(recording, sensor, rate=options.rate, gaps=True, **layout)
     _plausible(recording, sensor, source)
     gaps = bool(np.isnan(source.values).any())
@@ -243,26 +243,15 @@ def _identify(
         console.print(
             f"Because of gaps the fit uses {fit.samples} samples in segments of {shortest} or more; the deviation uses all samples."
         )
-    rows = identification.table(fit)
     found = fit.listing()
     show(found, f"Noise coefficients with {100.0 * fit.level:g} % intervals", notes=False)
     console.print("For a term not detected in this record, the last column is an upper bound.")
-    with written_beside(out / specification) as temporary:
-        temporary.write_text(parameters.to_specification(fit, f"{recording.name}, {length}"), encoding="utf-8")
-    content = {
-        "source": recording.name,
-        "sample_interval_s": fit.sample_interval,
-        "level": fit.level,
-        "coefficients": rows,
-        "misfit_probability": fit.misfit_probability,
-        "misfit": fit.misfit,
-        "estimator": deviation.estimator,
-        "tau_s": deviation.taus,
-        f"deviation_{_UNITS[sensor][1]}": deviation.deviation,
-    }
-    write_json(out / numbers, plain(content))
-    paths += save_as({out / figure_name: figure}, output.form)
-    written(out / specification, out / numbers, *paths, *tables_written(output.tables, found))
+    paths = [
+        *_saved(recording, fit, deviation, length, output),
+        *paths,
+        *save_as({out / figure_name: figure}, output.form),
+    ]
+    written(*paths, *tables_written(output.tables, found))
     for warning in fit.warnings:
         console.print(f"warning: {warning}", highlight=False)
     if fit.warnings:
@@ -271,6 +260,35 @@ def _identify(
         )
         console.print(f"warning: {parameters.DISTRUST}, nor {specification}.", highlight=False)
     return fit
+
+
+def _saved(
+    recording: Path,
+    fit: identification.NoiseFit,
+    deviation: identification.AllanDeviation,
+    length: str,
+    output: _Output,
+) -> list[Path]:
+    """Write the specification and the numbers of a sensor, and return the files."""
+    from strapdown import allan as identification
+    from strapdown.allan import parameters
+
+    specification, numbers = (output.out / name for name in _names(fit.sensor)[:2])
+    with written_beside(specification) as temporary:
+        temporary.write_text(parameters.to_specification(fit, f"{recording.name}, {length}"), encoding="utf-8")
+    content = {
+        "source": recording.name,
+        "sample_interval_s": fit.sample_interval,
+        "level": fit.level,
+        "coefficients": identification.table(fit),
+        "misfit_probability": fit.misfit_probability,
+        "misfit": fit.misfit,
+        "estimator": deviation.estimator,
+        "tau_s": deviation.taus,
+        f"deviation_{_UNITS[fit.sensor][1]}": deviation.deviation,
+    }
+    write_json(numbers, plain(content))
+    return [specification, numbers]
 
 
 def _plausible(recording: Path, sensor: str, source: GyroSamples) -> None:

@@ -119,72 +119,74 @@ def summary(
 
 def tables(summary: Mapping[str, Any]) -> list[Table]:
     """Return the tables of a :func:`summary`: consistency, errors at the end, and coverage; those of terminal, files and report."""
-    passed = lambda good: "pass" if good else "FAIL"  # noqa: E731
-    number = lambda value: "-" if value is None else f"{value:.4g}" if value >= 1e3 else f"{value:.4f}"  # noqa: E731
-    ranged = lambda value: "" if value is None else number(value)  # noqa: E731
-    runs = f"{summary['runs']} runs"
-    refused = ", ".join(f"{part['refused']} of {part['sensor']}" for part in summary["nis"] if part["refused"])
-    tests = [
+    return [_tests(summary), _errors(summary), _coverage(summary)]
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.4g}" if value >= 1e3 else f"{value:.4f}"
+
+
+def _tests(summary: Mapping[str, Any]) -> Table:
+    """Return NEES and NIS with their bounds."""
+    ranged = lambda value: "" if value is None else _number(value)  # noqa: E731
+    rows = [
         ("NEES", subset, part["anees"], part["least"], part["greatest"], *part["bounds"], part["consistent"])
         for subset, part in summary["nees"].items()
     ]
-    tests += [
+    rows += [
         ("NIS", part["sensor"], part["nis"], None, None, *part["bounds"], part["consistent"]) for part in summary["nis"]
     ]
-    consistency = Table(
-        f"Per degree of freedom; 1 for a consistent filter. NEES over {summary['epochs_judged']} epochs; {runs}, bounds "
-        f"{100.0 * summary['confidence_level']:g} % together",
-        (
-            Column("", "statistic"),
-            Column("of", "of"),
-            Column("mean", "mean", shown=number),
-            Column("minimum", "least", shown=ranged),
-            Column("maximum", "greatest", shown=ranged),
-            Column("from", "lower_bound", shown=number),
-            Column("to", "upper_bound", shown=number),
-            Column("", "consistent", shown=passed),
-        ),
-        tests,
-        [f"The gate rejected {refused}."] if refused else [],
-        left=2,
-        name="consistency",
+    columns = (
+        Column("", "statistic"),
+        Column("of", "of"),
+        Column("mean", "mean", shown=_number),
+        Column("minimum", "least", shown=ranged),
+        Column("maximum", "greatest", shown=ranged),
+        Column("from", "lower_bound", shown=_number),
+        Column("to", "upper_bound", shown=_number),
+        Column("", "consistent", shown=lambda passed: "pass" if passed else "FAIL"),
     )
-    last, coverage = summary["last_epoch"], summary["coverage"]
-    worst = ", ".join(
-        f"{part['run']} ({'failed' if part['largest_nees'] is None else format(part['largest_nees'], '.1f')})"
-        for part in summary["worst_runs"][:5]
+    title = (
+        f"Per degree of freedom; 1 for a consistent filter. NEES over {summary['epochs_judged']} epochs; {summary['runs']} runs, bounds "
+        f"{100.0 * summary['confidence_level']:g} % together"
     )
-    failed = summary["failed_runs"]
-    notes = [f"Worst runs, by maximum NEES of the state: {worst}."]
-    if failed:
-        runs_failed = f"{failed} run{'s' if failed > 1 else ''}"
-        notes.append(f"In {runs_failed} the filter failed: no finite error or covariance.")
+    refused = ", ".join(f"{part['refused']} of {part['sensor']}" for part in summary["nis"] if part["refused"])
+    notes = [f"The gate rejected {refused}."] if refused else []
+    return Table(title, columns, rows, notes, left=2, name="consistency")
+
+
+def _errors(summary: Mapping[str, Any]) -> Table:
+    """Return the errors at the last epoch by axis."""
+    last = summary["last_epoch"]
     sizes = ("mean_error", "rms_error", "sigma", *(f"error_quantile_{q:g}" for q in QUANTILES))
     labels = ("mean", "RMS", "filter's σ", *(f"{100.0 * q:g} %" for q in QUANTILES))
-    errors = [
+    rows = [
         (f"{what} {axis}", words, *(last[f"{what}_{key}_{unit}"][k] for key in sizes))
         for what, unit, words in (("attitude", "arcsec", "arcsec"), ("bias", "deg_per_hour", "°/h"))
         if what in summary["nees"]  # not all filters estimate a bias
         for k, axis in enumerate("xyz")
     ]
-    at_the_end = Table(
-        f"Errors at {last['time_s']:g} s, {runs}; quantiles of the absolute error",
-        (Column("", "state"), Column("unit", "unit"), *map(Column, labels, sizes)),
-        errors,
-        _efficiency_words(summary),
-        left=2,
-        name="errors",
-    )
-    shares = [(what, *coverage[what]) for what in coverage if what == "expected" or what in summary["nees"]]
+    title = f"Errors at {last['time_s']:g} s, {summary['runs']} runs; quantiles of the absolute error"
+    columns = (Column("", "state"), Column("unit", "unit"), *map(Column, labels, sizes))
+    return Table(title, columns, rows, _efficiency_words(summary), left=2, name="errors")
+
+
+def _coverage(summary: Mapping[str, Any]) -> Table:
+    """Return the fraction of errors within kσ, with the worst runs."""
     percent = lambda share: "-" if share is None else f"{100.0 * share:.2f} %"  # noqa: E731
-    within = Table(
-        f"Fraction of the errors within kσ at the tested epochs, {runs}",
-        (Column("of", "of"), *(Column(f"{k}σ", f"inside_{k}_sigma", shown=percent) for k in (1, 2, 3))),
-        shares,
-        notes,
-        name="coverage",
+    rows = [
+        (what, *shares) for what, shares in summary["coverage"].items() if what == "expected" or what in summary["nees"]
+    ]
+    worst = ", ".join(
+        f"{part['run']} ({'failed' if part['largest_nees'] is None else format(part['largest_nees'], '.1f')})"
+        for part in summary["worst_runs"][:5]
     )
-    return [consistency, at_the_end, within]
+    notes = [f"Worst runs, by maximum NEES of the state: {worst}."]
+    if failed := summary["failed_runs"]:
+        notes.append(f"In {failed} run{'s' if failed > 1 else ''} the filter failed: no finite error or covariance.")
+    columns = (Column("of", "of"), *(Column(f"{k}σ", f"inside_{k}_sigma", shown=percent) for k in (1, 2, 3)))
+    title = f"Fraction of the errors within kσ at the tested epochs, {summary['runs']} runs"
+    return Table(title, columns, rows, notes, name="coverage")
 
 
 def _efficiency_words(summary: Mapping[str, Any]) -> tuple[str, ...]:

@@ -405,24 +405,22 @@ def fit(
     stage.what = "parameters not identified"
     point = _with_means(objective, best.point, ranges, known)
     misfit = errors.misfit and not objective.composite
-
-    def estimated(j: int, name: str) -> Estimated:
-        found, error = ranges[j], float(errors.standard[j])
-        return Estimated(
-            name=name,
-            start=float(np.exp(objective.start[j])),
-            value=float(np.exp(point[j])),
-            most_likely=float(np.exp(best.point[j])) if not best.local.settled[j] else 0.0,
-            lower=found.lower,
-            upper=found.upper,
-            standard_error=error,
-            identified=found.identified,
-            note=_note(name, found, error, best.local, j, known, doubtful=misfit),
-            unit=objective.unit(name),
-        )
-
     return Tuning(
-        parameters=tuple(estimated(j, name) for j, name in enumerate(objective.names)),
+        parameters=tuple(
+            Estimated(
+                name=name,
+                start=float(np.exp(objective.start[j])),
+                value=float(np.exp(point[j])),
+                most_likely=float(np.exp(best.point[j])) if not best.local.settled[j] else 0.0,
+                lower=ranges[j].lower,
+                upper=ranges[j].upper,
+                standard_error=float(errors.standard[j]),
+                identified=ranges[j].identified,
+                note=_note(name, ranges[j], float(errors.standard[j]), best.local, j, known, doubtful=misfit),
+                unit=objective.unit(name),
+            )
+            for j, name in enumerate(objective.names)
+        ),
         setup=objective.setup(point),
         point=point,
         before=local_at(objective, objective.start, known).value,

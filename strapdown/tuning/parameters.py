@@ -85,16 +85,6 @@ SENSOR_STATES = {
     **{name: (name, Unit(name=unit, factor=1.0)) for name, unit in VELOCITY.items()},
 }
 """Parameters of a sensor's optional states, named ``SENSOR.KEY``: field of :class:`.SensorStates`, unit."""
-CONSTANTS = (
-    "scale_sigma",
-    "misalignment_sigma",
-    "force_sigma",
-    "bias_sigma",
-    "lever_sigma",
-    INITIAL_ATTITUDE,
-    INITIAL_BIAS,
-)
-"""Suffixes of the names of the σ of constants, of which a record of any duration has one draw per axis."""
 _WHOLE = {SCALE: _ONE, OUTLIER_SHARE: Unit(name="%", factor=0.01), OUTLIER_SCALE: _ONE}
 """Units of the parameters that are no fields of a setup."""
 

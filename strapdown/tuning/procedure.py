@@ -17,7 +17,7 @@ from strapdown.tuning.objective import OUTLIERS, Case, Objective
 from strapdown.tuning.outliers import TunedGate, contaminated_likelihood, log_likelihood, tuned_gate
 from strapdown.tuning.parameters import Prior, default_names
 from strapdown.tuning.residual_checks import doubted, examined
-from strapdown.tuning.validation import compare
+from strapdown.tuning.validation import Comparison, compare
 
 GATED = ("gate.probability", *OUTLIERS)
 """Names of parameters that need a model of outliers."""
@@ -136,22 +136,39 @@ def tune(
     found = tuned_gate(made, result) if isinstance(made, Likelihood) and made.mixed else None
     if found is not None and found.gate is not None:
         result = dataclasses.replace(result, setup=dataclasses.replace(result.setup, gate=found.gate))
-    comparison = None
-    if held:
-        comparison = compare(held, setup, result.setup, threads=threads)
-        if isinstance(made, Likelihood) and made.mixed:  # the likelihood after tuning includes the gate
-            likely = log_likelihood(held, made, result)
-            comparison = dataclasses.replace(
-                comparison, after=dataclasses.replace(comparison.after, log_likelihood=likely)
-            )
-    tested = examined(cases, setup, result)
+    result = dataclasses.replace(result, gate=found, comparison=_compared(held, setup, result, made, threads))
+    return Tuned(_examined(cases, setup, result, made, **objective), made, found)
+
+
+def _compared(
+    held: Sequence[Case], before: FilterSetup, result: Tuning, made: Objective, threads: int
+) -> Comparison | None:
+    """Return the filter before and after on held-out data; None if there are none."""
+    if not held:
+        return None
+    comparison = compare(held, before, result.setup, threads=threads)
+    if isinstance(made, Likelihood) and made.mixed:  # the likelihood after tuning includes the gate
+        likely = log_likelihood(held, made, result)
+        comparison = dataclasses.replace(comparison, after=dataclasses.replace(comparison.after, log_likelihood=likely))
+    return comparison
+
+
+def _examined(
+    cases: Sequence[Case],
+    before: FilterSetup,
+    result: Tuning,
+    made: Any,
+    *,
+    truth: bool = False,
+    rmse: bool = False,
+    **_: Any,
+) -> Tuning:
+    """Return the tuning with tests for errors that it does not model, and what was minimised."""
+    tested = examined(cases, before, result)
     for one in sorted(tested, key=lambda one: one.severity)[-1:]:
         result = doubted(result, one)
     rms = None
-    if objective.get("rmse"):
-        rms = tuple(made.rms(np.stack([made.start, result.point - np.log(result.scale)])).tolist())  # type: ignore[attr-defined]
-    measure = ("rmse" if objective.get("rmse") else "likelihood") + (" of the errors" if objective.get("truth") else "")
-    result = dataclasses.replace(
-        result, measure=measure, gate=found, comparison=comparison, unmodelled=tested, attitude_rms=rms
-    )
-    return Tuned(result, made, found)
+    if rmse:
+        rms = tuple(made.rms(np.stack([made.start, result.point - np.log(result.scale)])).tolist())
+    measure = ("rmse" if rmse else "likelihood") + (" of the errors" if truth else "")
+    return dataclasses.replace(result, measure=measure, unmodelled=tested, attitude_rms=rms)
