@@ -47,7 +47,11 @@ def ours(rate: list[Any], force: list[Any], field: list[Any]) -> dict[str, tuple
             return lambda k: f.update(f.time + 0.01, rate[k], accelerometer=force[k], magnetometer=field[k])
         return lambda k: f.update(f.time + 0.01, rate[k], accelerometer=force[k])
 
-    imu, step = LiveAhrs(interval=1.0 / RATE), StepFilter(NOISE, START)
+    imu, nine, step = (
+        LiveAhrs(interval=1.0 / RATE),
+        LiveAhrs(interval=1.0 / RATE, magnetometer=True),
+        StepFilter(NOISE, START),
+    )
 
     def steps(k: int) -> None:
         step.predict(np.array(rate[k]) / RATE, 1.0 / RATE)
@@ -59,6 +63,9 @@ def ours(rate: list[Any], force: list[Any], field: list[Any]) -> dict[str, tuple
     def samples(k: int) -> None:
         imu.update(next(stamps) / RATE, rate[k], force[k])
 
+    def with_field(k: int) -> None:
+        nine.update(next(stamps) / RATE, rate[k], force[k], field[k])
+
     return {
         OURS: (live(), n),
         "the same, one vector": (live(two=False), n),
@@ -66,6 +73,7 @@ def ours(rate: list[Any], force: list[Any], field: list[Any]) -> dict[str, tuple
         "the same, look-back of 0.5 s": (live(look_back=0.5), n),
         "the same, nine error states": (live(error_states=(GyroScale(scale_sigma=1e-3, misalignment_sigma=1e-3),)), n),
         "strapdown LiveAhrs, gyro and accelerometer, 21 states": (samples, n),
+        "strapdown LiveAhrs, and magnetometer, 27 states": (with_field, n),
         "strapdown StepFilter on filterpy, two vectors": (steps, 500),
     }
 

@@ -11,11 +11,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from strapdown import estimation
-from strapdown.ahrs import regions
+from strapdown.ahrs import headings, regions
 from strapdown.ahrs.parameters import AhrsParameters, of_motion
 from strapdown.ahrs.preparing import Prepared, prepare
 from strapdown.ahrs.starting import (
     Rests,
+    first_vector,
     informative,
     need_accelerometer,
     rests,
@@ -246,8 +247,10 @@ def _at_stamps(
     assert filtered.covariance is not None
     iron = np.zeros(len(edge))
     if prepared.field is not None:
-        iron[1:] = (parameters.iron_sigma / np.cos(prepared.field.usual[:, 1])) ** 2
-        iron[0] = iron[1]
+        iron[1:] = prepared.field.variance
+        force = first_vector(used.specific_force, prepared.turned, used.source, "accelerometer")
+        field = first_vector(used.magnetic_field, prepared.turned, used.source, "magnetometer")
+        iron[0] = headings.first_variance(force, field, parameters)
     at_steps = (filtered.attitude, filtered.bias, filtered.variance, filtered.covariance, tilt, floor, heading, iron)
     compiled(recording_steps.carry_to_stamps)(
         recording_steps.Steps(edge, *map(read_only, at_steps)),

@@ -14,8 +14,8 @@ import numpy as np
 from strapdown import quaternion
 from strapdown.ahrs.parameters import AhrsParameters
 from strapdown.checks import Array, lengths
-from strapdown.kernels import recording_steps
-from strapdown.kernels.machine import compiled
+from strapdown.kernels import headings as kernel
+from strapdown.kernels.machine import compiled, read_only
 from strapdown.recordings import hard_iron
 from strapdown.recordings.hard_iron import low_pass
 from strapdown.vectors import VectorMeasurements
@@ -60,20 +60,73 @@ class Headings(NamedTuple):
     """Usual magnitude, in the field's unit, and dip, rad, at each step (k, 2)."""
     iron: Array
     """Hard iron subtracted at each step (k, 3), body axes, in the field's unit."""
+    variance: Array
+    """Variance of the heading by constant iron, rad² (k,)."""
 
 
-def measured(steps: FieldSteps, parameters: AhrsParameters, *, causal: bool) -> Headings:
-    """Return the heading measurements. ``causal``: from the steps up to each; otherwise from all."""
+def online(steps: kernel.Steps, start: float, parameters: AhrsParameters, interval: float) -> Headings:
+    """Return the heading measurements, each from the steps up to it; the first sample is at ``start``, s."""
+    k = len(steps.time)
+    found = kernel.Found(np.zeros((k, 3)), np.zeros(k), np.empty((k, 2)), np.empty((k, 3)), np.empty(k))
+    constants = constants_of(parameters, interval)
+    memory = memory_of(constants)
+    memory.start[0] = start
+    compiled(kernel.heading_steps)(constants, kernel.Steps(*map(read_only, steps)), memory, found)
+    seen = found.sigma > 0.0
+    vectors = VectorMeasurements(
+        sensor="magnetometer",
+        kind="heading",
+        time=steps.time[seen],
+        vector_b=found.direction[seen],
+        reference_f=NORTH,
+        sigma=found.sigma[seen],
+    )
+    return Headings(vectors, found.usual, found.iron, found.variance)
+
+
+def constants_of(parameters: AhrsParameters, interval: float) -> kernel.Constants:
+    """Return the kernel's constants for steps of an interval, s."""
+    times = VERTICAL_TIME, parameters.field_change_time, parameters.field_memory
+    vertical, change, memory = (-float(np.expm1(-interval / time)) for time in times)
+    return kernel.Constants(
+        vertical_share=vertical,
+        change_share=change,
+        memory_share=memory,
+        every=max(1, round(MEDIAN_INTERVAL / interval)),
+        heading_interval=parameters.heading_interval,
+        deviation_odds=2.0 * IRON_DEVIATION**2,
+        own_iron=OWN_IRON * parameters.hard_iron_sigma,
+        max_dip=float(MAX_DIP),
+        field_disturbance=parameters.field_disturbance,
+        field_deviation=parameters.field_deviation,
+        iron_sigma=parameters.iron_sigma,
+        **hard_iron.parts(interval),
+    )
+
+
+def memory_of(constants: kernel.Constants) -> kernel.Memory:
+    """Return the kernel's memory at the start."""
+    return hard_iron.memory(constants.lag, MEDIAN_SAMPLES)
+
+
+def first_variance(force: Array, field: Array, parameters: AhrsParameters) -> float:
+    """Return the variance of the heading by constant iron, rad², from the first specific force and field (3,)."""
+    sine = float(force @ field) / float(np.linalg.norm(force) * np.linalg.norm(field))
+    return parameters.iron_sigma**2 / max(1.0 - sine**2, 1e-12)
+
+
+def smoothed(steps: FieldSteps, parameters: AhrsParameters) -> Headings:
+    """Return the heading measurements, each from all steps."""
     known = steps.length > 0.0
     interval = float(np.median(np.diff(steps.time)))
     field = held(steps.field, known)
     vertical = _vertical(steps.force, interval)
-    as_measured = _look(field, vertical, parameters, interval, causal=causal)
+    as_measured = _look(field, vertical, parameters, interval)
     seen = as_measured
-    iron = hard_iron.find(steps.field, steps.frame, steps.time[1:], known, float(seen.usual[0, 0]), causal=causal)
+    iron = hard_iron.find(steps.field, steps.frame, steps.time[1:], known, float(seen.usual[0, 0]), causal=False)
     if iron.any():
         # Iron may have been attached or removed: it is subtracted only where that does not increase the deviation of the field.
-        without = _look(field - quaternion.rotate(steps.frame, iron), vertical, parameters, interval, causal=causal)
+        without = _look(field - quaternion.rotate(steps.frame, iron), vertical, parameters, interval)
         odds = np.clip((as_measured.deviation - without.deviation) / (2.0 * IRON_DEVIATION**2), -50.0, 0.0)
         iron *= (2.0 / (1.0 + np.exp(-odds)))[:, None]
         left = (OWN_IRON * parameters.hard_iron_sigma * seen.usual[0, 0]) ** 2 / np.maximum(
@@ -82,11 +135,12 @@ def measured(steps: FieldSteps, parameters: AhrsParameters, *, causal: bool) -> 
         iron *= np.maximum(1.0 - left, 0.0)[:, None]
         iron[lengths(iron) < hard_iron.NEGLIGIBLE * seen.usual[0, 0]] = 0.0
         field = field - quaternion.rotate(steps.frame, iron)
-        seen = _look(field, vertical, parameters, interval, causal=causal)
+        seen = _look(field, vertical, parameters, interval)
     steep = np.minimum(np.abs(seen.usual[:, 1]), MAX_DIP)
     noise = (parameters.field_disturbance / np.cos(steep)) ** 2 * (1.0 + seen.deviation / parameters.field_deviation**2)
     direction = np.where(known[:, None], field / seen.strength[:, None], 0.0)
-    return Headings(_gathered(steps, direction, steps.length / noise, parameters.heading_interval), seen.usual, iron)
+    vectors = _gathered(steps, direction, steps.length / noise, parameters.heading_interval)
+    return Headings(vectors, seen.usual, iron, (parameters.iron_sigma / np.cos(seen.usual[:, 1])) ** 2)
 
 
 class _Look(NamedTuple):
@@ -97,32 +151,17 @@ class _Look(NamedTuple):
     deviation: Array
 
 
-def _look(field: Array, vertical: Array, parameters: AhrsParameters, interval: float, *, causal: bool) -> _Look:
+def _look(field: Array, vertical: Array, parameters: AhrsParameters, interval: float) -> _Look:
     level = _strength_and_dip(field, vertical)
-    usual = _usual(level, interval, causal=causal)
-    change = field - _mean_over(field, interval / parameters.field_change_time, causal=causal)
+    usual = np.broadcast_to(np.median(level, axis=0), level.shape)
+    share = interval / parameters.field_change_time
+    change = field - 0.5 * (low_pass(field, share) + low_pass(field[::-1], share)[::-1])
     square = (
         (level[:, 0] / usual[:, 0] - 1.0) ** 2
         + (level[:, 1] - usual[:, 1]) ** 2
         + np.sum(change**2, axis=1) / usual[:, 0] ** 2
     )
     return _Look(level[:, 0], usual, low_pass(square[:, None], interval / parameters.field_memory)[:, 0])
-
-
-def _usual(level: Array, interval: float, *, causal: bool) -> Array:
-    """Return the medians of magnitude and dip (k, 2), of the rows up to each or of all."""
-    if not causal:
-        return np.broadcast_to(np.median(level, axis=0), level.shape)
-    median = np.empty_like(level)
-    every = max(1, round(MEDIAN_INTERVAL / interval))
-    compiled(recording_steps.running_median)(np.ascontiguousarray(level), every, np.empty((2, MEDIAN_SAMPLES)), median)
-    return median
-
-
-def _mean_over(values: Array, share: float, *, causal: bool) -> Array:
-    """Return the low-passed rows (k, 3), from the rows up to each or on both sides; ``share``: interval over time constant."""
-    before = low_pass(values, share)
-    return before if causal else 0.5 * (before + low_pass(values[::-1], share)[::-1])
 
 
 def _gathered(steps: FieldSteps, direction: Array, information: Array, heading_interval: float) -> VectorMeasurements:

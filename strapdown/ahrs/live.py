@@ -10,20 +10,20 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from strapdown import estimation
-from strapdown.ahrs import regions, starting
-from strapdown.ahrs.parameters import HAND_HELD_WITHOUT_MAGNETOMETER, AhrsParameters
+from strapdown.ahrs import headings, regions, starting
+from strapdown.ahrs.parameters import AhrsParameters, of_motion
 from strapdown.ahrs.preparing import GRAVITY
 from strapdown.checks import Array, InputError, non_negative, positive
 from strapdown.estimation.forward import TooPreciseError
 from strapdown.estimation.live import arrays_of, restart
+from strapdown.kernels import headings as k_headings
 from strapdown.kernels import live_imu as kernel
 from strapdown.kernels import recording_steps
 from strapdown.kernels.argument_tables import packed
-from strapdown.kernels.live import FIRST, TOO_PRECISE
+from strapdown.kernels.live import TOO_PRECISE
 from strapdown.kernels.machine import address_of, compiled, read_only
 from strapdown.recordings.sensor_delays import ASSUMED_SIGMA, GIVEN_SIGMA
 from strapdown.records.recording import LARGEST_RATE, Recording
-from strapdown.units import STANDARD_GRAVITY
 from strapdown.vectors import VectorMeasurements
 
 MOST = 4
@@ -31,14 +31,16 @@ MOST = 4
 
 
 class LiveAhrs:
-    """The filter of :func:`strapdown.estimate` for gyro and accelerometer, sample by sample, in about two microseconds a sample.
+    """The filter of :func:`strapdown.estimate` for an IMU, sample by sample, in about two microseconds a sample.
 
     Parameters
     ----------
     interval : float
         Usual interval of the samples, s: the median of a recording of the unit.
+    magnetometer : bool, default False
+        Whether the samples have a field.
     parameters : AhrsParameters, optional
-        The filter's model of the unit and of its motion. Default: that of a unit in the hand without a magnetometer.
+        The filter's model of the unit and of its motion. Default: that of a unit in the hand, with or without a magnetometer.
     latency : float, optional
         Delay of the samples, s, as for :func:`strapdown.estimate`. Default: half the interval.
 
@@ -55,8 +57,10 @@ class LiveAhrs:
     -----
     Attitude, bias and covariance after each sample equal, bit for bit, the online rows of ``sd.estimate(recording, parameters)`` for a
     recording of these samples, except what that takes from the whole recording: ``interval`` must be the recording's median, its first
-    sample must have a specific force, and its samples no faults (truncation, clipping, gaps). The last row differs too, because the end of
-    a recording ends a step of the filter. Samples before the first one of the accelerometer are not used. A magnetometer is not supported.
+    sample must have a specific force and a field, and its samples no faults (truncation, clipping, gaps). The last row differs too, because
+    the end of a recording ends a step of the filter. Samples before the first complete one are not used.
+
+    The delay of the magnetometer relative to the gyro, which ``estimate`` finds, is taken as zero here.
 
     Examples
     --------
@@ -67,29 +71,40 @@ class LiveAhrs:
     """
 
     def __init__(
-        self, *, interval: float, parameters: AhrsParameters | None = None, latency: float | None = None
+        self,
+        *,
+        interval: float,
+        magnetometer: bool = False,
+        parameters: AhrsParameters | None = None,
+        latency: float | None = None,
     ) -> None:
         self.interval = positive("interval", interval, unit="s")
-        self.parameters = parameters or HAND_HELD_WITHOUT_MAGNETOMETER
+        self.magnetometer = magnetometer
+        self.parameters = parameters or of_motion("hand", magnetometer=magnetometer)
         late = 0.5 * self.interval if latency is None else non_negative("latency", latency, unit="s")
         setup = self.parameters.setup
         # The record's parts have this noise.
         walk = float(np.sqrt(setup.process_noise.angle_random_walk**2))
-        one = np.zeros(1)
+        kinds: list[tuple[str, Any, Array]] = [
+            ("accelerometer", "vector", GRAVITY),
+            ("magnetometer", "heading", headings.NORTH),
+        ][: 1 + magnetometer]
+        sensors = [
+            VectorMeasurements(
+                sensor=sensor,
+                kind=kind,
+                time=np.zeros(1),
+                vector_b=reference[None],
+                reference_f=reference,
+                sigma=np.ones(1),
+            )
+            for sensor, kind, reference in kinds
+        ]
         self._filter = estimation.LiveFilter(
             replace(setup.process_noise, angle_random_walk=walk),
             estimation.initial_state([1.0, 0.0, 0.0, 0.0], attitude_sigma=1.0, bias_sigma=1.0),
-            () if setup.states is None else setup.states.blocks({"accelerometer": "vector"}),
-            sensors=[
-                VectorMeasurements(
-                    sensor="accelerometer",
-                    kind="vector",
-                    time=one,
-                    vector_b=GRAVITY[None],
-                    reference_f=GRAVITY,
-                    sigma=one + 1.0,
-                )
-            ],
+            () if setup.states is None else setup.states.blocks({one.sensor: one.kind for one in sensors}),
+            sensors=sensors,
         )
         sigma = ASSUMED_SIGMA if latency is None else GIVEN_SIGMA
         self._imu = self._arrays(late, sigma)
@@ -117,8 +132,19 @@ class LiveAhrs:
         shapes = (1, 4), (1, 3), (1, 6), (1, 6, 6), (1,), (1,), (1,), (1,)
         steps = k.Steps(np.zeros(1, np.int64), *(np.ones(shape) for shape in shapes))
         self._found = k.Carried(*(np.full((2, *shape), np.nan) for shape in ((4,), (3,), (6,), (6, 6))))
-        steps.floor[:] = parameters.tilt_sigma**2 / STANDARD_GRAVITY**2
         steps.iron[:] = 0.0
+        first, weight = regions.FIRST_LEVEL
+        field, field_total, field_number = np.zeros((most, 3)), np.zeros((1, 3)), np.zeros(1)
+        nis, field_level = np.zeros(1), np.full(1, first if self.magnetometer else 0.0)
+        forgotten = parameters.heading_interval / regions.FIELD_MEMORY
+        constants = headings.constants_of(parameters, max(parameters.step, self.interval))
+        memory = headings.memory_of(constants)
+        head_frame, head_end, head_length, head_time = np.zeros((1, 4)), np.zeros((1, 4)), np.zeros(1), np.zeros(1)
+        of_step = (field_total, field_number, head_length, head_frame, total, number, head_end, head_time)
+        head_steps = k_headings.Steps(*map(read_only, of_step))
+        found = k_headings.Found(np.zeros((1, 3)), np.zeros(1), np.zeros((1, 2)), np.zeros((1, 3)), np.zeros(1))
+        scaled = (read_only(level_after[1]), read_only(field_level))
+        shares = regions.shares_of(parameters, magnetometer=self.magnetometer)
         live, state, numbers, places = arrays_of(self._filter)
         carried = (
             k.Steps(steps.edge, *map(read_only, steps[1:])),
@@ -127,13 +153,21 @@ class LiveAhrs:
             self._found,
         )
         return kernel.Imu(
-            filter=live._replace(call=np.zeros(FIRST + 3)),
+            filter=live._replace(call=np.zeros(kernel.FIELD + 3)),
+            magnetometer=int(self.magnetometer),
             follow=_routine(k.follow_gyro, read_only(time), read_only(rate), turned),
             average=_routine(k.average_samples, read_only(force), read_only(frame), edge, total, number),
             end=_routine(k.end_steps, read_only(frame), edge, total, number, mean, turn),
             level=_routine(k.low_pass, levels, float(share), level_after),
-            tilt=_routine(k.tilt_factors, read_only(level_after[1]), regions.TILT_SHARES, steps.tilt),
+            scale=_routine(k.scale_factors, *scaled, shares, steps.tilt, steps.floor, steps.heading),
             carry=_routine(k.carry_to_stamps, *carried),
+            average_field=_routine(
+                k.average_samples, read_only(field), read_only(frame), edge, field_total, field_number
+            ),
+            head=_routine(k_headings.heading_steps, constants, head_steps, memory, found),
+            field_mean=_routine(
+                k.running_mean, read_only(nis), forgotten, np.array([first * weight, weight]), field_level
+            ),
             interval=self.interval,
             step=parameters.step,
             noise=parameters.specific_force_noise,
@@ -162,6 +196,19 @@ class LiveAhrs:
             stamp_rate=stamps.rate,
             stamp_turned=stamps.turned,
             ahead=stamps.ahead,
+            field=field,
+            field_number=field_number,
+            head_frame=head_frame,
+            head_length=head_length,
+            head_end=head_end,
+            head_time=head_time,
+            head_start=memory.start,
+            direction=found.direction,
+            sigma=found.sigma,
+            iron_variance=found.variance,
+            iron=steps.iron,
+            field_nis=nis,
+            span_field=np.zeros((span, 3)),
             span_time=np.zeros(span),
             span_rate=np.zeros((span, 3)),
             span_force=np.zeros((span, 3)),
@@ -170,7 +217,13 @@ class LiveAhrs:
 
     # ---------------------------------------------------------------------------------------------------------------------- samples
 
-    def update(self, time: float, gyro: ArrayLike, accelerometer: ArrayLike | None = None) -> None:
+    def update(
+        self,
+        time: float,
+        gyro: ArrayLike,
+        accelerometer: ArrayLike | None = None,
+        magnetometer: ArrayLike | None = None,
+    ) -> None:
         """Process a sample.
 
         Parameters
@@ -181,6 +234,8 @@ class LiveAhrs:
             Angular rate, rad/s, body axes.
         accelerometer : array_like (3,), optional
             Specific force, m/s², body axes. None, NaN or zero: missing.
+        magnetometer : array_like (3,), optional
+            Field, any unit, body axes. None, NaN or zero: missing.
 
         Raises
         ------
@@ -190,6 +245,7 @@ class LiveAhrs:
         call, name, given = self._call, "time", time
         rate: Any = gyro
         force: Any = accelerometer
+        field: Any = magnetometer
         try:
             call[0] = time
             name, given = "gyro", rate
@@ -199,6 +255,11 @@ class LiveAhrs:
                 call[4] = call[5] = call[6] = math.nan
             else:
                 call[4], call[5], call[6] = force.tolist() if type(force) is np.ndarray else force
+            name, given = "magnetometer", field
+            if field is None:
+                call[7] = call[8] = call[9] = math.nan
+            else:
+                call[7], call[8], call[9] = field.tolist() if type(field) is np.ndarray else field
         except (TypeError, ValueError, OverflowError):
             raise InputError(
                 f"{name} is {given!r}; give {'one number' if name == 'time' else 'three numbers'}"
@@ -211,21 +272,25 @@ class LiveAhrs:
             self._take_flags(code)
 
     def _begin(self) -> None:
-        """Start at the sample in the call, if it has a specific force."""
-        time, *numbers = self._call[:7]
-        if not 0.0 < math.hypot(*numbers[3:]) < math.inf:
+        """Start at the sample in the call, if it has a specific force and, with a magnetometer, a field."""
+        time, *numbers = self._call
+        sample = np.array(numbers).reshape(3, 3)
+        size = np.linalg.norm(sample, axis=1)
+        if not (0.0 < size[1] < math.inf and (not self.magnetometer or 0.0 < size[2] < math.inf)):
             return
         code = self._take(self._kind, self._table, kernel.FIRST_SAMPLE)
-        sample = np.array(numbers).reshape(2, 3)
         if code >= 0:
             first = Recording(
                 source="the first sample",
                 time=np.array([time, time + self.interval]),
                 rate=np.array([sample[0], sample[0]]),
                 specific_force=np.array([sample[1], sample[1]]),
+                magnetic_field=np.array([sample[2], sample[2]]) if self.magnetometer else None,
             )
             restart(self._filter, starting.start(first, np.array([[1.0, 0.0, 0.0, 0.0]] * 2), self.parameters), time)
             self._rested = time
+            if self.magnetometer:
+                self._imu.iron[0] = headings.first_variance(sample[1], sample[2], self.parameters)
             self._take(self._kind, self._table, kernel.START)
         if code:
             self._take_flags(code)
@@ -248,7 +313,7 @@ class LiveAhrs:
         mean, sigma = starting.mean_rates(imu.span_rate.reshape(1, parts, part, 3), parameters)
         if not sigma[0] < starting.MAX_REST_SIGMA:
             return
-        if starting.is_rest(imu.span_time, (imu.span_force, None), slice(None), mean[0]):
+        if starting.is_rest(imu.span_time, (imu.span_force, imu.span_field), slice(None), mean[0]):
             time = self._call[0]
             measured = starting.bias_variance(self._bias_variance, time - self._rested, sigma[0], parameters)
             if measured is not None:
@@ -259,13 +324,13 @@ class LiveAhrs:
         """Raise the error for a sample that the kernel refuses."""
         if code == TOO_PRECISE:
             raise TooPreciseError()
-        time, *numbers = self._call[:7]
+        time, *numbers = self._call
         raise InputError(
             {
                 kernel.NO_TIME: f"time is {time} s; give the time of the sample",
                 kernel.BEHIND: f"time is {time:.9g} s, not after the last sample; give samples in order",
                 kernel.NO_GYRO: "gyro has a NaN; omit the sample",
-                kernel.INFINITE: f"gyro and accelerometer are {numbers}; give finite numbers, rates in rad/s",
+                kernel.INFINITE: f"gyro, accelerometer and magnetometer are {numbers}; give finite numbers, rates in rad/s",
                 kernel.TOO_FAST: f"the interval of the samples is far below {self.interval:g} s, their usual interval",
             }[code]
         )

@@ -12,6 +12,7 @@ from strapdown.ahrs import headings, starting
 from strapdown.ahrs.parameters import AhrsParameters
 from strapdown.checks import Array
 from strapdown.gyro.temperature import BiasOverTemperature
+from strapdown.kernels import headings as kernel
 from strapdown.kernels import recording_steps
 from strapdown.kernels.machine import compiled, read_only
 from strapdown.recordings import Recording, gyro_temperature, sensor_delays
@@ -79,17 +80,21 @@ def prepare(
             frame = np.empty_like(turned)
             over = sensor_delays.turn_over(recording, field_delay)
             compiled(recording_steps.turn_back)(read_only(turned), read_only(over), frame)
-        fixed_force = total / np.maximum(number, 1.0)[:, None]
-        total, number = sums(recording.magnetic_field, frame, edge)
-        samples = headings.FieldSteps(
-            field=total / np.maximum(number, 1.0)[:, None],
-            frame=frame[(edge[:-1] + edge[1:] + 1) // 2],
-            length=number * interval,
-            force=headings.held(fixed_force, shown),
-            at_edge=turned[edge],
-            time=time,
-        )
-        found = headings.measured(samples, parameters, causal=causal)
+        field, seen = sums(recording.magnetic_field, frame, edge)
+        middle = frame[(edge[:-1] + edge[1:] + 1) // 2]
+        if causal:
+            rows = kernel.Steps(field, seen, seen * interval, middle, total, number, turned[edge[1:]], time[1:])
+            found = headings.online(rows, float(time[0]), parameters, max(parameters.step, interval))
+        else:
+            samples = headings.FieldSteps(
+                field=field / np.maximum(seen, 1.0)[:, None],
+                frame=middle,
+                length=seen * interval,
+                force=headings.held(total / np.maximum(number, 1.0)[:, None], shown),
+                at_edge=turned[edge],
+                time=time,
+            )
+            found = headings.smoothed(samples, parameters)
         vectors.append(found.vectors)
     known = recording.temperature is not None and bool(np.isfinite(recording.temperature).all())
     temperature = recording.temperature[edge] if known and recording.temperature is not None else None

@@ -65,14 +65,26 @@ def scales(filtered: Estimate, parameters: AhrsParameters, level: Array, *, caus
 
     ``level`` is that of the acceleration. ``causal``: from the measurements before each step, otherwise from all.
     """
-    field = field_level(filtered, parameters, causal=causal) / FIELD_LEVEL
-    error = parameters.tilt_sigma**2 + np.minimum(parameters.tilt_by_field * field**2, MAX_BY_FIELD) ** 2
-    heading = np.minimum(parameters.heading_share + parameters.heading_by_field * field**1.5, MAX_HEADING)
-    if "magnetometer" not in filtered.innovations:
-        heading = np.ones(len(field))
-    tilt = np.empty(len(level))
-    compiled(recording_steps.tilt_factors)(read_only(level), TILT_SHARES, tilt)
-    return tilt, error / STANDARD_GRAVITY**2, np.sqrt(heading)
+    field = field_level(filtered, parameters, causal=causal)
+    shares = shares_of(parameters, magnetometer="magnetometer" in filtered.innovations)
+    tilt, floor, heading = np.empty((3, len(level)))
+    compiled(recording_steps.scale_factors)(read_only(level), read_only(field), shares, tilt, floor, heading)
+    return tilt, floor, heading
+
+
+def shares_of(parameters: AhrsParameters, *, magnetometer: bool) -> recording_steps.Shares:
+    """Return the constants for the kernel."""
+    return recording_steps.Shares(
+        tilt=TILT_SHARES,
+        tilt_variance=parameters.tilt_sigma**2,
+        tilt_by_field=parameters.tilt_by_field,
+        max_by_field=MAX_BY_FIELD,
+        heading=parameters.heading_share if magnetometer else 1.0,
+        heading_by_field=parameters.heading_by_field,
+        max_heading=MAX_HEADING,
+        field_level=FIELD_LEVEL,
+        gravity=STANDARD_GRAVITY,
+    )
 
 
 def field_level(filtered: Estimate, parameters: AhrsParameters, *, causal: bool) -> Array:
@@ -86,5 +98,5 @@ def field_level(filtered: Estimate, parameters: AhrsParameters, *, causal: bool)
     first, weight = FIRST_LEVEL
     mean = np.empty(len(nis))
     share = parameters.heading_interval / FIELD_MEMORY
-    compiled(recording_steps.running_mean)(read_only(nis), share, first, weight, mean)
+    compiled(recording_steps.running_mean)(read_only(nis), share, np.array([first * weight, weight]), mean)
     return np.asarray(np.append(first, mean)[np.searchsorted(seen.time, filtered.time, side="right")])

@@ -80,7 +80,7 @@ def quiet_span(recording: Recording) -> slice:
     return slice(first * length, (first + 1) * length)
 
 
-def first_vector(samples: Array, turned: Array, source: str, sensor: str) -> Array:
+def first_vector(samples: Array | None, turned: Array, source: str, sensor: str) -> Array:
     """Return the first valid sample (3,) of a sensor in the body axes of the first row; ``turned``: attitude by the gyro (n, 4).
 
     Raises
@@ -88,6 +88,7 @@ def first_vector(samples: Array, turned: Array, source: str, sensor: str) -> Arr
     InputError
         If there is none, or all are zero.
     """
+    assert samples is not None
     size = lengths(samples)
     valid = np.isfinite(size) & (size > 0.0)
     if not valid.any():

@@ -16,6 +16,8 @@ from strapdown.kernels.live import FIRST, GYRO, LENGTH, ROW, SIGMA, TIME, VALUE,
 
 FIRST_SAMPLE, START, SAMPLE = range(3)
 """What to do: take the first sample, show the state in which the filter starts at it, or take another sample."""
+FIELD = FIRST + 3
+"""Place of the magnetometer in a call."""
 STEP, REST = 1, 2
 """Flags of a result: a step of the filter ended, a span in which rest is looked for ended."""
 NO_TIME, BEHIND, NO_GYRO, INFINITE, TOO_FAST = range(-25, -20)
@@ -33,13 +35,18 @@ class Imu(NamedTuple):
     """Arrays of an IMU's samples and of the kernels that process them."""
 
     filter: Live
-    """Its ``call`` has the sample: time, gyro and accelerometer."""
+    """Its ``call`` has the sample: time, gyro, accelerometer and magnetometer."""
+    magnetometer: int
+    """Whether there is one."""
     follow: Routine
     average: Routine
     end: Routine
     level: Routine
-    tilt: Routine
+    scale: Routine
     carry: Routine
+    average_field: Routine
+    head: Routine
+    field_mean: Routine
     interval: float
     """Usual interval of the samples, s."""
     step: float
@@ -83,9 +90,29 @@ class Imu(NamedTuple):
     stamp_turned: np.ndarray
     ahead: np.ndarray
     """Start of the step and last sample: time (2,), rate (2, 3), attitude by the gyro (2, 4), rotation over the delay (2, 3)."""
+    field: np.ndarray
+    """Field at the samples of the step (most, 3)."""
+    field_number: np.ndarray
+    """Number of them with a field (1,)."""
+    head_frame: np.ndarray
+    head_length: np.ndarray
+    head_end: np.ndarray
+    head_time: np.ndarray
+    """Attitude by the gyro in the middle of the step, duration of the field's samples, attitude and time at the end (1, …)."""
+    head_start: np.ndarray
+    """Time of the first sample first (3,)."""
+    direction: np.ndarray
+    sigma: np.ndarray
+    """Heading measurement at the end of the step (1, 3), and its σ (1,); 0: none."""
+    iron_variance: np.ndarray
+    """Variance of the heading by constant iron, at the end of the step (1,), and as reported (1,)."""
+    iron: np.ndarray
+    field_nis: np.ndarray
+    """NIS of the last heading (1,)."""
     span_time: np.ndarray
     span_rate: np.ndarray
     span_force: np.ndarray
+    span_field: np.ndarray
     """Samples of the span in which rest is looked for (length,), (length, 3)."""
     in_span: np.ndarray
     """Number of them (1,)."""
@@ -125,7 +152,11 @@ def refusal(imu, task):
     for i in range(3):
         if math.isnan(given[GYRO + i]):
             return NO_GYRO
-        if abs(given[GYRO + i]) > imu.largest_rate or abs(given[FIRST + i]) == math.inf:
+        if (
+            abs(given[GYRO + i]) > imu.largest_rate
+            or abs(given[FIRST + i]) == math.inf
+            or abs(given[FIELD + i]) == math.inf
+        ):
             return INFINITE
     if task != FIRST_SAMPLE and imu.edge[1] + 1 >= len(imu.force):
         return TOO_FAST
@@ -139,6 +170,7 @@ def keep_for_rest(imu):
     for i in range(3):
         imu.span_rate[k, i] = imu.filter.call[GYRO + i]
         imu.span_force[k, i] = imu.filter.call[FIRST + i]
+        imu.span_field[k, i] = imu.filter.call[FIELD + i]
     imu.in_span[0] = (k + 1) % len(imu.span_time)
     return REST if k + 1 == len(imu.span_time) else 0
 
@@ -164,6 +196,7 @@ def begin(imu):
     """Start at the first sample, with the identity as attitude by the gyro."""
     write_sample(imu, 1)
     imu.start[0] = imu.time[1]
+    imu.head_start[0] = imu.time[1]
     imu.filter.clock[0] = imu.time[1]
     for i in range(4):
         imu.turned[1, i] = 1.0 if i == 0 else 0.0
@@ -191,6 +224,7 @@ def turn_with_gyro(imu):
     imu.edge[1] = m
     for i in range(3):
         imu.force[m, i] = imu.filter.call[FIRST + i]
+        imu.field[m, i] = imu.filter.call[FIELD + i]
     for i in range(4):
         imu.frame[m, i] = imu.turned[1, i]
     before = math.floor((imu.time[0] + imu.interval - imu.start[0]) / imu.step + 1e-6)
@@ -213,13 +247,19 @@ def end_step(imu):
         live.rows[0, SIGMA] = imu.noise / math.sqrt(number * imu.interval) / length
         for i in range(3):
             live.rows[0, VALUE + i] = imu.mean[0, i] / length
+    heading = False
+    if imu.magnetometer > 0:
+        heading = read_heading(imu)
+        if heading:
+            write_heading(imu, count)
+            count += 1
     for i in range(3):
         live.increment[i] = imu.turn[0, i]
     code = process(live, imu.time[1], count, 1)
     if code < 0:
         return code
     nis = 1.0
-    if count > 0:
+    if number > 0.0:
         total = live.innovation[0, 0] * live.innovation[0, 0] / live.innovation[0, 1]
         total += live.innovation[0, 2] * live.innovation[0, 2] / live.innovation[0, 3]
         total += live.innovation[0, 4] * live.innovation[0, 4] / live.innovation[0, 5]
@@ -228,6 +268,12 @@ def end_step(imu):
     imu.levels[0, 0] = imu.level_after[1, 0]
     imu.levels[1, 0] = nis
     call(imu.level.address, imu.level.arguments, ())
+    if heading:
+        innovation = live.innovation[count - 1, 0]
+        nis = innovation * innovation / live.innovation[count - 1, 1]
+        imu.field_nis[0] = nis if abs(nis) < math.inf else 0.0
+        call(imu.field_mean.address, imu.field_mean.arguments, ())
+    imu.iron[0] = imu.iron_variance[0]
     begin_step(imu)
     show_step(imu)
     return 0
@@ -243,4 +289,27 @@ def show_step(imu):
         for j in range(6):
             imu.covariance[0, i, j] = imu.numbers[imu.places[i, j]]
         imu.variance[0, i] = imu.covariance[0, i, i]
-    call(imu.tilt.address, imu.tilt.arguments, ())
+    call(imu.scale.address, imu.scale.arguments, ())
+
+
+def read_heading(imu):
+    """Process the field of the step; return whether a heading ends with it."""
+    m = imu.edge[1]
+    call(imu.average_field.address, imu.average_field.arguments, ())
+    for i in range(4):
+        imu.head_frame[0, i] = imu.frame[(m + 1) // 2, i]
+        imu.head_end[0, i] = imu.frame[m, i]
+    imu.head_length[0] = imu.field_number[0] * imu.interval
+    imu.head_time[0] = imu.time[1]
+    call(imu.head.address, imu.head.arguments, ())
+    return imu.sigma[0] > 0.0
+
+
+def write_heading(imu, row):
+    """Write the heading to a row of the filter's measurements."""
+    rows = imu.filter.rows
+    for i in range(ROW):
+        rows[row, i] = imu.filter.declared[1, i]
+    rows[row, TIME], rows[row, SIGMA] = imu.time[1], imu.sigma[0]
+    for i in range(3):
+        rows[row, VALUE + i] = imu.direction[0, i]

@@ -198,10 +198,31 @@ def carry_to_stamps(steps, stamps, timing, out):
                         out.covariance[n, 3 + i, 3 + j] = P[3 + i, 3 + j]
 
 
-def tilt_factors(level, shares, factor):
-    """Write the factor (k,) on the σ of the tilt at each level of the acceleration (k,)."""
+class Shares(NamedTuple):
+    """Constants of the reported covariance: :mod:`strapdown.ahrs.regions`."""
+
+    tilt: tuple[float, float]
+    tilt_variance: float
+    """(m/s²)²"""
+    tilt_by_field: float
+    max_by_field: float
+    """m/s²"""
+    heading: float
+    heading_by_field: float
+    max_heading: float
+    field_level: float
+    gravity: float
+
+
+def scale_factors(level, field_level, shares, tilt, floor, heading):
+    """Write the factor on σ of the tilt, the variance that is added to it, and the factor on σ of the heading (k,) each."""
     for i in range(len(level)):
-        factor[i] = math.sqrt(shares[0] + shares[1] * math.sqrt(level[i]))
+        field = field_level[i] / shares.field_level
+        by_field = min(shares.tilt_by_field * field * field, shares.max_by_field)
+        tilt[i] = math.sqrt(shares.tilt[0] + shares.tilt[1] * math.sqrt(level[i]))
+        floor[i] = (shares.tilt_variance + by_field * by_field) / (shares.gravity * shares.gravity)
+        by_field = shares.heading_by_field * field * math.sqrt(field)
+        heading[i] = math.sqrt(min(shares.heading + by_field, shares.max_heading))
 
 
 def low_pass(values, share, result):
@@ -213,36 +234,12 @@ def low_pass(values, share, result):
             result[i, j] = y
 
 
-def running_median(values, every, ordered, result):
-    """Write the median of the rows of ``values`` (k, 2) up to each, by column, of every ``every``-th row.
+def running_mean(values, share, sums, mean):
+    """Write the mean (k,) of ``values`` up to each, with exponential forgetting by ``share`` a value.
 
-    ``ordered`` (2, capacity) is scratch. Where it is full, every other value is dropped in order of size, which keeps the median, and the
-    stride is doubled.
+    ``sums``: sum of the values and of their weights before, and at return, after them (2,).
     """
-    capacity = ordered.shape[1]
-    for c in range(values.shape[1]):
-        count, stride, median = 0, every, values[0, c]
-        for i in range(len(values)):
-            if i % stride == 0:
-                if count == capacity:
-                    count = capacity // 2
-                    for k in range(count):
-                        ordered[c, k] = 0.5 * (ordered[c, 2 * k] + ordered[c, 2 * k + 1])
-                    stride *= 2
-                value, k = values[i, c], count
-                while k > 0 and ordered[c, k - 1] > value:
-                    ordered[c, k] = ordered[c, k - 1]
-                    k -= 1
-                ordered[c, k] = value
-                count += 1
-                median = 0.5 * (ordered[c, (count - 1) // 2] + ordered[c, count // 2])
-            result[i, c] = median
-
-
-def running_mean(values, share, start, weight, mean):
-    """Write the mean (k,) of ``values`` up to each, with exponential forgetting by ``share`` a value, from ``start`` of this weight."""
-    total = start * weight
     for i in range(len(values)):
-        total = (1.0 - share) * total + values[i]
-        weight = (1.0 - share) * weight + 1.0
-        mean[i] = total / weight
+        sums[0] = (1.0 - share) * sums[0] + values[i]
+        sums[1] = (1.0 - share) * sums[1] + 1.0
+        mean[i] = sums[0] / sums[1]

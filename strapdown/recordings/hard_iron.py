@@ -7,12 +7,14 @@ which is linear in b. A field that varies along the path of the unit causes an a
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from strapdown import quaternion
-from strapdown.checks import Array, lengths
-from strapdown.kernels import recording_steps
-from strapdown.kernels.machine import compiled
+from strapdown.checks import Array
+from strapdown.kernels import headings, recording_steps
+from strapdown.kernels.machine import compiled, read_only
 
 SPAN = 1.0
 """Time difference over which the change of the field is computed, s."""
@@ -38,6 +40,12 @@ def find(field: Array, frame: Array, time: Array, known: np.ndarray, strength: f
     """
     interval = float(np.median(np.diff(time)))
     lag = max(1, round(SPAN / interval))
+    if causal:
+        others = dict.fromkeys(headings.Constants._fields, 0.0) | {"every": 1}
+        constants, found = headings.Constants(**others | parts(interval)), np.empty((len(time), 3))
+        rows = (read_only(one) for one in (field, frame, known, time))
+        compiled(headings.iron_steps)(constants, *rows, strength, memory(lag, 1), found)
+        return found
     if len(time) <= lag:
         return np.zeros((len(time), 3))
     now, then = quaternion.conjugate(frame[lag:]), quaternion.conjugate(frame[:-lag])
@@ -51,15 +59,46 @@ def find(field: Array, frame: Array, time: Array, known: np.ndarray, strength: f
     own = np.column_stack([normal, right]) * pair[:, None]
     before = np.zeros((lag, own.shape[1]))
     sums = _integral(np.concatenate([before, own]), interval)
-    if not causal:
-        sums = sums + _integral(np.concatenate([before, own[::-1]]), interval)[::-1]
+    sums = sums + _integral(np.concatenate([before, own[::-1]]), interval)[::-1]
     matrix = sums[:, [0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(-1, 3, 3)
     iron = np.linalg.solve(matrix + (CHANGE_NOISE / SIGMA) ** 2 * np.eye(3), sums[:, 6:, None])[..., 0]
     iron *= strength * np.maximum(1.0 - FEIGNED**2 / np.maximum(np.sum(iron**2, axis=1), 1e-30), 0.0)[:, None]
-    if causal:
-        iron = low_pass(iron, interval / RISE)
-        iron[lengths(iron) < NEGLIGIBLE * strength] = 0.0
     return np.asarray(iron)
+
+
+def parts(interval: float) -> dict[str, Any]:
+    """Return what the kernel needs to know of the iron, for steps of an interval, s."""
+    share = -float(np.expm1(-interval / MEMORY))
+    return {
+        "iron_share": share,
+        "iron_interval": interval / share,
+        "rise_share": -float(np.expm1(-interval / RISE)),
+        "lag": max(1, round(SPAN / interval)),
+        "step": interval,
+        "span": SPAN,
+        "ridge": (CHANGE_NOISE / SIGMA) ** 2,
+        "feigned": FEIGNED,
+        "negligible": NEGLIGIBLE,
+    }
+
+
+def memory(lag: int, capacity: int) -> headings.Memory:
+    """Return the memory of the kernel at the start, with room for this number of values of each running median."""
+    return headings.Memory(
+        counted=np.zeros(2, np.int64),
+        start=np.zeros(3),
+        held=np.zeros((2, 3)),
+        vertical=np.zeros((2, 3)),
+        mean=np.zeros((3, 3)),
+        deviation=np.zeros(3),
+        ordered=np.zeros((6, capacity)),
+        stride=np.zeros((6, 2), np.int64),
+        median=np.zeros(6),
+        ring=np.zeros((lag, 9)),
+        sums=np.zeros(9),
+        iron=np.zeros(3),
+        total=np.zeros(4),
+    )
 
 
 def _integral(rows: Array, interval: float) -> Array:

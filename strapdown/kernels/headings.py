@@ -1,0 +1,312 @@
+"""Headings from the field and hard iron of a unit, from the filter's steps up to each: :mod:`strapdown.ahrs.headings` has the method.
+
+All that lasts from one step to the next is in arrays, so steps may be processed at once or one at a time, with the same bits.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from strapdown.kernels.algebra import (
+    dot,
+    factored,
+    matrix_times_vector,
+    scale,
+    solved,
+    subtract,
+    transpose_times_vector,
+)
+from strapdown.kernels.measurement import quaternion_at, vector_at
+from strapdown.kernels.rotation import quaternion_multiply, rotation_matrix
+from strapdown.kernels.state import store_row
+
+
+class Constants(NamedTuple):
+    """Constants of the method, and of a unit."""
+
+    vertical_share: float
+    change_share: float
+    memory_share: float
+    iron_share: float
+    rise_share: float
+    """Factors of the low-pass filters: 1 − exp(−step over time constant)."""
+    iron_interval: float
+    """Interval of the steps over ``iron_share``, s."""
+    every: int
+    """Number of steps from one value of the running medians to the next."""
+    lag: int
+    """Number of steps over which the change of the field is computed."""
+    step: float
+    """Interval of the steps, s."""
+    heading_interval: float
+    span: float
+    """Duration over which the change of the field is computed, s."""
+    ridge: float
+    """Squared ratio of the noise of the change to the prior σ of the iron."""
+    feigned: float
+    negligible: float
+    deviation_odds: float
+    """Twice the square of the increase of the deviation at which iron is no longer subtracted."""
+    own_iron: float
+    """Iron that is left to the states of the filter, relative to the magnitude."""
+    max_dip: float
+    field_disturbance: float
+    field_deviation: float
+    iron_sigma: float
+
+
+class Steps(NamedTuple):
+    """Samples of each step, in the frame fixed by the integrated gyro."""
+
+    field: np.ndarray
+    """Sum of the field (k, 3)."""
+    number: np.ndarray
+    """Number of its samples (k,)."""
+    length: np.ndarray
+    """Duration that they cover, s (k,)."""
+    frame: np.ndarray
+    """Attitude by the gyro in the middle of the step (k, 4)."""
+    force: np.ndarray
+    """Sum of the specific force (k, 3)."""
+    force_number: np.ndarray
+    end: np.ndarray
+    """Attitude by the gyro at the end of the step (k, 4)."""
+    time: np.ndarray
+    """Time of the end, s (k,)."""
+
+
+class Memory(NamedTuple):
+    """What lasts from one step to the next."""
+
+    counted: np.ndarray
+    """1 with a field, 2 with a force, 3 with both so far; number of steps since there were both (2,)."""
+    start: np.ndarray
+    """Time of the first sample, s, first usual magnitude, and interval of the headings of the last step (3,)."""
+    held: np.ndarray
+    """Last field and force (2, 3)."""
+    vertical: np.ndarray
+    """Force after each of two low-pass filters (2, 3)."""
+    mean: np.ndarray
+    """Mean field: as measured, without the iron that appears, without the iron subtracted (3, 3)."""
+    deviation: np.ndarray
+    """Square deviation of each (3,)."""
+    ordered: np.ndarray
+    """Values of magnitude and dip of each, in order of size (6, capacity)."""
+    stride: np.ndarray
+    """Number of these values and steps from one to the next (6, 2)."""
+    median: np.ndarray
+    """(6,)"""
+    ring: np.ndarray
+    """Field (3), attitude (4), whether known, time, of the last ``lag`` steps (lag, 9)."""
+    sums: np.ndarray
+    """Normal equations of the iron (9,)."""
+    iron: np.ndarray
+    """Iron after its low-pass filter (3,)."""
+    total: np.ndarray
+    """Sum of the directions of a heading, and of their information (4,)."""
+
+
+class Found(NamedTuple):
+    """Results of each step."""
+
+    direction: np.ndarray
+    """Heading measurement in body axes (k, 3)."""
+    sigma: np.ndarray
+    """Its σ (k,); 0: there is none at this step."""
+    usual: np.ndarray
+    """Usual magnitude and dip (k, 2)."""
+    iron: np.ndarray
+    """Iron subtracted (k, 3)."""
+    variance: np.ndarray
+    """Variance of the heading by constant iron, rad² (k,)."""
+
+
+def heading_steps(constants, steps, memory, found):
+    """Process steps."""
+    for k in range(len(steps.time)):
+        heading_step(constants, steps, memory, found, k)
+
+
+def iron_steps(constants, field, frame, known, time, strength, memory, iron):
+    """Write the iron (k, 3) of each row from fields (k, 3) in the frame fixed by the gyro, and attitudes (k, 4)."""
+    for k in range(len(time)):
+        one = iron_step(constants, vector_at(field, k), quaternion_at(frame, k), known[k], time[k], strength, memory)
+        memory.counted[1] += 1
+        store_row(iron, k, one)
+
+
+def heading_step(constants, steps, memory, found, k):
+    """Process step k."""
+    known = steps.number[k] > 0.0
+    if known:
+        store_row(memory.held, 0, scale(1.0 / steps.number[k], vector_at(steps.field, k)))
+        memory.counted[0] |= 1
+    if steps.force_number[k] > 0.0:
+        store_row(memory.held, 1, scale(1.0 / steps.force_number[k], vector_at(steps.force, k)))
+        memory.counted[0] |= 2
+    found.sigma[k] = 0.0
+    store_row(found.iron, k, (0.0, 0.0, 0.0))
+    found.usual[k, 0], found.usual[k, 1] = 1.0, 0.0
+    if memory.counted[0] == 3:
+        look_at_field(constants, steps, memory, found, k, known)
+        memory.counted[1] += 1
+    across = constants.iron_sigma / math.cos(found.usual[k, 1])
+    found.variance[k] = across * across
+    close_heading(constants, steps, memory, found, k)
+
+
+def look_at_field(constants, steps, memory, found, k, known):
+    """Add the direction of the field of step k to the heading, with the information that its deviation leaves."""
+    field = vector_at(memory.held, 0)
+    frame = quaternion_at(steps.frame, k)
+    low_passed(constants.vertical_share, memory.vertical, 0, vector_at(memory.held, 1), memory.counted[1])
+    low_passed(constants.vertical_share, memory.vertical, 1, vector_at(memory.vertical, 0), memory.counted[1])
+    up = vector_at(memory.vertical, 1)
+    up = scale(1.0 / math.sqrt(dot(up, up)), up)
+    look(constants, memory, 0, field, up)
+    if memory.counted[1] == 0:
+        memory.start[1] = memory.median[0]
+    strength = memory.start[1]
+    iron = iron_step(constants, field, frame, known, steps.time[k], strength, memory)
+    R = rotation_matrix(frame)
+    look(constants, memory, 1, subtract(field, matrix_times_vector(R, iron)), up)
+    # Iron may have been attached or removed: it is subtracted only where that does not increase the deviation of the field.
+    odds = min(max((memory.deviation[0] - memory.deviation[1]) / constants.deviation_odds, -50.0), 0.0)
+    iron = scale(2.0 / (1.0 + math.exp(-odds)), iron)
+    left = (constants.own_iron * strength) ** 2 / max(dot(iron, iron), 1e-30)
+    iron = scale(max(1.0 - left, 0.0), iron)
+    if math.sqrt(dot(iron, iron)) < constants.negligible * strength:
+        iron = (0.0, 0.0, 0.0)
+    store_row(found.iron, k, iron)
+    field = subtract(field, matrix_times_vector(R, iron))
+    size = look(constants, memory, 2, field, up)
+    found.usual[k, 0], found.usual[k, 1] = memory.median[4], memory.median[5]
+    if known:
+        steep = min(abs(memory.median[5]), constants.max_dip)
+        relative = constants.field_disturbance / math.cos(steep)
+        noise = (
+            relative * relative * (1.0 + memory.deviation[2] / (constants.field_deviation * constants.field_deviation))
+        )
+        information = steps.length[k] / noise
+        for i in range(3):
+            memory.total[i] += field[i] / size * information
+        memory.total[3] += information
+
+
+def close_heading(constants, steps, memory, found, k):
+    """Write the heading measurement, if its interval ends with step k."""
+    before = memory.start[2]
+    memory.start[2] = math.floor((steps.time[k] + constants.step - memory.start[0]) / constants.heading_interval - 1e-6)
+    total = (memory.total[0], memory.total[1], memory.total[2])
+    if memory.start[2] != before and memory.total[3] > 0.0:
+        R = rotation_matrix(quaternion_at(steps.end, k))
+        store_row(found.direction, k, transpose_times_vector(R, scale(1.0 / math.sqrt(dot(total, total)), total)))
+        found.sigma[k] = 1.0 / math.sqrt(memory.total[3])
+    if memory.start[2] != before:
+        for i in range(4):
+            memory.total[i] = 0.0
+
+
+def low_passed(share, values, row, new, count):
+    """Pass a vector through the low-pass filter in a row of ``values``, which starts with the first one."""
+    for i in range(3):
+        values[row, i] = new[i] if count == 0 else values[row, i] + share * (new[i] - values[row, i])
+
+
+def look(constants, memory, which, field, up):
+    """Update usual magnitude and dip and the deviation from them; return the magnitude."""
+    count = memory.counted[1]
+    size = math.sqrt(dot(field, field))
+    if size == 0.0:
+        size = 1.0
+    dip = math.asin(min(max(-dot(field, up) / size, -1.0), 1.0))
+    insert(memory, 2 * which, size, count, constants.every)
+    insert(memory, 2 * which + 1, dip, count, constants.every)
+    low_passed(constants.change_share, memory.mean, which, field, count)
+    change = subtract(field, vector_at(memory.mean, which))
+    usual = memory.median[2 * which]
+    relative, steeper = size / usual - 1.0, dip - memory.median[2 * which + 1]
+    square = relative * relative + steeper * steeper + dot(change, change) / (usual * usual)
+    old = square if count == 0 else memory.deviation[which]
+    memory.deviation[which] = old + constants.memory_share * (square - old)
+    return size
+
+
+def insert(memory, which, value, step, every):
+    """Insert every ``every``-th value among those in order of size, and update the median.
+
+    Where they are full, every other one is dropped, which keeps the median, and the stride is doubled.
+    """
+    if step == 0:
+        memory.stride[which, 0], memory.stride[which, 1] = 0, every
+    if step % memory.stride[which, 1] != 0:
+        return
+    ordered, count, capacity = memory.ordered, memory.stride[which, 0], memory.ordered.shape[1]
+    if count == capacity:
+        count = capacity // 2
+        for k in range(count):
+            ordered[which, k] = 0.5 * (ordered[which, 2 * k] + ordered[which, 2 * k + 1])
+        memory.stride[which, 1] *= 2
+    k = count
+    while k > 0 and ordered[which, k - 1] > value:
+        ordered[which, k] = ordered[which, k - 1]
+        k -= 1
+    ordered[which, k] = value
+    count += 1
+    memory.stride[which, 0] = count
+    memory.median[which] = 0.5 * (ordered[which, (count - 1) // 2] + ordered[which, count // 2])
+
+
+def iron_step(constants, field, frame, known, time, strength, memory):
+    """Return the iron that the change of the field since ``lag`` steps shows, together with all earlier changes."""
+    lag, step, sums, ring = constants.lag, memory.counted[1], memory.sums, memory.ring
+    r = step % lag
+    pair = step >= lag and known and ring[r, 7] > 0.0 and abs(time - ring[r, 8] - constants.span) < 2.0 * constants.step
+    old = (ring[r, 3], ring[r, 4], ring[r, 5], ring[r, 6])
+    own = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    if pair:
+        change = scale(1.0 / strength, subtract(field, vector_at(ring, r)))
+        # With A = R − R' and v the vector part of the quaternion of the rotation between them, AᵀA = 4 (|v|² I − v vᵀ).
+        _, x, y, z = quaternion_multiply((frame[0], -frame[1], -frame[2], -frame[3]), old)
+        right = subtract(
+            transpose_times_vector(rotation_matrix(frame), change), transpose_times_vector(rotation_matrix(old), change)
+        )
+        own = (
+            4.0 * (y * y + z * z),
+            -4.0 * x * y,
+            -4.0 * x * z,
+            4.0 * (x * x + z * z),
+            -4.0 * y * z,
+            4.0 * (x * x + y * y),
+            right[0],
+            right[1],
+            right[2],
+        )
+    for i in range(3):
+        ring[r, i] = field[i]
+    for i in range(4):
+        ring[r, 3 + i] = frame[i]
+    ring[r, 7], ring[r, 8] = (1.0 if known else 0.0), time
+    for i in range(9):
+        sums[i] += constants.iron_share * (own[i] - sums[i])
+    h, ridge = constants.iron_interval, constants.ridge
+    normal = (
+        h * sums[0] + ridge,
+        h * sums[1],
+        h * sums[2],
+        h * sums[3] + ridge,
+        h * sums[4],
+        h * sums[5] + ridge,
+    )
+    iron = solved(factored(normal), (h * sums[6], h * sums[7], h * sums[8]))
+    less = 1.0 - constants.feigned * constants.feigned / max(dot(iron, iron), 1e-30)
+    iron = scale(strength * max(less, 0.0), iron)
+    for i in range(3):
+        memory.iron[i] += constants.rise_share * (iron[i] - memory.iron[i])
+    iron = (memory.iron[0], memory.iron[1], memory.iron[2])
+    if math.sqrt(dot(iron, iron)) < constants.negligible * strength:
+        iron = (0.0, 0.0, 0.0)
+    return iron
