@@ -155,7 +155,9 @@ def rests(recording: Recording, parameters: AhrsParameters) -> Rests:
     sigma = np.hypot(parameters.rest_bias_sigma, np.sqrt(np.sum((tenths - mean[:, None]) ** 2, axis=(1, 2)) / parts))
     last = np.arange(length - 1, n * length, length)
     steady = recording.time[last] - recording.time[last - length + 1] < 1.5 * QUIET_SPAN  # no gap
-    used = np.flatnonzero(steady & (sigma < MAX_REST_SIGMA))
+    assert recording.specific_force is not None
+    measured = np.isfinite(recording.specific_force[: n * length, 0]).reshape(n, length).mean(axis=1) > 0.5
+    used = np.flatnonzero(steady & measured & (sigma < MAX_REST_SIGMA))
     turning = lengths(mean[used]) > TURNING_RATE
     used = np.array(
         [
