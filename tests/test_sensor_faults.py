@@ -228,19 +228,6 @@ def test_a_gap_filled_by_interpolation_is_a_gap(smooth):
     assert np.abs(found.estimate.bias[-1]).max() < 0.5 * DEGREE
 
 
-def test_the_rate_over_such_a_gap_is_the_mean_of_a_process_between_its_ends():
-    """Conditional mean of an Ornstein–Uhlenbeck process, by its covariance."""
-    time, random = np.arange(101) / 50.0, np.random.default_rng(4)
-    rate = random.standard_normal((101, 3))
-    found = sensor_faults.bridged(time, rate, [(20, 60)])
-    mean = rate.mean(axis=0)
-    correlation = np.exp(-np.abs(time[:, None] - time) / sensor_faults.TURN_TIME)
-    ends = [20, 60]
-    weights = correlation[20:61, ends] @ np.linalg.inv(correlation[np.ix_(ends, ends)])
-    np.testing.assert_allclose(found[20:61], mean + weights @ (rate[ends] - mean), rtol=1e-9, atol=1e-12)
-    np.testing.assert_array_equal(np.delete(found, np.s_[20:61], axis=0), np.delete(rate, np.s_[20:61], axis=0))
-
-
 def test_straight_lines_of_a_still_or_noisy_gyro_are_no_gaps():
     level = np.zeros((200, 3))
     level[100:, 1] = 0.01  # a coarse gyro

@@ -48,8 +48,6 @@ MIN_STRAIGHT = 10
 """Minimum number of successive gyro samples on one straight line to be treated as interpolated."""
 STRAIGHT = 1e-4
 """Maximum second difference of such samples, relative to the median one of the recording."""
-TURN_TIME = 0.3
-"""Correlation time of the rate over a gap filled by interpolation, s."""
 UNKNOWN_TURN = 1.0
 """Maximum variance of a rotation over a gap filled by interpolation, rad² per axis."""
 LONG_INTERVAL = 1.5
@@ -102,7 +100,6 @@ def find(recording: Recording) -> Faults:
         turn = min(turn_variance_over(recording.time, rate, length, usual), UNKNOWN_TURN)
         variance[first:last] += turn / (last - first)
     if filled:
-        changes["rate"] = rate = bridged(recording.time, rate, filled)
         inside = np.concatenate([np.arange(first + 1, last) for first, last in filled])
         for name in ("specific_force", "magnetic_field"):
             samples = changes.get(name, getattr(recording, name))
@@ -134,25 +131,11 @@ def interpolated(rate: Array) -> list[tuple[int, int]]:
     bend = np.max(np.abs(np.diff(rate, n=2, axis=0)), axis=1, initial=0.0)
     if not bend.any():
         return []
-    straight = bend <= STRAIGHT * np.median(bend[bend > 0.0])
+    usual = np.median(bend[bend > 0.0])
+    straight = bend <= STRAIGHT * usual
     edges = np.flatnonzero(np.diff(np.concatenate([[0], straight.astype(int), [0]]))).reshape(-1, 2)
     runs = [(first, stop + 1) for first, stop in edges.tolist() if stop + 2 - first >= MIN_STRAIGHT]
-    return [(first, last) for first, last in runs if np.any(rate[last] != rate[first])]
-
-
-def bridged(time: Array, rate: Array, spans: list[tuple[int, int]]) -> Array:
-    """Return rates (n, 3) with the mean of a process of correlation time :data:`TURN_TIME` between first and last sample of each span."""
-    result, mean = rate.copy(), rate.mean(axis=0)
-    for first, last in spans:
-        before = ((time[first : last + 1] - time[first]) / TURN_TIME)[:, None]
-        after, whole = before[::-1], before[-1]
-
-        def share(u: Array, whole: Array = whole) -> Array:
-            """Return sinh(u)/sinh(whole)."""
-            return np.asarray(np.exp(u - whole) * np.expm1(-2.0 * u) / np.expm1(-2.0 * whole))
-
-        result[first : last + 1] = mean + (rate[first] - mean) * share(after) + (rate[last] - mean) * share(before)
-    return result
+    return [(first, last) for first, last in runs if np.max(np.abs(rate[last] - rate[first])) > usual]
 
 
 def truncation_step(rate: Array) -> float | None:
