@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
+import json
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -201,9 +202,28 @@ def compared(folders: Sequence[Path], names: Sequence[str]) -> Iterator[tuple[st
             yield folder.name, name, len(recordings), mean([score(one, FILTERS[name][1]) for one in recordings])
 
 
-def main(folders: Sequence[Path], names: Sequence[str]) -> dict[str, Any]:
-    """Return the scores of filters on sets, and print each as soon as it is known."""
+def table(result: dict[str, Any]) -> str:
+    """Return scores as a table in Markdown: error of the total and, of this package, coverage of its region."""
+    columns = [("estimate", "error_deg"), ("estimate", "coverage"), ("VQF", "error_deg"), ("imufusion", "error_deg")]
+    columns += [("Madgwick", "error_deg"), ("estimate --smooth", "error_deg"), ("estimate --smooth", "coverage")]
+    columns += [("offline VQF", "error_deg")]
+    head = ["set, recordings", *(f"`{name}`" if "estimate" in name else name for name, _ in columns)]
+    head = [
+        words if what != "coverage" else "95 % region"
+        for words, (_, what) in zip(head, [("", ""), *columns], strict=True)
+    ]
+    rows = [head, ["---"] * len(head)]
+    for where, number in result["sets"].items():
+        values = [(result["filters"].get(name, {}).get(where, {}).get(what), what) for name, what in columns]
+        cells = ["" if v is None else f"{v[0]:.2f}" if what == "coverage" else f"{v[0]:.3g}" for v, what in values]
+        rows.append([f"{where}, {number}", *cells])
+    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+
+
+def main(folders: Sequence[Path], names: Sequence[str], known: dict[str, Any] | None = None) -> dict[str, Any]:
+    """Return the scores of filters on sets, added to those known, and print each as soon as it is known."""
     result: dict[str, Any] = {"metric": " ".join(__doc__.split("\n\n")[1].split()), "sets": {}, "filters": {}}
+    result.update({key: dict(value) for key, value in (known or {}).items() if key in ("sets", "filters")})
     for where, name, number, found in compared(folders, names):
         result["sets"][where] = number
         result["filters"].setdefault(name, {})[where] = asdict(found)
@@ -219,10 +239,12 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("folders", nargs="+", type=Path)
     parser.add_argument("--filters", nargs="+", choices=FILTERS, default=list(FILTERS))
-    parser.add_argument("--json", type=Path)
+    parser.add_argument("--json", type=Path, help="file of the results; those of other sets and filters in it are kept")
     arguments = parser.parse_args()
     installed = [name for name in arguments.filters if importlib.util.find_spec(FILTERS[name][0])]
     print(f"{'set':14s} {'filter':18s} {'error, deg':>18s} {'coverage':>18s} NEES  rows     µs")
-    scores = main(arguments.folders, installed)
+    held = json.loads(arguments.json.read_text()) if arguments.json and arguments.json.exists() else None
+    scores = main(arguments.folders, installed, held)
+    print(table(scores))
     if arguments.json:
         write_json(arguments.json, scores)
