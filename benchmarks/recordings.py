@@ -1,78 +1,250 @@
-"""Reading recordings compared with iteration by the format's library: ns per message, and ratios. ``python benchmarks/recordings.py``.
+"""Accuracy of attitude filters on sets of recordings with a reference: ``python benchmarks/recordings.py [--json FILE] FOLDER...``.
 
-Each file contains only gyro and accelerometer, written by this package. rosbags yields raw messages, not decoded.
+A folder is a set: files that :func:`strapdown.read` reads with their reference. A filter is one function of a recording (:data:`FILTERS`);
+peers that are not installed are left out. The error is RMS over the movement, one constant heading offset of each recording removed, so
+that declination and the reference's own heading do not count; of the total rotation, its heading and its inclination. Figures of a set are
+means over its recordings:
+
+- *coverage*: share of the movement in which the filter's own 95 % region contains the error: total, heading, inclination;
+- *NEES* per degree of freedom, median over the recordings;
+- *rows*: share of the samples that have an attitude, of the recording with the least;
+- µs of processor time per sample.
 """
 
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import json
-import tempfile
 import time
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
+import strapdown as sd
+from strapdown.checks import Array
 from strapdown.files import write_json
-from strapdown.kernels.machine import describe
-from strapdown.recordings import Recording, read, write
+from strapdown.recordings import Recording
 
-ENDINGS = (".db3", ".mcap", ".bag")
+Filter = Callable[[Recording], tuple[Array, Array | None]]
+"""Attitude (n, 4), body to a frame with z up, and, if the filter has it, covariance (n, 3, 3) of the error in body axes, rad²."""
+REGION = 0.95
+PARTS = ("total", "heading", "inclination")
 
 
-def recording(n: int) -> Recording:
-    """Return a unit at rest, sampled at 1 kHz."""
-    noise = np.random.default_rng(0)
-    return Recording(
-        source="benchmark",
-        time=np.arange(n) / 1000.0,
-        rate=1e-3 * noise.standard_normal((n, 3)),
-        specific_force=noise.normal((0.0, 0.0, 9.81), 1.0, (n, 3)),
+def ours(recording: Recording, *, smooth: bool = False) -> tuple[Array, Array]:
+    """Return the estimate of this package at the stamps of the recording."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        found = sd.estimate(recording, full_covariance=True, smooth=smooth)
+    assert found.covariance is not None
+    attitude, covariance = np.full((len(recording.time), 4), np.nan), np.full((len(recording.time), 3, 3), np.nan)
+    row = np.searchsorted(recording.time, found.time)
+    attitude[row], covariance[row] = found.attitude, found.covariance[:, :3, :3]
+    return attitude, covariance
+
+
+def samples(recording: Recording) -> tuple[float, list[Array]]:
+    """Return the interval, s, and the samples of the sensors."""
+    sensors = (recording.rate, recording.specific_force, recording.magnetic_field)
+    return float(np.median(np.diff(recording.time))), [np.ascontiguousarray(x) for x in sensors if x is not None]
+
+
+def vqf(recording: Recording, *, offline: bool = False) -> tuple[Array, None]:
+    """Return the attitude of VQF, with a magnetometer 9D, or of offline VQF."""
+    from vqf import VQF, offlineVQF
+
+    interval, sensors = samples(recording)
+    name = "quat9D" if len(sensors) == 3 else "quat6D"
+    if not offline:
+        return np.asarray(VQF(interval).updateBatch(*sensors)[name]), None
+    return np.asarray(offlineVQF(*sensors, *([None] * (3 - len(sensors))), interval)[name]), None
+
+
+def imufusion(recording: Recording) -> tuple[Array, None]:
+    """Return the attitude of imufusion with the settings of its documentation."""
+    from imufusion import CONVENTION_ENU, Ahrs, AhrsSettings
+
+    interval, (rate, force, *field) = samples(recording)
+    settings = AhrsSettings()
+    settings.sample_rate, settings.convention, settings.gain = 1.0 / interval, CONVENTION_ENU, 0.5
+    settings.gyroscope_range, settings.rejection_timeout = 2000.0, 5.0
+    settings.acceleration_rejection = settings.magnetic_rejection = 10.0
+    ahrs = Ahrs()
+    ahrs.set_settings(settings)
+    attitude = np.empty((len(rate), 4))
+    update = ahrs.update if field else ahrs.update_no_magnetometer
+    for k, each in enumerate(zip(np.degrees(rate), force / 9.81, *field, strict=True)):
+        update(*each)
+        attitude[k] = ahrs.get_quaternion()
+    return attitude, None
+
+
+def madgwick(recording: Recording) -> tuple[Array, None]:
+    """Return the attitude of Madgwick's filter (package ``ahrs``)."""
+    from ahrs.filters import Madgwick
+
+    interval, sensors = samples(recording)
+    return np.asarray(Madgwick(**dict(zip(("gyr", "acc", "mag"), sensors, strict=False)), Dt=interval).Q), None
+
+
+FILTERS: dict[str, tuple[str, Filter]] = {
+    "estimate": ("strapdown", ours),
+    "estimate --smooth": ("strapdown", lambda recording: ours(recording, smooth=True)),
+    "VQF": ("vqf", vqf),
+    "offline VQF": ("vqf", lambda recording: vqf(recording, offline=True)),
+    "imufusion": ("imufusion", imufusion),
+    "Madgwick": ("ahrs", madgwick),
+}
+"""The package that each filter needs, and its function."""
+
+
+@dataclass(frozen=True)
+class Score:
+    """Score of a filter on a recording, or on a set of them."""
+
+    error_deg: tuple[float, float, float] | None
+    """RMS of the total, the heading and the inclination; None if no row is judged."""
+    coverage: tuple[float, float, float] | None
+    nees: float | None
+    rows: float
+    us: float
+
+
+def score(recording: Recording, run: Filter) -> Score:
+    """Return the score of a filter on a recording."""
+    begin = time.process_time()
+    attitude, covariance = run(recording)
+    us = 1e6 * (time.process_time() - begin) / len(recording.time)
+    judged, error = errors(recording, attitude)
+    rows = float(np.mean(np.isfinite(attitude).all(axis=1)))
+    if not judged.any():
+        return Score(None, None, None, rows, us)
+    turn = lengths(error)
+    # Heading about the vertical, then inclination about a level axis: half-angles of the quaternion.
+    w, x, y, z = np.cos(turn / 2.0), *(error * (0.5 * np.sinc(turn / 2.0 / np.pi))[:, None]).T
+    heading, inclination = 2.0 * np.arctan2(np.abs(z), np.abs(w)), 2.0 * np.arcsin(np.clip(np.hypot(x, y), 0.0, 1.0))
+    size = tuple(float(np.degrees(np.sqrt(np.mean(part**2)))) for part in (turn, heading, inclination))
+    if covariance is None:
+        return Score(size, None, None, rows, us)
+    M = matrices(attitude[judged])
+    P = M @ covariance[judged] @ np.swapaxes(M, 1, 2)
+    parts = (np.arange(3), np.array([2]), np.array([0, 1]))
+    nees = [np.einsum("ni,nij,nj->n", error[:, at], np.linalg.inv(P[:, at[:, None], at]), error[:, at]) for at in parts]
+    held = tuple(float(np.mean(n < chi2.ppf(REGION, len(at)))) for n, at in zip(nees, parts, strict=True))
+    return Score(size, held, float(nees[0].mean() / 3.0), rows, us)
+
+
+def errors(recording: Recording, attitude: Array) -> tuple[np.ndarray, Array]:
+    """Return the rows that are judged (n,), and the rotation vectors (m, 3) of their errors in the fixed frame, rad.
+
+    A row is judged if the unit moves there, and reference and attitude are known.
+    """
+    reference = recording.true_attitude
+    assert reference is not None
+    judged = np.isfinite(reference).all(axis=1) & np.isfinite(attitude).all(axis=1)
+    if recording.movement is not None:
+        judged &= recording.movement
+    q, r = (Rotation.from_quat(each[judged], scalar_first=True) for each in (attitude, reference))
+    if not judged.any():
+        return judged, np.empty((0, 3))
+    e = (q * r.inv()).as_quat(scalar_first=True)
+    offset = np.angle(np.mean(np.exp(2j * np.arctan2(e[:, 3], e[:, 0]))))
+    return judged, (Rotation.from_rotvec([0.0, 0.0, -offset]) * q * r.inv()).as_rotvec()
+
+
+def matrices(attitude: Array) -> Array:
+    """Return rotation matrices (n, 3, 3)."""
+    return np.asarray(Rotation.from_quat(attitude, scalar_first=True).as_matrix())
+
+
+def lengths(vectors: Array) -> Array:
+    """Return the length of each row."""
+    return np.sqrt(np.sum(vectors**2, axis=1))
+
+
+def read(folder: Path) -> list[Recording]:
+    """Return the recordings of a folder."""
+    found = [
+        sd.read(path) for path in sorted(folder.iterdir()) if path.suffix in (".hdf5", ".h5", ".csv", ".bag", ".mcap")
+    ]
+    return [one for one in found if isinstance(one, Recording) and one.true_attitude is not None]
+
+
+def mean(scores: Sequence[Score]) -> Score:
+    """Return the score of a set."""
+    judged = [one for one in scores if one.error_deg is not None]
+    with_region = [one for one in judged if one.coverage is not None]
+
+    def over(name: str, those: Sequence[Score]) -> tuple[float, float, float] | None:
+        return tuple(np.mean([getattr(one, name) for one in those], axis=0).tolist()) if those else None
+
+    return Score(
+        over("error_deg", judged),
+        over("coverage", with_region),
+        float(np.median([one.nees for one in with_region])) if with_region else None,
+        min(one.rows for one in scores),
+        float(np.mean([one.us for one in scores])),
     )
 
 
-def iterate(path: Path) -> None:
-    """Iterate over all messages by the library of the format."""
-    from rosbags.highlevel import AnyReader
-    from rosbags.typesys import Stores, get_typestore
-
-    with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as reader:
-        for _ in reader.messages():
-            pass
+def compared(folders: Sequence[Path], names: Sequence[str]) -> Iterator[tuple[str, str, int, Score]]:
+    """Yield set, filter, number of recordings and score."""
+    for folder in folders:
+        recordings = read(folder)
+        for name in names:
+            yield folder.name, name, len(recordings), mean([score(one, FILTERS[name][1]) for one in recordings])
 
 
-def main(*, n: int = 1_000_000, repeats: int = 3) -> dict[str, Any]:
-    """Return ns per message (minimum of the repeats) of our reader and of the library, and their ratio, for each format."""
-    rows = []
-    with tempfile.TemporaryDirectory() as folder:
-        for ending in ENDINGS:
-            path = Path(folder) / f"unit{ending}"
-            write(recording(n), path)
-            works: dict[str, Callable[[Path], object]] = {"library": iterate, "read": read}
-            times: dict[str, list[float]] = {name: [] for name in works}
-            for _ in range(repeats):
-                for name, work in works.items():
-                    start = time.process_time()  # excludes other processes
-                    work(path)
-                    times[name].append((time.process_time() - start) / n * 1e9)
-            ours, theirs = min(times["read"]), min(times["library"])
-            rows.append({"ending": ending, "read": ours, "library": theirs, "ratio": ours / theirs})
-            path.unlink()
-    return {"machine": describe(), "messages": n, "rows": rows}
+def table(result: dict[str, Any]) -> str:
+    """Return scores as a table in Markdown: error of the total and, of this package, coverage of its region."""
+    columns = [("estimate", "error_deg"), ("estimate", "coverage"), ("VQF", "error_deg"), ("imufusion", "error_deg")]
+    columns += [("Madgwick", "error_deg"), ("estimate --smooth", "error_deg"), ("estimate --smooth", "coverage")]
+    columns += [("offline VQF", "error_deg")]
+    head = ["set, recordings", *(f"`{name}`" if "estimate" in name else name for name, _ in columns)]
+    head = [
+        words if what != "coverage" else "95 % region"
+        for words, (_, what) in zip(head, [("", ""), *columns], strict=True)
+    ]
+    rows = [head, ["---"] * len(head)]
+    for where, number in result["sets"].items():
+        values = [(result["filters"].get(name, {}).get(where, {}).get(what), what) for name, what in columns]
+        cells = ["" if v is None else f"{v[0]:.2f}" if what == "coverage" else f"{v[0]:.3g}" for v, what in values]
+        rows.append([f"{where}, {number}", *cells])
+    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+
+
+def main(folders: Sequence[Path], names: Sequence[str], known: dict[str, Any] | None = None) -> dict[str, Any]:
+    """Return the scores of filters on sets, added to those known, and print each as soon as it is known."""
+    result: dict[str, Any] = {"metric": " ".join(__doc__.split("\n\n")[1].split()), "sets": {}, "filters": {}}
+    result.update({key: dict(value) for key, value in (known or {}).items() if key in ("sets", "filters")})
+    for where, name, number, found in compared(folders, names):
+        result["sets"][where] = number
+        result["filters"].setdefault(name, {})[where] = asdict(found)
+        words = [f"{where} ({number})".ljust(14), name.ljust(18)]
+        for values in (found.error_deg, found.coverage):
+            words.append(("" if values is None else "/".join(f"{x:.2f}" for x in values)).rjust(18))
+        words.append("    " if found.nees is None else f"{found.nees:4.2f}")
+        print(*words, f"{found.rows:.3f} {found.us:6.2f}", flush=True)
+    return result
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--messages", type=int, default=1_000_000)
-    parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--json", type=Path)
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("folders", nargs="+", type=Path)
+    parser.add_argument("--filters", nargs="+", choices=FILTERS, default=list(FILTERS))
+    parser.add_argument("--json", type=Path, help="file of the results; those of other sets and filters in it are kept")
     arguments = parser.parse_args()
-    result = main(n=arguments.messages, repeats=arguments.repeats)
-    print(json.dumps(result["machine"]))
-    print(f"{result['messages']} messages {'read, ns':>10s} {'library, ns':>12s} {'ratio':>6s}")
-    for row in result["rows"]:
-        print(f"{row['ending']:16s} {row['read']:10.0f} {row['library']:12.0f} {row['ratio']:6.2f}")
+    installed = [name for name in arguments.filters if importlib.util.find_spec(FILTERS[name][0])]
+    print(f"{'set':14s} {'filter':18s} {'error, deg':>18s} {'coverage':>18s} NEES  rows     µs")
+    held = json.loads(arguments.json.read_text()) if arguments.json and arguments.json.exists() else None
+    scores = main(arguments.folders, installed, held)
+    print(table(scores))
     if arguments.json:
-        write_json(arguments.json, result)
+        write_json(arguments.json, scores)

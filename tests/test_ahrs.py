@@ -137,8 +137,8 @@ def test_a_disturbed_field_turns_the_heading_only(parameters):
     field[2000:3000] = plain.magnetic_field[2000:3000] @ Rotation.from_rotvec([0.3, 0.9, 0.2]).as_matrix()
     disturbed = ahrs.estimate(dataclasses.replace(plain, magnetic_field=field), parameters, latency=0.0)
     assert worst(disturbed)["heading"] > 0.05
-    # by the bias that it feigns; a vehicle's vertical is bound least
-    assert worst(disturbed)["inclination"] < (0.1 if parameters.velocity_sigma < 2.0 else 0.25)
+    # by the bias that it feigns; half the velocity σ of a vessel gives 0.06° here, but 1.4° instead of 0.8° on waves
+    assert worst(disturbed)["inclination"] < (0.2 if parameters.position_time else 0.1)
 
 
 def test_how_the_unit_is_mounted_and_the_unit_of_the_field_do_not_matter():
@@ -759,7 +759,7 @@ def test_between_two_steps_the_attitudes_covariance_is_turned_with_the_unit(smoo
     np.testing.assert_array_equal(without.variance, estimate.variance)
 
 
-def test_the_level_of_the_acceleration_scales_the_tilt_alone():
+def test_the_share_of_the_tilt_scales_the_tilt_alone():
     """The filter's covariance in fixed axes, its first two rows and columns by one factor."""
     unit = dataclasses.replace(
         ahrs.HAND_HELD,
@@ -781,7 +781,7 @@ def test_the_level_of_the_acceleration_scales_the_tilt_alone():
     scaled = R @ P @ R.transpose(0, 2, 1)
     ratio = scaled / (own_R @ plain.covariance[:, :3, :3] @ own_R.transpose(0, 2, 1))
     tilt = np.sqrt(ratio[:, 0, 0])
-    assert tilt.min() < 0.9
+    np.testing.assert_allclose(tilt, np.sqrt(regions.TILT_SHARE), rtol=1e-6)
     np.testing.assert_allclose(ratio[:, 1, 1], tilt**2, rtol=1e-6)
     np.testing.assert_allclose(ratio[:, 2, 2], 1.0, rtol=1e-6)
     correlated = np.abs(scaled[:, 0, 2]) > 1e-3 * np.sqrt(scaled[:, 0, 0] * scaled[:, 2, 2])
@@ -880,7 +880,7 @@ def test_the_level_of_the_acceleration_and_the_innovations_variance_by_it():
 def test_innovations_of_broad_are_as_large_as_their_variance_says(broad):
     """NIS per degree of freedom, scaled by the level of the acceleration, with one motion for all."""
     found = [score(file, False).nis[0] for file in sorted(broad.glob("*.hdf5"))]
-    assert 0.05 < min(found) < max(found) < 0.9, found
+    assert 0.1 < min(found) < max(found) < 0.9, found
 
 
 def test_an_estimate_is_judged_by_the_reference_kept_beside_it(tmp_path):
@@ -920,5 +920,5 @@ def test_a_disturbed_field_leaves_the_heading_of_a_recording(broad):
     up = quaternion.to_matrix(found.attitude[-1])[2]
     sigma = np.sqrt(up @ found.covariance[-1, :3, :3] @ up)
     off = abs((turned + np.pi) % (2.0 * np.pi) - np.pi)
-    assert off < 4.5 * DEGREE
+    assert off < 4.5 * DEGREE  # 0.3° with half the σ of the hard iron, which costs the other recordings 2 %
     assert off < 3.0 * sigma < 60.0 * DEGREE

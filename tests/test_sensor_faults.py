@@ -199,6 +199,43 @@ def test_a_truncated_gyro_shows_the_same_bias_at_rest_and_in_motion():
     assert np.abs(np.mean((truncated.rate - rate)[resting], axis=0)).max() > 0.3 * LSB
 
 
+def filled(plain: Recording, *spans: tuple[float, float]) -> Recording:
+    """The recording with straight lines from begin to end of each span, s, in every sensor."""
+    samples = {name: getattr(plain, name).copy() for name in ("rate", "specific_force", "magnetic_field")}
+    for begin, end in spans:
+        first, last = round(begin * RATE), round(end * RATE)
+        u = np.linspace(0.0, 1.0, last - first + 1)[:, None]
+        for values in samples.values():
+            values[first : last + 1] = (1.0 - u) * values[first] + u * values[last]
+    return dataclasses.replace(plain, **samples)
+
+
+@pytest.mark.parametrize("smooth", [False, True])
+def test_a_gap_filled_by_interpolation_is_a_gap(smooth):
+    """Neither its samples count nor its steady rate as rest."""
+    spans = ((10.0, 10.2), (20.0, 20.4), (38.0, 39.9))
+    plain = swing()
+    broken = filled(plain, *spans)
+    rows = np.rint(RATE * np.array(spans)).astype(int)
+    assert sensor_faults.interpolated(broken.rate) == [tuple(span) for span in rows.tolist()]
+    _, nees, found = off_by(broken, smooth=smooth)
+    assert "Gaps filled by interpolation: 3, up to 1.9 s" in found.faults.words[0]
+    gap = np.concatenate([np.arange(first + 1, last) for first, last in rows])
+    for samples in (found.recording.specific_force, found.recording.magnetic_field):
+        np.testing.assert_array_equal(np.flatnonzero(~sampled(samples)), gap)
+    assert np.mean(nees < 7.81) > 0.9
+    assert not np.intersect1d(found.rests.last, gap).size
+    assert np.abs(found.estimate.bias[-1]).max() < 0.5 * DEGREE
+
+
+def test_straight_lines_of_a_still_or_noisy_gyro_are_no_gaps():
+    level = np.zeros((200, 3))
+    level[100:, 1] = 0.01  # a coarse gyro
+    assert sensor_faults.interpolated(level) == []
+    assert sensor_faults.interpolated(np.random.default_rng(1).normal(0.0, 1e-3, (5000, 3))) == []
+    assert sensor_faults.interpolated(np.zeros((5, 3))) == []
+
+
 def test_a_clipped_accelerometer_is_left_out():
     plain = swing()
     force = plain.specific_force + 30.0 * np.sin(40.0 * plain.time)[:, None] * (plain.time > 5.0)[:, None]

@@ -47,9 +47,9 @@ class AhrsEstimate:
     recording : Recording
         The recording, clipped gyro samples restored.
     estimate : Estimate
-        Attitude and gyro bias at the stamps of the recording. The covariance of the tilt and the variance of the accelerometer's
-        innovations follow the level of the acceleration up to each stamp; the covariance includes timing errors and constant iron,
-        which the filter does not estimate.
+        Attitude and gyro bias at the stamps of the recording. The covariance follows the disturbance of the field up to each stamp
+        (:mod:`strapdown.ahrs.regions`), the variance of the accelerometer's innovations the level of the acceleration; the covariance
+        includes timing errors and constant iron, which the filter does not estimate.
     record : ImuRecord
         Input of the filter: increments and vectors averaged over its steps.
     initial : State
@@ -243,7 +243,7 @@ def _at_stamps(
     ahead = -sensor_delays.turn_over(used, -late) if options.smooth else used.rate * late[:, None]
     interval = max(parameters.step, float(np.median(np.diff(used.time))))
     level = regions.acceleration_level(filtered, _over_steps(turn_variance, edge) > 0.0, interval)
-    tilt, floor, heading = regions.scales(filtered, parameters, level, causal=not options.smooth)
+    tilt, floor, heading = regions.scales(filtered, parameters, causal=not options.smooth)
     assert filtered.covariance is not None
     iron = np.zeros(len(edge))
     if prepared.field is not None:

@@ -126,8 +126,6 @@ class LiveAhrs:
         time, rate, turned = np.zeros(2), np.zeros((2, 3)), np.zeros((2, 4))
         force, frame, edge = np.zeros((most, 3)), np.zeros((most, 4)), np.zeros(2, np.int64)
         total, number, mean, turn = np.zeros((1, 3)), np.zeros(1), np.zeros((1, 3)), np.zeros((1, 3))
-        levels, level_after = np.ones((2, 1)), np.ones((2, 1))
-        share = -np.expm1(-max(parameters.step, self.interval) / regions.LEVEL_TIME)
         stamps = k.Stamps(np.zeros(2), np.zeros((2, 3)), np.zeros((2, 4)), np.full(2, late), np.zeros((2, 3)))
         shapes = (1, 4), (1, 3), (1, 6), (1, 6, 6), (1,), (1,), (1,), (1,)
         steps = k.Steps(np.zeros(1, np.int64), *(np.ones(shape) for shape in shapes))
@@ -143,7 +141,6 @@ class LiveAhrs:
         of_step = (field_total, field_number, head_length, head_frame, total, number, head_end, head_time)
         head_steps = k_headings.Steps(*map(read_only, of_step))
         found = k_headings.Found(np.zeros((1, 3)), np.zeros(1), np.zeros((1, 2)), np.zeros((1, 3)), np.zeros(1))
-        scaled = (read_only(level_after[1]), read_only(field_level))
         shares = regions.shares_of(parameters, magnetometer=self.magnetometer)
         live, state, numbers, places = arrays_of(self._filter)
         carried = (
@@ -158,8 +155,7 @@ class LiveAhrs:
             follow=_routine(k.follow_gyro, read_only(time), read_only(rate), turned),
             average=_routine(k.average_samples, read_only(force), read_only(frame), edge, total, number),
             end=_routine(k.end_steps, read_only(frame), edge, total, number, mean, turn),
-            level=_routine(k.low_pass, levels, float(share), level_after),
-            scale=_routine(k.scale_factors, *scaled, shares, steps.tilt, steps.floor, steps.heading),
+            scale=_routine(k.scale_factors, read_only(field_level), shares, steps.tilt, steps.floor, steps.heading),
             carry=_routine(k.carry_to_stamps, *carried),
             average_field=_routine(
                 k.average_samples, read_only(field), read_only(frame), edge, field_total, field_number
@@ -183,8 +179,6 @@ class LiveAhrs:
             number=number,
             mean=mean,
             turn=turn,
-            levels=levels,
-            level_after=level_after,
             state=state,
             numbers=numbers,
             places=places,

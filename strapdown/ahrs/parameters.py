@@ -161,24 +161,33 @@ class AhrsParameters:
 
 HAND_HELD = AhrsParameters(
     angle_random_walk=2e-3,
-    rate_random_walk=1.5e-4,
+    rate_random_walk=3e-4,
     specific_force_noise=0.06,
     field_disturbance=0.025,
     hard_iron_sigma=0.04,
     bias_sigma=2.0 * DEGREE,
     rest_bias_sigma=0.05 * DEGREE,
     velocity_sigma=0.7,
+    acceleration_time=0.15,
     accelerometer_bias_sigma=0.02,
-    tilt_sigma=0.06,
-    tilt_by_field=0.7,
+    tilt_sigma=0.02,
+    tilt_by_field=0.3,
     heading_share=0.1,
-    heading_by_field=0.8,
+    heading_by_field=1.0,
     gyro_scale_sigma=3e-3,
 )
 """A unit with a magnetometer in the hand, on a person or a small aircraft: its velocity is bounded. Chosen on the development halves of
-BROAD, RepoIMU, Sassari, OxIOD and the phones of PerCom 2017 (``benchmarks/recordings.py``)."""
+BROAD, RepoIMU, Sassari, OxIOD and the phones of PerCom 2017 (``benchmarks/recording_parameters.py``)."""
 HAND_HELD_SMOOTHED = replace(
-    HAND_HELD, velocity_sigma=1.0, gyro_scale_sigma=4e-3, field_disturbance=0.02, tilt_sigma=0.045
+    HAND_HELD,
+    field_disturbance=0.02,
+    field_change_time=2.0,
+    hard_iron_time=200.0,
+    rate_random_walk=1.5e-4,
+    velocity_sigma=1.0,
+    tilt_sigma=0.05,
+    tilt_by_field=0.16,
+    gyro_scale_sigma=4e-3,
 )
 """The same for the smoother, which weighs acceleration that lasts over all the time before and after. Chosen on the same recordings."""
 HAND_HELD_WITHOUT_MAGNETOMETER = replace(
@@ -189,8 +198,9 @@ HAND_HELD_WITHOUT_MAGNETOMETER = replace(
     bias_sigma=0.25 * DEGREE,
     velocity_sigma=3.0,
     velocity_time=1.0,
+    acceleration_time=0.1,
     accelerometer_bias_sigma=0.0,
-    tilt_sigma=0.08,
+    tilt_sigma=0.045,
     gyro_scale_sigma=5e-3,
 )
 """Such a unit without a magnetometer. Acceleration that lasts, in body axes too, would otherwise be modelled as gyro bias about the
@@ -200,10 +210,13 @@ _VESSEL = {"velocity_sigma": 3.0, "velocity_time": 10.0, "acceleration_time": 2.
 MOTIONS: dict[str, tuple[AhrsParameters, AhrsParameters]] = {
     "hand": (HAND_HELD, HAND_HELD_WITHOUT_MAGNETOMETER),
     "vehicle": (
-        replace(HAND_HELD, field_disturbance=0.1, **_VEHICLE),
+        replace(HAND_HELD, field_disturbance=0.1, rate_random_walk=1.5e-4, **_VEHICLE),
         replace(HAND_HELD_WITHOUT_MAGNETOMETER, **_VEHICLE),
     ),
-    "vessel": (replace(HAND_HELD, **_VESSEL), replace(HAND_HELD_WITHOUT_MAGNETOMETER, **_VESSEL)),
+    "vessel": (
+        replace(HAND_HELD, bias_sigma=0.5 * DEGREE, **_VESSEL),
+        replace(HAND_HELD_WITHOUT_MAGNETOMETER, **_VESSEL),
+    ),
     "any": (AhrsParameters(), AhrsParameters()),
 }
 """Parameters by kind of motion, with a magnetometer and without: of a hand, the default; of a vehicle on a road or a large aircraft, whose

@@ -1,4 +1,4 @@
-"""The reported covariance: the filter's own, scaled by what the recording shows so far of the motion and the field.
+"""The reported covariance: the filter's own, scaled by what the recording shows so far of the field.
 
 One model serves slow and fast motion, good and poor units, clean and disturbed fields, so the filter's own σ is right on average only. Its
 innovations show how far a recording differs from it. The scales were chosen so that the 95 %
@@ -20,17 +20,16 @@ from strapdown.records import Estimate, Innovations
 from strapdown.units import STANDARD_GRAVITY
 
 LEVEL_TIME = 5.0
-"""Time constant of the average that gives the level of the acceleration, s."""
+"""Time constant of the average that gives the level of the acceleration, s; by it the innovations' variance is scaled."""
 OWN_SHARE = 0.1
 """Share of the modelled variance of an innovation that comes from the sensor's errors, whatever the acceleration's level."""
-TILT_SHARES = (0.007, 0.048)
-"""Shares of the tilt variance that do not depend on that level, and that are proportional to its root, as the steady-state variance is to σ
-of the acceleration."""
+TILT_SHARE = 0.3
+"""Variance of the tilt relative to that of the filter, whose acceleration is larger than that of most motion."""
 MAX_BY_FIELD = 0.3
 """Maximum σ of the accelerometer's error computed from the level of the field's disturbance, m/s²."""
 FIELD_LEVEL = 0.02
 """Mean NIS of the magnetometer in a field disturbed as that along the path of a phone indoors."""
-MAX_HEADING = 30.0
+MAX_HEADING = 40.0
 """Maximum factor on the variance of the heading."""
 FIRST_LEVEL = (0.01, 15.0)
 """Mean NIS of the magnetometer assumed at first, and the number of measurements that weigh as much."""
@@ -60,22 +59,22 @@ def scaled_innovations(filtered: Estimate, level: Array) -> dict[str, Innovation
     return {**filtered.innovations, "accelerometer": replace(own, variance=own.variance * share[:, None])}
 
 
-def scales(filtered: Estimate, parameters: AhrsParameters, level: Array, *, causal: bool) -> tuple[Array, Array, Array]:
+def scales(filtered: Estimate, parameters: AhrsParameters, *, causal: bool) -> tuple[Array, Array, Array]:
     """Return the factor on σ of the tilt, the variance that is added to it, rad², and the factor on σ of the heading (k + 1,) each.
 
-    ``level`` is that of the acceleration. ``causal``: from the measurements before each step, otherwise from all.
+    ``causal``: from the measurements before each step, otherwise from all.
     """
     field = field_level(filtered, parameters, causal=causal)
     shares = shares_of(parameters, magnetometer="magnetometer" in filtered.innovations)
-    tilt, floor, heading = np.empty((3, len(level)))
-    compiled(recording_steps.scale_factors)(read_only(level), read_only(field), shares, tilt, floor, heading)
+    tilt, floor, heading = np.empty((3, len(field)))
+    compiled(recording_steps.scale_factors)(read_only(field), shares, tilt, floor, heading)
     return tilt, floor, heading
 
 
 def shares_of(parameters: AhrsParameters, *, magnetometer: bool) -> recording_steps.Shares:
     """Return the constants for the kernel."""
     return recording_steps.Shares(
-        tilt=TILT_SHARES,
+        tilt=TILT_SHARE,
         tilt_variance=parameters.tilt_sigma**2,
         tilt_by_field=parameters.tilt_by_field,
         max_by_field=MAX_BY_FIELD,

@@ -180,8 +180,14 @@ def mean_rates(rate: Array, parameters: AhrsParameters) -> tuple[Array, Array]:
 
 
 def is_rest(time: Array, vectors: tuple[Array | None, ...], span: slice, rate: Array) -> bool:
-    """Return whether a span has no gap, and vertical and field do not rotate at more than half its mean rate."""
+    """Return whether a span has no gap, and vertical and field do not rotate at more than half its mean rate.
+
+    ``vectors``: specific force, which half of the samples must have, and field.
+    """
     if not time[span][-1] - time[span][0] < 1.5 * QUIET_SPAN:
+        return False
+    force = vectors[0]
+    if force is None or not np.isfinite(force[span, 0]).mean() > 0.5:
         return False
     if not lengths(rate) > TURNING_RATE:
         return True

@@ -41,7 +41,6 @@ class Imu(NamedTuple):
     follow: Routine
     average: Routine
     end: Routine
-    level: Routine
     scale: Routine
     carry: Routine
     average_field: Routine
@@ -71,10 +70,6 @@ class Imu(NamedTuple):
     """Number of them with a specific force (1,)."""
     mean: np.ndarray
     turn: np.ndarray
-    levels: np.ndarray
-    """Level of the acceleration before the step, and its NIS over its degrees of freedom (2, 1)."""
-    level_after: np.ndarray
-    """(2, 1)"""
     state: np.ndarray
     """Attitude and bias of the filter (7 or more,)."""
     numbers: np.ndarray
@@ -232,7 +227,7 @@ def turn_with_gyro(imu):
 
 
 def end_step(imu):
-    """Filter the step, and update the level of the acceleration."""
+    """Filter the step, and update the level of the field's disturbance."""
     live = imu.filter
     call(imu.average.address, imu.average.arguments, ())
     call(imu.end.address, imu.end.arguments, ())
@@ -258,16 +253,6 @@ def end_step(imu):
     code = process(live, imu.time[1], count, 1)
     if code < 0:
         return code
-    nis = 1.0
-    if number > 0.0:
-        total = live.innovation[0, 0] * live.innovation[0, 0] / live.innovation[0, 1]
-        total += live.innovation[0, 2] * live.innovation[0, 2] / live.innovation[0, 3]
-        total += live.innovation[0, 4] * live.innovation[0, 4] / live.innovation[0, 5]
-        if abs(total) < math.inf:
-            nis = total / 3.0
-    imu.levels[0, 0] = imu.level_after[1, 0]
-    imu.levels[1, 0] = nis
-    call(imu.level.address, imu.level.arguments, ())
     if heading:
         innovation = live.innovation[count - 1, 0]
         nis = innovation * innovation / live.innovation[count - 1, 1]

@@ -201,7 +201,7 @@ def carry_to_stamps(steps, stamps, timing, out):
 class Shares(NamedTuple):
     """Constants of the reported covariance: :mod:`strapdown.ahrs.regions`."""
 
-    tilt: tuple[float, float]
+    tilt: float
     tilt_variance: float
     """(m/s²)²"""
     tilt_by_field: float
@@ -214,12 +214,12 @@ class Shares(NamedTuple):
     gravity: float
 
 
-def scale_factors(level, field_level, shares, tilt, floor, heading):
+def scale_factors(field_level, shares, tilt, floor, heading):
     """Write the factor on σ of the tilt, the variance that is added to it, and the factor on σ of the heading (k,) each."""
-    for i in range(len(level)):
+    for i in range(len(field_level)):
         field = field_level[i] / shares.field_level
-        by_field = min(shares.tilt_by_field * field * field, shares.max_by_field)
-        tilt[i] = math.sqrt(shares.tilt[0] + shares.tilt[1] * math.sqrt(level[i]))
+        by_field = min(shares.tilt_by_field * field, shares.max_by_field)
+        tilt[i] = math.sqrt(shares.tilt)
         floor[i] = (shares.tilt_variance + by_field * by_field) / (shares.gravity * shares.gravity)
         by_field = shares.heading_by_field * field * math.sqrt(field)
         heading[i] = math.sqrt(min(shares.heading + by_field, shares.max_heading))

@@ -1,4 +1,4 @@
-"""Faulty samples of a recording: truncated samples, clipped samples, and gaps of the gyro.
+"""Faulty samples of a recording: truncated samples, clipped samples, and gaps of the gyro, filled by interpolation or not.
 
 If the samples of a gyro are multiples of a step, truncated toward zero, every rate is measured half a step too small, so that the bias at
 rest differs from that in motion: half a step is added (:func:`truncation_step`).
@@ -6,6 +6,9 @@ rest differs from that in motion: half a step is added (:func:`truncation_step`)
 A clipped gyro sample is a lower bound of the rate. The rate of a run of clipped samples is restored by a cubic between the samples before
 and after (:func:`restored`). Its error is represented by a variance of the rotation, which the filter adds to that of the gyro's noise, as
 it does for the rotation over a gap. A clipped sample of the accelerometer has a wrong direction and is left out.
+
+Where a recording was resampled, a gap of its sensors can be filled by a straight line, which is no measurement: the rotation over it is as
+uncertain as over a gap, and the other sensors' samples there are left out (:func:`interpolated`).
 """
 
 from __future__ import annotations
@@ -41,6 +44,12 @@ BINS = 4
 """Number of bins on either side of the zero bin with which it is compared."""
 TRUNCATED_ODDS = 100.0
 """Minimum likelihood ratio of truncation to rounding for samples to be treated as truncated."""
+MIN_STRAIGHT = 10
+"""Minimum number of successive gyro samples on one straight line to be treated as interpolated."""
+STRAIGHT = 1e-4
+"""Maximum second difference of such samples, relative to the median one of the recording."""
+UNKNOWN_TURN = 1.0
+"""Maximum variance of a rotation over a gap filled by interpolation, rad² per axis."""
 LONG_INTERVAL = 1.5
 """Ratio of an interval between stamps to the median interval above which its rotation is uncertain."""
 
@@ -85,6 +94,22 @@ def find(recording: Recording) -> Faults:
         words.append(f"The accelerometer was clipped in {np.sum(lost)} samples ({lost.mean():.2%}), which are ignored")
     steps = np.diff(recording.time)
     usual = float(np.median(steps))
+    filled = interpolated(recording.rate)
+    for first, last in filled:
+        length = float(recording.time[last] - recording.time[first])
+        turn = min(turn_variance_over(recording.time, rate, length, usual), UNKNOWN_TURN)
+        variance[first:last] += turn / (last - first)
+    if filled:
+        inside = np.concatenate([np.arange(first + 1, last) for first, last in filled])
+        for name in ("specific_force", "magnetic_field"):
+            samples = changes.get(name, getattr(recording, name))
+            if samples is not None:
+                changes[name] = samples.copy()
+                changes[name][inside] = np.nan
+        longest = max(recording.time[last] - recording.time[first] for first, last in filled)
+        words.append(
+            f"Gaps filled by interpolation: {len(filled)}, up to {longest:.3g} s; samples there are ignored, and σ grows over each"
+        )
     long = np.flatnonzero(steps > LONG_INTERVAL * usual)
     for k in long:
         variance[k] += turn_variance_over(recording.time, rate, float(steps[k]), usual)
@@ -96,6 +121,21 @@ def find(recording: Recording) -> Faults:
     if changes:
         recording = replace(recording, **changes)
     return Faults(recording=recording, turn_variance=variance, words=tuple(words))
+
+
+def interpolated(rate: Array) -> list[tuple[int, int]]:
+    """Return first and last sample of each run of at least :data:`MIN_STRAIGHT` rates (n, 3) on a straight line that is not level.
+
+    Noise never draws such a line; held samples of a gyro at rest are level.
+    """
+    bend = np.max(np.abs(np.diff(rate, n=2, axis=0)), axis=1, initial=0.0)
+    if not bend.any():
+        return []
+    usual = np.median(bend[bend > 0.0])
+    straight = bend <= STRAIGHT * usual
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], straight.astype(int), [0]]))).reshape(-1, 2)
+    runs = [(first, stop + 1) for first, stop in edges.tolist() if stop + 2 - first >= MIN_STRAIGHT]
+    return [(first, last) for first, last in runs if np.max(np.abs(rate[last] - rate[first])) > usual]
 
 
 def truncation_step(rate: Array) -> float | None:

@@ -1,0 +1,198 @@
+"""Parameters of the filter of recordings: what a choice on all sets but one is worth, and what each part of the model gives.
+
+*Left out*: of the released parameters and those with one of :data:`SEARCHED` multiplied by a factor, those are chosen with the least
+geometric mean, over the other sets, of the error relative to VQF's (offline VQF's for the smoother), and scored on the set left out. Sets
+without a magnetometer have parameters of their own, chosen on all sets without their magnetometers.
+
+*Parts*: the released parameters with one part of the model left out in turn (:data:`PARTS`).
+
+Run ``python benchmarks/recording_parameters.py [--every N] [--json FILE] FOLDER...``; a folder is a set (``benchmarks/recordings.py``).
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from benchmarks import recordings as leaderboard
+from strapdown import ahrs
+from strapdown.ahrs import AhrsParameters
+from strapdown.checks import Array
+from strapdown.files import write_json
+from strapdown.recordings import Recording, sensor_faults
+
+SEARCHED = {
+    "acceleration_time": (0.5, 1.5),
+    "rate_random_walk": (0.4, 2.5),
+    "gyro_scale_sigma": (0.5, 2.0),
+    "accelerometer_bias_sigma": (0.5, 2.0),
+    "hard_iron_time": (0.4, 2.5),
+    "field_deviation": (0.6, 1.6),
+    "field_change_time": (0.5, 2.0),
+}
+"""Factors by which each parameter is multiplied."""
+
+LEAST_COVERAGE = 0.88
+"""Least coverage of the total, mean over a set, with which parameters are chosen."""
+
+
+@contextmanager
+def changed(module: Any, **values: Any) -> Iterator[None]:
+    """Set constants of a module for a while."""
+    before = {name: getattr(module, name) for name in values}
+    vars(module).update(values)
+    try:
+        yield
+    finally:
+        vars(module).update(before)
+
+
+PARTS: dict[str, Callable[[AhrsParameters], AhrsParameters] | tuple[Any, dict[str, Any]]] = {
+    "nothing": lambda p: p,
+    "bounded velocity (white acceleration instead)": lambda p: replace(p, velocity_sigma=0.0, specific_force_noise=0.6),
+    "gyro scale and misalignment": lambda p: replace(p, gyro_scale_sigma=0.0),
+    "accelerometer bias": lambda p: replace(p, accelerometer_bias_sigma=0.0),
+    "drift of the gyro's bias": lambda p: replace(p, rate_random_walk=0.0),
+    "hard iron": lambda p: replace(p, hard_iron_sigma=0.0),
+    "deviation of the field": lambda p: replace(p, field_deviation=1e3),
+    "gaps filled by interpolation": (sensor_faults, {"interpolated": lambda rate: []}),
+}
+"""What is left out of the model."""
+
+
+@dataclass(frozen=True)
+class Group:
+    """A set with a model: its recordings, and the total error of the peer on each."""
+
+    name: str
+    recordings: list[Recording]
+    peer: Array
+
+    @property
+    def magnetometer(self) -> bool:
+        """Whether there is one."""
+        return self.recordings[0].magnetic_field is not None
+
+
+def groups(folders: Sequence[Path], *, smooth: bool, every: int = 1) -> list[Group]:
+    """Return the sets, and after them those with a magnetometer without it, their names with a minus sign."""
+    found = [(folder.name, leaderboard.read(folder)[::every]) for folder in folders]
+    for name, those in found[:]:
+        if those[0].magnetic_field is not None:
+            found.append((f"{name} −", [replace(one, magnetic_field=None, magnetic_unit="") for one in those]))
+    peer = functools.partial(leaderboard.vqf, offline=smooth)
+    return [
+        Group(name, those, np.array([leaderboard.score(one, peer).error_deg for one in those])[:, 0])
+        for name, those in found
+    ]
+
+
+def scored(group: Group, parameters: AhrsParameters, *, smooth: bool) -> dict[str, float]:
+    """Return the error of the total relative to the peer's, the coverage of the total and the median NEES."""
+
+    def run(recording: Recording) -> tuple[Array, Array]:
+        found = ahrs.estimate(recording, parameters, smooth=smooth, full_covariance=True).estimate
+        assert found.covariance is not None
+        return found.attitude, found.covariance[:, :3, :3]
+
+    found = leaderboard.mean([leaderboard.score(one, run) for one in group.recordings])
+    assert found.error_deg is not None
+    assert found.coverage is not None
+    return {"ratio": found.error_deg[0] / float(group.peer.mean()), "coverage": found.coverage[0], "nees": found.nees}
+
+
+def geometric_mean(scores: Sequence[dict[str, float]]) -> float:
+    """Return the geometric mean of the ratios."""
+    return float(np.exp(np.mean(np.log([one["ratio"] for one in scores]))))
+
+
+def left_out(those: Sequence[Group], *, smooth: bool) -> dict[str, Any]:
+    """Return what is chosen on the other sets, and the score on each set that counts: those as recorded."""
+    result: dict[str, Any] = {}
+    for magnetometer in (True, False):
+        model = [group for group in those if group.magnetometer == magnetometer]
+        released = ahrs.of_motion("hand", magnetometer=magnetometer, smooth=smooth)
+        candidates = {"released": released}
+        for name, factors in SEARCHED.items():
+            value = getattr(released, name)
+            candidates |= {f"{name} {f * value:.3g}": replace(released, **{name: f * value}) for f in factors if value}
+        scores = {}
+        for name, parameters in candidates.items():
+            scores[name] = [scored(group, parameters, smooth=smooth) for group in model]
+            print(
+                "smoothed" if smooth else "online", name, [round(one["ratio"], 3) for one in scores[name]], flush=True
+            )
+        for k, group in enumerate(model):
+            others = {name: those[:k] + those[k + 1 :] for name, those in scores.items()}
+            enough = [n for n, s in others.items() if min(one["coverage"] for one in s) >= LEAST_COVERAGE] or [
+                "released"
+            ]
+            best = min(enough, key=lambda name: geometric_mean(others[name]))
+            if not group.name.endswith("−"):
+                result[group.name] = {"chosen": best, **scores[best][k], "released": scores["released"][k]["ratio"]}
+    print("geometric mean on the sets left out:", round(geometric_mean(list(result.values())), 3), flush=True)
+    return result
+
+
+def parts(those: Sequence[Group], *, smooth: bool) -> dict[str, Any]:
+    """Return the scores without each part: the geometric mean of the errors, and the mean coverage of the total."""
+    result = {}
+    for name, part in PARTS.items():
+        scores = []
+        for group in those:
+            parameters = ahrs.of_motion("hand", magnetometer=group.magnetometer, smooth=smooth)
+            with changed(
+                *(part[:1] if isinstance(part, tuple) else [sensor_faults]),
+                **(part[1] if isinstance(part, tuple) else {}),
+            ):
+                scores.append(scored(group, parameters if isinstance(part, tuple) else part(parameters), smooth=smooth))
+        held = float(np.mean([one["coverage"] for one in scores]))
+        result[name] = {"ratio": geometric_mean(scores), "coverage": held}
+        print("smoothed" if smooth else "online", "without", name, result[name], flush=True)
+    return result
+
+
+def table(result: dict[str, Any]) -> str:
+    """Return the parts as a table in Markdown: geometric mean of the errors, and mean coverage of the total."""
+    rows = [["left out", "online", "95 % region", "smoothed", "95 % region"], ["---"] * 5]
+    for name in result["parts"]["online"]:
+        cells = [name]
+        for mode in ("online", "smoothed"):
+            one = result["parts"][mode][name]
+            cells += [f"{one['ratio']:.3f}", f"{one['coverage']:.2f}"]
+        rows.append(cells)
+    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+
+
+def main(folders: Sequence[Path], studies: Sequence[str], *, every: int = 1) -> dict[str, Any]:
+    """Return the results of the studies, online and smoothed."""
+    result: dict[str, Any] = {name: {} for name in studies}
+    for smooth in (False, True):
+        those = groups(folders, smooth=smooth, every=every)
+        for name in studies:
+            study = (
+                left_out(those, smooth=smooth) if name == "left out" else parts(those[: len(folders)], smooth=smooth)
+            )
+            result[name]["smoothed" if smooth else "online"] = study
+    return result
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("folders", nargs="+", type=Path)
+    parser.add_argument("--studies", nargs="+", choices=("left out", "parts"), default=["left out", "parts"])
+    parser.add_argument("--every", type=int, default=1, help="use one recording in so many of each set")
+    parser.add_argument("--json", type=Path)
+    arguments = parser.parse_args()
+    scores = main(arguments.folders, arguments.studies, every=arguments.every)
+    if arguments.json:
+        write_json(arguments.json, scores)
