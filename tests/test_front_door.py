@@ -29,6 +29,7 @@ NAMES = {
         "allan_deviation",
         "check",
         "covariance_analysis",
+        "diagnose",
         "estimate",
         "fit_noise",
     ),
