@@ -41,8 +41,8 @@ SEARCHED = {
 }
 """Factors by which each parameter is multiplied."""
 
-LEAST_COVERAGE = 0.88
-"""Least coverage of the total, mean over a set, with which parameters are chosen."""
+MIN_COVERAGE = 0.88
+"""Minimum coverage of the total, mean over a set, with which parameters are chosen."""
 
 
 @contextmanager
@@ -133,9 +133,7 @@ def left_out(those: Sequence[Group], *, smooth: bool) -> dict[str, Any]:
             )
         for k, group in enumerate(model):
             others = {name: those[:k] + those[k + 1 :] for name, those in scores.items()}
-            enough = [n for n, s in others.items() if min(one["coverage"] for one in s) >= LEAST_COVERAGE] or [
-                "released"
-            ]
+            enough = [n for n, s in others.items() if min(one["coverage"] for one in s) >= MIN_COVERAGE] or ["released"]
             best = min(enough, key=lambda name: geometric_mean(others[name]))
             if not group.name.endswith("−"):
                 result[group.name] = {"chosen": best, **scores[best][k], "released": scores["released"][k]["ratio"]}
@@ -190,7 +188,7 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("folders", nargs="+", type=Path)
     parser.add_argument("--studies", nargs="+", choices=("left out", "parts"), default=["left out", "parts"])
-    parser.add_argument("--every", type=int, default=1, help="use one recording in so many of each set")
+    parser.add_argument("--every", type=int, default=1, help="use every N-th recording of each set")
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     scores = main(arguments.folders, arguments.studies, every=arguments.every)

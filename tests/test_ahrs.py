@@ -401,6 +401,14 @@ def rests_of(recording: Recording) -> starting.Rests:
     return starting.rests(recording, ahrs.HAND_HELD)
 
 
+def test_a_span_without_samples_of_the_accelerometer_is_no_rest():
+    """As over a gap filled by interpolation."""
+    quiet = quiet_second((4.0, -3.0, 2.0))
+    force = quiet.specific_force.copy()
+    force[200:380] = np.nan
+    np.testing.assert_array_equal(rests_of(dataclasses.replace(quiet, specific_force=force)).last, [199, 599])
+
+
 @pytest.mark.parametrize("rate", [(0.3, -0.2, 0.1), (4.0, -3.0, 2.0)])
 def test_the_mean_rate_at_rest_measures_the_bias_however_large(rate):
     found = rests_of(quiet_second(rate))

@@ -15,6 +15,7 @@ import pytest
 from typer.main import get_command
 
 import strapdown
+from benchmarks import recording_parameters, recordings
 from strapdown import quaternion
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -228,17 +229,16 @@ def write_walk(path):
     return angle
 
 
-def test_the_table_of_recordings_is_that_of_the_data_file():
-    """Error and coverage of the total of each set, to the digits printed."""
-    data = json.loads((README.parent / "docs" / "_data" / "recordings.json").read_text(encoding="utf-8"))
-    text = README.read_text(encoding="utf-8")
-    for name, online in data["online"].items():
-        (row,) = re.findall(rf"^\| {name}, (\d+) \| (.*) \|$", text, re.MULTILINE)
-        assert int(row[0]) == online["recordings"]
-        cells = [float(cell) for cell in row[1].split(" | ")]
-        both = online, data["smoothed"][name]
-        expected = [[one["ours_deg"][0], one["vqf_deg"][0], one["coverage"][0]] for one in both]
-        np.testing.assert_allclose(cells, np.ravel(expected), rtol=5e-3, atol=6e-3)
+def test_the_tables_of_recordings_are_those_of_the_data_files():
+    """As ``benchmarks/recordings.py`` and ``benchmarks/recording_parameters.py`` print them."""
+    page = (DOCS / "guide" / "recording.md").read_text(encoding="utf-8")
+    scores, parts = (
+        json.loads((DOCS / "_data" / f"{name}.json").read_text()) for name in ("recordings", "recording_parts")
+    )
+    assert len(scores["sets"]) == 8
+    for text in (README.read_text(encoding="utf-8"), page):
+        assert recordings.table(scores) in text
+    assert recording_parameters.table(parts) in page
 
 
 def test_the_code_of_the_readme_runs(blocks, tmp_path, monkeypatch, capsys):
