@@ -29,7 +29,7 @@ MAX_BY_FIELD = 0.3
 """Maximum σ of the accelerometer's error computed from the level of the field's disturbance, m/s²."""
 FIELD_LEVEL = 0.02
 """Mean NIS of the magnetometer in a field disturbed as that along the path of a phone indoors."""
-MAX_HEADING = 40.0
+MAX_HEADING = 38.0
 """Maximum factor on the variance of the heading."""
 FIRST_LEVEL = (0.01, 15.0)
 """Mean NIS of the magnetometer assumed at first, and the number of measurements that weigh as much."""
