@@ -92,7 +92,7 @@ def white(name, duration, **gyro):
 # -------------------------------------------------------------------------------------------------------------- exact relations
 
 
-@pytest.mark.parametrize("name", ["spin", "tumbling-satellite", "magnetometer-only", "slew-vibration"])
+@pytest.mark.parametrize("name", ["spin", "tumbling-satellite", "magnetometer-only", "slew-vibration", "ship"])
 def test_the_budget_of_a_matched_filter_adds_up_to_its_own_covariance(name):
     scenario = white(name, min(load_scenario(name).duration, 60.0))
     belief = setup.FilterSetup.for_scenario(scenario, states=False)
@@ -414,10 +414,10 @@ def test_coning_shows_as_the_bias_that_the_formula_gives():
 
 
 def monte_carlo(scenario, belief, runs, epochs, seed=3):
-    """Errors and NEES of independent runs: (runs, epochs + 1, 6), (runs, epochs + 1)."""
+    """Errors, NEES and NIS per degree of freedom of independent runs: (runs, epochs + 1, 6), (runs, epochs + 1), (runs,) by sensor."""
     steps = (len(scenario.edges) - 1) // belief.integration.samples
     every = steps // epochs
-    errors, nees = [], []
+    errors, nees, nis = [], [], {}
     for run in range(runs):
         record = simulate(scenario, seed, run)
         used = setup.modelled_record(record, belief)
@@ -426,12 +426,17 @@ def monte_carlo(scenario, belief, runs, epochs, seed=3):
         e = consistency.errors(estimate.attitude, estimate.bias, used.truth.attitude[::every], used.truth.bias[::every])
         errors.append(e)
         nees.append(consistency.nees(e, estimate.covariance))
-    return np.array(errors), np.array(nees)
+        for name, one in estimate.innovations.items():
+            nis.setdefault(name, []).append(one.nis.mean() / one.innovation.shape[1])
+    return np.array(errors), np.array(nees), {name: np.array(values) for name, values in nis.items()}
 
 
 def check_monte_carlo(scenario, belief, *, runs, epochs, probability=0.99):
     found = covariance.analyse(scenario, belief, epochs=epochs)
-    errors, nees = monte_carlo(scenario, belief, runs, epochs)
+    errors, nees, nis = monte_carlo(scenario, belief, runs, epochs)
+    for name, values in nis.items():
+        limit = norm.ppf(0.5 + 0.5 * probability ** (1.0 / len(nis))) * values.std() / np.sqrt(runs)
+        assert abs(values.mean() - found.expected_nis[name]) < limit + 0.002, name
     number = len(found.time) - 1
     C, mean, P = found.covariance, found.mean_error, found.filter_covariance
     each = 1.0 - (1.0 - probability) / number

@@ -97,15 +97,15 @@ def test_positive_definite_over_twelve_decades_of_noise_over_the_prior(exponent,
 @pytest.mark.parametrize("gate", [None, OPTIONS], ids=["plain", "gate"])
 @pytest.mark.parametrize("kind", ["direction", "vector", "attitude"])
 def test_what_needs_more_digits_than_a_covariance_has_is_refused(kind, gate, states):
-    """A measurement of a nanoradian at a start known to a radian; σ of a hundredth of that start is taken."""
+    """A nanoradian at a start known to a radian; a hundredth of that start, and 0.1 arcseconds at one known to 3 rad, are taken."""
     axis = np.array([0.0, 0.6, 0.8])
-    for sigma, refused in ((1e-9, True), (1e-2, False)):
+    for sigma, first, refused in ((1e-9, 1.0, True), (1e-2, 1.0, False), (0.1 * ARCSECOND, 3.0, False)):
         series = {"sensor": "star", "kind": kind, "time": [0.0], "sigma": sigma}
         series |= (
             {"attitude": [quaternion.IDENTITY]} if kind == "attitude" else {"vector_b": [axis], "reference_f": axis}
         )
         record = resting(VectorMeasurements(**series))
-        start = initial_state(quaternion.IDENTITY, attitude_sigma=1.0, bias_sigma=0.1)
+        start = initial_state(quaternion.IDENTITY, attitude_sigma=first, bias_sigma=0.1)
         if refused:
             with pytest.raises(InputError, match=REFUSED):
                 estimation.run(record, NOISE, start, states, gate=gate)

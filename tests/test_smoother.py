@@ -758,6 +758,22 @@ def test_sigmas_of_any_magnitude_are_smoothed_right() -> None:
     assert refused < 15
 
 
+def test_an_attitude_known_far_better_than_the_noise_of_a_step_stays() -> None:
+    """Known to 1e-9 rad, noise of 1e-3, then a milliradian measured: the first attitude moves by 1e-12 of it, the last by nearly all."""
+    turn = quaternion.exp([0.0, 0.0, 1e-3])
+    time = np.array([0.0, 1.0])
+    series = tuple(
+        dataclasses.replace(one, vector_b=quaternion.rotate(quaternion.conjugate(turn), one.vector_b))
+        for one in (exact(str(k), "vector", time[1:], axis, 1e-6) for k, axis in enumerate(np.eye(3)))
+    )
+    record = ImuRecord(time=time, increments=np.zeros((1, 3)), vectors=series)
+    start = estimation.initial_state(quaternion.IDENTITY, attitude_sigma=1e-9, bias_sigma=1e-9)
+    found = estimation.smooth(record, ProcessNoise(angle_random_walk=1e-3, rate_random_walk=0.0), start)
+    off = 2.0 * found.attitude[:, 3]
+    assert abs(off[0]) < 1e-14
+    assert off[1] == pytest.approx(1e-3, rel=1e-5)
+
+
 def test_a_filter_that_diverges_is_an_error() -> None:
     """From starts off by a radian or two: rates without end, and with a scale factor of σ 1 an attitude that is not a number."""
 

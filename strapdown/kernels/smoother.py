@@ -58,7 +58,7 @@ OPEN = (
     "turn_vectors",
     "write_transition",
 )
-CALLED = ("factorise", "solve", "subtract_products", "load_segment")
+CALLED = ("factorise", "solve", "subtract_products", "load_segment", "gather_small_columns", "clear_rows", "copy_rows")
 
 
 class Models(NamedTuple):
@@ -195,7 +195,7 @@ def step_back(segments, k, models, space):
     copy_state(predicted, after)
     advance(after, later_P, back, -dt, models.quiet, coefficients, 0.0)
     gather_noisy_columns(Q, gain)
-    gather_small_columns(P, Q, gain, kept, space.states, n, width)
+    small = gather_small_columns(P, Q, gain, kept, space.states, n, width)
     for i in range(0, n * width, WIDTH):
         store(P, i, load(P, i) + load(Q, i))
     factorise(P, n, width)
@@ -203,20 +203,19 @@ def step_back(segments, k, models, space):
     reduce_error(error, gain, kept, space.states, n)
     # N (Y Nᵀ + Q̄), Y the later covariance at the start: only rows and columns of states with noise differ from those of Y.
     rows_of_noisy(later_P, work)
-    scale_rows(work, kept)
+    if small:
+        clear_rows(work, kept, width)
     subtract_products(gain, later_P, work, n, noisy)
     scatter_noisy_columns(work, later_P)
     for i in range(0, n * width, WIDTH):
         store(later_P, i, load(later_P, i) + load(Q, i))
     rows_of_noisy(later_P, work)
-    scale_rows(work, kept)
+    if small:
+        clear_rows(work, kept, width)
     subtract_products(gain, later_P, work, n, noisy)
     rows_to_noisy(work, later_P)
-    for r in range(noisy):
-        if kept[r] == 0.0:  # in the other triangle the element would be a difference
-            k = space.states[r]
-            for i in range(n):
-                later_P[width * i + k] = later_P[width * k + i]
+    if small:
+        copy_rows(later_P, kept, space.states, n, width)
     correct_filtered(x, error, later_x, later_P)
 
 
@@ -232,22 +231,33 @@ def apply_error(error, top, coefficients):
 
 
 def gather_small_columns(P, Q, gain, kept, states, n, width):
-    """Write columns of −P, of its upper triangle, for the states whose variance is below their noise's."""
-    columns = len(gain) // n
+    """Write columns of −P, of its upper triangle, for the states whose variance is below their noise's; return whether there are any."""
+    columns, small = len(gain) // n, False
     for r in range(len(states)):
         k = states[r]
         kept[r] = 1.0
         if P[width * k + k] < Q[width * k + k]:
             kept[r] = 0.0
+            small = True
             for i in range(n):
                 gain[columns * i + r] = -P[width * min(i, k) + max(i, k)]
+    return small
 
 
-def scale_rows(A, factors):
-    """Multiply rows by 0 or 1."""
-    for r in range(len(factors)):
-        if factors[r] == 0.0:
-            scale_row(A, r, 0.0)
+def clear_rows(A, kept, width):
+    """Set the rows of these states to zero."""
+    for r in range(len(kept)):
+        for c in range(width):
+            A[width * r + c] *= kept[r]
+
+
+def copy_rows(P, kept, states, n, width):
+    """Copy the rows of these states to their columns, whose elements are differences."""
+    for r in range(len(kept)):
+        if kept[r] == 0.0:
+            k = states[r]
+            for i in range(n):
+                P[width * i + k] = P[width * k + i]
 
 
 def reduce_error(error, gain, kept, states, n):
