@@ -551,7 +551,8 @@ def test_a_recording_that_is_not_what_it_says_is_doubted(run, succeeds, recordin
     said = succeeds("estimate", recording, "--out", tmp_path / "out")
     words = "warning: probably gyro rates are 57.3 times too small (rad/s read as deg/s; --gyro-unit rad/s); specific force is 9.81"
     assert words in said
-    assert words in run("tune", recording, "--free", "")[1]  # which then ends for want of a parameter
+    # Which then ends for want of the parameter.
+    assert words in run("tune", recording, "--free", "nothing", "--out", tmp_path / "filter.toml")[1]
     assert f"See `strapdown doctor {recording}`." in said
 
 
