@@ -24,7 +24,7 @@ import numpy as np
 
 from strapdown import coning
 from strapdown.coning import ALGORITHMS, Algorithm
-from strapdown.files import write_json, written_beside
+from strapdown.files import atomic_write, write_json
 from strapdown.units import DEGREE
 
 DIGITS = 50
@@ -593,7 +593,7 @@ def draw(result: Result, folder: Path) -> list[Path]:
 
     def saved(name: str, figure: Any) -> None:
         path = folder / f"{name}.png"
-        with written_beside(path) as temporary, matplotlib.rc_context({"axes.formatter.min_exponent": 3}):
+        with atomic_write(path) as temporary, matplotlib.rc_context({"axes.formatter.min_exponent": 3}):
             figure.savefig(temporary, dpi=140, bbox_inches="tight")
         plt.close(figure)
         paths.append(path)

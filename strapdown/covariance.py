@@ -794,7 +794,7 @@ def analyse(
     >>> found = sd.covariance_analysis("two-stars")  # doctest: +SKIP
     >>> print(found)  # doctest: +SKIP
     """
-    scenario = scenarios.chosen(scenario)
+    scenario = scenarios.as_scenario(scenario)
     setup = FilterSetup.for_scenario(scenario) if setup is None else setup
     consider = Consider() if consider is None else consider
     _check_considered(scenario, consider)

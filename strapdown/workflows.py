@@ -41,7 +41,7 @@ from strapdown.estimation import setup as setups
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.setup import FilterSetup, for_record
 from strapdown.estimation.states import ProcessNoise, State
-from strapdown.files import reading, written_beside
+from strapdown.files import atomic_write, reading
 from strapdown.gyro import GyroSpec
 from strapdown.recordings import Recording, recordfiles
 from strapdown.recordings.attitudes import Attitudes, read_attitudes
@@ -178,7 +178,7 @@ def write(
                 f"{path}: a {type(content).__name__} is written as TOML without options; name a file *.toml"
             )
         text = setups.to_toml(content) if isinstance(content, FilterSetup) else scenarios.scenario_to_toml(content)
-        with written_beside(path) as temporary:
+        with atomic_write(path) as temporary:
             temporary.write_text(text, encoding="utf-8")
     elif isinstance(content, (ImuRecord, Estimate)) and Path(path).suffix.lower() in HDF5:
         save: Callable[..., None] = setups.write_estimate if isinstance(content, Estimate) else recordfiles.write_record
@@ -772,7 +772,7 @@ def monte_carlo(
     """
     from strapdown import montecarlo
 
-    chosen = plan(scenarios.chosen(scenario), setup=setup, seed=seed, states=states, dispersions=dispersions)
+    chosen = plan(scenarios.as_scenario(scenario), setup=setup, seed=seed, states=states, dispersions=dispersions)
     return montecarlo.run_plan(chosen, runs=runs, threads=threads, progress=progress)
 
 

@@ -12,12 +12,19 @@ from typing import Any
 import numpy as np
 
 import strapdown
-from strapdown import estimation, gyro, motion, scenarios, vectors
+from strapdown import estimation, gyro, motion, scenarios, tuning, vectors
 from strapdown.estimation import setup
 from strapdown.motion.orbit import CircularOrbit
 from strapdown.tuning.diagnosis import Cause
 
-FOR_CHECKERS = {"CircularOrbit": CircularOrbit, "GyroSpec": gyro.GyroSpec, "Scenario": scenarios.Scenario}
+FOR_CHECKERS = {
+    "CircularOrbit": CircularOrbit,
+    "GyroSpec": gyro.GyroSpec,
+    "Scenario": scenarios.Scenario,
+    "TunedGate": tuning.TunedGate,
+    "Comparison": tuning.Comparison,
+    "Unmodelled": tuning.Unmodelled,
+}
 """Types that a module imports for type checkers alone: they stand above it."""
 
 

@@ -129,8 +129,8 @@ def test_bad_tables_are_refused_with_their_place(table, words):
         (lambda: FilterSetup(process_noise=NOISE, bias_sigma=1e-5, states={}), "states is {}, not of class States"),
         (lambda: States(sensors={"mag": {}}), "must be SensorStates"),
         (lambda: setup.run(simulated(), chosen(States(sensors={"map": SensorStates(bias_sigma=1.0)})), None), "'mag'"),
-        (lambda: WHOLE.chosen(("gyro.scael",)), "did you mean 'gyro.scale'"),
-        (lambda: States().chosen(("gyro.scale",)), "no states are declared"),
+        (lambda: WHOLE.select(("gyro.scael",)), "did you mean 'gyro.scale'"),
+        (lambda: States().select(("gyro.scale",)), "no states are declared"),
         (lambda: run(uneven(), chosen(States(sensors={"acc": SensorStates(lever_arm_sigma=0.1)}))), "equal gyro intervals"),
         (lambda: run(simulated(duration=1.0), chosen(States(sensors={"acc": SensorStates(lever_arm_sigma=0.1)}))), "needs 100"),
         (lambda: error_states.LeverArm(sensor="acc", arm_sigma=0.0), "arm_sigma is 0"),
@@ -558,10 +558,10 @@ def test_individuals_are_drawn_with_the_reported_errors_for_sigma():
 
 
 def test_chosen_states_are_those_named():
-    part = WHOLE.chosen(("gyro.drift", "acc.lever"))
+    part = WHOLE.select(("gyro.drift", "acc.lever"))
     assert part.names == ("gyro.drift", "acc.lever")
     assert part.gyro_fast_bias_sigma == WHOLE.gyro_fast_bias_sigma
-    assert WHOLE.chosen(WHOLE.names) == WHOLE
+    assert WHOLE.select(WHOLE.names) == WHOLE
     assert WHOLE.names == (
         "gyro.scale", "gyro.misalignment", "gyro.force", "gyro.drift", "mag.mounting", "mag.bias", "acc.lever", "acc.correlated",
     )  # fmt: skip

@@ -630,10 +630,10 @@ def test_a_setup_holds_it_to_the_last_bit(one):
     assert setup.from_toml(text) == chosen
     assert "velocity_time_s = 0.3" in text
     assert "acc.velocity" in chosen.states.names
-    kept = chosen.states.chosen(("acc.velocity",))
+    kept = chosen.states.select(("acc.velocity",))
     assert kept.sensors["acc"] == dataclasses.replace(one, bias_sigma=0.0)
     if _more_than_velocity(one):
-        assert chosen.states.chosen(("acc.bias",)).sensors["acc"] == SensorStates(bias_sigma=one.bias_sigma)
+        assert chosen.states.select(("acc.bias",)).sensors["acc"] == SensorStates(bias_sigma=one.bias_sigma)
 
 
 def _more_than_velocity(one: SensorStates) -> bool:

@@ -10,7 +10,7 @@ from contextlib import nullcontext
 import pytest
 
 from strapdown.checks import InputError
-from strapdown.files import locked, tables, write_json, written_beside
+from strapdown.files import atomic_write, locked, tables, write_json
 
 
 def names(folder) -> list[str]:
@@ -19,7 +19,7 @@ def names(folder) -> list[str]:
 
 def test_the_target_appears_only_at_the_end(tmp_path):
     target = tmp_path / "new" / "folder" / "result.png"
-    with written_beside(target) as temporary:
+    with atomic_write(target) as temporary:
         assert temporary.parent == target.parent
         assert temporary.suffix == ".png"
         assert temporary != target
@@ -39,7 +39,7 @@ def test_an_interrupted_write_leaves_the_old_file_and_no_temporary(tmp_path, err
     target.write_text("old")
 
     def interrupted() -> None:
-        with written_beside(target) as temporary:
+        with atomic_write(target) as temporary:
             temporary.write_text("half of the n")
             raise error
 
@@ -51,7 +51,7 @@ def test_an_interrupted_write_leaves_the_old_file_and_no_temporary(tmp_path, err
 
 def test_a_failed_first_write_leaves_nothing(tmp_path):
     def failing() -> None:
-        with written_beside(tmp_path / "result.json") as temporary:
+        with atomic_write(tmp_path / "result.json") as temporary:
             temporary.write_text("half")
             raise OSError("disk full")
 
@@ -63,7 +63,7 @@ def test_a_failed_first_write_leaves_nothing(tmp_path):
 def test_a_writer_that_removes_or_replaces_the_temporary_is_served(tmp_path):
     """h5py truncates, matplotlib reopens; some writers rename over what they were given."""
     target = tmp_path / "result.txt"
-    with written_beside(target) as temporary:
+    with atomic_write(target) as temporary:
         other = tmp_path / "other"
         other.write_text("from elsewhere")
         other.replace(temporary)
@@ -73,7 +73,7 @@ def test_a_writer_that_removes_or_replaces_the_temporary_is_served(tmp_path):
 
 def test_two_writers_at_once_do_not_meet(tmp_path):
     target = tmp_path / "result.txt"
-    with written_beside(target) as first, written_beside(target) as second:
+    with atomic_write(target) as first, atomic_write(target) as second:
         assert first != second
         first.write_text("first")
         second.write_text("second")
@@ -166,7 +166,7 @@ def test_links_beside_an_output_do_not_lead_to_what_is_overwritten(tmp_path, nam
             pass
         assert not target.exists()
     else:
-        with written_beside(target, durable=True) as temporary:
+        with atomic_write(target, durable=True) as temporary:
             temporary.write_text("whole")
         assert target.read_text() == "whole"
     assert victim.read_text() == "precious"
@@ -187,7 +187,7 @@ def test_files_have_the_permissions_of_the_umask_or_of_what_they_replace(tmp_pat
     before = os.umask(umask)
     try:
         for expected in (mode, 0o640):
-            with written_beside(target, durable=durable) as temporary:
+            with atomic_write(target, durable=durable) as temporary:
                 temporary.write_text("{}")
             assert target.stat().st_mode & 0o777 == expected
             target.chmod(0o640)

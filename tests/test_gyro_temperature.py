@@ -251,8 +251,8 @@ def test_the_matched_filter_has_the_slope_and_a_plain_one_is_named_for_lacking_i
     states = setup.FilterSetup.for_scenario(linear, states=True).states
     np.testing.assert_allclose(states.gyro_temperature_sigma, [1e-5, 2e-5, 0.0], rtol=1e-12)
     assert "gyro.temperature" in states.names
-    assert states.chosen(("gyro.temperature",)).gyro_temperature_sigma == states.gyro_temperature_sigma
-    assert states.chosen(()).names == ()
+    assert states.select(("gyro.temperature",)).gyro_temperature_sigma == states.gyro_temperature_sigma
+    assert states.select(()).names == ()
     (block,) = states.blocks({})
     np.testing.assert_allclose(block.sigma, [1e-5, 2e-5, 2e-11], rtol=1e-12)  # an axis without one is none, in effect
     missing = "the gyro's bias over temperature"

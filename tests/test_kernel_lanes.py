@@ -19,10 +19,10 @@ from strapdown.kernels.filter_step import predict, update_direction
 from strapdown.kernels.lane_angles import arctangent, inverse_root, rotation_vector
 from strapdown.kernels.lane_values import (
     WIDTH,
-    anywhere,
+    all_lanes,
+    any_lane,
     bits_of,
-    chosen,
-    everywhere,
+    broadcast,
     flush_tiny,
     halves,
     lanes_of,
@@ -35,11 +35,11 @@ from strapdown.kernels.lane_values import (
     number_of_bits,
     number_where,
     restore_mode,
+    select,
     signed_number,
-    spread,
     store,
     store_quadruples,
-    total,
+    sum_lanes,
 )
 from strapdown.kernels.rotation import rotation_matrix
 
@@ -109,7 +109,7 @@ def test_numbers_are_spread():
         for _ in range(2):
             x = x + load(a, 0)  # a number at first, then lanes
         store(out, 0, 2 - 0.5 * x * s)
-        store(out, 8, -spread(s))
+        store(out, 8, -broadcast(s))
 
     out = np.empty(2 * WIDTH)
     kernel(apply)(A, 0.3, out)
@@ -135,8 +135,8 @@ def test_comparisons_and_choice(name):
         x = load(a, 0)
         y = load(b, 0)
         condition = operation(x, y)
-        store(out, 0, chosen(condition, x, 7.0))
-        return everywhere(condition), anywhere(condition)
+        store(out, 0, select(condition, x, 7.0))
+        return all_lanes(condition), any_lane(condition)
 
     fast = kernel(apply)
     mixed = np.array([1.0, 2.0, 3.0, math.nan, 1.0, math.inf, -0.0, 5.0])
@@ -150,7 +150,7 @@ def test_comparisons_and_choice(name):
 
 def test_choices_take_floats_and_plain_conditions():
     def choose(a, b):
-        return chosen(a > b, a, 3.0), everywhere(a > b), anywhere(a < b)
+        return select(a > b, a, 3.0), all_lanes(a > b), any_lane(a < b)
 
     assert kernel(choose)(2.0, 1.0) == (2.0, True, False)
     assert kernel(choose)(1.0, 2.0) == (3.0, False, True)
@@ -232,7 +232,7 @@ def test_any_number_of_lanes(width, dtype):
         counts[0] = n
         counts[1] = number_where(x > 0.0)
         restore_mode(mode)
-        return total(x)
+        return sum_lanes(x)
 
     a, doubles = RANDOM.standard_normal(width + 1).astype(dtype), RANDOM.standard_normal(width + 1)
     results = []

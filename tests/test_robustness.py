@@ -338,7 +338,7 @@ def test_a_record_in_single_intervals_recovers_as_the_whole_does():
 
 def judged(outcomes, recovery=3, limit=4):
     """Rows of a gate with two sensors after outcomes (sensor, filter's, candidate's or None); verdicts, recoveries and lock-outs."""
-    memory, counters = np.zeros(gate_rules.MEMORY), np.zeros((2, gate_rules.STANDING))
+    memory, counters = np.zeros(gate_rules.MEMORY), np.zeros((2, gate_rules.COUNTERS))
     counters[:, gate_rules.REPORTED] = -1.0
     lock_outs, count, found = np.zeros((9, 4)), 0, []
     for k, (sensor, mine, other) in enumerate(outcomes):

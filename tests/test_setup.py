@@ -235,7 +235,7 @@ def test_with_states_there_is_less_that_is_not_covered():
             setup.unmodelled_errors(chosen.gyro, chosen.sensors, filter_setup.states, gravity_f=chosen.gravity_f) == ()
         )
     held = scenarios.load_scenario("hand-held")
-    part = setup.FilterSetup.for_scenario(held, states=True).states.chosen(("gyro.drift", "accelerometer.lever"))
+    part = setup.FilterSetup.for_scenario(held, states=True).states.select(("gyro.drift", "accelerometer.lever"))
     words = " and ".join(setup.unmodelled_errors(held.gyro, held.sensors, part))
     assert "correlated noise of the magnetometer" in words
     assert "lever arm" not in words

@@ -52,7 +52,7 @@ def test_a_scale_factor_that_the_walk_of_the_bias_stands_for_is_found_with_its_s
         assert np.all(np.abs(size.value - 1e-3) < 4.0 * size.standard_error)
         assert np.all(size.standard_error[:2] < 4e-4)
         assert any("scale factor of the gyro" in words for words in found.words)
-        notes = {parameter.name: parameter.note for parameter in tuning.doubted(result, found).parameters}
+        notes = {parameter.name: parameter.note for parameter in tuning.with_misfit_flag(result, found).parameters}
         doubted += "in doubt" in notes["gyro.rrw"]
         assert not any("in doubt" in note for name, note in notes.items() if name != "gyro.rrw")
         assert json.dumps(found.summary())
@@ -68,7 +68,7 @@ def test_of_right_filters_hardly_one_is_suspected():
         gains.append(found.scale_factor.gain)
         if not found.suspected:
             assert found.words == ()
-            assert tuning.doubted(result, found) is result
+            assert tuning.with_misfit_flag(result, found) is result
     assert suspected <= 1
     assert np.mean(gains) < 6.0  # the largest of three χ² of three degrees of freedom, all but the same
 

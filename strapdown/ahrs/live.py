@@ -26,7 +26,7 @@ from strapdown.recordings.sensor_delays import ASSUMED_SIGMA, GIVEN_SIGMA
 from strapdown.records.recording import LARGEST_RATE, Recording
 from strapdown.vectors import VectorMeasurements
 
-MOST = 4
+MAX_SAMPLES_RATIO = 4
 """Samples of a step, in multiples of the usual number, above which the declared interval is wrong."""
 
 
@@ -120,7 +120,7 @@ class LiveAhrs:
     def _arrays(self, late: float, sigma: float) -> kernel.Imu:
         """Return the kernel's arrays."""
         k, parameters = recording_steps, self.parameters
-        most = MOST * max(1, math.ceil(parameters.step / self.interval)) + 2
+        most = MAX_SAMPLES_RATIO * max(1, math.ceil(parameters.step / self.interval)) + 2
         parts, part = starting.rest_length(self.interval)
         span = parts * part
         time, rate, turned = np.zeros(2), np.zeros((2, 3)), np.zeros((2, 4))

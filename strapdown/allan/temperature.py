@@ -35,7 +35,7 @@ __all__ = [
 
 MAX_PASSES = 50
 """Maximum number of iterations for the noise terms."""
-SETTLED = 1e-6
+LIKELIHOOD_TOLERANCE = 1e-6
 """Smallest increase of the log-likelihood of a further iteration."""
 SHORTEST_STEP = 1e-6
 FLICKER, WALK = TERMS.index("bias_instability"), TERMS.index("rate_random_walk")
@@ -226,7 +226,7 @@ def _maximised(bins: _Bins, start: Array, free: NDArray[np.bool_]) -> _Fit:
         gain = fit.loss - trial.loss
         if gain > 0.0:
             fit = trial
-        if gain < SETTLED:
+        if gain < LIKELIHOOD_TOLERANCE:
             break
     return fit
 

@@ -50,7 +50,7 @@ FREE_STEPS = 3
 """Number of steps with the initial noise."""
 PROBES = 16
 """Random vectors with which the redundancy of each kind of equation is estimated."""
-SETTLED = 0.02
+NOISE_TOLERANCE = 0.02
 """Relative change of the noise below which it is final."""
 WINDOW = 8.0
 """Length of the windows in which the spectra of velocity and disturbance are computed, s."""
@@ -352,7 +352,7 @@ def _iterated(problem: Problem, x: Unknowns, weak: Array, *, noise: bool) -> Unk
             J = found.jacobian
         r = found.residual
         x, damping, gain = _descended(problem, x, (J.T @ J).tocsc() + prior, J.T @ r, float(r @ r), damping)
-        if (not noise or step > 2 * FREE_STEPS) and changed < SETTLED and gain < 1e-4:
+        if (not noise or step > 2 * FREE_STEPS) and changed < NOISE_TOLERANCE and gain < 1e-4:
             break
     return x
 

@@ -9,7 +9,7 @@ import typer
 
 from strapdown.cli.progress import progress_bar
 from strapdown.cli.reading import RECORDING_HELP, Layout
-from strapdown.cli.terminal import command, doubt, need_own, show, written
+from strapdown.cli.terminal import command, need_own, show, warn_about_conventions, written
 from strapdown.files import writable
 
 
@@ -35,7 +35,7 @@ def calibrate(
     with progress_bar("reading"):
         sources = [files.read(path, **layout.options(path)) for path in recordings]
     for source, path in zip(sources, recordings, strict=True):
-        doubt(source, path)
+        warn_about_conventions(source, path)
     with progress_bar("calibrating"):
         found = calibration.calibrate(sources, gravity=gravity)
     show(found.listing())

@@ -19,7 +19,7 @@ from strapdown.cli.terminal import (
     command,
     console,
     counted,
-    given,
+    options_given,
     scenario_named,
     show,
     tables_folder,
@@ -146,7 +146,7 @@ def _planned(source: Path, scenario: str, model: _Model, machine: str) -> tuple[
     held = campaigns.read(source)
     if model.filter_file is not None and (own := own_filter(model.filter_file)) is not None:
         held, model = _with_filter(held, own, source), replace(model, filter_file=None)
-    for name in given(model):
+    for name in options_given(model):
         raise InputError(f"{name} is given, but {source} contains its own; leave it out, or name a scenario")
     return held, held.plan
 
@@ -173,12 +173,12 @@ def _computed(plan: Plan, target: Path, name: str, computing: _Computing, output
     engine.in_threads(computing.threads)  # checks the number
     console.print(f"{plan.scenario.name or name}: {counted(runs, 'run')}, seed {plan.seed}, machine: {choice}.")
     with contextlib.ExitStack() as stack:
-        hands = None
+        workers = None
         if computing.workers is not None or computing.cluster is not None:
             from strapdown.montecarlo.cluster import dask_client, on_dask
 
             client = stack.enter_context(dask_client(workers=computing.workers, address=computing.cluster))
-            hands = on_dask(client)
+            workers = on_dask(client)
             console.print(f"Dask at {client.scheduler.address}: {sum(client.nthreads().values())} worker threads.")
         stop_if_asked = stack.enter_context(asked_to_stop())
         advance = stack.enter_context(progress_bar("runs", runs, rate="runs/s"))
@@ -197,7 +197,7 @@ def _computed(plan: Plan, target: Path, name: str, computing: _Computing, output
                 chunk=computing.chunk,
                 machine=computing.machine,
                 threads=computing.threads,
-                workers=hands,
+                workers=workers,
                 progress=advanced,
             )
         except KeyboardInterrupt:

@@ -19,11 +19,11 @@ from strapdown.cli.terminal import (
     FigureFormat,
     command,
     console,
-    doubt,
-    given,
     need_own,
+    options_given,
     say,
     show,
+    warn_about_conventions,
     written,
 )
 from strapdown.files import usable_folder, writable, write_json
@@ -194,11 +194,11 @@ def estimate(
     need_own(out / FILES[0], "estimate", lambda path: reading.kind(path) == "strapdown estimate")
     reading_options = layout.options(recording)
     simulated = is_record(recording)
-    if simulated and (options := given(recorded)):
+    if simulated and (options := options_given(recorded)):
         raise InputError(
             f"{options[0]} goes with a recording without a specification; {recording} contains one, of `strapdown simulate`"
         )
-    if not simulated and (options := given(specified)):
+    if not simulated and (options := options_given(specified)):
         raise InputError(
             f"{options[0]} goes with a recording that contains its specification, as those of `strapdown simulate`; {recording} does not"
         )
@@ -462,7 +462,7 @@ def _estimate_recording(
         raise InputError(
             f"{recording}: no sample to judge has a reference attitude; check its movement mask and its reference"
         )
-    doubt(source, recording)
+    warn_about_conventions(source, recording)
     with progress_bar("smoothing" if shared.smooth else "filtering"):
         run = workflows.estimate_recording(
             source,

@@ -16,8 +16,8 @@ from strapdown.cli.terminal import (
     command,
     console,
     counted,
-    given,
     json_target,
+    options_given,
     put_json,
     say,
     show,
@@ -101,7 +101,7 @@ def check(
         raise InputError(
             "--record goes with an estimate of `strapdown estimate` without --truth; leave out --truth or --record"
         )
-    for name in given(foreign) if foreign.truth is None else ():
+    for name in options_given(foreign) if foreign.truth is None else ():
         if name not in ("--topic", "--truth-topic"):
             raise InputError(f"{name} goes with --truth; give a reference, or leave it out")
     if foreign.truth is not None or not own:

@@ -10,7 +10,7 @@ from typing import Any
 import typer
 
 from strapdown.checks import InputError, one_of
-from strapdown.cli.terminal import given
+from strapdown.cli.terminal import options_given
 
 RECORDING_HELP = (
     "Recording of any format: table (CSV, TSV, Parquet) with time, gx, gy, gz[, ax, ay, az[, mx, my, mz]], ROS bag, ULog, EuRoC folder, "
@@ -43,7 +43,7 @@ class Samples:
         """Return the options of :func:`strapdown.recordings.read` that are given; a simulated record takes none of them."""
         from strapdown import recordings
 
-        if (options := given(self)) and recordings.is_record(path):
+        if (options := options_given(self)) and recordings.is_record(path):
             what = {"--topic": "a bag or a flight log", "--axes": "a recording", "--invert": "a recording"}
             own = "contains its units" if options[0].endswith("-unit") else "needs none"
             raise InputError(f"{options[0]} applies to {what.get(options[0], 'a table')}; the record {path} {own}")

@@ -26,7 +26,7 @@ from strapdown.cli.terminal import (
     tables_written,
     written,
 )
-from strapdown.files import plain, usable_folder, writable, write_json, written_beside
+from strapdown.files import atomic_write, plain, usable_folder, writable, write_json
 from strapdown.results import Column, Table
 
 if TYPE_CHECKING:
@@ -140,7 +140,7 @@ class _Exports:
             "imu_sensor.m": lambda: parameters.to_matlab(fits, source=source),
         }
         for name in self.files:
-            with written_beside(out / name) as temporary:
+            with atomic_write(out / name) as temporary:
                 temporary.write_text(made[name](), encoding="utf-8")
         if self.files:
             written(*(out / name for name in self.files))
@@ -274,7 +274,7 @@ def _saved(
     from strapdown.allan import parameters
 
     specification, numbers = (output.out / name for name in _names(fit.sensor)[:2])
-    with written_beside(specification) as temporary:
+    with atomic_write(specification) as temporary:
         temporary.write_text(parameters.to_specification(fit, f"{recording.name}, {length}"), encoding="utf-8")
     content = {
         "source": recording.name,
@@ -327,7 +327,7 @@ def _regressed(recording: Path, sensor: str, source: GyroSamples, order: int, ou
     unit, stem = _UNITS[sensor]
     show(fit.listing(unit))
     paths.append(out / _names(sensor)[3])
-    with written_beside(paths[-1]) as temporary:
+    with atomic_write(paths[-1]) as temporary:
         text = commented(
             [f"Bias over temperature by `strapdown allan` from {recording.name}, a polynomial in T - reference."]
         )

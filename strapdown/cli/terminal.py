@@ -76,7 +76,7 @@ def _options(group: Any) -> list[inspect.Parameter]:
     return found
 
 
-def given(group: Any) -> list[str]:
+def options_given(group: Any) -> list[str]:
     """Return the options of a group that were given, as on the command line."""
     flags = []
     for field in dataclasses.fields(group):
@@ -193,7 +193,7 @@ def need_own(target: Path, command: str, own: Callable[[Path], bool]) -> None:
         )
 
 
-def doubt(source: Recording, path: Path) -> None:
+def warn_about_conventions(source: Recording, path: Path) -> None:
     """Warn if axes, signs or units of a recording seem wrong."""
     from strapdown.ahrs import check_conventions
 

@@ -17,15 +17,15 @@ from strapdown.cli.terminal import (
     FigureFormat,
     command,
     console,
-    doubt,
     need_own,
     say,
     show,
     tables_folder,
     tables_written,
+    warn_about_conventions,
     written,
 )
-from strapdown.files import writable, write_json, written_beside
+from strapdown.files import atomic_write, writable, write_json
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -221,7 +221,7 @@ def _sources(
             recording = recordings.read(path, **layout.options(path))
             say(recording.left_out_words)
             ahrs.need_accelerometer(recording)
-            doubt(recording, path)
+            warn_about_conventions(recording, path)
             sources.append(recording)
             continue
         record = recordfiles.read_record(path)
@@ -247,7 +247,7 @@ def _write(result: Tuning, objective: Any, paths: Sequence[Path], output: _Outpu
     from strapdown.report import tunings
 
     out = output.out
-    with written_beside(out) as temporary:
+    with atomic_write(out) as temporary:
         temporary.write_text(to_toml(result.setup), encoding="utf-8")
     places = {name: out.with_name(f"{out.stem}-{name}.{output.form}") for name in FIGURES}
     for place in places.values():  # of an earlier tuning, which may have had more of them, or in another format

@@ -24,7 +24,7 @@ import strapdown
 from strapdown.checks import InputError, one_of
 from strapdown.codegen import c, design, javascript
 from strapdown.estimation.setup import FilterSetup, read_setup, to_toml
-from strapdown.files import usable_folder, writable, written_beside
+from strapdown.files import atomic_write, usable_folder, writable
 from strapdown.records import ImuRecord
 from strapdown.vectors import VectorMeasurements, VectorSensor
 
@@ -95,7 +95,7 @@ def export(
     paths = [Path(folder) / name for name in made]
     writable("folder", *paths)
     for path, text in zip(paths, made.values(), strict=True):
-        with written_beside(path) as temporary:
+        with atomic_write(path) as temporary:
             temporary.write_text(text, encoding="utf-8")
     return tuple(paths)
 

@@ -244,7 +244,7 @@ def measured_values(m: Any, sensor: Sensor, value: Any) -> tuple[Any, Any]:
         return sensor.variances, (*(x / norm for x in value), 0.0, 0.0, 0.0, 0.0, 0.0)
     off = squared - 1.0
     as_it_is = (off > -UNIT) & (off < UNIT)
-    return tuple(m.chosen(as_it_is, x, x / norm) for x in value), sensor.frame
+    return tuple(m.select(as_it_is, x, x / norm) for x in value), sensor.frame
 
 
 def take_row(m: Any, program: Program, f: SimpleNamespace, row: Any, residual: Any, variance: Any, step: Any) -> None:
@@ -271,7 +271,7 @@ def initialize(m: Any, program: Program, f: SimpleNamespace, attitude: Any) -> N
     usable = (squared >= SHORTEST_SQUARED) & (squared <= LONGEST_SQUARED)
     norm = m.root(squared)
     for i, x in enumerate(attitude):
-        f.x[i] = m.chosen(usable, x / norm, 1.0 if i == 0 else 0.0)
+        f.x[i] = m.select(usable, x / norm, 1.0 if i == 0 else 0.0)
     for i in range(4, program.n + 1):
         f.x[i] = 0.0
     place = 0

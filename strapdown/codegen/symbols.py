@@ -1,7 +1,7 @@
 """Symbols that trace formulas: executing a kernel on them records its operations, equal ones once.
 
 A number that is known while tracing stays a Python float, and zeros and ones vanish as they do in the kernels. A condition on symbols has
-no truth value: :meth:`Trace.anywhere` has the function under :meth:`Trace.fork` executed for both outcomes, and what differs between the
+no truth value: :meth:`Trace.any_lane` has the function under :meth:`Trace.fork` executed for both outcomes, and what differs between the
 two results becomes a selection, which :mod:`strapdown.codegen.regions` writes as an ``if``.
 """
 
@@ -27,7 +27,7 @@ class Symbol:
 
     def __bool__(self) -> bool:
         raise TypeError(
-            f"a condition ({self.kind}) that is known only on the target; a kernel must use anywhere or chosen"
+            f"a condition ({self.kind}) that is known only on the target; a kernel must use any_lane or select"
         )
 
     def __add__(self, other: Any) -> Any:
@@ -145,7 +145,7 @@ class Trace:
         """Return √x."""
         return self.symbol("sqrt", x) if isinstance(x, Symbol) else math.sqrt(x)
 
-    def chosen(self, condition: Any, a: Any, b: Any) -> Any:
+    def select(self, condition: Any, a: Any, b: Any) -> Any:
         """Return a where the condition holds, else b."""
         if isinstance(condition, Symbol) and condition in self.outcomes:
             condition = self.outcomes[condition]
@@ -155,7 +155,7 @@ class Trace:
             return a
         return self.symbol("select", condition, a, b)
 
-    def anywhere(self, condition: Any) -> bool:
+    def any_lane(self, condition: Any) -> bool:
         """Return the outcome of a condition under :meth:`fork`."""
         if not isinstance(condition, Symbol):
             return bool(condition)
@@ -181,8 +181,8 @@ class Trace:
                 del self.outcomes[condition]
                 effects.append([array.copied() for array in self.arrays])
             for array, (known, _), (_, true), (_, false) in zip(self.arrays, before, *effects, strict=False):
-                array.merge(known, lambda a, b: self.chosen(condition, a, b), true, false)
-            return tuple(self.chosen(condition, a, b) for a, b in zip(*results, strict=True))
+                array.merge(known, lambda a, b: self.select(condition, a, b), true, false)
+            return tuple(self.select(condition, a, b) for a, b in zip(*results, strict=True))
 
         return both
 

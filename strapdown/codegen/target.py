@@ -27,8 +27,8 @@ class Target(Function):
         trace = self.trace
         helpers = {
             "square_root": trace.square_root,
-            "chosen": trace.chosen,
-            "anywhere": trace.anywhere,
+            "select": trace.select,
+            "any_lane": trace.any_lane,
             "far_turn": self._far_turn,
             "load": load,
             "spread": spread,
@@ -36,7 +36,7 @@ class Target(Function):
             "math": SimpleNamespace(expm1=lambda x: trace.symbol("expm1", x), nan=float("nan"), pi=3.141592653589793),
         }
         self.kernels = Kernels(program.kernels, helpers, dict.fromkeys(FORKED, trace.fork))
-        self.chosen, self.root = trace.chosen, trace.square_root
+        self.select, self.root = trace.select, trace.square_root
         self.state = SimpleNamespace(
             x=self.array(name_of_state),
             P=self.array(lambda i: f"f->P[{i}]"),

@@ -14,11 +14,11 @@ ORDERS = (3, 5, 7)
 WINDOWS = (5, 7, 9, 11, 13, 17, 21, 25, 31, 37, 45, 53, 61)
 """Windows tried, number of samples."""
 _REACH = WINDOWS[-1] // 2
-MOST = 20000
+MAX_SAMPLES = 20000
 """Maximum number of samples from which order and window are chosen."""
-LASTING = 4.0
+BIAS_WEIGHT = 4.0
 """Weight of the bias due to curvature within the window relative to noise."""
-LEAST = 100
+MIN_SAMPLES = 100
 """Minimum number of samples, to separate noise from motion; more than the longest window."""
 UNEVEN = 0.01
 """Maximum difference of the gyro's intervals from their mean, relative to it."""
@@ -42,9 +42,9 @@ def turning(record: ImuRecord, time: Array) -> tuple[Array, Array]:
             f"a lever arm needs equal gyro intervals, but that from {record.time[k]:.9g} s is {dt[k]:.6g} s, "
             f"the mean {mean:.6g} s; cut the record, or leave the lever arm out"
         )
-    if len(dt) < LEAST:
+    if len(dt) < MIN_SAMPLES:
         raise InputError(
-            f"a lever arm needs {LEAST} gyro samples or more, to separate noise from motion; the record has {len(dt)}"
+            f"a lever arm needs {MIN_SAMPLES} gyro samples or more, to separate noise from motion; the record has {len(dt)}"
         )
     rates = record.rates
     white = np.mean(np.diff(rates, 5, axis=0) ** 2, axis=0) / 252.0
@@ -55,7 +55,7 @@ def turning(record: ImuRecord, time: Array) -> tuple[Array, Array]:
     def slope(order: int, window: int) -> Array:
         return np.asarray(savgol_filter(rates, window, order, deriv=1, delta=mean, axis=0))
 
-    bending = np.diff(rates[:MOST], 2, axis=0).T
+    bending = np.diff(rates[:MAX_SAMPLES], 2, axis=0).T
     products = [_products(axis) for axis in bending]
     tried = [(order, window) for order in ORDERS for window in WINDOWS if window >= order + 2]
     noises, bends = [], []
@@ -65,7 +65,7 @@ def turning(record: ImuRecord, time: Array) -> tuple[Array, Array]:
         bent -= white * float(apart[_REACH] @ apart[_REACH])
         noises.append(white * float(np.sum(weights(order, window) ** 2)))
         bends.append(np.maximum(bent, 0.0))
-    best = int(np.argmin(np.sum(np.array(noises) + LASTING * np.array(bends), axis=1)))
+    best = int(np.argmin(np.sum(np.array(noises) + BIAS_WEIGHT * np.array(bends), axis=1)))
     order, window = tried[best]
     acceleration = slope(order, window)
     h, sharper = weights(order, window), weights(order, _half(order, window))

@@ -363,7 +363,7 @@ class Judge:
         restart = gate.Restart(
             restart_bias_variance(self.gate, self.problem.initial), start.values, start.covariance, start.start
         )
-        return gate.Body(form=form, options=self.options, restart=restart, standing=self.counters, memory=self.memory)
+        return gate.Body(form=form, options=self.options, restart=restart, counters=self.counters, memory=self.memory)
 
     def outputs(self, form: structure.Outputs) -> gate.Outputs:
         """Return arrays for the outputs of the gate in addition to the filter's.
@@ -423,7 +423,7 @@ def gate_options(gate_: Gate | None, robust: Robust | None) -> gate.Options:
 
 def remembered(gate_: Gate | None, memory: GateMemory | None, sensors: tuple[str, ...]) -> tuple[Array, Array]:
     """Return the gate's state with which a kernel continues: its ``memory``, and ``counters`` of these sensors."""
-    counts, counters = np.zeros(gate_rules.MEMORY), np.zeros((len(sensors), gate_rules.STANDING))
+    counts, counters = np.zeros(gate_rules.MEMORY), np.zeros((len(sensors), gate_rules.COUNTERS))
     counts[gate_rules.PASSES] = 1.0
     if gate_ is not None and memory is not None:
         counts[:] = memory.counts

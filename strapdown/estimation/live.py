@@ -34,7 +34,7 @@ from strapdown.kernels.walk import walk
 from strapdown.records import Event, ImuRecord, Innovations
 from strapdown.vectors import KINDS, VectorMeasurements, VectorSensor, need_level, triad
 
-MOST = 64
+MAX_MEASUREMENTS = 64
 """Maximum number of measurements within one gyro interval."""
 UPPER = np.triu_indices(3)
 
@@ -130,7 +130,7 @@ class LiveFilter:
         """Make the arrays that the kernels work on, and load the kernels."""
         judge, model = self._judge, self._problem.model
         sensors, kernels = len(self._sensors), forward.instance_of(model)
-        most = max(MOST, sensors)
+        most = max(MAX_MEASUREMENTS, sensors)
         self._whole = not forward.fits_registers(self._problem, options)
         filter_: Any = (
             forward.filter_body(self._problem, {}) if self._whole else forward.body_in_registers(self._problem)

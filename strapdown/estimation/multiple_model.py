@@ -48,7 +48,7 @@ MIN_WEIGHT = 1e-6
 """Minimum weight of a hypothesis, relative to the largest; below it the hypothesis is dropped."""
 LARGEST_SHARE = 0.15
 """Maximum fraction of the mixture's covariance due to the distance of the hypotheses at which they are merged into one Gaussian."""
-DOUBTED = 3
+MAX_FIRST_OUTLIERS = 3
 """With a gate or robust updates: number of first directions that may all be outliers."""
 DOUBT = 1e-3
 """Weight of a hypothesis that refuses a direction, relative to one that uses it, until the next direction decides: that of a measurement
@@ -206,7 +206,7 @@ class _Options(NamedTuple):
     robust: Robust | None
 
     @property
-    def doubted(self) -> bool:
+    def outliers_possible(self) -> bool:
         """Whether the first directions may be outliers."""
         return self.gate is not None or self.robust is not None
 
@@ -281,7 +281,7 @@ def _walked(
     record: ImuRecord, process_noise: ProcessNoise, events: Schedule, first: int, options: _Options, recovery: int
 ) -> _Walked:
     """Run the bank with the hypotheses of the first direction and, if it may be an outlier, of the next ones."""
-    later = _directions(events, first + 1)[: DOUBTED if options.doubted else 0]
+    later = _directions(events, first + 1)[: MAX_FIRST_OUTLIERS if options.outliers_possible else 0]
     sets = [
         start(record, events, int(one), options.hypotheses, bias=options.bias, bias_sigma=options.bias_sigma)
         for one in (first, *later)
@@ -335,7 +335,9 @@ def _walked(
         bias=out.bias[:rows],
         variance=np.ascontiguousarray(np.diagonal(P, axis1=1, axis2=2)),
         covariance=P,
-        innovations=innovations_by_sensor(events, out.innovation, out.share if options.doubted else None, processed),
+        innovations=innovations_by_sensor(
+            events, out.innovation, out.share if options.outliers_possible else None, processed
+        ),
     )
     return _Walked(estimate, kept, angles, out.weights[:rows], weight, at, used)
 

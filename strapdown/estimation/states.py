@@ -204,7 +204,7 @@ FIRST_SETS = 10
 """Number of sets of first measurements that are tried in turn for an initial attitude, in case one holds an outlier."""
 VERTICAL = math.radians(1.0)
 """Largest angle between the fixed z axis and a reference that is treated as the vertical, rad."""
-ONCE = 10.0
+PRIOR_INFLATION = 10.0
 """Factor on σ of an initial attitude from measurements, because the filter processes the same measurements again."""
 
 
@@ -214,7 +214,7 @@ def first_state(
     """Return a state at the first edge from the first measurements: a measured attitude, or two or more directions (Wahba's problem).
 
     Each measurement is rotated back to the first edge by the gyro; its noise is increased by that of the gyro and of the bias. The σ of
-    the attitude is multiplied by ``ONCE``, because the filter processes the same measurements again.
+    the attitude is multiplied by ``PRIOR_INFLATION``, because the filter processes the same measurements again.
 
     Parameters
     ----------
@@ -253,7 +253,7 @@ def first_state(
             problem = problem if k else error
             continue
         whole = np.zeros((6, 6))
-        whole[:3, :3] = ONCE**2 * P
+        whole[:3, :3] = PRIOR_INFLATION**2 * P
         whole[3:, 3:] = bias_sigma**2 * np.eye(3)
         return State(attitude=attitude, bias=b, covariance=whole)
     raise type(problem)(f"the first measurements do not give the attitude: {problem}; give the initial attitude")

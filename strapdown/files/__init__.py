@@ -8,6 +8,7 @@
 
 from __future__ import annotations
 
+from strapdown.files.writing import atomic_write as atomic_write
 from strapdown.files.writing import json_text as json_text
 from strapdown.files.writing import locked as locked
 from strapdown.files.writing import plain as plain
@@ -17,4 +18,3 @@ from strapdown.files.writing import usable_folder as usable_folder
 from strapdown.files.writing import whole_hdf5 as whole_hdf5
 from strapdown.files.writing import writable as writable
 from strapdown.files.writing import write_json as write_json
-from strapdown.files.writing import written_beside as written_beside

@@ -136,10 +136,12 @@ def build(kind: type, table: Mapping[str, Any], form: Form, place: str, **more: 
             choice = form.get(field.name, PLAIN)
             key = f"{field.name}_{choice[0][0]}" if choice[0][0] else field.name
             raise InputError(f"{place}: {key} is missing; add it")
-    return made(kind, values, table, form, place)
+    return construct(kind, values, table, form, place)
 
 
-def made(make: Callable[..., Any], values: Mapping[str, Any], table: Mapping[str, Any], form: Form, place: str) -> Any:
+def construct(
+    make: Callable[..., Any], values: Mapping[str, Any], table: Mapping[str, Any], form: Form, place: str
+) -> Any:
     """Return ``make(**values)``; its errors are reported with the place in the file, the key and the number there.
 
     The values have the type of the file (string, number, list), which may not be that of the field, so type errors of ``make`` are reported

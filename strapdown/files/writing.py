@@ -21,7 +21,7 @@ from strapdown.files.reading import BLOCK, SEAL, uninterrupted
 
 
 @contextlib.contextmanager
-def written_beside(path: str | os.PathLike[str], *, durable: bool = False) -> Iterator[Path]:
+def atomic_write(path: str | os.PathLike[str], *, durable: bool = False) -> Iterator[Path]:
     """Yield a temporary path in the same folder; on success it replaces ``path``, on any error it is removed.
 
     The file is new, whatever another user may have put beside ``path``, and has the permissions of what it replaces, else those of the
@@ -182,5 +182,5 @@ def json_text(content: Any) -> str:
 def write_json(path: str | os.PathLike[str], content: Any) -> None:
     """Write ``content`` as indented JSON; NaN and infinities, which are not part of JSON, are rejected."""
     text = json_text(content)  # before any folder is created
-    with written_beside(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_text(text, encoding="utf-8")

@@ -653,7 +653,7 @@ def from_table(table: Mapping[str, Any], place: str = "gyro", base: GyroSpec | N
     values = tables.decode(own, FORM, place)
     if "temperature" in table:
         values["temperature"] = thermal.from_table(table["temperature"], f"{place}: temperature")
-    return tables.made(functools.partial(replace, base or GyroSpec()), values, own, FORM, place)  # type: ignore[no-any-return]
+    return tables.construct(functools.partial(replace, base or GyroSpec()), values, own, FORM, place)  # type: ignore[no-any-return]
 
 
 def read_spec(path: str | os.PathLike[str]) -> GyroSpec:

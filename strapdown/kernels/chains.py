@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from strapdown.kernels.lane_values import WIDTH, load, spread, total
+from strapdown.kernels.lane_values import WIDTH, broadcast, load, sum_lanes
 
 CALLED = ("chain_step",)
 """Called, not inlined, by other kernels: a call costs little compared with their work, and each copy would be compiled again."""
@@ -45,8 +45,8 @@ def chain_step(decay, chains, k, first, dt):
     a, b, c = 0.0, 0.0, 1.0
     af, bf, cf = 0.0, 0.0, 1.0
     nodes, weights = load(NODES, 0), dt * load(NODES, WIDTH)
-    A = B = spread(0.0)
-    C = powers = spread(1.0)
+    A = B = broadcast(0.0)
+    C = powers = broadcast(1.0)
     for i in range(1, TERMS + 1):
         share = 1.0 / i
         a = share * (to_far * b + far * a)
@@ -56,4 +56,11 @@ def chain_step(decay, chains, k, first, dt):
         powers = powers * nodes
         A, B, C = A + a * powers, B + b * powers, C + c * powers
     a, b, c = weights * A, weights * B, weights * C
-    return (af, bf, cf), (total(a * A), total(b * A), total(c * A), total(b * B), total(c * B), total(c * C))
+    return (af, bf, cf), (
+        sum_lanes(a * A),
+        sum_lanes(b * A),
+        sum_lanes(c * A),
+        sum_lanes(b * B),
+        sum_lanes(c * B),
+        sum_lanes(c * C),
+    )

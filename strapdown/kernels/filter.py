@@ -46,7 +46,7 @@ from strapdown.kernels.gate_rules import (
 )
 from strapdown.kernels.iterated_update import ACCEPTED, PASSED_OVER, REFUSED, arc_over_chord, robust_weight, seen_from
 from strapdown.kernels.lane_angles import arctangent, rotation_vector
-from strapdown.kernels.lane_values import anywhere, chosen, lanes_of, load_like, store
+from strapdown.kernels.lane_values import any_lane, lanes_of, load_like, select, store
 from strapdown.kernels.measurement import (
     ATTITUDE,
     DIRECTION,
@@ -644,9 +644,9 @@ def turning_matrix(rate, acceleration):
 def across(d, like):
     """Return unit vectors t1, t2 with t1 × t2 = d, for a unit vector d."""
     one = like + 1.0
-    x, y, z = chosen(d[0] < 0.0, -d[0], d[0]), chosen(d[1] < 0.0, -d[1], d[1]), chosen(d[2] < 0.0, -d[2], d[2])
-    second = chosen(y < x, chosen(y <= z, one, like), like)
-    third = chosen(z < x, one - second, like)
+    x, y, z = select(d[0] < 0.0, -d[0], d[0]), select(d[1] < 0.0, -d[1], d[1]), select(d[2] < 0.0, -d[2], d[2])
+    second = select(y < x, select(y <= z, one, like), like)
+    third = select(z < x, one - second, like)
     t = cross((one - second - third, second, third), d)
     t = scale(1.0 / square_root(dot(t, t)), t)
     return t, cross(d, t)
@@ -756,8 +756,8 @@ def heading_rows(s, x, measured, numbers, like):
         m = matrix_times_vector(R, measured.z)
         level = m[0] * m[0] + m[1] * m[1]
         valid = level > VERTICAL
-        tilt = -m[2] / chosen(valid, level, one)
-        unit_row = chosen(valid, one, like)
+        tilt = -m[2] / select(valid, level, one)
+        unit_row = select(valid, one, like)
         h = transpose_times_vector(R, (unit_row * (tilt * m[0]), unit_row * (tilt * m[1]), unit_row))
         y = unit_row * arctangent(m[0] * r[1] - m[1] * r[0], m[0] * r[0] + m[1] * r[1])
         return (h + (0,) * (N - 3),), (y,), axes, valid
@@ -773,14 +773,14 @@ def heading_rows(s, x, measured, numbers, like):
     m = subtract(p, fixed)
     level = m[0] * m[0] + m[1] * m[1]
     valid = level > VERTICAL
-    unit_row = chosen(valid, one, like)
+    unit_row = select(valid, one, like)
     y = unit_row * arctangent(m[0] * r[1] - m[1] * r[0], m[0] * r[0] + m[1] * r[1])
     # Derivatives at the predicted heading: those at the measured one depend on its noise, which would bias the estimated offsets.
     stretch = square_root(level / (r[0] * r[0] + r[1] * r[1]))
     m = (stretch * r[0], stretch * r[1], m[2])
     p = add(m, fixed)
     clean = transpose_times_vector(R, add(p, carried))
-    inverted = unit_row / chosen(valid, m[0] * m[0] + m[1] * m[1], one)
+    inverted = unit_row / select(valid, m[0] * m[0] + m[1] * m[1], one)
     g = (-inverted * m[1], inverted * m[0], like)
     h = dict(enumerate(transpose_times_vector(R, cross(p, g))))
     share = 1.0 / measured.length
@@ -893,7 +893,7 @@ def turned_by(q, correction):
     moved = turned(q, correction)
     G = right_jacobian(correction)
     large = dot(correction, correction) > SQUARED_RANGE
-    if anywhere(large):
+    if any_lane(large):
         far, J = far_turn(correction)
         moved = chosen_parts(large, unit(quaternion_multiply(q, far)), moved)
         G = chosen_parts(large, J, G)
@@ -966,7 +966,7 @@ def gains(s, x, P, work, measured, numbers, factor, like):
     nis = products(tuple(e * e for e in errors), tuple(inverted))
     errors, variances = tuple(errors), tuple(variances)
     skipped = STRUCTURE.sensors[s].kind == HEADING  # possibly: a vertical vector has no heading
-    reported = (chosen(valid, errors[0], like + math.nan),) if skipped else errors
+    reported = (select(valid, errors[0], like + math.nan),) if skipped else errors
     rest = precise, tuple(shares), tuple(r), tuple(y), angle, valid, nis
     return Gains(tuple(gain), tuple(steps), errors, variances, reported, *rest)
 
@@ -1005,8 +1005,8 @@ def judged(s, g, options):
     accepted = g.nis <= threshold
     if kind == DIRECTION:  # the transverse rows cannot detect it
         accepted = accepted & ((g.angle[1] >= 0.0) | (threshold == math.inf))
-    outcome = chosen(accepted, ACCEPTED, REFUSED)
-    return chosen(g.valid, outcome, PASSED_OVER) if kind == HEADING else outcome
+    outcome = select(accepted, ACCEPTED, REFUSED)
+    return select(g.valid, outcome, PASSED_OVER) if kind == HEADING else outcome
 
 
 def weighted(s, g, options, like):
@@ -1206,12 +1206,12 @@ def take_row(P, work, line, residual, variance, like):
         put_at(work, p + i, t)
         put_at(work, step + i, value_at(work, step + i, like) + error * t)
     precise = s > SHORT_FORM * variance
-    if anywhere(precise):
+    if any_lane(precise):
         d = LINE * ROUNDING
         product(P, work, first, d, like)
         for i in range(N):
             rounding = value_at(work, d + i, like) - variance * value_at(work, p + i, like)
-            put_at(work, d + i, chosen(precise, rounding, like))
+            put_at(work, d + i, select(precise, rounding, like))
         minus_outer_rows(P, work, d, p, like + 1.0, like)
     return error, s
 
@@ -1232,7 +1232,7 @@ def take_precisely(x, P, work, rows, like):
         _, s = take_row(P, work, ROWS + i, value_at(work, line + RESIDUAL, like), variance, like)
         lost = lost | (s > MAX_PRECISION * variance)
     apply_step(x, P, work, like)
-    return anywhere(lost)
+    return any_lane(lost)
 
 
 def take_precisely_in_lanes(body, gain, steps, precise, rows, like):
@@ -1256,7 +1256,7 @@ def copy_values(a, b, count, like):
 def blend_values(a, b, condition, count, like):
     """Replace values of b by those of a in the runs in which the condition holds."""
     for i in range(count):
-        put_at(b, i, chosen(condition, value_at(a, i, like), value_at(b, i, like)))
+        put_at(b, i, select(condition, value_at(a, i, like), value_at(b, i, like)))
 
 
 def apply_step(x, P, work, like):
@@ -1284,7 +1284,7 @@ def transverse_rows_{s}(x, body, measured, e, like):
 def take_{s}(body, measured, e, innovation, like):
     g = gains_{s}(body, measured, e, None, like)
     store_innovations(innovation, measured.place[e], g.reported, g.variances)
-    if anywhere(g.precise):
+    if any_lane(g.precise):
         rows_{s}(body.x[0], body, measured, e, like)
         return {precise}
     apply_gains(body.x[0], body.P[0], body.work, g.gain, g.steps, like)
@@ -1309,7 +1309,7 @@ def judge_{s}(body, measured, e, options, like):
         if options.robust > 0:
             weight = weight_{s}(g, options, like)
             g = gains_{s}(body, measured, e, 1.0 / weight, like)
-        if anywhere(g.precise):
+        if any_lane(g.precise):
             rows_{s}(body.x[0], body, measured, e, like)
             divide_variances(body.work, {rows}, weight, like)
             lost = take_precisely(body.x[0], body.P[0], body.work, {rows}, like)

@@ -13,7 +13,7 @@ import numpy as np
 
 from strapdown.kernels.algebra import combine, dot
 from strapdown.kernels.filter import advance, fill_coefficients, take
-from strapdown.kernels.lane_values import WIDTH, chosen, lanes_of, load_like, store
+from strapdown.kernels.lane_values import WIDTH, lanes_of, load_like, select, store
 from strapdown.kernels.series import SQUARED_RANGE
 from strapdown.kernels.structure import Body as Filter
 
@@ -72,7 +72,7 @@ def predict(state, part, dt, body, out):
     bias = (load_like(x, 4 * WIDTH, like), load_like(x, 5 * WIDTH, like), load_like(x, 6 * WIDTH, like))
     turn = combine(1.0, part, -dt, bias)
     within = dot(turn, turn) <= SQUARED_RANGE  # for NaN it does not hold
-    store(body.lost, 0, chosen(within, load_like(body.lost, 0, like), like + 1.0))
+    store(body.lost, 0, select(within, load_like(body.lost, 0, like), like + 1.0))
     if dt != filters.dt[0]:
         fill_coefficients(filters.coefficients, dt, filters.model)
         filters.dt[0] = dt

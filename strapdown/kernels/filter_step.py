@@ -31,7 +31,7 @@ from strapdown.kernels.algebra import (
     transpose,
     transpose_times_vector,
 )
-from strapdown.kernels.lane_values import anywhere, chosen, everywhere
+from strapdown.kernels.lane_values import all_lanes, any_lane, select
 from strapdown.kernels.measurement import direction_rows
 from strapdown.kernels.rotation import far_turn, logarithm, quaternion_multiply, right_jacobian, turned, unit
 from strapdown.kernels.series import SQUARED_RANGE, fifth, fourth, second, sinc, third
@@ -99,7 +99,7 @@ def predict(q, b, A, B, C, delta_theta, dt, angle_variance, rate_variance):
 
 def chosen_parts(condition, a, b):
     """Return the tuple a in lanes in which the condition holds, b in the others."""
-    return tuple(chosen(condition, x, y) for x, y in zip(a, b, strict=True))
+    return tuple(select(condition, x, y) for x, y in zip(a, b, strict=True))
 
 
 def update_row(b, A, B, C, h, innovation, variance):
@@ -118,7 +118,7 @@ def update_row(b, A, B, C, h, innovation, variance):
     A = symmetric_minus_outer(A, ka, pa)
     B = minus_outer(B, ka, pb)
     precise = s > SHORT_FORM * variance
-    if anywhere(precise):
+    if any_lane(precise):
         d = combine(1.0, symmetric_times_vector(A, h), -variance, ka)
         A = chosen_parts(precise, symmetric_minus_outer(A, d, ka), A)
         B = chosen_parts(precise, minus_outer(B, d, kb), B)
@@ -141,7 +141,7 @@ def reset(q, A, B, correction):
     G = right_jacobian(correction)
     moved = turned(q, correction)
     large = dot(correction, correction) > SQUARED_RANGE
-    if anywhere(large):
+    if any_lane(large):
         far, J = far_turn(correction)
         moved = chosen_parts(large, unit(quaternion_multiply(q, far)), moved)
         G = chosen_parts(large, J, G)
@@ -206,9 +206,9 @@ def update_direction_and_judge(q, b, A, B, C, R, u, v, z, variance):
     s12 = dot(h1, pa2)
     s22 = dot(h2, pa2) + variance
     together = s1 + s22 < SHORT_FORM * variance
-    if everywhere(together):
+    if all_lanes(together):
         correction, b, A, B, C, e2, s2, nis = rows_at_once(b, A, B, C, pa1, pa2, h1, e1, h2, y2, (s1, s12, s22))
-    elif anywhere(together):
+    elif any_lane(together):
         at_once = rows_at_once(b, A, B, C, pa1, pa2, h1, e1, h2, y2, (s1, s12, s22))
         one_by_one = row_after_row(b, A, B, C, h1, e1, h2, y2, variance)
         correction = chosen_parts(together, at_once[0], one_by_one[0])
@@ -216,9 +216,9 @@ def update_direction_and_judge(q, b, A, B, C, R, u, v, z, variance):
         A = chosen_parts(together, at_once[2], one_by_one[2])
         B = chosen_parts(together, at_once[3], one_by_one[3])
         C = chosen_parts(together, at_once[4], one_by_one[4])
-        e2 = chosen(together, at_once[5], one_by_one[5])
-        s2 = chosen(together, at_once[6], one_by_one[6])
-        nis = chosen(together, at_once[7], one_by_one[7])
+        e2 = select(together, at_once[5], one_by_one[5])
+        s2 = select(together, at_once[6], one_by_one[6])
+        nis = select(together, at_once[7], one_by_one[7])
     else:
         correction, b, A, B, C, e2, s2, nis = row_after_row(b, A, B, C, h1, e1, h2, y2, variance)
     q, A, B = reset(q, A, B, correction)

@@ -50,10 +50,10 @@ from strapdown.kernels.iterated_update import (
     ACCEPTED,
     IDENTITY,
     KNOWN,
+    MIN_CORRECTION_UNKNOWN,
     PASSED_OVER,
     REFUSED,
     RELINEARIZED,
-    SETTLED,
     TURN_ASIDE,
     UNKNOWN,
     UNKNOWN_TILT,
@@ -142,8 +142,8 @@ class Body(NamedTuple):
     options: Options
     restart: Restart
     """Initial values of a candidate."""
-    standing: np.ndarray
-    """Counters of each sensor (sensors, ``STANDING``); at return, their final values."""
+    counters: np.ndarray
+    """Counters of each sensor (sensors, ``COUNTERS``); at return, their final values."""
     memory: np.ndarray
     """Counters of the candidate (``MEMORY``,); at return, final values. Initially zero, except ``PASSES`` = 1 and ``REPORTED`` = −1."""
 
@@ -202,7 +202,7 @@ def predict(state, part, dt, body, out):
 def update(state, e, now, measured, body, out):
     """Test a measurement with the filter and the candidate, if there is one, and update."""
     running, lock_outs, recoveries, segments, lost = state
-    form, options, memory, standing = body.form, body.options, body.memory, body.standing
+    form, options, memory, counters = body.form, body.options, body.memory, body.counters
     place = measured.place[e]
     sensor = measured.sensor[e]
     degrees = degrees_of_freedom(measured.series[sensor, KIND])
@@ -218,7 +218,7 @@ def update(state, e, now, measured, body, out):
             out.weight[place] = weight
             store_innovations(out.form.innovation, place, innovation, variance)
             lock_outs, start = judge_filter(
-                outcome, now, sensor, options.recovery, options.lock_out, standing, memory, out.lock_outs, lock_outs
+                outcome, now, sensor, options.recovery, options.lock_out, counters, memory, out.lock_outs, lock_outs
             )
             if start:
                 start_candidate(form, memory, now, options.attitude_sigma, body.restart)
@@ -227,13 +227,13 @@ def update(state, e, now, measured, body, out):
             nis = 0.0
             for r in range(3):
                 nis += innovation[r] * innovation[r] / variance[r]
-            verdict = judge_candidate(outcome, nis, degrees, sensor, standing, memory, bias_at(form, 1))
+            verdict = judge_candidate(outcome, nis, degrees, sensor, counters, memory, bias_at(form, 1))
             if verdict == DROPPED:
                 running = 1
             elif verdict == TOO_NARROW:
                 widen(form, memory)
-            if verdict != DROPPED and takes_over(sensor, options.recovery, standing, memory):
-                recover(now, sensor, options.lock_out, standing, memory, out.recoveries[recoveries], out.lock_outs)
+            if verdict != DROPPED and takes_over(sensor, options.recovery, counters, memory):
+                recover(now, sensor, options.lock_out, counters, memory, out.recoveries[recoveries], out.lock_outs)
                 recoveries += 1
                 become(form)
                 running = 1
@@ -290,7 +290,7 @@ def iterated_update(form, i, e, measured, passes, options):
         return PASSED_OVER, 0.0, (math.nan, 0.0, 0.0), (1.0, 1.0, 1.0), False
     A = attitude_covariance(form, i, state)
     unknown = A[0] + A[3] + A[5] >= UNKNOWN
-    tolerance = SETTLED if unknown else RELINEARIZED
+    tolerance = MIN_CORRECTION_UNKNOWN if unknown else RELINEARIZED
     now_q = q
     M = IDENTITY
     prior = (0.0, 0.0, 0.0)  # prior mean relative to the attitude of the linearisation

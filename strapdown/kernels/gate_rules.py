@@ -1,7 +1,7 @@
 """Rules of a gate: refusals by sensor, lock-outs, a restart candidate beside the filter, and restarts that widen.
 
 They implement :class:`strapdown.estimation.gating.Gate` for any form of the state. Their state is ``memory`` (``MEMORY``,), of the restart
-candidate, and ``standing`` (sensors, ``STANDING``), the counters of each sensor. :mod:`strapdown.kernels.gate` calls them compiled.
+candidate, and ``counters`` (sensors, ``COUNTERS``), the counters of each sensor. :mod:`strapdown.kernels.gate` calls them compiled.
 
 For each measurement :func:`judge_filter` counts the filter's outcome and may request a candidate (:func:`reset_candidate`); then
 :func:`judge_candidate` counts the candidate's. A candidate whose start is too narrow is widened where :func:`may_widen` allows it; one
@@ -62,7 +62,7 @@ FIRST_BIAS = 10
 FIRST_VARIANCE = 13
 MEMORY = 16
 
-# Columns of a sensor's row of ``standing``.
+# Columns of a sensor's row of ``counters``.
 IN_A_ROW = 0
 """Refusals in a row."""
 EXCESS = 1
@@ -73,7 +73,7 @@ FIRST = 3
 LAST = 4
 REPORTED = 5
 """Row of ``lock_outs`` in which they are reported; −1: not reported."""
-STANDING = 6
+COUNTERS = 6
 
 # Outcomes for a candidate.
 DROPPED = 0
@@ -81,36 +81,36 @@ FOLLOWED = 1
 TOO_NARROW = 2
 
 
-def judge_filter(outcome, now, sensor, recovery, limit, standing, memory, lock_outs, reported):
+def judge_filter(outcome, now, sensor, recovery, limit, counters, memory, lock_outs, reported):
     """Count the filter's outcome of a measurement; return the number of lock-outs reported, and whether a candidate must start.
 
     A lock-out is reported when the refusals of a sensor exceed its acceptances by more than ``limit``, in a row of ``lock_outs``: times of
     the first and last refusal, sensor, number of refusals. ``recovery``: refusals in a row that start a candidate; 0: never.
     """
-    seat = standing[sensor]
+    counts = counters[sensor]
     if outcome == ACCEPTED:
-        seat[IN_A_ROW] = 0.0
-        seat[EXCESS] = max(seat[EXCESS] - 1.0, 0.0)
+        counts[IN_A_ROW] = 0.0
+        counts[EXCESS] = max(counts[EXCESS] - 1.0, 0.0)
         memory[TRUSTED] += 1.0
     if outcome != REFUSED:
         return reported, False
-    seat[IN_A_ROW] += 1.0
-    if seat[EXCESS] == 0.0:
-        seat[NUMBER] = 0.0
-        seat[FIRST] = now
-        seat[REPORTED] = -1.0
-    seat[EXCESS] = min(seat[EXCESS] + 1.0, 2.0 * limit)
-    seat[NUMBER] += 1.0
-    seat[LAST] = now
-    if seat[EXCESS] > limit and seat[REPORTED] < 0.0:
-        seat[REPORTED] = reported
+    counts[IN_A_ROW] += 1.0
+    if counts[EXCESS] == 0.0:
+        counts[NUMBER] = 0.0
+        counts[FIRST] = now
+        counts[REPORTED] = -1.0
+    counts[EXCESS] = min(counts[EXCESS] + 1.0, 2.0 * limit)
+    counts[NUMBER] += 1.0
+    counts[LAST] = now
+    if counts[EXCESS] > limit and counts[REPORTED] < 0.0:
+        counts[REPORTED] = reported
         reported += 1
-    if seat[REPORTED] >= 0.0:
-        row = lock_outs[int(seat[REPORTED])]
-        row[0] = seat[FIRST]
+    if counts[REPORTED] >= 0.0:
+        row = lock_outs[int(counts[REPORTED])]
+        row[0] = counts[FIRST]
         row[1] = now
         row[2] = sensor
-        row[3] = seat[NUMBER]
+        row[3] = counts[NUMBER]
     if recovery == 0 or memory[CANDIDATE] > 0.0:
         return reported, False
     if memory[TRUSTED] >= FORGOTTEN * recovery:
@@ -142,7 +142,7 @@ def reset_candidate(memory, now, bias, variance):
         memory[FIRST_VARIANCE + i] = variance[i]
 
 
-def judge_candidate(outcome, nis, degrees, sensor, standing, memory, bias):
+def judge_candidate(outcome, nis, degrees, sensor, counters, memory, bias):
     """Count the candidate's outcome of a measurement, after the filter's, and return whether it is dropped, kept or too narrow.
 
     It is dropped when the filter accepts all sensors again, or when it fails itself; then the next one starts wider.
@@ -154,11 +154,11 @@ def judge_candidate(outcome, nis, degrees, sensor, standing, memory, bias):
         memory[MISSED] = 0.0
         memory[NIS] += nis
         memory[DEGREES] += degrees
-        if standing[sensor, IN_A_ROW] > 0.0:
+        if counters[sensor, IN_A_ROW] > 0.0:
             memory[HITS] += 1.0
     trusted = True
-    for s in range(len(standing)):
-        if standing[s, IN_A_ROW] > 0.0:
+    for s in range(len(counters)):
+        if counters[s, IN_A_ROW] > 0.0:
             trusted = False
     if trusted:
         memory[CANDIDATE] = 0.0
@@ -213,25 +213,25 @@ def count_widening(memory):
     memory[DEGREES] = 0.0
 
 
-def takes_over(sensor, recovery, standing, memory):
+def takes_over(sensor, recovery, counters, memory):
     """Return whether the candidate takes over: it has accepted at least ``recovery`` measurements that the filter refused."""
-    return standing[sensor, IN_A_ROW] >= recovery and memory[HITS] >= recovery
+    return counters[sensor, IN_A_ROW] >= recovery and memory[HITS] >= recovery
 
 
-def recover(now, sensor, limit, standing, memory, row, lock_outs):
+def recover(now, sensor, limit, counters, memory, row, lock_outs):
     """Report a recovery in ``row`` (4,): time, sensor, time of the first refusal, refusals in a row; reset the counters.
 
     It replaces the short lock-outs that it ends: their number of refusals is set to zero.
     """
     row[0] = now
     row[1] = sensor
-    row[2] = min(memory[SINCE], standing[sensor, FIRST])
-    row[3] = standing[sensor, IN_A_ROW]
-    for s in range(len(standing)):
-        if standing[s, REPORTED] >= 0.0 and standing[s, NUMBER] <= 2.0 * limit and standing[s, EXCESS] > 0.0:
-            lock_outs[int(standing[s, REPORTED]), 3] = 0.0
-        for j in range(STANDING):
-            standing[s, j] = 0.0
-        standing[s, REPORTED] = -1.0
+    row[2] = min(memory[SINCE], counters[sensor, FIRST])
+    row[3] = counters[sensor, IN_A_ROW]
+    for s in range(len(counters)):
+        if counters[s, REPORTED] >= 0.0 and counters[s, NUMBER] <= 2.0 * limit and counters[s, EXCESS] > 0.0:
+            lock_outs[int(counters[s, REPORTED]), 3] = 0.0
+        for j in range(COUNTERS):
+            counters[s, j] = 0.0
+        counters[s, REPORTED] = -1.0
     step_aside(memory)
     memory[PASSES] = WIDE_PASSES

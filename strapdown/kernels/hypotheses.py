@@ -62,7 +62,7 @@ CALLED = ("updated", "moment_match", "normalized_weights")
 
 PASSES = 5
 """Maximum number of Gauss–Newton iterations of an update."""
-SETTLED = 1e-6
+MIN_STEP = 1e-6
 """Squared step, rad², below which the iteration ends."""
 NEVER = -1
 LOST = -2
@@ -93,7 +93,7 @@ def update_iterated(q, b, A, B, C, u, v, z, variance):
         A_new = congruent(turn, A_new)
         B_new = multiply(turn, B_new)
         m = matrix_times_vector(turn, subtract(m, step))
-        if squared < SETTLED:
+        if squared < MIN_STEP:
             break
     return q, b_new, A_new, B_new, C_new, e1, s1, e2, s2
 

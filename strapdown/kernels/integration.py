@@ -15,11 +15,11 @@ import math
 from strapdown.kernels.algebra import add, combine, cross, dot
 from strapdown.kernels.lane_values import (
     WIDTH,
-    anywhere,
-    chosen,
+    any_lane,
+    broadcast,
     load_quadruples,
     load_triples,
-    spread,
+    select,
     store_quadruples,
 )
 from strapdown.kernels.measurement import vector_at
@@ -102,21 +102,21 @@ def write_row(attitude, k, q):
 
 def multiply_exponentials(vectors, start, length, work):
     """Write the running products of exp(φ) in each lane's segment; lane i begins at row ``start`` + i ``length``."""
-    p = (spread(1.0), spread(0.0), spread(0.0), spread(0.0))
-    largest = spread(0.0)
+    p = (broadcast(1.0), broadcast(0.0), broadcast(0.0), broadcast(0.0))
+    largest = broadcast(0.0)
     for k in range(length):
         phi = load_triples(vectors, 3 * (start + k), 3 * length)
         x = dot(phi, phi)
-        largest = chosen(x > largest, x, largest)
+        largest = select(x > largest, x, largest)
         p = quaternion_multiply(p, exponential(phi))
         store_several(work, 4 * WIDTH * k, p)
-    if anywhere(largest > SQUARED_RANGE):
+    if any_lane(largest > SQUARED_RANGE):
         multiply_large_exponentials(vectors, start, length, work)
 
 
 def multiply_large_exponentials(vectors, start, length, work):
     """Do what multiply_exponentials does for rotation vectors of any size."""
-    p = (spread(1.0), spread(0.0), spread(0.0), spread(0.0))
+    p = (broadcast(1.0), broadcast(0.0), broadcast(0.0), broadcast(0.0))
     for k in range(length):
         for i in range(WIDTH):
             row = 3 * (start + k + i * length)
@@ -127,7 +127,7 @@ def multiply_large_exponentials(vectors, start, length, work):
 
 def multiply_quaternions(steps, start, length, work):
     """Write the running products in each lane's segment; lane i begins at row ``start`` + i ``length``."""
-    p = (spread(1.0), spread(0.0), spread(0.0), spread(0.0))
+    p = (broadcast(1.0), broadcast(0.0), broadcast(0.0), broadcast(0.0))
     for k in range(length):
         p = quaternion_multiply(p, load_quadruples(steps, 4 * (start + k), 4 * length))
         store_several(work, 4 * WIDTH * k, p)

@@ -65,15 +65,15 @@ def stretch(edges, interval, start, end, ratio, lopsided):
     return (interval - min(before, after + lopsided), interval + 1 + min(after, before + lopsided))
 
 
-def uneven_steps(increments, edges, chosen, samples, previous, window, ratio, lopsided, work, rates, series, steps):
-    """Write the step quaternions (m, 4) of the steps ``chosen`` (m,), each through the increments of its window.
+def uneven_steps(increments, edges, places, samples, previous, window, ratio, lopsided, work, rates, series, steps):
+    """Write the step quaternions (m, 4) of the steps at ``places`` (m,), each through the increments of its window.
 
     The window is that of :func:`strapdown.kernels.integration_polynomial.polynomial_steps`, reduced to the :func:`stretch` of each
     interval. If the data are too rough for the polynomial, the increment of the interval is its rotation vector.
     """
     latest = len(increments) - window
-    for j in range(len(chosen)):
-        begin = chosen[j] * samples
+    for j in range(len(places)):
+        begin = places[j] * samples
         start = min(max(begin - previous, 0), latest)
         q = (1.0, 0.0, 0.0, 0.0)
         for i in range(begin, begin + samples):

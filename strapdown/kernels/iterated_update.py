@@ -28,7 +28,7 @@ STUDENT = 2
 """Weight of Student's t distribution, variational mean."""
 RELINEARIZED = 0.05
 """Tolerance of an iterated update, rad: it is relinearised until the correction is smaller."""
-SETTLED = 1e-4
+MIN_CORRECTION_UNKNOWN = 1e-4
 """The same for a nearly unknown attitude, rad. The unknown rotation must stay about the measured axis: an axis in error by half the last
 correction would let an uncertainty of a radian about it appear as that fraction of a radian across it."""
 

@@ -10,7 +10,7 @@ import math
 import numpy as np
 
 from strapdown.kernels.algebra import square_root
-from strapdown.kernels.lane_values import chosen, narrowed
+from strapdown.kernels.lane_values import narrowed, select
 
 _QUARTER_ARM = math.sqrt(2.0) - 1.0
 """tan 22.5°: above it the angle is computed relative to 45°."""
@@ -51,28 +51,28 @@ def arctangent_series(t):
 
 def arctangent(y, x):
     """Return the angle of the point (x, y), rad in [−π, π]; 0 at the origin."""
-    across = chosen(y < 0.0, -y, y)
-    along = chosen(x < 0.0, -x, x)
+    across = select(y < 0.0, -y, y)
+    along = select(x < 0.0, -x, x)
     steep = across > along
-    short = chosen(steep, along, across)
-    long = chosen(steep, across, along)
+    short = select(steep, along, across)
+    long = select(steep, across, along)
     near_half = short > _QUARTER_ARM * long
-    top = chosen(near_half, short - long, short)
-    bottom = chosen(near_half, short + long, long)
-    bottom = chosen(bottom > 0.0, bottom, 1.0)
+    top = select(near_half, short - long, short)
+    bottom = select(near_half, short + long, long)
+    bottom = select(bottom > 0.0, bottom, 1.0)
     angle = arctangent_series(top / bottom)
-    angle = chosen(near_half, angle + 0.25 * math.pi, angle)
-    angle = chosen(steep, 0.5 * math.pi - angle, angle)
-    angle = chosen(x < 0.0, math.pi - angle, angle)
-    return chosen(y < 0.0, -angle, angle)
+    angle = select(near_half, angle + 0.25 * math.pi, angle)
+    angle = select(steep, 0.5 * math.pi - angle, angle)
+    angle = select(x < 0.0, math.pi - angle, angle)
+    return select(y < 0.0, -angle, angle)
 
 
 def rotation_vector(q):
     """Return the rotation vector of a unit quaternion, the shorter way round."""
     squared = q[1] * q[1] + q[2] * q[2] + q[3] * q[3]
     sine = square_root(squared)
-    w = chosen(q[0] < 0.0, -q[0], q[0])
+    w = select(q[0] < 0.0, -q[0], q[0])
     seen = squared > 1e-36  # below, the angle is twice the vector part, and the square may have underflowed
-    factor = chosen(seen, 2.0 * arctangent(sine, w) / chosen(seen, sine, 1.0), 2.0)
-    factor = chosen(q[0] < 0.0, -factor, factor)
+    factor = select(seen, 2.0 * arctangent(sine, w) / select(seen, sine, 1.0), 2.0)
+    factor = select(q[0] < 0.0, -factor, factor)
     return (factor * q[1], factor * q[2], factor * q[3])

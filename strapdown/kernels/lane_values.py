@@ -7,7 +7,7 @@ their arrays, which are contiguous.
 ``WIDTH`` is the default number of lanes. A kernel for any number of lanes takes a ``pattern``, a tuple of that many floats:
 :func:`lanes_of` returns zeros of its length and type, and :func:`load_like` and others take such a value as ``like``. One lane is a scalar.
 
-There is no ``if`` on lanes: branch with :func:`everywhere` or :func:`anywhere`, and select by lane with :func:`chosen`. These three take
+There is no ``if`` on lanes: branch with :func:`all_lanes` or :func:`any_lane`, and select by lane with :func:`select`. These three take
 plain conditions and floats too.
 """
 
@@ -72,7 +72,7 @@ def narrowed(x, like):
     return np.asarray(x, np.asarray(like).dtype)[()]
 
 
-def total(x):
+def sum_lanes(x):
     """Return the sum over the lanes, the upper half added to the lower until one is left: one order on every machine."""
     while len(x) > 1:
         x = x[: len(x) // 2] + x[len(x) // 2 :]
@@ -124,22 +124,22 @@ def restore_mode(mode):
     """Undo :func:`flush_tiny`."""
 
 
-def spread(x):
+def broadcast(x):
     """Return a float in every lane."""
     return np.full(WIDTH, x)
 
 
-def everywhere(condition):
+def all_lanes(condition):
     """Return whether the condition holds in all lanes."""
     return bool(np.all(condition))
 
 
-def anywhere(condition):
+def any_lane(condition):
     """Return whether the condition holds in any lane."""
     return bool(np.any(condition))
 
 
-def chosen(condition, a, b):
+def select(condition, a, b):
     """Return a in the lanes where the condition holds, b in the others."""
     if isinstance(condition, bool | np.bool_):
         return a if condition else b

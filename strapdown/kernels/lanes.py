@@ -343,7 +343,7 @@ def _align_stack(builder: Any) -> None:
     builder.asm(ir.FunctionType(ir.VoidType(), [place.type]), "", "r", [place], side_effect=True)
 
 
-@_instead_of(lane_values.spread, lambda x: Lanes(x, WIDTH)(x))
+@_instead_of(lane_values.broadcast, lambda x: Lanes(x, WIDTH)(x))
 def _spread_over_lanes(target: Any, builder: Any, sig: Any, x: Any) -> Any:
     return _spread(builder, x, _vector(sig.return_type))
 
@@ -353,7 +353,7 @@ def _narrowed(target: Any, builder: Any, sig: Any, x: Any, like: Any) -> Any:
     return _converted(builder, x, sig.args[0], sig.return_type)
 
 
-@_instead_of(lane_values.total, lambda x: x.dtype(x))
+@_instead_of(lane_values.sum_lanes, lambda x: x.dtype(x))
 def _total(target: Any, builder: Any, sig: Any, value: Any) -> Any:
     """Add the upper half to the lower until one is left."""
     n = sig.args[0].count
@@ -441,7 +441,7 @@ def _bits(builder: Any, mask: Any) -> Any:
     return builder.bitcast(mask, ir.IntType(mask.type.count))
 
 
-@_instead_of(lane_values.everywhere, types.boolean)
+@_instead_of(lane_values.all_lanes, types.boolean)
 def _everywhere(target: Any, builder: Any, sig: Any, condition: Any) -> Any:
     if not isinstance(sig.args[0], Lanes):
         return condition
@@ -449,7 +449,7 @@ def _everywhere(target: Any, builder: Any, sig: Any, condition: Any) -> Any:
     return builder.icmp_unsigned("==", bits, ir.Constant(bits.type, (1 << bits.type.width) - 1))
 
 
-@_instead_of(lane_values.anywhere, types.boolean)
+@_instead_of(lane_values.any_lane, types.boolean)
 def _anywhere(target: Any, builder: Any, sig: Any, condition: Any) -> Any:
     if not isinstance(sig.args[0], Lanes):
         return condition
@@ -468,7 +468,7 @@ def _choice(condition: Any, a: Any, b: Any) -> Any:
     return result(condition, result, result)
 
 
-@_instead_of(lane_values.chosen, _choice)
+@_instead_of(lane_values.select, _choice)
 def _chosen(target: Any, builder: Any, sig: Any, condition: Any, *values: Any) -> Any:
     result = sig.return_type
     if isinstance(result, Lanes) and isinstance(result.dtype, types.Float):

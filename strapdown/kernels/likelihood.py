@@ -16,7 +16,7 @@ from strapdown.kernels.algebra import add, combine, dot, matrix_times_vector, tr
 from strapdown.kernels.filter_step import predict as propagated
 from strapdown.kernels.filter_step import reset, update_row
 from strapdown.kernels.lane_angles import arctangent, rotation_vector
-from strapdown.kernels.lane_values import WIDTH, load, spread, store, total
+from strapdown.kernels.lane_values import WIDTH, broadcast, load, store, sum_lanes
 from strapdown.kernels.measurement import (
     ATTITUDE,
     HEADING,
@@ -96,7 +96,7 @@ def longest_step(state, part, dt, body):
     """Return the longest step, s, for all lanes except diverged ones, with angles above ``MAX_TURN``."""
     b = state[1]
     # Usually sufficient: the sum over the lanes is not less than the largest, and comparisons with NaN are false.
-    if dot(part, part) <= HALF_RANGE and total(dot(b, b)) * (dt * dt) < HALF_RANGE:
+    if dot(part, part) <= HALF_RANGE and sum_lanes(dot(b, b)) * (dt * dt) < HALF_RANGE:
         return dt
     turn = combine(1.0, part, -dt, b)
     room = body.room
@@ -130,7 +130,7 @@ def put_row(rows, k, h, y):
 def put_axes(rows, y):
     """Write the rows of a measured error of the attitude."""
     for k in range(3):
-        put_row(rows, k, tuple(spread(1.0 if i == k else 0.0) for i in range(3)), y[k])
+        put_row(rows, k, tuple(broadcast(1.0 if i == k else 0.0) for i in range(3)), y[k])
 
 
 def measured_rows(q, z, kind, t, triads, rows):
@@ -230,7 +230,7 @@ def updated(b, A, B, C, number, measured, place, sensor, z, factor, room, found)
     Innovations and their variances are written to the work space at ``found``, in lanes; the third is that of a vector's length.
     """
     kind = measured.series[sensor, KIND]
-    correction = (spread(0.0), spread(0.0), spread(0.0))
+    correction = (broadcast(0.0), broadcast(0.0), broadcast(0.0))
     for r in range(number):
         h, y = row_at(room, r)
         innovation = y - dot(h, correction)

@@ -18,7 +18,7 @@ from strapdown.kernels.algebra import (
     symmetric_times_vector,
     transpose_times_vector,
 )
-from strapdown.kernels.lane_values import chosen, element
+from strapdown.kernels.lane_values import element, select
 from strapdown.kernels.rotation import logarithm, quaternion_multiply
 
 DIRECTION = 0
@@ -156,8 +156,8 @@ def heading_row(R, z):
     m = matrix_times_vector(R, z)
     level = m[0] * m[0] + m[1] * m[1]
     has_heading = level > VERTICAL
-    tilt = -m[2] / chosen(has_heading, level, 1.0)
-    whole = chosen(has_heading, level - level + 1.0, 0.0)
+    tilt = -m[2] / select(has_heading, level, 1.0)
+    whole = select(has_heading, level - level + 1.0, 0.0)
     return transpose_times_vector(R, (whole * (tilt * m[0]), whole * (tilt * m[1]), whole))
 
 

@@ -26,13 +26,13 @@ from strapdown.kernels.algebra import (
 from strapdown.kernels.filter_step import predict, update_direction_and_judge, update_heading, update_residual
 from strapdown.kernels.lane_angles import arctangent, inverse_root, rotation_vector
 from strapdown.kernels.lane_values import (
-    chosen,
     flush_tiny,
     halves,
     lanes_of,
     load_like,
     narrowed,
     restore_mode,
+    select,
     store,
 )
 from strapdown.kernels.measurement import ATTITUDE, HEADING, VECTOR, frame_at, heading_row, vector_at
@@ -347,7 +347,7 @@ def sensor_noise(e, events, draws, like):
     if struck_below > np.uint64(0) or share > 0.0:
         s0, s1, s2, s3 = four(streams, 4 * (source + 1), like)
         word, s0, s1, s2, s3 = next_word(s0, s1, s2, s3)
-        larger = chosen(word < struck_below, like - like + events.outlier_scale[sensor], 1.0)
+        larger = select(word < struck_below, like - like + events.outlier_scale[sensor], 1.0)
         noise = scale(larger, noise)
         store_several(streams, 4 * (source + 1), like, (s0, s1, s2, s3))
         if share > 0.0:

@@ -1,7 +1,7 @@
 """Sums over Monte Carlo runs, eight runs at a time in lanes (SIMD), in double precision: see :mod:`strapdown.montecarlo.statistics`.
 
 Every eighth run is added to the same lane of a sum, in the order of the runs, and the lanes are summed at the end of a chunk in a fixed
-order (:func:`strapdown.kernels.lane_values.total`), so the sums have the same bits on every machine and for any number of lanes.
+order (:func:`strapdown.kernels.lane_values.sum_lanes`), so the sums have the same bits on every machine and for any number of lanes.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from strapdown.kernels.algebra import (
 from strapdown.kernels.lane_angles import rotation_vector
 from strapdown.kernels.lane_values import (
     bits_of,
-    chosen,
     lanes_of,
     load_like,
     number_of_bits,
     number_where,
+    select,
     store,
 )
 from strapdown.kernels.montecarlo_run import KEPT
@@ -66,8 +66,8 @@ def normalized_squares(e_theta, e_bias, A, B, C):
 def bin_numbers(x, first, last):
     """Return the bins of non-negative lanes: their shifted bits, limited to ``first`` and ``last``, minus ``first``."""
     word = bits_of(x) >> np.uint64(49)
-    word = chosen(word < first, first, word)
-    word = chosen(word > last, last, word)
+    word = select(word < first, first, word)
+    word = select(word > last, last, word)
     return word - first
 
 
@@ -75,7 +75,7 @@ def add_up(sums, row, place, good, values):
     """Add the good lanes of values to neighbouring numbers of an epoch."""
     for i, x in enumerate(values):
         at = (row * SUMS + place + i) * len(x)
-        store(sums, at, load_like(sums, at, x) + chosen(good, x, 0.0))
+        store(sums, at, load_like(sums, at, x) + select(good, x, 0.0))
 
 
 class Sums(NamedTuple):
@@ -129,7 +129,7 @@ def accumulate(pattern, kept, width, column, valid, truth, error_bins, nees_bins
             & (dot(e_theta, e_theta) <= _LARGEST)
             & (dot(e_bias, e_bias) <= _LARGEST)
         )
-        worst = chosen(sound, chosen(nees[0] > worst, nees[0], worst), _INFINITE)
+        worst = select(sound, select(nees[0] > worst, nees[0], worst), _INFINITE)
         good = sound & counted
         out.finite[row] += number_where(good)
         e = (*e_theta, *e_bias)
@@ -138,7 +138,7 @@ def accumulate(pattern, kept, width, column, valid, truth, error_bins, nees_bins
         add_coverage(out.coverage, row, good, e, (P[0], P[3], P[5], C[0], C[3], C[5]))
         store_bins(out.scratch, error_bins, e, 0)
         store_bins(out.scratch, nees_bins, nees, 6)
-        store(score, 0, chosen(good, 1.0, like))
+        store(score, 0, select(good, 1.0, like))
         for lane in range(n):
             if score[lane] > 0.0:
                 for c in range(9):
@@ -164,7 +164,7 @@ def multiply_nees(sums, row, good, nees):
     for column, x in enumerate(nees):
         n = len(x)
         at = (row * SUMS + NEES_PRODUCT + 2 * column) * n
-        bits = bits_of(load_like(sums, at, x) * chosen(good, chosen(x > _TINY, x, _TINY), 1.0))
+        bits = bits_of(load_like(sums, at, x) * select(good, select(x > _TINY, x, _TINY), 1.0))
         store(sums, at, number_of_bits((bits & _MANTISSA) | _UNIT))
         binades = number_of_bits((bits >> _S52) | _INTEGER) - _EXPONENT_BIAS
         store(sums, at + n, load_like(sums, at + n, x) + binades)
@@ -182,4 +182,4 @@ def add_coverage(coverage, row, good, e, variances):
 def store_bins(scratch, bounds, values, first):
     """Write the bins of |x| of each value, from place ``first`` on."""
     for i, x in enumerate(values):
-        store(scratch, (first + i) * len(x), bin_numbers(chosen(x < 0.0, -x, x), bounds[0], bounds[1]))
+        store(scratch, (first + i) * len(x), bin_numbers(select(x < 0.0, -x, x), bounds[0], bounds[1]))

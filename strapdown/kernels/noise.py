@@ -16,7 +16,7 @@ import math
 import numpy as np
 
 from strapdown.kernels.algebra import square_root
-from strapdown.kernels.lane_values import anywhere, bits_of, chosen, leading_zeros, number_of_bits, signed_number
+from strapdown.kernels.lane_values import any_lane, bits_of, leading_zeros, number_of_bits, select, signed_number
 
 _ZERO, _ONE, _TWO, _THREE, _FOUR, _FIVE = (np.uint64(k) for k in range(6))
 _PARITY = np.uint64(0x1BD11BDAA9FC1A22)
@@ -160,9 +160,9 @@ def normal_pair(word0, word1):
     cosine = ((((_C8 * w + _C7) * ww + (_C6 * w + _C5)) * ww + (_C4 * w + _C3)) * ww + (_C2 * w + _C1)) * w + _C0
     a = radius * sine
     b = radius * cosine
-    b = chosen((word1 & _SIGN) != _ZERO, -b, b)
+    b = select((word1 & _SIGN) != _ZERO, -b, b)
     swap = (word1 & _SWAP) != _ZERO
-    return chosen(swap, b, a), chosen(swap, a, b)
+    return select(swap, b, a), select(swap, a, b)
 
 
 def single_normals(radius_word, angle_word):
@@ -176,11 +176,11 @@ def single_normals(radius_word, angle_word):
     d = signed_number(radius_word << zeros) * _WORD + _HALF
     binades = signed_number(zeros)
     scarce = radius_word < _SCARCE
-    if anywhere(scarce):
+    if any_lane(scarce):
         longer = (radius_word << _W16) | (angle_word & _LOW) | _W1
         zeros = leading_zeros(longer)
-        d = chosen(scarce, signed_number(longer << zeros) * _WORD, d)
-        binades = chosen(scarce, signed_number(zeros + _W16), binades)
+        d = select(scarce, signed_number(longer << zeros) * _WORD, d)
+        binades = select(scarce, signed_number(zeros + _W16), binades)
     p = (((((((_R8 * d + _R7) * d + _R6) * d + _R5) * d + _R4) * d + _R3) * d + _R2) * d + _R1) * d + _R0
     radius = square_root(d * p + binades * _TWO_LOG_TWO)
     x = signed_number(angle_word) * _TWO_WORDS + _WORD

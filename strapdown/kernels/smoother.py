@@ -36,7 +36,7 @@ from strapdown.kernels.filter import (
     turn_vectors,
     write_transition,
 )
-from strapdown.kernels.lane_values import WIDTH, load, spread, store
+from strapdown.kernels.lane_values import WIDTH, broadcast, load, store
 from strapdown.kernels.rotation import inverse_right_jacobian, logarithm, moved, quaternion_multiply
 from strapdown.kernels.structure import Model
 
@@ -165,7 +165,7 @@ def subtract_products(gain, A, B, n, noisy):
 def fill_zeros(A):
     """Set a matrix, whose size is a multiple of eight, to zero."""
     for i in range(0, len(A), WIDTH):
-        store(A, i, spread(0.0))
+        store(A, i, broadcast(0.0))
 
 
 def step_back(segments, k, models, space):

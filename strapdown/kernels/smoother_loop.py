@@ -16,13 +16,13 @@ import numpy as np
 from strapdown.kernels.algebra import dot, multiply, scale, times_transpose_upper
 from strapdown.kernels.lane_values import (
     WIDTH,
-    anywhere,
-    chosen,
+    any_lane,
+    broadcast,
     fetch,
     lanes_of,
     load,
     load_quadruples,
-    spread,
+    select,
     store,
 )
 from strapdown.kernels.rotation import (
@@ -150,15 +150,15 @@ def prepare_turns(segments, start, work, group):
     r = quaternion_multiply((p[0], -p[1], -p[2], -p[3]), load_quadruples(segments, start + ROW + 4, ROW))
     squared = r[1] * r[1] + r[2] * r[2] + r[3] * r[3]
     # Without an update the bias is unchanged to the bit, the attitude to rounding.
-    seen = chosen(dot(step_b, step_b) > 0.0, spread(1.0), squared) > _NOTHING
-    if anywhere(seen):
+    seen = select(dot(step_b, step_b) > 0.0, broadcast(1.0), squared) > _NOTHING
+    if any_lane(seen):
         turn = (-r[3], *r, *step_b, r[2], -r[1], r[0], r[3], -r[2])
         store_several(work, COLUMNS + TURN * w, turn)
-        near = chosen(r[0] > 0.0, squared, spread(1.0)) < 0.25 * SHORT
-        how = chosen(near, spread(1.0), spread(2.0))
-        store(work, group + MOVED, chosen(seen, how, spread(0.0)))
+        near = select(r[0] > 0.0, squared, broadcast(1.0)) < 0.25 * SHORT
+        how = select(near, broadcast(1.0), broadcast(2.0))
+        store(work, group + MOVED, select(seen, how, broadcast(0.0)))
     else:
-        store(work, group + MOVED, spread(0.0))
+        store(work, group + MOVED, broadcast(0.0))
 
 
 def prepare_shares(segments, start, work, angle_variance, rate_variance):
@@ -202,7 +202,7 @@ def load_share(work):
 
 def prepare_rows(work, group):
     """Write the matrices of :func:`prepare_gains`, one row per segment, eight numbers of four segments at a time."""
-    blocks = MATRICES // WIDTH if anywhere(load(work, group + MOVED) > 0.5) else TURN // WIDTH
+    blocks = MATRICES // WIDTH if any_lane(load(work, group + MOVED) > 0.5) else TURN // WIDTH
     for k in range(blocks):
         for i in range(0, WIDTH, 4):
             one, two, three, four = load_quadruples(work, COLUMNS + WIDTH * WIDTH * k + i, WIDTH)
@@ -272,13 +272,13 @@ def fold_jacobians(work, group, errors):
     """Write the first three columns of G J for a group, J = J_r(a)⁻¹ J_r(ε) with ε the error at the end of each segment."""
     w = WIDTH
     seen = load(work, group + MOVED) > 0.5
-    if anywhere(seen):
+    if any_lane(seen):
         e0, e1, e2, _ = load_quadruples(work, errors + w, w)
         a0, a1, a2, _ = load_quadruples(work, SEEN, w)
         a0, a1, a2 = scale(load(work, FACTOR), (a0, a1, a2))
         e = (e0, e1, e2)
-        a = (chosen(seen, a0, e0), chosen(seen, a1, e1), chosen(seen, a2, e2))
-        if anywhere(dot(e, e) > SQUARED_RANGE) or anywhere(dot(a, a) > SQUARED_RANGE):
+        a = (select(seen, a0, e0), select(seen, a1, e1), select(seen, a2, e2))
+        if any_lane(dot(e, e) > SQUARED_RANGE) or any_lane(dot(a, a) > SQUARED_RANGE):
             for i in range(WIDTH):
                 s = errors + w + w * i
                 e = (work[s], work[s + 1], work[s + 2])
@@ -342,7 +342,7 @@ def move_states(work, group, errors, whole):
     t = SMOOTHED
     store_several(work, t + 4 * w, (b0 + beta0, b1 + beta1, b2 + beta2))
     e = (e0, e1, e2)
-    if anywhere(dot(e, e) > SQUARED_RANGE):
+    if any_lane(dot(e, e) > SQUARED_RANGE):
         for i in range(WIDTH):
             u = group + ATTITUDE + i
             s = errors + w * i
@@ -442,7 +442,7 @@ def smooth_back(segments, starts, first, angle_variance, rate_variance, work, ou
         errors_before = ERRORS + (w + 1) * w * (1 - (t & 1))
         if t == top:
             for i in range(w + 1):
-                store(work, errors + w * i, spread(0.0))
+                store(work, errors + w * i, broadcast(0.0))
         elif t > top:
             store(work, errors + w * count, load(work, errors_before))
             p_end = COVARIANCE + COVARIANCE_ROW * count_before

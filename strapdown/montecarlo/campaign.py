@@ -25,7 +25,7 @@ import strapdown
 from strapdown import scenarios
 from strapdown.checks import Hint, InputError, count, finite, one_of
 from strapdown.estimation import setup
-from strapdown.files import locked, reading, set_attributes, whole_hdf5, written_beside
+from strapdown.files import atomic_write, locked, reading, set_attributes, whole_hdf5
 from strapdown.montecarlo.engine import MACHINES, Chunks, Identity, Work, Workers, choose, identity, in_threads
 from strapdown.montecarlo.plan import Plan, from_table
 from strapdown.montecarlo.statistics import BINS, Statistics, merge
@@ -275,7 +275,7 @@ def _compute(
     work: Work,
     state: _Progress,
     runs: int,
-    hands: Workers,
+    workers: Workers,
     write: Callable[[], Campaign],
     progress: Callable[[int], None] | None,
 ) -> Campaign:
@@ -286,7 +286,7 @@ def _compute(
     written = write()  # fails before anything is computed if the file cannot be written
     due, unwritten = 0.0, False
     try:
-        for place, (part,) in hands(work, missing):
+        for place, (part,) in workers(work, missing):
             state.take(missing[place][0], part)
             unwritten = True
             if progress is not None:
@@ -341,7 +341,7 @@ def _write(path: Path, campaign: Campaign, state: _Progress, table: Mapping[str,
     import numba
 
     plan = campaign.plan
-    with written_beside(path, durable=True) as temporary, whole_hdf5(temporary) as file:
+    with atomic_write(path, durable=True) as temporary, whole_hdf5(temporary) as file:
         attributes = {
             "kind": KIND,
             "format": FORMAT,

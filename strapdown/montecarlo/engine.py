@@ -225,17 +225,17 @@ def in_threads(threads: int | None = None) -> Workers:
         tasks: SimpleQueue[int | None] = SimpleQueue()
         results: SimpleQueue[tuple[int, Parts | BaseException]] = SimpleQueue()
 
-        def labour() -> None:
+        def worker_loop() -> None:
             while (place := tasks.get()) is not None:
                 try:
                     results.put((place, work(*chunks[place])))
                 except BaseException as error:
                     results.put((place, error))
 
-        hands = [Thread(target=labour, daemon=True) for _ in range(min(number, len(chunks)))]
-        for hand in hands:
-            hand.start()
-        window = Window(len(chunks), len(hands))
+        workers = [Thread(target=worker_loop, daemon=True) for _ in range(min(number, len(chunks)))]
+        for thread in workers:
+            thread.start()
+        window = Window(len(chunks), len(workers))
         try:
             while window.open:
                 while (place := window.begin()) is not None:
@@ -246,7 +246,7 @@ def in_threads(threads: int | None = None) -> Workers:
                 window.finish(done)
                 yield done, result
         finally:
-            for _ in hands:
+            for _ in workers:
                 tasks.put(None)
 
     return work_through

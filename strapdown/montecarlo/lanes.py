@@ -481,7 +481,7 @@ def run_chunk(plan: Plan, first_run: int, runs: int, *, width: int | None = None
 
 
 def _total(lanes: Array) -> Array:
-    """Return the sum over the last axis, in the order of :func:`strapdown.kernels.lane_values.total`."""
+    """Return the sum over the last axis, in the order of :func:`strapdown.kernels.lane_values.sum_lanes`."""
     first = np.ascontiguousarray(np.moveaxis(lanes, -1, 0))
     while len(first) > 1:
         half = len(first) // 2

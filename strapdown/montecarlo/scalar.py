@@ -93,7 +93,7 @@ def record_of(plan: Plan, run: int) -> ImuRecord:
 class _Remembered:
     """A motion that caches its last results: all runs evaluate it at the same times, at more cost than the filter's."""
 
-    _MOST = 32
+    _MAX_KEPT = 32
 
     def __init__(self, motion: Motion) -> None:
         self._motion = motion
@@ -109,7 +109,7 @@ class _Remembered:
             answer = np.array(getattr(self._motion, what)(times))
             answer.flags.writeable = False  # shared by all runs
             self._known[key] = answer
-            if len(self._known) > self._MOST:  # times of a jittered clock, which do not recur
+            if len(self._known) > self._MAX_KEPT:  # times of a jittered clock, which do not recur
                 with contextlib.suppress(KeyError):
                     self._known.popitem(last=False)
         return answer

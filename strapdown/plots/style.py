@@ -16,7 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from strapdown.checks import one_of
-from strapdown.files import written_beside
+from strapdown.files import atomic_write
 from strapdown.units import DEGREE_PER_HOUR, STANDARD_GRAVITY
 
 BLUE, ORANGE, GREEN, VERMILION, PURPLE, SKY, YELLOW = (
@@ -124,7 +124,7 @@ def save(figure: Figure, path: str | os.PathLike[str]) -> Path:
         The file written.
     """
     undated: dict[str, Any] = {".pdf": {"CreationDate": None}, ".svg": {"Date": None}}
-    with written_beside(path) as temporary, matplotlib.rc_context(STYLE), warnings.catch_warnings():
+    with atomic_write(path) as temporary, matplotlib.rc_context(STYLE), warnings.catch_warnings():
         warnings.filterwarnings("ignore", r"Glyph .* missing from font")  # characters of a file name, drawn as boxes
         figure.savefig(temporary, metadata=undated.get(Path(path).suffix.lower()))
     return Path(path)

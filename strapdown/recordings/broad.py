@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from strapdown.checks import InputError, positive
-from strapdown.files import reading, whole_hdf5, written_beside
+from strapdown.files import atomic_write, reading, whole_hdf5
 from strapdown.recordings import recordfiles
 from strapdown.records.recording import Recording, field_in, with_gyro
 
@@ -82,7 +82,7 @@ def write_broad(recording: Recording, path: str | os.PathLike[str]) -> None:
         "opt_quat": recording.true_attitude,
         "movement": recording.movement,
     }
-    with written_beside(path) as temporary, whole_hdf5(temporary) as file:
+    with atomic_write(path) as temporary, whole_hdf5(temporary) as file:
         file.attrs["sampling_rate"] = 1.0 / interval
         for name, value in content.items():
             if value is not None:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from strapdown.checks import Array, InputError, numbers
-from strapdown.files import reading, written_beside
+from strapdown.files import atomic_write, reading
 from strapdown.files.extras import library
 from strapdown.recordings import columns as naming
 from strapdown.recordings.delimited import recording_columns
@@ -225,6 +225,6 @@ def write_parquet_columns(
         arrow.field(name, values.type, metadata={"unit": unit} if (unit := (units or {}).get(name)) else None)
         for name, values in zip(found, arrays, strict=True)
     ]
-    with written_beside(path) as temporary:
+    with atomic_write(path) as temporary:
         table = arrow.Table.from_arrays(arrays, schema=arrow.schema(fields))
         parquet.write_table(table, temporary, write_page_checksum=True)

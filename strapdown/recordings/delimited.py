@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from strapdown.checks import Array, InputError
-from strapdown.files import reading, written_beside
+from strapdown.files import atomic_write, reading
 from strapdown.recordings import columns as naming
 from strapdown.recordings import recordfiles
 from strapdown.records.recording import CLOCK_OFFSET, Recording
@@ -244,6 +244,6 @@ def write_columns(path: str | os.PathLike[str], found: Mapping[str, NDArray[np.g
             texts.append([str(x) for x in column.tolist()])
         else:
             texts.append(["" if math.isnan(x) else repr(x) for x in column.tolist()])
-    with written_beside(path) as temporary, open(temporary, "w", encoding="utf-8", newline="") as file:
+    with atomic_write(path) as temporary, open(temporary, "w", encoding="utf-8", newline="") as file:
         file.write(separator.join(found) + "\n")
         file.writelines(separator.join(row) + "\n" for row in zip(*texts, strict=True))

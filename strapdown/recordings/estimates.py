@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from strapdown.checks import Array
-from strapdown.files import written_beside
+from strapdown.files import atomic_write
 from strapdown.files.extras import library
 from strapdown.recordings.dataframes import write_parquet_columns
 from strapdown.recordings.delimited import write_columns
@@ -33,7 +33,7 @@ def write_tum(
     found = estimate.table(frame=frame)
     q = np.stack([found[name] for name in ("qx", "qy", "qz", "qw")], axis=1)
     stamps = np.rint(estimate.time * 1e9).astype(np.int64) + (0 if recording is None else recording.epoch_ns)
-    with written_beside(path) as temporary, open(temporary, "w", encoding="utf-8") as file:
+    with atomic_write(path) as temporary, open(temporary, "w", encoding="utf-8") as file:
         file.write("# time tx ty tz qx qy qz qw\n")
         for stamp, row in zip(stamps.tolist(), q.tolist(), strict=True):
             sign, size = "-" if stamp < 0 else "", abs(stamp)
@@ -48,7 +48,7 @@ def write_rerun(estimate: Estimate, path: str | os.PathLike[str], *, recording: 
     """
     rr = library("rerun", f"writing {Path(path).name}", "rerun")
     found = estimate.table()
-    with written_beside(path) as temporary:
+    with atomic_write(path) as temporary:
         stream = rr.RecordingStream("strapdown")
         stream.save(str(temporary))
         time = [rr.TimeColumn("time", duration=estimate.time)]

@@ -9,7 +9,7 @@ from typing import Any
 
 import strapdown
 from strapdown.checks import Array, InputError
-from strapdown.files import reading, set_attributes, whole_hdf5, written_beside
+from strapdown.files import atomic_write, reading, set_attributes, whole_hdf5
 
 CONVENTIONS = (
     "quaternions Hamilton, scalar first, body to fixed frame: v_f = q v_b q^-1; error state (dtheta, db): "
@@ -23,7 +23,7 @@ CHUNK_ROWS = 4096
 @contextlib.contextmanager
 def result_file(path: str | os.PathLike[str], kind: str, attributes: Mapping[str, Any] | None) -> Iterator[Any]:
     """Yield an HDF5 file with its kind, version and conventions as attributes; it is created only when complete."""
-    with written_beside(path) as temporary, whole_hdf5(temporary) as file:
+    with atomic_write(path) as temporary, whole_hdf5(temporary) as file:
         own = {"kind": f"strapdown {kind}", "version": strapdown.__version__, "conventions": CONVENTIONS}
         set_attributes(file, {**own, **(attributes or {})})
         yield file

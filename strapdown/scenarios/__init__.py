@@ -162,12 +162,15 @@ class Scenario:
         return np.arange(round(self.duration * self.rate) + 1) / self.rate
 
 
-def chosen(given: Scenario | str | os.PathLike[str]) -> Scenario:
+def as_scenario(scenario: Scenario | str | os.PathLike[str]) -> Scenario:
     """Return a scenario from a Scenario, a built-in name, or the path of its TOML file."""
     instance(
-        "scenario", given, (Scenario, str, os.PathLike), "give a Scenario, a built-in name, or the path of a TOML file"
+        "scenario",
+        scenario,
+        (Scenario, str, os.PathLike),
+        "give a Scenario, a built-in name, or the path of a TOML file",
     )
-    return given if isinstance(given, Scenario) else load_scenario(given)
+    return scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
 
 
 def simulate(scenario: Scenario | str | os.PathLike[str], seed: int | None = None, run: int = 0) -> ImuRecord:
@@ -198,7 +201,7 @@ def simulate(scenario: Scenario | str | os.PathLike[str], seed: int | None = Non
     >>> record.truth.attitude.shape, [one.sensor for one in record.vectors]
     ((30001, 4), ['star 1', 'star 2'])
     """
-    scenario = chosen(scenario)
+    scenario = as_scenario(scenario)
     seed = scenario.seed if seed is None else seed
     spec, nominal = scenario.gyro, scenario.edges
     edges, stamps = gyro.sampling(spec, nominal, generator(seed, run, "gyro sampling"))
@@ -415,7 +418,7 @@ def _from_table(table: dict[str, Any], place: str) -> Scenario:
         values["temperature"] = tables.build(
             Temperature, tables.subtable(table["temperature"], where), _TEMPERATURE, where
         )
-    return tables.made(Scenario, values, table, _TOP_FORM, place)  # type: ignore[no-any-return]
+    return tables.construct(Scenario, values, table, _TOP_FORM, place)  # type: ignore[no-any-return]
 
 
 def _word(table: dict[str, Any], place: str, choices: Any) -> str:
@@ -428,7 +431,7 @@ def _read_motion(table: dict[str, Any], place: str) -> Motion:
     word = _word(table, place, [*_MOTIONS, "rest", "composed"])
     if word == "rest":
         form: Form = {"initial_attitude": tables.PLAIN}
-        return tables.made(motion.rest, tables.decode(table, form, place), table, form, place)  # type: ignore[no-any-return]
+        return tables.construct(motion.rest, tables.decode(table, form, place), table, form, place)  # type: ignore[no-any-return]
     if word == "composed":
         known_keys(place, table, ("base", "vibration"))
         parts = {

@@ -46,8 +46,8 @@ from strapdown.tuning.parameters import with_values as with_values
 from strapdown.tuning.procedure import GATED as GATED
 from strapdown.tuning.procedure import tune
 from strapdown.tuning.residual_checks import Unmodelled as Unmodelled
-from strapdown.tuning.residual_checks import doubted as doubted
 from strapdown.tuning.residual_checks import unmodelled as unmodelled
+from strapdown.tuning.residual_checks import with_misfit_flag as with_misfit_flag
 from strapdown.tuning.validation import Comparison as Comparison
 from strapdown.tuning.validation import compare, split
 

@@ -19,8 +19,8 @@ import numpy as np
 from strapdown import consistency
 from strapdown.checks import Array, InputError, one_of
 from strapdown.estimation.setup import FilterSetup
-from strapdown.tuning.innovations import MOST, Likelihood, made, with_engine
-from strapdown.tuning.objective import STEP, Case, Derivatives, Objective, by_part, posed
+from strapdown.tuning.innovations import MAX_DERIVATIVES, Likelihood, construct, with_engine
+from strapdown.tuning.objective import STEP, Case, Derivatives, Objective, by_part, make_problem
 
 Measure = Literal["likelihood", "rmse"]
 MAX_EPOCHS = 1000
@@ -104,11 +104,11 @@ def error_objective(
     """
     one_of("measure", measure, ("likelihood", "rmse"))
     applied = replace(chosen, gate=None, robust=None) if measure == "rmse" else chosen
-    problem = posed(cases, applied, free, threads=threads)
-    plain = applied.gate is None and applied.robust is None and len(problem.names) <= MOST
+    problem = make_problem(cases, applied, free, threads=threads)
+    plain = applied.gate is None and applied.robust is None and len(problem.names) <= MAX_DERIVATIVES
     base = with_engine(problem, lanes=plain)
     references = tuple(_spread(base, number, measure) for number in range(len(base.cases)))
-    objective = made(ErrorObjective, problem, base=base, measure=measure, references=references)
+    objective = construct(ErrorObjective, problem, base=base, measure=measure, references=references)
     return replace(objective, chosen=replace(problem.chosen, gate=chosen.gate, robust=chosen.robust))
 
 

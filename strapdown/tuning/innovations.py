@@ -36,12 +36,12 @@ from strapdown.tuning.objective import (
     Objective,
     by_part,
     joined,
+    make_problem,
     outliers_at,
-    posed,
 )
 from strapdown.tuning.parameters import ARW, INITIAL_ATTITUDE, INITIAL_BIAS, RRW, SCALE, SIGMA, axis_of
 
-MOST = WIDTH - 1
+MAX_DERIVATIVES = WIDTH - 1
 """Maximum number of derivatives in one pass over a record."""
 CURVATURE_STEP = 0.02
 """Step of a log parameter for the curvature by differences of the score."""
@@ -81,7 +81,7 @@ class LaneLikelihood(Objective):
     def derivatives(self, point: Array) -> Derivatives:
         """Return the likelihood and its derivatives at a point, in one pass over each record for up to seven parameters."""
         p = len(self.names)
-        blocks = [tuple(range(p))] if p <= MOST else _pairs_of_groups(p)
+        blocks = [tuple(range(p))] if p <= MAX_DERIVATIVES else _pairs_of_groups(p)
         jobs = [(case, point, block) for case in self.prepared for block in blocks]
         results = self.each(self._differences, jobs)
         found = []
@@ -281,7 +281,7 @@ Likelihood = LaneLikelihood | RunLikelihood
 Made = TypeVar("Made", bound=Objective)
 
 
-def made(kind: type[Made], problem: Objective, **more: Any) -> Made:
+def construct(kind: type[Made], problem: Objective, **more: Any) -> Made:
     """Return an objective of this class for a problem."""
     return kind(**{one.name: getattr(problem, one.name) for one in fields(Objective)} | more)
 
@@ -320,7 +320,7 @@ def likelihood(
     Objective
         For :func:`fit`.
     """
-    return with_engine(posed(cases, chosen, free, spacing=spacing, parts=parts, threads=threads))
+    return with_engine(make_problem(cases, chosen, free, spacing=spacing, parts=parts, threads=threads))
 
 
 def with_engine(problem: Objective, *, lanes: bool = True) -> Likelihood:
@@ -332,9 +332,9 @@ def with_engine(problem: Objective, *, lanes: bool = True) -> Likelihood:
     )
     if by_axis or problem.chosen.states is not None or not lanes:
         motions = [setup.measured_motion(record, problem.chosen) for record in records]
-        return made(RunLikelihood, problem, steps=tuple(map(Steps, problem.cases, steps, motions)))
+        return construct(RunLikelihood, problem, steps=tuple(map(Steps, problem.cases, steps, motions)))
     prepared = [_prepared(problem, *one) for one in zip(problem.cases, records, strict=True)]
-    return made(LaneLikelihood, problem, prepared=tuple(prepared))
+    return construct(LaneLikelihood, problem, prepared=tuple(prepared))
 
 
 def _prepared(problem: Objective, case: Case, record: ImuRecord) -> Prepared:

@@ -212,7 +212,7 @@ class Objective:
         return case.initial if factor == 1.0 else replace(case.initial, covariance=factor**2 * case.initial.covariance)
 
 
-def posed(
+def make_problem(
     cases: Sequence[Case],
     chosen: FilterSetup,
     free: Sequence[str],

@@ -16,7 +16,7 @@ from strapdown.tuning.innovations import LaneLikelihood, Likelihood, likelihood
 from strapdown.tuning.objective import OUTLIERS, Case, Objective
 from strapdown.tuning.outliers import TunedGate, contaminated_likelihood, log_likelihood, tuned_gate
 from strapdown.tuning.parameters import Prior, default_names
-from strapdown.tuning.residual_checks import doubted, examined
+from strapdown.tuning.residual_checks import examined, with_misfit_flag
 from strapdown.tuning.validation import Comparison, compare
 
 GATED = ("gate.probability", *OUTLIERS)
@@ -166,7 +166,7 @@ def _examined(
     """Return the tuning with tests for errors that it does not model, and what was minimised."""
     tested = examined(cases, before, result)
     for one in sorted(tested, key=lambda one: one.severity)[-1:]:
-        result = doubted(result, one)
+        result = with_misfit_flag(result, one)
     rms = None
     if rmse:
         rms = tuple(made.rms(np.stack([made.start, result.point - np.log(result.scale)])).tolist())

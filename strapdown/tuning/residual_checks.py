@@ -150,7 +150,7 @@ def unmodelled(case: Case, chosen: FilterSetup, *, probability: float = 0.99) ->
     """Return the evidence against a tuned filter in the part of a record that it was tuned on."""
     tail(probability)
     judgement = performance([case], chosen).judgements[0]
-    record = seen(case)
+    record = record_for_tuning(case)
     used = of_sensors(chosen, record)
     initial = setup.initial_state(used, case.initial.attitude, case.initial.bias)
     if used.gate is not None:
@@ -187,7 +187,7 @@ def examined(cases: Sequence[Case], before: FilterSetup, tuning: Tuning) -> tupl
     return tuple(unmodelled(case, tuning.setup) for case in cases[:MAX_EXAMINED])
 
 
-def seen(case: Case) -> ImuRecord:
+def record_for_tuning(case: Case) -> ImuRecord:
     """Return a case's record up to the end of its tuning data."""
     time = case.record.time
     last = int(np.searchsorted(time, case.last, side="right")) - 1
@@ -235,7 +235,7 @@ def scale_factor(record: ImuRecord, noise: ProcessNoise, initial: estimation.Sta
     )
 
 
-def doubted(tuning: Tuning, found: Unmodelled) -> Tuning:
+def with_misfit_flag(tuning: Tuning, found: Unmodelled) -> Tuning:
     """Return the tuning with a note on the random walk of the bias if a scale factor explains the innovations better."""
     if not found.moves_with_the_rate:
         return tuning

@@ -34,7 +34,7 @@ _ROBUST_FORM: tables.Form = {
     "iterations": tables.PLAIN,
 }
 _PARTS = ("integration", "sigma", "gate", "robust", "states", "estimator")
-NEVER = 0
+NO_RECOVERY = 0
 """Value of ``recovery`` in a file for a gate that never recovers, as TOML has no null."""
 
 
@@ -48,7 +48,7 @@ def to_table(setup: FilterSetup) -> dict[str, Any]:
     if setup.gate is not None:
         table["gate"] = tables.encode(setup.gate, _GATE_FORM)
         if setup.gate.recovery is None:
-            table["gate"]["recovery"] = NEVER
+            table["gate"]["recovery"] = NO_RECOVERY
     if setup.robust is not None:
         table["robust"] = tables.encode(setup.robust, _ROBUST_FORM)
     if setup.states is not None:
@@ -76,7 +76,7 @@ def from_table(table: Mapping[str, Any], place: str = "filter") -> FilterSetup:
     if "sigma" in given:
         parts["sigma"] = {name: sensor_sigma(f"{place}: sigma: {name}", s) for name, s in given["sigma"].items()}
     if "gate" in given:
-        never = {"recovery": None} if given["gate"].get("recovery") == NEVER else {}
+        never = {"recovery": None} if given["gate"].get("recovery") == NO_RECOVERY else {}
         gate = {key: value for key, value in given["gate"].items() if key not in never}
         parts["gate"] = tables.build(Gate, gate, _GATE_FORM, f"{place}: gate", **never)
     if "robust" in given:

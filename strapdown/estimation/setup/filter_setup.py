@@ -214,7 +214,7 @@ class FilterSetup(ByValue):
         noise = ProcessNoise(**matching.noise_beside_states(spec, white))
         accurate = matching.commutes_badly(record, noise.angle_random_walk)
         if not isinstance(states, bool) and states is not None:
-            kept = kept.chosen(tuple(states)) if states else States()
+            kept = kept.select(tuple(states)) if states else States()
         return replace(
             plain,
             # Flicker is a state, or in the noise.

@@ -270,7 +270,7 @@ class States(ByValue):
             found += [f"{sensor}.{part}" for part, fields in _SENSOR_PARTS.items() if _declared(one, fields)]
         return tuple(found)
 
-    def chosen(self, names: tuple[str, ...]) -> States:
+    def select(self, names: tuple[str, ...]) -> States:
         """Return only the states with these names.
 
         Parameters
