@@ -27,7 +27,6 @@ from strapdown.ahrs.starting import (
 from strapdown.calibration import UnitCalibration, with_gyro_states
 from strapdown.checks import Array
 from strapdown.estimation.gating import Gate, Robust
-from strapdown.estimation.memory import side_by_side
 from strapdown.estimation.schedule import joined
 from strapdown.kernels import recording_steps
 from strapdown.kernels.machine import compiled, read_only
@@ -237,8 +236,8 @@ def _at_stamps(
 ) -> Estimate:
     """Return the estimate at the recording's stamps: propagated by the gyro from the step before each stamp, and over the gyro's delay."""
     edge, n = prepared.edge, len(used.time)
-    attitude, bias, variance = side_by_side(*(((n, width), float) for width in (4, 3, 6)))
-    (P,) = side_by_side(((n if options.full_covariance else 0, 6, 6), float))
+    attitude, bias, variance = (np.empty((n, width)) for width in (4, 3, 6))
+    P = np.empty((n if options.full_covariance else 0, 6, 6))
     late = np.broadcast_to(delays.gyro, used.time.shape)
     ahead = -sensor_delays.turn_over(used, -late) if options.smooth else used.rate * late[:, None]
     interval = max(parameters.step, float(np.median(np.diff(used.time))))

@@ -18,7 +18,6 @@ from strapdown.estimation import temperature
 from strapdown.estimation.angular_acceleration import turning
 from strapdown.estimation.error_states import ErrorStates, spans
 from strapdown.estimation.gating import LOCK_OUT, Gate, Robust
-from strapdown.estimation.memory import side_by_side
 from strapdown.estimation.model import Model
 from strapdown.estimation.schedule import Schedule, innovations_by_sensor, joined, schedule, skipped_too
 from strapdown.estimation.states import (
@@ -304,8 +303,8 @@ def _in_registers(problem: Problem, options: Options) -> Passed:
     record, events, every = problem.record, problem.events, options.every
     rows = len(record.increments) // every + 1
     shapes = (rows, 4), (rows, 3), (rows, 6), (rows if options.full_covariance else 0, 21)
-    written = side_by_side(*((shape, float) for shape in (*shapes, _innovations(events, judged=False))))
-    (segments,) = side_by_side(((options.segments + 1 if options.segments else 0, 32), float))
+    written = [np.empty(shape) for shape in (*shapes, _innovations(events, judged=False))]
+    segments = np.empty((options.segments + 1 if options.segments else 0, 32))
     out = six_states.Outputs._make((*written, segments[: options.segments]))
     body = body_in_registers(problem)
     state = body.state
@@ -526,7 +525,7 @@ def _run(problem: Problem, options: Options) -> Passed:
         _innovations(events, judged=options.judged) if options.outliers is None else (len(events.time), 9),
         (options.segments + 1 if options.segments else 0, segment_width(model)),
     )
-    *written, stored = side_by_side(*((shape, float) for shape in shapes))
+    *written, stored = (np.empty(shape) for shape in shapes)
     out = structure.Outputs._make((*written, stored[: options.segments]))
     judge = Judge(problem, options)
     weight, happened = None, []

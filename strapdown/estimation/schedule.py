@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from strapdown.checks import Array, InputError
-from strapdown.estimation.memory import side_by_side
 from strapdown.kernels import measurement
 from strapdown.kernels.machine import compiled, read_only
 from strapdown.kernels.measurement import KIND_CODES
@@ -54,7 +53,7 @@ class Schedule:
         number = int(self.bounds[-1])
         # One byte for the sensor if possible: the loops read it for each event.
         narrow = np.uint8 if len(self.sensors) <= 256 else np.uint32
-        time, row, sensor = side_by_side(((number,), float), ((number,), np.uint32), ((number,), narrow))
+        time, row, sensor = np.empty(number), np.empty(number, np.uint32), np.empty(number, narrow)
         first, *others = self.series_time or (np.empty(0),)
         if all(np.array_equal(first, other) for other in others):
             compiled(measurement.common_order)(first, len(self.sensors), time, row, sensor)

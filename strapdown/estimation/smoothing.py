@@ -30,7 +30,6 @@ from strapdown.estimation import model as modelling
 from strapdown.estimation.error_states import ErrorStates
 from strapdown.estimation.forward import Options, Problem
 from strapdown.estimation.gating import Gate, Robust
-from strapdown.estimation.memory import side_by_side
 from strapdown.estimation.recovery_segments import Break, Rerun
 from strapdown.estimation.states import (
     GateMemory,
@@ -296,7 +295,7 @@ class _SixStates:
     def outputs(self, edges: int, options: Options) -> list[Array]:
         """Return arrays for the smoothed states."""
         shapes = (edges, 4), (edges, 3), (edges, 6), (edges if options.full_covariance else 0, 21)
-        return side_by_side(*((shape, float) for shape in shapes))
+        return [np.empty(shape) for shape in shapes]
 
     def estimate(self, outputs: Sequence[Array], options: Options) -> Estimate:
         """Return the smoothed states as an estimate."""
@@ -349,7 +348,7 @@ class _ManyStates:
         kept = n if options.error_state_covariance else 6
         whole = (edges if options.full_covariance else 0, kept, kept)
         shapes = (edges, n + 1), (edges, n), whole
-        return side_by_side(*((shape, float) for shape in shapes))
+        return [np.empty(shape) for shape in shapes]
 
     def estimate(self, outputs: Sequence[Array], options: Options) -> Estimate:
         """Return the smoothed states as an estimate."""
