@@ -32,11 +32,11 @@ from strapdown.kernels.gate_rules import WIDE_PASSES
 from strapdown.kernels.iterated_update import (
     ACCEPTED,
     KNOWN,
+    MIN_CORRECTION_UNKNOWN,
     ONE_AXIS,
     PASSED_OVER,
     REFUSED,
     RELINEARIZED,
-    SETTLED,
     TURN_ASIDE,
     UNKNOWN,
     UNKNOWN_TILT,
@@ -171,7 +171,7 @@ def linearize(
     if passes == 1:
         return first
     unknown = bool(np.trace(P[:3, :3]) >= UNKNOWN)
-    tolerance = SETTLED if unknown else RELINEARIZED
+    tolerance = MIN_CORRECTION_UNKNOWN if unknown else RELINEARIZED
     done, trials = 1, 0
     while True:
         step, size = seen.correction()

@@ -28,7 +28,7 @@ from strapdown.checks import InputError
 from strapdown.cli.filters import filter_for
 from strapdown.estimation import setup
 from strapdown.estimation.setup import read_estimate
-from strapdown.estimation.states import ONCE, ProcessNoise
+from strapdown.estimation.states import PRIOR_INFLATION, ProcessNoise
 from strapdown.gyro import GyroSpec
 from strapdown.recordings.recordfiles import read_record, write_record
 from strapdown.records import ImuRecord, Truth
@@ -158,7 +158,7 @@ def test_the_first_measurements_start_the_filter_where_its_sigma_says(sensors):
         record = simulate(made(sensors, 1.0), 8, run_number)
         state = estimation.first_state(record, NOISE, bias_sigma=2e-3)
         e = quaternion.log(quaternion.multiply(quaternion.conjugate(state.attitude), record.truth.attitude[0]))
-        errors.append(e @ np.linalg.solve(state.covariance[:3, :3], e) * ONCE**2 / 3.0)
+        errors.append(e @ np.linalg.solve(state.covariance[:3, :3], e) * PRIOR_INFLATION**2 / 3.0)
     assert 0.4 < np.mean(errors) < 1.8
 
 

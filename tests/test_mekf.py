@@ -11,7 +11,7 @@ from measured import record_of, resting, series_of
 from strapdown import coning, consistency, estimation, gyro, motion, quaternion, records
 from strapdown.checks import InputError
 from strapdown.estimation.schedule import schedule
-from strapdown.estimation.states import ONCE, ProcessNoise, initial_state
+from strapdown.estimation.states import PRIOR_INFLATION, ProcessNoise, initial_state
 from strapdown.estimation.step_filter import StepFilter
 from strapdown.kernels import measurement
 from strapdown.records import ImuRecord, Truth
@@ -188,7 +188,7 @@ def test_a_start_from_vertical_and_heading_knows_what_the_tilt_does_to_the_headi
         state = estimation.first_state(
             record, ProcessNoise(angle_random_walk=1e-6, rate_random_walk=0.0), bias_sigma=1e-3
         )
-        P = state.covariance[:3, :3] / ONCE**2
+        P = state.covariance[:3, :3] / PRIOR_INFLATION**2
         e = quaternion.log(quaternion.multiply(quaternion.conjugate(state.attitude), q))
         vertical = quaternion.to_matrix(state.attitude)[2]
         whole.append(e @ np.linalg.solve(P, e) / 3.0)
@@ -220,7 +220,7 @@ def test_a_start_from_a_measured_attitude_goes_back_to_the_first_edge():
     R = quaternion.to_matrix(quaternion.exp(turn))
     expected = R @ np.diag(axes**2) @ R.T + (1e-6 * 2.0 + (2e-3 * 2.0) ** 2) * np.eye(3)
     assert quaternion.angle_between(state.attitude, q) < 1e-12
-    np.testing.assert_allclose(state.covariance[:3, :3] / ONCE**2, expected, rtol=1e-10, atol=1e-18)
+    np.testing.assert_allclose(state.covariance[:3, :3] / PRIOR_INFLATION**2, expected, rtol=1e-10, atol=1e-18)
 
 
 def test_a_start_from_whole_vectors_is_that_from_their_directions():
@@ -267,7 +267,7 @@ def test_sigma_of_a_start_from_vertical_and_heading_has_the_gyro_s_error_between
         record = ImuRecord(time=dt * np.arange(15), increments=turns, vectors=series)
         state = estimation.first_state(record, noise, bias_sigma=1e-9)
         error = quaternion.log(quaternion.multiply(quaternion.conjugate(state.attitude), q))
-        nees.append(error @ np.linalg.solve(state.covariance[:3, :3] / ONCE**2, error) / 3.0)
+        nees.append(error @ np.linalg.solve(state.covariance[:3, :3] / PRIOR_INFLATION**2, error) / 3.0)
     assert abs(np.mean(nees) - 1.0) < 4.0 * np.sqrt(2.0 / (3.0 * runs))
 
 

@@ -180,8 +180,8 @@ def test_a_cause_that_explains_more_goes_first():
 def test_what_is_held_out_is_left_out():
     one, _ = tuned(1)
     (train,), _ = tuning.split([one], 0.4)
-    assert residual_checks.seen(train).time[-1] == pytest.approx(540.0)
-    assert residual_checks.seen(one) is one.record
+    assert residual_checks.record_for_tuning(train).time[-1] == pytest.approx(540.0)
+    assert residual_checks.record_for_tuning(one) is one.record
 
 
 def test_a_hard_iron_is_named_where_the_innovations_are_not_white():
