@@ -477,7 +477,7 @@ def test_from_more_wild_directions_than_it_doubts_it_recovers(size):
     recovered = 0
     for run in range(15):
         record, belief = orbit(run)
-        number = multiple_model.DOUBTED + 1
+        number = multiple_model.MAX_FIRST_OUTLIERS + 1
         found = multiple_model.run(
             wild(record, number, size, run), belief, every=10, gate=Gate(restart_bias_sigma=1e-4)
         )
