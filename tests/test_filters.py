@@ -906,7 +906,6 @@ def test_coefficients_of_a_turn_of_any_size(angle):
             wanted = [mpmath.sin(t) / t, (1 - mpmath.cos(t)) / t**2, third, (t**2 / 2 - 1 + mpmath.cos(t)) / t**4]
             wanted.append((mpmath.mpf(1) / 3 - 2 * third) / t**2)
         wanted = [float(one) for one in wanted]
-    np.testing.assert_allclose(rotation.sine_and_versine(angle * angle), wanted[:2], rtol=1e-12, atol=1e-15)
     phi = angle * np.array([0.6, -0.64, 0.48])
     q, J = rotation.moved((1.0, 0.0, 0.0, 0.0), tuple(phi))
     skew = kinematics.skew(np.array([0.6, -0.64, 0.48]))

@@ -197,8 +197,3 @@ def divided(X, F):
 def congruent(M, S):
     """Return the symmetric M S Mᵀ."""
     return times_transpose_upper(multiply(M, full(S)), M)
-
-
-def plus_square(S, v):
-    """Return S + v vᵀ of a symmetric matrix."""
-    return symmetric_minus_outer(S, scale(-1.0, v), v)

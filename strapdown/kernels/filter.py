@@ -179,11 +179,6 @@ def any_number(entries):
 # -------------------------------------------------------------------------------------------------------------------------------- layout
 
 
-def zero_of(pattern):
-    """Return zero, a float or lanes, for a tuple of as many floats as there are lanes."""
-    return pattern[0] if LANES == 1 else lanes_of(pattern)
-
-
 def value_at(array, i, like):
     """Return value i of an array of lanes."""
     return array[i] if LANES == 1 else load_like(array, i * LANES, like)

@@ -167,15 +167,6 @@ def moved(q, phi):
     return q, skew_polynomial(1.0, -2.0 * s * s / x, (theta - math.sin(theta)) / (theta * x), phi)
 
 
-def sine_and_versine(x):
-    """Return sin θ/θ and (1 − cos θ)/θ² at θ = √x of any size."""
-    if x <= SQUARED_RANGE:
-        return sinc(x), second(x)
-    angle = math.sqrt(x)
-    half = math.sin(0.5 * angle)
-    return math.sin(angle) / angle, 2.0 * half * half / x
-
-
 def composed(r, phi):
     """Return the rotation vector of r ⊗ exp(φ), r a unit quaternion, any angles."""
     u = (
