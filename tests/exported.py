@@ -37,11 +37,11 @@ class Plain:
         self.program, n = program, program.n
         helpers = {
             "square_root": math.sqrt,
-            "chosen": lambda condition, a, b: a if condition else b,
-            "anywhere": self.turned_far,
+            "select": lambda condition, a, b: a if condition else b,
+            "any_lane": self.turned_far,
         }
         self.kernels = body.Kernels(program.kernels, helpers, {})
-        self.chosen, self.root, self.equal = helpers["chosen"], math.sqrt, lambda a, b: a == b
+        self.select, self.root, self.equal = helpers["select"], math.sqrt, lambda a, b: a == b
         self.whole, self.scratch = math.floor, dict
         self.f = SimpleNamespace(
             x=[0.0] * (n + 1),

@@ -31,8 +31,8 @@ class Target(Function):
             "any_lane": trace.any_lane,
             "far_turn": self._far_turn,
             "load": load,
-            "spread": spread,
-            "total": total,
+            "broadcast": broadcast,
+            "sum_lanes": sum_lanes,
             "math": SimpleNamespace(expm1=lambda x: trace.symbol("expm1", x), nan=float("nan"), pi=3.141592653589793),
         }
         self.kernels = Kernels(program.kernels, helpers, dict.fromkeys(FORKED, trace.fork))
@@ -89,7 +89,7 @@ def load(array: Any, start: int) -> Eight:
     return Eight(array.reshape(-1)[start : start + 8].tolist())
 
 
-def total(x: Any) -> Any:
+def sum_lanes(x: Any) -> Any:
     """Return the sum of eight numbers, the upper half added to the lower until one is left."""
     while len(x) > 1:
         half = len(x) // 2
@@ -97,7 +97,7 @@ def total(x: Any) -> Any:
     return x[0]
 
 
-def spread(x: Any) -> Eight:
+def broadcast(x: Any) -> Eight:
     """Return a number eight times."""
     return Eight([x] * 8)
 
