@@ -51,7 +51,7 @@ class LiveAhrs:
 
     See Also
     --------
-    LiveFilter : The filter for any sensors and error states.
+    strapdown.estimation.LiveFilter : The filter for any sensors and error states.
 
     Notes
     -----

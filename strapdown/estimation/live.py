@@ -69,7 +69,7 @@ class LiveFilter:
 
     See Also
     --------
-    LiveAhrs : The same for an IMU, with what :func:`strapdown.estimate` does with its recording.
+    strapdown.ahrs.LiveAhrs : The same for an IMU, with what :func:`strapdown.estimate` does with its recording.
     StepFilter : The same filter on filterpy, five hundred times slower, for inspection of its steps.
 
     Notes
