@@ -211,7 +211,10 @@ class Analysis(Listed):
             )
         if (worst := max(attitude, bias)) > MAX_NEES:
             of = "bias" if bias > attitude else "attitude"
-            return f"The filter will be optimistic in {of}: its errors will be {np.sqrt(worst):.3g} times its σ."
+            return (
+                f"For a unit with exactly the specified constant errors, the filter is optimistic in {of}: √NEES is {np.sqrt(worst):.3g}. "
+                "Over units (a Monte Carlo draws them) it may be consistent."
+            )
         if min(attitude, bias) < MIN_NEES:
             return "The filter will be pessimistic: its σ will be larger than its errors."
         return "The filter will be consistent."

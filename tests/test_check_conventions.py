@@ -280,9 +280,9 @@ def test_python_warns_of_what_the_command_warns_of(run, mistake, words):
         with warnings.catch_warnings(record=True) as found:
             warnings.simplefilter("always")
             use(walk)
+        advice = "See `strapdown doctor walk.csv`, with the same options of the file."
         assert [
-            f"warning: {Hint.replaced(str(one.message), option).removeprefix('walk.csv: ')}. See `strapdown doctor walk.csv`."
-            for one in found
+            f"warning: {Hint.replaced(str(one.message), option).removeprefix('walk.csv: ')}. {advice}" for one in found
         ] == said
     assert all(Hint.replaced(words, option) in line for line in said)
 

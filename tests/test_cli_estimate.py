@@ -553,7 +553,7 @@ def test_a_recording_that_is_not_what_it_says_is_doubted(run, succeeds, recordin
     assert words in said
     # Which then ends for want of the parameter.
     assert words in run("tune", recording, "--free", "nothing", "--out", tmp_path / "filter.toml")[1]
-    assert f"See `strapdown doctor {recording}`." in said
+    assert f"See `strapdown doctor {recording}`, with the same options of the file." in said
 
 
 @pytest.mark.slow

@@ -759,8 +759,7 @@ def test_the_command_prints_a_budget_and_writes_it(succeeds, tmp_path):
     )
     assert np.allclose(np.array(found["rms"]["attitude_arcsec"]) * ARCSECOND, direct.rms[:, :3])
     assert np.allclose(found["expected_nees_per_state"]["bias"], direct.expected_nees[:, 2])
-    times = f"{np.sqrt(direct.expected_nees[-1, 2]):.3g} times its σ"
-    assert f"optimistic in bias: its errors will be {times}" in " ".join(said.split())
+    assert f"optimistic in bias: √NEES is {np.sqrt(direct.expected_nees[-1, 2]):.3g}." in " ".join(said.split())
     assert (tmp_path / "covariance-results" / "budget.png").read_bytes().startswith(b"\x89PNG")
 
 

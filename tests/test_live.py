@@ -317,6 +317,14 @@ def test_bad_declarations_are_refused():
         LiveFilter(NOISE, start(), sensors=[up, up])
     with pytest.raises(InputError, match=r"give vectors\.VectorSensor"):
         LiveFilter(NOISE, start(), sensors=["up"])
+    with pytest.raises(InputError, match="not of class Sequence; give a list of sensors"):
+        LiveFilter(NOISE, start(), sensors=up)
+    with pytest.raises(InputError, match="named 'gyro', as an argument of update"):
+        LiveFilter(NOISE, start(), sensors=[replace(up, name="gyro")])
+    with pytest.raises(
+        InputError, match=r"over 1e\+06 s from the last sample at 0 s; .* time is that of the initial state"
+    ):
+        LiveFilter(NOISE, start(), sensors=[up]).update(1e6, (0.0, 0.0, 0.1))
     with pytest.raises(InputError, match="the series is empty"):
         LiveFilter(NOISE, start(), sensors=[record_of().vectors[0].taken(slice(0))])
     with pytest.raises(TypeError, match="start another one from its state"):

@@ -130,6 +130,7 @@ def test_it_starts_at_the_first_specific_force():
         ((0.31, (0, 0), (0, 0, 9.8)), r"gyro is \(0, 0\); give three numbers"),
         ((0.31, (0, 0, 0), "abc"), r"accelerometer is 'abc'; give three numbers"),
         ((10**400, (0, 0, 0), (0, 0, 9.8)), r"time is 1000+; give one number"),
+        ((0.31, (0, 0, 0), (0, 0, 9.8), (1, 0, 0)), r"this filter has none; start LiveAhrs\(magnetometer=True\)"),
     ],
 )
 def test_bad_samples_are_refused_and_leave_the_filter_as_it_was(sample, message):
@@ -144,6 +145,12 @@ def test_bad_samples_are_refused_and_leave_the_filter_as_it_was(sample, message)
             live.update(0.01 * k, (0.1, 0.0, 0.2), (0.0, 1.0, 9.7))
     np.testing.assert_array_equal(one.covariance, other.covariance)
     np.testing.assert_array_equal(one.attitude, other.attitude)
+
+
+@pytest.mark.parametrize(("name", "value"), [("magnetometer", "yes"), ("parameters", "vehicle")])
+def test_arguments_of_another_class_are_refused_by_name(name, value):
+    with pytest.raises(InputError, match=f"{name} is '{value}', not of class"):
+        LiveAhrs(interval=0.01, **{name: value})
 
 
 def test_samples_far_faster_than_declared_are_refused():

@@ -60,7 +60,7 @@ def test_errors_and_nis_of_estimate(estimated):
         sigma = np.sqrt(np.einsum("mii->i", covariance).reshape(2, 3).sum(axis=1) / len(error))
         assert (
             f"attitude error RMS {math.degrees(rms[0]):.4g}° (σ {math.degrees(sigma[0]):.4g}°), bias error RMS "
-            f"{rms[1] / DEGREE_PER_HOUR:.4g} °/h (σ {sigma[1] / DEGREE_PER_HOUR:.4g} °/h); "
+            f"{rms[1] / DEGREE_PER_HOUR:.4g} °/h (σ {sigma[1] / DEGREE_PER_HOUR:.4g} °/h), each of three axes together; "
             f"mean NEES per state {nees(error, covariance).mean() / 6.0:.3g}"
         ) in estimated
         for number, name in enumerate(("star 1", "star 2")):

@@ -13,7 +13,7 @@ from strapdown import estimation
 from strapdown.ahrs import headings, regions, starting
 from strapdown.ahrs.parameters import AhrsParameters, of_motion
 from strapdown.ahrs.preparing import GRAVITY
-from strapdown.checks import Array, InputError, non_negative, positive
+from strapdown.checks import Array, InputError, instance, non_negative, positive
 from strapdown.estimation.forward import TooPreciseError
 from strapdown.estimation.live import arrays_of, restart
 from strapdown.kernels import headings as k_headings
@@ -40,7 +40,8 @@ class LiveAhrs:
     magnetometer : bool, default False
         Whether the samples have a field.
     parameters : AhrsParameters, optional
-        The filter's model of the unit and of its motion. Default: that of a unit in the hand, with or without a magnetometer.
+        The filter's model of the unit and of its motion, such as ``ahrs.of_motion("vehicle", magnetometer=True)``. Default: that of a unit
+        in the hand.
     latency : float, optional
         Delay of the samples, s, as for :func:`strapdown.estimate`. Default: half the interval.
 
@@ -55,8 +56,8 @@ class LiveAhrs:
 
     Notes
     -----
-    Attitude, bias and covariance after each sample equal, bit for bit, the online rows of ``sd.estimate(recording, parameters)`` for a
-    recording of these samples, except what that takes from the whole recording: ``interval`` must be the recording's median, its first
+    Attitude, bias and covariance after each sample equal, bit for bit, the online rows of :func:`strapdown.estimate` for a recording of
+    these samples, except what that takes from the whole recording: ``interval`` must be the recording's median, its first
     sample must have a specific force and a field, and its samples no faults (truncation, clipping, gaps). The last row differs too, because
     the end of a recording ends a step of the filter. Samples before the first complete one are not used.
 
@@ -79,6 +80,9 @@ class LiveAhrs:
         latency: float | None = None,
     ) -> None:
         self.interval = positive("interval", interval, unit="s")
+        instance("magnetometer", magnetometer, bool, "give True or False")
+        if parameters is not None:
+            instance("parameters", parameters, AhrsParameters, 'such as ahrs.of_motion("vehicle", magnetometer=True)')
         self.magnetometer = magnetometer
         self.parameters = parameters or of_motion("hand", magnetometer=magnetometer)
         late = 0.5 * self.interval if latency is None else non_negative("latency", latency, unit="s")
@@ -227,7 +231,7 @@ class LiveAhrs:
         gyro : array_like (3,)
             Angular rate, rad/s, body axes.
         accelerometer : array_like (3,), optional
-            Specific force, m/s², body axes. None, NaN or zero: missing.
+            Specific force, m/s² (not g), body axes. None, NaN or zero: missing.
         magnetometer : array_like (3,), optional
             Field, any unit, body axes. None, NaN or zero: missing.
 
@@ -240,6 +244,8 @@ class LiveAhrs:
         rate: Any = gyro
         force: Any = accelerometer
         field: Any = magnetometer
+        if field is not None and not self.magnetometer:
+            raise InputError("magnetometer is given, but this filter has none; start LiveAhrs(magnetometer=True)")
         try:
             call[0] = time
             name, given = "gyro", rate

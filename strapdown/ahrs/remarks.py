@@ -60,4 +60,4 @@ def _model(moved_by: str, result: AhrsEstimate) -> str:
     if number == 0:
         return f"{words} No second is quiet enough to measure the gyro's bias, so the heading may drift at first."
     at = ", ".join(f"{time[last]:.2f}" for last in result.rests.last[:4]) + (", …" if number > 4 else "")
-    return f"{words} The gyro's bias is measured at rest, in {number} second{'s' if number > 1 else ''}, until {at} s."
+    return f"{words} The gyro's bias is measured at rest, in {number} span{'s' if number > 1 else ''} of a second, ending at {at} s."

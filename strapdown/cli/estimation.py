@@ -325,7 +325,7 @@ def _observability(out: Path, source: str, record: ImuRecord, chosen: FilterSetu
 def _errors_words(found: dict[str, float]) -> str:
     line = (
         f"Second half: attitude error RMS {found['attitude_rms_deg']:.4g}° (σ {found['attitude_sigma_deg']:.4g}°), bias error RMS "
-        f"{found['bias_rms_deg_per_h']:.4g} °/h (σ {found['bias_sigma_deg_per_h']:.4g} °/h)"
+        f"{found['bias_rms_deg_per_h']:.4g} °/h (σ {found['bias_sigma_deg_per_h']:.4g} °/h), each of three axes together"
     )
     if "nees_per_state" in found:
         line += f"; mean NEES per state {found['nees_per_state']:.3g} (expected: about 1)"

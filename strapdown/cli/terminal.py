@@ -199,7 +199,12 @@ def warn_about_conventions(source: Recording, path: Path) -> None:
 
     with progress_bar("testing conventions"):
         found = check_conventions.examine(source)
-    say(*(f"warning: {words}. See `strapdown doctor {path}`." for words in found.warnings))
+    say(
+        *(
+            f"warning: {words}. See `strapdown doctor {path}`, with the same options of the file."
+            for words in found.warnings
+        )
+    )
 
 
 STANDARD_OUTPUT = Path("-")

@@ -18,7 +18,17 @@ from typing import Any, NamedTuple, NoReturn
 import numpy as np
 from numpy.typing import ArrayLike
 
-from strapdown.checks import Array, InputError, array, finite, non_negative, one_of, positive, unit_quaternions
+from strapdown.checks import (
+    Array,
+    InputError,
+    array,
+    finite,
+    instance,
+    non_negative,
+    one_of,
+    positive,
+    unit_quaternions,
+)
 from strapdown.estimation import forward
 from strapdown.estimation import model as modelling
 from strapdown.estimation.error_states import ErrorStates
@@ -36,6 +46,8 @@ from strapdown.vectors import KINDS, VectorMeasurements, VectorSensor, need_leve
 
 MAX_MEASUREMENTS = 64
 """Maximum number of measurements within one gyro interval."""
+RESERVED = ("self", "time", "gyro", "delta_theta", "sigma", "reference_f")
+"""Arguments of :meth:`LiveFilter.update` that are no measurements."""
 UPPER = np.triu_indices(3)
 
 
@@ -58,9 +70,10 @@ class LiveFilter:
     robust : Robust, optional
         Robust updates, which weight measurements by their residuals.
     look_back : float, default 0.0
-        Maximum delay of a measurement, s. The states of this span are kept in memory.
+        Maximum delay of a measurement, s. The states of this span are kept in memory. Older measurements are ignored, and counted in
+        ``late``.
     time : float, default 0.0
-        Time of the initial state, s.
+        Time of the initial state, s. The first gyro sample covers the interval from it.
 
     Raises
     ------
@@ -104,7 +117,10 @@ class LiveFilter:
         check_arguments(gate=gate, robust=robust)
         self._time = finite("time", time, unit="s")
         self.look_back = non_negative("look_back", look_back, unit="s")
+        instance("sensors", sensors, Sequence, "give a list of sensors")
         series = [template(one, self._time) for one in sensors]
+        for reserved in {one.sensor for one in series} & set(RESERVED):
+            raise InputError(f"a sensor is named {reserved!r}, as an argument of update; give it another name")
         self._sensors = {one.sensor: one for one in series}
         if len(self._sensors) < len(series):
             raise InputError(f"sensors has a name twice: {', '.join(one.sensor for one in series)}")
@@ -342,7 +358,8 @@ class LiveFilter:
                 kernel.BEHIND: f"time is {time:.9g} s, before the filter's {now:.9g} s; give samples in order",
                 kernel.NO_GYRO: f"{name} has a NaN; omit the sample; the next one then covers both intervals",
                 kernel.INFINITE_GYRO: f"{name} is {given}; give finite numbers",
-                kernel.LARGE_GYRO: f"{name} is {given}, too large for the rotation between two samples; check the unit",
+                kernel.LARGE_GYRO: f"{name} is {given}, too large for the rotation over {time - now:.6g} s from the last sample at "
+                f"{now:.9g} s; check the unit, and that time is that of the initial state",
                 kernel.INFINITE: f"{name} is {given}; give finite numbers, or NaN for a missing measurement",
                 kernel.NO_DIRECTION: f"{name} is {given}, which has no direction; give NaN for a missing measurement",
             }[code]

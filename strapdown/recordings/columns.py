@@ -397,7 +397,11 @@ def _need_time_unit(source: str, name: str, time: Array) -> None:
     steps = np.abs(np.diff(time))
     usual = float(np.median(steps[steps > 0.0])) if np.any(steps > 0.0) else 1.0
     if not USUAL_INTERVALS[0] <= usual <= USUAL_INTERVALS[1]:
+        plausible = (
+            unit for unit, size in TIME_UNITS.items() if USUAL_INTERVALS[0] <= size * usual <= USUAL_INTERVALS[1]
+        )
+        unit = next(plausible, "us")
         raise InputError(
-            f"{source}: the stamps of {name} are {usual:g} apart, not plausible in seconds; declare the unit, as in {name} [us], or by "
-            f"{Hint('units', {'time': 'us'})} ({', '.join(TIME_UNITS)})"
+            f"{source}: the stamps of {name} are {usual:g} apart, not plausible in seconds; declare the unit, as in {name} [{unit}], or by "
+            f"{Hint('units', {'time': unit})} ({', '.join(TIME_UNITS)})"
         )
