@@ -441,6 +441,8 @@ def _windows(recording: Recording, sensors: _Sensors, known: np.ndarray | bool =
     step = max(1, round(MIN_INTERVAL / float(np.median(np.diff(recording.time)))))
     rows = slice(None, None, step)
     time = recording.time[rows]
+    if len(time) < 2:
+        return None
     window = np.floor((time - time[0]) / SPAN).astype(int)
     turning = np.bincount(window, lengths(recording.rate[rows])) / np.bincount(window).clip(1)
     least = 0.5 * max(1.0, SPAN / float(np.median(np.diff(time))))
