@@ -39,9 +39,14 @@ def language(*, single: bool) -> Language:
     )
 
 
+def is_public(function: Target) -> bool:
+    """Return whether users of the filter call a function."""
+    return function.name in PUBLIC or function.name.startswith("update_")
+
+
 def signature(function: Target) -> str:
     """Return the head of a function."""
-    public = function.name in PUBLIC or function.name.startswith("update_")
+    public = is_public(function)
     name = f"strapdown_{function.name}" if public else function.name
     parameters = [] if function.name == "far_turn" else ["strapdown_filter *f"]
     for parameter, size in function.parameters:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from strapdown.codegen.c import PUBLIC, constant_of, diagonal, members, whole_bias, wrapped
+from strapdown.codegen.c import constant_of, diagonal, is_public, members, whole_bias, wrapped
 from strapdown.codegen.program import STATUS, Program
 from strapdown.codegen.target import Target, traced
 from strapdown.codegen.writer import Language, Writer
@@ -25,10 +25,9 @@ LANGUAGE = Language(
 
 def head(function: Target) -> str:
     """Return the head of a function."""
-    public = function.name in PUBLIC or function.name.startswith("update_")
     parameters = [] if function.name == "far_turn" else ["f"]
     parameters += [parameter for parameter, _ in function.parameters]
-    return f"{'export ' if public else ''}function {function.name}({', '.join(parameters)})"
+    return f"{'export ' if is_public(function) else ''}function {function.name}({', '.join(parameters)})"
 
 
 def files(program: Program, origin: str) -> dict[str, str]:
