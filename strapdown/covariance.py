@@ -286,6 +286,31 @@ class Analysis(Listed):
             )
         return P
 
+    def summary(self) -> dict[str, Any]:
+        """Return the errors over time and by source as plain values for JSON, with the units in the keys."""
+        sizes = np.array([units.ARCSECOND] * 3 + [units.DEGREE_PER_HOUR] * 3)
+
+        def parts(values: Array) -> dict[str, Any]:
+            shown = values / sizes
+            return {"attitude_arcsec": shown[..., :3].tolist(), "bias_deg_per_hour": shown[..., 3:].tolist()}
+
+        def by_source(names: Sequence[str], values: Array) -> dict[str, Any]:
+            return {name: parts(values[:, k]) for k, name in enumerate(names)}
+
+        random = np.sqrt(np.maximum(np.diagonal(self.contributions, axis1=2, axis2=3), 0.0))
+        nees = zip(("state", "attitude", "bias"), self.expected_nees.T.tolist(), strict=True)
+        return {
+            "time_s": self.time.tolist(),
+            **{name: parts(getattr(self, name)) for name in ("rms", "filter_sigma", "mean_error")},
+            "expected_nees_per_state": dict(nees),
+            "expected_nis": dict(self.expected_nis),
+            "random": by_source(self.sources, random),
+            "fixed": by_source(self.fixed, self.fixed_errors),
+            "considered": by_source(self.considered, self.considered_errors),
+            "left_out": list(self.left_out),
+            "beyond_linear": list(self.beyond_linear),
+        }
+
     def budget(self, epoch: int = -1) -> list[tuple[str, str, float, float]]:
         """Return the error budget at an epoch, one row per source.
 

@@ -40,3 +40,16 @@ def rate_unit(value: ArrayLike) -> tuple[str, float]:
     """Return the name and size of the unit in which rates of this size (rad/s) are read best."""
     typical = float(np.nanmax(np.abs(value), initial=0.0))
     return ("°/h", DEGREE_PER_HOUR) if typical < 0.1 * DEGREE else ("°/s", DEGREE)
+
+
+_STATE_UNITS = {
+    "gyro scale": {"1": ("ppm", 1e-6), "rad": ("mrad", 1e-3)},
+    "gyro drift": {"rad/s": ("°/h", DEGREE_PER_HOUR)},
+    "gyro force": {"rad s/m": ("°/h/g", DEGREE_PER_HOUR / STANDARD_GRAVITY)},
+}
+
+
+def error_state_unit(name: str, unit: str) -> tuple[str, float]:
+    """Return the name and the factor to SI of the printed unit of an error state, from its name and SI unit."""
+    word = "dimensionless" if unit == "1" else unit
+    return _STATE_UNITS.get(" ".join(name.split()[:2]), {}).get(unit, (word, 1.0))

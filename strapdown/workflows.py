@@ -31,17 +31,18 @@ from strapdown import (
     units,
 )
 from strapdown.ahrs.remarks import fixed_frame, remarks
-from strapdown.checks import Array, Hint, InputError, count, instance
+from strapdown.checks import Array, Hint, InputError, array, count, instance
 from strapdown.consistency import Accuracy, Judgement
 from strapdown.consistency.accuracy import accuracy as accuracy_of_rows
 from strapdown.consistency.accuracy import accuracy_of
 from strapdown.consistency.alignment import Series
 from strapdown.covariance import analyse as covariance_analysis
 from strapdown.estimation import setup as setups
+from strapdown.estimation.filters.own import Own
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.setup import FilterSetup, for_record
 from strapdown.estimation.states import ProcessNoise, State
-from strapdown.files import atomic_write, reading
+from strapdown.files import reading, write_text
 from strapdown.gyro import GyroSpec
 from strapdown.recordings import Recording, recordfiles
 from strapdown.recordings.attitudes import Attitudes, read_attitudes
@@ -61,14 +62,13 @@ if TYPE_CHECKING:
 
 __all__ = [
     "AttitudeHistory",
-    "RecordRun",
+    "Run",
     "accuracy",
     "allan_deviation",
     "check",
     "covariance_analysis",
     "diagnose",
     "estimate",
-    "estimate_record",
     "fit_noise",
     "integrate",
     "monte_carlo",
@@ -178,8 +178,7 @@ def write(
                 f"{path}: a {type(content).__name__} is written as TOML without options; name a file *.toml"
             )
         text = setups.to_toml(content) if isinstance(content, FilterSetup) else scenarios.scenario_to_toml(content)
-        with atomic_write(path) as temporary:
-            temporary.write_text(text, encoding="utf-8")
+        write_text(path, text)
     elif isinstance(content, (ImuRecord, Estimate)) and Path(path).suffix.lower() in HDF5:
         save: Callable[..., None] = setups.write_estimate if isinstance(content, Estimate) else recordfiles.write_record
         save(path, content, **options)
@@ -191,105 +190,17 @@ def write(
 # ------------------------------------------------------------------------------------------------------------------- estimate
 
 
-class RecordRun(NamedTuple):
-    """Result of running a filter over a record."""
+class Run(NamedTuple):
+    """An estimate with what it was made from."""
 
     estimate: Estimate
     record: ImuRecord
-    """The record from the start of the filter on, as processed by it (:func:`strapdown.estimation.setup.modelled_record`)."""
+    """Input of the filter, from its start on (:func:`strapdown.estimation.setup.modelled_record`)."""
+    setup: FilterSetup
+    """The filter without gate and weights."""
     initial: State
-
-
-def estimate_record(
-    record: ImuRecord,
-    chosen: FilterSetup,
-    start: for_record.Start | None = None,
-    *,
-    every: int = 1,
-    full_covariance: bool = True,
-    smooth: bool = False,
-) -> RecordRun:
-    """Run the filter of a setup, or with ``smooth`` its smoother, over a record, by default from the first measurements on."""
-    modelled = setups.modelled_record(record, chosen)
-    if count("every", every) > len(modelled.increments):
-        raise InputError(
-            f"every is {every}, more than the {len(modelled.increments)} filter steps of the record; only the first epoch would be kept"
-        )
-    begin = for_record.start(modelled, chosen) if start is None else start
-    if begin.edge > 0:
-        modelled = records.cut(modelled, begin.edge, len(modelled.increments))
-        if every > len(modelled.increments):
-            raise InputError(
-                f"every is {every}, more than the {len(modelled.increments)} filter steps after the start of the filter"
-            )
-    if smooth:
-        result = setups.smooth_modelled(modelled, chosen, begin.state, full_covariance=full_covariance)
-    else:
-        result = setups.run_modelled(modelled, chosen, begin.state, every=every, full_covariance=full_covariance)
-    truth = None if modelled.truth is None else modelled.truth.taken(np.searchsorted(modelled.time, result.time))
-    result = dataclasses.replace(
-        result, setup=chosen, origin=record.origin, truth=truth, smoothed=smooth, remarks=(begin.words,)
-    )
-    return RecordRun(result, modelled, begin.state)
-
-
-def estimate_recording(
-    source: Recording,
-    *,
-    noise: GyroSpec | NoiseFit | ProcessNoise | None = None,
-    temperature: BiasOverTemperature | None = None,
-    motion: str = "hand",
-    walks: bool = False,
-    full_covariance: bool | None = None,
-    gate: Gate | None = None,
-    robust: Robust | None = None,
-    smooth: bool = False,
-    **options: Any,
-) -> ahrs.AhrsEstimate:
-    """Run the filter over a recording; its estimate has the setup, the reference, and remarks on the start, the motion and the samples.
-
-    ``temperature``: the gyro's bias over temperature, which is subtracted first; ``walks``: model the error of its slope as a random walk.
-    ``options`` are those of :func:`strapdown.ahrs.estimate`.
-    """
-    ahrs.need_accelerometer(source)
-    parameters = ahrs.of_motion(motion, magnetometer=source.magnetic_field is not None, smooth=smooth)
-    if isinstance(noise, ProcessNoise):
-        parameters = dataclasses.replace(
-            parameters, angle_random_walk=noise.angle_random_walk, rate_random_walk=noise.rate_random_walk
-        )
-    elif noise is not None:
-        spec = _specification(noise)
-        parameters, temperature = with_gyro_noise(parameters, spec), temperature or spec.temperature
-    if temperature is not None:
-        source, parameters = ahrs.without_temperature(source, parameters, temperature, walks=walks or smooth)
-    known = source.true_attitude is not None
-    result = ahrs.estimate(
-        source,
-        parameters,
-        gate=gate,
-        robust=robust,
-        full_covariance=known if full_covariance is None else full_covariance,
-        smooth=smooth,
-        **options,
-    )
-    used = result.recording
-    truth = None if used.true_attitude is None else Truth.of_reference(used.true_attitude, used.movement)
-    estimate = dataclasses.replace(
-        result.estimate,
-        setup=dataclasses.replace(result.parameters.setup, gate=gate, robust=robust),
-        origin=Origin(source=used.source),
-        truth=truth,
-        fixed_frame=fixed_frame(used),
-        motion=motion,
-        smoothed=smooth,
-        remarks=remarks(result, motion),
-        details={
-            **{f"parameter.{name}": value for name, value in vars(result.parameters).items()},
-            "latency": result.delays.last_gyro,
-            "magnetometer_latency": result.delays.last_field,
-        },
-    )
-    return dataclasses.replace(result, estimate=estimate)
+    calibration: UnitCalibration | None = None
+    """Calibration of the unit that a recording yields."""
 
 
 def estimate(
@@ -297,13 +208,15 @@ def estimate(
     *,
     noise: GyroSpec | NoiseFit | ProcessNoise | None = None,
     setup: FilterSetup | None = None,
-    initial: State | None = None,
+    initial: State | ArrayLike | str | None = None,
     states: bool | Sequence[str] | None = None,
+    every: int = 1,
     gate: Gate | float | None = None,
     robust: Robust | str | None = None,
     motion: str | None = None,
     latency: float | None = None,
     calibration: UnitCalibration | None = None,
+    temperature: BiasOverTemperature | None = None,
     full_covariance: bool | None = None,
     smooth: bool = False,
 ) -> Estimate:
@@ -321,11 +234,14 @@ def estimate(
         record's origin; for a recording that of :data:`strapdown.ahrs.MOTIONS`.
     setup : FilterSetup, optional
         For a record: the complete filter, for example from :func:`tune`, in place of ``noise`` and ``states``.
-    initial : State, optional
-        For a record: initial state (:func:`initial_state`) at the first edge. Default: from the first measurements.
+    initial : State, array_like (4,) or "truth", optional
+        For a record: initial state (:func:`initial_state`) at the first edge; an attitude q_fb, with the filter's σ; or the truth with
+        errors drawn from the filter's σ. Default: from the first measurements.
     states : bool or sequence of str, optional
         For a record: whether to add an error state for each error that the scenario specifies (scale factor, misalignment, hard iron, …),
         or the names of those to add. Default: True if the scenario specifies such errors.
+    every : int, default 1
+        For a record: store every n-th filter step.
     gate : Gate or float, optional
         Reject measurements beyond this quantile of χ² (such as 0.999), and recover from a lost attitude.
     robust : Robust or {"huber", "student"}, optional
@@ -337,6 +253,8 @@ def estimate(
         For a recording: delay of the gyro's samples, s. Default: half a sample interval.
     calibration : UnitCalibration, optional
         For a recording: calibration of the unit, from :func:`strapdown.calibrate`; the bias is then that of the corrected rates.
+    temperature : BiasOverTemperature, optional
+        For a recording: the gyro's bias over temperature, which is subtracted first. Default: that of ``noise``.
     full_covariance : bool, optional
         Whether to store covariance matrices rather than their diagonals. Default: True, but for a recording without a reference attitude.
     smooth : bool, default False
@@ -366,29 +284,158 @@ def estimate(
     >>> estimate = sd.estimate(sd.simulate("two-stars"))  # doctest: +SKIP
     >>> estimate.attitude[-1], estimate.sigma[-1]  # doctest: +SKIP
     """
+    if isinstance(source, Recording):
+        _doubt(source)
+    return run(
+        source,
+        noise=noise,
+        setup=setup,
+        initial=initial,
+        states=states,
+        every=every,
+        gate=gate,
+        robust=robust,
+        motion=motion,
+        latency=latency,
+        calibration=calibration,
+        temperature=temperature,
+        full_covariance=full_covariance,
+        smooth=smooth,
+    ).estimate
+
+
+def run(
+    source: ImuRecord | Recording,
+    *,
+    gate: Gate | float | None = None,
+    robust: Robust | str | None = None,
+    walks: bool = False,
+    **options: Any,
+) -> Run:
+    """Return the estimate of :func:`estimate` with what it was made from; ``walks``: model the bias slope's error as a random walk."""
     gate = Gate(probability=gate) if isinstance(gate, (int, float)) else gate
     robust = Robust(kind=robust) if isinstance(robust, str) else robust  # type: ignore[arg-type]
+    instance("source", source, (ImuRecord, Recording), SOURCE)
+    recorded = isinstance(source, Recording)
+    others = ("motion", "latency", "calibration", "temperature")
+    for name in ("setup", "initial", "states", "every") if recorded else others:
+        value = options.pop(name, None) if recorded or name in others else None
+        if value not in (None, False) and not (name == "every" and value == 1):
+            raise InputError(f"{Hint(name)} goes with a record{'' if recorded else 'ing'}; leave it out")
     if isinstance(source, Recording):
-        _refuse("a record", setup=setup, initial=initial, states=states or None)
-        _doubt(source)
-        return estimate_recording(
-            source,
-            noise=noise,
-            motion=motion or "hand",
-            latency=latency,
-            calibration=calibration,
-            gate=gate,
-            robust=robust,
-            full_covariance=full_covariance,
-            smooth=smooth,
-        ).estimate
-    instance("source", source, ImuRecord, SOURCE)
-    _refuse("a recording", motion=motion, latency=latency, calibration=calibration)
-    chosen = _record_setup(source, noise, setup, initial, states)
-    changed = {name: value for name, value in (("gate", gate), ("robust", robust)) if value is not None}
-    chosen = dataclasses.replace(chosen, **changed)  # type: ignore[arg-type]
-    start = None if initial is None else for_record.Start(initial, "Started from the state given.")
-    return estimate_record(source, chosen, start, full_covariance=full_covariance is not False, smooth=smooth).estimate
+        return _run_recording(source, gate, robust, walks=walks, **options)
+    changes = {name: value for name, value in (("gate", gate), ("robust", robust)) if value is not None}
+    return _run_record(source, changes, **options)
+
+
+def _run_record(
+    record: ImuRecord,
+    changes: Mapping[str, Any],
+    *,
+    noise: GyroSpec | NoiseFit | ProcessNoise | None = None,
+    setup: FilterSetup | None = None,
+    initial: State | ArrayLike | str | None = None,
+    states: bool | Sequence[str] | None = None,
+    every: int = 1,
+    full_covariance: bool | None = None,
+    smooth: bool = False,
+) -> Run:
+    """Run the filter over a record; ``changes``: the gate and the weights."""
+    if smooth and count("every", every) > 1:
+        raise InputError(f"{Hint('every')} stores some filter steps, but the smoother needs all; leave one of them out")
+    chosen, notes = _record_setup(record, noise, setup, initial, states)
+    chosen = dataclasses.replace(chosen, **changes)
+    modelled = setups.modelled_record(record, chosen)
+    if every > len(modelled.increments):
+        raise InputError(
+            f"every is {every}, more than the {len(modelled.increments)} filter steps of the record; only the first epoch would be kept"
+        )
+    if initial is None:
+        begin = for_record.start(modelled, chosen)
+    elif isinstance(initial, str) and initial == "truth":
+        begin = for_record.drawn_start(record, chosen)
+    elif isinstance(initial, State):
+        begin = for_record.Start(initial, "Started from the state given.")
+    else:
+        q = array("initial", initial, (4,))  # type: ignore[arg-type]
+        if not q.any():
+            raise InputError("initial is the zero quaternion; give w, x, y, z of an attitude")
+        begin = for_record.Start(
+            setups.initial_state(chosen, quaternion.normalize(q)), "Started from the attitude given."
+        )
+    if begin.edge > 0:
+        modelled = records.cut(modelled, begin.edge, len(modelled.increments))
+        if every > len(modelled.increments):
+            raise InputError(
+                f"every is {every}, more than the {len(modelled.increments)} filter steps after the start of the filter"
+            )
+    full = full_covariance is not False
+    if smooth:
+        result = setups.smooth_modelled(modelled, chosen, begin.state, full_covariance=full)
+    else:
+        result = setups.run_modelled(modelled, chosen, begin.state, every=every, full_covariance=full)
+    truth = None if modelled.truth is None else modelled.truth.taken(np.searchsorted(modelled.time, result.time))
+    result = dataclasses.replace(
+        result, setup=chosen, origin=record.origin, truth=truth, smoothed=smooth, remarks=(begin.words, *notes)
+    )
+    return Run(result, modelled, chosen, begin.state)
+
+
+def _run_recording(
+    source: Recording,
+    gate: Gate | None,
+    robust: Robust | None,
+    *,
+    noise: GyroSpec | NoiseFit | ProcessNoise | None = None,
+    temperature: BiasOverTemperature | None = None,
+    motion: str | None = None,
+    walks: bool = False,
+    full_covariance: bool | None = None,
+    smooth: bool = False,
+    **options: Any,
+) -> Run:
+    """Run the filter over a recording; its estimate has the setup, the reference, and remarks on the start, the motion and the samples."""
+    motion = motion or "hand"
+    ahrs.need_accelerometer(source)
+    parameters, notes = ahrs.of_motion(motion, magnetometer=source.magnetic_field is not None, smooth=smooth), []
+    if isinstance(noise, ProcessNoise):
+        parameters = dataclasses.replace(
+            parameters, angle_random_walk=noise.angle_random_walk, rate_random_walk=noise.rate_random_walk
+        )
+    elif noise is not None:
+        spec = _specification(noise)
+        parameters, temperature = with_gyro_noise(parameters, spec), temperature or spec.temperature
+        arw = parameters.angle_random_walk / units.DEGREE_PER_ROOT_HOUR
+        rrw = parameters.rate_random_walk / units.DEGREE_PER_HOUR_PER_ROOT_HOUR
+        notes = [f"Gyro noise, flicker included: {arw:.3g} °/√h, bias random walk {rrw:.3g} °/h/√h."]
+    if temperature is not None:
+        source, parameters = ahrs.without_temperature(source, parameters, temperature, walks=walks or smooth)
+    reference = source.true_attitude
+    if reference is not None and source.movement is not None:
+        judged = np.isfinite(reference).all(axis=1) & source.movement
+        if not judged.any():
+            raise InputError(
+                f"{source.source}: no sample to judge has a reference attitude; check its movement mask and its reference"
+            )
+    full = reference is not None if full_covariance is None else full_covariance
+    result = ahrs.estimate(source, parameters, gate=gate, robust=robust, full_covariance=full, smooth=smooth, **options)
+    used = result.recording
+    estimate = dataclasses.replace(
+        result.estimate,
+        setup=dataclasses.replace(result.parameters.setup, gate=gate, robust=robust),
+        origin=Origin(source=used.source),
+        truth=None if used.true_attitude is None else Truth.of_reference(used.true_attitude, used.movement),
+        fixed_frame=fixed_frame(used),
+        motion=motion,
+        smoothed=smooth,
+        remarks=(*remarks(result, motion), *notes),
+        details={
+            **{f"parameter.{name}": value for name, value in vars(result.parameters).items()},
+            "latency": result.delays.last_gyro,
+            "magnetometer_latency": result.delays.last_field,
+        },
+    )
+    return Run(estimate, result.record, result.parameters.setup, result.initial, result.calibration)
 
 
 def smooth(source: ImuRecord | Recording, **options: Any) -> Estimate:
@@ -455,19 +502,19 @@ def _record_setup(
     record: ImuRecord,
     noise: GyroSpec | NoiseFit | ProcessNoise | None,
     setup: FilterSetup | None,
-    initial: State | None,
+    initial: State | ArrayLike | str | None,
     states: bool | Sequence[str] | None,
-) -> FilterSetup:
+) -> tuple[FilterSetup, list[str]]:
+    """Return the filter for a record, and remarks on its error states and on errors that it does not model."""
     if setup is not None:
-        instance(
-            "setup", setup, FilterSetup, "give a FilterSetup, as setup.FilterSetup.for_scenario or tune returns it"
-        )
-        _refuse("the filter of the scenario, and setup defines another", noise=noise, states=states or None)
-        return setup
+        remedy = "give a FilterSetup, as setup.FilterSetup.for_scenario or tune returns it"
+        instance("setup", setup, FilterSetup, remedy)
+        _need_alone(noise, states)
+        need_angles(setup, record)
+        return setup, no_state_words(for_record.unmodelled_errors(record.origin, setup), setup)
     if not isinstance(noise, ProcessNoise):
-        spec = None if noise is None else _specification(noise)
-        return setups.FilterSetup.for_record(record, spec, states=states)
-    if initial is None:
+        return matched_filter(record, None if noise is None else _specification(noise), states=states)
+    if not isinstance(initial, State):
         raise InputError(
             "noise is a ProcessNoise, which has no σ of the initial gyro bias; give initial= too, or a GyroSpec as noise"
         )
@@ -475,7 +522,76 @@ def _record_setup(
     sigma = np.sqrt(np.diag(initial.covariance))
     return FilterSetup(
         process_noise=noise, attitude_sigma=float(np.max(sigma[:3])), bias_sigma=float(np.max(sigma[3:6]))
+    ), []
+
+
+def _need_alone(noise: Any, states: Any) -> None:
+    """Raise an error for options that go with a matched filter, if a complete one is given."""
+    for name, value in (("states", states), ("noise", noise)):
+        if value is not None:
+            raise InputError(
+                f"{Hint('setup')} is the complete filter, with its noise and states; leave {Hint(name)} out"
+            )
+
+
+def need_angles(setup: FilterSetup, record: ImuRecord) -> None:
+    """Raise an error for σ of the record's sensors that cannot be in rad, unless the record's own are as large."""
+    fine = {one.sensor: one.kind for one in record.vectors if len(one.time) and np.max(one.sigma) <= np.pi}
+    setups.need_angles(setup, fine, "filter")
+
+
+def matched_filter(
+    record: ImuRecord, spec: GyroSpec | None = None, *, states: bool | Sequence[str] | None = None
+) -> tuple[FilterSetup, list[str]]:
+    """Return the filter that matches a record's specifications, and remarks on its error states and on errors without one."""
+    chosen = setups.FilterSetup.for_record(record, spec, states=states)
+    missing = for_record.unmodelled_errors(record.origin, chosen)
+    if states is False or (states is None and chosen.states is None):
+        return chosen, no_state_words(missing, chosen)
+    notes = []
+    if record.origin is None or record.origin.scenario is None:
+        notes.append(
+            "The record does not contain its scenario, so the errors of its sensors are unknown: no state for them."
+        )
+    if chosen.states is None:
+        notes.append("No errors are specified that need optional states; the filter has none.")
+    elif states is None:
+        notes.append(state_words(chosen.states.names))
+    else:
+        notes.append(f"Optional states: {', '.join(chosen.states.names)}.")
+    return chosen, [*notes, *([f"Still without a state: {', '.join(missing)}."] if missing else [])]
+
+
+def filter_for_scenario(
+    scenario: Scenario,
+    *,
+    setup: FilterSetup | None = None,
+    gyro: GyroSpec | None = None,
+    states: bool | Sequence[str] | None = None,
+) -> FilterSetup:
+    """Return the filter for a scenario: ``setup``, or one that matches it, assuming another ``gyro`` if given."""
+    if setup is None:
+        assumed = scenario if gyro is None else dataclasses.replace(scenario, gyro=gyro)
+        return setups.FilterSetup.for_scenario(assumed, states=states)
+    _need_alone(gyro, states)
+    kinds = {sensor.name: str(getattr(sensor, "kind", "attitude")) for sensor in scenario.sensors}
+    setups.need_angles(setup, kinds, "filter")
+    return setup
+
+
+def state_words(names: Sequence[str]) -> str:
+    """Return the reason why a filter has error states by default."""
+    return (
+        f"The filter has states for the specified errors, {', '.join(names)}: without them its σ would be too small "
+        f"({Hint('states', False)} omits them)."
     )
+
+
+def no_state_words(missing: Sequence[str], chosen: FilterSetup) -> list[str]:
+    """Return a message about errors for which a filter has no state, with a remedy; empty if there are none."""
+    remedy = "" if chosen.states is not None else f"; {Hint('states', True)} adds states for most of them"
+    said = f"The record specifies errors for which this filter has no state: {', '.join(missing)}{remedy}."
+    return [said] if missing else []
 
 
 class AttitudeHistory(NamedTuple):
@@ -695,7 +811,7 @@ def accuracy(result: Estimate, truth: Truth | ImuRecord | Recording | Attitudes 
 def plan(
     scenario: Scenario,
     *,
-    setup: FilterSetup | None = None,
+    setup: FilterSetup | Own | None = None,
     gyro: GyroSpec | None = None,
     seed: int | None = None,
     states: bool | None = None,
@@ -710,10 +826,10 @@ def plan(
     """
     from strapdown import montecarlo
 
-    if setup is not None and (states is not None or gyro is not None):
-        raise InputError("a filter setup has its own states and gyro noise; leave states and gyro out")
-    assumed = scenario if gyro is None else dataclasses.replace(scenario, gyro=gyro)
-    chosen = setups.FilterSetup.for_scenario(assumed, states=states) if setup is None else setup
+    if isinstance(setup, Own):
+        _need_alone(gyro, states)
+        setup = dataclasses.replace(FilterSetup.for_scenario(scenario, states=False), estimator=setup)
+    chosen = filter_for_scenario(scenario, setup=setup, gyro=gyro, states=states)
     names = chosen.states.names if setup is None and chosen.states is not None else ()
     return montecarlo.Plan(
         scenario=scenario,
@@ -872,7 +988,18 @@ def tuned(
     for one, label in zip(sources, labels, strict=True):
         instance("sources", one, (ImuRecord, Recording), SOURCE)
         if isinstance(one, ImuRecord):
-            setup = setup or setups.FilterSetup.for_record(one, states=states)
+            if setup is None:
+                if one.origin is None or one.origin.gyro is None:
+                    raise InputError(
+                        f"{label or 'the record'} does not contain its gyro's specification; give a filter, {Hint('setup')}"
+                    )
+                setup = setups.FilterSetup.for_record(one, states=states)
+            elif own and states:
+                if setup.states is not None:
+                    raise InputError(f"{Hint('setup')} contains the filter's states; leave {Hint('states')} out")
+                added = setups.FilterSetup.for_record(one, states=True).states
+                setup, states = dataclasses.replace(setup, states=added), None
+            need_angles(setup, one)
             cases.append(tuning.record_case(one, setup, name=label))
         else:
             setup = setup or tuning.recording_setup()

@@ -26,7 +26,9 @@ def estimate(**change):
 
 def checked(**change):
     given = {**GIVEN, "true_time": TIME, "true_attitude": TRUE, "true_bias": BIAS} | change
-    return consistency.check_arrays(**given)
+    truth = {name: given.pop(f"true_{name}") for name in ("time", "attitude", "bias")}
+    both = (recordings.Attitudes.from_arrays(**one) for one in (given, truth))
+    return consistency.check_attitudes(*both)
 
 
 def errors(**change):
@@ -51,7 +53,10 @@ def masked(value):
 
 @pytest.mark.parametrize(("call", "name"), CALLS, ids=lambda one: getattr(one, "__name__", one))
 def test_complex_arrays_are_refused_by_name(call, name):
-    with pytest.raises(InputError, match=rf"{name} is not an array of numbers \(it holds complex numbers\)"):
+    with pytest.raises(
+        InputError,
+        match=rf"{'time' if name == 'true_time' else name} is not an array of numbers \(it holds complex numbers\)",
+    ):
         call(**{name: VALUES[name] + 1e-3j})
 
 
@@ -77,7 +82,7 @@ def test_masked_values_are_missing_or_refused_by_name(call, name):
         assert np.isnan(np.asarray(result)[3]).any()
         np.testing.assert_array_equal(result, expected)
     else:
-        with pytest.raises(InputError, match=rf"{name}(\[3.*\])? is (masked|nan)"):
+        with pytest.raises(InputError, match=rf"{'time' if name == 'true_time' else name}(\[3.*\])? is (masked|nan)"):
             call(**{name: value})
 
 

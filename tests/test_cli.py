@@ -93,12 +93,11 @@ def test_ctrl_c_ends_with_status_130(run, monkeypatch, tmp_path):
 
 def test_a_fault_of_the_program_is_no_verdict(run, monkeypatch):
     """Status 1 of a raw traceback would be "not consistent" of `check`."""
-    from strapdown import workflows
 
     def broken(*_: object) -> str:
         raise ZeroDivisionError("a fault")
 
-    monkeypatch.setattr(workflows, "read", broken)
+    monkeypatch.setattr("strapdown.read", broken)
     status, said, error = run("check", "estimate.h5")
     assert (status, said) == (70, "")
     assert "ZeroDivisionError: a fault" in error.splitlines()
@@ -235,8 +234,8 @@ def test_coning_is_the_same_for_the_same_seed(succeeds, coning, tmp_path):
         (("--runs", 0), "runs is 0; it must be a whole number of 1 or more"),
         (("--runs", -3), "runs is -3"),
         (("--seed", -1), "seed is -1; it must be a whole number of 0 or more"),
-        (("--angle", 0), "--angle is 0 degrees; it must be greater than zero"),
-        (("--angle", 200), "--angle is 200 degrees; the half-angle of a cone must be below"),
+        (("--angle", 0), "angle is 0 degrees; it must be greater than zero"),
+        (("--angle", 200), "angle is 200 degrees; the half-angle of a cone must be below"),
         (("--angle", "nan"), "angle is nan; it must be a finite number"),
         (("--frequency", -1), "frequency is -1"),
         (("--rate", 0), "rate is 0"),

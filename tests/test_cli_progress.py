@@ -17,7 +17,6 @@ def said(monkeypatch):
     text = io.StringIO()
     monkeypatch.setattr(progress, "errors", Console(file=text, markup=False, highlight=False, width=200))
     monkeypatch.setattr(progress, "LINE_INTERVAL", 0.1)
-    monkeypatch.setattr(progress, "_POLL", 0.01)
     monkeypatch.setattr(progress, "_quiet", False)
     return text
 
@@ -66,7 +65,7 @@ def test_a_terminal_has_a_bar(monkeypatch):
     text = io.StringIO()
     monkeypatch.setattr(progress, "errors", Console(file=text, force_terminal=True, width=100))
     monkeypatch.setattr(progress, "_quiet", False)
-    with progress.progress_bar("runs", 3, rate="runs/s") as advance:
+    with progress.progress_bar("runs", 3) as advance:
         advance(2)
         time.sleep(0.3)
     assert "2/3" in text.getvalue()

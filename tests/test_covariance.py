@@ -744,7 +744,7 @@ def test_axes_of_a_gyro_may_differ():
 
 
 def test_the_command_prints_a_budget_and_writes_it(succeeds, tmp_path):
-    options = ("--epochs", 10, "--misalignment", 0.1, "--time-offset", "star=2")
+    options = ("--epochs", 10, "--consider", "misalignment=0.1", "--consider", "star.delay=2")
     said = succeeds("covariance", "spin", "--no-states", *options)
     assert "The filter has no state for the gyro's scale factor" in said
     for word in ("angle random walk", "gyro scale factor", "misalignment", "star time offset", "the filter's own σ"):
@@ -766,8 +766,8 @@ def test_the_command_prints_a_budget_and_writes_it(succeeds, tmp_path):
 def test_the_command_takes_a_filter_and_units(succeeds, tmp_path):
     belief = setup.FilterSetup.for_scenario(load_scenario("low-orbit"), states=False)
     (tmp_path / "filter.toml").write_text(setup.to_toml(belief), encoding="utf-8")
-    arguments = ("low-orbit", "--filter", "filter.toml", "--epochs", 5, "--sensor-bias", "magnetometer=100")
-    said = succeeds("covariance", *arguments, "--attitude-sigma", 2, "--bias-sigma", 30)
+    arguments = ("low-orbit", "--filter", "filter.toml", "--epochs", 5, "--consider", "magnetometer.bias=100")
+    said = succeeds("covariance", *arguments, "--consider", "initial.attitude=2", "--consider", "initial.bias=30")
     assert "the filter given" in said
     found = json.loads((tmp_path / "covariance-results" / "covariance.json").read_text(encoding="utf-8"))
     direct = covariance.analyse(
@@ -794,9 +794,10 @@ def test_the_command_gives_no_verdict_beyond_the_linear_range(run, succeeds):
 
 def test_the_command_refuses_in_one_line(run):
     for arguments, word in (
-        (("spin", "--time-offset", "star"), "NAME=VALUE"),
-        (("spin", "--mounting", "sta=3"), "did you mean 'star'"),
-        (("spin", "--scale-factor", "-1"), "--scale-factor is -1 ppm"),
+        (("spin", "--consider", "star.delay"), "NAME=VALUE"),
+        (("spin", "--consider", "sta.mounting=3"), "did you mean 'star.mounting'"),
+        (("spin", "--consider", "star.bias=x"), "'x' is no number"),
+        (("spin", "--consider", "scale_factor=-1"), "--consider scale_factor is -1"),
         (("nowhere",), "nowhere"),
     ):
         status, said, refused = run("covariance", *arguments, "--epochs", 4)
@@ -811,12 +812,14 @@ def test_the_options_of_the_command_are_in_the_units_that_they_name(monkeypatch,
     def analysed(scenario, belief, **options):
         raise Reached(options["consider"])
 
-    monkeypatch.setattr(covariance, "analyse", analysed)
+    monkeypatch.setattr("strapdown.covariance_analysis", analysed, raising=False)
     monkeypatch.chdir(tmp_path)
-    command = ["covariance", "coning", "--scale-factor", "3", "--misalignment", "2", "--g-sensitivity", "7"]
-    found = CliRunner().invoke(cli.app, command)
+    errors = ("scale_factor=3", "misalignment=2", "g_sensitivity=7", "star.bias=4", "star.mounting=5")
+    found = CliRunner().invoke(cli.app, ["covariance", "spin", *(f"--consider={one}" for one in errors)])
     assert isinstance(found.exception, Reached), found.output
     (consider,) = found.exception.args
     assert consider.scale_factor == pytest.approx(3e-6)
     assert consider.misalignment == pytest.approx(2e-3)
+    assert consider.sensor_bias == {"star": pytest.approx(4.0 * ARCSECOND)}
+    assert consider.mounting == {"star": pytest.approx(5.0 * ARCSECOND)}
     assert consider.g_sensitivity == pytest.approx(7.0 * np.pi / 180.0 / 3600.0 / 9.80665, rel=1e-12)  # rad/s per m/s²

@@ -15,11 +15,11 @@ from ulog_writer import message as ulog_message
 from sims import peer_judged
 from strapdown import cli, consistency, montecarlo, quaternion, recordings, report, scenarios, vectors
 from strapdown.checks import InputError
-from strapdown.consistency import alignment, check_arrays, foreign
+from strapdown.consistency import alignment, foreign
 from strapdown.estimation import setup
 from strapdown.gyro import GyroSpec
 from strapdown.recordings import attitudes, recordfiles
-from strapdown.recordings.attitudes import read_attitudes
+from strapdown.recordings.attitudes import Attitudes, read_attitudes
 from strapdown.records import Truth
 from strapdown.records.outputs import euler, euler_axes, to_ned
 from strapdown.units import DEGREE, DEGREE_PER_HOUR_PER_ROOT_HOUR, DEGREE_PER_ROOT_HOUR
@@ -50,6 +50,14 @@ def checked(run, **changes):
     arrays = {"time": e.time, "attitude": e.attitude, "covariance": e.covariance, "true_time": e.time}
     arrays |= {"true_attitude": t.attitude, "bias": e.bias, "true_bias": t.bias, "innovations": e.innovations}
     return check_arrays(**{**arrays, **changes})
+
+
+def check_arrays(time, attitude, covariance, true_time, true_attitude, **more):
+    """The verdict on arrays against a truth of arrays."""
+    own = {name: more.pop(name) for name in ("bias", "innovations") if name in more}
+    theirs = {name: more.pop(f"true_{name}") for name in ("bias", "movement") if f"true_{name}" in more}
+    estimate = Attitudes.from_arrays(time, attitude, covariance=covariance, **own)
+    return consistency.check_attitudes(estimate, Attitudes.from_arrays(true_time, true_attitude, **theirs), **more)
 
 
 def carried(P, turn):

@@ -325,7 +325,7 @@ def test_files_are_recognised_by_their_content(tmp_path):
     [
         ({"motion": "hand"}, "recording"),
         ({"latency": 0.01}, "recording"),
-        ({"setup": sd.FilterSetup.for_scenario(scenario(1.0), states=False), "states": True}, "setup defines another"),
+        ({"setup": sd.FilterSetup.for_scenario(scenario(1.0), states=False), "states": True}, "complete filter"),
         ({"states": ["gyro.nothing"]}, "gyro.nothing"),
         ({"gate": 1.5}, "1.5"),
         ({"robust": "hubert"}, "hubert"),

@@ -21,9 +21,10 @@ REST = FIRST + '[motion]\ntype = "rest"\n'
 def test_the_built_in_ones_are_those_asked_for():
     moving = {"coning", "spin", "slew-vibration", "tumbling-satellite", "low-orbit", "magnetometer-only", "hand-held"}
     assert set(scenarios.SCENARIOS) == moving | {"rest", "two-stars", "earth-observer", "ship"}
-    rows = scenarios.builtin_rows()
-    assert [row["name"] for row in rows] == list(scenarios.SCENARIOS)
-    assert all(row["description"] for row in rows)
+    table = scenarios.builtin()
+    assert [row[0] for row in table.rows] == list(scenarios.SCENARIOS)
+    assert [note.partition(": ")[0] for note in table.notes] == list(scenarios.SCENARIOS)
+    assert all(note.partition(": ")[2] for note in table.notes)
 
 
 @pytest.mark.parametrize("name", scenarios.SCENARIOS)

@@ -124,7 +124,7 @@ def test_tune_by_the_size_of_the_error(succeeds, tmp_path, record, wrong):
     [
         (("--free", "gyro.awr"), "did you mean 'gyro.arw'"),
         (("--holdout", "1.5"), "between 0 and 1"),
-        (("--holdout", "0.3", "--holdout-by", "week"), "holdout-by 'week'"),
+        (("--holdout", "0.3", "--holdout-by", "week"), "holdout by 'week'"),
         (("--out", "filter.json"), ".toml"),
         (("--truth", "--spacing", "1"), "leave it out"),
         (("--prior", "no-such-gyro"), "no-such-gyro"),

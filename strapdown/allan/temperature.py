@@ -16,7 +16,7 @@ J. Am. Stat. Assoc. 72, 1977; Berger, de Oliveira & Sansó, "Objective Bayesian 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,8 +24,8 @@ from numpy.typing import ArrayLike, NDArray
 from strapdown import checks
 from strapdown.allan.deviation import TERMS
 from strapdown.allan.spectrum import bin_starts, mean_power
-from strapdown.checks import Array, InputError
-from strapdown.gyro.temperature import BiasOverTemperature
+from strapdown.checks import Array, Hint, InputError
+from strapdown.gyro.temperature import BiasOverTemperature, to_table
 from strapdown.results import Table
 
 __all__ = [
@@ -49,6 +49,10 @@ LEVEL = 0.95
 """Confidence of the intervals."""
 SMALLEST_SPAN = 0.5
 """Minimum temperature range of a regression, K."""
+
+
+UNITS = {"gyro": ("rad/s", "rad_per_s"), "accelerometer": ("m/s²", "m_per_s2"), "magnetometer": ("T", "t")}
+"""Unit of the samples of each sensor, in messages and in keys."""
 
 
 class TemperatureFit(NamedTuple):
@@ -124,6 +128,24 @@ def fit_temperature(
         coefficients[:, axis] = float(np.mean(x[:, axis]) - powers.mean(axis=0) @ found), *found
     polynomial = BiasOverTemperature(reference=reference, span=span, coefficients=coefficients, sigma=sigma)
     return TemperatureFit(polynomial, reach, left)
+
+
+def regressed(source: Any, sensor: str, order: int) -> tuple[Array, Table, str]:
+    """Return recorded samples (:class:`strapdown.recordings.GyroSamples`) less their bias over temperature, its table and its TOML."""
+    import tomli_w
+
+    if source.temperature is None:
+        raise InputError(f"no temperature is recorded; leave {Hint('temperature')} out")
+    if np.isnan(source.values).any():
+        raise InputError(
+            "there are gaps, which a regression on temperature does not support; cut the recording between them"
+        )
+    scale = source.sample_interval if source.kind == "increments" else 1.0
+    fit = fit_temperature(source.values / scale, source.temperature, source.sample_interval, order=order)
+    unit, stem = UNITS[sensor]
+    title = "Bias over temperature by `strapdown allan`, a polynomial in T - reference."
+    toml = tomli_w.dumps({sensor: {"temperature": to_table(fit.polynomial, stem)}})
+    return fit.left * scale, fit.listing(unit), f"# {title}\n\n{toml}"
 
 
 class _Bins(NamedTuple):

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from strapdown.checks import Array, InputError, array, finite
-from strapdown.files import atomic_write, tables
+from strapdown.files import tables, write_text
 from strapdown.records import ErrorStateEstimate
 from strapdown.records.recording import MAGNETIC_UNITS, Recording
 from strapdown.results import Column, Listed, Table
@@ -253,8 +253,7 @@ def write(calibration: UnitCalibration, path: str | os.PathLike[str]) -> None:
         "# each sensor measures (I + M) v + b: M is its matrix, by rows, b its bias or hard iron (in magnetic_unit)\n"
         + "".join(f"# {line}\n" for line in calibration.remarks)
     )
-    with atomic_write(path) as temporary:
-        temporary.write_text(text + tomli_w.dumps({"calibration": content}), encoding="utf-8")
+    write_text(path, text + tomli_w.dumps({"calibration": content}))
 
 
 def read(path: str | os.PathLike[str]) -> UnitCalibration:

@@ -9,7 +9,7 @@ from strapdown.cli.terminal import app
 COMMANDS: dict[str, dict[str, tuple[str, ...]]] = {
     "Simulate, estimate, judge": {
         "scenarios": ("sensors",),
-        "keys": ("keys", "strapdown keys sensors", "strapdown keys coning"),
+        "keys": ("sensors", "strapdown keys sensors", "strapdown keys coning"),
         "simulate": (
             "sensors",
             "strapdown simulate two-stars",
@@ -31,10 +31,10 @@ COMMANDS: dict[str, dict[str, tuple[str, ...]]] = {
             "strapdown montecarlo satellite.toml --runs 400",
             "strapdown montecarlo satellite.toml --filter mine.py:run",
         ),
-        "covariance": ("planning", "strapdown covariance satellite.toml --scale-factor 300"),
+        "covariance": ("studies", "strapdown covariance satellite.toml --consider scale_factor=300"),
     },
     "Noise and tuning": {
-        "allan": ("sensors", "strapdown allan rest.csv --gyro-unit deg/s"),
+        "allan": ("allan", "strapdown allan rest.csv --gyro-unit deg/s"),
         "tune": ("tuning", "strapdown tune one.h5 two.h5 --filter guess.toml --holdout 0.4"),
     },
     "Recordings": {
@@ -55,7 +55,7 @@ COMMANDS: dict[str, dict[str, tuple[str, ...]]] = {
     "On a microcontroller": {
         "export": ("exporting", "strapdown export filter.toml satellite.toml --precision single --out firmware"),
     },
-    "This installation": {"info": ("installation",)},
+    "This installation": {"info": ("exporting",)},
 }
 """Commands by group: the module that registers each, and examples."""
 

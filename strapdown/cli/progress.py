@@ -1,4 +1,4 @@
-"""Progress of long computations on standard error: a bar on a terminal, otherwise a line every ten seconds."""
+"""The consoles, and progress of long computations on standard error: a bar on a terminal, otherwise a line every ten seconds."""
 
 from __future__ import annotations
 
@@ -8,25 +8,14 @@ from contextlib import contextmanager
 from threading import Event, Thread
 from typing import Any
 
+import rich.progress as bars
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    ProgressColumn,
-    Task,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 from rich.text import Text
 
 from strapdown.checks import Hint
 
 _CONTROL = dict.fromkeys((*range(9), *range(11, 32), *range(127, 160)), "�")
 """Control characters except tab and newline."""
-
-
 _OPTIONS = {
     "initial": "--attitude or --from-truth",
     "noise": "--gyro",
@@ -39,8 +28,9 @@ _OPTIONS = {
 
 def option(hint: Hint) -> str:
     """Return the option for an argument of Python, with its value."""
-    flag = _OPTIONS.get(hint.argument, "--" + hint.argument.replace("_", "-"))
-    if hint.value is None or hint.value is True:
+    name = hint.argument.replace("_", "-")
+    flag = _OPTIONS.get(hint.argument, f"--no-{name}" if hint.value is False else f"--{name}")
+    if hint.value is None or isinstance(hint.value, bool):
         return flag
     if hint.argument == "units":
         return " ".join(f"--{name}-unit {unit}" for name, unit in hint.value.items())
@@ -60,7 +50,6 @@ errors = PlainConsole(stderr=True, markup=False, highlight=False)
 
 LINE_INTERVAL = 10.0
 """Time between two lines if the output is no terminal, s."""
-_POLL = 0.2
 
 _quiet = False
 
@@ -76,17 +65,12 @@ def rate_text(speed: float) -> str:
     return f"{speed:.0f}" if speed >= 100.0 else f"{speed:.3g}"
 
 
-class _Rate(ProgressColumn):
-    """Units per second."""
+class _Rate(bars.ProgressColumn):
+    """Runs per second, recent or, of a finished task, on average."""
 
-    def __init__(self, unit: str) -> None:
-        super().__init__()
-        self._unit = unit
-
-    def render(self, task: Task) -> Text:
-        """Return the recent rate, or the mean rate of a finished task."""
+    def render(self, task: bars.Task) -> Text:
         speed = task.finished_speed or task.speed
-        return Text("" if speed is None else f"{rate_text(speed)} {self._unit}")
+        return Text("" if speed is None else f"{rate_text(speed)} runs/s")
 
 
 Advance = Callable[[int | str], None]
@@ -94,12 +78,30 @@ Advance = Callable[[int | str], None]
 
 
 @contextmanager
-def progress_bar(what: str, total: int | None = None, *, rate: str = "") -> Iterator[Advance]:
+def progress_bar(what: str, total: int | None = None) -> Iterator[Advance]:
     """Yield a function that advances the progress; without ``total`` only the time is shown."""
     if _quiet:
         yield lambda step: None
-        return
-    done, ended = 0, Event()
+    elif errors.is_terminal:
+        known = (
+            (bars.MofNCompleteColumn(), *([_Rate()] if what == "runs" else []), bars.TimeRemainingColumn())
+            if total
+            else ()
+        )
+        columns = (bars.TextColumn("{task.description}"), bars.BarColumn(), *known, bars.TimeElapsedColumn())
+        with bars.Progress(*columns, console=errors, transient=True) as progress:
+            task = progress.add_task(what, total=total)
+            yield lambda step: progress.update(
+                task, **({"description": step} if isinstance(step, str) else {"advance": step})
+            )
+    else:
+        with _lines(what, total) as advance:
+            yield advance
+
+
+@contextmanager
+def _lines(what: str, total: int | None) -> Iterator[Advance]:
+    done, begin, ended = 0, time.monotonic(), Event()
 
     def advance(step: int | str) -> None:
         nonlocal done, what
@@ -108,44 +110,15 @@ def progress_bar(what: str, total: int | None = None, *, rate: str = "") -> Iter
         else:
             done += step
 
-    def watch(say: Say) -> None:
-        begin = time.monotonic()
-        while not ended.wait(_POLL):
-            say(what, done, time.monotonic() - begin)
-
-    with _terminal(what, total, rate) if errors.is_terminal else _lines(total) as say:
-        watcher = Thread(target=watch, args=(say,), daemon=True)
-        watcher.start()
-        try:
-            yield advance
-        finally:
-            ended.set()
-            watcher.join()
-
-
-Say = Callable[[str, int, float], None]
-"""Shows the task, the number of completed units, and the elapsed time, s."""
-
-
-@contextmanager
-def _terminal(what: str, total: int | None, rate: str) -> Iterator[Say]:
-    known = (MofNCompleteColumn(), *([_Rate(rate)] if rate else []))
-    columns = (TextColumn("{task.description}"), BarColumn(), *(known if total is not None else ()))
-    left = (TextColumn("left"), TimeRemainingColumn()) if total is not None else ()
-    with Progress(*columns, TimeElapsedColumn(), *left, console=errors, transient=True) as progress:
-        task = progress.add_task(what, total=total)
-        yield lambda now, done, _: progress.update(task, description=now, completed=done)
-
-
-@contextmanager
-def _lines(total: int | None) -> Iterator[Say]:
-    next_line = LINE_INTERVAL
-
-    def say(now: str, done: int, seconds: float) -> None:
-        nonlocal next_line
-        if seconds >= next_line:
-            next_line += LINE_INTERVAL
+    def watch() -> None:
+        while not ended.wait(LINE_INTERVAL):
             share = "" if total is None else f" {done} of {total},"
-            errors.print(f"{now}:{share} {seconds:.0f} s", soft_wrap=True)
+            errors.print(f"{what}:{share} {time.monotonic() - begin:.0f} s", soft_wrap=True)
 
-    yield say
+    watcher = Thread(target=watch, daemon=True)
+    watcher.start()
+    try:
+        yield advance
+    finally:
+        ended.set()
+        watcher.join()

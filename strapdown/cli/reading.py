@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import typer
+from typer import Option
 
 from strapdown.checks import InputError, one_of
 from strapdown.cli.terminal import options_given
@@ -22,16 +22,16 @@ RECORDING_HELP = (
 class Samples:
     """Layout of the recording."""
 
-    gyro_unit: str | None = typer.Option(None, help="Table: unit of the gyro, rad/s, deg/s, mrad/s or mdeg/s.")
-    accelerometer_unit: str | None = typer.Option(None, help="Table: unit of the accelerometer, m/s2, g or mg.")
-    magnetometer_unit: str | None = typer.Option(None, help="Table: unit of the magnetometer, T, mT, uT, nT, G or mG.")
-    time_unit: str | None = typer.Option(None, help="Table: unit of the time, s, ms, us or ns.")
-    columns: str | None = typer.Option(
+    gyro_unit: str | None = Option(None, help="Table: unit of the gyro, rad/s, deg/s, mrad/s or mdeg/s.")
+    accelerometer_unit: str | None = Option(None, help="Table: unit of the accelerometer, m/s2, g or mg.")
+    magnetometer_unit: str | None = Option(None, help="Table: unit of the magnetometer, T, mT, uT, nT, G or mG.")
+    time_unit: str | None = Option(None, help="Table: unit of the time, s, ms, us or ns.")
+    columns: str | None = Option(
         None,
         metavar="ROLE=NAME,…",
-        help="Table: names of its columns if they are not the usual ones, unit in parentheses: time=timestamp(us),gx=gyro_x(dps),gy=….",
+        help="Table: names of its columns, with units: time=timestamp(us),gx=gyro_x(dps),….",
     )
-    topic: str | None = typer.Option(None, help="Bag or flight log: topic of the inertial unit, if there are several.")
+    topic: str | None = Option(None, help="Bag or flight log: topic of the inertial unit, if there are several.")
 
     @property
     def units(self) -> dict[str, str]:
@@ -43,29 +43,29 @@ class Samples:
         """Return the options of :func:`strapdown.recordings.read` that are given; a simulated record takes none of them."""
         from strapdown import recordings
 
-        if (options := options_given(self)) and recordings.is_record(path):
-            what = {"--topic": "a bag or a flight log", "--axes": "a recording", "--invert": "a recording"}
-            own = "contains its units" if options[0].endswith("-unit") else "needs none"
-            raise InputError(f"{options[0]} applies to {what.get(options[0], 'a table')}; the record {path} {own}")
-        found: dict[str, Any] = {"units": self.units}
-        if self.columns:
-            found["columns"] = recordings.parse_mapping(self.columns)
-        if self.topic:
-            found["topic"] = self.topic
-        return found
+        given = options_given(self)
+        if recordings.is_record(path):
+            if given:
+                what = {"--topic": "a bag or a flight log", "--axes": "a recording", "--invert": "a recording"}
+                own = "contains its units" if given[0].endswith("-unit") else "needs none"
+                raise InputError(f"{given[0]} applies to {what.get(given[0], 'a table')}; the record {path} {own}")
+            return {}
+        columns = recordings.parse_mapping(self.columns) if self.columns else None
+        values = {"units": self.units, "columns": columns, "topic": self.topic}
+        return {name: value for name, value in values.items() if value}
 
 
 @dataclass(frozen=True, eq=False)
 class Layout(Samples):
     """Layout of the recording."""
 
-    axes: list[str] | None = typer.Option(
+    axes: list[str] | None = Option(
         None,
         metavar="[SENSOR=]AXES",
         help="Recorded axes that become the body's x, y, z: x,-y,-z for a unit whose z axis points down, magnetometer=y,x,-z for one "
         "sensor; may be repeated.",
     )
-    invert: list[str] | None = typer.Option(
+    invert: list[str] | None = Option(
         None,
         metavar="SENSOR",
         help="Sensor with inverted sign: accelerometer (if it reads -g upward at rest), magnetometer or gyro; may be repeated.",
@@ -75,12 +75,12 @@ class Layout(Samples):
         """Return the options of :func:`strapdown.recordings.read` that are given; a simulated record takes none of them."""
         from strapdown import recordings
 
-        found = super().options(path)
+        options = super().options(path)
         if self.axes:
-            found["axes"] = _axes(self.axes)
+            options["axes"] = _axes(self.axes)
         if self.invert:
-            found["invert"] = tuple(one_of("--invert", sensor, recordings.SENSORS) for sensor in self.invert)
-        return found
+            options["invert"] = tuple(one_of("--invert", sensor, recordings.SENSORS) for sensor in self.invert)
+        return options
 
 
 def _axes(texts: Sequence[str]) -> str | dict[str, str]:

@@ -1,21 +1,21 @@
-"""Functions shared by all commands: the application, the two consoles, tables."""
+"""Functions shared by all commands: the application, the two consoles, tables, shared options, checks of files."""
 
 from __future__ import annotations
 
 import copy
 import dataclasses
-import enum
 import functools
 import inspect
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_type_hints
+from typing import TYPE_CHECKING, Any, Literal, get_type_hints
 
 import rich.table
 import typer
 from rich import box
 from rich.text import Text
+from typer import Option
 
 from strapdown.checks import InputError
 from strapdown.cli.progress import PlainConsole, progress_bar
@@ -24,12 +24,6 @@ from strapdown.files import json_text, usable_folder, writable, write_json
 if TYPE_CHECKING:
     from strapdown.recordings import Recording
     from strapdown.results import Table
-    from strapdown.scenarios import Scenario
-
-LARGEST_NUMBER = 1e30
-"""Maximum of a number in a scenario, in any unit; squares and products of larger ones overflow."""
-MAX_MEASUREMENTS = 1e8
-"""Maximum number of measurements of one sensor in a scenario; more do not fit into memory."""
 
 app = typer.Typer(
     help="Strapdown gyro attitude estimation: simulate, estimate, judge.",
@@ -39,10 +33,25 @@ app = typer.Typer(
 # Without markup, so that brackets in file names are printed; a statement is one line, which the terminal wraps.
 console = PlainConsole(markup=False, highlight=False, soft_wrap=True)
 
+Format = Literal["png", "pdf", "svg"]
+"""Formats of figures."""
+FORMAT: Any = Option("png", "--format", help="Format of the figures.")
+TABLES: Any = Option(None, help="Folder to which the tables are also written, as CSV with all digits and as LaTeX.")
+FILTER: Any = Option(
+    None, "--filter", help="TOML with a table named filter, as of `strapdown tune`. Default: a matched one."
+)
+STATES: Any = Option(
+    None,
+    "--states/--no-states",
+    help="A state for each specified error, or none. Default: if the matched filter needs them.",
+)
+GYRO: Any = Option(None, help="TOML with a table named gyro, as of `strapdown allan`: the gyro noise of the filter.")
+SCENARIO = "Name of a built-in scenario, or a TOML file."
+
 
 def command(function: Callable[..., None]) -> Callable[..., None]:
     """Register a command; a parameter whose type is a dataclass becomes one option per field, under one heading of --help."""
-    hints = get_type_hints(function, include_extras=True)
+    hints = get_type_hints(function)
     groups: dict[str, Any] = {name: hint for name, hint in hints.items() if dataclasses.is_dataclass(hint)}
     parameters = []
     for name, parameter in inspect.signature(function).parameters.items():
@@ -67,13 +76,13 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
 def _options(group: Any) -> list[inspect.Parameter]:
     """Return the fields of a group as parameters; the first line of its docstring is the heading in --help."""
     hints = get_type_hints(group)
-    found = []
+    parameters = []
     for field in dataclasses.fields(group):
         option: Any = copy.copy(field.default)
         option.rich_help_panel = group.__doc__.partition("\n")[0].rstrip(".")
         kind = inspect.Parameter.KEYWORD_ONLY
-        found.append(inspect.Parameter(field.name, kind, default=option, annotation=hints[field.name]))
-    return found
+        parameters.append(inspect.Parameter(field.name, kind, default=option, annotation=hints[field.name]))
+    return parameters
 
 
 def options_given(group: Any) -> list[str]:
@@ -87,22 +96,6 @@ def options_given(group: Any) -> list[str]:
     return flags
 
 
-class FigureFormat(enum.StrEnum):
-    """Formats of figures."""
-
-    png = "png"
-    pdf = "pdf"
-    svg = "svg"
-
-
-FORMAT: Any = typer.Option(FigureFormat.png, "--format", help="Format of the figures.")
-"""Option of all commands that draw figures."""
-TABLES: Any = typer.Option(
-    None, "--tables", help="Folder to which the tables are also written, as CSV with all digits and as LaTeX."
-)
-"""Option of all commands that print the tables of a study."""
-
-
 def say(*sentences: str) -> None:
     """Print sentences, each on its line; empty ones are omitted."""
     for sentence in filter(None, sentences):
@@ -114,83 +107,61 @@ def counted(number: int, what: str) -> str:
     return f"{number} {what}" if number == 1 else f"{number} {what}s"
 
 
-def show(table: Table, title: str | None = None, *, notes: bool = True) -> None:
-    """Print a table, optionally under another title; on a narrow terminal its lines wrap and are not cut off."""
-    console.print(title or table.title, style="bold")
-    rows = rich.table.Table(box=box.SIMPLE_HEAD, header_style="", pad_edge=False, padding=(0, 1, 0, 0))
-    for k, column in enumerate(table.head):
-        rows.add_column(column, justify="left" if k < table.left else "right", no_wrap=k > 0 or table.left == 1)
+def show(*tables: Table, title: str | None = None, notes: bool = True) -> None:
+    """Print tables, optionally under another title; on a narrow terminal their lines wrap and are not cut off."""
     styles = {"pass": "green", "FAIL": "red", "likely": "red"}
-    for row in table.cells:
-        # Only plain strings are cleared of control characters.
-        rows.add_row(*(Text(cell, style=styles[cell]) if cell in styles else cell for cell in row))
-    width, console.width = console.width, 1000
+    for table in tables:
+        console.print(title or table.title, style="bold")
+        rows = rich.table.Table(box=box.SIMPLE_HEAD, header_style="", pad_edge=False, padding=(0, 1, 0, 0))
+        for k, column in enumerate(table.head):
+            rows.add_column(column, justify="left" if k < table.left else "right", no_wrap=k > 0 or table.left == 1)
+        for row in table.cells:
+            # Only plain strings are cleared of control characters.
+            rows.add_row(*(Text(cell, style=styles[cell]) if cell in styles else cell for cell in row))
+        width, console.width = console.width, 1000
+        try:
+            console.print(rows, crop=False)
+        finally:
+            console.width = width
+        say(*(table.notes if notes else ()))
+
+
+def check_files(
+    *paths: Path,
+    tables: Path | None = None,
+    sources: Any = (),
+    suffixes: tuple[str, ...] = (),
+    own: Callable[[Path], bool] | None = None,
+    command: str = "",
+) -> None:
+    """Raise an error, before anything is computed, for output files that cannot be written; ``tables``: folder of ``--tables``.
+
+    ``own``: whether the first file was written by ``command``, which replaces no other, of which there may be no copy.
+    """
+    writable("out", *paths, suffixes=suffixes, sources=sources)
+    if tables is not None:
+        usable_folder("--tables", tables)
+    if own is None:
+        return
     try:
-        console.print(rows, crop=False)
-    finally:
-        console.width = width
-    say(*(table.notes if notes else ()))
-
-
-def tables_written(folder: Path | None, *tables: Table) -> list[Path]:
-    """Write tables to the folder of ``--tables``, if one is given, and return the files."""
-    if folder is None:
-        return []
-    from strapdown.report.tables import write
-
-    return write(tables, folder)
-
-
-def tables_folder(folder: Path | None) -> None:
-    """Raise an error if the folder of ``--tables`` cannot be written to, before anything is computed."""
-    if folder is not None:
-        usable_folder("--tables", folder)
-
-
-def scenario_named(name: str) -> Scenario:
-    """Return the scenario of a name or a TOML file, after checking that its numbers are within the range of computation."""
-    from strapdown.scenarios import load_scenario, scenario_to_table
-
-    chosen = load_scenario(name)
-    for key, number in _numbers("", scenario_to_table(chosen)):
-        if LARGEST_NUMBER < abs(number) < float("inf"):  # infinity is valid, as for a time that never comes
-            raise InputError(f"{name}: {key} is {number:g}, which is impossible; check it and its unit")
-    if chosen.duration * chosen.rate < 1.0:
-        raise InputError(
-            f"{name}: {chosen.duration:g} s at {chosen.rate:g} Hz are less than one gyro sample; increase the duration or the rate"
-        )
-    for sensor in chosen.sensors:
-        measurements = chosen.duration * getattr(sensor, "rate", 0.0)
-        if measurements > MAX_MEASUREMENTS:
-            raise InputError(
-                f"{name}: {sensor.name} would measure {measurements:.3g} times, more than {MAX_MEASUREMENTS:.0e}; lower its rate or "
-                "the duration"
-            )
-    return chosen
-
-
-def _numbers(place: str, content: Any) -> Iterator[tuple[str, float]]:
-    """Yield the numbers in a TOML table with their places."""
-    if isinstance(content, dict):
-        for key, value in content.items():
-            yield from _numbers(f"{place}.{key}" if place else key, value)
-    elif isinstance(content, list):
-        for k, value in enumerate(content):
-            yield from _numbers(f"{place}[{k}]", value)
-    elif isinstance(content, (int, float)) and not isinstance(content, bool):
-        yield place, float(content)
-
-
-def need_own(target: Path, command: str, own: Callable[[Path], bool]) -> None:
-    """Raise an error if the command would replace a file that it did not write, of which there may be no other copy."""
-    try:
-        replaceable = not target.exists() or own(target)
+        replaceable = not paths[0].exists() or own(paths[0])
     except InputError:
         replaceable = False
     if not replaceable:
         raise InputError(
-            f"{target} exists and was not written by `strapdown {command}`; move it, or choose another --out"
+            f"{paths[0]} exists and was not written by `strapdown {command}`; move it, or choose another --out"
         )
+
+
+def written(*paths: Any, tables: tuple[Path | None, Any] = (None, ())) -> None:
+    """Print which files were written; ``tables``: folder of ``--tables``, if one is given, and the tables to write to it."""
+    folder, listed = tables
+    if folder is not None:
+        from strapdown.report.tables import write
+
+        paths = (*paths, *write(listed, folder))
+    if paths:
+        console.print("Written: " + ", ".join(map(str, paths)))
 
 
 def warn_about_conventions(source: Recording, path: Path) -> None:
@@ -198,13 +169,8 @@ def warn_about_conventions(source: Recording, path: Path) -> None:
     from strapdown.ahrs import check_conventions
 
     with progress_bar("testing conventions"):
-        found = check_conventions.examine(source)
-    say(
-        *(
-            f"warning: {words}. See `strapdown doctor {path}`, with the same options of the file."
-            for words in found.warnings
-        )
-    )
+        doubts = check_conventions.examine(source).warnings
+    say(*(f"warning: {words}. See `strapdown doctor {path}`, with the same options of the file." for words in doubts))
 
 
 STANDARD_OUTPUT = Path("-")
@@ -225,8 +191,3 @@ def put_json(json: Path | None, content: Any) -> None:
     elif json is not None:
         write_json(json, content)
         written(json)
-
-
-def written(*paths: Any) -> None:
-    """Print which files were written."""
-    console.print("Written: " + ", ".join(str(path) for path in paths))

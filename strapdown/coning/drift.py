@@ -154,6 +154,11 @@ def read_vibration(path: str | os.PathLike[str]) -> tuple[VibrationLine, ...]:
             )
         if not lines:
             raise InputError(f"{file.name} has a header but no lines")
+        largest = max(max(line.angle, line.angle_across or 0.0) for line in lines)
+        if largest >= 90.0 * DEGREE:
+            raise InputError(
+                f"{file} has an amplitude of {largest / DEGREE:.4g}°, but that of a vibration is below 90°; check the unit"
+            )
         return tuple(lines)
 
 

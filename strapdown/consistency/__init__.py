@@ -20,7 +20,7 @@ from strapdown.consistency.bounds import log_mean_p_value as log_mean_p_value
 from strapdown.consistency.bounds import log_moments as log_moments
 from strapdown.consistency.bounds import mean_bounds
 from strapdown.consistency.bounds import mean_p_value as mean_p_value
-from strapdown.consistency.foreign import Checked, check_arrays, check_attitudes
+from strapdown.consistency.foreign import Checked, check_attitudes
 from strapdown.consistency.judgement import DETECTABLE as DETECTABLE
 from strapdown.consistency.judgement import Finding, Judgement, judge
 from strapdown.consistency.judgement import concluded as concluded
@@ -42,7 +42,6 @@ __all__ = [
     "Checked",
     "Finding",
     "Judgement",
-    "check_arrays",
     "check_attitudes",
     "errors",
     "judge",

@@ -16,8 +16,8 @@ from strapdown.checks import Array, InputError, array, increasing, positive
 from strapdown.consistency.alignment import ALIGNED, Alignment, Series, align_series, at_common_times, in_truth_frames
 from strapdown.files import plain
 from strapdown.records import Estimate, Truth
-from strapdown.results import Column, Listed, Table
-from strapdown.units import DEGREE
+from strapdown.results import Column, Listed, Table, figure
+from strapdown.units import DEGREE, DEGREE_PER_HOUR
 
 KINDS = ("total", "heading", "inclination")
 """Parts of an attitude error: its angle, its part about the vertical, the angle between the two verticals."""
@@ -128,12 +128,15 @@ class Accuracy(Listed):
         The same after clocks and frames are aligned.
     alignment : Alignment, optional
         The differences of clocks and frames; they are removed from ``aligned`` only.
+    bias : tuple of float, optional
+        RMS error of the gyro bias and the root mean square of its σ, both of three axes together, rad/s.
     """
 
     samples: Mapping[str, int]
     given: Mapping[str, Mapping[str, ErrorSize]]
     aligned: Mapping[str, Mapping[str, ErrorSize]] = field(default_factory=dict)
     alignment: Alignment | None = None
+    bias: tuple[float, float] | None = None
 
     @property
     def rms_over_sigma(self) -> dict[str, float]:
@@ -154,6 +157,9 @@ class Accuracy(Listed):
         notes = [
             "RMS, median and maximum of the angle of each part; RMS/σ per axis of the part, 1 for a consistent filter."
         ]
+        if self.bias is not None:
+            error, sigma = (figure(value / DEGREE_PER_HOUR) for value in self.bias)
+            notes.append(f"Gyro bias: RMS error {error} °/h, σ {sigma} °/h, of three axes together.")
         if self.alignment is not None:
             notes.append(self.alignment.differences)
         columns = (
@@ -177,7 +183,7 @@ class Accuracy(Listed):
         Returns
         -------
         dict
-            ``samples``; ``given`` and ``aligned`` by span and part; ``alignment``.
+            ``samples``; ``given`` and ``aligned`` by span and part; ``alignment``; ``bias``.
         """
 
         def angles(table: Mapping[str, Mapping[str, ErrorSize]]) -> dict[str, Any]:
@@ -194,6 +200,10 @@ class Accuracy(Listed):
             }
 
         found = {"samples": dict(self.samples), "given": angles(self.given), "aligned": angles(self.aligned)}
+        if self.bias is not None:
+            found["bias"] = dict(
+                zip(("rms_deg_per_h", "sigma_deg_per_h"), np.divide(self.bias, DEGREE_PER_HOUR), strict=True)
+            )
         if self.alignment is not None:
             found["alignment"] = self.alignment.summary()
         return plain(found)  # type: ignore[no-any-return]
@@ -230,7 +240,11 @@ def accuracy(estimate: Estimate, truth: Truth | None = None, *, align: bool = Fa
     aligned: dict[str, dict[str, ErrorSize]] = {}
     if align:
         found, aligned, _ = _aligned_sizes(own, Series(own.time[known], theirs.attitude, movement=theirs.movement))
-    return Accuracy(samples=_numbers(theirs), given=given, aligned=aligned, alignment=found)
+    bias = None
+    if truth.has_bias and estimate.has_bias:
+        squares = np.sum((estimate.bias - truth.bias) ** 2, axis=1), np.sum(estimate.variance[:, 3:], axis=1)
+        bias = tuple(float(np.sqrt(np.mean(one))) for one in squares)
+    return Accuracy(samples=_numbers(theirs), given=given, aligned=aligned, alignment=found, bias=bias)  # type: ignore[arg-type]
 
 
 def accuracy_of(own: Series, theirs: Series) -> Accuracy:

@@ -1,7 +1,8 @@
 """The verdict on the estimate of another program, against a truth that may have another clock and other frames.
 
-:func:`check_arrays` aligns clocks and frames: gross differences are removed, reported, and their uncertainty added to the covariance. The
-definition of the attitude covariance is given or found from the errors, and :func:`strapdown.consistency.judge` judges the result. Small
+:func:`check_attitudes` aligns clocks and frames: gross differences are removed, reported, and their uncertainty added to the covariance.
+The definition of the attitude covariance is given or found from the errors, and :func:`strapdown.consistency.judge` judges the result.
+Small
 differences that would explain the errors are reported with the verdict and not removed unless requested, because a constant rotation
 between frames and a constant error of the filter are indistinguishable.
 """
@@ -14,7 +15,6 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from strapdown import quaternion
 from strapdown.checks import Array, Hint, InputError, one_of
@@ -87,7 +87,7 @@ class Checked:
         Differences that would explain the errors and were not removed, the most likely first.
     remarks : tuple of str
         Differences removed and the definition of the covariance used, one sentence each.
-    accuracy : Accuracy
+    accuracy : Accuracy or None
         The errors as given and aligned.
     """
 
@@ -99,7 +99,7 @@ class Checked:
     frame_probability: Mapping[str, float]
     explanations: tuple[Explanation, ...]
     remarks: tuple[str, ...]
-    accuracy: Accuracy
+    accuracy: Accuracy | None
 
     def listing(self) -> Table:
         """Return the possible causes of the attitude errors as a table."""
@@ -124,54 +124,37 @@ class Checked:
             "error_frame_probability": dict(self.frame_probability),
             "explanations": [vars(one) for one in self.explanations],
             "remarks": list(self.remarks),
-            "accuracy": self.accuracy.summary(),
+            "accuracy": None if self.accuracy is None else self.accuracy.summary(),
         }
         if self.alignment is not None:
             table["alignment"] = self.alignment.summary()
         return table
 
 
-def check_arrays(
-    time: ArrayLike,
-    attitude: ArrayLike,
-    covariance: ArrayLike | None,
-    true_time: ArrayLike,
-    true_attitude: ArrayLike,
+def check_attitudes(
+    own: Attitudes,
+    truth: Attitudes | None = None,
     *,
-    bias: ArrayLike | None = None,
-    true_bias: ArrayLike | None = None,
-    innovations: Mapping[str, Innovations] | None = None,
     error_frame: str = "find",
     align: str | Iterable[str] = "auto",
     confidence_level: float = 0.99,
     detectable_error: float = DETECTABLE,
-    true_movement: ArrayLike | None = None,
 ) -> Checked:
-    """Return the verdict on an estimate of any filter against a truth.
+    """Return the verdict on an estimate of any filter against a truth, as ``strapdown check`` with a truth does.
 
     Parameters
     ----------
-    time : array_like (m,)
-        Times of the estimate, s, increasing.
-    attitude : array_like (m, 4)
-        Estimated q_fb, scalar first.
-    covariance : array_like (m, 3, 3) or (m, 6, 6), or None
-        Covariance of the attitude error, rad², or of attitude and bias error, defined as ``error_frame``. If None, errors are reported but
-        not judged.
-    true_time, true_attitude : array_like (n,), (n, 4)
-        The truth, in its own clock and frames.
-    bias, true_bias : array_like (m, 3), (n, 3), optional
-        Gyro bias, rad/s, body axes; judged if both are given.
-    innovations : mapping, optional
-        :class:`strapdown.records.Innovations` by sensor.
+    own, truth : Attitudes
+        Results of :func:`strapdown.read_attitudes`, or :class:`strapdown.recordings.Attitudes` of arrays; each in its own clock and frames.
+        Without a covariance, errors are reported but not judged; biases are judged if both have one. Without a truth only the
+        innovations are judged.
     error_frame : {"find", "body", "fixed", "euler"}
-        Definition of the covariance (:data:`ERROR_FRAMES`). "find" takes the one of maximum likelihood given the errors.
+        Definition of the covariance (:data:`ERROR_FRAMES`). "find" takes the one that the file declares, else that of maximum likelihood
+        given the errors.
     align : "auto", "none", or any of "time", "fixed", "body"
         Differences to estimate and remove. "auto": a clock offset beyond three times its σ, and rotations above 5°.
     confidence_level, detectable_error : float
         As for :func:`strapdown.consistency.judge`.
-    true_movement : array_like (n,) of bool, optional
-        Whether the unit moved, at the truth's times; the accuracy is reported for the movement too.
 
     Returns
     -------
@@ -182,62 +165,48 @@ def check_arrays(
     --------
     >>> import numpy as np
     >>> from strapdown import quaternion
+    >>> from strapdown.recordings import Attitudes
     >>> random = np.random.default_rng(1)
     >>> time = np.arange(1000.0)
-    >>> truth = quaternion.exp(np.cumsum(0.1 * random.standard_normal((1000, 3)), axis=0) % 2.0)
-    >>> estimate = quaternion.multiply(truth, quaternion.exp(0.01 * random.standard_normal((1000, 3))))
+    >>> attitude = quaternion.exp(np.cumsum(0.1 * random.standard_normal((1000, 3)), axis=0) % 2.0)
+    >>> estimate = quaternion.multiply(attitude, quaternion.exp(0.01 * random.standard_normal((1000, 3))))
     >>> P = np.tile(1e-4 * np.eye(3), (1000, 1, 1))
-    >>> check_arrays(time, estimate, P, time, truth).judgement.verdict
+    >>> truth = Attitudes.from_arrays(time, attitude)
+    >>> check_attitudes(Attitudes.from_arrays(time, estimate, covariance=P), truth).judgement.verdict
     'consistent'
-    >>> check_arrays(time, estimate, 0.5 * P, time, truth).judgement.verdict
+    >>> check_attitudes(Attitudes.from_arrays(time, estimate, covariance=0.5 * P), truth).judgement.verdict
     'not consistent'
     """
-    own = series_of("", time, attitude, covariance, bias)
-    theirs = series_of("true_", true_time, true_attitude, None, true_bias, true_movement)
-    how = {"confidence_level": confidence_level, "detectable_error": detectable_error}
-    return _checked(own, theirs, innovations or {}, error_frame, align, how)
-
-
-def check_attitudes(
-    own: Attitudes,
-    truth: Attitudes,
-    *,
-    error_frame: str = "find",
-    align: str | Iterable[str] = "auto",
-    confidence_level: float = 0.99,
-    detectable_error: float = DETECTABLE,
-) -> Checked:
-    """Return the verdict on the attitudes of a file against those of another, as ``strapdown check`` with a truth does.
-
-    Parameters
-    ----------
-    own, truth : Attitudes
-        Results of :func:`strapdown.read_attitudes`.
-    error_frame, align, confidence_level, detectable_error : optional
-        As for :func:`check_arrays`; "find" takes the definition of the covariance that the file declares, if it does.
-
-    Returns
-    -------
-    Checked
-        The verdict, with the alignment and the definition of the covariance that it rests on.
-    """
+    if truth is None:
+        if not own.innovations:
+            raise InputError(
+                f"{own.source} has no innovations, so it cannot be judged without a truth; give {Hint('truth')}, attitudes over the same "
+                "time"
+            )
+        estimate = without_truth(own.seconds(int(own.stamps_ns[0])), own.attitude, own.innovations)
+        judgement = judge(estimate, confidence_level=confidence_level, detectable_error=detectable_error)
+        return Checked(
+            judgement=judgement,
+            estimate=estimate,
+            truth=None,
+            alignment=None,
+            error_frame="",
+            frame_probability={},
+            explanations=(),
+            remarks=(),
+            accuracy=None,
+        )
     # One clock may count from 1970 and the other from the boot of a machine: both relative to the first stamp, in integer ns.
     origin = int(min(own.stamps_ns[0], truth.stamps_ns[0]))
     declared = own.error_frame if error_frame == "find" and own.error_frame else error_frame
-    checked = check_arrays(
-        own.seconds(origin),
-        own.attitude,
-        own.covariance,
-        truth.seconds(origin),
-        truth.attitude,
-        bias=own.bias,
-        true_bias=truth.bias,
-        innovations=own.innovations,
-        error_frame=declared,
-        align=align,
-        confidence_level=confidence_level,
-        detectable_error=detectable_error,
-        true_movement=truth.movement,
+    how = {"confidence_level": confidence_level, "detectable_error": detectable_error}
+    checked = _checked(
+        series_of("", own.seconds(origin), own.attitude, own.covariance, own.bias),
+        series_of("true_", truth.seconds(origin), truth.attitude, None, truth.bias, truth.movement),
+        own.innovations,
+        declared,
+        align,
+        how,
     )
     if declared == error_frame:
         return checked

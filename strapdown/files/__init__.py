@@ -18,3 +18,4 @@ from strapdown.files.writing import usable_folder as usable_folder
 from strapdown.files.writing import whole_hdf5 as whole_hdf5
 from strapdown.files.writing import writable as writable
 from strapdown.files.writing import write_json as write_json
+from strapdown.files.writing import write_text as write_text

@@ -174,6 +174,12 @@ def plain(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
+def write_text(path: str | os.PathLike[str], text: str, **options: Any) -> None:
+    """Write text as UTF-8, atomically; ``options`` are those of :meth:`pathlib.Path.write_text`."""
+    with atomic_write(path) as temporary:
+        temporary.write_text(text, encoding="utf-8", **options)
+
+
 def json_text(content: Any) -> str:
     """Return ``content`` as indented JSON; NaN and infinities, which are not part of JSON, are rejected."""
     return json.dumps(content, indent=2, allow_nan=False) + "\n"
@@ -181,6 +187,4 @@ def json_text(content: Any) -> str:
 
 def write_json(path: str | os.PathLike[str], content: Any) -> None:
     """Write ``content`` as indented JSON; NaN and infinities, which are not part of JSON, are rejected."""
-    text = json_text(content)  # before any folder is created
-    with atomic_write(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    write_text(path, json_text(content))

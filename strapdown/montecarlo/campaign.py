@@ -25,6 +25,7 @@ import strapdown
 from strapdown import scenarios
 from strapdown.checks import Hint, InputError, count, finite, one_of
 from strapdown.estimation import setup
+from strapdown.estimation.filters.own import Own
 from strapdown.files import atomic_write, locked, reading, set_attributes, whole_hdf5
 from strapdown.montecarlo.engine import MACHINES, Chunks, Identity, Work, Workers, choose, identity, in_threads
 from strapdown.montecarlo.plan import Plan, from_table
@@ -146,6 +147,16 @@ class Campaign(Listed):
             "version": self.version,
             "seconds": self.seconds,
         }
+
+    def with_filter(self, own: Own, path: Path) -> Campaign:
+        """Return the campaign of a file with the code of its filter, which the file does not contain."""
+        setup = self.plan.setup
+        if setup.estimator != own:
+            raise InputError(
+                f"{own.name} in its present file is not the filter of {path}, {setup.estimator_name}; restore the file, or start again "
+                "with the scenario and another file"
+            )
+        return replace(self, plan=replace(self.plan, setup=replace(setup, estimator=own)))
 
     @property
     def finished(self) -> bool:

@@ -48,6 +48,8 @@ STEP_MULTIPLE = 12
 
 A coning-compensated step divided in its middle would be treated as a rotation at constant rate, which it is not under coning."""
 
+MIN_SAMPLES_A_CYCLE = 0.1
+"""Minimum number of gyro samples per cone cycle; with fewer, a step contains more than ten cycles and the results are meaningless."""
 MAX_STEPS = 60_000
 """Maximum number of steps of a run in which a drift is measured."""
 EPOCHS = 100
@@ -104,8 +106,10 @@ class ConingParameters:
 
     def __post_init__(self) -> None:
         """Check every field."""
+        angle = positive("angle", self.angle / DEGREE, unit="degrees")
+        if angle >= 90.0:
+            raise InputError(f"angle is {angle:g} degrees; the half-angle of a cone must be below 90 degrees")
         for name in (
-            "angle",
             "frequency",
             "rate",
             "duration",
@@ -116,8 +120,11 @@ class ConingParameters:
         ):
             positive(name, getattr(self, name))
         non_negative("rate_random_walk", self.rate_random_walk)
-        if self.angle >= 0.5 * np.pi:
-            raise InputError(f"angle is {self.angle:g} rad; a cone's half-angle is below a right angle")
+        if self.rate / self.frequency < MIN_SAMPLES_A_CYCLE:
+            raise InputError(
+                f"rate is {self.rate:g} Hz, {self.rate / self.frequency:.3g} samples per cone cycle at {self.frequency:g} Hz, too few for "
+                f"any algorithm; raise the rate to at least {MIN_SAMPLES_A_CYCLE:g} samples per cycle"
+            )
         count("runs", self.runs)
         count("seed", self.seed, minimum=0)
         if not 0.0 < self.probability < 1.0:

@@ -21,14 +21,13 @@ from strapdown.plots.style import (
     SKY,
     VERMILION,
     axes_or_new,
-    error_state_unit,
     ink,
     legend_above,
     legend_below,
     new_figure,
 )
 from strapdown.records import Estimate, Truth
-from strapdown.units import DEGREE, angle_unit, rate_unit
+from strapdown.units import DEGREE, angle_unit, error_state_unit, rate_unit
 
 THREE_SIGMA = "±3σ (99.7 %)"
 """Legend of a band of three standard deviations, with the probability of a normal error of one axis within it."""

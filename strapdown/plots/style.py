@@ -17,7 +17,6 @@ from matplotlib.figure import Figure
 
 from strapdown.checks import one_of
 from strapdown.files import atomic_write
-from strapdown.units import DEGREE_PER_HOUR, STANDARD_GRAVITY
 
 BLUE, ORANGE, GREEN, VERMILION, PURPLE, SKY, YELLOW = (
     "#0072B2",
@@ -175,16 +174,3 @@ def match_scales(axes: Sequence[Axes]) -> None:
         else:
             ratio = span / spans[alike].max()
             ax.set_title(f"vertical scale ×{ratio:.2g}", loc="right", fontsize="small", color=VERMILION)
-
-
-_STATE_UNITS = {
-    "gyro scale": {"1": ("ppm", 1e-6), "rad": ("mrad", 1e-3)},
-    "gyro drift": {"rad/s": ("°/h", DEGREE_PER_HOUR)},
-    "gyro force": {"rad s/m": ("°/h/g", DEGREE_PER_HOUR / STANDARD_GRAVITY)},
-}
-
-
-def error_state_unit(name: str, unit: str) -> tuple[str, float]:
-    """Return the name and the factor to SI of the printed unit of an error state, from its name and SI unit."""
-    word = "dimensionless" if unit == "1" else unit
-    return _STATE_UNITS.get(" ".join(name.split()[:2]), {}).get(unit, (word, 1.0))

@@ -21,6 +21,7 @@ SQLite have none: one changed bit of a sample is another sample.
 from __future__ import annotations
 
 # Names imported "as" themselves and not listed in __all__ are for use within the package only.
+from strapdown.recordings.attitudes import Attitudes
 from strapdown.recordings.body_axes import SENSORS as SENSORS
 from strapdown.recordings.body_axes import axes_matrix as axes_matrix
 from strapdown.recordings.body_axes import with_axes as with_axes
@@ -47,6 +48,7 @@ from strapdown.records.recording import increments as increments
 
 __all__ = [
     "FORMATS",
+    "Attitudes",
     "GyroSamples",
     "Recording",
     "from_table",

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from strapdown import quaternion
 from strapdown.checks import Array, Hint, InputError, array, one_of
@@ -34,7 +34,7 @@ from strapdown.units import DEGREE, DEGREE_PER_HOUR
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Attitudes:
-    """Attitudes of a file, in the frames of the file."""
+    """Attitudes of a file or of another program, in its own clock and frames."""
 
     source: str
     stamps_ns: NDArray[np.int64]
@@ -52,6 +52,12 @@ class Attitudes:
     movement: NDArray[np.bool_] | None = None
     """Whether the unit moved (m,), if the file states it."""
     remarks: tuple[str, ...] = ()
+
+    @classmethod
+    def from_arrays(cls, time: ArrayLike, attitude: ArrayLike, *, source: str = "arrays", **fields: Any) -> Attitudes:
+        """Return attitudes q_fb (m, 4) at times (m,), s; ``fields``: the other ones of this class, which are checked when used."""
+        stamps = _whole_ns(array("time", time, ("m",)))
+        return cls(source=source, stamps_ns=stamps, attitude=attitude, **fields)  # type: ignore[arg-type]
 
     def seconds(self, origin_ns: int) -> Array:
         """Return the stamps in s since an origin of the clock."""

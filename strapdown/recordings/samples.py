@@ -6,6 +6,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -86,8 +87,28 @@ def read_samples(
         If the sensor is missing, its unit is unknown, or its sample intervals are unequal.
     """
     file = Path(path)
-    one_of("sensor", sensor, SENSORS)
-    given = dict(units or {})
+    samples = _samples(file, one_of("sensor", sensor, SENSORS), rate, dict(units or {}), columns, topic, gaps)
+    largest = float(np.nanmax(np.abs(samples.values), initial=0.0))
+    if samples.values.shape[1] not in (1, 3):
+        raise InputError(
+            f"{file.name} has {samples.values.shape[1]} columns; a {sensor} has three axes, or pass one column, (n,) or (n, 1)"
+        )
+    if largest > LARGEST:
+        raise InputError(f"{file.name} holds {largest:g}, SI, which no {sensor} measures; check its unit")
+    if not 1.0 / LARGEST <= samples.sample_interval <= LARGEST:
+        raise InputError(
+            f"{file.name}: {1.0 / samples.sample_interval:g} Hz is no sample rate of a {sensor}; check it and its unit"
+        )
+    return samples
+
+
+LARGEST = 1e12
+"""Maximum sample, SI, and sample rate, Hz: far beyond any sensor, and far below overflow of squares in a fit."""
+
+
+def _samples(
+    file: Path, sensor: str, rate: float | None, given: dict[str, str], columns: Any, topic: str, gaps: bool
+) -> GyroSamples:
     if file.suffix.lower() == ".npy":
         reading.existing_file(file)
         with reading.from_file(file):

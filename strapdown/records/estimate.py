@@ -26,7 +26,7 @@ from strapdown.records import outputs
 from strapdown.records.record import Origin, Truth
 from strapdown.records.recording import Recording
 from strapdown.results import ByContent, Column, Listed, Table, figure
-from strapdown.units import DEGREE, DEGREE_PER_HOUR
+from strapdown.units import DEGREE, DEGREE_PER_HOUR, error_state_unit
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
@@ -158,6 +158,12 @@ class ErrorStateEstimate(ByContent):
         """Standard deviations (m, size)."""
         return np.sqrt(self.variance)
 
+    def summary(self) -> dict[str, Any]:
+        """Return the estimate at the end and its σ at both ends as plain values for JSON."""
+        ends = {"values": self.values[-1], "sigma": self.sigma[-1], "first_sigma": self.sigma[0]}
+        names = {"components": list(self.components), "units": list(self.units)}
+        return names | {name: value.tolist() for name, value in ends.items()}
+
 
 def matrices(name: str, value: ArrayLike, m: int) -> Array:
     """Return covariances (m, 3, 3) or (m, 6, 6) of attitude or attitude and bias; NaN at times without an estimate."""
@@ -253,15 +259,20 @@ class Estimate(ByContent, Listed):
             name, unit, size = ("attitude", "°", DEGREE) if k < 3 else ("gyro bias", "°/h", DEGREE_PER_HOUR)
             value = "" if k < 3 else self.bias[-1, k - 3] / size
             rows.append((f"{name} {'xyz'[k % 3]}", unit, value, *self.sigma[[-1, 0], k] / size))
+        # The states of a direction or a heading are relative to its vector.
+        relative = tuple(f"{name} " for name, one in self.innovations.items() if one.innovation.shape[1] < 3)
         for name, states in self.error_states.items():
             for k, (component, unit) in enumerate(zip(states.components, states.units, strict=True)):
                 label = f"{name} {component.removeprefix(name.split()[-1]).strip()}".strip()
-                rows.append((label, unit, states.values[-1, k], *states.sigma[[-1, 0], k]))
+                word, size = error_state_unit(name, unit)
+                if unit == "1" and name.startswith(relative):
+                    word, size = "% of the vector", 0.01
+                rows.append((label, word, states.values[-1, k] / size, *states.sigma[[-1, 0], k] / size))
         notes = [f"Attitude at the end, q_fb (w, x, y, z): {', '.join(f'{q:.6f}' for q in self.attitude[-1])}"]
         for sensor, one in self.innovations.items():
             if np.any(one.used):
                 nis = np.mean(one.nis[one.used]) / one.innovation.shape[1]
-                gate = f", {one.refused} refused by the gate" if one.refused else ""
+                gate = f", {one.refused} rejected by the gate" if one.refused else ""
                 notes.append(
                     f"{sensor}: {len(one.time)} measurements{gate}, mean NIS per degree of freedom {figure(nis, 3)}"
                 )

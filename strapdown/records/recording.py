@@ -200,6 +200,18 @@ class Recording(Listed):
         return np.rint(self.time * 1e9).astype(np.int64) + self.epoch_ns
 
     @property
+    def parts(self) -> tuple[str, ...]:
+        """Quantities that it contains."""
+        held = {
+            "accelerometer": self.specific_force,
+            "magnetometer": self.magnetic_field,
+            "temperature": self.temperature,
+            "reference": self.true_attitude,
+            "movement": self.movement,
+        }
+        return ("gyro", *(name for name, values in held.items() if values is not None))
+
+    @property
     def left_out_words(self) -> str:
         """Description of the rows that were left out; empty if there are none."""
         words = []

@@ -19,7 +19,7 @@ from typing import Any
 
 from strapdown import records
 from strapdown.checks import InputError
-from strapdown.files import atomic_write, write_json
+from strapdown.files import write_json, write_text
 from strapdown.files.reading import existing_file, from_file, json_file
 from strapdown.report import campaigns, comparisons, conings, estimates, tunings
 
@@ -88,8 +88,7 @@ def write(
                 raise InputError(f"{source} and {other}: only two estimates can be compared; give their HDF5 files")
             content, statistics = comparisons.report(source, Path(other))
     beside = target.with_suffix(".report.json")  # not .json, which other commands write beside their results
-    with atomic_write(target) as temporary:
-        temporary.write_text(content, encoding="utf-8", errors="backslashreplace")  # a name may not be UTF-8
+    write_text(target, content, errors="backslashreplace")  # a name may not be UTF-8
     write_json(beside, statistics)
     return Report(page=target, statistics=beside, verdict=str(statistics["judgement"]["verdict"]))
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from strapdown.files import atomic_write
+from strapdown.files import write_text
 from strapdown.results import Table, Value
 
 
@@ -23,8 +23,7 @@ def write(tables: Sequence[Table], folder: str | os.PathLike[str]) -> list[Path]
     for table in tables:
         for suffix, content in (("csv", to_csv(table)), ("tex", to_latex(table))):
             written.append(Path(folder) / f"{table.name}.{suffix}")
-            with atomic_write(written[-1]) as temporary:
-                temporary.write_text(content, encoding="utf-8", errors="backslashreplace", newline="")
+            write_text(written[-1], content, errors="backslashreplace", newline="")
     return written
 
 

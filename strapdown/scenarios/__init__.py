@@ -9,6 +9,7 @@ import dataclasses
 import functools
 import os
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ from strapdown.motion import Motion
 from strapdown.motion.orbit import CircularOrbit
 from strapdown.randomness import generator
 from strapdown.records import ImuRecord, Origin, Truth
+from strapdown.results import Column, Table
 from strapdown.vectors import Sensor
 
 __all__ = [
@@ -389,7 +391,28 @@ def scenario_from_toml(text: str, place: str = "scenario") -> Scenario:
     return _from_table(reading.from_toml(text, place), place)
 
 
+LARGEST_NUMBER = 1e30
+"""Maximum of a number in a file, in any unit; squares and products of larger ones overflow."""
+MAX_MEASUREMENTS = 1e8
+"""Maximum number of measurements of one sensor; more do not fit into memory."""
+
+
+def _numbers(place: str, content: Any) -> Iterator[tuple[str, float]]:
+    """Yield the numbers in a TOML table with their places."""
+    if isinstance(content, dict):
+        for key, value in content.items():
+            yield from _numbers(f"{place}.{key}" if place else key, value)
+    elif isinstance(content, list):
+        for k, value in enumerate(content):
+            yield from _numbers(f"{place}[{k}]", value)
+    elif isinstance(content, (int, float)) and not isinstance(content, bool):
+        yield place, content
+
+
 def _from_table(table: dict[str, Any], place: str) -> Scenario:
+    for key, number in _numbers("", table):
+        if LARGEST_NUMBER < abs(number) < float("inf"):  # infinity is valid, as for a time that never comes
+            raise InputError(f"{place}: {key} is {number:g}, which is impossible; check it and its unit")
     known_keys(place, table, _TOP)
     for key in ("rate_hz", "duration_s", "motion"):
         if key not in table:
@@ -418,7 +441,18 @@ def _from_table(table: dict[str, Any], place: str) -> Scenario:
         values["temperature"] = tables.build(
             Temperature, tables.subtable(table["temperature"], where), _TEMPERATURE, where
         )
-    return tables.construct(Scenario, values, table, _TOP_FORM, place)  # type: ignore[no-any-return]
+    made: Scenario = tables.construct(Scenario, values, table, _TOP_FORM, place)
+    if made.duration * made.rate < 1.0:
+        raise InputError(
+            f"{place}: {made.duration:g} s at {made.rate:g} Hz are less than one gyro sample; increase the duration or the rate"
+        )
+    for sensor in made.sensors:
+        number = made.duration * getattr(sensor, "rate", 0.0)
+        if number > MAX_MEASUREMENTS:
+            raise InputError(
+                f"{place}: {sensor.name} would measure {number:.3g} times, more than {MAX_MEASUREMENTS:.0e}; lower its rate or the duration"
+            )
+    return made
 
 
 def _word(table: dict[str, Any], place: str, choices: Any) -> str:
@@ -540,18 +574,13 @@ def scenario_to_toml(scenario: Scenario) -> str:
 
 
 @functools.cache
-def builtin_rows() -> tuple[dict[str, object], ...]:
-    """Return one row per built-in scenario for printing: name, description, duration s, rate Hz, gyro."""
-    rows = []
-    for name in SCENARIOS:
-        table = reading.toml(_BUILTIN / f"{name}.toml")
-        rows.append(
-            {
-                "name": name,
-                "description": table["description"],
-                "duration_s": table["duration_s"],
-                "rate_hz": table["rate_hz"],
-                "gyro": table["gyro"].get("preset", "own figures"),
-            }
-        )
-    return tuple(rows)
+def builtin() -> Table:
+    """Return the built-in scenarios as a table."""
+    contents = {name: reading.toml(_BUILTIN / f"{name}.toml") for name in SCENARIOS}
+    rows = [
+        (name, one["duration_s"], one["rate_hz"], one["gyro"].get("preset", "own figures"))
+        for name, one in contents.items()
+    ]
+    columns = ("name", Column("s", digits=6), Column("Hz", digits=6), "gyro")
+    notes = [f"{name}: {one['description']}" for name, one in contents.items()]
+    return Table("Built-in scenarios: `strapdown simulate NAME`", columns, rows, notes)

@@ -23,6 +23,7 @@ from strapdown.checks import InputError
 from strapdown.files import tables
 from strapdown.gyro import datasheets
 from strapdown.motion import orbit
+from strapdown.results import Table
 
 SYMBOLS = {
     "": "",
@@ -126,6 +127,17 @@ def named(name: str) -> list[Section]:
         known = [*dict.fromkeys(one.group for one in every), *dict.fromkeys(one.type for one in every if one.type)]
         raise InputError(f"there is no section {name!r} in a scenario file; name one of {', '.join(known)}")
     return found
+
+
+def listing(section: Section) -> Table:
+    """Return the keys of a section as a table."""
+    plain = lambda text: text.replace("`", "")  # noqa: E731
+    rows = [
+        (" or ".join((key.name, *key.others)), key.unit, key.type, plain(key.default), plain(key.meaning))
+        for key in section.keys
+    ]
+    title = section.header + (f', type = "{section.type}"' if section.type else "")
+    return Table(f"{title}: {plain(section.summary)}", ("key", "unit", "value", "default", "meaning"), rows, left=5)
 
 
 def example(section: Section) -> str:
