@@ -287,7 +287,13 @@ class Analysis(Listed):
         return P
 
     def summary(self) -> dict[str, Any]:
-        """Return the errors over time and by source as plain values for JSON, with the units in the keys."""
+        """Return the errors over time and by source as plain values for JSON.
+
+        Returns
+        -------
+        dict
+            Arrays over time as lists, with the unit in each key.
+        """
         sizes = np.array([units.ARCSECOND] * 3 + [units.DEGREE_PER_HOUR] * 3)
 
         def parts(values: Array) -> dict[str, Any]:

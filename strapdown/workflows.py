@@ -254,7 +254,7 @@ def estimate(
     calibration : UnitCalibration, optional
         For a recording: calibration of the unit, from :func:`strapdown.calibrate`; the bias is then that of the corrected rates.
     temperature : BiasOverTemperature, optional
-        For a recording: the gyro's bias over temperature, which is subtracted first. Default: that of ``noise``.
+        For a recording: the gyro's bias over temperature (°C), which is subtracted first. Default: that of ``noise``.
     full_covariance : bool, optional
         Whether to store covariance matrices rather than their diagonals. Default: True, but for a recording without a reference attitude.
     smooth : bool, default False

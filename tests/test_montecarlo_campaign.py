@@ -371,9 +371,10 @@ def test_the_command_matches_the_filter_to_a_data_sheet(command):
     assert plan.scenario.gyro == SCENARIO.gyro
     assert plan.setup.process_noise.angle_random_walk == pytest.approx(0.9 * np.pi / 10800.0)
     assert plan.setup.process_noise.rate_random_walk == pytest.approx(6.0 * np.pi / 180.0 / 3600.0 / 60.0)
+    Path("filter.toml").write_text(setups.to_toml(plan.setup), encoding="utf-8")
     status, _, error = command("short.toml", "--gyro", "gyro.toml", "--filter", "filter.toml")
     assert status == 2
-    assert "--gyro and --filter both define" in error
+    assert "--filter is the complete filter, with its noise and states; leave --gyro out" in error
 
 
 def test_the_command_resumes_extends_and_shows(command):
@@ -401,9 +402,10 @@ def test_the_command_gives_the_filter_states_where_asked(command, tmp_path):
     assert held.plan.individuals
     assert held.plan.setup.states is not None
     assert held.plan.setup.states.names == ("gyro.scale",)
+    (tmp_path / "any.toml").write_text(setups.to_toml(held.plan.setup), encoding="utf-8")
     status, _, error = command("short.toml", "--runs", 2, "--states", "--filter", "any.toml")
-    assert status != 0
-    assert "leave --states and --no-states out" in error
+    assert status == 2
+    assert "--filter is the complete filter, with its noise and states; leave --states out" in error
 
 
 def test_each_run_draws_its_own_gyro_where_the_filter_has_states_for_its_errors(command):

@@ -667,13 +667,18 @@ def test_a_json_that_is_no_tuning_is_refused_with_its_place(tmp_path, content):
 
 @pytest.mark.parametrize(
     ("key", "value", "words"),
-    [("value", "2", "Input should be a valid number"), ("si_per_unit", 0, "Input should be greater than 0")],
+    [
+        ("value", "2", "is '2'; it must be one number"),
+        ("si_per_unit", 0, "is 0; it must be greater than zero"),
+        ("identified", 1, "is 1, not of class bool"),
+        ("lower", True, "is True; it must be one number"),
+    ],
 )
 def test_the_refusal_of_a_tuning_names_the_entry(known, tmp_path, key, value, words):
     tuning = json.loads(known["tuning.json"].content)
     tuning["parameters"][0][key] = value
     (tmp_path / "tuning.json").write_text(json.dumps(tuning))
-    with pytest.raises(InputError, match=rf"tuning\.json: parameters\.0\.{key}: {words}"):
+    with pytest.raises(InputError, match=rf"tuning\.json: parameters\.0\.{key} {words}"):
         report.write(tmp_path / "tuning.json")
 
 

@@ -126,7 +126,7 @@ def _planned(source: Path, scenario: str, model: _Model, machine: str) -> tuple[
     if source.suffix.lower() in _SUFFIXES:
         held = campaigns.read(source)
         if own is not None:
-            held, model = held.with_filter(own, source), replace(model, filter_file=None)
+            held, model = campaigns.with_filter(held, own, source), replace(model, filter_file=None)
         for name in options_given(model):
             raise InputError(f"{name} is given, but {source} contains its own; leave it out, or name a scenario")
         return held, held.plan

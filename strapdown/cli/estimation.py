@@ -138,8 +138,6 @@ def estimate(
     simulated = is_record(recording)
     for name in options_given(recorded if simulated else specified):
         raise InputError(f"{name} goes with a record{'ing' if simulated else ' of `strapdown simulate`'}; leave it out")
-    if shared.gyro is not None and specified.filter_file is not None:
-        raise InputError("--gyro and --filter both define the gyro noise of the filter; give one of them")
     options: dict[str, Any] = {"gate": shared.gate, "robust": shared.robust, "smooth": shared.smooth}
     options |= {"noise": shared.gyro and read_spec(shared.gyro), "full_covariance": shared.full_covariance}
     if simulated:

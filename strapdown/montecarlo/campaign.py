@@ -148,20 +148,21 @@ class Campaign(Listed):
             "seconds": self.seconds,
         }
 
-    def with_filter(self, own: Own, path: Path) -> Campaign:
-        """Return the campaign of a file with the code of its filter, which the file does not contain."""
-        setup = self.plan.setup
-        if setup.estimator != own:
-            raise InputError(
-                f"{own.name} in its present file is not the filter of {path}, {setup.estimator_name}; restore the file, or start again "
-                "with the scenario and another file"
-            )
-        return replace(self, plan=replace(self.plan, setup=replace(setup, estimator=own)))
-
     @property
     def finished(self) -> bool:
         """Whether the statistics contain all runs."""
         return self.statistics is not None and self.statistics.runs == self.runs
+
+
+def with_filter(held: Campaign, own: Own, path: Path) -> Campaign:
+    """Return the campaign of a file with the code of its filter, which the file does not contain."""
+    setup = held.plan.setup
+    if setup.estimator != own:
+        raise InputError(
+            f"{own.name} in its present file is not the filter of {path}, {setup.estimator_name}; restore the file, or start again with "
+            "the scenario and another file"
+        )
+    return replace(held, plan=replace(held.plan, setup=replace(setup, estimator=own)))
 
 
 @dataclass

@@ -34,33 +34,76 @@ from strapdown.units import DEGREE, DEGREE_PER_HOUR
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Attitudes:
-    """Attitudes of a file or of another program, in its own clock and frames."""
+    """Attitudes of a file or of another program, in its own clock and frames.
+
+    Parameters
+    ----------
+    source : str
+        Name of the file.
+    stamps_ns : ndarray (m,) of int
+        Time stamps, ns of the file's clock, increasing.
+    attitude : ndarray (m, 4)
+        q_fb, scalar first.
+    covariance : ndarray (m, 3, 3) or (m, 6, 6), optional
+        Covariance of the attitude error, rad², or including the bias.
+    error_frame : str, default ""
+        Error described by the covariance (:data:`strapdown.consistency.foreign.ERROR_FRAMES`), if the format defines it.
+    bias : ndarray (m, 3), optional
+        Gyro bias, rad/s, body axes.
+    innovations : mapping of str to Innovations, default empty
+        Innovations by sensor; times in s since the first stamp.
+    movement : ndarray (m,) of bool, optional
+        Whether the unit moved, if the file states it.
+    remarks : tuple of str, default empty
+        Choices of the reader.
+    """
 
     source: str
     stamps_ns: NDArray[np.int64]
-    """Time stamps (m,), ns of the file's clock, increasing."""
     attitude: Array
-    """q_fb (m, 4), scalar first."""
     covariance: Array | None = None
-    """Covariance of the attitude error (m, 3, 3), rad², or including the bias (m, 6, 6)."""
     error_frame: str = ""
-    """Error described by the covariance (:data:`strapdown.consistency.foreign.ERROR_FRAMES`) if the format defines it; else empty."""
     bias: Array | None = None
-    """Gyro bias (m, 3), rad/s, body axes."""
     innovations: Mapping[str, Innovations] = field(default_factory=dict)
-    """Innovations by sensor; times in s since the first stamp."""
     movement: NDArray[np.bool_] | None = None
-    """Whether the unit moved (m,), if the file states it."""
     remarks: tuple[str, ...] = ()
 
     @classmethod
     def from_arrays(cls, time: ArrayLike, attitude: ArrayLike, *, source: str = "arrays", **fields: Any) -> Attitudes:
-        """Return attitudes q_fb (m, 4) at times (m,), s; ``fields``: the other ones of this class, which are checked when used."""
+        """Return attitudes at times in seconds.
+
+        Parameters
+        ----------
+        time : array_like (m,)
+            Times, s, increasing.
+        attitude : array_like (m, 4)
+            q_fb, scalar first.
+        source : str, default "arrays"
+            Name in messages.
+        **fields
+            Other fields of this class; all are checked where they are used.
+
+        Returns
+        -------
+        Attitudes
+            Their stamps are rounded to nanoseconds.
+        """
         stamps = _whole_ns(array("time", time, ("m",)))
         return cls(source=source, stamps_ns=stamps, attitude=attitude, **fields)  # type: ignore[arg-type]
 
     def seconds(self, origin_ns: int) -> Array:
-        """Return the stamps in s since an origin of the clock."""
+        """Return the stamps relative to an origin.
+
+        Parameters
+        ----------
+        origin_ns : int
+            Origin, ns of the clock.
+
+        Returns
+        -------
+        ndarray (m,)
+            Times since the origin, s.
+        """
         return np.asarray((self.stamps_ns - origin_ns) / 1e9)
 
 

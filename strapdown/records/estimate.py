@@ -159,7 +159,13 @@ class ErrorStateEstimate(ByContent):
         return np.sqrt(self.variance)
 
     def summary(self) -> dict[str, Any]:
-        """Return the estimate at the end and its σ at both ends as plain values for JSON."""
+        """Return the estimate at the end and its σ at both ends as plain values for JSON.
+
+        Returns
+        -------
+        dict
+            ``components``, ``units``, and by component ``values``, ``sigma`` and ``first_sigma``.
+        """
         ends = {"values": self.values[-1], "sigma": self.sigma[-1], "first_sigma": self.sigma[0]}
         names = {"components": list(self.components), "units": list(self.units)}
         return names | {name: value.tolist() for name, value in ends.items()}
@@ -273,8 +279,11 @@ class Estimate(ByContent, Listed):
             if np.any(one.used):
                 nis = np.mean(one.nis[one.used]) / one.innovation.shape[1]
                 gate = f", {one.refused} rejected by the gate" if one.refused else ""
+                unused = (
+                    f", {number} more missing or outside the record" if (number := self.skipped.get(sensor)) else ""
+                )
                 notes.append(
-                    f"{sensor}: {len(one.time)} measurements{gate}, mean NIS per degree of freedom {figure(nis, 3)}"
+                    f"{sensor}: {len(one.time)} measurements{gate}{unused}, mean NIS per degree of freedom {figure(nis, 3)}"
                 )
         return Table(
             f"Estimate at {len(self.time)} epochs over {self.time[-1] - self.time[0]:.6g} s",

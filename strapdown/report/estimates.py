@@ -49,7 +49,7 @@ def report(path: Path, confidence_level: float) -> tuple[str, dict[str, Any]]:
             if estimate.events
             else []
         ),
-        _numbers(estimate, error),
+        findings.listed(estimate.listing()),
         *([] if table is None else [findings.listed(table.listing())]),
         findings.evidence(judgement),
         _over_time(estimate, truth, error),
@@ -65,7 +65,6 @@ def report(path: Path, confidence_level: float) -> tuple[str, dict[str, Any]]:
     return content, {
         "source": path.name,
         "judgement": judgement.summary(),
-        "key_numbers": _key_numbers(estimate, error),
         "accuracy": None if table is None else table.summary(),
     }
 
@@ -74,65 +73,6 @@ def _parts(estimate: Estimate) -> tuple[tuple[slice, Callable[[Array], tuple[str
     """Return the states of the attitude and, if it is estimated, of the bias, with the function that chooses their unit."""
     parts = ((slice(0, 3), angle_unit), (slice(3, 6), rate_unit))
     return parts if estimate.has_bias else parts[:1]
-
-
-def _key_numbers(estimate: Estimate, error: Array | None) -> dict[str, Any]:
-    numbers: dict[str, Any] = {
-        "states": len(estimate.time),
-        "duration_s": float(estimate.time[-1] - estimate.time[0]),
-        "final_attitude_sigma_rad": estimate.sigma[-1, :3].tolist(),
-        "measurements": {name: len(one.time) for name, one in estimate.innovations.items()},
-        "skipped": dict(estimate.skipped),
-        "refused": estimate.refused,
-    }
-    if estimate.has_bias:
-        numbers["final_bias_rad_per_s"] = estimate.bias[-1].tolist()
-        numbers["final_bias_sigma_rad_per_s"] = estimate.sigma[-1, 3:].tolist()
-    if error is not None:
-        half = error[len(error) // 2 :]
-        for name, states in (
-            ("attitude_error_second_half_rad", slice(3)),
-            ("bias_error_second_half_rad_per_s", slice(3, 6)),
-        ):
-            known = half[np.isfinite(half[:, states]).all(axis=1), states]
-            if len(known):
-                numbers[f"rms_{name}"] = np.sqrt(np.mean(known**2, axis=0)).tolist()
-    return numbers
-
-
-def _numbers(estimate: Estimate, error: Array | None) -> str:
-    half = len(estimate.time) // 2
-    sigma = np.sqrt(np.mean(estimate.variance[half:], axis=0))
-    rows = []
-    for what, (states, unit_of) in zip(("attitude", "gyro bias"), _parts(estimate), strict=False):
-        unit, size = unit_of(3.0 * sigma[states])
-        for axis, name in enumerate(AXES):
-            k = states.start + axis
-            row = [f"{what} {name}, {unit}", page.number(float(sigma[k] / size))]
-            if error is not None:
-                own = error[half:, k][np.isfinite(error[half:, k])] / size
-                values = (np.sqrt(np.mean(own**2)), np.mean(own), np.abs(own).max()) if len(own) else (np.nan,) * 3
-                row += [page.number(float(x)) for x in values]
-            rows.append(row)
-    head = ["second half of the run", "σ of the filter"]
-    head += ["RMS error", "mean error", "largest"] if error is not None else []
-    parts = [page.table(head, rows, numbers=len(head) - 1)]
-    sensors = [
-        (
-            name,
-            len(one.time),
-            estimate.skipped.get(name, 0),
-            one.refused,
-            page.number(float(np.mean(one.nis[one.used])) / one.innovation.shape[1] if one.used.any() else np.nan),
-        )
-        for name, one in estimate.innovations.items()
-        if len(one.time)
-    ]
-    if sensors:
-        why = ("not used: missing or outside", "rejected by the gate")
-        head = ["sensor", "measurements", *why, "NIS per degree of freedom"]
-        parts.append(page.table(head, sensors, numbers=4))
-    return page.section("Key numbers", *parts)
 
 
 def _over_time(estimate: Estimate, truth: Truth | None, error: Array | None) -> str:

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
-
-from strapdown.checks import Hint, InputError
+from strapdown.checks import Hint, InputError, count, finite, instance, one_of, positive
 from strapdown.consistency.judgement import INNOVATIONS
 from strapdown.files import reading
 from strapdown.report import page
@@ -20,83 +18,68 @@ BOUNDS = (
 """Note below NIS and a verdict on the held-out data."""
 
 
-class _Table(BaseModel):
-    """Part of the JSON that the page needs; other keys are ignored."""
-
-    model_config = ConfigDict(strict=True, allow_inf_nan=False)
+def _text(place: str, value: Any) -> None:
+    instance(place, value, str, "give a text")
 
 
-class _Parameter(_Table):
-    name: str
-    note: str
-    identified: bool
-    start: float | None
-    value: float | None
-    lower: float | None
-    upper: float | None
-    unit: str = ""
-    si_per_unit: Annotated[float, Field(gt=0.0)] = 1.0
+def _flag(place: str, value: Any) -> None:
+    instance(place, value, bool, "give true or false")
 
 
-class _Objective(_Table):
-    name: str
-    before: float
-    after: float
-    attitude_rms_rad: tuple[float, float] | None = None
+def _verdict(place: str, value: Any) -> None:
+    one_of(place, value, VERDICTS)
 
 
-class _Searches(_Table):
-    number: int
-    at_the_best_point: int
+def _number(place: str, value: Any) -> None:
+    count(place, value, minimum=0)
 
 
-class _Finding(_Table):
-    rejected: bool
-    means: str
+VERDICTS = ("consistent", "cannot tell", "not consistent")
+_JUDGEMENT = {"verdict": _verdict, "reason": _text, "findings": [{"rejected": _flag, "means": _text}]}
+_FILTER = {
+    "log_likelihood_per_innovation": finite,
+    "nis_per_degree": finite,
+    "nis_bounds": [finite, finite],
+    "anees_per_state?": (finite,),
+    "attitude_rms_rad?": (finite,),
+    "judgements": [_JUDGEMENT],
+}
+_PARAMETER = {"name": _text, "note": _text, "identified": _flag, "unit?": _text, "si_per_unit?": positive}
+_TUNING = {
+    "records": [_text],
+    "units": _text,
+    "parameters": [_PARAMETER | dict.fromkeys(("start", "value", "lower", "upper"), (finite,))],
+    "objective": {"name": _text, "before": finite, "after": finite, "attitude_rms_rad?": ([finite, finite],)},
+    "searches": {"number": _number, "at_the_best_point": _number},
+    "held_out?": ({"before": _FILTER, "after": _FILTER},),
+    "gate?": ({"probability": (finite,), "lower": (finite,), "upper": (finite,), "thresholds": {"*": finite}},),
+    "unmodelled?": [{"words": [_text]}],
+}
+"""Part of the JSON of `strapdown tune` that the page needs: a check of each value. ``?``: may be missing; (…,): may be null; [a]: of any
+length; [a, b]: of two values; ``*``: any keys."""
 
 
-class _Judgement(_Table):
-    verdict: Literal["consistent", "cannot tell", "not consistent"]
-    reason: str
-    findings: list[_Finding]
-
-
-class _HeldOut(_Table):
-    log_likelihood_per_innovation: float
-    nis_per_degree: float
-    nis_bounds: tuple[float, float]
-    anees_per_state: float | None = None
-    attitude_rms_rad: float | None = None
-    judgements: list[_Judgement]
-
-
-class _Comparison(_Table):
-    before: _HeldOut
-    after: _HeldOut
-
-
-class _Gate(_Table):
-    probability: float | None
-    lower: float | None
-    upper: float | None
-    thresholds: dict[str, float]
-
-
-class _Unmodelled(_Table):
-    words: list[str]
-
-
-class _Tuning(_Table):
-    """The JSON of `strapdown tune`."""
-
-    records: list[str]
-    parameters: list[_Parameter]
-    units: str
-    objective: _Objective
-    searches: _Searches
-    held_out: _Comparison | None = None
-    gate: _Gate | None = None
-    unmodelled: list[_Unmodelled] = []
+def _need(place: str, value: Any, shape: Any) -> None:
+    """Raise an error for a value that is not of a shape, written as :data:`_TUNING`."""
+    if isinstance(shape, tuple):
+        if value is not None:
+            _need(place, value, shape[0])
+    elif isinstance(shape, dict):
+        instance(place or "its content", value, dict, "give a table")
+        for key in value if "*" in shape else shape:
+            name = key.removesuffix("?")
+            if name in value:
+                _need(f"{place}.{name}".lstrip("."), value[name], shape.get("*", shape.get(key)))
+            elif name == key:
+                raise InputError(f"{f'{place}.{name}'.lstrip('.')} is missing")
+    elif isinstance(shape, list):
+        instance(place, value, list, "give a list")
+        if len(shape) > 1 and len(value) != len(shape):
+            raise InputError(f"{place} has {len(value)} values, not {len(shape)}")
+        for k, one in enumerate(value):
+            _need(f"{place}.{k}", one, shape[0])
+    else:
+        shape(place, value)
 
 
 def report(path: Path, confidence_level: float) -> tuple[str, dict[str, Any]]:
@@ -140,12 +123,10 @@ def read(path: Path) -> dict[str, Any]:
     """Read the JSON of a tuning."""
     content = reading.json_file(path)
     try:
-        _Tuning.model_validate_json(reading.text(path))
-    except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(str(part) for part in first["loc"])
+        _need("", content, _TUNING)
+    except InputError as error:
         raise InputError(
-            f"{path}: {place or 'its content'}: {first['msg']}; give the JSON that `strapdown tune` writes beside its filter.toml"
+            f"{path}: {error}; give the JSON that `strapdown tune` writes beside its filter.toml"
         ) from None
     return content  # type: ignore[no-any-return]
 
@@ -158,7 +139,7 @@ def verdict(content: dict[str, Any]) -> tuple[str, str, list[str]]:
     after = held["after"]["judgements"]
     if not after:
         return "cannot tell", "the held-out data were not judged", []
-    worst = max(after, key=lambda one: ("consistent", "cannot tell", "not consistent").index(one["verdict"]))
+    worst = max(after, key=lambda one: VERDICTS.index(one["verdict"]))
     details = [finding["means"] for one in after for finding in one["findings"] if finding["rejected"]]
     gain = held["after"]["log_likelihood_per_innovation"] - held["before"]["log_likelihood_per_innovation"]
     if gain < 0.0:
