@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -95,7 +95,15 @@ COLUMNS = ("columns", "data_vars", "__arrow_c_stream__")
 """Attributes of an object that holds columns."""
 
 
-def read(path: Any, **options: Any) -> ImuRecord | Recording | Estimate | Campaign:
+def read(
+    path: Any,
+    *,
+    units: Mapping[str, str] | None = None,
+    columns: Mapping[str, str] | None = None,
+    topic: str = "",
+    axes: str | Mapping[str, str] | None = None,
+    invert: str | Iterable[str] = (),
+) -> ImuRecord | Recording | Estimate | Campaign:
     """Read a file of any known format, identified by its content, or a table in memory.
 
     Parameters
@@ -104,8 +112,16 @@ def read(path: Any, **options: Any) -> ImuRecord | Recording | Estimate | Campai
         A simulated record, an estimate or a Monte Carlo of this package, or a recording in a format of
         :data:`strapdown.recordings.FORMATS` (CSV, ROS bag, ULog, EuRoC folder, …); or the columns of a recording, as for
         :func:`strapdown.recordings.from_table` (pandas, polars, pyarrow, xarray, structured arrays, arrays by name).
-    **options
-        For recordings: ``units``, ``columns`` and ``topic`` of :func:`strapdown.recordings.read`.
+    units : mapping of str to str, optional
+        For tables: units of ``time``, ``gyro``, ``accelerometer`` and ``magnetometer`` if the header does not declare them.
+    columns : mapping of str to str, optional
+        For tables: names of columns by role, ``{"time": "timestamp [us]", "gx": "gyro_x[dps]"}``.
+    topic : str, default ""
+        For bags and flight logs: topic of the inertial unit, if there are several.
+    axes : str or mapping of str to str, optional
+        For recordings: the recorded axes that become the body's x, y, z (:func:`strapdown.recordings.read`).
+    invert : str or iterable of str, default empty
+        For recordings: sensors with inverted sign.
 
     Returns
     -------
@@ -122,8 +138,13 @@ def read(path: Any, **options: Any) -> ImuRecord | Recording | Estimate | Campai
     >>> import strapdown as sd
     >>> walk = sd.read("walk.csv", units={"gyro": "deg/s", "accelerometer": "g"})  # doctest: +SKIP
     """
+    given = {"units": units, "columns": columns, "topic": topic, "axes": axes, "invert": invert}
+    options: dict[str, Any] = {name: value for name, value in given.items() if value}
     if isinstance(path, (Mapping, np.ndarray)) or any(map(partial(hasattr, path), COLUMNS)):
-        return recordings.from_table(path, **options)
+        if topic:
+            raise InputError(f"{Hint('topic')} is for a bag or a flight log; leave it out")
+        table = recordings.from_table(path, units=units, columns=columns)
+        return recordings.with_axes(table, axes, invert) if axes or invert else table
     instance("path", path, (str, os.PathLike), "give a path, a data frame, a Dataset, or arrays by name")
     file = Path(path)
     kinds = {"strapdown estimate": "estimate", "strapdown montecarlo": "Monte Carlo"}
@@ -902,11 +923,15 @@ def tune(
     free: Sequence[str] | None = None,
     states: bool | None = None,
     priors: Mapping[str, Prior] | GyroSpec | None = None,
+    truth: bool = False,
+    rmse: bool = False,
+    gate: bool = False,
+    spacing: float = 0.0,
     holdout: float | None = None,
+    holdout_by: str = "time",
     starts: int = 4,
     seed: int = 0,
     threads: int | None = None,
-    **objective: Any,
 ) -> Tuning:
     """Tune noise parameters of a filter by maximum likelihood of its innovations, with confidence intervals.
 
@@ -923,17 +948,24 @@ def tune(
         Whether the matched filter has an error state for each error that the record specifies. Default: if there are such errors.
     priors : mapping of str to Prior, or GyroSpec, optional
         Prior distributions of parameters, by name; or a gyro, for weak priors of its noise.
+    truth : bool, default False
+        Whether to tune by the likelihood of the errors relative to the truth, in place of that of the innovations.
+    rmse : bool, default False
+        Whether to tune by the RMS attitude error against the truth, and then to scale all σ by the innovations.
+    gate : bool, default False
+        Whether to model the fraction and scale of outliers too, for the filter's gate.
+    spacing : float, default 0.0
+        Interval between the samples of a sensor that are used, with the weight of all, s: for correlated disturbances.
     holdout : float, optional
         Fraction of the data held out, for comparing the filter before and after tuning (``Tuning.comparison``).
+    holdout_by : {"time", "record"}, default "time"
+        Whether the end of each record is held out, or complete records.
     starts : int, default 4
         Number of searches: one from the initial filter, the others from random initial values.
     seed : int, default 0
         Seed of the random initial values.
     threads : int, optional
         Number of threads. Default: one per core.
-    **objective
-        ``truth``, ``rmse``, ``gate``, ``spacing``, ``factor`` of :func:`strapdown.tuning.tune`; ``holdout_by`` "record" holds out
-        complete records.
 
     Returns
     -------
@@ -953,11 +985,15 @@ def tune(
         free=free,
         states=states,
         priors=priors,
+        truth=truth,
+        rmse=rmse,
+        gate=gate,
+        spacing=spacing,
         holdout=holdout,
+        holdout_by=holdout_by,
         starts=starts,
         seed=seed,
         threads=threads,
-        **objective,
     )
     for one in given:
         if isinstance(one, Recording):
@@ -1051,7 +1087,9 @@ def allan_deviation(
     *,
     sensor: str = "gyro",
     kind: str = "rate",
-    **options: Any,
+    taus: ArrayLike | None = None,
+    estimator: str = "overlapping",
+    level: float = 0.95,
 ) -> AllanDeviation:
     """Return the Allan deviation of a sensor at rest, with its confidence band.
 
@@ -1065,8 +1103,12 @@ def allan_deviation(
         For a recording: the sensor.
     kind : {"rate", "increments"}
         For an array: averages over each sample interval, or integrals.
-    **options
-        ``taus``, ``level``, ``estimator`` of :func:`strapdown.allan.allan_deviation`.
+    taus : array_like, optional
+        Averaging times, s. Default: 12 per decade, up to a third of the record.
+    estimator : {"overlapping", "robust", "modified", "hadamard"}, default "overlapping"
+        Estimator (:func:`strapdown.allan.allan_deviation`).
+    level : float, default 0.95
+        Confidence of the band.
 
     Returns
     -------
@@ -1083,7 +1125,7 @@ def allan_deviation(
     0.1
     """
     values, interval, what = _samples(source, sample_interval, sensor, kind)
-    return allan.allan_deviation(values, interval, kind=what, **options)
+    return allan.allan_deviation(values, interval, kind=what, taus=taus, estimator=estimator, level=level)
 
 
 def fit_noise(
@@ -1092,7 +1134,9 @@ def fit_noise(
     *,
     sensor: str = "gyro",
     kind: str = "rate",
-    **options: Any,
+    terms: Sequence[str] = allan.TERMS,
+    highest_frequency: float | None = None,
+    level: float = 0.95,
 ) -> NoiseFit:
     """Return the noise coefficients of a sensor at rest (angle random walk, bias instability, …), with confidence intervals.
 
@@ -1104,8 +1148,12 @@ def fit_noise(
         For an array: time between its samples, s.
     sensor, kind : str
         As for :func:`allan_deviation`.
-    **options
-        ``highest_frequency``, ``terms``, ``level`` of :func:`strapdown.allan.fit_noise`.
+    terms : sequence of str
+        Terms to fit, by default all (``strapdown.allan.TERMS``).
+    highest_frequency : float, optional
+        Maximum frequency of the spectrum that is used, Hz, to exclude a low-pass filter or a vibration.
+    level : float, default 0.95
+        Confidence of the intervals.
 
     Returns
     -------
@@ -1119,4 +1167,5 @@ def fit_noise(
     >>> estimate = sd.estimate(record, noise=noise)  # doctest: +SKIP
     """
     values, interval, what = _samples(source, sample_interval, sensor, kind)
+    options: dict[str, Any] = {"terms": terms, "highest_frequency": highest_frequency, "level": level}
     return allan.fit_noise(values, interval, kind=what, sensor=sensor, **options)

@@ -49,7 +49,7 @@ def integrate(
     check_files(out, suffixes=(".h5", ".hdf5"), sources=(recording,), own=own, command="integrate")
     chosen, options, simulated = coning.named(algorithm), layout.options(recording), recordings.is_record(recording)
     with progress_bar("reading, integrating, writing", 3) as advance:
-        source: Any = sd.read(recording, **options, **({} if simulated else {"gyro_alone": True}))
+        source: Any = sd.read(recording) if simulated else recordings.read(recording, **options, gyro_alone=True)
         samples = len(source.time) - 1
         truth = source.truth and source.truth.attitude if simulated else source.true_attitude
         advance(1)
