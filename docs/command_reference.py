@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import enum
 import typing
 from pathlib import Path
 from typing import Any
@@ -62,10 +61,10 @@ def _value(hint: Any) -> str:
     inner = [one for one in typing.get_args(hint) if isinstance(one, type) and one is not type(None)]
     if inner and not isinstance(hint, type):
         return _value(inner[0])
+    if typing.get_origin(hint) is typing.Literal:
+        return "\\|".join(typing.get_args(hint))
     if typing.get_args(hint):
         return _value(typing.get_args(hint)[0])
-    if isinstance(hint, type) and issubclass(hint, enum.Enum):
-        return "\\|".join(str(one.value) for one in hint)
     return {str: "TEXT", Path: "FILE", float: "NUMBER", int: "N"}.get(hint, "VALUE")
 
 

@@ -165,7 +165,7 @@ def estimate(
         vectors = ", ".join(f"{len(one.time)} of {one.sensor}" for one in source.vectors) or "no measurements"
         length = source.time[-1] - source.time[0]
         console.print(f"{recording.name}: {len(source.increments)} gyro samples over {length:.6g} s, {vectors}.")
-    say(*result.remarks, *map(str, result.events))
+    say(*result.remarks)
     show(result.listing())
     _clear(out)
     contents: dict[str, Any] = {}

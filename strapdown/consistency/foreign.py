@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -93,13 +93,13 @@ class Checked:
 
     judgement: Judgement
     estimate: Estimate
-    truth: Truth | None
-    alignment: Alignment | None
-    error_frame: str
-    frame_probability: Mapping[str, float]
-    explanations: tuple[Explanation, ...]
-    remarks: tuple[str, ...]
-    accuracy: Accuracy | None
+    truth: Truth | None = None
+    alignment: Alignment | None = None
+    error_frame: str = ""
+    frame_probability: Mapping[str, float] = field(default_factory=dict)
+    explanations: tuple[Explanation, ...] = ()
+    remarks: tuple[str, ...] = ()
+    accuracy: Accuracy | None = None
 
     def listing(self) -> Table:
         """Return the possible causes of the attitude errors as a table."""
@@ -177,6 +177,7 @@ def check_attitudes(
     >>> check_attitudes(Attitudes.from_arrays(time, estimate, covariance=0.5 * P), truth).judgement.verdict
     'not consistent'
     """
+    how: dict[str, Any] = {"confidence_level": confidence_level, "detectable_error": detectable_error}
     if truth is None:
         if not own.innovations:
             raise InputError(
@@ -184,22 +185,10 @@ def check_attitudes(
                 "time"
             )
         estimate = without_truth(own.seconds(int(own.stamps_ns[0])), own.attitude, own.innovations)
-        judgement = judge(estimate, confidence_level=confidence_level, detectable_error=detectable_error)
-        return Checked(
-            judgement=judgement,
-            estimate=estimate,
-            truth=None,
-            alignment=None,
-            error_frame="",
-            frame_probability={},
-            explanations=(),
-            remarks=(),
-            accuracy=None,
-        )
+        return Checked(judgement=judge(estimate, **how), estimate=estimate)
     # One clock may count from 1970 and the other from the boot of a machine: both relative to the first stamp, in integer ns.
     origin = int(min(own.stamps_ns[0], truth.stamps_ns[0]))
     declared = own.error_frame if error_frame == "find" and own.error_frame else error_frame
-    how = {"confidence_level": confidence_level, "detectable_error": detectable_error}
     checked = _checked(
         series_of("", own.seconds(origin), own.attitude, own.covariance, own.bias),
         series_of("true_", truth.seconds(origin), truth.attitude, None, truth.bias, truth.movement),

@@ -261,7 +261,7 @@ class Estimate(ByContent, Listed):
     def listing(self) -> Table:
         """Return σ at the start and at the end, the estimate at the end, and the innovations, as a table."""
         rows: list[tuple[Any, ...]] = []
-        for k in range(6):
+        for k in range(6 if self.has_bias else 3):
             name, unit, size = ("attitude", "°", DEGREE) if k < 3 else ("gyro bias", "°/h", DEGREE_PER_HOUR)
             value = "" if k < 3 else self.bias[-1, k - 3] / size
             rows.append((f"{name} {'xyz'[k % 3]}", unit, value, *self.sigma[[-1, 0], k] / size))

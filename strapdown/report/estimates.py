@@ -44,11 +44,6 @@ def report(path: Path, confidence_level: float) -> tuple[str, dict[str, Any]]:
         f"{'without truth' if truth is None else 'with truth' if truth.has_bias else 'with a reference attitude'}; "
         f"strapdown {attributes.get('version', '')}",
         findings.verdict(judgement),
-        *(
-            [page.section("Events", *(page.paragraph(str(event)) for event in estimate.events))]
-            if estimate.events
-            else []
-        ),
         findings.listed(estimate.listing()),
         *([] if table is None else [findings.listed(table.listing())]),
         findings.evidence(judgement),
