@@ -780,6 +780,7 @@ def test_the_command_takes_a_filter_and_units(succeeds, tmp_path):
     )
     assert np.allclose(found["rms"]["attitude_arcsec"], direct.rms[:, :3] / ARCSECOND)
     assert found["rms"]["attitude_arcsec"][0][0] == pytest.approx(7200.0)
+    assert found["rms"]["bias_deg_per_hour"][0][0] == pytest.approx(30.0)
 
 
 def test_the_command_gives_no_verdict_beyond_the_linear_range(run, succeeds):

@@ -7,6 +7,7 @@ import pytest
 from scipy.stats import chi2
 
 import strapdown as sd
+from sims import hand_held
 from strapdown import consistency, estimation, montecarlo, records, scenarios
 from strapdown.checks import InputError
 from strapdown.estimation import error_states, setup
@@ -271,6 +272,23 @@ def test_the_matched_filter_has_the_slope_and_a_plain_one_is_named_for_lacking_i
     np.testing.assert_allclose(
         setup.FilterSetup.for_scenario(of_units, states=True).states.gyro_temperature_sigma, SLOPE, rtol=1e-12
     )
+
+
+def test_a_recording_is_corrected_by_the_table_of_its_gyro_or_by_another_one(monkeypatch):
+    class Reached(Exception):  # noqa: N818
+        pass
+
+    def corrected(source, parameters, warm, **_):
+        raise Reached(warm)
+
+    monkeypatch.setattr(sd.ahrs, "without_temperature", corrected)
+    spec = scenarios.scenario_from_toml(TOML).gyro
+    other = replace(spec.temperature, reference=31.0)
+    recording = hand_held.simulated(1, 0, 4.0)
+    for options, wanted in (({}, spec.temperature), ({"temperature": other}, other)):
+        with pytest.raises(Reached) as found:
+            sd.estimate(recording, noise=spec, **options)
+        assert found.value.args[0] is wanted
 
 
 def test_lost_samples_and_locked_out_sensors():

@@ -58,6 +58,7 @@ def test_every_hint_has_an_option():
     [
         (Hint("latency"), "`latency=`", "--latency"),
         (Hint("resume", True), "`resume=True`", "--resume"),
+        (Hint("states", False), "`states=False`", "--no-states"),
         (Hint("error_frame", "body"), "`error_frame='body'`", "--error-frame body"),
         (Hint("axes", {"gyro": "y,x,-z"}), "`axes={'gyro': 'y,x,-z'}`", "--axes gyro=y,x,-z"),
         (Hint("units", {"time": "ms"}), "`units={'time': 'ms'}`", "--time-unit ms"),

@@ -666,19 +666,24 @@ def test_a_json_that_is_no_tuning_is_refused_with_its_place(tmp_path, content):
 
 
 @pytest.mark.parametrize(
-    ("key", "value", "words"),
+    ("place", "value", "words"),
     [
-        ("value", "2", "is '2'; it must be one number"),
-        ("si_per_unit", 0, "is 0; it must be greater than zero"),
-        ("identified", 1, "is 1, not of class bool"),
-        ("lower", True, "is True; it must be one number"),
+        (("parameters", 0, "value"), "2", "is '2'; it must be one number"),
+        (("parameters", 0, "si_per_unit"), 0, "is 0; it must be greater than zero"),
+        (("parameters", 0, "identified"), 1, "is 1, not of class bool"),
+        (("parameters", 0, "lower"), True, "is True; it must be one number"),
+        (("objective", "attitude_rms_rad"), [1.0], "has 1 values, not 2"),
+        (("searches", "number"), -1, "is -1; it must be a whole number"),
+        (("held_out",), {}, r"\.before is missing"),
     ],
 )
-def test_the_refusal_of_a_tuning_names_the_entry(known, tmp_path, key, value, words):
-    tuning = json.loads(known["tuning.json"].content)
-    tuning["parameters"][0][key] = value
+def test_the_refusal_of_a_tuning_names_the_entry(known, tmp_path, place, value, words):
+    tuning = entry = json.loads(known["tuning.json"].content)
+    for key in place[:-1]:
+        entry = entry[key]
+    entry[place[-1]] = value
     (tmp_path / "tuning.json").write_text(json.dumps(tuning))
-    with pytest.raises(InputError, match=rf"tuning\.json: parameters\.0\.{key} {words}"):
+    with pytest.raises(InputError, match=rf"tuning\.json: {'.'.join(map(str, place))} ?{words}"):
         report.write(tmp_path / "tuning.json")
 
 
