@@ -90,7 +90,7 @@ def check(
         judgement, content = _judged_foreign(result, topic or "", foreign, how)
         words = judgement.words
         _show_statistics(judgement)
-    say(*(f"Note: {limit}." for limit in judgement.limits), words)
+    console.print(words)
     put_json(json, content | judgement.summary())
     if foreign.aligned is not None:
         written(foreign.aligned)
@@ -162,14 +162,11 @@ def _judged_foreign(
 
 
 def _show_statistics(judgement: Judgement) -> None:
+    table = judgement.listing()
     if judgement.findings:
-        title = "Statistics of the filter and their bounds for a consistent filter"
-        show(judgement.listing(), title=title, notes=False)
-        share = 100.0 * (1.0 - judgement.confidence_level)
-        console.print(
-            "Each p-value is for one statistic; bounds, pass and FAIL are for all together (a consistent filter fails with at most "
-            f"{share:.2g} %). NIS, NEES: per degree of freedom."
-        )
+        show(table, title="Statistics of the filter and their bounds for a consistent filter")
+    else:
+        say(*table.notes)
 
 
 def _diagnosed(

@@ -216,7 +216,13 @@ class Judgement(Listed):
             "samples",
             "",
         )
-        return Table(self.headline, columns, rows, [f"Note: {one}." for one in self.limits], left=2)
+        meaning = (
+            f"Bounds, pass and FAIL are for all tests together: a consistent filter fails with at most "
+            f"{100.0 * (1.0 - self.confidence_level):.2g} %. Each p-value is for one statistic; NIS and NEES are per degree of freedom; of "
+            "correlated samples the effective number is given."
+        )
+        notes = [*([meaning] if rows else []), *(f"Note: {one}." for one in self.limits)]
+        return Table(self.headline, columns, rows, notes, left=2)
 
     @property
     def words(self) -> str:

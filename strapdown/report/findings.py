@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 from strapdown.consistency import Judgement
 from strapdown.report import page
 from strapdown.results import Table
@@ -29,10 +27,4 @@ def tabled(table: Table) -> list[str]:
 
 def evidence(judgement: Judgement) -> str:
     """Return the section with all statistics, their bounds and their limitations."""
-    percent = 100.0 * judgement.confidence_level
-    note = (
-        f"Bounds, pass and fail are for all tests together: a consistent filter fails with at most {100.0 - percent:g} %. Each p-value is "
-        "for one statistic. For correlated samples, the number is the effective number of independent samples."
-    )
-    table = judgement.listing()
-    return page.section("Evidence", *tabled(dataclasses.replace(table, notes=[note, *table.notes])))
+    return page.section("Evidence", *tabled(judgement.listing()))
