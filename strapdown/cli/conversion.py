@@ -40,7 +40,8 @@ def convert(
         if reference is not None or "axes" in options or "invert" in options:
             raise InputError("--reference, --axes and --invert apply to a recording; estimate again with them")
     content: Any = sd.read(source, **({} if estimate else options))
-    time, parts, name = content.time, ["attitude", "bias"], source.name
+    parts: Any = ("attitude", "bias") if estimate and content.has_bias else ("attitude",)
+    time, name = content.time, source.name
     if not estimate:
         if simulated:
             content = recordings.from_record(content, name)
