@@ -32,9 +32,7 @@ from strapdown.cli.terminal import app, console
 @app.callback(invoke_without_command=True)
 def _about(
     version: bool = typer.Option(False, "--version", help="Print the version and stop.", is_eager=True),
-    quiet: bool = typer.Option(
-        False, "--quiet", help="Show no progress on standard error; also allowed after the command."
-    ),
+    quiet: bool = typer.Option(False, "--quiet", help="Show no progress; also allowed after the command."),
 ) -> None:
     if quiet:
         be_quiet()

@@ -24,9 +24,7 @@ class _Identification:
     """Identification."""
 
     rate: float | None = Option(None, help="Sample rate of an NPY file, Hz.")
-    highest_frequency: float | None = Option(
-        None, help="Maximum frequency of the fit, Hz, to exclude a low-pass filter."
-    )
+    highest_frequency: float | None = Option(None, help="Maximum frequency of the fit, Hz.")
     robust: bool = Option(False, "--robust", help="Compute the deviation from medians; does not affect the fit.")
     temperature: int | None = Option(
         None,

@@ -64,9 +64,7 @@ class _Computing:
 
     runs: int | None = Option(None, help="Number of runs. Default: 1000, or that of the resumed file.")
     threads: int | None = Option(None, help="Number of threads. Default: one per core.")
-    machine: str = Option(
-        "auto", help="lanes: eight runs at once; scalar: any scenario and filter; auto: lanes if possible."
-    )
+    machine: str = Option("auto", help="lanes (eight runs at once), scalar (any filter), or auto.")
     chunk: int | None = Option(None, help="Runs between merges and writes. Default: chosen by the machine.")
     workers: int | None = Option(None, help="Number of processes to use instead of threads (needs Dask).")
     cluster: str | None = Option(

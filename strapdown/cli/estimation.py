@@ -88,9 +88,7 @@ class _Recorded:
     )
     latency: float | None = Option(None, help="Delay of the gyro's samples, ms. Default: half a sample interval.")
     calibration: Path | None = Option(None, help="calibration.toml of the unit; a new one is written.")
-    temperature: Path | None = Option(
-        None, help="gyro-temperature.toml of `strapdown allan --temperature`: the bias to subtract first."
-    )
+    temperature: Path | None = Option(None, help="TOML of `strapdown allan --temperature`: bias to subtract.")
 
 
 @dataclass(frozen=True, eq=False)

@@ -48,9 +48,7 @@ def check(
     foreign: _Foreign,
     topic: str | None = Option(None, help="Topic of the estimate, if a bag has several."),
     confidence_level: float = Option(0.99, help="Minimum probability with which a consistent filter passes all tests."),
-    detectable_error: float = Option(
-        1.5, help="Factor on σ that the tests must be able to detect for the verdict consistent."
-    ),
+    detectable_error: float = Option(1.5, help="Factor on σ that the tests must be able to detect."),
     record: Path | None = Option(None, help="Record from which the estimate was made, to search for likely causes."),
     filter_file: Path | None = Option(None, "--filter", help="TOML of the filter. Default: that in the estimate."),
     json: Path | None = Option(None, "--json", help="File for all statistics; - for standard output."),

@@ -13,13 +13,9 @@ from strapdown.files.reading import existing_file
 
 @command
 def report(
-    result: Path = Argument(
-        help="HDF5 of `strapdown estimate` or `montecarlo`, or JSON of `strapdown tune` or `coning`."
-    ),
+    result: Path = Argument(help="HDF5 of `estimate` or `montecarlo`, or JSON of `tune` or `coning`."),
     other: Path | None = Argument(None, help="A second estimate of the same motion: both, with their difference."),
-    out: Path | None = Option(
-        None, "--out", "-o", help="The page, .html. Default: the result's name with this suffix."
-    ),
+    out: Path | None = Option(None, "--out", "-o", help="The page, .html. Default: beside the result."),
 ) -> None:
     """Write a self-contained HTML page about a result: verdict, numbers, figures, provenance; and the statistics as JSON."""
     from strapdown import report as reports

@@ -37,9 +37,7 @@ def coning(
     runs: int = Option(100, help="Number of Monte Carlo runs."),
     seed: int = Option(1, help="Seed; the same one gives the same runs."),
     out: Path = Option(Path("coning-results"), help="Folder for coning.json and the figures."),
-    algorithm: list[Path] | None = Option(
-        None, help="TOML of your own algorithms, coefficients in the order of textbooks; repeatable."
-    ),
+    algorithm: list[Path] | None = Option(None, help="TOML of your own algorithms; repeatable."),
     form: Format = FORMAT,
     tables: Path | None = TABLES,
 ) -> None:

@@ -37,9 +37,7 @@ Format = Literal["png", "pdf", "svg"]
 """Formats of figures."""
 FORMAT: Any = Option("png", "--format", help="Format of the figures.")
 TABLES: Any = Option(None, help="Folder to which the tables are also written, as CSV with all digits and as LaTeX.")
-FILTER: Any = Option(
-    None, "--filter", help="TOML with a table named filter, as of `strapdown tune`. Default: a matched one."
-)
+FILTER: Any = Option(None, "--filter", help="TOML with a table named filter. Default: a matched one.")
 STATES: Any = Option(
     None,
     "--states/--no-states",

@@ -79,12 +79,8 @@ class _Objective:
 
     truth: bool = Option(False, "--truth", help="Tune by the likelihood of the errors relative to the truth.")
     rmse: bool = Option(False, "--rmse", help="Tune by the RMS attitude error against the truth; then scale all σ.")
-    gate: bool = Option(
-        False, "--gate", help="Also model outliers, and set the gate where an outlier is more likely than noise."
-    )
-    spacing: float = Option(
-        0.0, help="Use samples this far apart, s, with the weight of all: for correlated disturbances."
-    )
+    gate: bool = Option(False, "--gate", help="Also model outliers, and set the filter's gate.")
+    spacing: float = Option(0.0, help="Interval of the samples used, s, with the weight of all.")
     holdout: float | None = Option(None, help="Fraction of the data held out, to compare the filter before and after.")
     holdout_by: str = Option("time", help="Hold out the end of each record (time), or complete records (record).")
 
@@ -101,9 +97,7 @@ class _Search:
 @command
 def tune(
     *,
-    records: list[Path] = Argument(
-        help="Records of `strapdown simulate`, or recordings (BROAD HDF5, CSV), all of one unit."
-    ),
+    records: list[Path] = Argument(help="Records or recordings (BROAD HDF5, CSV), all of one unit."),
     start: _Filter,
     goal: _Objective,
     search: _Search,
