@@ -104,8 +104,8 @@ LINES = 17
 RESIDUAL, VARIANCE = N, N + 1
 """Places in a line of the rows, after h."""
 
-SHORT_FORM = 30.0
-"""Maximum ratio of innovation variance to measurement variance for the short form of the update, which then loses one or two digits."""
+SHORT_FORM = 100.0
+"""Maximum ratio of innovation variance to measurement variance for the short form of the update, which then loses at most two digits."""
 SERIES = tuple(1.0 / math.factorial(k) for k in range(16, 1, -1))
 """1/16! to 1/2!."""
 NODES = (0.5 - 0.5 * math.sqrt(0.6), 0.5, 0.5 + 0.5 * math.sqrt(0.6))
@@ -512,16 +512,20 @@ def write_transition(x, delta, dt, model, coefficients, top, like):
     transition_formula(x, delta, dt, model, coefficients, top, like)
 
 
-def subtract_row(A, i, B, k, factor):
-    """Subtract a factor times row k of the matrix B (rows of W) from row i of A."""
-    for c in PARTS:
-        put_part(A, i, c, part(A, i, c, factor) - factor * part(B, k, c, factor))
+def row_at(A, i):
+    """Return row i of a matrix (rows of W), by parts."""
+    return tuple(part(A, i, c, 0.0) for c in PARTS)
 
 
-def scale_row(A, i, factor):
-    """Multiply row i of a matrix by a factor."""
-    for c in PARTS:
-        put_part(A, i, c, factor * part(A, i, c, factor))
+def minus_row(row, B, k, factor):
+    """Return a row less a factor times row k of the matrix B."""
+    return tuple(t - factor * part(B, k, c, factor) for t, c in zip(row, PARTS, strict=True))
+
+
+def put_row(A, i, factor, row):
+    """Write a factor times a row to row i of a matrix."""
+    for c, t in zip(PARTS, row, strict=True):
+        put_part(A, i, c, factor * t)
 
 
 NOISY = tuple(sorted({3, 4, 5, 0, 1, 2, *CHAINED}))
@@ -529,19 +533,23 @@ NOISY = tuple(sorted({3, 4, 5, 0, 1, 2, *CHAINED}))
 NOISY_WIDTH = len(NOISY) + 7 - (len(NOISY) + 7) % 8
 
 
-def subtract_noisy_row(A, i, k, factor):
-    """Subtract a factor times row k of a matrix with columns for the states with process noise from row i of it."""
-    eight = lanes_of(EIGHT)
-    for c in range(0, NOISY_WIDTH, 8):
-        a, b = load_like(A, NOISY_WIDTH * i + c, eight), load_like(A, NOISY_WIDTH * k + c, eight)
-        store(A, NOISY_WIDTH * i + c, a - factor * b)
+NOISY_PARTS = tuple(range(0, NOISY_WIDTH, 8))
 
 
-def scale_noisy_row(A, i, factor):
-    """Multiply row i of such a matrix by a factor."""
-    eight = lanes_of(EIGHT)
-    for c in range(0, NOISY_WIDTH, 8):
-        store(A, NOISY_WIDTH * i + c, factor * load_like(A, NOISY_WIDTH * i + c, eight))
+def noisy_row_at(A, i):
+    """Return row i of a matrix with columns for the states with process noise, by parts."""
+    return tuple(load_like(A, NOISY_WIDTH * i + c, lanes_of(EIGHT)) for c in NOISY_PARTS)
+
+
+def minus_noisy_row(row, A, k, factor):
+    """Return a row less a factor times row k of such a matrix."""
+    return tuple(t - factor * u for t, u in zip(row, noisy_row_at(A, k), strict=True))
+
+
+def put_noisy_row(A, i, factor, row):
+    """Write a factor times a row to row i of such a matrix."""
+    for c, t in zip(NOISY_PARTS, row, strict=True):
+        store(A, NOISY_WIDTH * i + c, factor * t)
 
 
 def gather_noisy_columns(A, B):

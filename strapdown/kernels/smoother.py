@@ -23,15 +23,17 @@ from strapdown.kernels.filter import (
     fill_coefficients,
     fixed_turn,
     gather_noisy_columns,
+    minus_noisy_row,
+    minus_row,
+    noisy_row_at,
     predict_state,
+    put_noisy_row,
+    put_row,
     rotate_vectors,
+    row_at,
     rows_of_noisy,
     rows_to_noisy,
-    scale_noisy_row,
-    scale_row,
     scatter_noisy_columns,
-    subtract_noisy_row,
-    subtract_row,
     turn_attitude,
     turn_vectors,
     write_transition,
@@ -45,15 +47,17 @@ OPEN = (
     "apply_transition",
     "fill_coefficients",
     "gather_noisy_columns",
+    "minus_noisy_row",
+    "minus_row",
+    "noisy_row_at",
     "predict_state",
+    "put_noisy_row",
+    "put_row",
     "rotate_vectors",
+    "row_at",
     "rows_of_noisy",
     "rows_to_noisy",
-    "scale_noisy_row",
-    "scale_row",
     "scatter_noisy_columns",
-    "subtract_noisy_row",
-    "subtract_row",
     "turn_attitude",
     "turn_vectors",
     "write_transition",
@@ -134,32 +138,38 @@ def mirror(P, n, width):
 
 def factorise(A, n, width):
     """Replace the upper triangle of A by its Cholesky factor U, ``A = Uᵀ U``; the diagonal holds the reciprocals of U's."""
-    for j in range(n):
-        inverted = 1.0 / math.sqrt(A[width * j + j])
-        scale_row(A, j, inverted)
-        for i in range(j + 1, n):
-            subtract_row(A, i, A, j, A[width * j + i])
-        A[width * j + j] = inverted
+    for i in range(n):
+        row = row_at(A, i)
+        for k in range(i):
+            row = minus_row(row, A, k, A[width * k + i])
+        put_row(A, i, 1.0, row)
+        inverted = 1.0 / math.sqrt(A[width * i + i])
+        put_row(A, i, inverted, row)
+        A[width * i + i] = inverted
 
 
 def solve(U, B, n, width):
     """Replace B, with columns for the states with process noise, by the solution X of ``Uᵀ U X = B``."""
-    for k in range(n):
-        scale_noisy_row(B, k, U[width * k + k])
-        for i in range(k + 1, n):
-            subtract_noisy_row(B, i, k, U[width * k + i])
-    for k in range(n - 1, -1, -1):
-        scale_noisy_row(B, k, U[width * k + k])
-        for i in range(k):
-            subtract_noisy_row(B, i, k, U[width * i + k])
+    for i in range(n):
+        row = noisy_row_at(B, i)
+        for k in range(i):
+            row = minus_noisy_row(row, B, k, U[width * k + i])
+        put_noisy_row(B, i, U[width * i + i], row)
+    for i in range(n - 1, -1, -1):
+        row = noisy_row_at(B, i)
+        for k in range(n - 1, i, -1):
+            row = minus_noisy_row(row, B, k, U[width * i + k])
+        put_noisy_row(B, i, U[width * i + i], row)
 
 
 def subtract_products(gain, A, B, n, noisy):
     """Subtract gainᵀ A from B, which has a row for each of the ``noisy`` states with process noise."""
     width = len(gain) // n
-    for k in range(n):
-        for r in range(noisy):
-            subtract_row(B, r, A, k, gain[width * k + r])
+    for r in range(noisy):
+        row = row_at(B, r)
+        for k in range(n):
+            row = minus_row(row, A, k, gain[width * k + r])
+        put_row(B, r, 1.0, row)
 
 
 def fill_zeros(A):
