@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from strapdown.checks import Array, InputError, count
+from strapdown.checks import Array, InputError, count, is_definite
 from strapdown.estimation import model as modelling
 from strapdown.estimation import temperature
 from strapdown.estimation.angular_acceleration import turning
@@ -687,6 +687,8 @@ def covariance_at(body: structure.Body, i: int) -> Array:
 
 def definite(P: Array) -> Array:
     """Return a covariance; if rounding has made it indefinite, with smaller correlations."""
+    if is_definite(P):
+        return P
     sigma = np.sqrt(np.diag(P))
     least = float(np.linalg.eigvalsh(P / np.outer(sigma, sigma))[0])
     if least > 0.0:
