@@ -53,7 +53,7 @@ def ours(recording: Recording, *, smooth: bool = False) -> tuple[Array, Array]:
 def samples(recording: Recording) -> tuple[float, list[Array]]:
     """Return the interval, s, and the samples of the sensors."""
     sensors = (recording.rate, recording.specific_force, recording.magnetic_field)
-    return float(np.median(np.diff(recording.time))), [np.ascontiguousarray(x) for x in sensors if x is not None]
+    return recording.interval, [np.ascontiguousarray(x) for x in sensors if x is not None]
 
 
 def vqf(recording: Recording, *, offline: bool = False) -> tuple[Array, None]:

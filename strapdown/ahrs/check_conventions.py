@@ -438,7 +438,7 @@ def _turned(means: Array, axes: Array) -> Array:
 
 def _windows(recording: Recording, sensors: _Sensors, known: np.ndarray | bool = True) -> _Windows | None:
     """Return the windows with samples of each vector, where the attitude is ``known``; None if there are none."""
-    step = max(1, round(MIN_INTERVAL / float(np.median(np.diff(recording.time)))))
+    step = max(1, round(MIN_INTERVAL / recording.interval))
     rows = slice(None, None, step)
     time = recording.time[rows]
     if len(time) < 2:
@@ -503,7 +503,7 @@ def _turns(recording: Recording, known: np.ndarray) -> tuple[np.ndarray, np.ndar
     ``known`` masks the samples at which a window may begin and end.
     """
     total = np.concatenate([np.zeros((1, 3)), np.cumsum(increments(recording), axis=0)])
-    step = max(1, round(REFERENCE_SPAN / float(np.median(np.diff(recording.time)))))
+    step = max(1, round(REFERENCE_SPAN / recording.interval))
     first = np.arange(0, len(recording.time) - step, max(1, step // 2))
     first = first[known[first] & known[first + step]]
     turn = total[first + step] - total[first]

@@ -244,7 +244,7 @@ def _at_stamps(
     P = np.empty((n if options.full_covariance else 0, 6, 6))
     late = np.broadcast_to(delays.gyro, used.time.shape)
     ahead = -sensor_delays.turn_over(used, -late) if options.smooth else used.rate * late[:, None]
-    interval = max(parameters.step, float(np.median(np.diff(used.time))))
+    interval = max(parameters.step, used.interval)
     level = regions.acceleration_level(filtered, _over_steps(turn_variance, edge) > 0.0, interval)
     tilt, floor, heading = regions.scales(filtered, parameters, causal=not options.smooth)
     assert filtered.covariance is not None
