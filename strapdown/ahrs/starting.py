@@ -193,7 +193,7 @@ def are_rests(time: Array, vectors: tuple[Array | None, ...], rate: Array) -> np
     for k, samples in enumerate(vectors):
         if samples is None:
             continue
-        known = np.isfinite(samples[turning]).all(axis=2)
+        known = np.asarray(np.isfinite(samples[turning]).all(axis=2))
         number = known.sum(axis=1)
         first = known & (2 * np.cumsum(known, axis=1) <= number[:, None] + 1)
         share = np.stack([first, known & ~first], axis=1)
