@@ -17,6 +17,7 @@ from strapdown.ahrs.preparing import Prepared, prepare
 from strapdown.ahrs.starting import (
     Rests,
     first_vector,
+    for_whole,
     informative,
     need_accelerometer,
     rests,
@@ -137,8 +138,10 @@ def estimate(
             parameters = replace(parameters, gyro_scale_sigma=calibration.gyro_scale_sigma)
     turned = sensor_delays.gyro_attitude(used)
     delays = sensor_delays.find(used, latency, field_delay, causal=not smooth, turned=turned)
-    prepared = prepare(used, parameters, delays.field, causal=not smooth, turned=turned)
     at_rest = rests(used, parameters)
+    if smooth:
+        parameters = for_whole(used, parameters, at_rest)
+    prepared = prepare(used, parameters, delays.field, causal=not smooth, turned=turned)
     if smooth:
         prepared = prepared._replace(initial=with_all_rests(prepared.initial, at_rest, used.time, parameters))
     else:

@@ -27,6 +27,10 @@ SWING_TIME = 0.1
 """Time, s, over which a rate at the start is assumed to accelerate the unit: it adds to σ of the tilt."""
 MAX_TILT_SIGMA = 0.7
 """Maximum σ of the initial tilt, rad."""
+FACTORS = 0.4, 2.0
+"""Limits of the factor on σ of the velocity by which the smoother follows the motion."""
+MAX_DEVIATION = 0.1
+"""Maximum difference of the specific force at rest from gravity, m/s², with which σ of the accelerometer's bias is the usual one."""
 FIRST_HEADING = 0.1
 """σ of the first sample of the field, relative to its magnitude, which a disturbance has that later ones show."""
 
@@ -244,6 +248,27 @@ def with_rate_at_rest(state: estimation.State, rate: Array, sigma: float) -> est
         values=state.values + change[6:],
         covariance=0.5 * (P + P.T),
     )
+
+
+def for_whole(recording: Recording, parameters: AhrsParameters, found: Rests) -> AhrsParameters:
+    """Return the smoother's parameters, which follow what a whole recording shows of the motion and of the accelerometer.
+
+    σ of the velocity is proportional to the standard deviation of the specific force's magnitude (``usual_variation``). If the specific
+    force at rest differs from gravity by more than :data:`MAX_DEVIATION`, σ of the accelerometer's bias is that difference.
+    """
+    assert recording.specific_force is not None
+    if parameters.usual_variation > 0.0:
+        variation = float(np.nanstd(lengths(recording.specific_force)))
+        factor = float(np.clip(variation / parameters.usual_variation, *FACTORS))
+        parameters = replace(parameters, velocity_sigma=factor * parameters.velocity_sigma)
+    if parameters.accelerometer_bias_sigma > 0.0 and len(found.last):
+        parts, part = rest_length(recording.interval)
+        rows = found.last[:, None] + np.arange(1 - parts * part, 1)
+        force = lengths(np.nanmean(recording.specific_force[rows], axis=1))
+        deviation = float(np.sqrt(np.mean((force - STANDARD_GRAVITY) ** 2)))
+        if deviation > MAX_DEVIATION:
+            parameters = replace(parameters, accelerometer_bias_sigma=deviation)
+    return parameters
 
 
 def with_all_rests(state: estimation.State, found: Rests, time: Array, parameters: AhrsParameters) -> estimation.State:
