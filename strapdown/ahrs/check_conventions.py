@@ -422,7 +422,9 @@ class _Windows(NamedTuple):
         """Return for each sensor the means over each window of R_ab v_c (attitudes, windows, 3, 3, 3), R of attitudes at the rows."""
         sums = []
         for attitude in attitudes:
-            entries = np.stack(rotation_matrix(tuple(attitude.T)))  # (9, m): by entry, not by row, in a third of the time
+            entries = np.stack(
+                rotation_matrix(tuple(attitude.T))
+            )  # (9, m): by entry, not by row, in a third of the time
             sums.append([entries[:, a:b] @ self.vectors[a:b] for a, b in itertools.pairwise(self.edges)])
         parts = np.split(np.reshape(sums, (len(sums), len(self.edges) - 1, 3, 3, -1)), len(self.counts), axis=-1)
         return {
