@@ -611,9 +611,8 @@ def _run(problem: Problem, options: Options) -> Passed:
     out = structure.Outputs._make((*written, stored[: options.segments]))
     judge = Judge(problem, options)
     weight, number = None, 0
-    happened: dict[
-        tuple[str, str, float], Event
-    ] = {}  # a lock-out that continues in a second span is reported there as a whole
+    # A lock-out that continues in a second span is reported there as a whole.
+    happened: dict[tuple[str, str, float], Event] = {}
     bodies: tuple[ModuleType, ...] = (kernels,)
     if options.judged:
         judged = judge.outputs(out)
