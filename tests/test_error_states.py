@@ -437,7 +437,7 @@ def test_a_split_run_is_the_whole_run_to_the_bit(option):
     ("option", "gate"), [("a foreign block", None), (None, None), (None, Gate())], ids=["states", "registers", "gate"]
 )
 def test_a_run_in_spans_is_that_of_its_parts_to_the_bit(option, gate):
-    """Each part from the end of the one before, changed, and with its own noise; a common edge has the row before the change."""
+    """Each part from the end of the one before, changed, and with its own noise; a common edge, with its measurements, has the row before the change."""
     record, blocks = record_of(), OPTIONS[option] if option else ()
     options = {"gate": gate, "full_covariance": True}
 
@@ -445,7 +445,7 @@ def test_a_run_in_spans_is_that_of_its_parts_to_the_bit(option, gate):
         return dataclasses.replace(state, bias=state.bias + 1e-4, covariance=2.0 * state.covariance)
 
     n = len(record.increments)
-    spans = [forward.Span(31, 1e-3, wider), forward.Span(77, 5e-3), forward.Span(n, 2e-3, wider)]
+    spans = [forward.Span(24, 1e-3, wider), forward.Span(55, 5e-3), forward.Span(n, 2e-3, wider)]
     whole = forward.run_spans(record, NOISE, start(), blocks, spans, gate=gate)
     state, first, parts = start(), 0, []
     for last, walk_, change in spans:
