@@ -437,7 +437,10 @@ def test_a_split_run_is_the_whole_run_to_the_bit(option):
     ("option", "gate"), [("a foreign block", None), (None, None), (None, Gate())], ids=["states", "registers", "gate"]
 )
 def test_a_run_in_spans_is_that_of_its_parts_to_the_bit(option, gate):
-    """Each part from the end of the one before, changed, and with its own noise; a common edge, with its measurements, has the row before the change."""
+    """Each part from the end of the one before, changed, and with its own noise; a common edge has the row before the change.
+
+    At both edges there are measurements.
+    """
     record, blocks = record_of(), OPTIONS[option] if option else ()
     options = {"gate": gate, "full_covariance": True}
 
