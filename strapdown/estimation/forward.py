@@ -611,13 +611,12 @@ def _run(problem: Problem, options: Options) -> Passed:
     out = structure.Outputs._make((*written, stored[: options.segments]))
     judge = Judge(problem, options)
     weight, number = None, 0
-    happened: dict[
-        tuple[str, str, float], Event
-    ] = {}  # a lock-out that continues in a second span is reported there as a whole
+    # A lock-out that continues in a second span is reported there as a whole.
+    happened: dict[tuple[str, str, float], Event] = {}
     bodies: tuple[ModuleType, ...] = (kernels,)
     if options.judged:
         judged = judge.outputs(out)
-        bodies, weight = (gate, kernels), judged.weight
+        weight = judged.weight
     elif options.outliers is not None:
         body, weight = body._replace(outliers=options.outliers), out.innovation[:, 6:]
         bodies = (likelihood_outliers, kernels)
@@ -629,7 +628,7 @@ def _run(problem: Problem, options: Options) -> Passed:
         out_of_part = structure.Outputs._make((*part, *out[-2:]))
         if options.judged:
             outputs, judge.counters[:, gate_rules.REPORTED] = judged._replace(form=out_of_part), -1.0
-            number, *ends = compiled(walk, *bodies)(*arguments, every, judge.body(form), outputs)
+            number, *ends = compiled(walk, gate, kernels)(*arguments, every, judge.body(form), outputs)
             happened |= {(one.kind, one.sensor, one.start): one for one in judge.events(judged, *ends)}
         else:
             number = compiled(walk, *bodies)(*arguments, every, form, out_of_part)

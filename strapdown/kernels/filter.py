@@ -114,6 +114,8 @@ WEIGHTS = (5.0 / 18.0, 8.0 / 18.0, 5.0 / 18.0)
 
 CALLED = (
     "advance",
+    "transform",
+    "write_noise",
     "write_transition",
     "take_precisely",
     "take_row",
@@ -432,17 +434,56 @@ def top_rows(P, phi11, phi12, effects, columns, like):
     return tuple(zip(*rows, strict=True))
 
 
+def step_noise(phi, D, dt, model, like):
+    """Return Q of a step: Q_θθ, Q_θb, the diagonal of Q_bb, and the columns Q_θk of the other states; without that of the chains."""
+    q11, q12, q22 = process_noise(phi, dt, model.angle_variance, model.rate_variance)
+    q11, cross_noise = driven_noise(q11, scale(1.0 / dt, phi), D, dt, model, like)
+    return q11, q12 if D is None else multiply(q12, D), q22, cross_noise
+
+
+NO_NOISE = ((0,) * 6, (0,) * 9, 0, (None,) * N)
+
+
 def predict_formula(x, P, delta, dt, model, coefficients, like):
     """Propagate state and covariance over an increment at constant rate."""
+    effects = gyro_effects(x, delta, dt, model, coefficients, like)
+    noise = step_noise(effects[0], effects[1], dt, model, like)
+    propagate_formula(x, P, effects, noise, dt, model, coefficients, like)
+
+
+def transform_formula(x, P, delta, dt, model, coefficients, like):
+    """Propagate state and covariance without process noise."""
+    effects = gyro_effects(x, delta, dt, model, coefficients, like)
+    propagate_formula(x, P, effects, NO_NOISE, dt, model, coefficients, like)
+
+
+def noise_formula(x, Q, delta, dt, model, coefficients, like):
+    """Write the process noise over an increment to a matrix whose other elements are zero."""
+    phi, D, _ = gyro_effects(x, delta, dt, model, coefficients, like)
+    q11, q12, q22, cross_noise = step_noise(phi, D, dt, model, like)
+    for a in AXES:
+        for d in AXES[a:]:
+            put_element(Q, a, d, q11[place_6(a, d)])
+        for j in AXES:
+            put_element(Q, a, 3 + j, q12[3 * a + j])
+        put_element(Q, 3 + a, 3 + a, q22)
+    for states, g in STRUCTURE.chains:
+        for i, k in enumerate(states):
+            for a in AXES if cross_noise[k] is not None else ():
+                put_element(Q, a, k, cross_noise[k][a])
+            for d, j in enumerate(states[i:]):
+                put_element(Q, k, j, chain_noise(coefficients, g, len(states), i, i + d))
+
+
+def propagate_formula(x, P, gyro, noise, dt, model, coefficients, like):
+    """Propagate state and covariance, given the effects of the gyro and the noise of the step."""
+    (phi, D, force), (q11, q12, q22, cross_noise) = gyro, noise
     q = tuple_at(x, 0, 4, like)
     c = tuple_at(x, 7, N - 6, like)
-    phi, D, force = gyro_effects(x, delta, dt, model, coefficients, like)
     phi11, phi12 = transition(phi, dt)
-    q11, q12, q22 = process_noise(phi, dt, model.angle_variance, model.rate_variance)
     if D is not None:
-        phi12, q12 = multiply(phi12, D), multiply(q12, D)
+        phi12 = multiply(phi12, D)
     effects, columns = gyro_columns(phi, D, force, dt, phi12, model, like)
-    q11, cross_noise = driven_noise(q11, scale(1.0 / dt, phi), D, dt, model, like)
     for i, y in enumerate(turned(q, phi)):
         put_at(x, i, y)
     top = tuple(kept(row, P, W * a) for a, row in enumerate(top_rows(P, phi11, phi12, effects, columns, like)))
@@ -453,19 +494,19 @@ def predict_formula(x, P, delta, dt, model, coefficients, like):
             s = products(t[:3], phi11[3 * d : 3 * d + 3])
             s = s + products(rates, phi12[3 * d : 3 * d + 3])
             s = plus(s, products(direct, tuple(e[d] for _, e in columns)))
-            put_element(P, a, d, s + q11[place_6(a, d)])
+            put_element(P, a, d, plus(s, q11[place_6(a, d)]))
         for j in OTHERS:
             if j not in CHAINED:
                 if j < 6:
-                    put_element(P, a, j, t[j] + q12[3 * a + j - 3])
+                    put_element(P, a, j, plus(t[j], q12[3 * a + j - 3]))
                 else:
                     put_at(P, place(j, a), t[j])  # of one run, the row is written already
     for j in (3, 4, 5):
-        put_element(P, j, j, element_at(P, j, j, like) + q22)
-    predict_chains(x, P, top, c, cross_noise, coefficients, like)
+        put_element(P, j, j, plus(element_at(P, j, j, like), q22))
+    predict_chains(x, P, top, c, noise is not NO_NOISE, cross_noise, coefficients, like)
 
 
-def predict_chains(x, P, top, c, cross_noise, coefficients, like):
+def predict_chains(x, P, top, c, noisy, cross_noise, coefficients, like):
     """Propagate the states that decay or are driven; ``top``: rows of the attitude after the step, with these states before it."""
     half = {}
     for states, g in STRUCTURE.chains:
@@ -497,7 +538,7 @@ def predict_chains(x, P, top, c, cross_noise, coefficients, like):
                 for row, j in zip(F, others, strict=True):
                     if j >= k:
                         t = products(row, old)
-                        if states == others:
+                        if noisy and states == others:
                             t = t + chain_noise(coefficients, g, len(states), i, others.index(j))
                         put_element(P, k, j, t)
 
@@ -505,6 +546,16 @@ def predict_chains(x, P, top, c, cross_noise, coefficients, like):
 def advance(x, P, delta, dt, model, coefficients, like):
     """Propagate over an increment; the coefficients are those of dt."""
     predict_formula(x, P, delta, dt, model, coefficients, like)
+
+
+def transform(x, P, delta, dt, model, coefficients, like):
+    """Propagate without process noise."""
+    transform_formula(x, P, delta, dt, model, coefficients, like)
+
+
+def write_noise(x, Q, delta, dt, model, coefficients, like):
+    """Write the process noise over an increment; the coefficients are those of dt."""
+    noise_formula(x, Q, delta, dt, model, coefficients, like)
 
 
 def write_transition(x, delta, dt, model, coefficients, top, like):

@@ -18,7 +18,6 @@ from typing import NamedTuple
 import numpy as np
 
 from strapdown.kernels.filter import (
-    advance,
     apply_transition,
     fill_coefficients,
     fixed_turn,
@@ -34,16 +33,17 @@ from strapdown.kernels.filter import (
     rows_of_noisy,
     rows_to_noisy,
     scatter_noisy_columns,
+    transform,
     turn_attitude,
     turn_vectors,
+    write_noise,
     write_transition,
 )
-from strapdown.kernels.lane_values import WIDTH, broadcast, load, store
+from strapdown.kernels.lane_values import WIDTH, load, store
 from strapdown.kernels.rotation import inverse_right_jacobian, logarithm, moved, quaternion_multiply
 from strapdown.kernels.structure import Model
 
 OPEN = (
-    "advance",
     "apply_transition",
     "fill_coefficients",
     "gather_noisy_columns",
@@ -58,19 +58,20 @@ OPEN = (
     "rows_of_noisy",
     "rows_to_noisy",
     "scatter_noisy_columns",
+    "transform",
     "turn_attitude",
     "turn_vectors",
+    "write_noise",
     "write_transition",
 )
 CALLED = ("factorise", "solve", "subtract_products", "load_segment", "gather_small_columns", "clear_rows", "copy_rows")
 
 
 class Models(NamedTuple):
-    """Numbers of the model: those of the filter, those with noise of negative variance, and those without noise."""
+    """Numbers of the model: those of the filter, and those with noise of negative variance."""
 
     forward: Model
     backward: Model
-    quiet: Model
 
 
 class Workspace(NamedTuple):
@@ -86,7 +87,7 @@ class Workspace(NamedTuple):
     P: np.ndarray
     """Filtered covariance at the start of the segment; then the Cholesky factor of P + Q̄."""
     Q: np.ndarray
-    """Q̄"""
+    """Q̄, whose other elements than those of a step are zero."""
     work: np.ndarray
     later_P: np.ndarray
     """Smoothed covariance."""
@@ -172,12 +173,6 @@ def subtract_products(gain, A, B, n, noisy):
         put_row(B, r, 1.0, row)
 
 
-def fill_zeros(A):
-    """Set a matrix, whose size is a multiple of eight, to zero."""
-    for i in range(0, len(A), WIDTH):
-        store(A, i, broadcast(0.0))
-
-
 def step_back(segments, k, models, space):
     """Propagate the smoothed state from the end of segment k back to its start.
 
@@ -195,15 +190,12 @@ def step_back(segments, k, models, space):
     fill_coefficients(coefficients, dt, models.forward)
     predict_state(predicted, part, dt, models.forward, coefficients, 0.0)
     relative_error(predicted, later_x, later_P, error)
-    fill_zeros(Q)
     fill_coefficients(coefficients, -dt, models.backward)
     write_transition(predicted, back, -dt, models.backward, coefficients, space.top, 0.0)
     apply_error(error, space.top, coefficients)
+    write_noise(predicted, Q, back, -dt, models.backward, coefficients, 0.0)
     copy_state(predicted, after)
-    advance(after, Q, back, -dt, models.backward, coefficients, 0.0)
-    fill_coefficients(coefficients, -dt, models.quiet)
-    copy_state(predicted, after)
-    advance(after, later_P, back, -dt, models.quiet, coefficients, 0.0)
+    transform(after, later_P, back, -dt, models.backward, coefficients, 0.0)
     gather_noisy_columns(Q, gain)
     small = gather_small_columns(P, Q, gain, kept, space.states, n, width)
     for i in range(0, n * width, WIDTH):
