@@ -1,4 +1,4 @@
-"""Accuracy of attitude filters on sets of recordings with a reference: ``python benchmarks/recordings.py [--json FILE] FOLDER...``.
+"""Attitude filters on sets of recordings with a reference: ``python benchmarks/recordings.py [--json FILE | --time] FOLDER...``.
 
 A folder is a set: files that :func:`strapdown.read` reads with their reference. A filter is one function of a recording (:data:`FILTERS`);
 peers that are not installed are left out. The error is RMS over the movement, one constant heading offset of each recording removed, so
@@ -9,6 +9,8 @@ means over its recordings:
 - *NEES* per degree of freedom, median over the recordings;
 - *rows*: share of the samples that have an attitude, of the recording with the least;
 - µs of processor time per sample.
+
+With ``--time`` only the time is measured: the least of several runs on each recording, the filters in turn, and relative to VQF.
 """
 
 from __future__ import annotations
@@ -44,16 +46,13 @@ def ours(recording: Recording, *, smooth: bool = False) -> tuple[Array, Array]:
         warnings.simplefilter("ignore")
         found = sd.estimate(recording, full_covariance=True, smooth=smooth)
     assert found.covariance is not None
-    attitude, covariance = np.full((len(recording.time), 4), np.nan), np.full((len(recording.time), 3, 3), np.nan)
-    row = np.searchsorted(recording.time, found.time)
-    attitude[row], covariance[row] = found.attitude, found.covariance[:, :3, :3]
-    return attitude, covariance
+    return found.attitude, found.covariance[:, :3, :3]
 
 
 def samples(recording: Recording) -> tuple[float, list[Array]]:
     """Return the interval, s, and the samples of the sensors."""
     sensors = (recording.rate, recording.specific_force, recording.magnetic_field)
-    return float(np.median(np.diff(recording.time))), [np.ascontiguousarray(x) for x in sensors if x is not None]
+    return recording.interval, [np.ascontiguousarray(x) for x in sensors if x is not None]
 
 
 def vqf(recording: Recording, *, offline: bool = False) -> tuple[Array, None]:
@@ -202,6 +201,30 @@ def compared(folders: Sequence[Path], names: Sequence[str]) -> Iterator[tuple[st
             yield folder.name, name, len(recordings), mean([score(one, FILTERS[name][1]) for one in recordings])
 
 
+def least_times(recording: Recording, names: Sequence[str], rounds: int = 7) -> dict[str, float]:
+    """Return the least processor time of each filter, ns per sample; they run in turn, so that the clock of the machine affects all."""
+    least = dict.fromkeys(names, np.inf)
+    for _ in range(rounds):
+        for name in names:
+            begin = time.process_time()
+            FILTERS[name][1](recording)
+            least[name] = min(least[name], 1e9 * (time.process_time() - begin) / len(recording.time))
+    return least
+
+
+def print_times(folders: Sequence[Path], names: Sequence[str]) -> None:
+    """Print the time of each filter on each recording: ns per sample, and relative to VQF."""
+    print(f"{'recording':44s} {'samples':>8s}", *(f"{name:>24s}" for name in names))
+    for folder in folders:
+        for recording in read(folder):
+            least = least_times(recording, names)
+            usual = least.get("VQF", np.nan)
+            cells = (f"{least[name]:14.0f} ({least[name] / usual:6.2f})" for name in names)
+            print(
+                f"{Path(recording.source).stem:44s} {len(recording.time):8d}", *(f"{c:>24s}" for c in cells), flush=True
+            )
+
+
 def table(result: dict[str, Any]) -> str:
     """Return scores as a table in Markdown: error of the total and, of this package, coverage of its region."""
     columns = [("estimate", "error_deg"), ("estimate", "coverage"), ("VQF", "error_deg"), ("imufusion", "error_deg")]
@@ -240,8 +263,12 @@ if __name__ == "__main__":
     parser.add_argument("folders", nargs="+", type=Path)
     parser.add_argument("--filters", nargs="+", choices=FILTERS, default=list(FILTERS))
     parser.add_argument("--json", type=Path, help="file of the results; those of other sets and filters in it are kept")
+    parser.add_argument("--time", action="store_true", help="measure only the time")
     arguments = parser.parse_args()
     installed = [name for name in arguments.filters if importlib.util.find_spec(FILTERS[name][0])]
+    if arguments.time:
+        print_times(arguments.folders, installed)
+        raise SystemExit
     print(f"{'set':14s} {'filter':18s} {'error, deg':>18s} {'coverage':>18s} NEES  rows     µs")
     held = json.loads(arguments.json.read_text()) if arguments.json and arguments.json.exists() else None
     scores = main(arguments.folders, installed, held)

@@ -217,9 +217,9 @@ def modified(recording: Recording, seed: int = 1) -> dict[str, Recording]:
     clipped[:, 0] = np.clip(clipped[:, 0], -limit, limit)
     kept = np.ones(n, bool)
     for begin in (0.4, 0.55, 0.7):
-        kept[round(begin * n) : round(begin * n) + round(0.3 / np.median(np.diff(recording.time)))] = False
+        kept[round(begin * n) : round(begin * n) + round(0.3 / recording.interval)] = False
     moving = np.flatnonzero(recording.movement) if recording.movement is not None else np.arange(n)
-    begin = moving[0] + round(5.0 / np.median(np.diff(recording.time)))
+    begin = moving[0] + round(5.0 / recording.interval)
     field = recording.magnetic_field
     ironed = recording
     if field is not None:
@@ -297,7 +297,7 @@ def peers(used: Recording) -> dict[str, tuple[Array, float]]:
     """Return attitudes and processor time, s, of the installed peers on a recording without missing samples."""
     if used.magnetic_field is None or used.specific_force is None:
         return {}
-    interval = float(np.median(np.diff(used.time)))
+    interval = used.interval
     samples = [np.ascontiguousarray(each) for each in (used.rate, used.specific_force, used.magnetic_field)]
     found: dict[str, tuple[Array, float]] = {}
 

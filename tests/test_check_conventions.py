@@ -112,6 +112,17 @@ def test_one_mistake_in_a_simulated_recording_is_named(seed, reference):
         assert words in " ".join([found.reason, *(() if reference else found.notes)]), (name, found.reason)
 
 
+def test_the_axes_of_a_unit_that_is_swung_until_it_clips_are_not_doubted():
+    """As a phone in the hand of a runner: the acceleration is along one axis of the body, and its mean is not zero."""
+    recording = simulated(2)
+    swing = np.outer(np.abs(np.sin(6.0 * recording.time)), [-17.6, 5.3, -3.5])
+    swung = replace(recording, specific_force=np.clip(recording.specific_force + swing, -19.6, 19.6))
+    assert check_conventions.examine(swung).verdict == "as declared"
+    swapped = replace(swung, specific_force=swung.specific_force[:, [1, 0, 2]])
+    assert check_conventions.examine(swapped).verdict == "wrong convention"
+    assert not check_conventions.examine(replace(swung, specific_force=1.8 * swung.specific_force)).doubts
+
+
 def test_one_mistake_in_a_broad_trial_is_named(broad):
     for k, path in enumerate(sorted(broad.glob("*.hdf5"))[:1]):
         recording = recordings.read(path)

@@ -433,6 +433,37 @@ def test_a_split_run_is_the_whole_run_to_the_bit(option):
     assert np.array_equal(last.covariance, end.covariance)
 
 
+@pytest.mark.parametrize(
+    ("option", "gate"), [("a foreign block", None), (None, None), (None, Gate())], ids=["states", "registers", "gate"]
+)
+def test_a_run_in_spans_is_that_of_its_parts_to_the_bit(option, gate):
+    """Each part from the end of the one before, changed, and with its own noise; a common edge has the row before the change.
+
+    At both edges there are measurements.
+    """
+    record, blocks = record_of(), OPTIONS[option] if option else ()
+    options = {"gate": gate, "full_covariance": True}
+
+    def wider(state):
+        return dataclasses.replace(state, bias=state.bias + 1e-4, covariance=2.0 * state.covariance)
+
+    n = len(record.increments)
+    spans = [forward.Span(24, 1e-3, wider), forward.Span(55, 5e-3), forward.Span(n, 2e-3, wider)]
+    whole = forward.run_spans(record, NOISE, start(), blocks, spans, gate=gate)
+    state, first, parts = start(), 0, []
+    for last, walk_, change in spans:
+        noise = dataclasses.replace(NOISE, angle_random_walk=walk_)
+        part, end = estimation.run_part(records.cut(record, first, last), noise, state, blocks, **options)
+        state, first = change(end) if change else end, last
+        parts.append(part)
+    for name in ("attitude", "bias", "variance", "covariance"):
+        joined = np.concatenate([getattr(part, name)[k > 0 :] for k, part in enumerate(parts)])
+        assert np.array_equal(joined, getattr(whole, name)), name
+    for sensor, one in whole.innovations.items():
+        joined = np.concatenate([part.innovations[sensor].innovation for part in parts])
+        assert np.array_equal(joined, one.innovation), sensor
+
+
 @pytest.mark.parametrize("gate", [None, pytest.param(Gate(), marks=pytest.mark.slow)], ids=["plain", "gate"])
 def test_effects_in_the_sensors_own_unit_keep_it_from_part_to_part(gate):
     """A field four times as strong in the first half: the second part goes on in the first's unit, as the whole in that unit to the bit."""

@@ -11,6 +11,7 @@ from strapdown.ahrs import check_conventions as check_conventions
 from strapdown.ahrs.estimating import AhrsEstimate, estimate
 from strapdown.ahrs.live import LiveAhrs
 from strapdown.ahrs.parameters import HAND_HELD as HAND_HELD
+from strapdown.ahrs.parameters import HAND_HELD_SMOOTHED as HAND_HELD_SMOOTHED
 from strapdown.ahrs.parameters import HAND_HELD_WITHOUT_MAGNETOMETER as HAND_HELD_WITHOUT_MAGNETOMETER
 from strapdown.ahrs.parameters import MOTIONS, AhrsParameters
 from strapdown.ahrs.parameters import of_motion as of_motion

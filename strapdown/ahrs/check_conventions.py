@@ -28,6 +28,7 @@ import numpy as np
 from strapdown import coning, quaternion
 from strapdown.ahrs.starting import quiet_span
 from strapdown.checks import Array, Hint, InputError, lengths
+from strapdown.kernels.rotation import rotation_matrix
 from strapdown.records.recording import Recording, increments
 from strapdown.units import DEGREE, STANDARD_GRAVITY
 
@@ -78,7 +79,8 @@ FORCE_UNITS: dict[str, float] = {
 NO_CHANGE = "no change"
 PENALTY = 5.0
 FLOORS = {"reference": 0.003, "vectors": 0.04}
-"""m₀ of relations to a reference, and of those between sensors only, which accelerations and the gyro's bias disturb."""
+"""m₀ of relations to a reference, and of those between sensors only, which the gyro's bias disturbs. To those of the accelerometer the
+mean square difference of its magnitude from gravity, in g, is added: acceleration, and clipping by it, disturb its mean."""
 WINDOWS = 50
 """Maximum number of windows evaluated."""
 INDEPENDENT = 20
@@ -213,7 +215,7 @@ def examine(recording: Recording) -> Examination:
         for name, vectors in (("accelerometer", recording.specific_force), ("magnetometer", recording.magnetic_field))
         if vectors is not None
     }
-    unit_changes, doubts = _force_unit(sensors["accelerometer"][1]) if "accelerometer" in sensors else ((), [])
+    unit_changes, doubts = _force_unit(*sensors["accelerometer"]) if "accelerometer" in sensors else ((), [])
     doubts += _too_fast(recording)
     unsaid = [f"as it seems, {words}" for words in unit_changes]  # gravity alone shows it, whatever the turns do
     upright = at_rest(recording)
@@ -245,12 +247,12 @@ class _Explanations(NamedTuple):
     """Number of changes (m,)."""
     changes: Callable[[int], tuple[str, ...]]
     """Changes of one of them."""
-    floor: float
-    """m₀ of the relations."""
+    floors: dict[str, float]
+    """m₀ of each relation."""
 
 
 def _concluded(source: str, found: _Explanations, sure: tuple[str, ...], notes: list[str]) -> Examination:
-    fit = np.sum([_score(values, found.floor) for values in found.misfit.values()], axis=0)
+    fit = np.sum([_score(values, found.floors[name]) for name, values in found.misfit.items()], axis=0)
     score = fit - PENALTY * found.number
     order = np.argsort(-score, kind="stable")
     named = order[0] if score[order[0]] - score[0] >= MARGIN else 0
@@ -353,13 +355,21 @@ def _dip(recording: Recording, quiet: slice, up: Array) -> float | None:
     return -math.asin(float(np.clip(mean @ up / np.linalg.norm(mean), -1.0, 1.0)))
 
 
-def _force_unit(strength: float) -> tuple[tuple[str, ...], list[str]]:
-    """Return the change of unit by which the median specific force is gravity, and the doubt if there is none."""
+def _gravity(strength: float) -> tuple[str, float]:
+    """Return the change of unit by which a specific force of this magnitude is nearest to gravity, and gravity in its unit."""
+    words = min(FORCE_UNITS, key=lambda name: abs(math.log(strength * FORCE_UNITS[name] / STANDARD_GRAVITY)))
+    return words, STANDARD_GRAVITY / FORCE_UNITS[words]
+
+
+def _force_unit(force: Array, strength: float) -> tuple[tuple[str, ...], list[str]]:
+    """Return the change of unit by which the median specific force is gravity, and the doubt if there is none.
+
+    The median of a unit that is swung is larger than gravity by about the variation of the specific force.
+    """
     if not strength > 0.0:
         return (), ["the accelerometer reads zero throughout"]
-    distances = {words: abs(math.log(strength * factor / STANDARD_GRAVITY)) for words, factor in FORCE_UNITS.items()}
-    words = min(distances, key=lambda name: distances[name])
-    if distances[words] > 0.5:
+    words, gravity = _gravity(strength)
+    if abs(math.log(strength / gravity)) > 0.5 + float(np.nanstd(lengths(force))) / strength:
         return (), [f"the median specific force, {strength:.3g} m/s², fits neither m/s² nor g"]
     return ((words,) if words else ()), []
 
@@ -389,6 +399,15 @@ def _unseen(recording: Recording) -> list[str]:
     elif recording.specific_force is None:
         notes.append("without an accelerometer the vertical cannot be checked")
     return notes
+
+
+def _floors(relations: Iterable[str], floor: float, sensors: _Sensors) -> dict[str, float]:
+    """Return m₀ of each relation, by its name."""
+    acceleration = 0.0
+    if "accelerometer" in sensors:
+        force, strength = sensors["accelerometer"]
+        acceleration = float(np.nanmean((lengths(force) / _gravity(strength)[1] - 1.0) ** 2)) if strength > 0.0 else 0.0
+    return {name: floor + acceleration * ("accelerometer" in name) for name in relations}
 
 
 def _score(misfit: Array, floor: float) -> Array:
@@ -421,8 +440,10 @@ class _Windows(NamedTuple):
         """Return for each sensor the means over each window of R_ab v_c (attitudes, windows, 3, 3, 3), R of attitudes at the rows."""
         sums = []
         for attitude in attitudes:
-            turned = quaternion.to_matrix(attitude).reshape(-1, 9)
-            sums.append([turned[a:b].T @ self.vectors[a:b] for a, b in itertools.pairwise(self.edges)])
+            entries = np.stack(
+                rotation_matrix(tuple(attitude.T))
+            )  # (9, m): by entry, not by row, in a third of the time
+            sums.append([entries[:, a:b] @ self.vectors[a:b] for a, b in itertools.pairwise(self.edges)])
         parts = np.split(np.reshape(sums, (len(sums), len(self.edges) - 1, 3, 3, -1)), len(self.counts), axis=-1)
         return {
             name: part[:, n > 0] / n[n > 0, None, None, None]
@@ -438,7 +459,7 @@ def _turned(means: Array, axes: Array) -> Array:
 
 def _windows(recording: Recording, sensors: _Sensors, known: np.ndarray | bool = True) -> _Windows | None:
     """Return the windows with samples of each vector, where the attitude is ``known``; None if there are none."""
-    step = max(1, round(MIN_INTERVAL / float(np.median(np.diff(recording.time)))))
+    step = max(1, round(MIN_INTERVAL / recording.interval))
     rows = slice(None, None, step)
     time = recording.time[rows]
     if len(time) < 2:
@@ -494,7 +515,7 @@ def _with_reference(recording: Recording, sensors: _Sensors) -> _Explanations | 
     for name, means in ({} if windows is None else windows.means(at(windows.rows))).items():
         v = np.stack([_turned(one, _ALL) for one in means])[:, None] @ to_enu  # (readings, frames, 48, windows, 3)
         parts[name] = (_force_fits if name == "accelerometer" else _field_fits)(v).reshape(-1, len(AXES))
-    return _combined(parts)
+    return _combined(parts, _floors(parts, FLOORS["reference"], sensors))
 
 
 def _turns(recording: Recording, known: np.ndarray) -> tuple[np.ndarray, np.ndarray, Array]:
@@ -503,7 +524,7 @@ def _turns(recording: Recording, known: np.ndarray) -> tuple[np.ndarray, np.ndar
     ``known`` masks the samples at which a window may begin and end.
     """
     total = np.concatenate([np.zeros((1, 3)), np.cumsum(increments(recording), axis=0)])
-    step = max(1, round(REFERENCE_SPAN / float(np.median(np.diff(recording.time)))))
+    step = max(1, round(REFERENCE_SPAN / recording.interval))
     first = np.arange(0, len(recording.time) - step, max(1, step // 2))
     first = first[known[first] & known[first + step]]
     turn = total[first + step] - total[first]
@@ -533,10 +554,10 @@ def _field_fits(v: Array) -> Array:
     return np.asarray(1.0 - 2.0 * along / (np.sum(v**2, axis=(-2, -1)) / v.shape[-2] + 1.0))
 
 
-def _combined(parts: dict[str, Array]) -> _Explanations:
+def _combined(parts: dict[str, Array], floors: dict[str, float]) -> _Explanations:
     """Return combinations of the best settings of each sensor, and those that change the axes of all sensors alike.
 
-    ``parts``: misfits of each sensor by reading and frame of the reference, and by setting of the sensor.
+    ``parts``: misfits of each sensor by reading and frame of the reference, and by setting of the sensor; ``floors``: m₀ of each.
     """
     commons = [
         (f"reference quaternions are {reading}",) * (reading != "")
@@ -553,7 +574,7 @@ def _combined(parts: dict[str, Array]) -> _Explanations:
     settings, misfit = {}, {}
     for (name, values), choice in zip(parts.items(), combinations, strict=True):
         changed = np.array([len(one) for one in _settings(name)])
-        best = np.argsort(PENALTY * changed - _score(values, FLOORS["reference"]), axis=1, kind="stable")[:, :3]
+        best = np.argsort(PENALTY * changed - _score(values, floors[name]), axis=1, kind="stable")[:, :3]
         best = np.insert(np.where(best, best, -1), 0, 0, axis=1)[:, choice]  # as declared comes first, and once
         number[:, :columns] += changed[best]
         whole = np.array(alike, int) * (len(changed) // len(AXES))
@@ -568,7 +589,7 @@ def _combined(parts: dict[str, Array]) -> _Explanations:
         return sum((_settings(name)[which[common, column]] for name, which in settings.items()), commons[common])
 
     misfit = {name: values.ravel()[kept] for name, values in misfit.items()}
-    return _Explanations(misfit, number.ravel()[kept], changes, FLOORS["reference"])
+    return _Explanations(misfit, number.ravel()[kept], changes, floors)
 
 
 @functools.cache
@@ -609,7 +630,8 @@ def _without_reference(recording: Recording, sensors: _Sensors) -> _Explanations
     which, axes, changes = _one_wrong(tuple(windows.counts))
     means = {name: one[which] for name, one in windows.means(attitudes).items()}
     number = np.array([len(one) for one in changes])
-    return _Explanations(_fixed_misfits(means, axes), number, changes.__getitem__, FLOORS["vectors"])
+    misfit = _fixed_misfits(means, axes)
+    return _Explanations(misfit, number, changes.__getitem__, _floors(misfit, FLOORS["vectors"], sensors))
 
 
 @functools.cache

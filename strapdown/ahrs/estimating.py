@@ -17,6 +17,7 @@ from strapdown.ahrs.preparing import Prepared, prepare
 from strapdown.ahrs.starting import (
     Rests,
     first_vector,
+    for_whole,
     informative,
     need_accelerometer,
     rests,
@@ -137,8 +138,10 @@ def estimate(
             parameters = replace(parameters, gyro_scale_sigma=calibration.gyro_scale_sigma)
     turned = sensor_delays.gyro_attitude(used)
     delays = sensor_delays.find(used, latency, field_delay, causal=not smooth, turned=turned)
-    prepared = prepare(used, parameters, delays.field, causal=not smooth, turned=turned)
     at_rest = rests(used, parameters)
+    if smooth:
+        parameters = for_whole(used, parameters, at_rest)
+    prepared = prepare(used, parameters, delays.field, causal=not smooth, turned=turned)
     if smooth:
         prepared = prepared._replace(initial=with_all_rests(prepared.initial, at_rest, used.time, parameters))
     else:
@@ -186,38 +189,42 @@ def _run(
 
     If the rotation over some sample intervals is uncertain (``turn_variance`` (n,), rad², is positive), the record is run in parts. The
     angle random walk of each part is that of the gyro plus that variance spread over the part. Each part is smoothed separately, because
-    samples after an interval of unknown rotation have little information about the attitude before it. The filter's run is divided after
-    each span at rest too, where its bias is corrected; the smoother's initial state includes all of them.
+    samples after an interval of unknown rotation have little information about the attitude before it. The filter's bias is corrected after
+    each span at rest; the smoother's initial state includes all of them.
     """
     record, own, smooth = prepared.record, parameters.setup, options.smooth
     kinds = {series.sensor: series.kind for series in record.vectors}
     blocks = () if own.states is None else own.states.blocks(kinds)
     extra = _over_steps(turn_variance, prepared.edge)
-    change = np.flatnonzero(np.diff(extra > 0.0)) + 1
     rested = np.searchsorted(prepared.edge, [] if smooth else at_rest.last)
-    bounds = np.unique([0, *change, *rested, len(extra)]).tolist()
-    state = prepared.initial
-    parts: list[Estimate] = []
-    shared: dict[str, Any] = {
-        "full_covariance": True,
-        "error_state_covariance": False,
-        "gate": options.gate,
-        "robust": options.robust,
-    }
+    bounds = np.unique([0, *(np.flatnonzero(np.diff(extra > 0.0)) + 1), *rested, len(extra)]).tolist()
+    spans = []
     for first, last in itertools.pairwise(bounds):
-        part = record if len(bounds) == 2 else cut(record, first, last)
-        walk = parameters.angle_random_walk**2 + float(np.sum(extra[first:last])) / (part.time[-1] - part.time[0])
-        noise = replace(own.process_noise, angle_random_walk=float(np.sqrt(walk)))
-        end = state
-        if not smooth or last < len(extra):
-            found, end = estimation.run_part(part, noise, state, blocks, **shared)
-        if smooth:
-            found = estimation.smooth(part, noise, state, blocks, **shared)
-        for k in np.flatnonzero(rested == last):
-            end = with_rate_at_rest(end, at_rest.rate[k], float(at_rest.sigma[k]))
-        state = end
-        parts.append(found)
+        walk = parameters.angle_random_walk**2 + float(np.sum(extra[first:last])) / (
+            record.time[last] - record.time[first]
+        )
+        rates = [(at_rest.rate[k], float(at_rest.sigma[k])) for k in np.flatnonzero(rested == last)]
+        change = functools.partial(functools.reduce, _with_rate, rates) if rates else None
+        spans.append(estimation.Span(last, float(np.sqrt(walk)), change))
+    shared: dict[str, Any] = {"gate": options.gate, "robust": options.robust}
+    if not smooth:
+        found = estimation.run_spans(record, own.process_noise, prepared.initial, blocks, spans, **shared)
+        # Gaps are among the faults of the recording: the rotation over them is uncertain by more than the event says.
+        return replace(found, events=tuple(one for one in found.events if one.kind != "gap"))
+    shared |= {"full_covariance": True, "error_state_covariance": False}
+    state, parts = prepared.initial, []
+    for (first, last), span in zip(itertools.pairwise(bounds), spans, strict=True):
+        part = record if len(spans) == 1 else cut(record, first, last)
+        noise = replace(own.process_noise, angle_random_walk=span.angle_random_walk)
+        parts.append(estimation.smooth(part, noise, state, blocks, **shared))
+        if last < len(extra):
+            _, state = estimation.run_part(part, noise, state, blocks, **shared)
     return joined(parts)
+
+
+def _with_rate(state: estimation.State, measured: tuple[Array, float]) -> estimation.State:
+    """Return the state corrected by a mean rate at rest and its σ."""
+    return with_rate_at_rest(state, *measured)
 
 
 def _over_steps(variance: Array, edge: np.ndarray) -> Array:
@@ -240,7 +247,7 @@ def _at_stamps(
     P = np.empty((n if options.full_covariance else 0, 6, 6))
     late = np.broadcast_to(delays.gyro, used.time.shape)
     ahead = -sensor_delays.turn_over(used, -late) if options.smooth else used.rate * late[:, None]
-    interval = max(parameters.step, float(np.median(np.diff(used.time))))
+    interval = max(parameters.step, used.interval)
     level = regions.acceleration_level(filtered, _over_steps(turn_variance, edge) > 0.0, interval)
     tilt, floor, heading = regions.scales(filtered, parameters, causal=not options.smooth)
     assert filtered.covariance is not None

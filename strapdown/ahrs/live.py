@@ -313,7 +313,7 @@ class LiveAhrs:
         mean, sigma = starting.mean_rates(imu.span_rate.reshape(1, parts, part, 3), parameters)
         if not sigma[0] < starting.MAX_REST_SIGMA:
             return
-        if starting.is_rest(imu.span_time, (imu.span_force, imu.span_field), slice(None), mean[0]):
+        if starting.are_rests(imu.span_time[None], (imu.span_force[None], imu.span_field[None]), mean)[0]:
             time = self._call[0]
             measured = starting.bias_variance(self._bias_variance, time - self._rested, sigma[0], parameters)
             if measured is not None:

@@ -66,8 +66,12 @@ class AhrsParameters:
         Time constant of the acceleration, s.
     position_time : float, default 0.0
         Time constant of the position, s; 0: the position is not bounded.
+    usual_variation : float, default 0.0
+        Standard deviation of the magnitude of the specific force, m/s², in the motion that these parameters model. The smoother, which has
+        the whole recording, multiplies ``velocity_sigma`` by that of the recording relative to it; 0: it does not.
     accelerometer_bias_sigma : float, default 0.0
-        σ of a constant bias of the accelerometer, each component, m/s²; 0: no states.
+        σ of a constant bias of the accelerometer, each component, m/s²; 0: no states. The smoother replaces it by the difference between
+        the specific force at rest and gravity if that is larger than 0.1 m/s².
     tilt_sigma : float, default 0.0
         σ of a horizontal error of the accelerometer, m/s², that is part of the reported σ of the tilt and is not estimated.
     tilt_by_field : float, default 0.0
@@ -100,6 +104,7 @@ class AhrsParameters:
     velocity_time: float = 0.3
     acceleration_time: float = 0.1
     position_time: float = 0.0
+    usual_variation: float = 0.0
     accelerometer_bias_sigma: float = 0.0
     tilt_sigma: float = 0.0
     tilt_by_field: float = 0.0
@@ -121,6 +126,7 @@ class AhrsParameters:
             "rest_bias_sigma",
             "tilt_by_field",
             "tilt_sigma",
+            "usual_variation",
             "velocity_sigma",
         )
         for axis in np.atleast_1d(self.gyro_temperature_sigma):
@@ -185,11 +191,15 @@ HAND_HELD_SMOOTHED = replace(
     hard_iron_time=200.0,
     rate_random_walk=1.5e-4,
     velocity_sigma=1.0,
+    usual_variation=1.4,
     tilt_sigma=0.05,
-    tilt_by_field=0.16,
+    tilt_by_field=0.12,
+    heading_share=0.05,
+    heading_by_field=0.7,
     gyro_scale_sigma=4e-3,
 )
-"""The same for the smoother, which weighs acceleration that lasts over all the time before and after. Chosen on the same recordings."""
+"""The same for the smoother, which weighs acceleration that lasts over all the time before and after, and follows the motion. Chosen on the
+same recordings; that ``velocity_sigma`` is proportional to the variation is chosen whichever set is left out."""
 HAND_HELD_WITHOUT_MAGNETOMETER = replace(
     HAND_HELD,
     rate_random_walk=1e-5,

@@ -55,7 +55,7 @@ def prepare(
     if turned is None:
         turned = sensor_delays.gyro_attitude(recording)
     initial = starting.start(recording, turned, parameters)  # first, because it rejects a sensor without samples
-    interval = float(np.median(np.diff(recording.time)))
+    interval = recording.interval
     edge = edges(recording.time, parameters.step, interval)
     time = recording.time[edge]
     assert recording.specific_force is not None

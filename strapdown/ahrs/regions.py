@@ -25,7 +25,7 @@ OWN_SHARE = 0.1
 """Share of the modelled variance of an innovation that comes from the sensor's errors, whatever the acceleration's level."""
 TILT_SHARE = 0.3
 """Variance of the tilt relative to that of the filter, whose acceleration is larger than that of most motion."""
-MAX_BY_FIELD = 0.3
+MAX_BY_FIELD = 0.25
 """Maximum σ of the accelerometer's error computed from the level of the field's disturbance, m/s²."""
 FIELD_LEVEL = 0.02
 """Mean NIS of the magnetometer in a field disturbed as that along the path of a phone indoors."""

@@ -7,9 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from strapdown import estimation, kinematics, quaternion
+from strapdown import estimation, quaternion
 from strapdown.ahrs.parameters import AhrsParameters
 from strapdown.checks import Array, Hint, InputError, lengths
+from strapdown.kernels.rotation import moved, unit
 from strapdown.recordings import Recording
 from strapdown.units import DEGREE, STANDARD_GRAVITY
 from strapdown.vectors import wahba
@@ -26,6 +27,10 @@ SWING_TIME = 0.1
 """Time, s, over which a rate at the start is assumed to accelerate the unit: it adds to σ of the tilt."""
 MAX_TILT_SIGMA = 0.7
 """Maximum σ of the initial tilt, rad."""
+FACTORS = 0.4, 2.0
+"""Limits of the factor on σ of the velocity by which the smoother follows the motion."""
+MAX_DEVIATION = 0.1
+"""Maximum difference of the specific force at rest from gravity, m/s², with which σ of the accelerometer's bias is the usual one."""
 FIRST_HEADING = 0.1
 """σ of the first sample of the field, relative to its magnitude, which a disturbance has that later ones show."""
 
@@ -146,22 +151,20 @@ def rests(recording: Recording, parameters: AhrsParameters) -> Rests:
     """
     if parameters.rest_bias_sigma == 0.0:
         return NO_REST
-    samples_in_span(recording)  # rejects a recording that is too short
-    parts, part = rest_length(float(np.median(np.diff(recording.time))))
+    parts, part = rest_length(recording.interval)
     length = parts * part
     n = len(recording.time) // length
-    mean, sigma = mean_rates(recording.rate[: n * length].reshape(n, parts, part, 3), parameters)
-    last = np.arange(length - 1, n * length, length)
+    mean, sigma = mean_rates(_spans(recording.rate, n, length).reshape(n, parts, part, 3), parameters)
+    quiet = np.flatnonzero(sigma < MAX_REST_SIGMA)
     vectors = (recording.specific_force, recording.magnetic_field)
-    used = np.array(
-        [
-            k
-            for k in np.flatnonzero(sigma < MAX_REST_SIGMA)
-            if is_rest(recording.time, vectors, slice(last[k] - length + 1, last[k] + 1), mean[k])
-        ],
-        np.intp,
-    )
-    return Rests(last[used], mean[used], sigma[used])
+    taken = (None if samples is None else _spans(samples, n, length)[quiet] for samples in vectors)
+    quiet = quiet[are_rests(_spans(recording.time, n, length)[quiet], tuple(taken), mean[quiet])]
+    return Rests(length * (quiet + 1) - 1, mean[quiet], sigma[quiet])
+
+
+def _spans(samples: Array, n: int, length: int) -> Array:
+    """Return the first samples (n, length, …) of n spans."""
+    return samples[: n * length].reshape(n, length, *samples.shape[1:])
 
 
 def rest_length(interval: float) -> tuple[int, int]:
@@ -179,27 +182,34 @@ def mean_rates(rate: Array, parameters: AhrsParameters) -> tuple[Array, Array]:
     return mean, np.hypot(parameters.rest_bias_sigma, np.sqrt(spread))
 
 
-def is_rest(time: Array, vectors: tuple[Array | None, ...], span: slice, rate: Array) -> bool:
-    """Return whether a span has no gap, and vertical and field do not rotate at more than half its mean rate.
+def are_rests(time: Array, vectors: tuple[Array | None, ...], rate: Array) -> np.ndarray:
+    """Return which spans have no gap, and vertical and field that rotate at no more than half their mean rate (m,).
 
-    ``vectors``: specific force, which half of the samples must have, and field.
+    ``time`` (m, length); ``vectors``: specific force, which half of the samples must have, and field (m, length, 3); ``rate`` (m, 3).
     """
-    if not time[span][-1] - time[span][0] < 1.5 * QUIET_SPAN:
-        return False
     force = vectors[0]
-    if force is None or not np.isfinite(force[span, 0]).mean() > 0.5:
-        return False
-    if not lengths(rate) > TURNING_RATE:
-        return True
-    expected, seen = [], []
-    for samples in vectors:
-        known = np.empty((0, 3)) if samples is None else samples[span][np.isfinite(samples[span]).all(axis=1)]
-        if len(known) > 1 and np.any(mean := known.mean(axis=0)):
-            first, second = (half.mean(axis=0) / np.linalg.norm(mean) for half in np.array_split(known, 2))
-            seen.append(second - first)
-            expected.append(-0.5 * QUIET_SPAN * np.cross(rate, 0.5 * (first + second)))
-    e, s = np.ravel(expected), np.ravel(seen)
-    return not s @ e > 0.5 * (e @ e)
+    if force is None:
+        return np.zeros(len(time), bool)
+    held = np.mean(np.isfinite(force[:, :, 0]), axis=1) > 0.5
+    rests = np.asarray((time[:, -1] - time[:, 0] < 1.5 * QUIET_SPAN) & held)
+    turning = np.flatnonzero(rests & (lengths(rate) > TURNING_RATE))
+    expected, change = np.zeros((2, len(turning), 3 * len(vectors)))
+    for k, samples in enumerate(vectors):
+        if samples is None:
+            continue
+        known = np.asarray(np.isfinite(samples[turning]).all(axis=2))
+        number = known.sum(axis=1)
+        first = known & (2 * np.cumsum(known, axis=1) <= number[:, None] + 1)
+        share = np.stack([first, known & ~first], axis=1)
+        halves = share.astype(np.float64) @ np.where(known[:, :, None], samples[turning], 0.0)
+        size = lengths(halves.sum(axis=1)) / np.maximum(number, 1)
+        seen = np.asarray((number > 1) & (size > 0.0))
+        halves = halves[seen] / (share.sum(axis=2)[seen] * size[seen, None])[:, :, None]
+        columns = slice(3 * k, 3 * k + 3)
+        change[seen, columns] = halves[:, 1] - halves[:, 0]
+        expected[seen, columns] = -0.5 * QUIET_SPAN * np.cross(rate[turning[seen]], 0.5 * halves.sum(axis=1))
+    rests[turning] = np.sum(expected * change, axis=1) <= 0.5 * np.sum(expected**2, axis=1)
+    return rests
 
 
 def informative(found: Rests, time: Array, parameters: AhrsParameters) -> Rests:
@@ -227,16 +237,38 @@ def with_rate_at_rest(state: estimation.State, rate: Array, sigma: float) -> est
     left = np.eye(len(P))
     left[:, 3:6] -= K
     P = left @ P @ left.T + sigma**2 * K @ K.T
-    reset = np.eye(len(P))
-    reset[:3, :3] = kinematics.right_jacobian(change[:3])
-    P = reset @ P @ reset.T
+    attitude, reset = moved(state.attitude.tolist(), change[:3].tolist())
+    J = np.eye(len(P))
+    J[:3, :3] = np.reshape(reset, (3, 3))
+    P = J @ P @ J.T
     return replace(
         state,
-        attitude=quaternion.normalize(quaternion.multiply(state.attitude, quaternion.exp(change[:3]))),
+        attitude=np.array(unit(attitude)),
         bias=state.bias + change[3:6],
         values=state.values + change[6:],
         covariance=0.5 * (P + P.T),
     )
+
+
+def for_whole(recording: Recording, parameters: AhrsParameters, found: Rests) -> AhrsParameters:
+    """Return the smoother's parameters, which follow what a whole recording shows of the motion and of the accelerometer.
+
+    σ of the velocity is proportional to the standard deviation of the specific force's magnitude (``usual_variation``). If the specific
+    force at rest differs from gravity by more than :data:`MAX_DEVIATION`, σ of the accelerometer's bias is that difference.
+    """
+    assert recording.specific_force is not None
+    if parameters.usual_variation > 0.0:
+        variation = float(np.nanstd(lengths(recording.specific_force)))
+        factor = float(np.clip(variation / parameters.usual_variation, *FACTORS))
+        parameters = replace(parameters, velocity_sigma=factor * parameters.velocity_sigma)
+    if parameters.accelerometer_bias_sigma > 0.0 and len(found.last):
+        parts, part = rest_length(recording.interval)
+        rows = found.last[:, None] + np.arange(1 - parts * part, 1)
+        force = lengths(np.nanmean(recording.specific_force[rows], axis=1))
+        deviation = float(np.sqrt(np.mean((force - STANDARD_GRAVITY) ** 2)))
+        if deviation > MAX_DEVIATION:
+            parameters = replace(parameters, accelerometer_bias_sigma=deviation)
+    return parameters
 
 
 def with_all_rests(state: estimation.State, found: Rests, time: Array, parameters: AhrsParameters) -> estimation.State:

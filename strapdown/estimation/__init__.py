@@ -21,9 +21,11 @@ tangent space.
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from strapdown.estimation.forward import Span as Span
 from strapdown.estimation.forward import gaps as gaps
 from strapdown.estimation.forward import run
 from strapdown.estimation.forward import run_part as run_part
+from strapdown.estimation.forward import run_spans as run_spans
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.live import LiveFilter
 from strapdown.estimation.model import with_error_states as with_error_states

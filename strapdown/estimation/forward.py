@@ -6,13 +6,15 @@ The filter is that of :mod:`strapdown.kernels.filter`, compiled for its number o
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import functools
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import ModuleType
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from strapdown.checks import Array, InputError, count
+from strapdown.checks import Array, InputError, count, is_definite
 from strapdown.estimation import model as modelling
 from strapdown.estimation import temperature
 from strapdown.estimation.angular_acceleration import turning
@@ -71,6 +73,16 @@ class Options:
         return self.gate is not None or self.robust is not None
 
 
+class Span(NamedTuple):
+    """A part of a record with its own noise."""
+
+    last: int
+    """Last edge."""
+    angle_random_walk: float
+    change: Callable[[State], State] | None = None
+    """Returns the state from which the next span starts; None: the state at the end of this one."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Problem:
     """A record, prepared for the kernels."""
@@ -83,6 +95,8 @@ class Problem:
     model: Model
     motion: tuple[Array, Array] | None = None
     """:func:`strapdown.estimation.angular_acceleration.turning` at the events, if known; None: computed for a lever arm."""
+    spans: tuple[Span, ...] = ()
+    """Parts of the record, in order of time; empty: the whole."""
 
     @property
     def variances(self) -> tuple[float, float]:
@@ -197,6 +211,25 @@ def run_part(
     return passed.estimate, passed.end
 
 
+def run_spans(
+    record: ImuRecord,
+    process_noise: ProcessNoise,
+    initial: State,
+    error_states: Sequence[ErrorStates],
+    spans: Sequence[Span],
+    *,
+    gate: Gate | None = None,
+    robust: Robust | None = None,
+) -> Estimate:
+    """Run the filter over a record in spans, between which the noise or the state changes.
+
+    The row of a common edge is that before the change. Whole covariances are those of attitude and bias only.
+    """
+    options = Options(full_covariance=True, error_state_covariance=False, gate=gate, robust=robust)
+    problem = prepared(record, process_noise, initial, error_states, driven=True)
+    return filtered(replace(problem, spans=tuple(spans)), options).estimate
+
+
 def prepared(
     record: ImuRecord,
     process_noise: ProcessNoise,
@@ -258,14 +291,19 @@ def _over_temperature(problem: Problem, options: Options, slopes: slice) -> Pass
     T = temperature.of(record)
     state = replace(initial, unit_sigma=unit_sigmas(record, problem.model, initial.unit_sigma))
     parts: list[Estimate] = []
-    before = float(T[0])
-    for first, last, mean in temperature.stretches(record, options.every):
-        state = temperature.shifted(state, slopes, mean - before)
-        part, off = temperature.at_mean(cut(record, first, last), mean, state.values[slopes])
-        declared = prepared(part, problem.process_noise, state, problem.error_states, driven=True)
-        passed = _run(declared, options)
-        parts.append(temperature.at_edges(passed.estimate, slopes, off[:: options.every]))
-        state, before = passed.end, mean
+    before, begin = float(T[0]), 0
+    for span in _spans_of(problem):
+        noise = replace(problem.process_noise, angle_random_walk=span.angle_random_walk)
+        for first, last, mean in temperature.stretches(cut(record, begin, span.last), options.every):
+            state = temperature.shifted(state, slopes, mean - before)
+            part, off = temperature.at_mean(cut(record, begin + first, begin + last), mean, state.values[slopes])
+            passed = _run(prepared(part, noise, state, problem.error_states, driven=True), options)
+            parts.append(temperature.at_edges(passed.estimate, slopes, off[:: options.every]))
+            state, before = passed.end, mean
+        if span.change is not None:
+            at_edge = temperature.shifted(state, slopes, float(T[span.last]) - before)
+            state, before = span.change(at_edge), float(T[span.last])
+        begin = span.last
     end = temperature.shifted(state, slopes, float(T[-1]) - before)
     estimate = joined(parts)
     skipped = skipped_too(problem.events, estimate.innovations)
@@ -289,6 +327,37 @@ def in_order(events: Sequence[Event]) -> tuple[Event, ...]:
     return tuple(sorted(events, key=lambda event: event.start))
 
 
+def _spans_of(problem: Problem) -> tuple[Span, ...]:
+    """Return the spans of a record; without any, the whole as one."""
+    whole = Span(len(problem.record.increments), problem.process_noise.angle_random_walk)
+    return problem.spans or (whole,)
+
+
+def _in_spans(
+    problem: Problem, rows: Sequence[Array], read: Callable[[], State], write: Callable[[State], None]
+) -> Iterator[tuple[float, slice, tuple[Any, ...], list[Array]]]:
+    """Yield σ_v², the events, the kernel's first arguments and the rows to write for each span; then change the state.
+
+    ``rows``: arrays of the outputs with a row for each edge, ``read`` and ``write``: access to the state in the kernel's arrays.
+    """
+    edges, increments = problem.gyro
+    measured = problem.events.measurements
+    first = before = 0
+    for last, walk_, change in _spans_of(problem):
+        after = int(np.searchsorted(measured.time, edges[last], side="right"))
+        events = slice(before, after)
+        columns = {name: getattr(measured, name)[events] for name in ("time", "place", "sensor")}
+        at_first = [row[first : first + 1].copy() for row in rows]
+        arguments = edges[first : last + 1], increments[first:last], measured._replace(**columns)
+        yield walk_**2, events, arguments, [row[first:] for row in rows]
+        if first:
+            for row, kept in zip(rows, at_first, strict=True):
+                row[first : first + 1] = kept
+        if change is not None:
+            write(change(read()))
+        first, before = last, after
+
+
 def _innovations(events: Schedule, *, judged: bool) -> tuple[int, int]:
     """Return the shape of the array of innovations: measurements, and the largest number of values written for one."""
     most = 6 if judged else max([4, *(2 * KINDS[kind] for kind in events.kinds)])
@@ -307,10 +376,13 @@ def _in_registers(problem: Problem, options: Options) -> Passed:
     segments = np.empty((options.segments + 1 if options.segments else 0, 32))
     out = six_states.Outputs._make((*written, segments[: options.segments]))
     body = body_in_registers(problem)
-    state = body.state
-    number = compiled(walk, six_states)(*problem.gyro, events.measurements, every, body, out)
-    if number < 0:
-        raise TooPreciseError()
+    state, number = body.state, 0
+    read, write = functools.partial(state_of_numbers, state), functools.partial(put_state, body)
+    for variance, _, arguments, part in _in_spans(problem, out[:-2], read, write):
+        out_of_part = six_states.Outputs._make((*part, *out[-2:]))
+        number = compiled(walk, six_states)(*arguments, every, body._replace(angle_variance=variance), out_of_part)
+        if number < 0:
+            raise TooPreciseError()
     if options.segments:
         segments[number, :4] = 0.0
         segments[number, 4:] = state
@@ -336,6 +408,16 @@ def body_in_registers(problem: Problem) -> six_states.Body:
     """Return the filter of attitude and bias as the kernels' arguments."""
     initial = problem.initial
     return six_states.Body(pack(initial.attitude, initial.bias, initial.covariance), *problem.variances)
+
+
+def put_state(body: six_states.Body | structure.Body, state: State) -> None:
+    """Write a state to the arrays of a kernel."""
+    if isinstance(body, six_states.Body):
+        body.state[:] = pack(state.attitude, state.bias, state.covariance)
+        return
+    n = len(state.covariance)
+    body.x[0] = np.concatenate([state.attitude, state.bias, state.values])
+    body.P[0].reshape(n, -1)[:, :n] = state.covariance
 
 
 def state_of_numbers(state: Array) -> State:
@@ -481,13 +563,11 @@ def filter_body(problem: Problem, units: Mapping[str, float]) -> structure.Body:
     """Return the filter as the kernels' arguments."""
     model, initial, kernels = problem.model, problem.initial, instance_of(problem.model)
     x, P = np.zeros((2, kernels.N + 1)), np.zeros((2, kernels.N, kernels.W))
-    x[0] = np.concatenate([initial.attitude, initial.bias, initial.values])
-    P[0, :, : kernels.N] = initial.covariance
     if initial.gate is not None and initial.gate.candidate is not None:
         candidate = initial.gate.candidate
         x[1] = np.concatenate([candidate.attitude, candidate.others])
         P[1, :, : kernels.N] = candidate.covariance
-    return structure.Body(
+    body = structure.Body(
         model=kernel_model(model, problem.variances),
         x=x,
         P=P.reshape(2, -1),
@@ -499,6 +579,8 @@ def filter_body(problem: Problem, units: Mapping[str, float]) -> structure.Body:
         turning=turns(problem),
         offsets=model.offsets,
     )
+    put_state(body, initial)
+    return body
 
 
 def segment_width(model: Model) -> int:
@@ -528,20 +610,30 @@ def _run(problem: Problem, options: Options) -> Passed:
     *written, stored = (np.empty(shape) for shape in shapes)
     out = structure.Outputs._make((*written, stored[: options.segments]))
     judge = Judge(problem, options)
-    weight, happened = None, []
-    arguments = *problem.gyro, events.measurements, every
+    weight, number = None, 0
+    # A lock-out that continues in a second span is reported there as a whole.
+    happened: dict[tuple[str, str, float], Event] = {}
+    bodies: tuple[ModuleType, ...] = (kernels,)
     if options.judged:
         judged = judge.outputs(out)
-        number, recovered, locked = compiled(walk, gate, kernels)(*arguments, judge.body(body), judged)
-        weight, happened = judged.weight, judge.events(judged, recovered, locked)
-    else:
-        bodies: tuple[ModuleType, ...] = (kernels,)
-        if options.outliers is not None:
-            body, weight = body._replace(outliers=options.outliers), out.innovation[:, 6:]
-            bodies = (likelihood_outliers, kernels)
-        number = compiled(walk, *bodies)(*arguments, body, out)
-    if number < 0:
-        raise TooPreciseError()
+        weight = judged.weight
+    elif options.outliers is not None:
+        body, weight = body._replace(outliers=options.outliers), out.innovation[:, 6:]
+        bodies = (likelihood_outliers, kernels)
+    read, write = functools.partial(state_of, body, model, None, units), functools.partial(put_state, body)
+    for variance, at, arguments, part in _in_spans(problem, out[:-2], read, write):
+        form = body._replace(
+            model=body.model._replace(angle_variance=variance), length=body.length[at], turning=body.turning[at]
+        )
+        out_of_part = structure.Outputs._make((*part, *out[-2:]))
+        if options.judged:
+            outputs, judge.counters[:, gate_rules.REPORTED] = judged._replace(form=out_of_part), -1.0
+            number, *ends = compiled(walk, gate, kernels)(*arguments, every, judge.body(form), outputs)
+            happened |= {(one.kind, one.sensor, one.start): one for one in judge.events(judged, *ends)}
+        else:
+            number = compiled(walk, *bodies)(*arguments, every, form, out_of_part)
+        if number < 0:
+            raise TooPreciseError()
     if options.segments:
         stored[number, :4] = 0.0
         stored[number, 4 : 5 + n] = body.x[0]
@@ -552,7 +644,7 @@ def _run(problem: Problem, options: Options) -> Passed:
         estimate_of(problem, every, out.x, out.variance, covariance),
         innovations=innovations,
         skipped=skipped_too(events, innovations),
-        events=in_order([*gaps(record), *happened]),
+        events=in_order([*gaps(record), *happened.values()]),
     )
     if options.whole_bias:
         estimate = replace(
@@ -594,6 +686,8 @@ def covariance_at(body: structure.Body, i: int) -> Array:
 
 def definite(P: Array) -> Array:
     """Return a covariance; if rounding has made it indefinite, with smaller correlations."""
+    if is_definite(P):
+        return P
     sigma = np.sqrt(np.diag(P))
     least = float(np.linalg.eigvalsh(P / np.outer(sigma, sigma))[0])
     if least > 0.0:

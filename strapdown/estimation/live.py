@@ -34,7 +34,7 @@ from strapdown.estimation import model as modelling
 from strapdown.estimation.error_states import ErrorStates
 from strapdown.estimation.forward import Judge, Options, gate_events
 from strapdown.estimation.gating import Gate, Robust
-from strapdown.estimation.states import ProcessNoise, State, check_arguments, covariance_matrices, pack
+from strapdown.estimation.states import ProcessNoise, State, check_arguments, covariance_matrices
 from strapdown.kernels import gate, gate_rules, six_states, structure
 from strapdown.kernels import live as kernel
 from strapdown.kernels.argument_tables import packed
@@ -514,13 +514,7 @@ class LiveFilter:
 
 def restart(live: LiveFilter, state: State, time: float) -> None:
     """Continue a filter without gate and look-back from another state, of six or of all states, at another time, s."""
-    state, body = modelling.begin(state, live._problem.error_states), live._body
-    if live._whole:
-        n = len(state.covariance)
-        body.x[0] = np.concatenate([state.attitude, state.bias, state.values])
-        body.P[0].reshape(n, -1)[:, :n] = state.covariance
-    else:
-        body.state[:] = pack(state.attitude, state.bias, state.covariance)
+    forward.put_state(live._body, modelling.begin(state, live._problem.error_states))
     live._time = live._arrays.clock[0] = time
 
 

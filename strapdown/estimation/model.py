@@ -32,6 +32,11 @@ def with_error_states(initial: State, blocks: Sequence[ErrorStates]) -> State:
     """Return a state with error states of zero added, with their declared covariance, independent of attitude and bias."""
     blocks = as_blocks(blocks)
     check(blocks)
+    return _at_prior(initial, blocks)
+
+
+def _at_prior(initial: State, blocks: tuple[ErrorStates, ...]) -> State:
+    """Return a state with error states of zero added, with the covariance of declarations that are checked."""
     size = sum(block.size for block in blocks)
     P = np.zeros((6 + size, 6 + size))
     P[:6, :6] = initial.covariance
@@ -46,7 +51,7 @@ def begin(initial: State, blocks: tuple[ErrorStates, ...]) -> State:
     check(blocks)
     size = sum(block.size for block in blocks)
     if size and not len(initial.values):
-        return with_error_states(initial, blocks)
+        return _at_prior(initial, blocks)
     if len(initial.values) != size:
         raise InputError(
             f"initial has {len(initial.values)} error states, but {size} are declared; declare the same ones"
@@ -103,18 +108,14 @@ class _Numbers:
     """Entries of a structure, and the array of the numbers to which they refer."""
 
     def __init__(self) -> None:
-        self.values: list[float] = []
+        self.places: dict[float, int] = {}
 
     def entries(self, numbers: Array) -> tuple[int | tuple[int], ...]:
         """Return the entry of each number."""
-        return tuple(self._entry(float(x)) for x in np.ravel(numbers))
-
-    def _entry(self, x: float) -> int | tuple[int]:
-        if x in (0.0, 1.0):
-            return int(x)
-        if x not in self.values:
-            self.values.append(x)
-        return (self.values.index(x),)
+        places = self.places
+        return tuple(
+            int(x) if x in (0.0, 1.0) else (places.setdefault(x, len(places)),) for x in np.ravel(numbers).tolist()
+        )
 
 
 def assemble(blocks: tuple[ErrorStates, ...], kinds: Mapping[str, str], *, isotropic: bool = True) -> Model:
@@ -155,7 +156,7 @@ def assemble(blocks: tuple[ErrorStates, ...], kinds: Mapping[str, str], *, isotr
     fastest = float(np.max(decay * np.where(entering, 5.0, 1.0), initial=0.0))
     return Model(
         structure=Structure(6 + len(decay), gyro, chains, vectors, shapes),
-        numbers=np.array(numbers.values or [0.0]),
+        numbers=np.array(list(numbers.places) or [0.0]),
         shape=np.array([shapes.index(sensor) for sensor in sensors], np.int64),
         decay=decay,
         chains=np.stack([feed, density], axis=1),

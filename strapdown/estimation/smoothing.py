@@ -376,13 +376,12 @@ class _ManyStates:
             np.zeros(kernels.SET * max(len(model.last), 1)),
         )
         space = smoother.Workspace._make((*states, *matrices, *others, noisy, len(noisy)))
-        models = smoother.Models(model, *(_with_noise_times(factor, model) for factor in (-1.0, 0.0)))
+        models = smoother.Models(model, _with_negative_noise(model))
         compiled(smoother.smooth_back, kernels)(segments, starts, first, models, space, smoother.Outputs(*outputs))
 
 
-def _with_noise_times(factor: float, model: structure.Model) -> structure.Model:
-    """Return a model with its process noise times a factor."""
-    chains = model.chains * [1.0, factor]
+def _with_negative_noise(model: structure.Model) -> structure.Model:
+    """Return a model whose process noise has the negative variances, for steps back in time."""
     return model._replace(
-        angle_variance=factor * model.angle_variance, rate_variance=factor * model.rate_variance, chains=chains
+        angle_variance=-model.angle_variance, rate_variance=-model.rate_variance, chains=model.chains * [1.0, -1.0]
     )

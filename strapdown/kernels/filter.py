@@ -104,8 +104,8 @@ LINES = 17
 RESIDUAL, VARIANCE = N, N + 1
 """Places in a line of the rows, after h."""
 
-SHORT_FORM = 30.0
-"""Maximum ratio of innovation variance to measurement variance for the short form of the update, which then loses one or two digits."""
+SHORT_FORM = 100.0
+"""Maximum ratio of innovation variance to measurement variance for the short form of the update, which then loses at most two digits."""
 SERIES = tuple(1.0 / math.factorial(k) for k in range(16, 1, -1))
 """1/16! to 1/2!."""
 NODES = (0.5 - 0.5 * math.sqrt(0.6), 0.5, 0.5 + 0.5 * math.sqrt(0.6))
@@ -114,6 +114,8 @@ WEIGHTS = (5.0 / 18.0, 8.0 / 18.0, 5.0 / 18.0)
 
 CALLED = (
     "advance",
+    "transform",
+    "write_noise",
     "write_transition",
     "take_precisely",
     "take_row",
@@ -432,17 +434,56 @@ def top_rows(P, phi11, phi12, effects, columns, like):
     return tuple(zip(*rows, strict=True))
 
 
+def step_noise(phi, D, dt, model, like):
+    """Return Q of a step: Q_θθ, Q_θb, the diagonal of Q_bb, and the columns Q_θk of the other states; without that of the chains."""
+    q11, q12, q22 = process_noise(phi, dt, model.angle_variance, model.rate_variance)
+    q11, cross_noise = driven_noise(q11, scale(1.0 / dt, phi), D, dt, model, like)
+    return q11, q12 if D is None else multiply(q12, D), q22, cross_noise
+
+
+NO_NOISE = ((0,) * 6, (0,) * 9, 0, (None,) * N)
+
+
 def predict_formula(x, P, delta, dt, model, coefficients, like):
     """Propagate state and covariance over an increment at constant rate."""
+    effects = gyro_effects(x, delta, dt, model, coefficients, like)
+    noise = step_noise(effects[0], effects[1], dt, model, like)
+    propagate_formula(x, P, effects, noise, dt, model, coefficients, like)
+
+
+def transform_formula(x, P, delta, dt, model, coefficients, like):
+    """Propagate state and covariance without process noise."""
+    effects = gyro_effects(x, delta, dt, model, coefficients, like)
+    propagate_formula(x, P, effects, NO_NOISE, dt, model, coefficients, like)
+
+
+def noise_formula(x, Q, delta, dt, model, coefficients, like):
+    """Write the process noise over an increment to a matrix whose other elements are zero."""
+    phi, D, _ = gyro_effects(x, delta, dt, model, coefficients, like)
+    q11, q12, q22, cross_noise = step_noise(phi, D, dt, model, like)
+    for a in AXES:
+        for d in AXES[a:]:
+            put_element(Q, a, d, q11[place_6(a, d)])
+        for j in AXES:
+            put_element(Q, a, 3 + j, q12[3 * a + j])
+        put_element(Q, 3 + a, 3 + a, q22)
+    for states, g in STRUCTURE.chains:
+        for i, k in enumerate(states):
+            for a in AXES if cross_noise[k] is not None else ():
+                put_element(Q, a, k, cross_noise[k][a])
+            for d, j in enumerate(states[i:]):
+                put_element(Q, k, j, chain_noise(coefficients, g, len(states), i, i + d))
+
+
+def propagate_formula(x, P, gyro, noise, dt, model, coefficients, like):
+    """Propagate state and covariance, given the effects of the gyro and the noise of the step."""
+    (phi, D, force), (q11, q12, q22, cross_noise) = gyro, noise
     q = tuple_at(x, 0, 4, like)
     c = tuple_at(x, 7, N - 6, like)
-    phi, D, force = gyro_effects(x, delta, dt, model, coefficients, like)
     phi11, phi12 = transition(phi, dt)
-    q11, q12, q22 = process_noise(phi, dt, model.angle_variance, model.rate_variance)
     if D is not None:
-        phi12, q12 = multiply(phi12, D), multiply(q12, D)
+        phi12 = multiply(phi12, D)
     effects, columns = gyro_columns(phi, D, force, dt, phi12, model, like)
-    q11, cross_noise = driven_noise(q11, scale(1.0 / dt, phi), D, dt, model, like)
     for i, y in enumerate(turned(q, phi)):
         put_at(x, i, y)
     top = tuple(kept(row, P, W * a) for a, row in enumerate(top_rows(P, phi11, phi12, effects, columns, like)))
@@ -453,19 +494,19 @@ def predict_formula(x, P, delta, dt, model, coefficients, like):
             s = products(t[:3], phi11[3 * d : 3 * d + 3])
             s = s + products(rates, phi12[3 * d : 3 * d + 3])
             s = plus(s, products(direct, tuple(e[d] for _, e in columns)))
-            put_element(P, a, d, s + q11[place_6(a, d)])
+            put_element(P, a, d, plus(s, q11[place_6(a, d)]))
         for j in OTHERS:
             if j not in CHAINED:
                 if j < 6:
-                    put_element(P, a, j, t[j] + q12[3 * a + j - 3])
+                    put_element(P, a, j, plus(t[j], q12[3 * a + j - 3]))
                 else:
                     put_at(P, place(j, a), t[j])  # of one run, the row is written already
     for j in (3, 4, 5):
-        put_element(P, j, j, element_at(P, j, j, like) + q22)
-    predict_chains(x, P, top, c, cross_noise, coefficients, like)
+        put_element(P, j, j, plus(element_at(P, j, j, like), q22))
+    predict_chains(x, P, top, c, noise is not NO_NOISE, cross_noise, coefficients, like)
 
 
-def predict_chains(x, P, top, c, cross_noise, coefficients, like):
+def predict_chains(x, P, top, c, noisy, cross_noise, coefficients, like):
     """Propagate the states that decay or are driven; ``top``: rows of the attitude after the step, with these states before it."""
     half = {}
     for states, g in STRUCTURE.chains:
@@ -497,7 +538,7 @@ def predict_chains(x, P, top, c, cross_noise, coefficients, like):
                 for row, j in zip(F, others, strict=True):
                     if j >= k:
                         t = products(row, old)
-                        if states == others:
+                        if noisy and states == others:
                             t = t + chain_noise(coefficients, g, len(states), i, others.index(j))
                         put_element(P, k, j, t)
 
@@ -507,21 +548,35 @@ def advance(x, P, delta, dt, model, coefficients, like):
     predict_formula(x, P, delta, dt, model, coefficients, like)
 
 
+def transform(x, P, delta, dt, model, coefficients, like):
+    """Propagate without process noise."""
+    transform_formula(x, P, delta, dt, model, coefficients, like)
+
+
+def write_noise(x, Q, delta, dt, model, coefficients, like):
+    """Write the process noise over an increment; the coefficients are those of dt."""
+    noise_formula(x, Q, delta, dt, model, coefficients, like)
+
+
 def write_transition(x, delta, dt, model, coefficients, top, like):
     """Write the rows of the attitude of Φ over an increment to ``top`` (3 W)."""
     transition_formula(x, delta, dt, model, coefficients, top, like)
 
 
-def subtract_row(A, i, B, k, factor):
-    """Subtract a factor times row k of the matrix B (rows of W) from row i of A."""
-    for c in PARTS:
-        put_part(A, i, c, part(A, i, c, factor) - factor * part(B, k, c, factor))
+def row_at(A, i):
+    """Return row i of a matrix (rows of W), by parts."""
+    return tuple(part(A, i, c, 0.0) for c in PARTS)
 
 
-def scale_row(A, i, factor):
-    """Multiply row i of a matrix by a factor."""
-    for c in PARTS:
-        put_part(A, i, c, factor * part(A, i, c, factor))
+def minus_row(row, B, k, factor):
+    """Return a row less a factor times row k of the matrix B."""
+    return tuple(t - factor * part(B, k, c, factor) for t, c in zip(row, PARTS, strict=True))
+
+
+def put_row(A, i, factor, row):
+    """Write a factor times a row to row i of a matrix."""
+    for c, t in zip(PARTS, row, strict=True):
+        put_part(A, i, c, factor * t)
 
 
 NOISY = tuple(sorted({3, 4, 5, 0, 1, 2, *CHAINED}))
@@ -529,19 +584,23 @@ NOISY = tuple(sorted({3, 4, 5, 0, 1, 2, *CHAINED}))
 NOISY_WIDTH = len(NOISY) + 7 - (len(NOISY) + 7) % 8
 
 
-def subtract_noisy_row(A, i, k, factor):
-    """Subtract a factor times row k of a matrix with columns for the states with process noise from row i of it."""
-    eight = lanes_of(EIGHT)
-    for c in range(0, NOISY_WIDTH, 8):
-        a, b = load_like(A, NOISY_WIDTH * i + c, eight), load_like(A, NOISY_WIDTH * k + c, eight)
-        store(A, NOISY_WIDTH * i + c, a - factor * b)
+NOISY_PARTS = tuple(range(0, NOISY_WIDTH, 8))
 
 
-def scale_noisy_row(A, i, factor):
-    """Multiply row i of such a matrix by a factor."""
-    eight = lanes_of(EIGHT)
-    for c in range(0, NOISY_WIDTH, 8):
-        store(A, NOISY_WIDTH * i + c, factor * load_like(A, NOISY_WIDTH * i + c, eight))
+def noisy_row_at(A, i):
+    """Return row i of a matrix with columns for the states with process noise, by parts."""
+    return tuple(load_like(A, NOISY_WIDTH * i + c, lanes_of(EIGHT)) for c in NOISY_PARTS)
+
+
+def minus_noisy_row(row, A, k, factor):
+    """Return a row less a factor times row k of such a matrix."""
+    return tuple(t - factor * u for t, u in zip(row, noisy_row_at(A, k), strict=True))
+
+
+def put_noisy_row(A, i, factor, row):
+    """Write a factor times a row to row i of such a matrix."""
+    for c, t in zip(NOISY_PARTS, row, strict=True):
+        store(A, NOISY_WIDTH * i + c, factor * t)
 
 
 def gather_noisy_columns(A, B):

@@ -18,55 +18,60 @@ from typing import NamedTuple
 import numpy as np
 
 from strapdown.kernels.filter import (
-    advance,
     apply_transition,
     fill_coefficients,
     fixed_turn,
     gather_noisy_columns,
+    minus_noisy_row,
+    minus_row,
+    noisy_row_at,
     predict_state,
+    put_noisy_row,
+    put_row,
     rotate_vectors,
+    row_at,
     rows_of_noisy,
     rows_to_noisy,
-    scale_noisy_row,
-    scale_row,
     scatter_noisy_columns,
-    subtract_noisy_row,
-    subtract_row,
+    transform,
     turn_attitude,
     turn_vectors,
+    write_noise,
     write_transition,
 )
-from strapdown.kernels.lane_values import WIDTH, broadcast, load, store
+from strapdown.kernels.lane_values import WIDTH, load, store
 from strapdown.kernels.rotation import inverse_right_jacobian, logarithm, moved, quaternion_multiply
 from strapdown.kernels.structure import Model
 
 OPEN = (
-    "advance",
     "apply_transition",
     "fill_coefficients",
     "gather_noisy_columns",
+    "minus_noisy_row",
+    "minus_row",
+    "noisy_row_at",
     "predict_state",
+    "put_noisy_row",
+    "put_row",
     "rotate_vectors",
+    "row_at",
     "rows_of_noisy",
     "rows_to_noisy",
-    "scale_noisy_row",
-    "scale_row",
     "scatter_noisy_columns",
-    "subtract_noisy_row",
-    "subtract_row",
+    "transform",
     "turn_attitude",
     "turn_vectors",
+    "write_noise",
     "write_transition",
 )
 CALLED = ("factorise", "solve", "subtract_products", "load_segment", "gather_small_columns", "clear_rows", "copy_rows")
 
 
 class Models(NamedTuple):
-    """Numbers of the model: those of the filter, those with noise of negative variance, and those without noise."""
+    """Numbers of the model: those of the filter, and those with noise of negative variance."""
 
     forward: Model
     backward: Model
-    quiet: Model
 
 
 class Workspace(NamedTuple):
@@ -82,7 +87,7 @@ class Workspace(NamedTuple):
     P: np.ndarray
     """Filtered covariance at the start of the segment; then the Cholesky factor of P + Q̄."""
     Q: np.ndarray
-    """Q̄"""
+    """Q̄, whose other elements than those of a step are zero."""
     work: np.ndarray
     later_P: np.ndarray
     """Smoothed covariance."""
@@ -134,38 +139,38 @@ def mirror(P, n, width):
 
 def factorise(A, n, width):
     """Replace the upper triangle of A by its Cholesky factor U, ``A = Uᵀ U``; the diagonal holds the reciprocals of U's."""
-    for j in range(n):
-        inverted = 1.0 / math.sqrt(A[width * j + j])
-        scale_row(A, j, inverted)
-        for i in range(j + 1, n):
-            subtract_row(A, i, A, j, A[width * j + i])
-        A[width * j + j] = inverted
+    for i in range(n):
+        row = row_at(A, i)
+        for k in range(i):
+            row = minus_row(row, A, k, A[width * k + i])
+        put_row(A, i, 1.0, row)
+        inverted = 1.0 / math.sqrt(A[width * i + i])
+        put_row(A, i, inverted, row)
+        A[width * i + i] = inverted
 
 
 def solve(U, B, n, width):
     """Replace B, with columns for the states with process noise, by the solution X of ``Uᵀ U X = B``."""
-    for k in range(n):
-        scale_noisy_row(B, k, U[width * k + k])
-        for i in range(k + 1, n):
-            subtract_noisy_row(B, i, k, U[width * k + i])
-    for k in range(n - 1, -1, -1):
-        scale_noisy_row(B, k, U[width * k + k])
-        for i in range(k):
-            subtract_noisy_row(B, i, k, U[width * i + k])
+    for i in range(n):
+        row = noisy_row_at(B, i)
+        for k in range(i):
+            row = minus_noisy_row(row, B, k, U[width * k + i])
+        put_noisy_row(B, i, U[width * i + i], row)
+    for i in range(n - 1, -1, -1):
+        row = noisy_row_at(B, i)
+        for k in range(n - 1, i, -1):
+            row = minus_noisy_row(row, B, k, U[width * i + k])
+        put_noisy_row(B, i, U[width * i + i], row)
 
 
 def subtract_products(gain, A, B, n, noisy):
     """Subtract gainᵀ A from B, which has a row for each of the ``noisy`` states with process noise."""
     width = len(gain) // n
-    for k in range(n):
-        for r in range(noisy):
-            subtract_row(B, r, A, k, gain[width * k + r])
-
-
-def fill_zeros(A):
-    """Set a matrix, whose size is a multiple of eight, to zero."""
-    for i in range(0, len(A), WIDTH):
-        store(A, i, broadcast(0.0))
+    for r in range(noisy):
+        row = row_at(B, r)
+        for k in range(n):
+            row = minus_row(row, A, k, gain[width * k + r])
+        put_row(B, r, 1.0, row)
 
 
 def step_back(segments, k, models, space):
@@ -185,15 +190,12 @@ def step_back(segments, k, models, space):
     fill_coefficients(coefficients, dt, models.forward)
     predict_state(predicted, part, dt, models.forward, coefficients, 0.0)
     relative_error(predicted, later_x, later_P, error)
-    fill_zeros(Q)
     fill_coefficients(coefficients, -dt, models.backward)
     write_transition(predicted, back, -dt, models.backward, coefficients, space.top, 0.0)
     apply_error(error, space.top, coefficients)
+    write_noise(predicted, Q, back, -dt, models.backward, coefficients, 0.0)
     copy_state(predicted, after)
-    advance(after, Q, back, -dt, models.backward, coefficients, 0.0)
-    fill_coefficients(coefficients, -dt, models.quiet)
-    copy_state(predicted, after)
-    advance(after, later_P, back, -dt, models.quiet, coefficients, 0.0)
+    transform(after, later_P, back, -dt, models.backward, coefficients, 0.0)
     gather_noisy_columns(Q, gain)
     small = gather_small_columns(P, Q, gain, kept, space.states, n, width)
     for i in range(0, n * width, WIDTH):

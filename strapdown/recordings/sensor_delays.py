@@ -104,7 +104,7 @@ def find(
             if sigma < MAX_DELAY_SIGMA and 3.0 * sigma < abs(delay) < MAX_DELAY:
                 since = recording.time[0] + span if causal else recording.time[0]
                 found[np.searchsorted(recording.time, since) :] = delay
-    half = 0.5 * float(np.median(np.diff(recording.time)))
+    half = 0.5 * recording.interval
     gyro: Array | float = np.maximum(half, -found) if latency is None else latency
     return Delays(
         gyro=gyro,

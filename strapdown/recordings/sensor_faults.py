@@ -13,6 +13,7 @@ uncertain as over a gap, and the other sensors' samples there are left out (:fun
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -93,7 +94,7 @@ def find(recording: Recording) -> Faults:
         changes["specific_force"] = np.where(lost[:, None], np.nan, force)
         words.append(f"The accelerometer was clipped in {np.sum(lost)} samples ({lost.mean():.2%}), which are ignored")
     steps = np.diff(recording.time)
-    usual = float(np.median(steps))
+    usual = recording.interval
     filled = interpolated(recording.rate)
     for first, last in filled:
         length = float(recording.time[last] - recording.time[first])
@@ -128,7 +129,7 @@ def interpolated(rate: Array) -> list[tuple[int, int]]:
 
     Noise never draws such a line; held samples of a gyro at rest are level.
     """
-    bend = np.max(np.abs(np.diff(rate, n=2, axis=0)), axis=1, initial=0.0)
+    bend = functools.reduce(np.maximum, np.abs(np.diff(rate, n=2, axis=0)).T)
     if not bend.any():
         return []
     usual = np.median(bend[bend > 0.0])

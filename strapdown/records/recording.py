@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -145,6 +146,11 @@ class Recording(Listed):
                 rows.append((name, unit, len(size), *ends))
         title = f"{self.source}: {len(self.time)} samples over {span:.6g} s, {(len(self.time) - 1) / span:.4g} Hz"
         return Table(title, ("sensor", "unit", "samples", "median size", "largest"), rows, self.remarks, left=2)
+
+    @functools.cached_property
+    def interval(self) -> float:
+        """Median interval between the stamps, s."""
+        return float(np.median(np.diff(self.time)))
 
     def since(self, first: int) -> Recording:
         """Return the recording from a given sample on.
