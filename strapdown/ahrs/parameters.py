@@ -188,7 +188,7 @@ HAND_HELD_SMOOTHED = replace(
     HAND_HELD,
     field_disturbance=0.02,
     field_change_time=2.0,
-    hard_iron_time=200.0,
+    hard_iron_time=500.0,
     rate_random_walk=1.5e-4,
     velocity_sigma=1.0,
     usual_variation=1.4,
@@ -199,7 +199,7 @@ HAND_HELD_SMOOTHED = replace(
     gyro_scale_sigma=4e-3,
 )
 """The same for the smoother, which weighs acceleration that lasts over all the time before and after, and follows the motion. Chosen on the
-same recordings; that ``velocity_sigma`` is proportional to the variation is chosen whichever set is left out."""
+same recordings; ``hard_iron_time`` and that ``velocity_sigma`` is proportional to the variation are chosen whichever set is left out."""
 HAND_HELD_WITHOUT_MAGNETOMETER = replace(
     HAND_HELD,
     rate_random_walk=1e-5,
