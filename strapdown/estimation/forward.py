@@ -32,7 +32,7 @@ from strapdown.estimation.states import (
     restart_bias_variance,
 )
 from strapdown.kernels import filter as filter_kernels
-from strapdown.kernels import gate, gate_rules, iterated_update, likelihood_outliers, machine, six_states, structure
+from strapdown.kernels import gate, gate_rules, iterated_update, machine, six_states, structure
 from strapdown.kernels.lane_values import WIDTH
 from strapdown.kernels.machine import compiled, read_only
 from strapdown.kernels.series import LARGEST_ANGLE
@@ -57,9 +57,6 @@ class Options:
     whole_bias: bool = False
     """Report the whole gyro bias, including the contributions of the error states, and with ``full_covariance`` its covariance instead of
     that of all states."""
-    outliers: tuple[float, float] | None = None
-    """Share and variance ratio of outliers, without a gate. ``weight`` of each measurement is then minus its log likelihood,
-    the probability that it is an outlier, and the mean ratio of its noise to its innovations' variances (m, 3)."""
 
     def __post_init__(self) -> None:
         """Check the classes of gate and robust."""
@@ -248,7 +245,7 @@ def filtered(problem: Problem, options: Options) -> Passed:
 
 def fits_registers(problem: Problem, options: Options) -> bool:
     """Return whether the filter is that of attitude and bias in registers."""
-    more = problem.model.states or options.judged or options.whole_bias or options.outliers
+    more = problem.model.states or options.judged or options.whole_bias
     return not more and problem.events.noise_by_axis is None
 
 
@@ -522,7 +519,7 @@ def _run(problem: Problem, options: Options) -> Passed:
         (rows if options.full_covariance and not options.whole_bias else 0, kept, kept),
         (whole_rows, 6),
         (whole_rows if options.full_covariance else 0, 6, 6),
-        _innovations(events, judged=options.judged) if options.outliers is None else (len(events.time), 9),
+        _innovations(events, judged=options.judged),
         (options.segments + 1 if options.segments else 0, segment_width(model)),
     )
     *written, stored = (np.empty(shape) for shape in shapes)
@@ -535,11 +532,7 @@ def _run(problem: Problem, options: Options) -> Passed:
         number, recovered, locked = compiled(walk, gate, kernels)(*arguments, judge.body(body), judged)
         weight, happened = judged.weight, judge.events(judged, recovered, locked)
     else:
-        bodies: tuple[ModuleType, ...] = (kernels,)
-        if options.outliers is not None:
-            body, weight = body._replace(outliers=options.outliers), out.innovation[:, 6:]
-            bodies = (likelihood_outliers, kernels)
-        number = compiled(walk, *bodies)(*arguments, body, out)
+        number = compiled(walk, kernels)(*arguments, body, out)
     if number < 0:
         raise TooPreciseError()
     if options.segments:
