@@ -104,11 +104,13 @@ def test_a_start_that_makes_the_bias_wild_is_cut_into_sub_steps_as_by_the_filter
 
 
 def test_a_lane_that_no_sub_steps_mend_cuts_no_step_of_the_others():
-    body = likelihood.Body(*[None] * len(likelihood.Body._fields))._replace(room=np.empty(likelihood.ROOM))
-    theta, b = (0.1, 0.2, 0.0), np.zeros((3, WIDTH))
+    x = np.zeros((2, 7 * WIDTH))
+    filters = types.SimpleNamespace(x=x, model=types.SimpleNamespace(limit=math.inf))
+    body = types.SimpleNamespace(filters=filters, room=np.empty(likelihood.ROOM))
+    theta, b = (0.1, 0.2, 0.0), x[0, 4 * WIDTH :].reshape(3, WIDTH)
 
     def longest(part=theta):
-        return likelihood.longest_step((None, tuple(b)), part, 0.5, body)
+        return likelihood.longest_step((0, 0), part, 0.5, body)
 
     assert longest() == 0.5
     # Of one lane increment and bias turn by half the range each, and by a little more.

@@ -4,13 +4,14 @@ import dataclasses
 
 import numpy as np
 import pytest
+import two_stars
 from measured import FIELD
 from measured import HAND as SWAY
 from measured import errors as errors_of
 from scipy import optimize
 from two_stars import drawn_case as case_of
 
-from strapdown import coning, consistency, estimation, gyro, motion, scenarios, tuning, vectors
+from strapdown import coning, consistency, estimation, gyro, motion, quaternion, records, scenarios, tuning, vectors
 from strapdown.checks import InputError
 from strapdown.estimation import forward, setup
 from strapdown.estimation.setup import running
@@ -58,31 +59,127 @@ def wrong(chosen, factors) -> setup.FilterSetup:
 # ------------------------------------------------------------------------------------------------------------------- the likelihood
 
 
-@pytest.mark.parametrize(
-    "options",
-    [{"parts": 7}, {"spacing": 3.0}],
-    ids=["parts", "thinned"],  # whose edges are at no measurement
+OF_THE_GYRO = States(
+    gyro_scale_sigma=1e-2,
+    gyro_cross_force_sigma=((0.0, 1e-4, 2e-4), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
+    gyro_drift_sigma=(1e-3, 2e-3),
+    gyro_drift_time=(50.0, 20.0),
+    gyro_fast_bias_sigma=1e-4,
 )
-def test_without_states_it_is_the_likelihood_of_the_plain_filter(options):
+OF_SENSORS = States(
+    sensors={
+        "up": SensorStates(velocity_sigma=0.1, velocity_time=1.0, acceleration_time=2.0),
+        "north": SensorStates(correlated_sigma=1e-2, correlation_time=2.0),
+        "tracker": SensorStates(bias_sigma=1e-2),
+    }
+)
+"""Two times and a rate of 1/s are equal only at the starting point."""
+FEW = States(
+    gyro_drift_sigma=(1e-3,),
+    gyro_drift_time=(50.0,),
+    sensors={"north": SensorStates(correlated_sigma=1e-2, correlation_time=2.0)},
+)
+EVERY_STATE = {
+    "few": (FEW, {}, ("gyro.arw", "up.sigma", "north.sigma", "tracker.sigma")),
+    "gyro": (OF_THE_GYRO, {}, ("gyro.arw", "up.sigma", "north.sigma", "tracker.sigma")),
+    "sensors": (
+        OF_SENSORS,
+        {"sun": (1e-2, 2e-2, 1e-2)},
+        ("gyro.rrw", "initial.attitude", "initial.bias", "sun.sigma.y"),
+    ),
+}
+
+
+@pytest.mark.parametrize(
+    ("states", "sigma", "others"),
+    # The others take 10 s to compile.
+    [
+        pytest.param(*each, id=name, marks=pytest.mark.slow if name != "few" else [])
+        for name, each in EVERY_STATE.items()
+    ],
+)
+def test_every_lane_is_the_filter_itself_with_every_state_and_kind_of_sensor(states, sigma, others):
+    record = two_stars.every_kind(gaps=False)
+    chosen = dataclasses.replace(two_stars.KINDS, states=states, sigma=sigma)
+    one = tuning.record_case(record, chosen, seed=3)
+    names = (*others, *parameters.state_names(states))
+    objective = tuning.likelihood([one], chosen, names, parts=7)
+    points = objective.start + np.random.default_rng(1).uniform(-0.5, 0.5, (9, len(names)))
+    points[8] = objective.start
+    if "gyro.scale_sigma" in names:
+        points[3, names.index("gyro.scale_sigma")] = -np.inf  # a state that is zero
+    expected = []
+    for point in points:
+        found = setup.run(record, objective.setup(point), objective.initial(one, objective.setup(point))).innovations
+        expected.append(0.5 * sum(np.sum(np.log(i.variance) + i.innovation**2 / i.variance) for i in found.values()))
+    # A step is cut where the bias of any lane needs it, which matters to scale factors and forces.
+    np.testing.assert_allclose(objective.minus_log(points), expected, rtol=1e-6 if states is OF_THE_GYRO else 1e-9)
+    step = 1e-4 * np.eye(len(names))
+    slopes = objective.minus_log(points[8] + step) - objective.minus_log(points[8] - step)
+    found = objective.derivatives(points[8])
+    np.testing.assert_allclose(found.score.sum(axis=0), slopes / 2e-4, rtol=1e-3, atol=1e-2)
+    assert np.linalg.eigvalsh(found.information).min() > -1e-9 * found.information.max()
+
+
+def test_thinned_and_parted_it_is_the_same_likelihood():
     scenario = dataclasses.replace(scenarios.load_scenario("two-stars"), duration=60.0)
     chosen = dataclasses.replace(
         setup.FilterSetup.for_scenario(scenario, states=False), sigma={"star 1": 2e-4}, measurement_sigma_factor=1.5
     )
     cases = [case_of(scenario, chosen, 3, run) for run in range(2)]
     names = ["gyro.arw", "gyro.rrw", "star 1.sigma"]
-    plain = tuning.likelihood(cases, chosen, names, **options)
-    other = tuning.likelihood(cases, dataclasses.replace(chosen, states=States()), names, **options)
-    assert other.names == plain.names
-    np.testing.assert_allclose(other.start, plain.start, rtol=1e-15)
-    points = plain.start + np.array([[0.0, 0.0, 0.0], [0.3, -0.5, 0.2]])
-    np.testing.assert_allclose(other.minus_log(points), plain.minus_log(points), rtol=1e-9)
-    whole = tuning.likelihood(cases, chosen, names).minus_log(points[0])[0]
-    assert (other.minus_log(points[0])[0] != pytest.approx(whole)) == ("spacing" in options)
-    for point in points:
-        one, two = plain.derivatives(point), other.derivatives(point)
-        np.testing.assert_allclose(two.value, one.value, rtol=1e-9)
-        np.testing.assert_allclose(two.score, one.score, rtol=1e-5, atol=1e-4)
-        np.testing.assert_allclose(two.information, one.information, rtol=1e-4, atol=1e-4)
+    whole = tuning.likelihood(cases, chosen, names)
+    at = whole.start + 0.1
+    assert tuning.likelihood(cases, chosen, names, parts=7).minus_log(at) == pytest.approx(
+        whole.minus_log(at), rel=1e-13
+    )
+    thin = tuning.likelihood(cases, chosen, names, spacing=3.0)
+    record = setup.modelled_record(cases[0].record, thin.setup(at))
+    record = dataclasses.replace(record, vectors=tuple(thinned(series, 3.0) for series in record.vectors))
+    first = tuning.likelihood(cases[:1], chosen, names, spacing=3.0)
+    found = estimation.run(record, thin.setup(at).process_noise, cases[0].initial).innovations.values()
+    value = 0.5 * sum(np.sum(np.log(i.variance) + i.innovation**2 / i.variance) for i in found)
+    assert first.minus_log(at)[0] == pytest.approx(value, rel=1e-10)
+
+
+def test_of_a_bias_over_temperature_it_is_that_of_a_linear_filter():
+    """The oracle: one axis at rest, states (θ, b, c), ``θ' = θ − (b + c (T − T₀)) dt``, T up and down again."""
+    random, dt, sensor = np.random.default_rng(2), 0.05, 1e-4
+    T = 25.0 + 8.0 * np.sin(np.linspace(0.0, 5.0, 1201))
+    warm = 0.5 * (T[1:] + T[:-1]) - T[0]
+    turns = np.array([3e-5, -2e-5, 0.0]) * warm[:, None] * dt + 1e-6 * random.standard_normal((1200, 3))
+    time = dt * np.arange(1201)
+    angles = sensor * random.standard_normal((120, 3))
+    tracker = vectors.VectorMeasurements(
+        sensor="tracker",
+        kind="attitude",
+        time=time[10::10],
+        attitude=quaternion.exp(angles),
+        sigma_axes=np.full(3, sensor),
+    )
+    record = records.ImuRecord(time=time, increments=turns, vectors=(tracker,), temperature=T)
+    chosen = dataclasses.replace(two_stars.ANGLES, bias_sigma=1e-5, states=States(gyro_temperature_sigma=2e-5))
+    one = tuning.Case(record=record, initial=setup.initial_state(chosen, quaternion.IDENTITY))
+    objective = tuning.likelihood([one], chosen, ["gyro.temperature_sigma", "gyro.rrw", "tracker.sigma"])
+    points = objective.start + np.array([[0.0, 0.0, 0.0], [0.5, -0.3, 0.2]])
+    for point, value in zip(points, objective.minus_log(points), strict=True):
+        slope, walk, noise = np.exp(point)
+        white, expected, H = chosen.process_noise.angle_random_walk, 0.0, np.array([1.0, 0.0, 0.0])
+        for axis in range(3):
+            x, P = np.zeros(3), np.diag([chosen.attitude_sigma, 1e-5, slope]) ** 2.0
+            for k in range(1200):
+                F = np.eye(3)
+                F[0, 1:] = -dt, -dt * warm[k]
+                x = F @ x + turns[k, axis] * H
+                P = F @ P @ F.T + np.diag([white**2 * dt + walk**2 * dt**3 / 3.0, walk**2 * dt, 0.0])
+                P[0, 1] = P[1, 0] = P[0, 1] - 0.5 * walk**2 * dt**2
+                if k % 10 == 9:
+                    e, s = angles[k // 10, axis] - x[0], P[0, 0] + noise**2
+                    expected += 0.5 * (np.log(s) + e * e / s)
+                    x, P = x + P[:, 0] * e / s, P - np.outer(P[:, 0], P[0]) / s
+        assert value == pytest.approx(expected, rel=1e-6)
+    (_, bias, P) = objective.estimates(0, points[:1], np.array([1000]))
+    assert np.abs(bias[0, 0] - np.array([3e-5, -2e-5, 0.0]) * (T[1000] - T[0])).max() < 4.0 * np.sqrt(P[0, 0, 3, 3])
 
 
 def test_score_and_curvature_are_the_derivatives():
@@ -401,7 +498,7 @@ def test_a_parameter_is_printed_in_the_unit_by_whose_factor_it_is_divided():
     degree, g = np.pi / 180.0, 9.80665
     size = {"s": 1.0, "1": 1.0, "m": 1.0, "m/s": 1.0, "m/s²": 1.0, "rad, or the vector's unit": 1.0}
     size |= {"%": 0.01, "ppm": 1e-6, "mrad": 1e-3, "°": degree, "°/h": degree / 3600.0, "°/h/g": degree / 3600.0 / g}
-    size |= {"°/√h": degree / 60.0, "°/h/√h": degree / 3600.0 / 60.0}
+    size |= {"°/h/K": degree / 3600.0, "°/√h": degree / 60.0, "°/h/√h": degree / 3600.0 / 60.0}
     names = (*parameters.PLAIN, *parameters.GYRO_STATES, *parameters._WHOLE)
     for name in (*names, *(f"mag.{one}" for one in parameters.SENSOR_STATES)):
         assert parameters.unit_of(name).factor == pytest.approx(size[parameters.unit_of(name).name], rel=1e-12), name

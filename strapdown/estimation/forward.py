@@ -34,7 +34,7 @@ from strapdown.estimation.states import (
     restart_bias_variance,
 )
 from strapdown.kernels import filter as filter_kernels
-from strapdown.kernels import gate, gate_rules, iterated_update, likelihood_outliers, machine, six_states, structure
+from strapdown.kernels import gate, gate_rules, iterated_update, machine, six_states, structure
 from strapdown.kernels.lane_values import WIDTH
 from strapdown.kernels.machine import compiled, read_only
 from strapdown.kernels.series import LARGEST_ANGLE
@@ -59,9 +59,6 @@ class Options:
     whole_bias: bool = False
     """Report the whole gyro bias, including the contributions of the error states, and with ``full_covariance`` its covariance instead of
     that of all states."""
-    outliers: tuple[float, float] | None = None
-    """Share and variance ratio of outliers, without a gate. ``weight`` of each measurement is then minus its log likelihood,
-    the probability that it is an outlier, and the mean ratio of its noise to its innovations' variances (m, 3)."""
 
     def __post_init__(self) -> None:
         """Check the classes of gate and robust."""
@@ -281,7 +278,7 @@ def filtered(problem: Problem, options: Options) -> Passed:
 
 def fits_registers(problem: Problem, options: Options) -> bool:
     """Return whether the filter is that of attitude and bias in registers."""
-    more = problem.model.states or options.judged or options.whole_bias or options.outliers
+    more = problem.model.states or options.judged or options.whole_bias
     return not more and problem.events.noise_by_axis is None
 
 
@@ -604,7 +601,7 @@ def _run(problem: Problem, options: Options) -> Passed:
         (rows if options.full_covariance and not options.whole_bias else 0, kept, kept),
         (whole_rows, 6),
         (whole_rows if options.full_covariance else 0, 6, 6),
-        _innovations(events, judged=options.judged) if options.outliers is None else (len(events.time), 9),
+        _innovations(events, judged=options.judged),
         (options.segments + 1 if options.segments else 0, segment_width(model)),
     )
     *written, stored = (np.empty(shape) for shape in shapes)
@@ -613,13 +610,9 @@ def _run(problem: Problem, options: Options) -> Passed:
     weight, number = None, 0
     # A lock-out that continues in a second span is reported there as a whole.
     happened: dict[tuple[str, str, float], Event] = {}
-    bodies: tuple[ModuleType, ...] = (kernels,)
     if options.judged:
         judged = judge.outputs(out)
         weight = judged.weight
-    elif options.outliers is not None:
-        body, weight = body._replace(outliers=options.outliers), out.innovation[:, 6:]
-        bodies = (likelihood_outliers, kernels)
     read, write = functools.partial(state_of, body, model, None, units), functools.partial(put_state, body)
     for variance, at, arguments, part in _in_spans(problem, out[:-2], read, write):
         form = body._replace(
@@ -631,7 +624,7 @@ def _run(problem: Problem, options: Options) -> Passed:
             number, *ends = compiled(walk, gate, kernels)(*arguments, every, judge.body(form), outputs)
             happened |= {(one.kind, one.sensor, one.start): one for one in judge.events(judged, *ends)}
         else:
-            number = compiled(walk, *bodies)(*arguments, every, form, out_of_part)
+            number = compiled(walk, kernels)(*arguments, every, form, out_of_part)
         if number < 0:
             raise TooPreciseError()
     if options.segments:

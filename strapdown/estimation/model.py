@@ -9,6 +9,7 @@ import numpy as np
 
 from strapdown import quaternion
 from strapdown.checks import Array, InputError, array, one_of
+from strapdown.estimation import temperature
 from strapdown.estimation.error_states import Effect, ErrorStates, check, spans
 from strapdown.estimation.states import State, check_arguments
 from strapdown.kernels.chains import CHAIN, chain_start
@@ -105,29 +106,41 @@ def _stack(blocks: Sequence[ErrorStates], name: str, shape: tuple[int, ...]) -> 
 
 
 class _Numbers:
-    """Entries of a structure, and the array of the numbers to which they refer."""
+    """Entries of a structure, and the array of the numbers to which they refer; ``generic``: each number but 0 has its own place."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, generic: bool) -> None:
+        self.values: list[float] = []
         self.places: dict[float, int] = {}
+        self.generic = generic
 
     def entries(self, numbers: Array) -> tuple[int | tuple[int], ...]:
         """Return the entry of each number."""
-        places = self.places
-        return tuple(
-            int(x) if x in (0.0, 1.0) else (places.setdefault(x, len(places)),) for x in np.ravel(numbers).tolist()
-        )
+        return tuple(self._entry(x) for x in np.ravel(numbers).tolist())
+
+    def _entry(self, x: float) -> int | tuple[int]:
+        if x == 0.0 or (x == 1.0 and not self.generic):
+            return int(x)
+        if self.generic or x not in self.places:
+            self.places[x] = len(self.values)
+            self.values.append(x)
+        return (self.places[x],)
 
 
-def assemble(blocks: tuple[ErrorStates, ...], kinds: Mapping[str, str], *, isotropic: bool = True) -> Model:
+def assemble(
+    blocks: tuple[ErrorStates, ...], kinds: Mapping[str, str], *, isotropic: bool = True, generic: bool = False
+) -> Model:
     """Return the model of error states for the named sensors of the given kinds.
 
-    ``isotropic``: whether one σ gives the noise of each sensor, or three variances that of an attitude.
+    ``isotropic``: whether one σ gives the noise of each sensor, or three variances that of an attitude. ``generic``: a structure that does
+    not depend on the numbers except on which of them are zero; the slopes of the gyro's bias over temperature are an offset of 1 K.
     """
     decay, density = _stack(blocks, "decay", ()), _stack(blocks, "density", ())
     for name, values in (("decay", decay), ("density", density)):
         if np.any(values < 0.0):
             raise InputError(f"{name} of error state {int(np.argmax(values < 0.0))} is negative; give zero or more")
     offsets = _stack(blocks, "gyro_offset", (3,))
+    if generic and (slopes := temperature.slopes(blocks)) is not None:
+        offsets[slopes] = np.eye(3)
     scales, forces = _stack(blocks, "gyro_scale", (3, 3)), _stack(blocks, "gyro_force", (3, 3))
     force_f = _force(blocks, np.any(scales != 0.0, axis=(1, 2)) & np.any(forces != 0.0, axis=(1, 2)))
     feed = _feeds(blocks)
@@ -139,8 +152,9 @@ def assemble(blocks: tuple[ErrorStates, ...], kinds: Mapping[str, str], *, isotr
             f"error state {int(np.argmax(linked & of_the_gyro))} belongs to a chain and enters the gyro; give it a feed of 0, or no "
             "effect on the gyro"
         )
-    numbers = _Numbers()
-    chains, last, sets = _chains(decay, density, feed)
+    numbers = _Numbers(generic=generic)
+    groups = np.concatenate([np.full(one.size, generic * i) for i, one in enumerate(blocks)] or [np.empty(0)])
+    chains, last, sets = _chains(decay, density, feed, groups)
     gyro = tuple(
         GyroState(
             state=6 + k,
@@ -156,7 +170,7 @@ def assemble(blocks: tuple[ErrorStates, ...], kinds: Mapping[str, str], *, isotr
     fastest = float(np.max(decay * np.where(entering, 5.0, 1.0), initial=0.0))
     return Model(
         structure=Structure(6 + len(decay), gyro, chains, vectors, shapes),
-        numbers=np.array(list(numbers.places) or [0.0]),
+        numbers=np.array(numbers.values or [0.0]),
         shape=np.array([shapes.index(sensor) for sensor in sensors], np.int64),
         decay=decay,
         chains=np.stack([feed, density], axis=1),
@@ -170,11 +184,11 @@ def assemble(blocks: tuple[ErrorStates, ...], kinds: Mapping[str, str], *, isotr
 
 
 def _chains(
-    decay: Array, density: Array, feed: Array
+    decay: Array, density: Array, feed: Array, groups: Array
 ) -> tuple[tuple[tuple[tuple[int, ...], int], ...], np.ndarray, dict[int, int]]:
     """Return chains and their sets of coefficients, the last state of each set, and the set of each single state.
 
-    Chains with the same numbers share a set.
+    Chains of a group with the same numbers share a set.
     """
     chains: list[tuple[tuple[int, ...], int]] = []
     last: list[int] = []
@@ -186,7 +200,8 @@ def _chains(
         while feed[end] != 0.0:
             end += 1
         if end > k or decay[k] > 0.0 or density[k] > 0.0:
-            key = tuple(zip(*(values[k : end + 1].tolist() for values in (decay, density, feed)), strict=True))
+            columns = (decay, density, feed, groups)
+            key = tuple(zip(*(values[k : end + 1].tolist() for values in columns), strict=True))
             if key not in sets:
                 sets[key] = len(last)
                 last.append(end)

@@ -63,12 +63,12 @@ from strapdown.kernels.series import SQUARED_RANGE
 from strapdown.kernels.structure import MAX_PRECISION, SIX_STATES, Effects, Gains, Measured, Progress, Structure
 from strapdown.kernels.walk import step_within, turn_squared
 
-REPLACEABLE = ("take",)
-
 STRUCTURE: Structure = globals().get("STRUCTURE", SIX_STATES)
 """Structure of the model, given by :func:`strapdown.kernels.machine.instance`."""
 LANES: int = globals().get("LANES", 1)
 """Number of runs in a value, likewise."""
+PARAMETERS: bool = globals().get("PARAMETERS", False)
+"""Whether the runs differ in noise and error states, instead of gyro and measurements: numbers of the model are lanes."""
 
 N = STRUCTURE.n
 STATES = tuple(range(N))
@@ -135,7 +135,7 @@ def is_zero(x):
 
 def number(entry, numbers):
     """Return the number of an entry of the structure."""
-    return entry if isinstance(entry, int) else numbers[entry[0]]
+    return entry if isinstance(entry, int) else parameter(numbers, entry[0])
 
 
 def numbers_of(entries, numbers):
@@ -192,6 +192,24 @@ def put_at(array, i, value):
         array[i] = value
     else:
         store(array, i * LANES, value)
+
+
+def parameter(array, i):
+    """Return number i of the model."""
+    return load_like(array, i * LANES, lanes_of((0.0,) * LANES)) if PARAMETERS else array[i]
+
+
+def gyro_variances(model):
+    """Return σ_v² and σ_u²."""
+    if PARAMETERS:
+        return parameter(model.angle_variance, 0), parameter(model.rate_variance, 0)
+    return model.angle_variance, model.rate_variance
+
+
+def rate_and_density(model, g):
+    """Return λ and the PSD of the driving noise of the last state of chain g."""
+    k = model.last[g]
+    return parameter(model.decay, k), parameter(model.chains, 2 * k + 1) if PARAMETERS else model.chains[k, 1]
 
 
 def place(i, j):
@@ -294,13 +312,14 @@ def chain_matrix(coefficients, g, size):
     """Return Φ of a chain by rows."""
     first = 3 - size
     return tuple(
-        tuple(coefficients[SET * g + place_6(i, j)] if j >= i else 0 for j in range(first, 3)) for i in range(first, 3)
+        tuple(parameter(coefficients, SET * g + place_6(i, j)) if j >= i else 0 for j in range(first, 3))
+        for i in range(first, 3)
     )
 
 
 def chain_noise(coefficients, g, size, i, d):
     """Return an element of Q of a chain."""
-    return coefficients[SET * g + 6 + place_6(i + 3 - size, d + 3 - size)]
+    return parameter(coefficients, SET * g + 6 + place_6(i + 3 - size, d + 3 - size))
 
 
 def response(rate, u, decay):
@@ -347,7 +366,7 @@ def gyro_effects(x, delta, dt, model, coefficients, like):
     for g in STRUCTURE.gyro:
         c = value_at(x, 1 + g.state, like)
         if any_number(g.offset):
-            mean = coefficients[SET * g.decay + MEAN] if g.decay >= 0 else dt
+            mean = parameter(coefficients, SET * g.decay + MEAN) if g.decay >= 0 else dt
             e = numbers_of(g.offset, numbers)
             r = tuple(plus(s, times(-(mean * c), t)) for s, t in zip(r, e, strict=True))
         if any_number(g.force):
@@ -378,7 +397,7 @@ def gyro_columns(phi, D, force, dt, phi12, model, like):
                 effect = e
             else:
                 if g.decay not in responses:
-                    E, _ = response(rate, dt, model.decay[model.last[g.decay]])
+                    E, _ = response(rate, dt, rate_and_density(model, g.decay)[0])
                     responses[g.decay] = E if D is None else multiply(E, D)
                 columns.append((g.state, tuple(times(-1.0, t) for t in matrix_products(responses[g.decay], e))))
         if any_number(g.scale):
@@ -399,7 +418,7 @@ def driven_noise(q11, rate, D, dt, model, like):
     nodes = {}
     for g in STRUCTURE.gyro:
         if g.decay >= 0:
-            decay, density = model.decay[model.last[g.decay]], model.chains[model.last[g.decay], 1]
+            decay, density = rate_and_density(model, g.decay)
             if g.decay not in nodes:
                 nodes[g.decay] = tuple(response(rate, dt * (1.0 - node), decay) for node in NODES)
             e = numbers_of(g.offset, model.numbers)
@@ -436,7 +455,7 @@ def top_rows(P, phi11, phi12, effects, columns, like):
 
 def step_noise(phi, D, dt, model, like):
     """Return Q of a step: Q_θθ, Q_θb, the diagonal of Q_bb, and the columns Q_θk of the other states; without that of the chains."""
-    q11, q12, q22 = process_noise(phi, dt, model.angle_variance, model.rate_variance)
+    q11, q12, q22 = process_noise(phi, dt, *gyro_variances(model))
     q11, cross_noise = driven_noise(q11, scale(1.0 / dt, phi), D, dt, model, like)
     return q11, q12 if D is None else multiply(q12, D), q22, cross_noise
 
@@ -957,7 +976,7 @@ def turned_by(q, correction):
 def measurement_of(s, body, measured, e):
     """Return the e-th measurement, by a sensor of shape s."""
     shape, at, sensor = STRUCTURE.sensors[s], measured.place[e], measured.sensor[e]
-    if LANES > 1:
+    if LANES > 1 and not PARAMETERS:
         return measurement_in_lanes(s, body, measured, e, at, sensor)
     z = value_of(measured, at, sensor)
     if not shape.isotropic:
@@ -967,9 +986,26 @@ def measurement_of(s, body, measured, e):
     else:
         sigma = sigma_of(measured, at, sensor)
         noise = (sigma * sigma,)
+    if PARAMETERS:
+        z, noise = with_factors(shape, z, noise, tuple(parameter(body.factors, 3 * sensor + i) for i in AXES))
     levers = any(t.lever for t in shape.states)
     turning = tuple(body.turning[e, i] for i in NINE) if levers else (0.0,) * 9
     return Measured(z, frame_of(measured, at, sensor), noise, body.length[e] if shape.states else 1.0, turning)
+
+
+def with_factors(shape, z, noise, f):
+    """Return value and noise of a measurement with other σ about the body axes, as factors."""
+    if not shape.isotropic:
+        pairs = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+        return z, tuple(n * f[i] * f[j] for n, (i, j) in zip(noise, pairs, strict=True))
+    if shape.kind == ATTITUDE:
+        return tuple(variance * t * t for variance, t in zip(z, f, strict=True)), noise
+    return z, (noise[0] * f[0] * f[0],)
+
+
+def row_of_innovations(measured, e):
+    """Return the row for the innovations of a measurement; the first if another kernel takes them from there."""
+    return 0 if PARAMETERS else measured.place[e]
 
 
 def measurement_in_lanes(s, body, measured, e, at, sensor):
@@ -1337,7 +1373,7 @@ def transverse_rows_{s}(x, body, measured, e, like):
 
 def take_{s}(body, measured, e, innovation, like):
     g = gains_{s}(body, measured, e, None, like)
-    store_innovations(innovation, measured.place[e], g.reported, g.variances)
+    store_innovations(innovation, row_of_innovations(measured, e), g.reported, g.variances)
     if any_lane(g.precise):
         rows_{s}(body.x[0], body, measured, e, like)
         return {precise}

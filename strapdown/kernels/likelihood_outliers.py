@@ -1,4 +1,4 @@
-"""Update for measurements with outliers: for :mod:`strapdown.kernels.likelihood` and :mod:`strapdown.kernels.filter`.
+"""Update for measurements with outliers, for :mod:`strapdown.kernels.likelihood`.
 
 The noise of a measurement is normal with its variance or, with probability ε, with ``spread`` times that (Tukey 1960). The update is made
 with both; the likelihood is that of the mixture, and the filter continues with mean and covariance of the mixture (generalised
@@ -9,11 +9,9 @@ from __future__ import annotations
 
 import math
 
-from strapdown.kernels.algebra import full, scale, subtract
 from strapdown.kernels.filter import LINES, PRIOR, ROWS, STEP, apply_step, clear_step, take_row, write
-from strapdown.kernels.lane_values import WIDTH, load
-from strapdown.kernels.likelihood import FOUND, WIDE, WORK, deviance_of, updated, variance_of
-from strapdown.kernels.measurement import KIND, VECTOR
+from strapdown.kernels.lane_values import WIDTH, broadcast, load, store
+from strapdown.kernels.likelihood import WIDE, WORK, deviance_of
 
 OPEN = ("apply_step", "clear_step", "take_row", "write")
 """Functions of the instance of the filter."""
@@ -31,49 +29,56 @@ def mixed(share, nis, product, wide, wide_product):
     return -highest - math.log(near + far), far / (near + far)
 
 
-# ------------------------------------------------------------------------------------------------------------------------------- lanes
-
-
-def between(w, x, y):
-    """Return x + w (y − x) of two tuples of three."""
-    return tuple(a + w * (b - a) for a, b in zip(x, y, strict=True))
-
-
-def between_matrix(w, S, T, x, y, u, v):
-    """Return the cross-covariance of a mixture, (1 − w) of S and w of T, of attitude (means x, y) and bias (means u, v)."""
-    d, g = scale(w * (1.0 - w), subtract(y, x)), subtract(v, u)
-    M = between(w, S, T)
-    return tuple(M[3 * i + j] + d[i] * g[j] for i in range(3) for j in range(3))
-
-
-def between_symmetric(w, S, T, x, y):
-    """Return the covariance of a mixture, (1 − w) of (S, mean x) and w of (T, mean y), as upper triangle."""
-    d = subtract(y, x)
-    v, M = scale(w * (1.0 - w), d), full(between(w, S, T))
-    return tuple(M[3 * i + j] + v[i] * d[j] for i in range(3) for j in range(i, 3))
-
-
-def counted(b, A, B, C, e, span, number, measured, z, body, out):
-    """Update all lanes with both noises, and add to the sums; return attitude correction, b, A, B, C of the mixture."""
-    room, place, sensor = body.room, measured.place[e], measured.sensor[e]
-    kind = measured.series[sensor, KIND]
-    factor = load(body.factors, WIDTH * sensor)
-    turn, b0, A0, B0, C0 = updated(b, A, B, C, number, measured, place, sensor, z, factor, room, FOUND)
-    wide = factor * load(body.outliers, WIDTH)
-    other, b1, A1, B1, C1 = updated(b, A, B, C, number, measured, place, sensor, z, wide, room, WIDE)
-    rows = 3 if kind == VECTOR else number
-    weigh(span, rows, body, out)
-    w = load(room, FOUND)
+def counted(e, span, measured, body, out):
+    """Update all lanes with both noises, continue with the mixture, and add to the sums."""
+    f, room, like = body.filters, body.room, broadcast(0.0)
+    x, P, Q, work = f.x[0], f.P[0], f.P[1], f.work
+    line = len(work) // LINES
+    rows, _, _ = write(f.shape[measured.sensor[e]], x, f, measured, e, like)
+    for i in range(0, len(P), WIDTH):
+        store(Q, i, load(P, i))
+    size = len(x) - WIDTH
+    taken(Q, work, rows, line, size, load(body.outliers, WIDTH), room, WIDE)
+    for i in range(0, size, WIDTH):
+        store(work, line * PRIOR + i, load(work, line * STEP + i))
+    noise = taken(P, work, rows, line, size, broadcast(1.0), room, 0)
     if len(out.probability) > 0:
-        out.probability[e, 0] = room[FOUND]
-        out.probability[e, 1] = 0.0
-        for r in range(rows):
-            variance = variance_of(measured, place, sensor, kind, z, r) * body.factors[WIDTH * sensor]
-            out.probability[e, 1] += variance / (room[FOUND + 2 * WIDTH * r + WIDTH] * rows)
-    A = between_symmetric(w, A0, A1, turn, other)
-    B = between_matrix(w, B0, B1, turn, other, b0, b1)
-    C = between_symmetric(w, C0, C1, b0, b1)
-    return between(w, turn, other), between(w, b0, b1), A, B, C
+        store(room, WORK, noise)
+        out.probability[e, 1] = room[WORK] / rows
+    weigh(span, rows, body, out)
+    w = load(room, 0)
+    if len(out.probability) > 0:
+        out.probability[e, 0] = room[0]
+    for i in range(0, size, WIDTH):
+        d = load(work, line * PRIOR + i) - load(work, line * STEP + i)
+        store(work, line * PRIOR + i, d)
+        store(work, line * STEP + i, load(work, line * STEP + i) + w * d)
+    at = 0
+    for i in range(0, size, WIDTH):
+        share = w * (1.0 - w) * load(work, line * PRIOR + i)
+        for j in range(i, size, WIDTH):
+            p = load(P, at)
+            store(P, at, p + w * (load(Q, at) - p) + share * load(work, line * PRIOR + j))
+            at += WIDTH
+    apply_step(x, P, work, like)
+
+
+def taken(P, work, rows, line, size, factor, room, found):
+    """Update P and the step with the rows in the work space, their variances times a factor; return the sum of their ratios of noise.
+
+    Innovations and variances are written to ``room`` at ``found``.
+    """
+    like = broadcast(0.0)
+    clear_step(work, like)
+    noise = like
+    for r in range(rows):
+        at = line * (ROWS + r) + size
+        variance = factor * load(work, at + WIDTH)
+        error, s = take_row(P, work, ROWS + r, load(work, at), variance, like)
+        noise = noise + variance / s
+        store(room, found + 2 * WIDTH * r, error)
+        store(room, found + 2 * WIDTH * r + WIDTH, s)
+    return noise
 
 
 def weigh(span, number, body, out):
@@ -81,7 +86,7 @@ def weigh(span, number, body, out):
     room, free = body.room, body.free
     base = 0.0
     for i in range(WIDTH):
-        nis, product = deviance_of(room, FOUND, number, i)
+        nis, product = deviance_of(room, 0, number, i)
         wide, wide_product = deviance_of(room, WIDE, number, i)
         value, struck = mixed(body.outliers[i], nis, product, wide, wide_product)
         out.minus_log[WIDTH * span + i] += value
@@ -89,58 +94,8 @@ def weigh(span, number, body, out):
             base = value
         elif i <= free:
             room[WORK + i - 1] = (value - base) / body.step
-        room[FOUND + i] = struck
+        room[i] = struck
     for j in range(free):
         out.score[span, j] += room[WORK + j]
         for m in range(j + 1):
             out.information[span, j, m] += room[WORK + j] * room[WORK + m]
-
-
-# ------------------------------------------------------------------------------------------------------------------------- one filter
-
-
-def take(shape, body, measured, e, innovation, like):
-    """Update with both noises and replace the state by the mixture; write the outputs of :class:`strapdown.estimation.forward.Options`."""
-    x, P, Q, work, (share, spread) = body.x[0], body.P[0], body.P[1], body.work, body.outliers
-    n = len(x) - 1
-    width, line = len(P) // n, len(work) // LINES
-    rows, _, _ = write(shape, x, body, measured, e, like)
-    at = measured.place[e]
-    for i in range(n * width):
-        Q[i] = P[i]
-    wide_nis, wide_product, _ = taken(Q, work, rows, line, n, spread, False)
-    for i in range(n):
-        work[line * PRIOR + i] = work[line * STEP + i]
-    nis, product, noise = taken(P, work, rows, line, n, 1.0, True)
-    for r in range(rows):
-        innovation[at, 2 * r] = work[line * (ROWS + r) + n]
-        innovation[at, 2 * r + 1] = work[line * (ROWS + r) + n + 1]
-    value, w = mixed(share, nis, product, wide_nis, wide_product)
-    innovation[at, 6], innovation[at, 7], innovation[at, 8] = value, w, noise / rows
-    for i in range(n):
-        d = work[line * PRIOR + i] - work[line * STEP + i]
-        work[line * PRIOR + i] = d
-        work[line * STEP + i] += w * d
-    for i in range(n):
-        for j in range(n):
-            d = w * (1.0 - w) * work[line * PRIOR + i] * work[line * PRIOR + j]
-            P[width * i + j] = P[width * i + j] + w * (Q[width * i + j] - P[width * i + j]) + d
-    apply_step(x, P, work, like)
-    return False
-
-
-def taken(P, work, rows, line, n, factor, replaces):
-    """Update P and the step with the rows in the work space, their variances times a factor; return NIS, determinant and noise ratios.
-
-    If ``replaces``, the residuals and variances in the work space become the innovations and theirs.
-    """
-    clear_step(work, 0.0)
-    nis, product, noise = 0.0, 1.0, 0.0
-    for r in range(rows):
-        place = line * (ROWS + r) + n
-        variance = factor * work[place + 1]
-        error, s = take_row(P, work, ROWS + r, work[place], variance, 0.0)
-        nis, product, noise = nis + error * error / s, product * s, noise + variance / s
-        if replaces:
-            work[place], work[place + 1] = error, s
-    return nis, product, noise

@@ -1,4 +1,4 @@
-"""A state (q, b, A, B, C) as 28 numbers: attitude, bias, and the blocks of the covariance; of one filter, or of one per SIMD lane."""
+"""A state (q, b, A, B, C) as 28 numbers: attitude, bias, and the blocks of the covariance; and lanes of several components."""
 
 from __future__ import annotations
 
@@ -53,14 +53,3 @@ def store_several(array, start, values):
     """Write the lanes of any number of components from ``array[start]`` on."""
     for i, value in enumerate(values):
         store(array, start + i * WIDTH, value)
-
-
-def load_lanes(array, start):
-    """Return (q, b, A, B, C) in lanes from 28 times ``WIDTH`` numbers."""
-    n = tuple(load(array, start + i * WIDTH) for i in range(SIZE))
-    return n[:4], n[4:7], n[7:13], n[13:22], n[22:]
-
-
-def store_lanes(array, start, q, b, A, B, C):
-    """Write (q, b, A, B, C) in lanes to 28 times ``WIDTH`` numbers."""
-    store_several(array, start, (*q, *b, *A, *B, *C))

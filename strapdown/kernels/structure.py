@@ -74,7 +74,7 @@ SIX_STATES = Structure(6, (), (), (), ())
 
 
 class Model(NamedTuple):
-    """Numbers of the model."""
+    """Numbers of the model; of runs that differ in them, flat arrays whose last axis is that of the runs."""
 
     angle_variance: float
     """σ_v², rad²/s."""
@@ -131,8 +131,8 @@ class Body(NamedTuple):
     """Rate, angular acceleration and its variances at each measurement (events, 9); (0, 9) without lever arms."""
     offsets: np.ndarray
     """Effect e of each error state on the gyro as an offset (m, 3), for the whole bias."""
-    outliers: tuple[float, float] = (0.0, 1.0)
-    """Share of the measurements that are outliers, and their variance over that of the others, where they are modelled."""
+    factors: np.ndarray = np.empty(0)
+    """Factor on σ about each body axis of each sensor (sensors × 3 × runs), of runs that differ in noise."""
 
 
 class Outputs(NamedTuple):

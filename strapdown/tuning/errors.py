@@ -1,7 +1,6 @@
 """Tuning against a truth: the likelihood of the state errors under the filter's covariance, or the size of the attitude error.
 
-The likelihood is that of the filter with its error states, gate and robust weights. If it has none of them, and at most seven parameters
-are free, eight points are computed at once.
+The likelihood is that of the filter with its error states, gate and robust weights. Without these two, eight points are computed at once.
 
 Errors at neighbouring times are correlated, so epochs are spaced by the correlation time of the attitude error. The likelihood of all of
 them is a composite one (Lindsay 1988): its maximum is consistent, its curvature is not the information, and standard errors come from the
@@ -19,8 +18,8 @@ import numpy as np
 from strapdown import consistency
 from strapdown.checks import Array, InputError, one_of
 from strapdown.estimation.setup import FilterSetup
-from strapdown.tuning.innovations import MAX_DERIVATIVES, Likelihood, construct, with_engine
-from strapdown.tuning.objective import STEP, Case, Derivatives, Objective, by_part, make_problem
+from strapdown.tuning.innovations import Likelihood, construct, with_engine
+from strapdown.tuning.objective import STEP, Case, Derivatives, Objective, make_problem
 
 Measure = Literal["likelihood", "rmse"]
 MAX_EPOCHS = 1000
@@ -86,7 +85,10 @@ class ErrorObjective(Objective):
 
     def _by_part(self, value: Array, score: Array, information: Array) -> Derivatives:
         place = np.arange(len(value)) * self.parts // len(value)
-        return by_part(value, score, information, place, self.parts)
+        sums = np.zeros((self.parts, score.shape[1]))
+        np.add.at(sums, place, score)
+        summed = np.bincount(place, value, self.parts).astype(np.float64)
+        return Derivatives(value=summed, score=sums, information=information)
 
 
 def error_objective(
@@ -105,8 +107,7 @@ def error_objective(
     one_of("measure", measure, ("likelihood", "rmse"))
     applied = replace(chosen, gate=None, robust=None) if measure == "rmse" else chosen
     problem = make_problem(cases, applied, free, threads=threads)
-    plain = applied.gate is None and applied.robust is None and len(problem.names) <= MAX_DERIVATIVES
-    base = with_engine(problem, lanes=plain)
+    base = with_engine(problem)
     references = tuple(_spread(base, number, measure) for number in range(len(base.cases)))
     objective = construct(ErrorObjective, problem, base=base, measure=measure, references=references)
     return replace(objective, chosen=replace(problem.chosen, gate=chosen.gate, robust=chosen.robust))

@@ -1,45 +1,51 @@
 """The likelihood of filter parameters from the filter's own innovations, with its score and information.
 
 The innovations e of a filter are independent with variances s, so the likelihood of a record is ``Π N(e; 0, s)`` (prediction-error
-decomposition; Schweppe 1965, Harvey 1989 section 3.4). A filter of attitude and bias runs at eight points at once, with derivatives in the
-same pass (:class:`LaneLikelihood`). A filter with error states, or with noise that differs by axis, runs once more for each parameter,
-changed by :data:`STEP` (:class:`RunLikelihood`); standard errors are from the observed curvature at the maximum, by central differences of
-the score. The σ of a constant error state is estimated from one draw per state and record: for a scale factor on three axes, one record
-determines it within a factor of 1.5 at best.
+decomposition; Schweppe 1965, Harvey 1989 section 3.4). The filter runs at eight points at once, with derivatives in the same pass. With
+error states, standard errors are from the observed curvature at the maximum, by central differences of the score. The σ of a constant error
+state is estimated from one draw per state and record: for a scale factor on three axes, one record determines it within a factor of 1.5 at
+best.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, NamedTuple, TypeVar
+from types import ModuleType
+from typing import Any, TypeVar
 
 import numpy as np
 
 from strapdown.checks import Array
-from strapdown.estimation import setup
-from strapdown.estimation.schedule import Schedule, schedule, selected
+from strapdown.estimation import forward, setup, temperature
+from strapdown.estimation import model as modelling
+from strapdown.estimation.error_states import ErrorStates
+from strapdown.estimation.forward import Problem
+from strapdown.estimation.model import Model
+from strapdown.estimation.schedule import Schedule
 from strapdown.estimation.setup import FilterSetup
+from strapdown.estimation.setup.running import state_of_whole_bias
 from strapdown.estimation.setup.states import States
-from strapdown.estimation.states import covariance_matrices, pack
+from strapdown.estimation.states import State
+from strapdown.kernels import filter, likelihood_outliers, machine, structure
 from strapdown.kernels import likelihood as kernel
-from strapdown.kernels import likelihood_outliers
 from strapdown.kernels.lane_values import WIDTH
 from strapdown.kernels.machine import compiled, read_only
 from strapdown.kernels.walk import walk
-from strapdown.records import Estimate, ImuRecord, Innovations
+from strapdown.records import ImuRecord
 from strapdown.tuning.objective import (
+    OUTLIERS,
+    REACH,
     STEP,
     Case,
     Derivatives,
     Objective,
-    by_part,
     joined,
     make_problem,
     outliers_at,
 )
-from strapdown.tuning.parameters import ARW, INITIAL_ATTITUDE, INITIAL_BIAS, RRW, SCALE, SIGMA, axis_of
+from strapdown.tuning.parameters import ARW, AXES, RRW, SCALE, SIGMA, axis_of
 
 MAX_DERIVATIVES = WIDTH - 1
 """Maximum number of derivatives in one pass over a record."""
@@ -51,17 +57,28 @@ CURVATURE_STEP = 0.02
 class Prepared:
     """A record in the form of the kernel."""
 
-    time: Array
-    increments: Array
-    events: Schedule
-    state: Array
+    case: Case
+    steps: ImuRecord
+    """The record at the rate of the filter's steps, with its own σ."""
+    problem: Problem
+    """The same with the σ of the starting point, and the filter there."""
+    filter: tuple[Model, State]
+    """Model of the error states, whose structure is the same at every point, and initial state with them, at the starting point."""
+    kernels: ModuleType
     cuts: Array
     used: np.ndarray
     """Which parts are used (parts,), bool."""
+    lengths: Array
+    turning: Array
+    """Divisors of the effects of error states on the measurements, and rates and angular accelerations there, for the kernel."""
+    warming: Array
+    """Change of temperature at the edges since the start (n + 1,), K; (0,) without slopes of the gyro's bias."""
+    driven: np.ndarray
+    """Places in the model's numbers of that change."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class LaneLikelihood(Objective):
+class Likelihood(Objective):
     """Minus the log likelihood of the innovations, for eight points at once; with outliers if their parameters are among the names."""
 
     prepared: tuple[Prepared, ...] = field(repr=False)
@@ -103,46 +120,150 @@ class LaneLikelihood(Objective):
             information=(lower + np.tril(lower, -1).transpose(0, 2, 1))[case.used].sum(axis=0),
         )
 
-    def estimates(self, number: int, points: Array, epochs: np.ndarray) -> tuple[Array, Array, Array]:
-        """Return q_fb (m, k, 4), bias (m, k, 3) and P (m, k, 6, 6) on record ``number`` at edges (m,), at up to eight points (k, p)."""
-        found = self._pass(self.prepared[number], points, epochs=epochs)["states"][:, :, : len(points)]
-        states = np.moveaxis(found, 1, 2)
-        return states[..., :4], states[..., 4:7], covariance_matrices(states[..., 7:])
+    @property
+    def curvature(self) -> Callable[[Array], Array] | None:
+        """The observed information at a point, with error states, of which one record has few draws."""
+        return None if self.chosen.states is None else self._curvature
+
+    def _curvature(self, point: Array) -> Array:
+        """Return the second derivatives of minus the log likelihood at a point (p, p)."""
+        steps = CURVATURE_STEP * np.eye(len(point))
+        ends = [[self.derivatives(point + sign * step).score.sum(axis=0) for sign in (1.0, -1.0)] for step in steps]
+        rows = np.array([(ahead - back) / (2.0 * CURVATURE_STEP) for ahead, back in ends])
+        return np.asarray(0.5 * (rows + rows.T))
 
     def judged(self, point: Array) -> list[tuple[str, Array]]:
         """Return of each record and sensor the probability that a measurement is an outlier, and the share of its own noise (m, 2)."""
         found = []
         for case in self.prepared:
             rows = self._pass(case, point[None], judged=True)["probability"]
-            used = case.used[np.searchsorted(case.cuts, case.events.time, side="left")]
-            found += [(name, rows[used & (case.events.sensor == k)]) for k, name in enumerate(case.events.sensors)]
+            events = case.problem.events
+            used = case.used[np.searchsorted(case.cuts, events.time, side="left")]
+            found += [(name, rows[used & (events.sensor == k)]) for k, name in enumerate(events.sensors)]
         return found
 
-    def lanes(self, case: Prepared, points: Array) -> dict[str, Array]:
-        """Return the parameters of up to eight points (k, p) for the kernel, flat: gyro noise, factors on variances, state, outliers."""
+    def estimates(self, number: int, points: Array, epochs: np.ndarray) -> tuple[Array, Array, Array]:
+        """Return q_fb (m, k, 4), whole bias (m, k, 3) and P (m, k, 6, 6) on record ``number`` at edges (m,), at points (k, p).
+
+        If the setup has a gate or robust weights, they are applied.
+        """
+        case = self.prepared[number]
+        if self.chosen.gate is None and self.chosen.robust is None:
+            jobs = [(case, points[first : first + WIDTH], epochs) for first in range(0, len(points), WIDTH)]
+            parts = self.each(self._estimates, jobs)
+        else:
+            parts = self.each(self._gated, [(case, point, epochs) for point in points])
+        attitude, bias, P = (np.concatenate(one, axis=1) for one in zip(*parts, strict=True))
+        return attitude, bias, P
+
+    def _estimates(self, case: Prepared, points: Array, epochs: np.ndarray) -> tuple[Array, Array, Array]:
+        found = self._pass(case, points, epochs=epochs)
+        m, k = len(epochs), len(points)
+        x, triangle = (np.moveaxis(found[name].reshape(m, -1, WIDTH), 1, 2)[:, :k] for name in ("x", "P"))
+        n = x.shape[2] - 1
+        P = np.empty((m, k, n, n))
+        a, b = np.triu_indices(n)
+        P[..., a, b] = P[..., b, a] = triangle
+        setups = [self.setup(point) for point in points]
+        model = case.filter[0]
+        whole = np.tile(np.eye(6, n), (m, 1, 1, 1))
+        whole[..., 3:, 6:] = model.offsets.T
+        if len(case.warming):
+            slopes = _slopes(case.problem.error_states)
+            whole[..., 3:, 6 + slopes.start : 6 + slopes.stop] *= case.warming[epochs, None, None, None]
+        bias = (whole[..., 3:, 3:] @ x[..., 4:, None])[..., 0]
+        fast = np.array([0.0 if one.states is None else one.states.gyro_fast_bias_sigma for one in setups])
+        at_start = np.where((epochs == 0) & (len(case.case.initial.values) == 0), -1.0, 1.0)
+        added = (at_start[:, None] * fast**2)[..., None, None] * np.diag([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])
+        return x[..., :4], bias, whole @ P @ np.swapaxes(whole, -1, -2) + added
+
+    def _gated(self, case: Prepared, point: Array, epochs: np.ndarray) -> tuple[Array, Array, Array]:
+        chosen = self.setup(point)
+        every = max(1, int(np.gcd.reduce(epochs)))  # fewer rows, with the steps between them taken together
+        record, initial = self.modelled(case.steps, chosen), self.initial(case.case, chosen)
+        options: dict[str, Any] = {"motion": case.problem.motion, "every": every, "full_covariance": True}
+        found = setup.run_modelled(record, chosen, initial, **options)
+        rows = epochs // every
+        assert found.covariance is not None
+        return found.attitude[rows, None], found.bias[rows, None], found.covariance[rows, None]
+
+    # ------------------------------------------------------------------------------------------------------- lanes
+
+    def _filters(self, case: Prepared, points: Array) -> list[tuple[Model, State]]:
+        """Return model and initial state of the filter of each point; gyro noise, σ of sensors and outliers leave them as they are."""
+        others = [
+            j
+            for j, name in enumerate(self.names)
+            if not (name in (ARW, RRW, *OUTLIERS) or name.endswith(SIGMA) or axis_of(name))
+        ]
+        if not others:
+            return [case.filter] * len(points)
+        _, first, place = np.unique(points[:, others], axis=0, return_index=True, return_inverse=True)
+        # Zero, −∞, would be no state.
+        setups = [self.setup(np.maximum(points[k], self.start - 2.0 * REACH)) for k in first]
+        filters = [_filter(self, case.case, case.problem.events, chosen) for chosen in setups]
+        return [filters[k] for k in place.ravel()]
+
+    def _factors(self, case: Prepared, lane: dict[str, Array]) -> Array:
+        """Return the factors on σ about each axis of each sensor (sensors, 3, WIDTH)."""
+        base = dict(zip(self.names, np.exp(self.start), strict=True))
+        sensors = case.problem.events.sensors
+        factors = np.empty((len(sensors), 3, WIDTH))
+        factors[:] = lane.get(SCALE, 1.0)
+        for factor, sensor in zip(factors, sensors, strict=True):
+            for i, suffix in enumerate((*AXES, SIGMA)):
+                if sensor + suffix in lane:
+                    factor[i if i < 3 else ...] = lane[sensor + suffix] / base[sensor + suffix]
+        return factors
+
+    def _body(self, case: Prepared, points: Array) -> kernel.Body:
+        """Return the filters of up to eight points (k, p); those of the first fill the lanes that remain."""
         rows = np.concatenate([points, np.repeat(points[:1], WIDTH - len(points), axis=0)])
         lane = {name: np.exp(rows[:, j]) for j, name in enumerate(self.names)}
-        base = dict(zip(self.names, np.exp(self.start), strict=True))
-        noise = self.chosen.process_noise
-        all_of = lane.get(SCALE, np.ones(WIDTH))
-
-        def factor(name: str) -> Array:
-            return np.asarray(lane[name] / base[name]) if name in lane else all_of
-
-        white = lane.get(ARW, np.full(WIDTH, noise.angle_random_walk) * all_of) ** 2
-        walk = lane.get(RRW, np.full(WIDTH, noise.rate_random_walk) * all_of) ** 2
-        factors = np.array([factor(f"{sensor}{SIGMA}") ** 2 for sensor in case.events.sensors])
-        state = np.repeat(case.state[:, None], WIDTH, axis=1)
-        angle, bias = factor(INITIAL_ATTITUDE), factor(INITIAL_BIAS)
-        state[7:13] *= angle**2
-        state[13:22] *= angle * bias
-        state[22:] *= bias**2
-        return {
-            "noise": np.concatenate([white, walk]),
-            "factors": factors.ravel(),
-            "state": state.ravel(),
-            "outliers": np.concatenate(outliers_at(rows)) if self.mixed else np.empty(0),
-        }
+        noise, ones = self.chosen.process_noise, lane.get(SCALE, np.ones(WIDTH))
+        models, states = zip(*self._filters(case, rows), strict=True)
+        model, kernels, upper = models[0], case.kernels, np.triu_indices(case.kernels.N)
+        decay, chains = np.stack([one.decay for one in models]), np.stack([one.chains for one in models])
+        rates = [(a.tobytes(), b.tobytes()) for a, b in zip(decay, chains, strict=True)]
+        x, P = np.zeros((2, (kernels.N + 1) * WIDTH)), np.zeros((2, kernels.SIZE_OF_P))
+        x[0] = _in_lanes([np.concatenate([one.attitude, one.bias, one.values]) for one in states])
+        P[0] = _in_lanes([one.covariance[upper] for one in states])
+        return kernel.Body(
+            filters=structure.Body(
+                model=structure.Model(
+                    angle_variance=lane.get(ARW, ones * noise.angle_random_walk) ** 2,
+                    rate_variance=lane.get(RRW, ones * noise.rate_random_walk) ** 2,
+                    numbers=_in_lanes([one.numbers for one in models]),
+                    decay=_in_lanes(list(decay)),
+                    chains=_in_lanes(list(chains)),
+                    last=model.last,
+                    limit=min(one.limit for one in models),
+                    force_f=tuple(model.force_f.tolist()),
+                ),
+                x=x,
+                P=P,
+                coefficients=np.zeros(kernels.SET * max(len(model.last), 1) * WIDTH),
+                dt=np.zeros(1),
+                work=np.zeros(kernels.LINES * kernels.LINE * WIDTH),
+                shape=model.shape,
+                length=case.lengths,
+                turning=case.turning,
+                offsets=model.offsets,
+                factors=self._factors(case, lane).ravel(),
+            ),
+            decay=decay,
+            chains=chains,
+            same=np.array([rates.index(one) for one in rates]),
+            coefficients=np.zeros(kernels.SET * max(len(model.last), 1)),
+            driven=case.driven,
+            temperature=0.5 * (case.warming[1:] + case.warming[:-1]),
+            outliers=np.concatenate(outliers_at(rows)) if self.mixed else np.empty(0),
+            cuts=read_only(case.cuts),
+            epochs=np.empty(0, np.int64),
+            free=0,
+            step=STEP,
+            room=np.empty(kernel.ROOM),
+        )
 
     def _pass(
         self,
@@ -154,29 +275,31 @@ class LaneLikelihood(Objective):
         judged: bool = False,
     ) -> dict[str, Array]:
         """Run up to eight points over one record; return the outputs by names of :class:`strapdown.kernels.likelihood.Outputs`."""
+        body = self._body(case, points)
         kept = np.empty(0, np.int64) if epochs is None else np.ascontiguousarray(epochs, np.int64)
-        parts = len(case.cuts) + 1
+        parts, events = len(case.cuts) + 1, case.problem.events
         room = {
             "minus_log": np.zeros((parts, WIDTH)),
             "score": np.zeros((parts, free)),
             "information": np.zeros((parts, free, free)),
-            "states": np.empty((len(kept), 28, WIDTH)),
-            "probability": np.empty((len(case.events.time) if judged else 0, 2)),
+            "x": np.empty((len(kept), body.filters.x.shape[1])),
+            "P": np.empty((len(kept), body.filters.P.shape[1])),
+            "probability": np.empty((len(events.time) if judged else 0, 2)),
         }
-        body = kernel.Body(
-            **self.lanes(case, points),
-            cuts=read_only(case.cuts),
-            epochs=kept,
-            free=free,
-            step=STEP,
-            room=np.empty(kernel.ROOM),
-        )
-        flat = ("minus_log", "states")
-        out = kernel.Outputs(**{name: value.reshape(-1) if name in flat else value for name, value in room.items()})
-        bodies = (likelihood_outliers, kernel) if self.mixed else (kernel,)
-        run = compiled(walk, *bodies)
-        run(read_only(case.time), read_only(case.increments), case.events.measurements, 1, body, out)
+        out = kernel.Outputs(**room | {"minus_log": room["minus_log"].reshape(-1)})
+        bodies = (likelihood_outliers, kernel, case.kernels) if self.mixed else (kernel, case.kernels)
+        compiled(walk, *bodies)(*case.problem.gyro, events.measurements, 1, body._replace(free=free, epochs=kept), out)
         return room
+
+
+def _slopes(blocks: Sequence[ErrorStates]) -> slice:
+    """Return the places of the slopes of the gyro's bias over temperature among the error states; empty if there are none."""
+    return temperature.slopes(blocks) or slice(0, 0)
+
+
+def _in_lanes(columns: Sequence[Array]) -> Array:
+    """Return an array of each lane as one flat array, whose last axis is that of the lanes."""
+    return np.stack(columns, axis=-1).reshape(-1)
 
 
 def _pairs_of_groups(p: int) -> list[tuple[int, ...]]:
@@ -185,99 +308,6 @@ def _pairs_of_groups(p: int) -> list[tuple[int, ...]]:
     return [(*a, *b) for a, b in itertools.combinations(groups, 2)]
 
 
-class Steps(NamedTuple):
-    """What the runs over a record have in common at all points."""
-
-    case: Case
-    record: ImuRecord
-    """The record at the rate of the filter's steps, with its own σ."""
-    motion: tuple[Array, Array] | None
-    """Rate and angular acceleration at the measurements used, for a lever arm."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class RunLikelihood(Objective):
-    """The same for a filter with error states, or with noise that differs by axis: one run per point."""
-
-    steps: tuple[Steps, ...] = field(repr=False)
-
-    def minus_log(self, points: Array) -> Array:
-        """Return minus the log likelihood, without its constant, at several points (k, p): (k,)."""
-        runs = self._runs(np.atleast_2d(points))
-        return np.array([sum(float(np.sum(value)) for value, *_ in found) for found in runs])
-
-    def derivatives(self, point: Array) -> Derivatives:
-        """Return the likelihood and its derivatives at a point: p + 1 runs over each record."""
-        runs = self._runs(np.concatenate([point[None], point + STEP * np.eye(len(point))]))
-        return joined([self._differences(*one) for one in zip(*runs, strict=True)])
-
-    def _differences(self, *runs: tuple[Array, ...]) -> Derivatives:
-        value, part, e, s = runs[0]
-        if self.mixed:
-            score = np.stack([(one[0] - value) / STEP for one in runs[1:]], axis=1)
-            return by_part(value, score, score.T @ score, part, self.parts)
-        de, ds = (np.stack([(one[k] - runs[0][k]) / STEP for one in runs[1:]], axis=1) for k in (2, 3))
-        score = e[:, None] * de / s[:, None] + 0.5 * ds * ((1.0 - e * e / s) / s)[:, None]
-        information = (de / s[:, None]).T @ de + 0.5 * (ds / s[:, None] ** 2).T @ ds
-        return by_part(value, score, information, part, self.parts)
-
-    def curvature(self, point: Array) -> Array:  # type: ignore[override]
-        """Return the observed information at a point (p, p): the second derivatives of minus the log likelihood."""
-        steps = CURVATURE_STEP * np.eye(len(point))
-        ends = [[self.derivatives(point + sign * step).score.sum(axis=0) for sign in (1.0, -1.0)] for step in steps]
-        rows = np.array([(ahead - back) / (2.0 * CURVATURE_STEP) for ahead, back in ends])
-        return np.asarray(0.5 * (rows + rows.T))
-
-    def judged(self, point: Array) -> list[tuple[str, Array]]:
-        """Return of each record and sensor the probability that a measurement is an outlier, and the share of its own noise (m, 2)."""
-        found = [self._innovations(point, one) for one in self.steps]
-        return [(name, np.asarray(one.weight)[:, 1:]) for by_sensor in found for name, one in by_sensor.items()]
-
-    def _runs(self, points: Array) -> list[list[tuple[Array, ...]]]:
-        """Return the value of each term, its part, and innovations with variances, for each point and record."""
-        found = self.each(self._run, [(point, one) for point in points for one in self.steps])
-        return [found[k : k + len(self.cases)] for k in range(0, len(found), len(self.cases))]
-
-    def _run(self, point: Array, steps: Steps) -> tuple[Array, ...]:
-        first, last = steps.case.span
-        found = []
-        for one in self._innovations(point, steps).values():
-            place = ((one.time - first) / (last - first) * self.parts).astype(np.int64)
-            e, s = one.innovation.ravel(), one.variance.ravel()
-            value = 0.5 * (np.log(s) + e * e / s) if one.weight is None else one.weight[:, 0]
-            places = np.repeat(np.minimum(place, self.parts - 1), len(value) // max(len(place), 1))
-            found.append((value, places, e, s))
-        return tuple(np.concatenate(column) for column in zip(*found, strict=True))
-
-    def _innovations(self, point: Array, steps: Steps) -> dict[str, Innovations]:
-        """Return the innovations of a record that are used, by sensor."""
-        chosen = self.setup(point)
-        # The filter with error states, also without any, has the innovations of measurements whose noise differs by axis.
-        used = replace(chosen, states=States() if chosen.states is None else chosen.states)
-        # Only the first and the last state are stored.
-        every = len(steps.record.increments)
-        mixture: Any = tuple(map(float, outliers_at(point))) if self.mixed else None
-        estimate = self._estimate(used, steps, every=every, gate=None, robust=None, outliers=mixture)
-        first, last = steps.case.span
-        found = estimate.innovations.items()
-        return {name: selected(one, (one.time >= first) & (one.time <= last)) for name, one in found}
-
-    def estimates(self, number: int, points: Array, epochs: np.ndarray) -> tuple[Array, Array, Array]:
-        """Return q_fb (m, k, 4), bias (m, k, 3) and P (m, k, 6, 6) on record ``number`` at edges (m,), at points (k, p)."""
-        every = max(1, int(np.gcd.reduce(epochs)))  # fewer rows, with the steps between them taken together
-        options = {"every": every, "full_covariance": True}
-        found = [self._estimate(self.setup(point), self.steps[number], **options) for point in points]
-        kept = epochs // every
-        rows = [(one.attitude[kept], one.bias[kept], one.covariance[kept]) for one in found]  # type: ignore[index]
-        attitude, bias, P = (np.stack(parts, axis=1) for parts in zip(*rows, strict=True))
-        return attitude, bias, P
-
-    def _estimate(self, chosen: FilterSetup, steps: Steps, **options: Any) -> Estimate:
-        record, initial = self.modelled(steps.record, chosen), self.initial(steps.case, chosen)
-        return setup.run_modelled(record, chosen, initial, motion=steps.motion, **options)
-
-
-Likelihood = LaneLikelihood | RunLikelihood
 Made = TypeVar("Made", bound=Objective)
 
 
@@ -323,32 +353,43 @@ def likelihood(
     return with_engine(make_problem(cases, chosen, free, spacing=spacing, parts=parts, threads=threads))
 
 
-def with_engine(problem: Objective, *, lanes: bool = True) -> Likelihood:
-    """Return the likelihood of a problem, for eight points at once if the filter and ``lanes`` allow it."""
-    steps = [setup.at_steps(case.record, problem.chosen) for case in problem.cases]
-    records = [problem.modelled(record, problem.chosen) for record in steps]
-    by_axis = any(axis_of(name) for name in problem.names) or any(
-        one.anisotropic for record in records for one in record.vectors
-    )
-    if by_axis or problem.chosen.states is not None or not lanes:
-        motions = [setup.measured_motion(record, problem.chosen) for record in records]
-        return construct(RunLikelihood, problem, steps=tuple(map(Steps, problem.cases, steps, motions)))
-    prepared = [_prepared(problem, *one) for one in zip(problem.cases, records, strict=True)]
-    return construct(LaneLikelihood, problem, prepared=tuple(prepared))
+def with_engine(problem: Objective) -> Likelihood:
+    """Return the likelihood of a problem."""
+    return construct(Likelihood, problem, prepared=tuple(_prepared(problem, case) for case in problem.cases))
 
 
-def _prepared(problem: Objective, case: Case, record: ImuRecord) -> Prepared:
+def _filter(problem: Objective, case: Case, events: Schedule, chosen: FilterSetup) -> tuple[Model, State]:
+    """Return the model of the error states of a setup, and the initial state with them."""
+    states, kinds = chosen.states or States(), dict(zip(events.sensors, events.kinds, strict=True))
+    blocks = states.blocks(kinds)
+    start = state_of_whole_bias(problem.initial(case, chosen), blocks, states.gyro_fast_bias_sigma)
+    model = modelling.assemble(blocks, kinds, isotropic=events.noise_by_axis is None, generic=True)
+    return model, modelling.begin(start, blocks)
+
+
+def _prepared(problem: Objective, case: Case) -> Prepared:
+    steps = setup.at_steps(case.record, problem.chosen)
+    record = problem.modelled(steps, problem.chosen)
+    motion = setup.measured_motion(record, problem.chosen)
+    found = replace(setup.prepared(record, problem.chosen, problem.initial(case, problem.chosen)), motion=motion)
+    model, state = _filter(problem, case, found.events, problem.chosen)
     start, end = float(record.time[0]), float(record.time[-1])
     first, last = max(case.first, start), min(case.last, end)
     inner = list(np.linspace(first, last, problem.parts + 1)[1:-1])
     before = [np.nextafter(case.first, -np.inf)] if case.first > start else []
     after = [case.last] if case.last < end else []
-    initial = problem.initial(case, problem.chosen)
+    slopes = _slopes(found.error_states)
+    hot = range(6 + slopes.start, 6 + slopes.stop)
     return Prepared(
-        time=record.time,
-        increments=np.ascontiguousarray(record.increments),
-        events=schedule(record.vectors, start, end),
-        state=pack(initial.attitude, initial.bias, initial.covariance),
+        case=case,
+        steps=steps,
+        problem=found,
+        filter=(model, state),
+        kernels=machine.instance(filter, STRUCTURE=model.structure, LANES=WIDTH, PARAMETERS=True),
         cuts=np.array([*before, *inner, *after]),
         used=np.array([False] * len(before) + [True] * problem.parts + [False] * len(after)),
+        lengths=forward.lengths(record, found.events, found.model, forward.unit_sigmas(record, found.model, {})),
+        turning=forward.turns(found),
+        warming=temperature.of(record) - temperature.of(record)[0] if hot else np.empty(0),
+        driven=np.array([g.offset[g.state - hot[0]][0] for g in model.structure.gyro if g.state in hot], np.int64),
     )

@@ -116,14 +116,6 @@ def joined(found: Sequence[Derivatives]) -> Derivatives:
     )
 
 
-def by_part(value: Array, score: Array, information: Array, place: np.ndarray, parts: int) -> Derivatives:
-    """Return derivatives from the value (m,), gradient (m, p) and part ``place`` (m,) of each term."""
-    sums = np.zeros((parts, score.shape[1]))
-    np.add.at(sums, place, score)
-    summed = np.bincount(place, value, parts).astype(np.float64)
-    return Derivatives(value=summed, score=sums, information=information)
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Objective:
     """Objective to minimise: minus a log likelihood, or a substitute; a subclass defines its value on the records.
@@ -146,8 +138,11 @@ class Objective:
     """Called after each evaluation of a search."""
     composite: ClassVar[bool] = False
     """Whether its curvature is not an information matrix, so standard errors are from the scatter of its gradient."""
-    curvature: ClassVar[Callable[[Any, Array], Array] | None] = None
-    """Second derivatives at a point (p, p), if the information of the search is not accurate enough for standard errors."""
+
+    @property
+    def curvature(self) -> Callable[[Array], Array] | None:
+        """Second derivatives at a point (p, p), if the information of the search is not accurate enough for standard errors."""
+        return None
 
     @property
     def mixed(self) -> bool:
@@ -181,7 +176,7 @@ class Objective:
 
     def _bounded(self, name: str, value: float) -> float:
         """Return the value of a parameter of error states, limited to its range."""
-        if name in ("gyro.scale_sigma", "gyro.misalignment_sigma"):
+        if name in ("gyro.scale_sigma", "gyro.misalignment_sigma") or name.endswith(".mounting_sigma"):
             return min(value, LARGEST_SCALE)
         if not name.endswith("_time"):
             return value

@@ -73,11 +73,13 @@ GYRO_STATES = {
     "gyro.misalignment_sigma": (("states", "gyro_misalignment_sigma"), Unit(name="mrad", factor=1e-3)),
     "gyro.force_sigma": (("states", "gyro_force_sigma"), _PER_G),
     "gyro.cross_force_sigma": (("states", "gyro_cross_force_sigma"), _PER_G),
+    "gyro.temperature_sigma": (("states", "gyro_temperature_sigma"), Unit(name="°/h/K", factor=units.DEGREE_PER_HOUR)),
     "gyro.drift_sigma": (("states", "gyro_drift_sigma"), _PER_HOUR),
     "gyro.drift_time": (("states", "gyro_drift_time"), _SECOND),
 }
 """Parameters of the gyro's optional states."""
 SENSOR_STATES = {
+    "mounting_sigma": ("mounting_sigma", Unit(name="mrad", factor=1e-3)),
     "bias_sigma": ("bias_sigma", _OF_SENSOR),
     "correlated_sigma": ("correlated_sigma", _OF_SENSOR),
     "correlation_time": ("correlation_time", _SECOND),

@@ -12,7 +12,7 @@ from strapdown.checks import InputError
 from strapdown.estimation.setup import FilterSetup
 from strapdown.tuning.errors import error_objective
 from strapdown.tuning.fitting import Tuning, fit, rescaled
-from strapdown.tuning.innovations import LaneLikelihood, Likelihood, likelihood
+from strapdown.tuning.innovations import Likelihood, likelihood
 from strapdown.tuning.objective import OUTLIERS, Case, Objective
 from strapdown.tuning.outliers import TunedGate, contaminated_likelihood, log_likelihood, tuned_gate
 from strapdown.tuning.parameters import Prior, default_names
@@ -67,7 +67,7 @@ def objective_for(
         else likelihood(cases, setup, names, spacing=spacing, threads=threads)
     )
     # If eight points run at once, the threads run searches, otherwise records and points.
-    return dataclasses.replace(made, threads=1) if isinstance(made, LaneLikelihood) else made
+    return dataclasses.replace(made, threads=1) if isinstance(made, Likelihood) else made
 
 
 def tune(
@@ -123,7 +123,7 @@ def tune(
         starts=starts,
         factor=factor,
         seed=seed,
-        threads=threads if isinstance(made, LaneLikelihood) or (made.composite and len(cases) == 1) else 1,
+        threads=threads if isinstance(made, Likelihood) or (made.composite and len(cases) == 1) else 1,
         progress=progress,
     )
     if objective.get("rmse"):
