@@ -33,6 +33,7 @@ LONGEST_SQUARED = 1e24
 UNIT = 2e-6
 """A direction whose squared length differs from 1 by less than this is used as it is, as in :class:`strapdown.estimation.LiveFilter`."""
 
+NOT_STARTED = {"NOT_STARTED": ("16", "Waits for a sample with a specific force and, with a magnetometer, a field.")}
 STATUS = {
     "OK": ("0", "The sample was used."),
     "BAD_INPUT": (
@@ -59,7 +60,7 @@ class Sensor:
     length: float
     """Length of the reference of a whole vector, else 1."""
     noise: tuple[float, ...]
-    """Variance, or covariance in body axes (6), over the squared length."""
+    """Variance, or covariance in body axes (6), over the squared length; empty: its root is an argument of the update."""
     variances: tuple[float, float, float]
     """Variances about the body axes of an attitude."""
     words: str
@@ -88,6 +89,13 @@ class Program:
     """Names of the error states, with their units."""
     offsets: tuple[tuple[float, ...], ...] = ()
     """Effect of each error state on the gyro as an offset, for the whole bias."""
+    recording: Any = None
+    """Of the filter of an IMU: :class:`strapdown.codegen.recording.Recording`."""
+
+    @property
+    def statuses(self) -> dict[str, tuple[str, str]]:
+        """Statuses: their bits, and what they mean."""
+        return STATUS if self.recording is None else STATUS | NOT_STARTED
 
     @property
     def kernels(self) -> ModuleType:
@@ -148,12 +156,28 @@ class Scratch:
             self.others[i] = value
 
 
+class Table(list[Any]):
+    """Rows that are read by two indices, as those of an array."""
+
+    def __getitem__(self, place: Any) -> Any:
+        return super().__getitem__(place[0])[place[1]] if isinstance(place, tuple) else super().__getitem__(place)
+
+
+def place(n: int, i: int, j: int) -> int:
+    """Return the place of P[i, j], i ≤ j, among the numbers of the upper triangle."""
+    return i * n - i * (i - 1) // 2 + j - i
+
+
 # ------------------------------------------------------------------------------------------------------------------------- prediction
 
 
 def predict(m: Any, program: Program, f: SimpleNamespace, gyro: Any, dt: Any) -> None:
     """Propagate over a gyro sample: mean rate over dt."""
-    delta = scale(dt, gyro)
+    propagate(m, program, f, scale(dt, gyro), dt)
+
+
+def propagate(m: Any, program: Program, f: SimpleNamespace, delta: Any, dt: Any) -> None:
+    """Propagate over a rotation vector."""
     turn = turn_squared(delta, dt, tuple(f.x[4 + i] for i in range(3)))
     limit = program.model.limit
     within = turn <= SQUARED_RANGE
@@ -190,11 +214,13 @@ def prepare(m: Any, program: Program, f: SimpleNamespace, dt: Any) -> None:
 # ----------------------------------------------------------------------------------------------------------------------------- update
 
 
-def update(m: Any, program: Program, f: SimpleNamespace, sensor: Sensor, index: int, value: Any) -> None:
+def update(
+    m: Any, program: Program, f: SimpleNamespace, sensor: Sensor, index: int, value: Any, sigma: Any = 0
+) -> None:
     """Update with a measurement of a sensor."""
     k, s = m.kernels, sensor.shape
     z, frame = measured_values(m, sensor, value)
-    measured = Measured(z, frame, sensor.noise, sensor.length, (0.0,) * 9)
+    measured = Measured(z, frame, sensor.noise or (sigma * sigma,), sensor.length, (0.0,) * 9)
     m.comment("innovations and gains")
     g = k.gains(s, f.x, f.P, None, measured, program.model.numbers, None, 0.0)
     m.unless(g.valid, lambda: m.leave("NO_HEADING"))
@@ -272,17 +298,20 @@ def initialize(m: Any, program: Program, f: SimpleNamespace, attitude: Any) -> N
     norm = m.root(squared)
     for i, x in enumerate(attitude):
         f.x[i] = m.select(usable, x / norm, 1.0 if i == 0 else 0.0)
+    clear(m, program, f)
+    m.unless(usable, lambda: m.leave("BAD_INPUT"))
+    m.leave("OK")
+
+
+def clear(m: Any, program: Program, f: SimpleNamespace) -> None:
+    """Set all but the attitude to the start."""
     for i in range(4, program.n + 1):
         f.x[i] = 0.0
-    place = 0
     for i in range(program.n):
         for j in range(i, program.n):
-            f.P[place] = program.covariance[i][j]
-            place += 1
+            f.P[place(program.n, i, j)] = program.covariance[i][j]
     for i in range(len(program.sensors)):
         f.nis[i] = 0.0
     if program.structure.chains:
         f.dt[0] = 0.0
     m.clear_status()
-    m.unless(usable, lambda: m.leave("BAD_INPUT"))
-    m.leave("OK")

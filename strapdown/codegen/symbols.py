@@ -13,6 +13,9 @@ from types import CodeType, FunctionType
 from typing import Any, NamedTuple
 
 KERNELS = "strapdown.kernels"
+PINNED = ("load", "at", "result", "parameter")
+"""Kinds of symbols that stay in the block in which they were made."""
+CONDITIONS = ("<", ">", "<=", ">=", "==", "&&", "||", "not")
 
 
 class Symbol:
@@ -24,6 +27,8 @@ class Symbol:
     def __init__(self, trace: Trace, kind: str, operands: tuple[Any, ...], number: int, run: int) -> None:
         self.trace, self.kind, self.operands, self.number, self.run = trace, kind, operands, number, run
         self.place = trace.place
+        self.type = type_of(kind, operands)
+        """``"int"``, ``"wide"`` (of times, which are double in single precision too), or ``""``."""
 
     def __bool__(self) -> bool:
         raise TypeError(
@@ -48,6 +53,9 @@ class Symbol:
     def __rmul__(self, other: Any) -> Any:
         return self.trace.product(other, self)
 
+    def __pow__(self, other: int) -> Any:
+        return self * self if other == 2 else NotImplemented
+
     def __truediv__(self, other: Any) -> Any:
         return self.trace.symbol("/", self, other)
 
@@ -56,6 +64,15 @@ class Symbol:
 
     def __neg__(self) -> Any:
         return self.trace.symbol("neg", self)
+
+    def __abs__(self) -> Any:
+        return self.trace.symbol("fabs", self)
+
+    def __floordiv__(self, other: Any) -> Any:
+        return self.trace.symbol("//", self, other)
+
+    def __mod__(self, other: Any) -> Any:
+        return self.trace.symbol("%", self, other)
 
     def __lt__(self, other: Any) -> Any:
         return self.trace.symbol("<", self, other)
@@ -78,6 +95,24 @@ class Symbol:
         return self.trace.condition("||", self, other)
 
     __ror__ = __or__
+
+
+def type_of(kind: str, operands: tuple[Any, ...]) -> str:
+    """Return the type of an operation's result. The difference of two times as they are stored is a duration, of the usual type."""
+    symbols = [x for x in operands if isinstance(x, Symbol)]
+    if kind in CONDITIONS:
+        return "int"
+    if any(x.type == "wide" for x in symbols) and kind not in PINNED:
+        stored = len(symbols) == 2 and all(x.type == "wide" and x.kind in PINNED for x in symbols)
+        return "" if kind == "-" and stored else "wide"
+    if kind not in INTEGER:
+        return ""
+    whole = (x.type == "int" if isinstance(x, Symbol) else float(x).is_integer() for x in operands)
+    return "int" if all(whole) else ""
+
+
+INTEGER = ("+", "-", "*", "neg", "//", "%", "|")
+"""Operations whose result is an integer, if the operands are."""
 
 
 class UndecidedError(Exception):
@@ -193,8 +228,8 @@ class Values:
     ``name`` maps an index to the place on the target; None: the elements exist only while tracing.
     """
 
-    def __init__(self, trace: Trace, name: Callable[[int], str] | None = None) -> None:
-        self.trace, self.name = trace, name
+    def __init__(self, trace: Trace, name: Callable[[int], str] | None = None, kind: str = "") -> None:
+        self.trace, self.name, self.type = trace, name, kind
         self.known: dict[Any, Any] = {}
         self.changed: dict[Any, Any] = {}
         self.loaded: dict[Any, Any] = {}
@@ -209,6 +244,7 @@ class Values:
             if i not in self.loaded:
                 self.loads += 1
                 self.loaded[i] = self.trace.symbol("load", self.name(i), Version((id(self), self.loads)))
+                self.loaded[i].type = self.type
             self.known[i] = self.loaded[i]
         return self.known[i]
 

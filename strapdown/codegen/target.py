@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from types import SimpleNamespace
 from typing import Any
 
 from strapdown.codegen import program as body
-from strapdown.codegen.functions import Function, Statement
+from strapdown.codegen import recording
+from strapdown.codegen.functions import Function, Member, Statement
+from strapdown.codegen.interpreted import Interpreter
 from strapdown.codegen.program import Kernels, Program, Scratch
 from strapdown.codegen.symbols import Symbol, Values, rebound
 from strapdown.kernels.rotation import far_turn
@@ -20,10 +23,19 @@ class Target(Function):
     """A function of the filter while it is traced, as a machine for :mod:`strapdown.codegen.program`."""
 
     def __init__(
-        self, program: Program, name: str, parameters: Sequence[tuple[str, int]], *, returns: str, words: str
+        self,
+        program: Program,
+        name: str,
+        parameters: Sequence[tuple[str, Any]],
+        *,
+        returns: str,
+        words: str,
+        functions: dict[str, Any] | None = None,
     ) -> None:
         super().__init__(name, parameters, returns=returns)
-        self.words, self.n = words, program.n
+        self.words, self.n, self.program = words, program.n, program
+        self.functions: dict[str, Any] = {} if functions is None else functions
+        """Kernels that are functions of the target, and the number of their results."""
         trace = self.trace
         helpers = {
             "square_root": trace.square_root,
@@ -44,6 +56,24 @@ class Target(Function):
             coefficients=self.array(lambda i: f"f->coefficients[{i}]"),
             dt=self.array(lambda i: "f->step_dt"),
         )
+        self.kernel, self.spaces = Interpreter(self), {}
+        if program.recording is not None:
+            for a in program.recording.arrays:
+                setattr(self.state, a.name, Member(self, f"f->{a.name}", a.shape, a.kind))
+            self.spaces = {"memory": self.state, "constants": program.recording.constants}
+
+    def another(self, name: str, parameters: Sequence[tuple[str, Any]], words: str) -> Target:
+        """Return another function of the filter, not yet traced."""
+        return Target(self.program, name, parameters, returns="", words=words, functions=self.functions)
+
+    def table(self, name: str, shape: tuple[int, ...]) -> Member:
+        """Return a local array with rows."""
+        self.add(Statement("array", name, values=(math.prod(shape),)))
+        return Member(self, name, shape)
+
+    def lowest(self, x: Any) -> Any:
+        """Return x rounded down, however large."""
+        return self.trace.symbol("lowest", x)
 
     def _far_turn(self, phi: Any) -> tuple[Any, Any]:
         values = self.trace.symbol("tuple", "far_turn", 13, *phi)
@@ -121,22 +151,29 @@ class Eight(list[Any]):
     __rmul__ = __mul__
 
 
+UPDATE = (
+    "Take a sample. time: s, rising. gyro: rad/s, body axes. accelerometer: specific force, m/s^2, body axes; zero or null: missing. "
+    "magnetometer: field, any unit, body axes; zero or null: missing."
+)
+
+
 def traced(program: Program) -> list[Target]:
     """Return the functions of the filter, in an order in which each calls only those before it."""
 
     def function(
         name: str,
         words: str,
-        parameters: Sequence[tuple[str, int]],
+        parameters: Sequence[tuple[str, Any]],
         returns: str,
         formula: Callable[..., None],
         *more: Any,
     ) -> Target:
-        m = Target(program, name, parameters, returns=returns, words=words)
+        m = Target(program, name, parameters, returns=returns, words=words, functions=kernels)
         formula(m, program, m.state, *more, *(m.argument(parameter) for parameter, _ in parameters))
         m.flush()
         return m
 
+    kernels: dict[str, Any] = {}
     made = [turn_function(program)]
     if program.structure.chains:
         made.append(
@@ -150,6 +187,30 @@ def traced(program: Program) -> list[Target]:
         ),
         row_function(program),
         correction_function(program),
+    ]
+    vector = [("value", 3), ("sigma", 0)]
+    if program.recording is not None:
+        made.append(
+            function("propagate", "Propagate over a rotation.", [("delta", 3), ("dt", 0)], "status", body.propagate)
+        )
+        for index, sensor in enumerate(program.sensors):
+            name = f"update_{sensor.name}"
+            made.append(function(name, sensor.words, vector, "status", body.update, sensor, index))
+        last = []
+        if program.recording.rest is not None:
+            last.append(function("find_rest", "Measure the bias at rest.", [], "", recording.find_rest))
+            last.append(function("use_rest", "Correct the state by a rate at rest.", [], "", recording.use_rest))
+        last += [
+            function("carry", "Propagate the estimate to the last sample.", [], "", recording.carry),
+            function("end_step", "Filter a step: the mean of its samples.", [], "", recording.end_step),
+            function("init", "Wait for the first sample.", [], "status", recording.initialize),
+        ]
+        sample: list[tuple[str, Any]] = [("time", "wide"), ("gyro", 3), ("accelerometer", 3), ("magnetometer", 3)]
+        words = UPDATE if program.recording.magnetometer else UPDATE.partition(" magnetometer:")[0]
+        sample = sample[: 3 + program.recording.magnetometer]
+        last.append(function("update", words, sample, "status", recording.update))
+        return made + [target for target, _ in kernels.values()] + last
+    made += [
         function(
             "init",
             "Start at an attitude, with the sigma of the setup and zero bias.",
