@@ -40,6 +40,7 @@ class Member(Values):
     def __init__(self, function: Function, base: str, shape: tuple[int, ...], kind: str = "") -> None:
         super().__init__(function.trace, lambda i: f"{base}[{i}]", kind)
         self.function, self.base, self.shape = function, base, shape
+        function.changing.add(base)
 
     def __len__(self) -> int:
         return self.shape[0]
@@ -96,6 +97,8 @@ class Function:
         self.body = self.block = self.trace.place = Block()
         self.calls = 0
         self.names: dict[str, int] = {}
+        self.changing: set[str] = set()
+        """Arrays whose elements may change after they are read."""
 
     # ------------------------------------------------------------------------------------------------------------- arrays and parameters
 
@@ -134,7 +137,9 @@ class Function:
         size = len(values[0]) if isinstance(values[0], tuple) else 0
         kind = "" if size else self.type_of(*values)
         name = self.new_name(stem)
-        return Variable(self, name, size, kind), Statement("variable", name, values=(size, kind, changes))
+        if changes:
+            self.changing.add(name)
+        return Variable(self, name, size, kind), Statement("variable", name, values=(size, kind))
 
     # ------------------------------------------------------------------------------------------------------------------------ statements
 

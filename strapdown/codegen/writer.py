@@ -57,7 +57,6 @@ class Writer:
         self.names: dict[Symbol, str] = {}
         self.used: dict[str, int] = {}
         self.written: set[Symbol] = set()
-        self.changing: set[str] = set()
         self._block(function.body)
 
     def line(self, text: str) -> None:
@@ -99,9 +98,7 @@ class Writer:
         self.line(f"{self._member(statement.text)}[{self.text(index, 'int')}] = {self.text(value)};")
 
     def _variable(self, statement: Statement) -> None:
-        size, kind, changes = statement.values
-        if changes:
-            self.changing.add(statement.text)
+        size, kind = statement.values
         declared = self.language.variable[kind]
         self.line(self.language.array(statement.text, size) if size else f"{declared} {statement.text};")
 
@@ -199,7 +196,7 @@ class Writer:
 
     def _is_constant(self, place: str) -> bool:
         """Return whether a place is a parameter or a local array that nothing changes while its elements are used."""
-        return not place.startswith("f->") and place.partition("[")[0] not in self.changing
+        return not place.startswith("f->") and place.partition("[")[0] not in self.function.changing
 
     def _group(self, group: Group, slot: Slot) -> None:
         """Write selections with the same condition as one branch."""
