@@ -49,7 +49,7 @@ class Member(Values):
         if not isinstance(index, tuple):
             return index
         row, column = index
-        return self.trace.sum(self.trace.product(row, self.shape[1]), column)
+        return row * self.shape[1] + column
 
     def __getitem__(self, index: Any) -> Any:
         place = self._place(index)
