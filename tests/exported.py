@@ -122,13 +122,12 @@ class Plain:
         raise LeftError(status)
 
     def work(self):
-        k = self.kernels
-        self.step = [0.0] * self.program.n
-        return body.Scratch(self.step, k.LINE * k.STEP, self.program.n, {})
+        self.space = [0.0] * body.work_size(self.kernels)
+        return self.space
 
     def call(self, name, *arguments, result=None):
         self.called.add(name)
-        given = tuple(self.step if isinstance(argument, str) else argument for argument in arguments)
+        given = tuple(self.space if isinstance(argument, str) else argument for argument in arguments)
         sensor = [one for one in enumerate(self.program.sensors) if name == f"update_{one[1].name}"]
         if sensor:
             index, one = sensor[0]

@@ -167,7 +167,7 @@ class Function:
 
     def inside(self, block: Block, body: Callable[[], None]) -> None:
         """Trace a body into a block; what it knows of arrays is not known after it."""
-        before = [(*array.copied(), dict(array.loaded)) for array in self.trace.arrays]
+        before = [(dict(array.known), dict(array.changed), dict(array.loaded)) for array in self.trace.arrays]
         outer = self.block
         self.block = self.trace.place = block
         body()

@@ -275,18 +275,22 @@ class Interpreter:
         """Execute both outcomes; what differs between them is a variable afterwards."""
         m, ends = self.m, []
         parent = m.block
+        m.flush()
+        known = [(array.known, array.loaded) for array in self.trace.arrays]
 
-        def arm(body: Sequence[ast.stmt]) -> Callable[[], None]:
+        def arm(body: Sequence[ast.stmt], outcome: bool) -> Callable[[], None]:
             def execute() -> None:
                 here = dict(env)
                 before, self.outer = self.outer, False
+                self.trace.outcomes[condition] = outcome
                 result = self._statements(list(body), here)
+                del self.trace.outcomes[condition]
                 self.outer = before
                 ends.append(here | ({"": result[0]} if result else {}))
 
             return execute
 
-        m.branch(condition, *map(arm, bodies))
+        m.branch(condition, arm(bodies[0], True), arm(bodies[1], False))
         place = len(parent.statements) - 1
         blocks = parent.statements[place].blocks
         pure = not any(block.statements for block in blocks)
@@ -297,6 +301,8 @@ class Interpreter:
                 parent.statements.pop()
                 for x in created:
                     x.place = parent
+                for array, (elements, loaded) in zip(self.trace.arrays, known, strict=False):
+                    array.known, array.loaded = elements, loaded
         for name in sorted({*assigned(bodies[0]), *assigned(bodies[1]), ""}):
             values = [end[name] for end in ends if name in end]
             env.pop(name, None)

@@ -7,7 +7,7 @@ Every function here asks a *machine* ``m`` for what depends on it: branches, cal
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
@@ -135,25 +135,9 @@ def put_at(array: Any, i: int, value: Any) -> None:
     array[i] = value
 
 
-@dataclass(eq=False)
-class Scratch:
-    """Work space of one update: the correction is an array, the other lines are numbers of the machine."""
-
-    step: Any
-    first: int
-    size: int
-    others: Any = field(default_factory=dict)
-
-    def __getitem__(self, i: int) -> Any:
-        here = i - self.first
-        return self.step[here] if 0 <= here < self.size else self.others[i]
-
-    def __setitem__(self, i: int, value: Any) -> None:
-        here = i - self.first
-        if 0 <= here < self.size:
-            self.step[here] = value
-        else:
-            self.others[i] = value
+def work_size(k: Any) -> int:
+    """Return the number of values in the work space of an update."""
+    return int(k.LINE * (k.ROUNDING + 1))
 
 
 class Table(list[Any]):
@@ -241,14 +225,14 @@ def update(
 
     def precisely() -> None:
         m.comment("much more precise than the state: Joseph's form, row after row")
-        work = m.work()
-        k.store_rows(s, f.x, work, measured, program.model.numbers, False, 0.0)
+        work, rows = m.work(), m.scratch()
+        k.store_rows(s, f.x, rows, measured, program.model.numbers, False, 0.0)
         k.clear_step(work, 0.0)
         for i in range(ROWS_OF_KIND[sensor.kind]):
             line = k.LINE * (k.ROWS + i)
-            row = tuple(work[line + j] for j in range(program.n))
-            m.call("take_row", row, work[line + k.RESIDUAL], work[line + k.VARIANCE], "step")
-        m.call("apply_step", "step")
+            put_row(k, work, tuple(rows[line + j] for j in range(program.n)))
+            m.call("take_row", rows[line + k.RESIDUAL], rows[line + k.VARIANCE], "work")
+        m.call("apply_step", "work")
         m.leave("OK")
 
     m.branch(g.precise, precisely)
@@ -273,19 +257,21 @@ def measured_values(m: Any, sensor: Sensor, value: Any) -> tuple[Any, Any]:
     return tuple(m.select(as_it_is, x, x / norm) for x in value), sensor.frame
 
 
-def take_row(m: Any, program: Program, f: SimpleNamespace, row: Any, residual: Any, variance: Any, step: Any) -> None:
-    """Update covariance and correction with a row h, in Joseph's form."""
-    k = m.kernels
-    work = Scratch(step, k.LINE * k.STEP, program.n, m.scratch())
+def put_row(k: Any, work: Any, row: Any) -> None:
+    """Write a row h to the work space."""
     for j, h in enumerate(row):
         work[k.LINE * k.ROWS + j] = h
+
+
+def take_row(m: Any, program: Program, f: SimpleNamespace, residual: Any, variance: Any, work: Any) -> None:
+    """Update covariance and correction with the row in the work space, in Joseph's form."""
+    k = m.kernels
     k.take_row(f.P, work, k.ROWS, residual, variance, 0.0)
 
 
-def apply_step(m: Any, program: Program, f: SimpleNamespace, step: Any) -> None:
-    """Correct the state by a step, and transform the covariance to the new tangent space."""
-    k = m.kernels
-    k.apply_step(f.x, f.P, Scratch(step, k.LINE * k.STEP, program.n, m.scratch()), 0.0)
+def apply_step(m: Any, program: Program, f: SimpleNamespace, work: Any) -> None:
+    """Correct the state by the step in the work space, and transform the covariance to the new tangent space."""
+    m.kernels.apply_step(f.x, f.P, work, 0.0)
 
 
 # ------------------------------------------------------------------------------------------------------------------------------ start

@@ -366,13 +366,12 @@ def find_rest(m: Any, program: Any, f: SimpleNamespace) -> None:
 def use_rest(m: Any, program: Any, f: SimpleNamespace) -> None:
     """Correct the state by the last rate at rest: :func:`strapdown.ahrs.starting.with_rate_at_rest`."""
     k, n = m.kernels, program.n
-    step = m.work().step
-    for i in range(n):
-        step[i] = 0.0
+    work = m.work()
+    k.clear_step(work, 0.0)
     for i in range(3):
-        unit_row = tuple(1.0 if j == 3 + i else 0.0 for j in range(n))
-        m.call("take_row", unit_row, f.rest_rate[i] - f.x[4 + i], f.rest_variance[0], "step")
-    change = [step[i] for i in range(n)]
+        body.put_row(k, work, tuple(1.0 if j == 3 + i else 0.0 for j in range(n)))
+        m.call("take_row", f.rest_rate[i] - f.x[4 + i], f.rest_variance[0], "work")
+    change = [work[k.LINE * k.STEP + i] for i in range(n)]
     both = k.turned_by(tuple(f.x[i] for i in range(4)), tuple(change[:3]))
     q, J = m.kernel(unit, both[:4]), both[4:]
     for i in range(n + 1):

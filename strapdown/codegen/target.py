@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 from types import SimpleNamespace
@@ -11,12 +12,12 @@ from strapdown.codegen import program as body
 from strapdown.codegen import recording
 from strapdown.codegen.functions import Function, Member, Statement
 from strapdown.codegen.interpreted import Interpreter
-from strapdown.codegen.program import Kernels, Program, Scratch
+from strapdown.codegen.program import Kernels, Program, work_size
 from strapdown.codegen.symbols import Symbol, Values, rebound
 from strapdown.kernels.rotation import far_turn
 
-FORKED = ("turned_by", "take_row")
-"""Kernels with branches; each is traced for both outcomes."""
+BRANCHING = ("turned_by", "take_row")
+"""Kernels of the filter with branches and loops of the target."""
 
 
 class Target(Function):
@@ -40,23 +41,24 @@ class Target(Function):
         helpers = {
             "square_root": trace.square_root,
             "select": trace.select,
-            "any_lane": trace.any_lane,
+            "any_lane": lambda condition: condition,
             "far_turn": self._far_turn,
             "load": load,
             "broadcast": broadcast,
             "sum_lanes": sum_lanes,
             "math": SimpleNamespace(expm1=lambda x: trace.symbol("expm1", x), nan=float("nan"), pi=3.141592653589793),
         }
-        self.kernels = Kernels(program.kernels, helpers, dict.fromkeys(FORKED, trace.fork))
+        self.kernel, self.spaces = Interpreter(self), {}
+        wrapped = dict.fromkeys(BRANCHING, lambda function: functools.partial(self.kernel, function))
+        self.kernels = Kernels(program.kernels, helpers, wrapped)
         self.select, self.root = trace.select, trace.square_root
         self.state = SimpleNamespace(
             x=self.array(name_of_state),
-            P=self.array(lambda i: f"f->P[{i}]"),
+            P=Member(self, "f->P", (program.number_of_covariances,)),
             nis=self.array(lambda i: f"f->nis[{i}]"),
             coefficients=self.array(lambda i: f"f->coefficients[{i}]"),
             dt=self.array(lambda i: "f->step_dt"),
         )
-        self.kernel, self.spaces = Interpreter(self), {}
         if program.recording is not None:
             for a in program.recording.arrays:
                 setattr(self.state, a.name, Member(self, f"f->{a.name}", a.shape, a.kind))
@@ -96,10 +98,9 @@ class Target(Function):
         """Return numbers that exist while tracing."""
         return self.array()
 
-    def work(self) -> Scratch:
-        """Return work space with a local array for the correction."""
-        k = self.kernels
-        return Scratch(self.local("step", self.n), k.LINE * k.STEP, self.n, self.array())
+    def work(self) -> Member:
+        """Return work space."""
+        return self.table("work", (work_size(self.kernels),))
 
     def clear_status(self) -> None:
         """Clear the flags."""
@@ -185,8 +186,20 @@ def traced(program: Program) -> list[Target]:
         function(
             "step", "Propagate over one step: delta is the rotation vector.", [("delta", 3), ("dt", 0)], "", body.step
         ),
-        row_function(program),
-        correction_function(program),
+        work_function(
+            program,
+            "take_row",
+            "Update P and the correction with the row in the work space, in Joseph's form.",
+            [("residual", 0), ("variance", 0)],
+            body.take_row,
+        ),
+        work_function(
+            program,
+            "apply_step",
+            "Correct the state, and transform P to the tangent space of the corrected attitude.",
+            [],
+            body.apply_step,
+        ),
     ]
     vector = [("value", 3), ("sigma", 0)]
     if program.recording is not None:
@@ -235,32 +248,13 @@ def traced(program: Program) -> list[Target]:
     return made
 
 
-def row_function(program: Program) -> Target:
-    """Return the update with one very precise row."""
-    n = program.n
-    m = Target(
-        program,
-        "take_row",
-        [("row", n), ("residual", 0), ("variance", 0), ("step", -n)],
-        returns="",
-        words="Update P and the correction with one row, in Joseph's form.",
-    )
-    step = m.array(lambda i: f"step[{i}]")
-    body.take_row(m, program, m.state, m.argument("row"), m.argument("residual"), m.argument("variance"), step)
-    m.flush()
-    return m
-
-
-def correction_function(program: Program) -> Target:
-    """Return the correction of the state by a step."""
-    m = Target(
-        program,
-        "apply_step",
-        [("step", program.n)],
-        returns="",
-        words="Correct the state, and transform P to the tangent space of the corrected attitude.",
-    )
-    body.apply_step(m, program, m.state, m.argument("step"))
+def work_function(
+    program: Program, name: str, words: str, parameters: Sequence[tuple[str, int]], formula: Callable[..., None]
+) -> Target:
+    """Return a function with the work space of an update as its last parameter."""
+    size = work_size(program.kernels)
+    m = Target(program, name, [*parameters, ("work", -size)], returns="", words=words)
+    formula(m, program, m.state, *(m.argument(parameter) for parameter, _ in parameters), Member(m, "work", (size,)))
     m.flush()
     return m
 

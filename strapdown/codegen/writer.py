@@ -203,7 +203,9 @@ class Writer:
         members = group.members
         self._symbols(self.placement.needed((x for m in members for x in m.operands), slot, self.written), slot)
         names = [self._new("m") for _ in members]
-        self.line(f"{self.language.variable['']} {', '.join(names)};")
+        for kind in dict.fromkeys(member.type for member in members):
+            own = [name for name, member in zip(names, members, strict=True) if member.type == kind]
+            self.line(f"{self.language.variable[kind]} {', '.join(own)};")
         self.line(f"if ({self.text(members[0].operands[0])}) {{")
         assert group.arms is not None
         for i, arm in enumerate(group.arms, 1):
