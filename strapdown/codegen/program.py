@@ -223,9 +223,11 @@ def update(
         m.unless(accepted, lambda: m.leave("REJECTED"))
     m.unless(m.no(lost), lambda: m.leave("TOO_PRECISE"))
 
+    work = m.work()
+
     def precisely() -> None:
         m.comment("much more precise than the state: Joseph's form, row after row")
-        work, rows = m.work(), m.scratch()
+        rows = m.scratch()
         k.store_rows(s, f.x, rows, measured, program.model.numbers, False, 0.0)
         k.clear_step(work, 0.0)
         for i in range(ROWS_OF_KIND[sensor.kind]):
@@ -237,7 +239,13 @@ def update(
 
     m.branch(g.precise, precisely)
     m.comment("correction, covariance, and its transformation to the tangent space of the corrected attitude")
-    k.apply_gains(f.x, f.P, None, g.gain, g.steps, 0.0)
+    for j in range(program.n):
+        for i, gain in enumerate(g.gain):
+            work[k.LINE * (k.GAINS + i) + j] = gain[j]
+        work[k.LINE * k.STEP + j] = k.products(g.steps, tuple(gain[j] for gain in g.gain))
+    for i in range(len(g.gain)):
+        m.call("subtract", k.LINE * (k.GAINS + i), "work")
+    m.call("apply_step", "work")
     m.leave("OK")
 
 
@@ -267,6 +275,11 @@ def take_row(m: Any, program: Program, f: SimpleNamespace, residual: Any, varian
     """Update covariance and correction with the row in the work space, in Joseph's form."""
     k = m.kernels
     k.take_row(f.P, work, k.ROWS, residual, variance, 0.0)
+
+
+def subtract(m: Any, program: Program, f: SimpleNamespace, line: Any, work: Any) -> None:
+    """Subtract the outer product of a line of the work space from the covariance."""
+    m.kernels.minus_outer_by_elements(f.P, work, line, line, 1.0, 0.0)
 
 
 def apply_step(m: Any, program: Program, f: SimpleNamespace, work: Any) -> None:

@@ -16,7 +16,7 @@ from strapdown.codegen.program import Kernels, Program, work_size
 from strapdown.codegen.symbols import Symbol, Values, rebound
 from strapdown.kernels.rotation import far_turn
 
-BRANCHING = ("turned_by", "take_row")
+BRANCHING = ("turned_by", "take_row", "minus_outer_by_elements")
 """Kernels of the filter with branches and loops of the target."""
 
 
@@ -192,6 +192,13 @@ def traced(program: Program) -> list[Target]:
             "Update P and the correction with the row in the work space, in Joseph's form.",
             [("residual", 0), ("variance", 0)],
             body.take_row,
+        ),
+        work_function(
+            program,
+            "subtract",
+            "Subtract the outer product of a line of the work space from P.",
+            [("line", "int")],
+            body.subtract,
         ),
         work_function(
             program,
