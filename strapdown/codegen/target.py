@@ -256,7 +256,7 @@ def traced(program: Program) -> list[Target]:
 
 
 def work_function(
-    program: Program, name: str, words: str, parameters: Sequence[tuple[str, int]], formula: Callable[..., None]
+    program: Program, name: str, words: str, parameters: Sequence[tuple[str, Any]], formula: Callable[..., None]
 ) -> Target:
     """Return a function with the work space of an update as its last parameter."""
     size = work_size(program.kernels)
