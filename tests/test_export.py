@@ -136,6 +136,25 @@ def test_c_equals_python_to_the_bit(name, tmp_path):
     np.testing.assert_array_equal(numbers, expected)
 
 
+def test_recorded_samples_give_the_bits_of_python(broad, tmp_path):
+    """Fast rotations with accelerations that the gate refuses."""
+    recording = sd.recordings.read(broad / "07_undisturbed_fast_rotation_B.hdf5")
+    setup = sd.FilterSetup(process_noise=NOISE, attitude_sigma=0.4, bias_sigma=5e-3, gate=GATE)
+    program = program_of(setup, [SENSORS["level"], SENSORS["heading"]])
+    first = len(recording.time) // 2
+    columns = recording.time, recording.rate, recording.specific_force, recording.magnetic_field
+    time, rate, force, field = (column[first : first + 1500].tolist() for column in columns)
+    rows = []
+    for k in range(1, len(time)):
+        rows += [(None, rate[k], time[k] - time[k - 1]), (0, force[k], 0.0), (1, field[k], 0.0)]
+    start = sd.vectors.wahba.from_vertical_and_heading(force[0], field[0])
+    numbers, statuses = fed(Compiled(program, tmp_path), rows, start)
+    expected, expected_statuses = fed(Plain(program), rows, start)
+    assert statuses == expected_statuses
+    assert 0.01 < np.mean(np.array(statuses) == 2) < 0.9
+    np.testing.assert_array_equal(numbers, expected)
+
+
 @pytest.mark.parametrize("name", CASES)
 def test_javascript_equals_python_to_the_bit(name, tmp_path):
     record, setup, _ = case(name)
