@@ -13,7 +13,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from strapdown.codegen import c, design
+from strapdown.codegen import c, design, recording
 from strapdown.codegen import program as body
 
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-ffp-contract=off")
@@ -24,6 +24,9 @@ def compiler():
     if gcc is None:
         pytest.skip("no C compiler on this machine")
     return gcc
+
+
+missing = (0.0, 0.0, 0.0)
 
 
 class LeftError(Exception):
@@ -50,6 +53,9 @@ class Plain:
             coefficients=[0.0] * (16 * len(program.model.last)),
             dt=[0.0],
         )
+        for a in () if program.recording is None else program.recording.arrays:
+            setattr(self.f, a.name, np.zeros(a.shape, int if a.kind == "int" else float))
+        self.kernel, self.lowest = lambda function, *arguments: function(*arguments), math.floor
         self.status, self.called, self.far_turns = 0, set(), 0
 
     def turned_far(self, condition):
@@ -60,10 +66,16 @@ class Plain:
         try:
             function(self, self.program, self.f, *arguments)
         except LeftError as left:
-            bits = int(body.STATUS[str(left)][0])
+            bits = int(self.program.statuses[str(left)][0])
             self.status |= bits
             return bits
-        raise AssertionError("no status")
+        return None
+
+    def start(self):
+        return self.run(recording.initialize)
+
+    def take(self, time, *vectors):
+        return self.run(recording.update, time, *(missing if v is None else tuple(v) for v in vectors))
 
     def init(self, attitude):
         return self.run(body.initialize, attitude)
@@ -100,6 +112,9 @@ class Plain:
     def comment(self, text):
         pass
 
+    def table(self, name, shape):
+        return np.zeros(shape)
+
     def clear_status(self):
         self.status = 0
 
@@ -107,14 +122,17 @@ class Plain:
         raise LeftError(status)
 
     def work(self):
-        k = self.kernels
-        self.step = [0.0] * self.program.n
-        return body.Scratch(self.step, k.LINE * k.STEP, self.program.n, {})
+        self.space = [0.0] * body.work_size(self.kernels)
+        return self.space
 
-    def call(self, name, *arguments):
+    def call(self, name, *arguments, result=None):
         self.called.add(name)
-        given = tuple(self.step if argument == "step" else argument for argument in arguments)
-        getattr(body, name)(self, self.program, self.f, *given)
+        given = tuple(self.space if isinstance(argument, str) else argument for argument in arguments)
+        sensor = [one for one in enumerate(self.program.sensors) if name == f"update_{one[1].name}"]
+        if sensor:
+            index, one = sensor[0]
+            return self.run(body.update, one, index, *given)
+        return self.run(getattr(body, name, None) or getattr(recording, name), *given)
 
 
 class Compiled:
@@ -133,7 +151,8 @@ class Compiled:
             text=True,
         )
         self.real = ctypes.c_float if single else ctypes.c_double
-        fields = [(name, self.real * size if size else self.real) for name, size, _ in c.members(program)]
+        types = {"": self.real, "int": ctypes.c_int, "wide": ctypes.c_double}
+        fields = [(name, types[kind] * size if size else types[kind]) for name, size, _, kind in c.members(program)]
         self.struct = type("Filter", (ctypes.Structure,), {"_fields_": [*fields, ("status", ctypes.c_uint)]})
         self.state, self.library, self.program = self.struct(), ctypes.CDLL(str(library.resolve())), program
 
@@ -147,6 +166,12 @@ class Compiled:
 
     def predict(self, gyro, dt):
         return self._call("predict", gyro, float(dt))
+
+    def start(self):
+        return self._call("init")
+
+    def take(self, time, *vectors):
+        return self._call("update", ctypes.c_double(time), *vectors)
 
     def update(self, i, value):
         return self._call(f"update_{self.program.sensors[i].name}", value)

@@ -14,8 +14,9 @@ from strapdown.ahrs import headings, regions, starting
 from strapdown.ahrs.parameters import AhrsParameters, of_motion
 from strapdown.ahrs.preparing import GRAVITY
 from strapdown.checks import Array, InputError, instance, non_negative, positive
+from strapdown.estimation import live as estimation_live
 from strapdown.estimation.forward import TooPreciseError
-from strapdown.estimation.live import arrays_of, restart
+from strapdown.estimation.live import restart
 from strapdown.kernels import headings as k_headings
 from strapdown.kernels import live_imu as kernel
 from strapdown.kernels import recording_steps
@@ -93,7 +94,7 @@ class LiveAhrs:
             ("accelerometer", "vector", GRAVITY),
             ("magnetometer", "heading", headings.NORTH),
         ][: 1 + magnetometer]
-        sensors = [
+        self._sensors = [
             VectorMeasurements(
                 sensor=sensor,
                 kind=kind,
@@ -107,8 +108,8 @@ class LiveAhrs:
         self._filter = estimation.LiveFilter(
             replace(setup.process_noise, angle_random_walk=walk),
             estimation.initial_state([1.0, 0.0, 0.0, 0.0], attitude_sigma=1.0, bias_sigma=1.0),
-            () if setup.states is None else setup.states.blocks({one.sensor: one.kind for one in sensors}),
-            sensors=sensors,
+            () if setup.states is None else setup.states.blocks({one.sensor: one.kind for one in self._sensors}),
+            sensors=self._sensors,
         )
         sigma = ASSUMED_SIGMA if latency is None else GIVEN_SIGMA
         self._imu = self._arrays(late, sigma)
@@ -146,7 +147,7 @@ class LiveAhrs:
         head_steps = k_headings.Steps(*map(read_only, of_step))
         found = k_headings.Found(np.zeros((1, 3)), np.zeros(1), np.zeros((1, 2)), np.zeros((1, 3)), np.zeros(1))
         shares = regions.shares_of(parameters, magnetometer=self.magnetometer)
-        live, state, numbers, places = arrays_of(self._filter)
+        live, state, numbers, places = estimation_live.arrays_of(self._filter)
         carried = (
             k.Steps(steps.edge, *map(read_only, steps[1:])),
             k.Stamps(*map(read_only, stamps)),
@@ -361,6 +362,11 @@ class LiveAhrs:
     def covariance(self) -> Array:
         """Covariance of these errors (6, 6)."""
         return np.array(self._found.covariance[1])
+
+
+def arrays_of(live: LiveAhrs) -> tuple[kernel.Imu, list[VectorMeasurements]]:
+    """Return the kernel's arrays, and the sensors."""
+    return live._imu, live._sensors
 
 
 def _routine(function: Any, *arguments: Any) -> kernel.Routine:

@@ -7,28 +7,52 @@ from typing import Literal
 
 from typer import Argument, Option
 
-from strapdown.checks import InputError
+from strapdown.checks import InputError, positive
 from strapdown.cli.terminal import command, console, written
 
 
 @command
 def export(
-    filter_file: Path = Argument(metavar="FILTER", help="TOML file of a filter setup."),
-    sensors: str = Argument(help="Simulated record or scenario (name or TOML file) whose sensors the filter uses."),
+    filter_file: str = Argument(
+        metavar="FILTER",
+        help="TOML file of a filter setup; or a motion (hand, vehicle, vessel, any): the filter of `strapdown estimate` for an IMU.",
+    ),
+    sensors: str | None = Argument(
+        None, help="Simulated record or scenario (name or TOML file) whose sensors the filter of a setup uses."
+    ),
+    rate: float | None = Option(None, help="Sample rate of the IMU, Hz."),
+    magnetometer: bool = Option(False, "--magnetometer", help="The IMU has a magnetometer."),
     to: Literal["c", "js"] = Option("c", "--to", help="Language: C99, or JavaScript (an ES module)."),
     precision: Literal["double", "single"] = Option("double", help="Precision of all numbers in C."),
     out: Path = Option(Path("strapdown-filter"), help="Folder of the source code."),
 ) -> None:
     """Export a filter as source code for a microcontroller or a web page."""
     import strapdown as sd
+    from strapdown.ahrs.parameters import MOTIONS, of_motion
     from strapdown.records import ImuRecord
 
-    recorded = Path(sensors).suffix in (".h5", ".csv")
-    source = sd.read(sensors) if recorded else sd.scenarios.load_scenario(sensors)
-    if not isinstance(source, (ImuRecord, sd.Scenario)):
-        raise InputError(f"{sensors} is no simulated record; give a record of `strapdown simulate`, or a scenario")
-    paths = sd.export(filter_file, source, folder=out, to=to, precision=precision)
-    console.print(f"Filter of {filter_file} with the sensors of {sensors}, {precision} precision.")
+    if filter_file in MOTIONS:
+        if rate is None or sensors is not None:
+            raise InputError(
+                f"the filter of an IMU ({filter_file}) has its own sensors; give their rate alone, such as --rate 100"
+            )
+        parameters = of_motion(filter_file, magnetometer=magnetometer)
+        interval = 1.0 / positive("rate", rate, unit="Hz")
+        live = sd.LiveAhrs(interval=interval, magnetometer=magnetometer, parameters=parameters)
+        paths = sd.export(live, folder=out, to=to, precision=precision)
+        what = f"an IMU at {rate:g} Hz"
+    else:
+        if sensors is None or rate is not None or magnetometer:
+            raise InputError(
+                "a filter setup needs a record or a scenario of its sensors; rate and magnetometer are of an IMU"
+            )
+        recorded = Path(sensors).suffix in (".h5", ".csv")
+        source = sd.read(sensors) if recorded else sd.scenarios.load_scenario(sensors)
+        if not isinstance(source, (ImuRecord, sd.Scenario)):
+            raise InputError(f"{sensors} is no simulated record; give a record of `strapdown simulate`, or a scenario")
+        paths = sd.export(filter_file, source, folder=out, to=to, precision=precision)
+        what = f"the sensors of {sensors}"
+    console.print(f"Filter of {filter_file} with {what}, {precision} precision.")
     written(*paths)
 
 

@@ -2,7 +2,9 @@
 
 - ``design``: The setup and its sensors as a program; refusals.
 - ``program``: The filter sample by sample, with checks, flags and a gate, around the formulas of the kernels.
+- ``recording``: That of an IMU, around the filter's steps.
 - ``symbols``: Tracing of formulas.
+- ``interpreted``: Tracing of kernels with branches and loops.
 - ``functions``: A function of the target: statements, branches, calls.
 - ``regions``: The block to which each operation belongs.
 - ``target``: All functions of a filter, traced.
@@ -17,10 +19,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import strapdown
+from strapdown.ahrs import LiveAhrs
 from strapdown.checks import InputError, one_of
 from strapdown.codegen import c, design, javascript
 from strapdown.estimation.setup import FilterSetup, read_setup, to_toml
@@ -37,8 +41,8 @@ Sensors = ImuRecord | Sequence[VectorSensor | VectorMeasurements]
 
 
 def export(
-    setup: FilterSetup | str | os.PathLike[str],
-    sensors: Sensors | Scenario,
+    setup: FilterSetup | LiveAhrs | str | os.PathLike[str],
+    sensors: Sensors | Scenario | None = None,
     *,
     folder: str | os.PathLike[str],
     to: Literal["c", "js"] = "c",
@@ -46,15 +50,17 @@ def export(
 ) -> tuple[Path, ...]:
     """Write a filter as source code that needs nothing else: C99 for a microcontroller, or JavaScript.
 
-    The filter predicts with each gyro sample and updates with each measurement, as :class:`strapdown.LiveFilter`. In C it has no heap and
-    no global variables, and needs only ``sqrt`` (with states that decay, ``expm1`` too).
+    The filter predicts with each gyro sample and updates with each measurement, as :class:`strapdown.LiveFilter`; or it takes the samples
+    of an IMU as :class:`strapdown.LiveAhrs`. In C it has no heap and no global variables, and needs only ``sqrt`` (with states that decay,
+    ``expm1`` too; that of an IMU, functions of angles and ``exp``).
 
     Parameters
     ----------
-    setup : FilterSetup or path
-        Noise of the gyro, initial σ, σ of sensors, error states and gate; or a TOML file of them.
-    sensors : ImuRecord, Scenario or sequence of VectorSensor or VectorMeasurements
-        Sensors of the filter: their names, kinds, references and σ. Of a record or scenario all are exported.
+    setup : FilterSetup, LiveAhrs or path
+        Noise of the gyro, initial σ, σ of sensors, error states and gate; or a TOML file of them. The samples of a ``LiveAhrs`` are left
+        out.
+    sensors : ImuRecord, Scenario or sequence of VectorSensor or VectorMeasurements, optional
+        Sensors of the filter: their names, kinds, references and σ. Of a record or scenario all are exported. A ``LiveAhrs`` has its own.
     folder : path
         Folder of the files: ``strapdown_filter.h`` and ``.c``, ``main.c`` (an example) and ``CMakeLists.txt``; or
         ``strapdown_filter.mjs``. Files of these names are replaced.
@@ -81,15 +87,21 @@ def export(
     >>> up = sd.VectorSensor(name="accelerometer", reference_f=[0.0, 0.0, 1.0], sigma=0.02, rate=100.0)
     >>> setup = sd.FilterSetup(process_noise=noise, bias_sigma=1e-3)
     >>> sd.export(setup, [up], folder="firmware", precision="single")  # doctest: +SKIP
+    >>> sd.export(sd.LiveAhrs(interval=0.01), folder="firmware", precision="single")  # doctest: +SKIP
     """
     one_of("to", to, ("c", "js"))
     one_of("precision", precision, ("double", "single"))
     if to == "js" and precision == "single":
         raise InputError("precision is 'single', but numbers in JavaScript are double; use 'double'")
-    if not isinstance(setup, FilterSetup):
+    if not isinstance(setup, FilterSetup | LiveAhrs):
         setup = read_setup(setup)
     usable_folder("folder", folder)
-    program = design.program_of(setup, _sensors_of(sensors), single=precision == "single")
+    if isinstance(setup, LiveAhrs):
+        if sensors is not None:
+            raise InputError("sensors are given, but a LiveAhrs has its own; leave them out")
+        program = design.program_of_live(setup, single=precision == "single")
+    else:
+        program = design.program_of(setup, _sensors_of(sensors), single=precision == "single")
     origin = _origin(setup, precision)
     made = c.files(program, origin, single=precision == "single") if to == "c" else javascript.files(program, origin)
     paths = [Path(folder) / name for name in made]
@@ -100,8 +112,10 @@ def export(
     return tuple(paths)
 
 
-def _sensors_of(sensors: Sensors | Scenario) -> Sequence[VectorSensor | VectorMeasurements]:
+def _sensors_of(sensors: Sensors | Scenario | None) -> Sequence[VectorSensor | VectorMeasurements]:
     """Return the sensors of a record, of a scenario, or those given."""
+    if sensors is None:
+        return ()
     if isinstance(sensors, ImuRecord):
         return sensors.vectors
     if isinstance(sensors, VectorSensor | VectorMeasurements):
@@ -115,9 +129,9 @@ def _sensors_of(sensors: Sensors | Scenario) -> Sequence[VectorSensor | VectorMe
     raise InputError(f"sensors is {sensors!r}; give a record, a scenario, or a sequence of sensors")
 
 
-def _origin(setup: FilterSetup, precision: str) -> str:
+def _origin(setup: FilterSetup | LiveAhrs, precision: str) -> str:
     """Return the comment at the top of the files: version, conventions, setup."""
-    prose = (
+    prose = [
         f"Attitude filter exported by strapdown {strapdown.__version__}, {precision} precision. Do not edit: export again.",
         "",
         "Multiplicative extended Kalman filter of attitude and gyro bias. Quaternions are Hamilton's, scalar first; q_fb takes vectors "
@@ -125,5 +139,16 @@ def _origin(setup: FilterSetup, precision: str) -> str:
         "radians. One filter is one struct; nothing is allocated, and nothing is global. An invalid sample sets a flag and leaves the "
         "filter as it was.",
         "",
+    ]
+    if isinstance(setup, FilterSetup):
+        return "\n".join((*prose, c.SETUP, to_toml(setup).strip(), ""))
+    field = "with" if setup.magnetometer else "without"
+    prose += [
+        f"For an IMU {field} a magnetometer and samples every {setup.interval:g} s, as strapdown.LiveAhrs. Fixed axes: East, (magnetic) "
+        "North, up; without a magnetometer the first heading is arbitrary. Times are double in single precision too. A gap of up to an "
+        "hour is bridged; samples that come more than four times as fast as these are not used.",
+        "",
+    ]
+    return "\n".join(
+        (*prose, c.SETUP, *(f"{name} = {value!r}" for name, value in asdict(setup.parameters).items()), "")
     )
-    return "\n".join((*prose, c.SETUP, to_toml(setup).strip(), ""))

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import math
 import re
 import textwrap
 
 import numpy as np
 
-from strapdown.codegen.program import STATUS, Program, Sensor
+from strapdown.codegen.program import Program, Sensor
 from strapdown.codegen.target import Target, traced
 from strapdown.codegen.writer import Language, Writer
 
 PUBLIC = ("init", "predict")
+TYPES = {"": "strapdown_real", "int": "int", "wide": "double"}
 
 
 def _number(x: float, single: bool) -> str:
+    if math.isinf(x):
+        return "INFINITY" if x > 0.0 else "-INFINITY"
     if not single:
         return repr(x)
     text = str(np.float32(x))
@@ -24,23 +28,24 @@ def _number(x: float, single: bool) -> str:
 def language(*, single: bool) -> Language:
     """Return the words of C."""
     return Language(
-        constant="const strapdown_real",
-        condition="const int",
-        variable="strapdown_real",
+        variable=TYPES,
+        constant={kind: f"const {word}" for kind, word in TYPES.items()},
         member="->",
         number=lambda x: _number(x, single),
-        root="sqrtf" if single else "sqrt",
-        expm1="expm1f" if single else "expm1",
+        function=lambda name: "floor" if name == "lowest" else f"{name}f" if single else name,
         numbers=lambda texts: f"(const strapdown_real[]){{{', '.join(texts)}}}",
         array=lambda name, size: f"strapdown_real {name}[{size}];",
         status=lambda name: f"STRAPDOWN_{name}",
-        counter="int",
         whole=lambda text: f"(strapdown_real)(int)({text})",
+        narrow=lambda text: f"(strapdown_real)({text})",
+        quotient=lambda text: text,
     )
 
 
 def is_public(function: Target) -> bool:
     """Return whether users of the filter call a function."""
+    if function.program.recording is not None:
+        return function.name in ("init", "update")
     return function.name in PUBLIC or function.name.startswith("update_")
 
 
@@ -50,13 +55,18 @@ def signature(function: Target) -> str:
     name = f"strapdown_{function.name}" if public else function.name
     parameters = [] if function.name == "far_turn" else ["strapdown_filter *f"]
     for parameter, size in function.parameters:
-        if size == 0:
-            parameters.append(f"strapdown_real {parameter}")
+        if isinstance(size, str) or size == 0:
+            parameters.append(f"{TYPES[size or '']} {parameter}")
         else:
             constant = "const " if size > 0 else ""
             parameters.append(f"{constant}strapdown_real {parameter}[{abs(size)}]")
-    result = "unsigned" if function.returns == "status" else "void"
+    result = {"status": "unsigned", "real": "strapdown_real", "": "void"}[function.returns]
     return f"{'' if public else 'static '}{result} {name}({', '.join(parameters)})"
+
+
+def may_be_missing(function: Target) -> list[str]:
+    """Return the parameters that may be null."""
+    return [name for name, _ in function.parameters if name in ("accelerometer", "magnetometer")]
 
 
 def constant_of(sensor: Sensor) -> str:
@@ -64,8 +74,8 @@ def constant_of(sensor: Sensor) -> str:
     return f"STRAPDOWN_{sensor.name.upper()}"
 
 
-def members(program: Program) -> list[tuple[str, int, str]]:
-    """Return name, size (0: a scalar) and meaning of the numbers of the filter's state."""
+def members(program: Program) -> list[tuple[str, int, str, str]]:
+    """Return name, size (0: a scalar), meaning and type of the numbers of the filter's state."""
     k = program.kernels
     rows = [
         ("attitude", 4, "q_fb: unit quaternion, scalar first, from body axes to fixed axes"),
@@ -84,7 +94,8 @@ def members(program: Program) -> list[tuple[str, int, str]]:
     if program.structure.chains:
         rows.append(("coefficients", k.SET * len(program.model.last), "of the states that decay, for steps of dt"))
         rows.append(("step_dt", 0, "s"))
-    return rows
+    arrays = () if program.recording is None else program.recording.arrays
+    return [(*row, "") for row in rows] + [(a.name, math.prod(a.shape), a.words, a.kind) for a in arrays]
 
 
 def wrapped(text: str) -> str:
@@ -111,13 +122,13 @@ def header(program: Program, functions: list[Target], origin: str, *, single: bo
     out.append(
         "/* Status of a call, and flags in the filter's status, where they stay until strapdown_clear_status. */"
     )
-    out += [f"#define STRAPDOWN_{name} {bit}u /* {words} */" for name, (bit, words) in STATUS.items()]
+    out += [f"#define STRAPDOWN_{name} {bit}u /* {words} */" for name, (bit, words) in program.statuses.items()]
     if program.sensors:
         out += ["", "/* Sensors, for strapdown_nis. */"]
         out += [f"#define {constant_of(sensor)} {i}" for i, sensor in enumerate(program.sensors)]
     out += ["", "typedef struct {"]
-    for name, size, words in members(program):
-        out.append(f"    strapdown_real {name}{f'[{size}]' if size else ''}; /* {words} */")
+    for name, size, words, kind in members(program):
+        out.append(f"    {TYPES[kind]} {name}{f'[{size}]' if size else ''}; /* {words} */")
     out += ["    unsigned status; /* flags, see above */", "} strapdown_filter;", ""]
     for function in functions:
         head = signature(function)
@@ -156,14 +167,16 @@ def diagonal(n: int) -> list[int]:
 def accessors(program: Program, *, single: bool) -> list[str]:
     """Return the functions that read the filter."""
     words = language(single=single)
-    bodies: list[list[str]] = [[f"q[{i}] = f->attitude[{i}];" for i in range(4)]]
+    attitude = "attitude" if program.recording is None else "q"
+    bodies: list[list[str]] = [[f"q[{i}] = f->{attitude}[{i}];" for i in range(4)]]
     bodies.append([f"bias[{i}] = {whole_bias(program, i, words)};" for i in range(3)])
     places = ", ".join(map(str, diagonal(program.n)))
+    sigma = "f->P[places[i]]" if program.recording is None else "i < 6 ? f->variance[i] : f->P[places[i]]"
     bodies.append(
         [
             f"static const unsigned short places[STRAPDOWN_STATES] = {{{places}}};",
             "for (int i = 0; i < STRAPDOWN_STATES; i++) {",
-            f"    sigma[i] = {words.root}(f->P[places[i]]);",
+            f"    sigma[i] = {words.function('sqrt')}({sigma});",
             "}",
         ]
     )
@@ -189,10 +202,13 @@ def source(program: Program, functions: list[Target], origin: str, *, single: bo
     """Return the source."""
     words = language(single=single)
     out = ["/*", wrapped(origin), " */", '#include "strapdown_filter.h"', "", "#include <math.h>", ""]
+    if program.recording is not None:
+        out += ["static const strapdown_real missing[3] = {0};", ""]
     for function in functions:
         out += [
             f"/*\n{wrapped(function.words)}\n */",
             f"{signature(function)} {{",
+            *(f"    {name} = {name} ? {name} : missing;" for name in may_be_missing(function)),
             *Writer(function, words).lines,
             "}",
             "",
@@ -202,6 +218,8 @@ def source(program: Program, functions: list[Target], origin: str, *, single: bo
 
 def example(program: Program) -> str:
     """Return an example of the use."""
+    if program.recording is not None:
+        return example_of_recording(program)
     calls = []
     for sensor in program.sensors:
         example_value = (1.0, 0.0, 0.0, 0.0) if sensor.size == 4 else tuple(sensor.length * x for x in sensor.frame[6:])
@@ -227,13 +245,41 @@ int main(void) {{
         strapdown_predict(&f, gyro, (strapdown_real)0.01);
 {updates}
     }}
-    strapdown_real q[4], sigma[STRAPDOWN_STATES];
+{REPORT}"""
+
+
+def example_of_recording(program: Program) -> str:
+    """Return an example of the use of the filter of an IMU."""
+    r = program.recording
+    vector = (
+        "\n        const strapdown_real magnetometer[3] = {0.0, 20.0, -43.0}; /* any unit */" if r.magnetometer else ""
+    )
+    return f"""/* The filter over ten seconds of samples. */
+#include <stdio.h>
+
+#include "strapdown_filter.h"
+
+static strapdown_filter f;
+
+int main(void) {{
+    strapdown_init(&f);
+    for (int k = 0; k * {r.interval!r} < 10.0; k++) {{
+        const strapdown_real gyro[3] = {{0.0, 0.0, 0.0}}; /* rad/s, body axes: read the sensors here */
+        const strapdown_real accelerometer[3] = {{0.0, 0.0, (strapdown_real)9.81}}; /* m/s^2 */{vector}
+        if (strapdown_update(&f, k * {r.interval!r}, gyro, accelerometer{", magnetometer" if r.magnetometer else ""})) {{
+            /* not used: see the status */
+        }}
+    }}
+{REPORT}"""
+
+
+REPORT = """    strapdown_real q[4], sigma[STRAPDOWN_STATES];
     strapdown_attitude(&f, q);
     strapdown_sigma(&f, sigma);
     printf("attitude %g %g %g %g, sigma %g %g %g rad, status %u\\n", (double)q[0], (double)q[1], (double)q[2],
            (double)q[3], (double)sigma[0], (double)sigma[1], (double)sigma[2], strapdown_status(&f));
     return 0;
-}}
+}
 """
 
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from strapdown.codegen.symbols import Symbol, Trace, Values
+from strapdown.codegen.symbols import Symbol, Trace, Values, Version
 
 
 @dataclass(eq=False)
@@ -22,7 +22,8 @@ class Statement:
     """A statement: what it is, the symbols that it needs, and blocks inside it."""
 
     kind: str
-    """``"store"``, ``"if"``, ``"repeat"``, ``"call"``, ``"return"``, ``"comment"`` or ``"array"``."""
+    """``"store"``, ``"put"``, ``"if"``, ``"repeat"``, ``"for"``, ``"loop"``, ``"break"``, ``"call"``, ``"return"``, ``"comment"``,
+    ``"array"`` or ``"variable"``."""
     text: str = ""
     """Name of the called function, of the status returned, of an array; or a comment."""
     values: Sequence[Any] = ()
@@ -33,14 +34,71 @@ class Statement:
     """Place in the order of symbols and statements."""
 
 
+class Member(Values):
+    """An array of the target with rows, whose elements have indices that may be known only there."""
+
+    def __init__(self, function: Function, base: str, shape: tuple[int, ...], kind: str = "") -> None:
+        super().__init__(function.trace, lambda i: f"{base}[{i}]", kind)
+        self.function, self.base, self.shape = function, base, shape
+        function.changing.add(base)
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def _place(self, index: Any) -> Any:
+        if not isinstance(index, tuple):
+            return index
+        row, column = index
+        return row * self.shape[1] + column
+
+    def __getitem__(self, index: Any) -> Any:
+        place = self._place(index)
+        if not isinstance(place, Symbol):
+            return super().__getitem__(int(place))
+        self.function.flush()
+        self.loads += 1
+        value = self.trace.symbol("at", self.base, place, Version((id(self), self.loads)))
+        value.type = self.type
+        return value
+
+    def __setitem__(self, index: Any, value: Any) -> None:
+        place = self._place(index)
+        if not isinstance(place, Symbol):
+            super().__setitem__(int(place), value)
+            return
+        self.function.flush()
+        self.function.add(Statement("put", self.base, values=(place, value)))
+        self.forget()
+
+
+class Variable(Values):
+    """A number, or several, that a branch or a loop changes."""
+
+    def __init__(self, function: Function, base: str, size: int, kind: str) -> None:
+        super().__init__(function.trace, lambda i: f"{base}[{i}]" if size else base, kind)
+        self.base, self.size = base, size
+
+    def value(self) -> Any:
+        """Return its present value."""
+        return tuple(self[i] for i in range(self.size)) if self.size else self[0]
+
+    def put(self, value: Any) -> None:
+        """Change it."""
+        for i, x in enumerate(value if isinstance(value, tuple) else (value,)):
+            self[i] = x
+
+
 class Function:
     """A function of the target; its methods are those that :mod:`strapdown.codegen.program` asks of a machine."""
 
-    def __init__(self, name: str, parameters: Sequence[tuple[str, int]], *, returns: str = "") -> None:
+    def __init__(self, name: str, parameters: Sequence[tuple[str, Any]], *, returns: str = "") -> None:
         self.name, self.parameters, self.returns = name, parameters, returns
         self.trace = Trace()
         self.body = self.block = self.trace.place = Block()
         self.calls = 0
+        self.names: dict[str, int] = {}
+        self.changing: set[str] = set()
+        """Arrays whose elements may change after they are read."""
 
     # ------------------------------------------------------------------------------------------------------------- arrays and parameters
 
@@ -51,6 +109,10 @@ class Function:
     def argument(self, name: str) -> Any:
         """Return a parameter: a symbol, or a tuple of them."""
         size = dict(self.parameters)[name]
+        if isinstance(size, str):
+            number = self.trace.symbol("parameter", name)
+            number.type = size
+            return number
         if size:
             return tuple(self.trace.symbol("load", f"{name}[{i}]", name) for i in range(size))
         return self.trace.symbol("parameter", name)
@@ -59,6 +121,25 @@ class Function:
         """Return a local array, initially zero."""
         self.add(Statement("array", name, values=(size,)))
         return self.array(lambda i: f"{name}[{i}]")
+
+    def new_name(self, stem: str) -> str:
+        """Return a name for a variable."""
+        self.names[stem] = number = self.names.get(stem, 0) + 1
+        return f"{stem}_v{number}"
+
+    def type_of(self, *values: Any) -> str:
+        """Return the type of a variable with these values."""
+        types = {x.type if isinstance(x, Symbol) else "int" if isinstance(x, int) else "" for x in values}
+        return "wide" if "wide" in types else "int" if types == {"int"} else ""
+
+    def variable(self, stem: str, *values: Any, changes: bool = False) -> tuple[Variable, Statement]:
+        """Return a variable for one of some values, and its declaration."""
+        size = len(values[0]) if isinstance(values[0], tuple) else 0
+        kind = "" if size else self.type_of(*values)
+        name = self.new_name(stem)
+        if changes:
+            self.changing.add(name)
+        return Variable(self, name, size, kind), Statement("variable", name, values=(size, kind))
 
     # ------------------------------------------------------------------------------------------------------------------------ statements
 
@@ -86,13 +167,13 @@ class Function:
 
     def inside(self, block: Block, body: Callable[[], None]) -> None:
         """Trace a body into a block; what it knows of arrays is not known after it."""
-        before = [(*array.copied(), dict(array.loaded)) for array in self.trace.arrays]
+        before = [(dict(array.known), dict(array.changed), dict(array.loaded)) for array in self.trace.arrays]
         outer = self.block
         self.block = self.trace.place = block
         body()
         self.flush()
         self.block = self.trace.place = outer
-        left = bool(block.statements) and block.statements[-1].kind == "return"
+        left = bool(block.statements) and block.statements[-1].kind in ("return", "break")
         for array, state in zip(self.trace.arrays, before, strict=False):
             empty: Any = ({}, {}, {})
             array.known, array.changed, array.loaded = state if left or array.name is None else empty
@@ -127,11 +208,19 @@ class Function:
         self.add(Statement("repeat", values=(count,), blocks=[block]))
         self.inside(block, body)
 
-    def call(self, name: str, *arguments: Any, result: bool = False) -> Any:
-        """Call another function of the filter: symbols, tuples and local arrays are its arguments."""
+    def leave_loop(self) -> None:
+        """Leave the innermost loop."""
+        self.flush()
+        self.add(Statement("break"))
+
+    def call(self, name: str, *arguments: Any, result: str | None = None) -> Any:
+        """Call another function of the filter: symbols, tuples and local arrays are its arguments; ``result``: type of its result."""
         self.flush()
         self.calls += 1
-        value = self.trace.symbol("result", name, self.calls) if result else None
+        value = None
+        if result is not None:
+            value = self.trace.symbol("result", name, self.calls)
+            value.type = result
         self.add(Statement("call", name, values=arguments, result=value))
         for array in self.trace.arrays:
             array.forget()
@@ -143,6 +232,6 @@ class Function:
         self.add(Statement("return", status))
 
     def give(self, value: Any) -> None:
-        """Return a number."""
+        """Return a number, or nothing."""
         self.flush()
-        self.add(Statement("return", values=(value,)))
+        self.add(Statement("return", values=() if value is None else (value,)))

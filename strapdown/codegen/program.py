@@ -7,7 +7,7 @@ Every function here asks a *machine* ``m`` for what depends on it: branches, cal
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
@@ -33,6 +33,7 @@ LONGEST_SQUARED = 1e24
 UNIT = 2e-6
 """A direction whose squared length differs from 1 by less than this is used as it is, as in :class:`strapdown.estimation.LiveFilter`."""
 
+NOT_STARTED = {"NOT_STARTED": ("16", "Waits for a sample with a specific force and, with a magnetometer, a field.")}
 STATUS = {
     "OK": ("0", "The sample was used."),
     "BAD_INPUT": (
@@ -59,7 +60,7 @@ class Sensor:
     length: float
     """Length of the reference of a whole vector, else 1."""
     noise: tuple[float, ...]
-    """Variance, or covariance in body axes (6), over the squared length."""
+    """Variance, or covariance in body axes (6), over the squared length; empty: its root is an argument of the update."""
     variances: tuple[float, float, float]
     """Variances about the body axes of an attitude."""
     words: str
@@ -88,6 +89,13 @@ class Program:
     """Names of the error states, with their units."""
     offsets: tuple[tuple[float, ...], ...] = ()
     """Effect of each error state on the gyro as an offset, for the whole bias."""
+    recording: Any = None
+    """Of the filter of an IMU: :class:`strapdown.codegen.recording.Recording`."""
+
+    @property
+    def statuses(self) -> dict[str, tuple[str, str]]:
+        """Statuses: their bits, and what they mean."""
+        return STATUS if self.recording is None else STATUS | NOT_STARTED
 
     @property
     def kernels(self) -> ModuleType:
@@ -127,25 +135,21 @@ def put_at(array: Any, i: int, value: Any) -> None:
     array[i] = value
 
 
-@dataclass(eq=False)
-class Scratch:
-    """Work space of one update: the correction is an array, the other lines are numbers of the machine."""
+def work_size(k: Any) -> int:
+    """Return the number of values in the work space of an update."""
+    return int(k.LINE * (k.ROUNDING + 1))
 
-    step: Any
-    first: int
-    size: int
-    others: Any = field(default_factory=dict)
 
-    def __getitem__(self, i: int) -> Any:
-        here = i - self.first
-        return self.step[here] if 0 <= here < self.size else self.others[i]
+class Table(list[Any]):
+    """Rows that are read by two indices, as those of an array."""
 
-    def __setitem__(self, i: int, value: Any) -> None:
-        here = i - self.first
-        if 0 <= here < self.size:
-            self.step[here] = value
-        else:
-            self.others[i] = value
+    def __getitem__(self, place: Any) -> Any:
+        return super().__getitem__(place[0])[place[1]] if isinstance(place, tuple) else super().__getitem__(place)
+
+
+def place(n: int, i: int, j: int) -> int:
+    """Return the place of P[i, j], i ≤ j, among the numbers of the upper triangle."""
+    return i * n - i * (i - 1) // 2 + j - i
 
 
 # ------------------------------------------------------------------------------------------------------------------------- prediction
@@ -153,7 +157,11 @@ class Scratch:
 
 def predict(m: Any, program: Program, f: SimpleNamespace, gyro: Any, dt: Any) -> None:
     """Propagate over a gyro sample: mean rate over dt."""
-    delta = scale(dt, gyro)
+    propagate(m, program, f, scale(dt, gyro), dt)
+
+
+def propagate(m: Any, program: Program, f: SimpleNamespace, delta: Any, dt: Any) -> None:
+    """Propagate over a rotation vector."""
     turn = turn_squared(delta, dt, tuple(f.x[4 + i] for i in range(3)))
     limit = program.model.limit
     within = turn <= SQUARED_RANGE
@@ -190,11 +198,13 @@ def prepare(m: Any, program: Program, f: SimpleNamespace, dt: Any) -> None:
 # ----------------------------------------------------------------------------------------------------------------------------- update
 
 
-def update(m: Any, program: Program, f: SimpleNamespace, sensor: Sensor, index: int, value: Any) -> None:
+def update(
+    m: Any, program: Program, f: SimpleNamespace, sensor: Sensor, index: int, value: Any, sigma: Any = 0
+) -> None:
     """Update with a measurement of a sensor."""
     k, s = m.kernels, sensor.shape
     z, frame = measured_values(m, sensor, value)
-    measured = Measured(z, frame, sensor.noise, sensor.length, (0.0,) * 9)
+    measured = Measured(z, frame, sensor.noise or (sigma * sigma,), sensor.length, (0.0,) * 9)
     m.comment("innovations and gains")
     g = k.gains(s, f.x, f.P, None, measured, program.model.numbers, None, 0.0)
     m.unless(g.valid, lambda: m.leave("NO_HEADING"))
@@ -213,21 +223,29 @@ def update(m: Any, program: Program, f: SimpleNamespace, sensor: Sensor, index: 
         m.unless(accepted, lambda: m.leave("REJECTED"))
     m.unless(m.no(lost), lambda: m.leave("TOO_PRECISE"))
 
+    work = m.work()
+
     def precisely() -> None:
         m.comment("much more precise than the state: Joseph's form, row after row")
-        work = m.work()
-        k.store_rows(s, f.x, work, measured, program.model.numbers, False, 0.0)
+        rows = m.scratch()
+        k.store_rows(s, f.x, rows, measured, program.model.numbers, False, 0.0)
         k.clear_step(work, 0.0)
         for i in range(ROWS_OF_KIND[sensor.kind]):
             line = k.LINE * (k.ROWS + i)
-            row = tuple(work[line + j] for j in range(program.n))
-            m.call("take_row", row, work[line + k.RESIDUAL], work[line + k.VARIANCE], "step")
-        m.call("apply_step", "step")
+            put_row(k, work, tuple(rows[line + j] for j in range(program.n)))
+            m.call("take_row", rows[line + k.RESIDUAL], rows[line + k.VARIANCE], "work")
+        m.call("apply_step", "work")
         m.leave("OK")
 
     m.branch(g.precise, precisely)
     m.comment("correction, covariance, and its transformation to the tangent space of the corrected attitude")
-    k.apply_gains(f.x, f.P, None, g.gain, g.steps, 0.0)
+    for j in range(program.n):
+        for i, gain in enumerate(g.gain):
+            work[k.LINE * (k.GAINS + i) + j] = gain[j]
+        work[k.LINE * k.STEP + j] = k.products(g.steps, tuple(gain[j] for gain in g.gain))
+    for i in range(len(g.gain)):
+        m.call("subtract", k.LINE * (k.GAINS + i), "work")
+    m.call("apply_step", "work")
     m.leave("OK")
 
 
@@ -247,19 +265,26 @@ def measured_values(m: Any, sensor: Sensor, value: Any) -> tuple[Any, Any]:
     return tuple(m.select(as_it_is, x, x / norm) for x in value), sensor.frame
 
 
-def take_row(m: Any, program: Program, f: SimpleNamespace, row: Any, residual: Any, variance: Any, step: Any) -> None:
-    """Update covariance and correction with a row h, in Joseph's form."""
-    k = m.kernels
-    work = Scratch(step, k.LINE * k.STEP, program.n, m.scratch())
+def put_row(k: Any, work: Any, row: Any) -> None:
+    """Write a row h to the work space."""
     for j, h in enumerate(row):
         work[k.LINE * k.ROWS + j] = h
+
+
+def take_row(m: Any, program: Program, f: SimpleNamespace, residual: Any, variance: Any, work: Any) -> None:
+    """Update covariance and correction with the row in the work space, in Joseph's form."""
+    k = m.kernels
     k.take_row(f.P, work, k.ROWS, residual, variance, 0.0)
 
 
-def apply_step(m: Any, program: Program, f: SimpleNamespace, step: Any) -> None:
-    """Correct the state by a step, and transform the covariance to the new tangent space."""
-    k = m.kernels
-    k.apply_step(f.x, f.P, Scratch(step, k.LINE * k.STEP, program.n, m.scratch()), 0.0)
+def subtract(m: Any, program: Program, f: SimpleNamespace, line: Any, work: Any) -> None:
+    """Subtract the outer product of a line of the work space from the covariance."""
+    m.kernels.minus_outer_by_elements(f.P, work, line, line, 1.0, 0.0)
+
+
+def apply_step(m: Any, program: Program, f: SimpleNamespace, work: Any) -> None:
+    """Correct the state by the step in the work space, and transform the covariance to the new tangent space."""
+    m.kernels.apply_step(f.x, f.P, work, 0.0)
 
 
 # ------------------------------------------------------------------------------------------------------------------------------ start
@@ -272,17 +297,20 @@ def initialize(m: Any, program: Program, f: SimpleNamespace, attitude: Any) -> N
     norm = m.root(squared)
     for i, x in enumerate(attitude):
         f.x[i] = m.select(usable, x / norm, 1.0 if i == 0 else 0.0)
+    clear(m, program, f)
+    m.unless(usable, lambda: m.leave("BAD_INPUT"))
+    m.leave("OK")
+
+
+def clear(m: Any, program: Program, f: SimpleNamespace) -> None:
+    """Set all but the attitude to the start."""
     for i in range(4, program.n + 1):
         f.x[i] = 0.0
-    place = 0
     for i in range(program.n):
         for j in range(i, program.n):
-            f.P[place] = program.covariance[i][j]
-            place += 1
+            f.P[place(program.n, i, j)] = program.covariance[i][j]
     for i in range(len(program.sensors)):
         f.nis[i] = 0.0
     if program.structure.chains:
         f.dt[0] = 0.0
     m.clear_status()
-    m.unless(usable, lambda: m.leave("BAD_INPUT"))
-    m.leave("OK")

@@ -7,12 +7,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from strapdown.codegen.functions import Block, Function, Statement
-from strapdown.codegen.symbols import Symbol
+from strapdown.codegen.symbols import PINNED, Symbol
 
 WORTH_A_BRANCH = 4
 """Operations in the arms of a selection from which on it is written as ``if``."""
-PINNED = ("load", "result", "parameter")
-"""Kinds of symbols that stay in the block in which they were made."""
 
 
 @dataclass(eq=False)
@@ -43,8 +41,7 @@ def symbols_of(values: Iterable[Any]) -> Iterator[Symbol]:
 
 def operands_of(symbol: Symbol) -> Iterator[Symbol]:
     """Return the symbols on which a symbol depends."""
-    if symbol.kind not in PINNED:
-        yield from symbols_of(symbol.operands)
+    yield from symbols_of(symbol.operands)
 
 
 def blocks_of(block: Block) -> Iterator[Block]:
@@ -135,6 +132,8 @@ class Placement:
         for symbol in reversed(self.alive):
             if symbol.kind in PINNED:
                 places[symbol] = self.blocks[symbol.place]
+                for operand in operands_of(symbol):
+                    use(operand, places[symbol])
                 continue
             group = self.groups.get(symbol)
             if group is None:

@@ -1,8 +1,8 @@
 """Symbols that trace formulas: executing a kernel on them records its operations, equal ones once.
 
 A number that is known while tracing stays a Python float, and zeros and ones vanish as they do in the kernels. A condition on symbols has
-no truth value: :meth:`Trace.any_lane` has the function under :meth:`Trace.fork` executed for both outcomes, and what differs between the
-two results becomes a selection, which :mod:`strapdown.codegen.regions` writes as an ``if``.
+no truth value: kernels with branches on them are executed by :mod:`strapdown.codegen.interpreted`. What differs between two outcomes
+without other effects becomes a selection, which :mod:`strapdown.codegen.regions` writes as an ``if``.
 """
 
 from __future__ import annotations
@@ -13,6 +13,9 @@ from types import CodeType, FunctionType
 from typing import Any, NamedTuple
 
 KERNELS = "strapdown.kernels"
+PINNED = ("load", "at", "result", "parameter")
+"""Kinds of symbols that stay in the block in which they were made."""
+CONDITIONS = ("<", ">", "<=", ">=", "==", "&&", "||", "not")
 
 
 class Symbol:
@@ -24,6 +27,8 @@ class Symbol:
     def __init__(self, trace: Trace, kind: str, operands: tuple[Any, ...], number: int, run: int) -> None:
         self.trace, self.kind, self.operands, self.number, self.run = trace, kind, operands, number, run
         self.place = trace.place
+        self.type = type_of(kind, operands)
+        """``"int"``, ``"wide"`` (of times, which are double in single precision too), or ``""``."""
 
     def __bool__(self) -> bool:
         raise TypeError(
@@ -48,6 +53,9 @@ class Symbol:
     def __rmul__(self, other: Any) -> Any:
         return self.trace.product(other, self)
 
+    def __pow__(self, other: int) -> Any:
+        return self * self if other == 2 else NotImplemented
+
     def __truediv__(self, other: Any) -> Any:
         return self.trace.symbol("/", self, other)
 
@@ -56,6 +64,15 @@ class Symbol:
 
     def __neg__(self) -> Any:
         return self.trace.symbol("neg", self)
+
+    def __abs__(self) -> Any:
+        return self.trace.symbol("fabs", self)
+
+    def __floordiv__(self, other: Any) -> Any:
+        return self.trace.symbol("//", self, other)
+
+    def __mod__(self, other: Any) -> Any:
+        return self.trace.symbol("%", self, other)
 
     def __lt__(self, other: Any) -> Any:
         return self.trace.symbol("<", self, other)
@@ -80,12 +97,23 @@ class Symbol:
     __ror__ = __or__
 
 
-class UndecidedError(Exception):
-    """A condition with no known outcome, while a function under :func:`fork` is executed."""
+def type_of(kind: str, operands: tuple[Any, ...]) -> str:
+    """Return the type of an operation's result. The difference of two times as they are stored is a duration, of the usual type."""
+    symbols = [x for x in operands if isinstance(x, Symbol)]
+    if kind in CONDITIONS:
+        return "int"
+    if any(x.type == "wide" for x in symbols) and kind not in PINNED:
+        stored = len(symbols) == 2 and all(x.type == "wide" and x.kind in PINNED for x in symbols)
+        return "" if kind == "-" and stored else "wide"
+    if kind not in INTEGER:
+        return ""
+    operands = operands[1:] if kind == "select" else operands
+    whole = (x.type == "int" if isinstance(x, Symbol) else float(x).is_integer() for x in operands)
+    return "int" if all(whole) else ""
 
-    def __init__(self, condition: Symbol) -> None:
-        super().__init__(condition.kind)
-        self.condition = condition
+
+INTEGER = ("+", "-", "*", "neg", "//", "%", "|", "select")
+"""Operations whose result is an integer, if the operands are."""
 
 
 class Trace:
@@ -96,7 +124,8 @@ class Trace:
         self.number = 0
         self.run = 0
         self.group: tuple[Any, ...] = ()
-        self.outcomes: dict[Symbol, bool] = {}
+        self.outcomes: dict[Any, bool] = {}
+        """Conditions in the branches that are traced at present."""
         self.arrays: list[Values] = []
         self.place: Any = None
         """Block of the function in which symbols are made at present."""
@@ -147,44 +176,12 @@ class Trace:
 
     def select(self, condition: Any, a: Any, b: Any) -> Any:
         """Return a where the condition holds, else b."""
-        if isinstance(condition, Symbol) and condition in self.outcomes:
-            condition = self.outcomes[condition]
+        condition = self.outcomes.get(condition, condition)
         if not isinstance(condition, Symbol):
             return a if condition else b
         if a is b or (not isinstance(a, Symbol) and not isinstance(b, Symbol) and a == b):
             return a
         return self.symbol("select", condition, a, b)
-
-    def any_lane(self, condition: Any) -> bool:
-        """Return the outcome of a condition under :meth:`fork`."""
-        if not isinstance(condition, Symbol):
-            return bool(condition)
-        if condition not in self.outcomes:
-            raise UndecidedError(condition)
-        return self.outcomes[condition]
-
-    def fork(self, function: Callable[..., Any]) -> Callable[..., Any]:
-        """Return a function that is executed for both outcomes of each condition, with its results and its effects on arrays selected."""
-
-        def both(*arguments: Any) -> Any:
-            before = [array.copied() for array in self.arrays]
-            try:
-                return function(*arguments)
-            except UndecidedError as undecided:
-                condition = undecided.condition
-            results, effects = [], []
-            for outcome in (True, False):
-                for array, (known, changed) in zip(self.arrays, before, strict=False):
-                    array.known, array.changed = dict(known), dict(changed)
-                self.outcomes[condition] = outcome
-                results.append(both(*arguments))
-                del self.outcomes[condition]
-                effects.append([array.copied() for array in self.arrays])
-            for array, (known, _), (_, true), (_, false) in zip(self.arrays, before, *effects, strict=False):
-                array.merge(known, lambda a, b: self.select(condition, a, b), true, false)
-            return tuple(self.select(condition, a, b) for a, b in zip(*results, strict=True))
-
-        return both
 
 
 class Values:
@@ -193,12 +190,12 @@ class Values:
     ``name`` maps an index to the place on the target; None: the elements exist only while tracing.
     """
 
-    def __init__(self, trace: Trace, name: Callable[[int], str] | None = None) -> None:
-        self.trace, self.name = trace, name
+    def __init__(self, trace: Trace, name: Callable[[int], str] | None = None, kind: str = "") -> None:
+        self.trace, self.name, self.type = trace, name, kind
         self.known: dict[Any, Any] = {}
         self.changed: dict[Any, Any] = {}
         self.loaded: dict[Any, Any] = {}
-        """Elements as they are on the target, which :meth:`Trace.fork` does not reset."""
+        """Elements as they are on the target."""
         self.loads = 0
         trace.arrays.append(self)
 
@@ -209,26 +206,12 @@ class Values:
             if i not in self.loaded:
                 self.loads += 1
                 self.loaded[i] = self.trace.symbol("load", self.name(i), Version((id(self), self.loads)))
+                self.loaded[i].type = self.type
             self.known[i] = self.loaded[i]
         return self.known[i]
 
     def __setitem__(self, i: Any, value: Any) -> None:
         self.known[i] = self.changed[i] = value
-
-    def copied(self) -> tuple[dict[Any, Any], dict[Any, Any]]:
-        """Return copies of the known and of the changed elements."""
-        return dict(self.known), dict(self.changed)
-
-    def merge(
-        self, before: dict[Any, Any], select: Callable[[Any, Any], Any], true: dict[Any, Any], false: dict[Any, Any]
-    ) -> None:
-        """Select between the elements that a function has changed for two outcomes."""
-        self.known = dict(before)
-        old = {i: self[i] for i in (*true, *false) if i in before or self.name is not None}
-        self.changed = {}
-        for i in dict.fromkeys((*true, *false)):
-            if (i in true and i in false) or i in old:  # a scratch element of one outcome only is not read later
-                self[i] = select(true.get(i, old.get(i)), false.get(i, old.get(i)))
 
     def forget(self) -> None:
         """Forget the elements: the target may have other values now."""

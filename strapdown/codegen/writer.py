@@ -8,10 +8,12 @@ from dataclasses import dataclass
 from typing import Any
 
 from strapdown.codegen.functions import Block, Function, Statement
-from strapdown.codegen.regions import PINNED, Group, Placement, Slot, values_in
-from strapdown.codegen.symbols import Symbol
+from strapdown.codegen.regions import Group, Placement, Slot, values_in
+from strapdown.codegen.symbols import PINNED, Symbol
 
-PRECEDENCE = {"||": 1, "&&": 2, "<": 3, ">": 3, "<=": 3, ">=": 3, "==": 3, "+": 4, "-": 4, "*": 5, "/": 5}
+PRECEDENCE = {"||": 1, "&&": 2, "|": 2.5, "<": 3, ">": 3, "<=": 3, ">=": 3, "==": 3, "+": 4, "-": 4}
+PRECEDENCE |= dict.fromkeys(("*", "/", "//", "%"), 5)
+FUNCTIONS = ("sqrt", "fabs", "exp", "expm1", "sin", "cos", "tan", "asin", "atan2", "lowest")
 LONGEST = 72
 """Longest expression, in characters, that is written into another."""
 WIDTH = 118
@@ -21,26 +23,27 @@ WIDTH = 118
 class Language:
     """Words of a language."""
 
-    constant: str
-    """Declaration of a constant number."""
-    condition: str
-    variable: str
+    variable: dict[str, str]
+    """Declaration of a variable, by its type."""
+    constant: dict[str, str]
+    """Declaration of a constant."""
     member: str
     """Between the filter and its member."""
     number: Callable[[float], str]
-    root: str
-    """Name of the square root."""
-    expm1: str
+    function: Callable[[str], str]
+    """Name of a mathematical function."""
     numbers: Callable[[Iterable[str]], str]
     """A list of numbers as an argument."""
     array: Callable[[str, int], str]
     """Declaration of an array of zeros."""
     status: Callable[[str], str]
     """A status of the filter."""
-    counter: str
-    """Declaration of a counter."""
     whole: Callable[[str], str]
     """A number rounded down."""
+    narrow: Callable[[str], str]
+    """A duration: the difference of two times."""
+    quotient: Callable[[str], str]
+    """A quotient of positive integers rounded down."""
 
 
 class Writer:
@@ -65,7 +68,7 @@ class Writer:
     def _block(self, block: Block) -> None:
         slot = self.placement.blocks[block]
         for statement in block.statements:
-            if statement.kind not in ("comment", "array"):
+            if statement.kind not in ("comment", "array", "variable"):
                 self._symbols(self._loads_before(statement, slot), slot)
                 self._symbols(self.placement.needed(values_in(statement), slot, self.written), slot)
             getattr(self, f"_{statement.kind}")(statement)
@@ -73,11 +76,9 @@ class Writer:
     def _loads_before(self, statement: Statement, slot: Slot) -> list[Symbol]:
         """Return the loads that a statement with an effect must not overtake."""
         alive, places = self.placement.alive, self.placement.places
-        return [
-            x
-            for x in alive
-            if x.kind == "load" and x.number < statement.number and places[x] is slot and x not in self.written
-        ]
+        kinds = ("load", "at")
+        loads = [x for x in alive if x.kind in kinds and x.number < statement.number and places[x] is slot]
+        return self.placement.needed(loads, slot, self.written)
 
     def _clear(self, statement: Statement) -> None:
         self.line(f"{self._member('f->status')} = 0;")
@@ -90,11 +91,22 @@ class Writer:
 
     def _store(self, statement: Statement) -> None:
         for target, value in zip(statement.targets, statement.values, strict=True):
-            self.line(f"{self._member(target)} = {self.text(value)};")
+            self.line(f"{self._member(target)} = {self.text(value, 'int' if isinstance(value, int) else '')};")
+
+    def _put(self, statement: Statement) -> None:
+        index, value = statement.values
+        self.line(f"{self._member(statement.text)}[{self.text(index, 'int')}] = {self.text(value)};")
+
+    def _variable(self, statement: Statement) -> None:
+        size, kind = statement.values
+        declared = self.language.variable[kind]
+        self.line(self.language.array(statement.text, size) if size else f"{declared} {statement.text};")
 
     def _if(self, statement: Statement) -> None:
         self.line(f"if ({self.text(statement.values[0])}) {{")
         for i, block in enumerate(statement.blocks):
+            if i and not block.statements:
+                continue
             if i:
                 self.line("} else {")
             self.indent += 1
@@ -104,7 +116,22 @@ class Writer:
 
     def _repeat(self, statement: Statement) -> None:
         count = self.text(statement.values[0])
-        self.line(f"for ({self.language.counter} i = 0; i < {count}; i++) {{")
+        self._repeated(f"for ({self.language.variable['int']} i = 0; i < {count}; i++) {{", statement)
+
+    def _for(self, statement: Statement) -> None:
+        name, (start, stop) = statement.text, (self.text(x, "int") for x in statement.values)
+        self._repeated(
+            f"for ({self.language.variable['int']} {name} = {start}; {name} < {stop}; {name}++) {{", statement
+        )
+
+    def _loop(self, statement: Statement) -> None:
+        self._repeated("for (;;) {", statement)
+
+    def _break(self, statement: Statement) -> None:
+        self.line("break;")
+
+    def _repeated(self, head: str, statement: Statement) -> None:
+        self.line(head)
         self.indent += 1
         self._block(statement.blocks[0])
         self.indent -= 1
@@ -115,16 +142,16 @@ class Writer:
         for value in statement.values:
             if isinstance(value, str):
                 arguments.append(value)
+            elif isinstance(value, tuple):
+                arguments.append(self.language.numbers(self.text(x) for x in value))
             else:
-                arguments.append(
-                    self.language.numbers(self.text(x) for x in value) if isinstance(value, tuple) else self.text(value)
-                )
+                arguments.append(self.text(value, "int" if isinstance(value, int) else ""))
         text = f"{statement.text}({', '.join(arguments)})"
         if statement.result in self.placement.places:
             assert statement.result is not None
             name = self.names[statement.result] = self._new("s")
             self.written.add(statement.result)
-            text = f"{self.language.constant} {name} = {text}"
+            text = f"{self.language.constant[statement.result.type]} {name} = {text}"
         self.line(f"{text};")
 
     def _return(self, statement: Statement) -> None:
@@ -135,6 +162,8 @@ class Writer:
             self.line(f"return {status};")
         elif statement.values:
             self.line(f"return {self.text(statement.values[0])};")
+        else:
+            self.line("return;")
 
     # --------------------------------------------------------------------------------------------------------------------------- symbols
 
@@ -156,21 +185,27 @@ class Writer:
             self.line(self.language.array(here, int(size)))
             self.line(f"{name}({', '.join([*(self.text(x) for x in arguments), here])});")
             return
-        if symbol.kind == "parameter" or (symbol.kind == "load" and not symbol.operands[0].startswith("f->")):
+        if symbol.kind == "parameter" or (symbol.kind == "load" and self._is_constant(symbol.operands[0])):
             self.names[symbol] = symbol.operands[0]
             return
         text = self._expression(symbol)
-        name = self._new("t" if symbol.kind != "load" else re.sub(r"f->|\]", "", symbol.operands[0]).replace("[", "_"))
+        member = symbol.kind == "load" and symbol.operands[0].startswith("f->")
+        name = self._new(re.sub(r"f->|\]", "", symbol.operands[0]).replace("[", "_") if member else "t")
         self.names[symbol] = name
-        word = self.language.condition if is_condition(symbol) else self.language.constant
-        self.line(f"{word} {name} = {text};")
+        self.line(f"{self.language.constant[symbol.type]} {name} = {text};")
+
+    def _is_constant(self, place: str) -> bool:
+        """Return whether a place is a parameter or a local array that nothing changes while its elements are used."""
+        return not place.startswith("f->") and place.partition("[")[0] not in self.function.changing
 
     def _group(self, group: Group, slot: Slot) -> None:
         """Write selections with the same condition as one branch."""
         members = group.members
         self._symbols(self.placement.needed((x for m in members for x in m.operands), slot, self.written), slot)
         names = [self._new("m") for _ in members]
-        self.line(f"{self.language.variable} {', '.join(names)};")
+        for kind in dict.fromkeys(member.type for member in members):
+            own = [name for name, member in zip(names, members, strict=True) if member.type == kind]
+            self.line(f"{self.language.variable[kind]} {', '.join(own)};")
         self.line(f"if ({self.text(members[0].operands[0])}) {{")
         assert group.arms is not None
         for i, arm in enumerate(group.arms, 1):
@@ -224,43 +259,50 @@ class Writer:
     def _member(self, text: str) -> str:
         return text.replace("->", self.language.member)
 
-    def text(self, value: Any) -> str:
-        """Return a value where it is used."""
+    def text(self, value: Any, kind: str = "") -> str:
+        """Return a value where a number of a type is used."""
         if isinstance(value, Symbol):
             if value in self.names:
                 return self.names[value]
             return self._expression(value) if value.kind == "item" else f"({self._expression(value)})"
-        return self.language.number(float(value))
+        if kind == "int" and float(value).is_integer():
+            return str(int(value))
+        return repr(float(value)) if kind == "wide" else self.language.number(float(value))
 
-    def _operand(self, value: Any, level: int, *, right: bool) -> str:
+    def _operand(self, value: Any, level: float, *, right: bool, kind: str = "") -> str:
         if isinstance(value, Symbol) and value not in self.names:
-            own = PRECEDENCE.get(value.kind, 6 if value.kind in ("sqrt", "expm1", "load", "item") else 0)
+            own = PRECEDENCE.get(value.kind, 6 if value.kind in (*FUNCTIONS, "load", "at", "item") else 0)
             text = self._expression(value)
             return text if own > level or (own == level and not right) else f"({text})"
-        text = self.text(value)
+        text = self.text(value, kind)
         return f"({text})" if text.startswith("-") else text
 
     def _expression(self, symbol: Symbol) -> str:
         kind, operands, language = symbol.kind, symbol.operands, self.language
         if kind in PRECEDENCE:
-            level = PRECEDENCE[kind]
-            pair = self._operand(operands[0], level, right=False), self._operand(operands[1], level, right=True)
-            left, right = (f"({x})" if kind == "||" and "&&" in x else x for x in pair)
-            return f"{left} {kind} {right}"
+            return self._binary(symbol)
         if kind == "load":
             return self._member(operands[0])
-        if kind == "item":
-            return f"{self.names[operands[0]]}[{int(operands[1])}]"
+        if kind in ("at", "item"):
+            array = self._member(operands[0]) if kind == "at" else self.names[operands[0]]
+            return f"{array}[{self._operand(operands[1], 0, right=False, kind='int')}]"
         if kind == "select":
             c, a, b = (self._operand(x, 5, right=True) for x in operands)
             return f"{c} ? {a} : {b}"
-        if kind == "neg":
-            return f"-{self._operand(operands[0], 6, right=True)}"
-        inner = self._operand(operands[0], 0, right=False)
-        functions = {"sqrt": f"{language.root}({inner})", "expm1": f"{language.expm1}({inner})", "not": f"!({inner})"}
-        return functions.get(kind) or language.whole(inner)
+        if kind in ("neg", "not"):
+            inner = self._operand(operands[0], 6 if kind == "neg" else 0, right=kind == "neg")
+            return f"-{inner}" if kind == "neg" else f"!({inner})"
+        inner = ", ".join(self._operand(x, 0, right=False) for x in operands)
+        return f"{language.function(kind)}({inner})" if kind in FUNCTIONS else language.whole(inner)
 
-
-def is_condition(symbol: Symbol) -> bool:
-    """Return whether a symbol is true or false."""
-    return symbol.kind in ("<", ">", "<=", ">=", "==", "&&", "||", "not")
+    def _binary(self, symbol: Symbol) -> str:
+        kind, operands, language = symbol.kind, symbol.operands, self.language
+        level, types = PRECEDENCE[kind], [x.type for x in operands if isinstance(x, Symbol)]
+        own = "wide" if "wide" in types else "int" if "int" in types and kind != "/" else ""
+        pair = [self._operand(x, level, right=i > 0, kind=own) for i, x in enumerate(operands)]
+        left, right = (f"({x})" if kind == "||" and "&&" in x else x for x in pair)
+        if "wide" in types and symbol.type == "":
+            return language.narrow(f"{left} - {right}")
+        if kind == "//":
+            return language.quotient(f"{left} / {right}")
+        return f"{left} {kind} {right}"

@@ -84,7 +84,9 @@ class Memory(NamedTuple):
     counted: np.ndarray
     """1 with a field, 2 with a force, 3 with both so far; number of steps since there were both (2,)."""
     start: np.ndarray
-    """Time of the first sample, s, first usual magnitude, and interval of the headings of the last step (3,)."""
+    """Time of the first sample, s, and interval of the headings of the last step (2,)."""
+    strength: np.ndarray
+    """First usual magnitude (1,)."""
     held: np.ndarray
     """Last field and force (2, 3)."""
     vertical: np.ndarray
@@ -100,7 +102,9 @@ class Memory(NamedTuple):
     median: np.ndarray
     """(6,)"""
     ring: np.ndarray
-    """Field (3), attitude (4), whether known, time, of the last ``lag`` steps (lag, 9)."""
+    """Field (3), attitude (4), and whether known, of the last ``lag`` steps (lag, 8)."""
+    ring_time: np.ndarray
+    """Their times, s (lag,)."""
     sums: np.ndarray
     """Normal equations of the iron (9,)."""
     iron: np.ndarray
@@ -168,8 +172,8 @@ def look_at_field(constants, steps, memory, found, k, known):
     up = scale(1.0 / math.sqrt(dot(up, up)), up)
     look(constants, memory, 0, field, up)
     if memory.counted[1] == 0:
-        memory.start[1] = memory.median[0]
-    strength = memory.start[1]
+        memory.strength[0] = memory.median[0]
+    strength = memory.strength[0]
     iron = iron_step(constants, field, frame, known, steps.time[k], strength, memory)
     R = rotation_matrix(frame)
     look(constants, memory, 1, subtract(field, matrix_times_vector(R, iron)), up)
@@ -198,14 +202,14 @@ def look_at_field(constants, steps, memory, found, k, known):
 
 def close_heading(constants, steps, memory, found, k):
     """Write the heading measurement, if its interval ends with step k."""
-    before = memory.start[2]
-    memory.start[2] = math.floor((steps.time[k] + constants.step - memory.start[0]) / constants.heading_interval - 1e-6)
+    before = memory.start[1]
+    memory.start[1] = math.floor((steps.time[k] + constants.step - memory.start[0]) / constants.heading_interval - 1e-6)
     total = (memory.total[0], memory.total[1], memory.total[2])
-    if memory.start[2] != before and memory.total[3] > 0.0:
+    if memory.start[1] != before and memory.total[3] > 0.0:
         R = rotation_matrix(quaternion_at(steps.end, k))
         store_row(found.direction, k, transpose_times_vector(R, scale(1.0 / math.sqrt(dot(total, total)), total)))
         found.sigma[k] = 1.0 / math.sqrt(memory.total[3])
-    if memory.start[2] != before:
+    if memory.start[1] != before:
         for i in range(4):
             memory.total[i] = 0.0
 
@@ -264,7 +268,8 @@ def iron_step(constants, field, frame, known, time, strength, memory):
     """Return the iron that the change of the field since ``lag`` steps shows, together with all earlier changes."""
     lag, step, sums, ring = constants.lag, memory.counted[1], memory.sums, memory.ring
     r = step % lag
-    pair = step >= lag and known and ring[r, 7] > 0.0 and abs(time - ring[r, 8] - constants.span) < 2.0 * constants.step
+    then = memory.ring_time[r]
+    pair = step >= lag and known and ring[r, 7] > 0.0 and abs(time - then - constants.span) < 2.0 * constants.step
     old = (ring[r, 3], ring[r, 4], ring[r, 5], ring[r, 6])
     own = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     if pair:
@@ -289,7 +294,8 @@ def iron_step(constants, field, frame, known, time, strength, memory):
         ring[r, i] = field[i]
     for i in range(4):
         ring[r, 3 + i] = frame[i]
-    ring[r, 7], ring[r, 8] = (1.0 if known else 0.0), time
+    ring[r, 7] = 1.0 if known else 0.0
+    memory.ring_time[r] = time
     for i in range(9):
         sums[i] += constants.iron_share * (own[i] - sums[i])
     h, ridge = constants.iron_interval, constants.ridge

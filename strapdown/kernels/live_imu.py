@@ -95,7 +95,7 @@ class Imu(NamedTuple):
     head_time: np.ndarray
     """Attitude by the gyro in the middle of the step, duration of the field's samples, attitude and time at the end (1, …)."""
     head_start: np.ndarray
-    """Time of the first sample first (3,)."""
+    """Time of the first sample first (2,)."""
     direction: np.ndarray
     sigma: np.ndarray
     """Heading measurement at the end of the step (1, 3), and its σ (1,); 0: none."""

@@ -86,7 +86,8 @@ def memory(lag: int, capacity: int) -> headings.Memory:
     """Return the memory of the kernel at the start, with room for this number of values of each running median."""
     return headings.Memory(
         counted=np.zeros(2, np.int64),
-        start=np.zeros(3),
+        start=np.zeros(2),
+        strength=np.zeros(1),
         held=np.zeros((2, 3)),
         vertical=np.zeros((2, 3)),
         mean=np.zeros((3, 3)),
@@ -94,7 +95,8 @@ def memory(lag: int, capacity: int) -> headings.Memory:
         ordered=np.zeros((6, capacity)),
         stride=np.zeros((6, 2), np.int64),
         median=np.zeros(6),
-        ring=np.zeros((lag, 9)),
+        ring=np.zeros((lag, 8)),
+        ring_time=np.zeros(lag),
         sums=np.zeros(9),
         iron=np.zeros(3),
         total=np.zeros(4),

@@ -1,0 +1,427 @@
+"""Kernels with branches and loops, executed statement by statement on symbols.
+
+Their ``if``, ``while`` and ``for`` become those of the target, unless what decides them is known while tracing. A name that a branch or a
+loop changes is a variable of the target afterwards. Kernels in ``OWN`` become functions of the target, others are written where they are
+called.
+"""
+
+from __future__ import annotations
+
+import ast
+import functools
+import inspect
+import math
+import operator
+import textwrap
+from collections.abc import Callable, Sequence
+from types import FunctionType, SimpleNamespace
+from typing import Any, NamedTuple
+
+from strapdown.codegen.functions import Block, Statement
+from strapdown.codegen.symbols import KERNELS, Symbol, Trace
+
+OWN = ("look", "insert", "iron_step")
+"""Kernels that are called several times, or return early; their arguments are numbers, vectors, and what is the same for all calls."""
+LONGEST_UNROLLED = 12
+"""Maximum number of repetitions that are written one after the other."""
+
+LEAVING = (ast.Return, ast.Continue)
+
+
+class Range(NamedTuple):
+    """Integers of a loop of the target."""
+
+    start: Any
+    stop: Any
+
+
+class Bind(NamedTuple):
+    """Assignment of a value to the target of an unrolled loop."""
+
+    target: ast.expr
+    value: Any
+
+
+class Expressions(ast.NodeTransformer):
+    """Replaces what Python decides by the truth of an operand: chains of comparisons, ``and``, ``or``, ``not``, ``a if c else b``."""
+
+    def visit_Compare(self, node: ast.Compare) -> ast.expr:
+        """Join a chain of comparisons."""
+        self.generic_visit(node)
+        parts: list[ast.expr] = []
+        for left, sign, right in zip([node.left, *node.comparators], node.ops, node.comparators, strict=False):
+            if isinstance(sign, ast.Eq | ast.NotEq):
+                same = called("_equal_", left, right)
+                parts.append(same if isinstance(sign, ast.Eq) else called("_no_", same))
+            else:
+                parts.append(ast.Compare(left, [sign], [right]))
+        return parts[0] if len(parts) == 1 else called("_all_", *parts)
+
+    def visit_BoolOp(self, node: ast.BoolOp) -> ast.expr:
+        """Evaluate all operands."""
+        self.generic_visit(node)
+        return called("_all_" if isinstance(node.op, ast.And) else "_any_", *node.values)
+
+    def visit_UnaryOp(self, node: ast.UnaryOp) -> ast.expr:
+        """Negate a condition."""
+        self.generic_visit(node)
+        return called("_no_", node.operand) if isinstance(node.op, ast.Not) else node
+
+    def visit_IfExp(self, node: ast.IfExp) -> ast.expr:
+        """Select a value."""
+        self.generic_visit(node)
+        none = ast.arguments([], [], None, [], [], None, [])
+        return called("_select_", node.test, ast.Lambda(none, node.body), ast.Lambda(none, node.orelse))
+
+
+def called(name: str, *arguments: ast.expr) -> ast.expr:
+    """Return the call of a helper."""
+    return ast.Call(ast.Name(name, ast.Load()), list(arguments), [])
+
+
+@functools.cache
+def parsed(function: FunctionType) -> ast.FunctionDef:
+    """Return a kernel's syntax tree."""
+    (node,) = ast.parse(textwrap.dedent(inspect.getsource(function))).body
+    assert isinstance(node, ast.FunctionDef)
+    return node
+
+
+@functools.cache
+def code_of(node: ast.expr) -> Any:
+    """Return an expression as code."""
+    tree = ast.Expression(Expressions().visit(ast.parse(ast.unparse(node), mode="eval").body))
+    return compile(ast.fix_missing_locations(tree), "<kernel>", "eval")
+
+
+def assigned(statements: Sequence[ast.stmt]) -> set[str]:
+    """Return the names that statements assign."""
+    return {
+        x.id for s in statements for x in ast.walk(s) if isinstance(x, ast.Name) and not isinstance(x.ctx, ast.Load)
+    }
+
+
+def contains(statements: Sequence[ast.stmt], kinds: tuple[type, ...]) -> bool:
+    """Return whether there is a statement of a kind in statements."""
+    return any(isinstance(x, kinds) for s in statements for x in ast.walk(s))
+
+
+def mathematics(trace: Trace) -> dict[str, Any]:
+    """Return the functions that kernels use, on symbols or numbers."""
+
+    def function(name: str, kind: str | None = None) -> Callable[..., Any]:
+        plain = getattr(math, name)
+        return lambda *x: trace.symbol(kind or name, *x) if any(isinstance(t, Symbol) for t in x) else plain(*x)
+
+    def less(a: Any, b: Any) -> Any:
+        return trace.select(b < a, b, a)
+
+    def greater(a: Any, b: Any) -> Any:
+        return trace.select(b > a, b, a)
+
+    names = ("sqrt", "exp", "expm1", "sin", "cos", "tan", "asin", "atan2")
+    functions = {name: function(name) for name in names}
+    space = SimpleNamespace(
+        **functions,
+        floor=function("floor", "lowest"),
+        copysign=lambda a, b: trace.select(b < 0.0, -abs(a), abs(a)),
+        inf=math.inf,
+        nan=math.nan,
+        pi=math.pi,
+    )
+    return {
+        "math": space,
+        "abs": abs,
+        "min": less,
+        "max": greater,
+        "square_root": trace.square_root,
+        "_select_": lambda c, a, b: trace.select(c, a(), b()) if isinstance(c, Symbol) else a() if c else b(),
+        "_all_": lambda *x: functools.reduce(lambda a, b: trace.condition("&&", a, b), x),
+        "_any_": lambda *x: functools.reduce(lambda a, b: trace.condition("||", a, b), x),
+        "_no_": lambda x: trace.symbol("not", x) if isinstance(x, Symbol) else not x,
+        "_equal_": lambda a, b: trace.symbol("==", a, b) if isinstance(a, Symbol) or isinstance(b, Symbol) else a == b,
+    }
+
+
+class Interpreter:
+    """Executes kernels for a function of the target."""
+
+    def __init__(self, m: Any) -> None:
+        self.m, self.trace = m, m.trace
+        self.helpers = mathematics(m.trace) | {"range": self._range}
+        self.outer = False
+        """Whether the kernel is the function of the target, which may return anywhere."""
+
+    def _range(self, *bounds: Any) -> Any:
+        if len(bounds) == 3:
+            return range(*bounds)
+        start, stop = bounds if len(bounds) == 2 else (0, bounds[0])
+        known = not isinstance(start, Symbol) and not isinstance(stop, Symbol)
+        return range(start, stop) if known and stop - start <= LONGEST_UNROLLED else Range(start, stop)
+
+    def __call__(self, function: FunctionType, *arguments: Any) -> Any:
+        """Return the result of a kernel."""
+        if function.__name__ in OWN:
+            return self._call_own(function, arguments)
+        before, self.outer = self.outer, False
+        result = self._body(function, arguments)
+        self.outer = before
+        return result
+
+    def _body(self, function: FunctionType, arguments: Sequence[Any]) -> Any:
+        node = parsed(function)
+        env = dict(zip((a.arg for a in node.args.args), arguments, strict=True))
+        env["_globals_"] = function.__globals__
+        result = self._statements(list(node.body), env)
+        return result[0] if result else None
+
+    def _value(self, node: ast.expr, env: dict[str, Any]) -> Any:
+        """Return the value of an expression."""
+        names = {}
+        for name in {x.id for x in ast.walk(node) if isinstance(x, ast.Name)}:
+            if name in env:
+                names[name] = env[name]
+            elif name in self.helpers:
+                names[name] = self.helpers[name]
+            elif name in env["_globals_"]:
+                value = env["_globals_"][name]
+                kernel = isinstance(value, FunctionType) and value.__module__.startswith(KERNELS)
+                names[name] = functools.partial(self, value) if kernel else value
+        try:
+            return eval(code_of(node), {**self.helpers, **names})
+        except Exception as error:
+            error.add_note(f"in a kernel: {ast.unparse(node)}")
+            raise
+
+    # ---------------------------------------------------------------------------------------------------------------------- statements
+
+    def _statements(self, items: list[Any], env: dict[str, Any]) -> tuple[Any, ...]:
+        """Execute statements; return the value returned by them in a tuple, or an empty one."""
+        while items:
+            node = items.pop(0)
+            if isinstance(node, Bind):
+                self._assign(node.target, node.value, env)
+            elif isinstance(node, ast.Assign):
+                value = self._value(node.value, env)
+                for target in node.targets:
+                    self._assign(target, value, env)
+            elif isinstance(node, ast.AugAssign):
+                self._assign(node.target, self._augmented(node, env), env)
+            elif isinstance(node, ast.Expr):
+                if not isinstance(node.value, ast.Constant):
+                    self._value(node.value, env)
+            elif isinstance(node, ast.Return):
+                return (None if node.value is None else self._value(node.value, env),)
+            elif isinstance(node, ast.Continue):
+                return ()
+            elif isinstance(node, ast.While):
+                parts = node.test.values if isinstance(node.test, ast.BoolOp) else [node.test]
+                self._loop(Statement("loop"), parts, node.body, env)
+            elif isinstance(node, ast.For):
+                values = self._value(node.iter, env)
+                if isinstance(values, Range):
+                    self._count(values, node, env)
+                else:
+                    items[:0] = [x for value in values for x in (Bind(node.target, value), *node.body)]
+            elif isinstance(node, ast.If):
+                condition = self._value(node.test, env)
+                if not isinstance(condition, Symbol):
+                    items[:0] = node.body if condition else node.orelse
+                elif self.outer and contains(node.body, (ast.Return,)):
+                    self._leave_if(condition, node.body, env)
+                    items[:0] = node.orelse
+                else:
+                    otherwise = list(node.orelse)
+                    if contains(node.body, LEAVING):
+                        assert not any(isinstance(item, Bind) for item in items), "an unrolled loop is left"
+                        otherwise, items = otherwise + items, []
+                    result = self._branch(condition, (node.body, otherwise), env)
+                    if result:
+                        return result
+            else:
+                raise TypeError(f"a statement that cannot be exported: {ast.unparse(node)}")
+        return ()
+
+    def _augmented(self, node: ast.AugAssign, env: dict[str, Any]) -> Any:
+        target: Any = ast.parse(ast.unparse(node.target), mode="eval").body
+        old, value = self._value(target, env), self._value(node.value, env)
+        if isinstance(node.op, ast.BitOr):
+            return self.trace.symbol("|", old, value)
+        operations: dict[type, Any] = {ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul}
+        return operations[type(node.op)](old, value)
+
+    def _assign(self, target: ast.expr, value: Any, env: dict[str, Any]) -> None:
+        if isinstance(target, ast.Name):
+            env[target.id] = value
+        elif isinstance(target, ast.Tuple):
+            for part, x in zip(target.elts, value, strict=True):
+                self._assign(part, x, env)
+        else:
+            assert isinstance(target, ast.Subscript)
+            self._value(target.value, env)[self._value(target.slice, env)] = value
+
+    def _leave_if(self, condition: Symbol, body: Sequence[ast.stmt], env: dict[str, Any]) -> None:
+        """Return from the function of the target, if a condition holds."""
+
+        def then() -> None:
+            (value,) = self._statements(list(body), dict(env))
+            self.m.give(value)
+
+        self.m.branch(condition, then)
+
+    def _branch(
+        self, condition: Symbol, bodies: tuple[Sequence[ast.stmt], ...], env: dict[str, Any]
+    ) -> tuple[Any, ...]:
+        """Execute both outcomes; what differs between them is a variable afterwards."""
+        m, ends = self.m, []
+        parent = m.block
+        m.flush()
+        known = [(array.known, array.loaded) for array in self.trace.arrays]
+
+        def arm(body: Sequence[ast.stmt], outcome: bool) -> Callable[[], None]:
+            def execute() -> None:
+                here = dict(env)
+                before, self.outer = self.outer, False
+                self.trace.outcomes[condition] = outcome
+                result = self._statements(list(body), here)
+                del self.trace.outcomes[condition]
+                self.outer = before
+                ends.append(here | ({"": result[0]} if result else {}))
+
+            return execute
+
+        m.branch(condition, arm(bodies[0], True), arm(bodies[1], False))
+        place = len(parent.statements) - 1
+        blocks = parent.statements[place].blocks
+        pure = not any(block.statements for block in blocks)
+        if pure:
+            created = [x for x in self.trace.symbols.values() if x.place in blocks]
+            pure = all(x.kind != "at" for x in created)
+            if pure:
+                parent.statements.pop()
+                for x in created:
+                    x.place = parent
+                for array, (elements, loaded) in zip(self.trace.arrays, known, strict=False):
+                    array.known, array.loaded = elements, loaded
+        for name in sorted({*assigned(bodies[0]), *assigned(bodies[1]), ""}):
+            values = [end[name] for end in ends if name in end]
+            env.pop(name, None)
+            if len(values) == 2:
+                if same(*values):
+                    env[name] = values[0]
+                elif pure:
+                    env[name] = self._selected(condition, *values)
+                else:
+                    env[name] = self._merged(name, values, parent, place, blocks)
+        return (env.pop(""),) if "" in env else ()
+
+    def _selected(self, condition: Symbol, a: Any, b: Any) -> Any:
+        """Return one of two values without a branch."""
+        if isinstance(a, tuple):
+            return tuple(self._selected(condition, x, y) for x, y in zip(a, b, strict=True))
+        return self.trace.select(condition, a, b)
+
+    def _merged(self, name: str, values: list[Any], parent: Block, place: int, blocks: Sequence[Block]) -> Any:
+        """Return a variable that has one of two values, according to the block that was executed."""
+        variable, declaration = self.m.variable(name or "result", *values)
+        parent.statements.insert(place, declaration)
+        for block, value in zip(blocks, values, strict=True):
+            numbers = value if isinstance(value, tuple) else (value,)
+            targets = [variable.name(i) for i in range(len(numbers))]
+            block.statements.append(Statement("store", targets=targets, values=numbers, number=self.trace.count()))
+        return variable.value()
+
+    # --------------------------------------------------------------------------------------------------------------------------- loops
+
+    def _count(self, values: Range, node: ast.For, env: dict[str, Any]) -> None:
+        assert isinstance(node.target, ast.Name)
+        name = self.m.new_name(node.target.id)
+        statement = Statement("for", name, values=tuple(values))
+        counter = self.trace.symbol("parameter", name)
+        counter.type = "int"
+        self._loop(statement, [], node.body, env, (node.target.id, counter))
+
+    def _loop(
+        self,
+        statement: Statement,
+        conditions: Sequence[ast.expr],
+        body: Sequence[ast.stmt],
+        env: dict[str, Any],
+        counter: tuple[str, Any] | None = None,
+    ) -> None:
+        m = self.m
+        variables = {}
+        for name in sorted(assigned(body) & set(env)):
+            variables[name], declaration = m.variable(name, env[name], changes=True)
+            m.add(declaration)
+            variables[name].put(env[name])
+        m.flush()
+
+        def execute() -> None:
+            for array in self.trace.arrays:
+                array.forget()
+            here = env | {name: variable.value() for name, variable in variables.items()}
+            for condition in conditions:
+                m.unless(self._value(condition, here), m.leave_loop)
+            if counter is not None:
+                here[counter[0]] = counter[1]
+            result = self._statements(list(body), here)
+            assert not result, "a loop of the target returns nothing"
+            for name, variable in variables.items():
+                variable.put(here[name])
+
+        statement.blocks = [Block(m.block)]
+        m.add(statement)
+        m.inside(statement.blocks[0], execute)
+        for name, variable in variables.items():
+            env[name] = variable.value()
+
+    # ------------------------------------------------------------------------------------------------------ functions of the target
+
+    def _call_own(self, function: FunctionType, arguments: Sequence[Any]) -> Any:
+        m, name = self.m, function.__name__
+        names = [a.arg for a in parsed(function).args.args]
+        numbers = {n: a for n, a in zip(names, arguments, strict=True) if type(a) is tuple or is_number(a)}
+        if name not in m.functions:
+            m.functions[name] = None
+            parameters = [(n, len(a) if type(a) is tuple else m.type_of(a)) for n, a in numbers.items()]
+            words = (function.__doc__ or "").split("\n")[0]
+            target = m.another(name, parameters, words)
+            given = [target.argument(n) if n in numbers else target.spaces[n] for n in names]
+            interpreter = Interpreter(target)
+            interpreter.outer = True
+            result = interpreter._body(function, given)
+            if isinstance(result, tuple):
+                target.parameters = [*parameters, ("result", -len(result))]
+                out = target.array(lambda i: f"result[{i}]")
+                for i, value in enumerate(result):
+                    out[i] = value
+                target.flush()
+            elif result is not None:
+                target.returns = "real"
+                target.give(result)
+            else:
+                target.flush()
+            del m.functions[name]
+            m.functions[name] = target, len(result) if isinstance(result, tuple) else 0
+        target, size = m.functions[name]
+        if not size:
+            return m.call(name, *numbers.values(), result="" if target.returns == "real" else None)
+        variable, declaration = m.variable(name, (0.0,) * size)
+        m.add(declaration)
+        m.call(name, *numbers.values(), variable.base)
+        return variable.value()
+
+
+def is_number(value: Any) -> bool:
+    """Return whether a value is a number of the target or of Python."""
+    return isinstance(value, Symbol | int | float)
+
+
+def same(a: Any, b: Any) -> bool:
+    """Return whether two values are the same symbols or equal numbers."""
+    if isinstance(a, tuple) and isinstance(b, tuple):
+        return len(a) == len(b) and all(map(same, a, b))
+    if isinstance(a, Symbol) or isinstance(b, Symbol) or not (is_number(a) and is_number(b)):
+        return a is b
+    return a == b and type(a) is type(b)

@@ -1,0 +1,289 @@
+"""The exported filter of an IMU against its program in plain Python, to the bit, and against LiveAhrs, to rounding."""
+
+import ctypes
+import functools
+import json
+import math
+import subprocess
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from exported import STRICT, Compiled, Plain, compiler, node
+from test_live_ahrs import swinging, with_missing
+
+import strapdown as sd
+from strapdown import quaternion
+from strapdown.ahrs import AhrsParameters, LiveAhrs, of_motion
+from strapdown.checks import InputError
+from strapdown.codegen import c, design, javascript
+from strapdown.randomness import generator
+from strapdown.recordings import read, sensor_delays
+
+SINGLE_SIGMA = 1e-3
+"""Largest difference of single precision from double, in units of σ."""
+
+
+@functools.cache
+def case(name):
+    """A filter that has not started, and samples: time, gyro, accelerometer, magnetometer; None: missing."""
+    recording = with_missing(swinging(duration=12.0))
+    if name == "white":
+        shares = {"tilt_sigma": 0.02, "tilt_by_field": 0.3, "heading_share": 0.1, "heading_by_field": 1.0}
+        parameters = AhrsParameters(rest_bias_sigma=1e-3, hard_iron_sigma=0.0, **shares)
+        live = LiveAhrs(interval=0.01, magnetometer=True, parameters=parameters)
+        turned = quaternion.conjugate(sensor_delays.gyro_attitude(recording))
+        field = quaternion.rotate(turned, [0.0, 20.0, -43.0]) + np.array([4.0, -2.0, 1.0])
+        field += generator(12, 0, "field").normal(0.0, 0.3, field.shape)
+        field[5::13] = np.nan
+        field[320:350] = 0.0
+        recording = replace(recording, magnetic_field=field)
+    else:
+        # A gyro whose bias is measured in nearly every second at rest.
+        parameters = replace(of_motion(name, magnetometer=False), rate_random_walk=1e-3)
+        live = LiveAhrs(interval=0.01, parameters=parameters)
+    return live, rows_of(recording)
+
+
+def rows_of(recording):
+    columns = [recording.rate, recording.specific_force]
+    if recording.magnetic_field is not None:
+        columns.append(recording.magnetic_field)
+    vectors = zip(*(column.tolist() for column in columns), strict=True)
+    return [
+        (time, *(None if math.isnan(sum(v)) else v for v in row))
+        for time, row in zip(recording.time.tolist(), vectors, strict=True)
+    ]
+
+
+def fresh(live):
+    return LiveAhrs(interval=live.interval, magnetometer=live.magnetometer, parameters=live.parameters)
+
+
+def fed(f, rows):
+    f.start()
+    state = f.state if isinstance(f, Compiled) else f.f
+    out = []
+    for row in rows:
+        assert f.take(*row) == 0
+        bias = state.bias if isinstance(f, Compiled) else state.x[4:7]
+        out.append([*state.q, *bias, *state.variance])
+    return np.array(out)
+
+
+@functools.cache
+def expected(name):
+    """Attitude, bias and variances by LiveAhrs after each sample."""
+    live, rows = case(name)
+    return by_live(fresh(live), rows)
+
+
+def by_live(live, rows):
+    out = []
+    for row in rows:
+        live.update(*row)
+        out.append([*live.attitude, *live.bias, *live.variance])
+    return np.array(out)
+
+
+def need_close(numbers, others, *, angle, bias, variance):
+    assert quaternion.angle_between(numbers[:, :4], others[:, :4]).max() < angle
+    assert np.abs(numbers[:, 4:7] - others[:, 4:7]).max() < bias
+    np.testing.assert_allclose(numbers[:, 7:], others[:, 7:], rtol=variance)
+
+
+@pytest.fixture(scope="module", params=["white", "hand"])
+def compiled(request, tmp_path_factory):
+    """Name of a case, and its filter in C."""
+    live, _ = case(request.param)
+    program = design.program_of_live(live, single=False)
+    return request.param, Compiled(program, tmp_path_factory.mktemp("double"), flags=("-O0",))
+
+
+def test_c_equals_python_to_the_bit(compiled):
+    name, f = compiled
+    rows = case(name)[1][: 1200 if name == "white" else 330]
+    plain = Plain(f.program)
+    np.testing.assert_array_equal(fed(f, rows), fed(plain, rows))
+    assert {"end_step", "carry", "find_rest", "use_rest", "propagate", "update_accelerometer"} <= plain.called
+
+
+def test_c_equals_live_ahrs_to_rounding(compiled):
+    name, f = compiled
+    need_close(fed(f, case(name)[1]), expected(name), angle=1e-12, bias=1e-13, variance=1e-11)
+    assert np.abs(np.diff(expected(name)[:, 4:7], axis=0)).max() > 1e-4  # a rest has corrected the bias
+
+
+@pytest.mark.parametrize("name", ["white", pytest.param("hand", marks=pytest.mark.slow)])
+def test_single_precision_within_a_thousandth_of_sigma(name, tmp_path):
+    live, rows = case(name)
+    f = Compiled(design.program_of_live(live, single=True), tmp_path, single=True, flags=("-O0",))
+    numbers, others = fed(f, rows), expected(name)
+    away = quaternion.log(quaternion.multiply(quaternion.conjugate(others[:, :4]), numbers[:, :4]))
+    assert np.max(np.abs(away) / np.sqrt(others[:, 7:10])) < SINGLE_SIGMA
+    assert np.max(np.abs(numbers[:, 4:7] - others[:, 4:7]) / np.sqrt(others[:, 10:])) < SINGLE_SIGMA
+    np.testing.assert_allclose(numbers[:, 7:], others[:, 7:], rtol=1e-3)
+
+
+def test_single_precision_after_weeks(tmp_path):
+    """Times are double: in single, 100 Hz could not be told apart after a few days."""
+    live, rows = case("white")
+    f = Compiled(design.program_of_live(live, single=True), tmp_path, single=True, flags=("-O0",))
+    late = [(time + 2.0**22, *vectors) for time, *vectors in rows[:300]]
+    need_close(fed(f, late), by_live(fresh(live), late), angle=1e-4, bias=1e-5, variance=1e-3)
+
+
+FEED = """
+import * as filter from './strapdown_filter.mjs';
+import fs from 'fs';
+const f = filter.create();
+filter.init(f);
+const out = JSON.parse(fs.readFileSync('rows.json')).map((row) => {
+    if (filter.update(f, ...row) !== 0) throw new Error(`status of ${row}`);
+    return [...filter.attitude(f), ...filter.bias(f), ...filter.sigma(f).slice(0, 6).map((s) => s * s)];
+});
+console.log(JSON.stringify(out));
+"""
+
+
+@pytest.mark.parametrize("name", ["white", "hand"])
+def test_javascript_equals_live_ahrs_to_rounding(name, tmp_path):
+    live, rows = case(name)
+    (text,) = javascript.files(design.program_of_live(live, single=False), "test").values()
+    for file, content in {"strapdown_filter.mjs": text, "feed.mjs": FEED, "rows.json": json.dumps(rows)}.items():
+        (tmp_path / file).write_text(content, encoding="utf-8")
+    run = subprocess.run([node(), "feed.mjs"], cwd=tmp_path, check=True, capture_output=True, text=True)
+    need_close(np.array(json.loads(run.stdout)), expected(name), angle=1e-12, bias=1e-13, variance=1e-11)
+
+
+@pytest.mark.parametrize(
+    ("name", "magnetometer"), [("any", True), ("hand", False), pytest.param("hand", True, marks=pytest.mark.slow)]
+)
+def test_a_recording_of_broad(name, magnetometer, broad, tmp_path):
+    """Fast rotations with a magnetometer beside iron: over a minute equal to LiveAhrs within a millionth of a degree."""
+    recording = read(broad / "07_undisturbed_fast_rotation_B.hdf5")
+    recording = recording if magnetometer else replace(recording, magnetic_field=None)
+    live = LiveAhrs(
+        interval=float(np.median(np.diff(recording.time))),
+        magnetometer=magnetometer,
+        parameters=of_motion(name, magnetometer=magnetometer),
+    )
+    rows = rows_of(recording)[: 60 * 286]
+    f = Compiled(design.program_of_live(live, single=False), tmp_path, flags=("-O1" if magnetometer else "-O0",))
+    need_close(fed(f, rows), by_live(live, rows), angle=1e-8, bias=1e-9, variance=1e-6)
+
+
+BAD = [math.nan, math.inf, -math.inf, 1e13, -1e300]
+BAD_TIMES = [math.nan, math.inf, -math.inf, 0.0, -1e300, 1e300, 1e6]
+
+
+def test_hostile_samples_set_a_flag_and_leave_the_filter_as_it_was(compiled):
+    name, f = compiled
+    f.start()
+    assert f.take(0.0, [0.0] * 3, None, None) == 16  # waits for the vertical
+    for k, (time, *vectors) in enumerate(case(name)[1][:600]):
+        f.take(time, *vectors)
+        f.library.strapdown_clear_status(ctypes.byref(f.state))
+        before = bytes(f.state)
+        values = [time + 0.01, *([1.0, 2.0, 3.0] for _ in vectors)]
+        place = k % len(values)
+        if place:
+            values[place][k % 3] = BAD[k % len(BAD)]
+        else:
+            values[0] = BAD_TIMES[k % len(BAD_TIMES)]
+        assert f.take(*values) == f.status == 1, (k, values)
+        f.library.strapdown_clear_status(ctypes.byref(f.state))
+        assert bytes(f.state) == before
+    assert np.isfinite(f.numbers).all()
+    need_close(fed(f, case(name)[1]), expected(name), angle=1e-12, bias=1e-13, variance=1e-11)  # starts again as new
+
+
+SANITIZED = """
+#include <math.h>
+#include <stdlib.h>
+#include "strapdown_filter.h"
+int main(void) {
+    static strapdown_filter f;
+    const strapdown_real bad[8] = {NAN, INFINITY, -INFINITY, 1e9, -1e9, 1e30, 1e-30, 0};
+    double time = 1e9;
+    strapdown_init(&f);
+    srand(1);
+    for (int k = 0; k < 20000; k++) {
+        strapdown_real v[3][3];
+        for (int i = 0; i < 9; i++) v[i / 3][i % 3] = (strapdown_real)rand() / RAND_MAX - (strapdown_real)0.5;
+        v[1][2] += 9;
+        if (k % 3 == 0) v[rand() % 3][rand() % 3] = bad[rand() % 8];
+        time += k % 97 == 0 ? bad[rand() % 8] : k % 1000 == 1 ? 1000.0 : 0.01;
+        if (!(fabs(time) < 1e12)) time = 1e9 + 0.01 * k;
+        strapdown_update(&f, time, v[0], k % 5 ? v[1] : 0MAGNETOMETER);
+        if (k % 9000 == 8999) strapdown_init(&f);
+    }
+    strapdown_real sigma[STRAPDOWN_STATES];
+    strapdown_sigma(&f, sigma);
+    for (int i = 0; i < STRAPDOWN_STATES; i++) if (!(sigma[i] > 0)) return 1;
+    return 0;
+}
+"""
+
+
+@pytest.mark.parametrize("name", ["white", pytest.param("hand", marks=pytest.mark.slow)])
+def test_sanitizers_find_nothing(name, tmp_path):
+    gcc = compiler()
+    live, _ = case(name)
+    text = SANITIZED.replace("MAGNETOMETER", ", k % 7 ? v[2] : 0" if live.magnetometer else "")
+    for file, content in {
+        **c.files(design.program_of_live(live, single=False), "test", single=False),
+        "main.c": text,
+    }.items():
+        (tmp_path / file).write_text(content, encoding="utf-8")
+    sanitize = ["-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+    build = [gcc, *STRICT, *sanitize, "main.c", "strapdown_filter.c", "-o", "run", "-lm"]
+    done = subprocess.run(build, cwd=tmp_path, capture_output=True, text=True, check=False)
+    if "cannot find" in done.stderr:
+        pytest.skip(f"no sanitizers: {done.stderr.splitlines()[0]}")
+    assert done.returncode == 0, done.stderr
+    run = subprocess.run(["./run"], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert (run.returncode, run.stderr) == (0, "")
+
+
+def test_the_command_writes_a_filter_that_compiles_and_says_what_it_is(run, tmp_path):
+    status, out, _ = run(
+        "export", "any", "--rate", "100", "--magnetometer", "--precision", "single", "--out", str(tmp_path)
+    )
+    assert (status, "IMU at 100 Hz" in out) == (0, True)
+    header = (tmp_path / "strapdown_filter.h").read_text(encoding="utf-8")
+    for words in (
+        sd.__version__,
+        "with a magnetometer and samples every 0.01 s",
+        "specific_force_noise = 0.6",
+        "double time",
+    ):
+        assert words in " ".join(header.replace(" *", "").split())
+    gcc = [compiler(), *STRICT, "main.c", "strapdown_filter.c", "-o", "run", "-lm"]
+    subprocess.run(gcc, cwd=tmp_path, check=True)
+    done = subprocess.run(["./run"], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("attitude 1 0 0 0")
+    assert done.stdout.endswith("status 0\n")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("hand",), "give their rate"),
+        (("hand", "satellite", "--rate", "100"), "its own sensors"),
+        (("hand", "--rate", "-1"), "rate is -1"),
+        (("filter.toml", "--rate", "100"), "needs a record or a scenario"),
+    ],
+)
+def test_the_command_refuses_what_does_not_belong_together(arguments, words, run):
+    status, _, error = run("export", *arguments)
+    assert status != 0
+    assert words in " ".join(error.split())
+
+
+def test_a_live_filter_has_its_sensors_and_a_setup_has_not(tmp_path):
+    live, _ = case("white")
+    with pytest.raises(InputError, match="has its own"):
+        sd.export(live, [], folder=tmp_path)
+    with pytest.raises(InputError, match="no sensor"):
+        sd.export(live.parameters.setup, folder=tmp_path)
