@@ -198,6 +198,13 @@ def test_an_array_has_the_rate_and_the_unit_that_are_given(tmp_path):
     np.testing.assert_allclose(found.values, np.pi)
 
 
+def test_rows_of_times_are_those_of_their_stamps():
+    recording = Recording(source="a", time=0.5 * np.arange(4.0), rate=np.ones((4, 3)))
+    np.testing.assert_array_equal(recording.rows_of(np.array([0.0, 1.0, 1.5])), [0, 2, 3])
+    with pytest.raises(InputError):
+        recording.rows_of(np.array([0.25]))
+
+
 def test_vectors_of_a_record_are_at_their_stamps():
     """Row k is the interval that ends at edge k + 1; a vector between two edges belongs to none, that of a direction neither."""
     time, g = np.arange(5.0), np.array([0.0, 0.0, 9.81])
