@@ -9,6 +9,7 @@ import shutil
 import subprocess
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -136,25 +137,31 @@ class Plain:
 
 
 class Compiled:
-    """The filter in C, compiled into a library."""
+    """The filter in C, compiled into a library: once for a program."""
+
+    _libraries: ClassVar[dict[Any, ctypes.CDLL]] = {}
 
     def __init__(self, program, folder, *, single=False, flags=("-O2",)):
         folder = Path(folder)
-        for name, text in c.files(program, "test", single=single).items():
+        files = c.files(program, "test", single=single)
+        for name, text in files.items():
             (folder / name).write_text(text, encoding="utf-8")
-        library = folder / "filter.so"
-        subprocess.run(
-            [compiler(), *STRICT, *flags, "-shared", "-fPIC", "strapdown_filter.c", "-o", library.name, "-lm"],
-            cwd=folder,
-            check=True,
-            capture_output=True,
-            text=True,
-        )
+        key = (*files.items(), *flags)
+        if key not in self._libraries:
+            library = folder / "filter.so"
+            subprocess.run(
+                [compiler(), *STRICT, *flags, "-shared", "-fPIC", "strapdown_filter.c", "-o", library.name, "-lm"],
+                cwd=folder,
+                check=True,
+                capture_output=True,
+                text=True,
+            )
+            self._libraries[key] = ctypes.CDLL(str(library.resolve()))
         self.real = ctypes.c_float if single else ctypes.c_double
         types = {"": self.real, "int": ctypes.c_int, "wide": ctypes.c_double}
         fields = [(name, types[kind] * size if size else types[kind]) for name, size, _, kind in c.members(program)]
         self.struct = type("Filter", (ctypes.Structure,), {"_fields_": [*fields, ("status", ctypes.c_uint)]})
-        self.state, self.library, self.program = self.struct(), ctypes.CDLL(str(library.resolve())), program
+        self.state, self.library, self.program = self.struct(), self._libraries[key], program
 
     def _call(self, name, *arguments):
         given = [a if not isinstance(a, float) else self.real(a) for a in arguments]

@@ -289,6 +289,22 @@ def test_effective_samples_are_the_sum_over_lags(m, memory, first):
     assert timeaverage.effective_samples(z, first) == pytest.approx(max(1.0, m / (1.0 + 2.0 * total)), rel=2e-4)
 
 
+@pytest.mark.parametrize("memory", [0.0, 0.8])
+def test_effective_samples_of_squares_are_those_of_the_initial_monotone_sequence(memory):
+    """Geyer's sum by its definition: autocovariances of |z|² one by one, in pairs, until one is not positive, none larger than before."""
+    m = 200
+    z = scipy.signal.lfilter([1.0], [1.0, -memory], np.random.default_rng(4).standard_normal((m, 2)), axis=0)
+    x = np.sum(z * z, axis=1)
+    x -= x.mean()
+    c = [np.sum(x[: m - k] * x[k:]) / np.sum(x * x) for k in range(m)]
+    total, least, number = -1.0, math.inf, 0
+    while (pair := c[2 * number] + c[2 * number + 1]) > 0.0:
+        least, number = min(least, pair), number + 1
+        total += 2.0 * least
+    expected = m / max(total, 1.0) * (1.0 - 4.0 * number / m)
+    assert timeaverage.squares_effective(z) == pytest.approx(expected, rel=1e-9)
+
+
 def test_effective_samples_of_part_of_a_markov_process():
     """The first component is no Markov process: its correlation is known from the whole matrix."""
     A = np.array([[0.3, 0.5], [0.0, 0.98]])

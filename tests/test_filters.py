@@ -595,11 +595,11 @@ def test_equivariant_rows_are_wrong_in_third_order_and_plain_ones_in_second(seed
 def test_the_equivariant_error_does_not_hang_on_the_trajectory(name):
     """``Ė = −E [ε]``, ``ε̇ = [w_f] ε`` of ``E = R_true R_estᵀ``, ``ε = R_est (b_true − b_est)``: nothing of it but w_f.
 
-    Two attitudes and biases far apart, the same error and the same rate in fixed axes: the same error 300 steps later, and the same
+    Two attitudes and biases far apart, the same error and the same rate in fixed axes: the same error 100 steps later, and the same
     covariance of it. Of the MEKF's error, seen from the body, neither holds.
     """
     rng = np.random.default_rng(51)
-    number, dt = 300, 0.1
+    number, dt = 100, 0.1
     time = dt * np.arange(number + 1)
     rates_f = 2.0 * rng.standard_normal((number, 3))
     E, epsilon = quaternion.exp([0.3, -0.2, 0.4]), np.array([0.02, -0.03, 0.01])
@@ -1005,12 +1005,15 @@ def test_every_filter_stays_finite_from_any_start(name, many):
 
 @pytest.mark.parametrize("name", comparison.EXTENDED)
 def test_own_filters_stay_finite_from_any_start(name):
-    for seed in range(6):
+    for seed in range(4):
         record, initial = wild(seed, 200, (("direction",), ("direction", "attitude"))[seed % 2])
         assert_sound(own_filter(name, BELIEF).run(record, initial))
 
 
-@pytest.mark.parametrize(("kind", "form"), CASES)
+@pytest.mark.parametrize(
+    ("kind", "form"),
+    [pytest.param(*one, marks=pytest.mark.slow if one[1] == "axes" and one[0] != "attitude" else []) for one in CASES],
+)
 def test_every_filter_stays_finite_whatever_it_measures(kind, form):
     rng = np.random.default_rng([48, CASES.index((kind, form))])
     for together in (False, True):

@@ -73,8 +73,14 @@ def apart(one, other):
     return max(np.abs(state / sigma).max(), np.abs(covariance).max())
 
 
-@pytest.mark.parametrize("option", OPTIONS)
-@pytest.mark.parametrize("states", STATES)
+@pytest.mark.parametrize(
+    ("states", "option"),
+    [
+        pytest.param(states, option, marks=pytest.mark.slow if STATES[states] and "gate" in OPTIONS[option] else [])
+        for states in STATES
+        for option in OPTIONS
+    ],
+)
 def test_equals_the_record(states, option):
     record, given, blocks = record_of(), OPTIONS[option], STATES[states]
     initial = begun(record, option)

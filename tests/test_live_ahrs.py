@@ -62,7 +62,11 @@ def need_equal(recording: Recording, parameters: AhrsParameters | None = None, *
     return found
 
 
-@pytest.mark.parametrize("parameters", [None, DRIFTING, AhrsParameters()], ids=["hand", "drifting", "six states"])
+@pytest.mark.parametrize(
+    "parameters",
+    [None, DRIFTING, pytest.param(AhrsParameters(), marks=pytest.mark.slow)],
+    ids=["hand", "drifting", "six states"],
+)
 def test_each_sample_gives_the_row_of_the_recording(parameters):
     found = need_equal(with_missing(swinging()), parameters)
     assert (len(found.rests.last) > 3) == (parameters is DRIFTING)

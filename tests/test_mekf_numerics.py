@@ -93,9 +93,25 @@ def test_positive_definite_over_twelve_decades_of_noise_over_the_prior(exponent,
         assert np.max(quaternion.angle_between(result.attitude, truth)) < 1e-6
 
 
-@pytest.mark.parametrize("states", [(), (GyroScale(scale_sigma=1e-3, misalignment_sigma=1e-3),)], ids=["six", "more"])
-@pytest.mark.parametrize("gate", [None, OPTIONS], ids=["plain", "gate"])
-@pytest.mark.parametrize("kind", ["direction", "vector", "attitude"])
+SCALE = (GyroScale(scale_sigma=1e-3, misalignment_sigma=1e-3),)
+
+
+@pytest.mark.parametrize(
+    ("kind", "gate", "states"),
+    [
+        *((kind, None, ()) for kind in ("direction", "vector", "attitude")),
+        ("direction", OPTIONS, ()),
+        ("direction", None, SCALE),
+        *(
+            pytest.param(kind, gate, states, marks=pytest.mark.slow)
+            for kind, gate, states in (
+                *((kind, OPTIONS, ()) for kind in ("vector", "attitude")),
+                *((kind, None, SCALE) for kind in ("vector", "attitude")),
+                *((kind, OPTIONS, SCALE) for kind in ("direction", "vector", "attitude")),
+            )
+        ),
+    ],
+)
 def test_what_needs_more_digits_than_a_covariance_has_is_refused(kind, gate, states):
     """A nanoradian at a start known to a radian; a hundredth of that start, and 0.1 arcseconds at one known to 3 rad, are taken."""
     axis = np.array([0.0, 0.6, 0.8])
@@ -328,32 +344,30 @@ MANY = (
 )
 
 
-@pytest.mark.parametrize("states", [(), MANY], ids=["six", "states"])
+SHARP = {
+    "1 mrad": (1e-3, None, 1.0, 1e-6),
+    "1 arcsecond": (ARCSECOND, None, 1.0, 1e-6),
+    "one of 1 arcsecond": (1e-3, ARCSECOND, 1.0, 1e-6),
+    "1 µrad": (1e-6, None, 1.0, 1e-3),
+    "0.1 µrad": (1e-7, None, 1.0, 1e-3),
+    "one of 1 nrad": (1e-3, 1e-9, 1.0, 1e-3),
+    "from anywhere": (ARCSECOND, None, 1.8, 1e-3),
+    "from 3 rad": (ARCSECOND, None, 3.0, 1e-3),
+    "0.1 arcsecond from anywhere": (0.1 * ARCSECOND, None, 1.8, 1e-3),
+    "0.1 arcsecond from 3 rad": (0.1 * ARCSECOND, None, 3.0, 1e-3),
+}
+WITH_STATES = ("1 mrad", "one of 1 arcsecond", "one of 1 nrad", "from 3 rad")
+"""With error states in the default run; the reference takes a second."""
+
+
 @pytest.mark.parametrize(
-    ("sigma", "sharp", "start_sigma", "bound"),
+    ("sigma", "sharp", "start_sigma", "bound", "states"),
     [
-        (1e-3, None, 1.0, 1e-6),
-        (ARCSECOND, None, 1.0, 1e-6),
-        (1e-3, ARCSECOND, 1.0, 1e-6),
-        (1e-6, None, 1.0, 1e-3),
-        (1e-7, None, 1.0, 1e-3),
-        (1e-3, 1e-9, 1.0, 1e-3),
-        (ARCSECOND, None, 1.8, 1e-3),
-        (ARCSECOND, None, 3.0, 1e-3),
-        (0.1 * ARCSECOND, None, 1.8, 1e-3),
-        (0.1 * ARCSECOND, None, 3.0, 1e-3),
-    ],
-    ids=[
-        "1 mrad",
-        "1 arcsecond",
-        "one of 1 arcsecond",
-        "1 µrad",
-        "0.1 µrad",
-        "one of 1 nrad",
-        "from anywhere",
-        "from 3 rad",
-        "0.1 arcsecond from anywhere",
-        "0.1 arcsecond from 3 rad",
+        pytest.param(
+            *case, states, id=f"{name}-{many}", marks=[] if not states or name in WITH_STATES else pytest.mark.slow
+        )
+        for many, states in (("six", ()), ("states", MANY))
+        for name, case in SHARP.items()
     ],
 )
 def test_variances_are_those_of_the_square_root(sigma, sharp, start_sigma, bound, states):

@@ -299,7 +299,8 @@ def test_errors_are_drawn_in_the_unit_of_their_label(run):
 def test_a_budget_that_starts_without_error_shows_what_comes_after(scenario, tmp_path):
     opposite = dataclasses.replace(scenario.gyro, scale_factor=np.full(3, 1e-4), asymmetry=np.full(3, -1e-4))
     brief = dataclasses.replace(scenario, gyro=opposite, duration=2.0)
-    found = covariance.analyse(brief, initial_attitude_sigma=0.0, initial_bias_sigma=0.0, epochs=4)
+    belief = dataclasses.replace(setup.FilterSetup.for_scenario(brief), states=None)
+    found = covariance.analyse(brief, belief, initial_attitude_sigma=0.0, initial_bias_sigma=0.0, epochs=4)
     assert not found.rms[0].any()
     figure = plots.error_budget(found)
     plots.save(figure, tmp_path / "budget.png")

@@ -191,6 +191,34 @@ def test_units_of_other_sensors_need_not_be_reported_where_the_gyro_alone_is_use
     assert status.exit_code == 0, status.output
 
 
+def test_an_array_has_the_rate_and_the_unit_that_are_given(tmp_path):
+    np.save(tmp_path / "rest.npy", np.full((5, 3), 180.0))
+    found = recordings.read_samples(tmp_path / "rest.npy", "gyro", rate=200.0, units={"gyro": "deg/s"})
+    assert found.sample_interval == pytest.approx(0.005)
+    np.testing.assert_allclose(found.values, np.pi)
+
+
+def test_rows_of_times_are_those_of_their_stamps():
+    recording = Recording(source="a", time=0.5 * np.arange(4.0), rate=np.ones((4, 3)))
+    np.testing.assert_array_equal(recording.rows_of(np.array([0.0, 1.0, 1.5])), [0, 2, 3])
+    with pytest.raises(InputError):
+        recording.rows_of(np.array([0.25]))
+
+
+def test_vectors_of_a_record_are_at_their_stamps():
+    """Row k is the interval that ends at edge k + 1; a vector between two edges belongs to none, that of a direction neither."""
+    time, g = np.arange(5.0), np.array([0.0, 0.0, 9.81])
+    vectors = (
+        series_of("accelerometer", "vector", [1.0, 2.5, 4.0], [g, 2.0 * g, 3.0 * g], g, 0.01),
+        series_of("magnetometer", "direction", [1.0], [[1.0, 0.0, 0.0]], [1.0, 0.0, 0.0], 0.01),
+    )
+    found = recordings.from_record(ImuRecord(time=time, increments=np.ones((4, 3)), vectors=vectors))
+    none = np.full(3, np.nan)
+    np.testing.assert_array_equal(found.specific_force, [g, none, none, 3.0 * g])
+    assert found.magnetic_field is None
+    assert "Left out: magnetometer (direction)." in " ".join(found.remarks)
+
+
 @pytest.mark.parametrize("mark", [";", "\t", "|"])
 def test_other_separators_are_read_and_their_decimals_may_have_commas(csv, mark):
     plain = read(csv())

@@ -233,7 +233,7 @@ def assert_same(one: Estimate, other: Estimate, tolerance: float) -> None:
 )
 def test_equals_the_fixed_side_reference(name: str) -> None:
     # A wide prior and a wrong start, so that corrections are tenths of a radian and a missing Jacobian shows in the first digits.
-    case = dataclasses.replace(CASES[name], duration=4.0, attitude_sigma=0.2, bias_sigma=0.02)
+    case = dataclasses.replace(CASES[name], duration=2.0, attitude_sigma=0.2, bias_sigma=0.02)
     record, initial = simulated(case, np.random.default_rng(11))
     one = estimation.smooth(record, case.noise, initial, full_covariance=True)
     assert_same(one, fixed_side_smoother(record, case.noise, initial), 1e-8)
@@ -629,7 +629,7 @@ def test_any_number_of_segments(intervals: int) -> None:
 @pytest.mark.parametrize("angle", [0.3, 0.4, 0.6])
 def test_corrections_beyond_the_series(angle: float) -> None:
     # So large that the smoothed state lies outside of the range of the polynomials about the filtered one: both forms in one record.
-    case = dataclasses.replace(CASES["directions"], attitude_sigma=0.3, bias_sigma=0.02, duration=2.0)
+    case = dataclasses.replace(CASES["directions"], attitude_sigma=0.3, bias_sigma=0.02, duration=1.0)
     record, _ = simulated(case, np.random.default_rng(5))
     turn = quaternion.exp(angle * np.array([0.48, 0.6, 0.64]))
     initial = estimation.initial_state(

@@ -3,6 +3,7 @@
 - ``deviation``: :func:`allan_deviation` with confidence intervals.
 - ``noise_fit``: :func:`fit_noise` by maximum likelihood, on the ``spectrum`` of the cosine transform.
 - ``gaps``: Allan deviation of a record with gaps.
+- ``power_laws``: The power law of the noise, and degrees of freedom under it.
 - ``temperature``: Bias as a polynomial in temperature.
 - ``parameters``: Noise parameters of a six-axis unit in the formats of Kalibr, PX4 and MATLAB.
 """
@@ -12,11 +13,9 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
-from strapdown.allan.deviation import NOISE_TYPES as NOISE_TYPES
 from strapdown.allan.deviation import TERMS as TERMS
 from strapdown.allan.deviation import AllanDeviation as AllanDeviation
 from strapdown.allan.deviation import allan_deviation as allan_deviation
-from strapdown.allan.deviation import equivalent_degrees_of_freedom as equivalent_degrees_of_freedom
 from strapdown.allan.deviation import flicker_variance as flicker_variance
 from strapdown.allan.deviation import model_deviation as model_deviation
 from strapdown.allan.noise_fit import UNITS as UNITS
@@ -27,6 +26,8 @@ from strapdown.allan.noise_fit import fit_noise as fit_noise
 from strapdown.allan.noise_fit import table as table
 from strapdown.allan.noise_fit import to_gyro_parameters as to_gyro_parameters
 from strapdown.allan.noise_fit import upper_bounds as upper_bounds
+from strapdown.allan.power_laws import NOISE_TYPES as NOISE_TYPES
+from strapdown.allan.power_laws import equivalent_degrees_of_freedom as equivalent_degrees_of_freedom
 
 __all__ = [
     "AllanDeviation",

@@ -13,14 +13,13 @@ rate          K²/(2π f)²              K² τ/3         rad/s/√s
 ramp          deterministic R t       R² τ²/2        rad/s²
 ============  ======================  =============  ==========================================================================
 
-Sources: IEEE Std 952-1997 annex C; NIST SP 1065 (Riley 2008); Greenhall & Riley, "Uncertainty of stability variances based on
-finite differences", PTTI 2003; Riley & Greenhall, "Power law noise identification using the lag 1 autocorrelation", EFTF 2004.
+Sources: IEEE Std 952-1997 annex C; NIST SP 1065 (Riley 2008).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,6 +27,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from strapdown import checks
 from strapdown.allan import gaps
+from strapdown.allan.power_laws import (
+    ESTIMATORS,
+    MANY_BLOCKS,
+    NOISE_TYPES,
+    differences_of,
+    equivalent_degrees_of_freedom,
+    power_law,
+)
 from strapdown.allan.spectrum import flicker_covariance, inner
 from strapdown.checks import Array, InputError
 from strapdown.kernels.allan import accumulate, second_difference_sizes, second_difference_squares
@@ -37,32 +44,11 @@ from strapdown.results import Column, Listed, Table
 TERMS = ("quantization", "angle_random_walk", "bias_instability", "rate_random_walk", "rate_ramp")
 """The noise terms, in the order of every array over terms; also the names of the gyro specification."""
 
-NOISE_TYPES = {
-    2: "quantization",
-    1: "flicker angle",
-    0: "angle random walk",
-    -1: "bias instability",
-    -2: "rate random walk",
-}
-"""Name of each power law; the key is the exponent of f in the PSD of the rate."""
-
-ESTIMATORS = {
-    "overlapping": "overlapping Allan deviation, OADEV",
-    "robust": "Allan deviation by the median of second differences",
-    "modified": "modified Allan deviation, MDEV: of the angle averaged over τ; separates quantisation from flicker of the angle",
-    "hadamard": "overlapping Hadamard deviation, HDEV: from third differences of the angle, which are insensitive to a rate ramp",
-}
-"""Estimators of :func:`allan_deviation`."""
-
 _MEDIAN_OF_NORMAL = 0.6744897501960817  # Φ⁻¹(3/4): median of |z|, z standard normal
 
 _MEDIAN_EFFICIENCY = (
     0.3675  # of the median of |z| relative to the mean square, independent normal data: 8 (z φ(z))², z = Φ⁻¹(3/4)
 )
-
-_FEWEST_BLOCKS = 30  # with fewer the lag-1 autocorrelation is too uncertain (SP 1065, §5.5.6)
-
-_MANY_BLOCKS = 128  # the scatter of the power law is then well below one half
 
 _MAX_BLOCKS = 1 << 17
 
@@ -145,8 +131,8 @@ def allan_deviation(
     kind : {"rate", "increments"}, default "rate"
         Kind of the values.
     taus : array_like, optional
-        Averaging times, s, each rounded to a multiple of the sample interval; duplicates are dropped. Default: 12 per decade, up to a third
-        of the record.
+        Averaging times, s, each rounded to a multiple of the sample interval, with gaps up to 6 % less; duplicates are dropped. Default: 12
+        per decade, up to a third of the record, with gaps to a tenth.
     estimator : {"overlapping", "robust", "modified", "hadamard"}, default "overlapping"
         Estimator, see the notes.
     level : float, default 0.95
@@ -181,7 +167,7 @@ def allan_deviation(
         noise_type = np.vectorize(NOISE_TYPES.__getitem__)(found.pop("alphas"))
         return AllanDeviation(**found, noise_type=noise_type, level=level, estimator="gaps", sample_interval=dt)
     samples = record.shape[0]
-    multiples = _multiples(taus, samples, dt, _order(estimator))
+    multiples = _multiples(taus, samples, dt, differences_of(estimator))
     deviation = np.empty((record.shape[1], len(multiples)))
     edf = np.empty_like(deviation)
     alphas = np.empty(deviation.shape, dtype=int)
@@ -190,7 +176,7 @@ def allan_deviation(
         rate = read_only(record[:, axis])
         compiled(accumulate)(rate, float(np.mean(rate)), phase)
         # If the first τ has few averages, the power law before it is that of the longest τ with many.
-        alpha = _power_law(phase, max(1, min(int(multiples[0]), samples // _MANY_BLOCKS)), 0)
+        alpha = _power_law(phase, max(1, min(int(multiples[0]), samples // MANY_BLOCKS)), 0)
         for i, m in enumerate(int(m) for m in multiples):
             alpha = alphas[axis, i] = _power_law(phase, m, alpha)
             edf[axis, i] = equivalent_degrees_of_freedom(alpha, samples, m, estimator)
@@ -230,11 +216,6 @@ def _deviation(phase: Array, multiples: NDArray[np.int64], alphas: NDArray[np.in
     return np.array([math.sqrt(_third_differences(summed, int(m)) / 2.0) / m**2 for m in multiples])
 
 
-def _order(estimator: str) -> int:
-    """Return the order of the differences that an estimator squares: of the angle, or for the modified Allan deviation of its sum."""
-    return 3 if estimator in ("modified", "hadamard") else 2
-
-
 def _third_differences(series: Array, m: int) -> float:
     """Return the mean of (y[k + 3m] − 3 y[k + 2m] + 3 y[k + m] − y[k])² over all k, block by block."""
     count = len(series) - 3 * m
@@ -247,95 +228,6 @@ def _third_differences(series: Array, m: int) -> float:
     return total / count
 
 
-def equivalent_degrees_of_freedom(alpha: int, samples: int, m: int, estimator: str = "overlapping") -> float:
-    """Return the equivalent degrees of freedom of the variance at m samples, from ``samples`` samples of the rate.
-
-    ``2 E²/Var`` of the mean of squared differences, by summing their squared autocorrelation (Greenhall & Riley 2003). The phase of white,
-    flicker and random-walk noise in continuous time has the generalised covariances −|t|, t² ln|t| and |t|³, used without further
-    approximation; quantisation is white phase. The covariances of the summed phase, whose third differences the modified Allan deviation
-    squares, are their second integrals.
-    """
-    if alpha not in NOISE_TYPES:
-        raise InputError(f"alpha is {alpha!r}; it must be one of {', '.join(map(str, NOISE_TYPES))}")
-    checks.one_of("estimator", estimator, ESTIMATORS)
-    checks.count("samples", samples, minimum=2)
-    order = _order(estimator)
-    if not 1 <= m <= samples // order:
-        raise InputError(f"m is {m!r}; with {samples} samples it must be between 1 and {samples // order}")
-    summed = estimator == "modified"
-    count = samples + 1 + summed - order * m
-    if alpha == 2 and not summed:  # overlaps of the differences by lags of 0, m, 2m, …
-        weights = [math.comb(2 * order, order + j) for j in range(order + 1)]
-        overlaps = sum((1 + (j > 0)) * w**2 * max(count - j * m, 0) for j, w in enumerate(weights))
-        return float((weights[0] * count) ** 2 / overlaps)
-    # Midpoint rule with cells of one lag near the peaks at 0, m, 2m, … (narrow for flicker phase) and larger ones elsewhere.
-    end = min(count, 6 * m)
-    if m <= 1000:
-        edges = np.arange(end + 1)
-    else:
-        fine = [np.arange(centre - 1000, centre + 1001) for centre in range(0, (order + 1) * m, m)]
-        edges = np.unique(np.concatenate([*fine, np.arange(0, end, m // 500), [0, end]]))
-        edges = edges[(edges >= 0) & (edges <= end)]
-    width = np.diff(edges)
-    lag = edges[:-1] + 0.5 * (width - 1)
-    covariance = _summed_phase_covariance if summed else _phase_covariance
-    correlation = _difference_covariance(covariance, alpha, lag, m, order)
-    correlation /= _difference_covariance(covariance, alpha, np.zeros(1), m, order)
-    both_sides = np.where(edges[:-1] == 0, 1.0, 2.0) * width
-    return float(max(1.0, count / float(np.sum(both_sides * correlation**2 * (1.0 - lag / count)))))
-
-
-def _difference_covariance(
-    covariance: Callable[[int, Array, int], Array], alpha: int, lag: Array, m: int, order: int
-) -> Array:
-    """Return the autocovariance, up to a factor, of differences of the given order over m samples, from a generalised covariance."""
-    total = np.zeros_like(lag)
-    for j in range(-order, order + 1):
-        total += (-1) ** j * math.comb(2 * order, order + j) * covariance(alpha, lag + j * m, m)
-    return total
-
-
-def _phase_covariance(alpha: int, k: Array, m: int) -> Array:
-    """Return the generalised covariance of the phase at lags of k samples, in units of m samples, up to a factor."""
-    t = np.abs(k) / m
-    if alpha == 0:
-        return np.asarray(-t)
-    if alpha == -1:
-        return np.asarray(t * t * _logarithm(t))
-    if alpha == -2:
-        return np.asarray(t**3)
-
-    # Flicker of the phase needs a band limit for a finite variance: Greenhall's second difference over one sample interval.
-    def smooth(j: Array) -> Array:
-        return np.asarray(j * j * _logarithm(np.abs(j)))
-
-    near = np.minimum(np.abs(k), 1000)
-    difference = 2.0 * smooth(near) - smooth(near - 1) - smooth(near + 1)
-    return np.asarray(np.where(np.abs(k) <= 1000, difference, -2.0 * np.log(np.maximum(np.abs(k), 1)) - 3.0))
-
-
-def _summed_phase_covariance(alpha: int, k: Array, m: int) -> Array:
-    """Return the same for the running sum of the phase: minus its second difference over one sample is the covariance of the phase.
-
-    This is exact except for flicker of the rate, where the difference approximates the derivative.
-    """
-    t, step = np.abs(k) / m, 1.0 / m
-    if alpha == 2:
-        return np.asarray(-t)
-    if alpha == 1:
-        return np.asarray(t * t * _logarithm(t))
-    if alpha == 0:
-        return np.asarray(t**3 - step**2 * t)
-    if alpha == -1:
-        return np.asarray(-(t**4) * _logarithm(t))
-    return np.asarray(-(t**5) + step**2 * t**3 * 5.0 / 3.0 - step**4 * t * 2.0 / 3.0)
-
-
-def _logarithm(t: Array) -> Array:
-    """Return ln t, and 0 at t = 0, where it is multiplied by a power of t."""
-    return np.asarray(np.log(np.where(t > 0.0, t, 1.0)))
-
-
 def _median_deviation(phase: Array, m: int, alpha: int) -> float:
     """Return the Allan deviation from the median magnitude of the second differences, scaled for Gaussian noise."""
     # An overlap of 15/16 uses nearly all the information, unless the noise is white or flicker phase.
@@ -346,30 +238,10 @@ def _median_deviation(phase: Array, m: int, alpha: int) -> float:
 
 
 def _power_law(phase: Array, m: int, otherwise: int) -> int:
-    """Return the power law of the rate averaged over m samples, by the lag-1 autocorrelation (Riley & Greenhall 2004).
-
-    A series with correlation r at lag 1 has fractional-difference parameter δ = r/(1 + r); it is differenced while δ ≥ ¼. If there are very
-    many averages, only the middle of the record is used. The exponent of gyro noise decreases with τ. With few averages, whose estimate is
-    uncertain, the result is therefore at most ``otherwise``, the exponent at the previous τ.
-    """
+    """Return the power law of the rate averaged over m samples; if there are very many averages, only the middle of the record is used."""
     edges = phase[::m]
     spare = max(0, len(edges) - _MAX_BLOCKS) // 2
-    blocks = np.diff(edges[spare : spare + _MAX_BLOCKS])
-    count = len(blocks)
-    if count < _FEWEST_BLOCKS:
-        return otherwise
-    for differenced in range(3):
-        centred = blocks - blocks.mean()
-        power = inner(centred, centred)
-        if power <= 0.0:
-            return -2
-        correlation = inner(centred[1:], centred[:-1]) / power
-        delta = correlation / (1.0 + correlation) if correlation > -1.0 else -math.inf
-        if delta < 0.25 or differenced == 2:
-            alpha = int(np.clip(np.round(-2.0 * (max(delta, -2.0) + differenced)), -2, 2))
-            return alpha if count >= _MANY_BLOCKS else min(alpha, otherwise)
-        blocks = np.diff(blocks)
-    return otherwise
+    return power_law(np.diff(edges[spare : spare + _MAX_BLOCKS]), otherwise)
 
 
 def flicker_variance(multiples: ArrayLike) -> Array:

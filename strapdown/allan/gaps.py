@@ -3,30 +3,43 @@
 Gaps must not depend on the lost values: those of a lost packet do not, those of a saturated sensor do.
 
 This is the wavelet-variance estimator for gappy series of Mondal & Percival ("Wavelet variance analysis for gappy time series", Ann. Inst.
-Stat. Math. 62, 2010) for the Haar wavelet, whose wavelet variance is the Allan variance. With the semivariogram of all pairs of available
-samples, ``V_k = ½⟨(x_{t+k} − x_t)²⟩``, it is ``σ²(m) = −Σ_{k=1}^{2m−1} r_k V_k / m²``, r being the autocorrelation of m times −1 and m
-times +1. It is unbiased for every noise of the table in :mod:`strapdown.allan.deviation` and for any gaps, but not a sum of squares: with
-few pairs it may be negative (6 % of records of white noise at a tenth of the record, a fifth of it lost); the deviation is then NaN and its
-band unbounded. The band is computed from simulated records with the same gaps and power law.
+Stat. Math. 62, 2010) for the Haar wavelet, whose wavelet variance is the Allan variance: with the mean ``D_ij`` of the squared difference
+of places i and j over all windows of 2m samples that have both, ``σ²(m) = −¼ Σ h_i h_j D_ij``, h being −1/m and then 1/m. It is unbiased
+for every noise of the table in :mod:`strapdown.allan.deviation` and any gaps. Without gaps it is the overlapping estimator; with them it is
+not a sum of squares: with few windows it may be negative; the deviation is then NaN and its band unbounded.
+
+For more than :data:`DIRECT` samples the record is first averaged over blocks, 8 to 15 for each τ; with more the scatter is larger. If
+nearly all samples are in complete blocks, only these are used. Otherwise a block of which at least half is known has the mean of that,
+whose variance about that of the whole block is subtracted, s²(1/c − 1/q) for c of q samples with variance s² in a block: right for samples
+lost at random, but not for quantisation noise whose samples are lost in bursts. The band is computed from simulated records with the same
+gaps and power law.
 """
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from strapdown import checks
-from strapdown.allan.spectrum import inner
+from strapdown.allan.power_laws import MANY_BLOCKS, equivalent_degrees_of_freedom, power_law
 from strapdown.checks import Array, InputError
+from strapdown.kernels.allan import variance_of_pairs
+from strapdown.kernels.machine import compiled, read_only
 
-SIMULATED = 1 << 12
+DIRECT = 16
+"""Maximum number of samples of an averaging time for which the record is not averaged over blocks."""
+
+SIMULATED = 1 << 11
 """Maximum number of samples of a simulated record, which for longer records combines several samples into one."""
+
+FINEST = 4
+"""Minimum number of samples of an averaging time in a simulation that combines several samples into one."""
+
 RUNS = 400
 """Number of simulated records for each power law."""
-WHOLE_RUNS = 50
-"""Number of simulated records with all samples, for records longer than :data:`SIMULATED`."""
 
 
 class Deviation(NamedTuple):
@@ -52,18 +65,17 @@ def allan_deviation(
     known = np.asarray(~np.isnan(record).any(axis=1))
     if known.sum() < 3:
         raise InputError(f"values has {int(known.sum())} samples that are not NaN; an Allan deviation needs at least 3")
-    samples, record = len(record), np.where(known[:, None], record, 0.0)
+    samples, record = len(record), record.T
     wanted = dt * spread_multiples(samples // 10) if taus is None else taus
-    multiples = np.unique(np.rint(np.atleast_1d(checks.array("taus", wanted, (...,))) / dt).astype(np.int64))
-    if len(multiples) == 0 or multiples[0] < 1 or multiples[-1] > samples // 2:
+    multiples = np.rint(np.atleast_1d(checks.array("taus", wanted, (...,))) / dt).astype(np.int64)
+    if len(multiples) == 0 or multiples.min() < 1 or multiples.max() > samples // 2:
         raise InputError(
             f"taus must lie between {dt:g} s and {samples // 2 * dt:g} s, the sample interval and half the record"
         )
-    pairs = _Pairs.of(known, int(multiples[-1]))
-    variance = np.stack([pairs.variance(record[:, axis], multiples) for axis in range(record.shape[1])])
-    grid = spread_multiples(min(samples // 10, int(multiples[-1])))
-    alphas = np.stack([_power_laws(grid, pairs.variance(record[:, axis], grid)) for axis in range(record.shape[1])])
-    alphas = alphas[:, np.clip(np.searchsorted(grid, multiples), 0, len(grid) - 1)]
+    multiples = np.unique([math.prod(_blocks(m)) for m in multiples.tolist()])
+    centred = np.where(known, record - record[:, known].mean(axis=1)[:, None], 0.0)
+    variance = _variances(centred, known, multiples)
+    alphas = np.array([_power_laws(one, multiples) for one in np.where(known, record, np.nan)])
     edf, low, high = _spread(known, multiples, alphas, level, seed)
     variance = np.where(variance > 0.0, variance, np.nan)
     deviation = np.sqrt(variance)
@@ -78,55 +90,50 @@ def allan_deviation(
     )
 
 
-class _Pairs(NamedTuple):
-    """Pairs of available samples, by lag."""
-
-    known: NDArray[np.bool_]
-    size: int
-    transform: NDArray[np.complex128]
-    number: Array
-
-    @classmethod
-    def of(cls, known: NDArray[np.bool_], largest: int) -> _Pairs:
-        from scipy.fft import irfft, next_fast_len, rfft
-
-        size = int(next_fast_len(len(known) + 2 * largest, real=True))
-        transform = rfft(known.astype(np.float64), size)
-        return cls(known, size, transform, np.rint(irfft(np.abs(transform) ** 2, size)[: 2 * largest]))
-
-    def variance(self, x: Array, multiples: NDArray[np.int64]) -> Array:
-        """Return the Allan variance at each multiple of the sample interval; NaN if a lag has no pair."""
-        from scipy.fft import irfft, rfft
-
-        centred = np.where(self.known, x - x[self.known].mean(), 0.0)
-        products = irfft(np.abs(rfft(centred, self.size)) ** 2, self.size)[: len(self.number)]
-        squares = irfft(2.0 * (np.conj(rfft(centred**2, self.size)) * self.transform).real, self.size)[
-            : len(self.number)
-        ]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            semivariogram = np.where(self.number > 0.0, (0.5 * squares - products) / self.number, np.nan)
-        found = np.empty(len(multiples))
-        for i, m in enumerate(multiples.tolist()):
-            k = np.arange(1, 2 * m)
-            correlation = np.where(k <= m, 2.0 * m - 3.0 * k, k - 2.0 * m)
-            found[i] = -inner(correlation, semivariogram[1 : 2 * m]) / m**2
-        return found
+def _blocks(m: int) -> tuple[int, int]:
+    """Return number and size of the blocks that make up m samples, or up to 6 % less."""
+    return (m, 1) if m <= DIRECT else max(((k, m // k) for k in range(8, 16)), key=math.prod)
 
 
-def _power_laws(multiples: NDArray[np.int64], variance: Array) -> NDArray[np.int64]:
-    """Return the power law of the noise at each τ, the exponent of f in the PSD of the rate, from the local slope of the Allan variance."""
-    usable = np.flatnonzero(variance > 0.0)
-    if len(usable) < 3:
-        return np.zeros(len(multiples), np.int64)
-    x, y = np.log(multiples[usable]), np.log(variance[usable])
-    slopes = np.empty(len(usable))
-    for i in range(len(usable)):
-        near = np.abs(x - x[i]) <= np.log(3.0)
-        slopes[i] = np.polyfit(x[near], y[near], 1)[0] if near.sum() > 2 else -1.0
-    law = np.where(slopes < -1.5, 2, np.where(slopes < -0.5, 0, np.where(slopes < 0.5, -1, -2)))
-    for i in range(1, len(law)):  # the exponent of sensor noise decreases with τ, and few averages are uncertain
-        law[i] = min(law[i], law[i - 1])
-    return np.asarray(law[np.clip(np.searchsorted(usable, np.arange(len(multiples))), 0, len(usable) - 1)])
+def _variances(x: Array, known: NDArray[np.bool_], multiples: NDArray[np.int64]) -> Array:
+    """Return the Allan variance (s, k) of each series of x (s, n), 0 where not known, at each multiple of the sample interval."""
+    found = np.empty((len(multiples), len(x)))
+    for row, m in zip(found, multiples.tolist(), strict=True):
+        half, size = _blocks(m)
+        values, excess, there = map(read_only, _averaged(x, known, size))
+        sums, counts = np.empty((2, len(there) + 1))
+        compiled(variance_of_pairs)(values, excess, there, half, sums, counts, row)
+    return found.T
+
+
+def _averaged(x: Array, known: NDArray[np.bool_], size: int) -> tuple[Array, Array, Array]:
+    """Return averages over blocks, what the variance of each exceeds that of the whole block by, and 1 for known ones, else 0."""
+    if size == 1:
+        return x, np.zeros(x.shape), known.astype(np.float64)
+    whole = len(known) // size * size
+    count = known[:whole].reshape(-1, size).sum(axis=1)
+    parts = x[:, :whole].reshape(len(x), -1, size)
+    complete = count == size
+    there = complete if size * complete.sum() >= 0.85 * known.sum() else 2 * count >= size
+    number = np.where(there, count, size)
+    mean = parts.sum(axis=2) / number
+    if there is complete:
+        return mean, np.zeros(mean.shape), there.astype(np.float64)
+    squares = np.einsum("ijk,ijk->ij", parts, parts) - number * mean**2
+    within = np.sum(squares[:, there], axis=1, keepdims=True) / max(1, np.sum(count[there] - 1))
+    return mean, within * (1.0 / number - 1.0 / size), there.astype(np.float64)
+
+
+def _power_laws(x: Array, multiples: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the power law of the noise of one axis at each multiple of the sample interval; missing samples are NaN."""
+    laws, alpha = [], 0
+    for m in (max(1, min(int(multiples[0]), len(x) // MANY_BLOCKS)), *multiples.tolist()):
+        parts = x[: len(x) // m * m].reshape(-1, m)
+        count = np.isfinite(parts).sum(axis=1)
+        means = np.nansum(parts, axis=1) / np.where(2 * count >= m, count, np.nan)
+        alpha = power_law(means, alpha)
+        laws.append(alpha)
+    return np.array(laws[1:])
 
 
 def spread_multiples(largest: int) -> NDArray[np.int64]:
@@ -140,43 +147,50 @@ def _spread(
 ) -> tuple[Array, Array, Array]:
     """Return degrees of freedom, and low and high quantile over the mean, of the estimator for simulated records with the same gaps.
 
-    For records longer than :data:`SIMULATED`, the simulation with fewer samples gives the shape of the distribution (χ² below one of its
-    samples), and a few records with all samples its variance: for white noise and τ at a given fraction of the record, the relative
-    variance of the estimator increases with the number of samples.
+    A simulation of a longer record combines several samples into one. Its degrees of freedom are to those of the record as they are without
+    gaps; below :data:`FINEST` of its samples the distribution is χ².
     """
     from scipy.stats import chi2
 
     coarse = max(1, -(-len(known) // SIMULATED))
-    rows = len(known) // coarse
-    there = known[: rows * coarse].reshape(rows, coarse).mean(axis=1) > 0.5
+    parts = known[: len(known) // coarse * coarse].reshape(-1, coarse).mean(axis=1)
+    there = parts > 0.5
     if there.sum() < 3:
         raise InputError(
             "values has too few samples between its gaps for a confidence band; cut it to a part with fewer gaps"
         )
-    random = np.random.default_rng(seed)
-    at = multiples / coarse
-    usable = np.unique(np.clip(np.rint(at).astype(np.int64), 1, max(1, rows // 2 - 1)))
-    pairs = _Pairs.of(there, int(usable[-1]))
-    place = np.searchsorted(usable, np.clip(np.rint(at).astype(np.int64), usable[0], usable[-1]))
-    whole = _Pairs.of(known, int(multiples[-1]))
+    finest = FINEST if coarse > 1 else 1
+    largest = max(1, len(there) // 2)
+    usable = np.array([math.prod(_blocks(min(max(round(m / coarse), finest), largest))) for m in multiples.tolist()])
+    simulated, place = np.unique(usable, return_inverse=True)
     tail = 0.5 - 0.5 * level
     edf, low, high = (np.empty(alphas.shape) for _ in range(3))
+    random = np.random.default_rng(seed)
     for law in np.unique(alphas).tolist():
-        found = np.stack([pairs.variance(_noise(law, rows, random), usable) for _ in range(RUNS)])
-        freedom, quantiles = _freedom(found)[place], np.quantile(found / found.mean(axis=0), [tail, 1.0 - tail], axis=0)
-        more = freedom
+        found = _variances(_noise(law, (RUNS, len(there)), random) * there, there, simulated)
+        quantiles = np.quantile(found / found.mean(axis=0), [tail, 1.0 - tail], axis=0)[:, place]
+        scale = np.ones(len(multiples))
         if coarse > 1:
-            more = _freedom(
-                np.stack([whole.variance(_noise(law, len(known), random), multiples) for _ in range(WHOLE_RUNS)])
-            )
-        wider = np.sqrt(freedom / more)
+            scale = _without_gaps(law, len(known), multiples) / _without_gaps(law, len(there), usable)
+            if law == 0:  # white noise is that of the known samples in a block
+                scale *= np.mean(parts[there] ** 2)
+        freedom = _freedom(found)[place] * scale
         ends = [
-            np.where(at < 1.0, chi2.ppf(p, more) / more, 1.0 + wider * (quantiles[k][place] - 1.0))
-            for k, p in enumerate((tail, 1.0 - tail))
+            np.where(
+                (coarse > 1) & (multiples < finest * coarse),
+                chi2.ppf(p, freedom) / freedom,
+                1.0 + (q - 1.0) / np.sqrt(scale),
+            )
+            for p, q in zip((tail, 1.0 - tail), quantiles, strict=True)
         ]
-        for target, values in ((edf, np.fmax(more, 1.0)), (low, ends[0]), (high, ends[1])):
+        for target, values in ((edf, np.fmax(freedom, 1.0)), (low, ends[0]), (high, ends[1])):
             target[alphas == law] = np.broadcast_to(values, alphas.shape)[alphas == law]
     return edf, low, high
+
+
+def _without_gaps(law: int, samples: int, multiples: NDArray[np.int64]) -> Array:
+    """Return the degrees of freedom of a record without gaps at each multiple of the sample interval."""
+    return np.array([equivalent_degrees_of_freedom(law, samples, m) for m in multiples.tolist()])
 
 
 def _freedom(found: Array) -> Array:
@@ -185,19 +199,20 @@ def _freedom(found: Array) -> Array:
         return np.asarray(2.0 * found.mean(axis=0) ** 2 / found.var(axis=0, ddof=1))
 
 
-def _noise(alpha: int, samples: int, random: np.random.Generator) -> Array:
-    """Return a simulated record of a power law."""
-    white = random.standard_normal(samples + 1)
+def _noise(alpha: int, shape: tuple[int, int], random: np.random.Generator) -> Array:
+    """Return simulated records (runs, samples) of a power law."""
+    runs, samples = shape
+    white = random.standard_normal((runs, samples + 1))
     if alpha == 2:
         return np.asarray(np.diff(white))
     if alpha == 0:
-        return white[1:]
+        return white[:, 1:]
     if alpha == -2:
-        return np.cumsum(white[1:])
+        return np.cumsum(white[:, 1:], axis=1)
     from scipy.fft import irfft, rfft
 
     size = 2 * samples
-    spectrum = rfft(random.standard_normal(size))
-    spectrum[1:] /= np.sqrt(np.arange(1, len(spectrum)))
-    spectrum[0] = 0.0
-    return np.asarray(irfft(spectrum, size)[:samples])
+    spectrum = rfft(random.standard_normal((runs, size)))
+    spectrum[:, 1:] *= np.arange(1, size // 2 + 1) ** (0.5 * alpha)
+    spectrum[:, 0] = 0.0
+    return np.asarray(irfft(spectrum, size)[:, :samples])

@@ -234,20 +234,27 @@ class KernelCompiler(Compiler):  # type: ignore[misc]
 class _Library(JITCodeLibrary):  # type: ignore[misc]
     """LLVM code with explicit vectors: loops are neither vectorised nor unrolled, which took half of the time of LLVM."""
 
-    def _passes(self, level: int) -> tuple[Any, Any]:
+    def _builder(self, level: int) -> Any:
         tuning = llvm.create_pipeline_tuning_options(level)
         tuning.loop_unrolling = False
-        builder = llvm.create_pass_builder(self._codegen._tm, tuning)
-        return builder.getModulePassManager(), builder
+        return llvm.create_pass_builder(self._codegen._tm, tuning)
+
+    def _optimize_functions(self, ll_module: Any) -> None:
+        # Simplified before they are inlined, at the first level: higher ones take a third longer and give the same code in the end.
+        ll_module.data_layout = self._codegen._data_layout
+        for function in ll_module.functions:
+            builder = self._builder(1)
+            builder.getFunctionPassManager().run(function, builder)
 
     def _optimize_final_module(self) -> None:
-        first, builder = self._passes(0)  # inlines
+        builder = self._builder(0)
+        first = builder.getModulePassManager()  # inlines
         first.add_loop_rotate_pass()
         first.add_instruction_combine_pass()
         first.add_jump_threading_pass()
         first.run(self._final_module, builder)
-        whole, builder = self._passes(3)
-        whole.run(self._final_module, builder)
+        builder = self._builder(3)
+        builder.getModulePassManager().run(self._final_module, builder)
 
 
 class HelperCompiler(KernelCompiler):

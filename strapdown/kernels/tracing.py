@@ -55,11 +55,11 @@ class Trace:
     def signature(self, function: Any, given: tuple[Any, ...]) -> tuple[Any, Any]:
         """Return numba's type of a function and its signature for arguments of these types."""
         kind = self.typing._lookup_global(function) or self.typing.resolve_value_type(function)
-        key = (function, given)
+        key = (function, *map(id, given))  # numba has one object for each type; its hash runs in Python
         known = self._signatures.get(key)
         if known is None or known[0] != kind:
-            known = self._signatures[key] = (kind, self.typing.resolve_function_type(kind, given, {}))
-        return known
+            known = self._signatures[key] = (kind, self.typing.resolve_function_type(kind, given, {}), given)
+        return known[:2]
 
     def apply(self, function: Any, *arguments: Any) -> Any:
         """Return the result of a function known to numba for symbols and numbers."""
@@ -67,7 +67,7 @@ class Trace:
         kind, signature = self.signature(function, given)
         if self.builder is None:
             return symbols(signature.return_type)
-        key = (function, given)
+        key = (function, *map(id, given))
         if key not in self._implementations:
             self._implementations[key] = self.target.get_function(kind, signature)
         values = [self.value(a, t) for a, t in zip(arguments, signature.args, strict=True)]
@@ -75,6 +75,8 @@ class Trace:
 
     def value(self, argument: Any, wanted: Any) -> Any:
         """Return the LLVM value of a symbol, number, or tuple of these, cast to type ``wanted``."""
+        if isinstance(argument, Symbol) and argument.type is wanted:
+            return argument.value
         kind = type_of(argument)
         if isinstance(argument, Symbol):
             value = argument.value
@@ -90,7 +92,7 @@ class Trace:
 
 def type_of(value: Any) -> Any:
     """Return numba's type of a symbol, number, or tuple of these."""
-    if isinstance(value, Symbol):
+    if type(value) is Symbol:
         return value.type
     if isinstance(value, tuple):
         pytype = type(value) if hasattr(value, "_fields") else None
@@ -162,9 +164,9 @@ class _Mathematics:
 
 
 def _shape(argument: Any) -> Any:
-    if isinstance(argument, tuple):
-        return tuple(map(_shape, argument))
-    return argument.type if isinstance(argument, Symbol) else (argument,)
+    if type(argument) is Symbol:
+        return argument.type
+    return tuple(map(_shape, argument)) if isinstance(argument, tuple) else (argument,)
 
 
 class Formula:
