@@ -594,6 +594,7 @@ def filter_for_scenario(
     if setup is None:
         assumed = scenario if gyro is None else dataclasses.replace(scenario, gyro=gyro)
         return setups.FilterSetup.for_scenario(assumed, states=states)
+    setups.need_setup(setup)
     _need_alone(gyro, states)
     kinds = {sensor.name: str(getattr(sensor, "kind", "attitude")) for sensor in scenario.sensors}
     setups.need_angles(setup, kinds, "filter")

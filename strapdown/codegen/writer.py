@@ -19,7 +19,7 @@ LONGEST = 72
 WIDTH = 118
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Language:
     """Words of a language."""
 

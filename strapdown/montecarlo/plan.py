@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from strapdown import scenarios
-from strapdown.checks import Array, InputError, array, count, instance, non_negative, one_of
+from strapdown.checks import Array, InputError, array, count, non_negative, one_of
 from strapdown.estimation import setup
-from strapdown.estimation.setup import FilterSetup
+from strapdown.estimation.setup import FilterSetup, need_setup
 from strapdown.files import tables
 from strapdown.scenarios import Scenario
 
@@ -142,7 +142,7 @@ class Plan:
         for name, least in (("seed", 0), ("epochs", 1), ("nis_bins", 1)):
             object.__setattr__(self, name, count(name, getattr(self, name), minimum=least))
         one_of("precision", self.precision, PRECISIONS)
-        _need_setup(self.setup)
+        need_setup(self.setup)
         if self.samples % (self.epochs * self.setup.integration.samples):
             raise InputError(
                 f"{self.samples} gyro samples do not divide into {self.epochs} epochs of whole {self.setup.integration.name} steps; choose "
@@ -241,13 +241,9 @@ def _dispersions(table: Mapping[str, Any], place: str) -> Dispersions:
     return tables.build(Dispersions, table, _FORM, place)  # type: ignore[no-any-return]
 
 
-def _need_setup(setup: object) -> None:
-    instance("setup", setup, FilterSetup, "give estimation.setup.FilterSetup, as of FilterSetup.for_scenario")
-
-
 def whole_epochs(scenario: Scenario, filter_setup: FilterSetup, most: int = 100) -> int:
     """Return the largest number of epochs, at most ``most``, that divide the scenario into whole filter steps."""
-    _need_setup(filter_setup)
+    need_setup(filter_setup)
     samples, step = round(scenario.duration * scenario.rate), filter_setup.integration.samples
     if samples % step:
         raise InputError(

@@ -232,6 +232,11 @@ def need_mekf(setup: FilterSetup, what: str) -> None:
         )
 
 
+def need_setup(setup: object) -> None:
+    """Raise an error for a filter of another class."""
+    instance("setup", setup, FilterSetup, "give estimation.setup.FilterSetup, as of FilterSetup.for_scenario")
+
+
 def need_angles(setup: FilterSetup, kinds: Mapping[str, str], place: str) -> None:
     """Raise an error for a σ of more than π rad of a sensor that measures angles: it must have been meant in another unit."""
     for name, sigma in setup.sigma.items():
