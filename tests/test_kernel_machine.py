@@ -584,13 +584,28 @@ def test_cache_distinguishes_what_open_functions_are_bound_to(copied_kernels):
     assert ask("own") == [(10.0, 0)]
 
 
-def test_digest_depends_on_every_kernel_source(monkeypatch, tmp_path):
+def test_digest_depends_on_every_kernel_source(tmp_path):
     copy = tmp_path / "kernels"
     shutil.copytree(PACKAGE / "kernels", copy, ignore=shutil.ignore_patterns("__pycache__"))
-    monkeypatch.setattr(machine, "__file__", str(copy / "machine.py"))
-    digest = machine.sources_digest.__wrapped__
-    seen = {digest()}
+    seen = {machine.digest_of(copy.glob("**/*.py"))}
     for path in sorted(copy.rglob("*.py")):
         path.write_text(path.read_text() + "\n# edited\n")
-        seen.add(digest())
+        seen.add(machine.digest_of(copy.glob("**/*.py")))
     assert len(seen) == 1 + len(list(copy.rglob("*.py")))
+
+
+EDITED = """
+from pathlib import Path
+from strapdown.kernels import machine
+path = Path(machine.__file__).with_name("probe.py")
+path.write_text(path.read_text() + "# edited")
+answer = machine.sources_digest()
+"""
+
+
+def test_a_source_edited_while_a_process_runs_does_not_count_for_it(copied_kernels):
+    """Otherwise its code would be stored as that of the edited source, and loaded with other arrays by the next process."""
+    ask = partial(in_a_new_process, copied_kernels.parent.parent)
+    before = ask("from strapdown.kernels import machine\nanswer = machine.sources_digest()")
+    assert ask(EDITED) == before
+    assert ask(EDITED) != before

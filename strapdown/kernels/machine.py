@@ -14,7 +14,7 @@ import functools
 import hashlib
 import platform
 import sys
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterable
 from importlib import import_module
 from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
@@ -27,14 +27,23 @@ INTRINSIC = {f"{PACKAGE}.lane_values": f"{PACKAGE}.lanes", f"{PACKAGE}.argument_
 """Modules whose functions are compiled by instructions of their own, which the other module writes."""
 
 
+def digest_of(paths: Iterable[Path]) -> str:
+    """Return a digest of files, in the order of their names."""
+    digest = hashlib.sha256()
+    for path in sorted(paths):
+        digest.update(path.read_bytes() if path.is_file() else b"")
+    return digest.hexdigest()
+
+
+_SOURCES = digest_of(Path(__file__).parent.glob("**/*.py"))
+"""Read on import: if a source is edited later, the code of this process is not stored as that of the edited one."""
+
+
 @functools.cache
 def sources_digest(parts: tuple[ModuleType, ...] = ()) -> str:
     """Return a digest of all kernel sources and of ``parts``; numba's own key misses edits of helper modules and constants."""
-    digest = hashlib.sha256()
-    own = sorted(Path(__file__).parent.glob("**/*.py"))
-    for path in (*own, *(Path(module.__file__ or "") for module in parts)):
-        digest.update(path.read_bytes() if path.is_file() else b"")
-    return digest.hexdigest()
+    others = [Path(module.__file__ or "") for module in parts if not module.__name__.startswith(PACKAGE)]
+    return _SOURCES + digest_of(others) if others else _SOURCES
 
 
 def _is_kernel(value: object) -> bool:
