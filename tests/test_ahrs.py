@@ -753,6 +753,13 @@ def test_all_samples_hold_more_than_those_before(parameters):
     assert np.all(smoothed.estimate.sigma <= found.estimate.sigma * (1.0 + 1e-9))
 
 
+def test_states_of_an_accelerometer_are_in_its_unit():
+    blocks = ahrs.HAND_HELD.setup.states.blocks({"accelerometer": "vector", "magnetometer": "heading"})
+    units = {block.name: set(block.units) for block in blocks}
+    assert units["accelerometer bias"] == {"m/s²"}
+    assert units["accelerometer velocity"] == {"m/s", "m/s²"}
+
+
 def test_beliefs_are_a_setup_that_goes_through_its_file(parameters):
     assert setup.from_toml(setup.to_toml(parameters.setup)) == parameters.setup
     assert (parameters.setup.states is None) == (parameters == AhrsParameters())

@@ -140,7 +140,10 @@ class SensorStates:
         if _any(self.mounting_sigma):
             found.append(SensorMounting(sensor=sensor, mounting_sigma=np.asarray(self.mounting_sigma)))
         if _any(self.bias_sigma):
-            found.append(VectorBias(sensor=sensor, bias_sigma=np.asarray(self.bias_sigma), varying=self.varying))
+            # Only beside a velocity is the vector known to be a specific force.
+            unit = "m/s²" if kind == "vector" and self.velocity_time > 0.0 else "1"
+            bias_sigma = np.asarray(self.bias_sigma)
+            found.append(VectorBias(sensor=sensor, bias_sigma=bias_sigma, varying=self.varying, unit=unit))
         if _any(self.lever_arm_sigma):
             found.append(LeverArm(sensor=sensor, arm_sigma=np.asarray(self.lever_arm_sigma), strength=strength))
         if self.correlated_sigma > 0.0:
