@@ -211,11 +211,11 @@ def examine(recording: Recording) -> Examination:
             f"{recording.source} has only a gyro; a reference attitude, an accelerometer or a magnetometer is needed too"
         )
     sensors = {
-        name: (vectors, float(np.nanmedian(lengths(vectors))))
+        name: _Sensor(vectors, float(np.nanmedian(size := lengths(vectors))), size)
         for name, vectors in (("accelerometer", recording.specific_force), ("magnetometer", recording.magnetic_field))
         if vectors is not None
     }
-    unit_changes, doubts = _force_unit(*sensors["accelerometer"]) if "accelerometer" in sensors else ((), [])
+    unit_changes, doubts = _force_unit(sensors["accelerometer"]) if "accelerometer" in sensors else ((), [])
     doubts += _too_fast(recording)
     unsaid = [f"as it seems, {words}" for words in unit_changes]  # gravity alone shows it, whatever the turns do
     upright = at_rest(recording)
@@ -361,15 +361,16 @@ def _gravity(strength: float) -> tuple[str, float]:
     return words, STANDARD_GRAVITY / FORCE_UNITS[words]
 
 
-def _force_unit(force: Array, strength: float) -> tuple[tuple[str, ...], list[str]]:
+def _force_unit(force: _Sensor) -> tuple[tuple[str, ...], list[str]]:
     """Return the change of unit by which the median specific force is gravity, and the doubt if there is none.
 
     The median of a unit that is swung is larger than gravity by about the variation of the specific force.
     """
+    strength = force.strength
     if not strength > 0.0:
         return (), ["the accelerometer reads zero throughout"]
     words, gravity = _gravity(strength)
-    if abs(math.log(strength / gravity)) > 0.5 + float(np.nanstd(lengths(force))) / strength:
+    if abs(math.log(strength / gravity)) > 0.5 + float(np.nanstd(force.size)) / strength:
         return (), [f"the median specific force, {strength:.3g} m/s², fits neither m/s² nor g"]
     return ((words,) if words else ()), []
 
@@ -404,9 +405,9 @@ def _unseen(recording: Recording) -> list[str]:
 def _floors(relations: Iterable[str], floor: float, sensors: _Sensors) -> dict[str, float]:
     """Return m₀ of each relation, by its name."""
     acceleration = 0.0
-    if "accelerometer" in sensors:
-        force, strength = sensors["accelerometer"]
-        acceleration = float(np.nanmean((lengths(force) / _gravity(strength)[1] - 1.0) ** 2)) if strength > 0.0 else 0.0
+    force = sensors.get("accelerometer")
+    if force is not None and force.strength > 0.0:
+        acceleration = float(np.nanmean((force.size / _gravity(force.strength)[1] - 1.0) ** 2))
     return {name: floor + acceleration * ("accelerometer" in name) for name in relations}
 
 
@@ -420,8 +421,17 @@ MIN_INTERVAL = 0.02
 """Minimum interval of the samples of a vector used, s."""
 
 
-_Sensors = Mapping[str, tuple[Array, float]]
-"""Samples of the vectors by sensor, and their median magnitude."""
+class _Sensor(NamedTuple):
+    """Samples of a vector."""
+
+    vectors: Array
+    strength: float
+    """Median of the magnitudes."""
+    size: Array
+    """Magnitudes."""
+
+
+_Sensors = Mapping[str, _Sensor]
 
 
 class _Windows(NamedTuple):
@@ -440,9 +450,8 @@ class _Windows(NamedTuple):
         """Return for each sensor the means over each window of R_ab v_c (attitudes, windows, 3, 3, 3), R of attitudes at the rows."""
         sums = []
         for attitude in attitudes:
-            entries = np.stack(
-                rotation_matrix(tuple(attitude.T))
-            )  # (9, m): by entry, not by row, in a third of the time
+            # By entry, (9, m), not by row: a third of the time.
+            entries = np.stack(rotation_matrix(tuple(attitude.T)))
             sums.append([entries[:, a:b] @ self.vectors[a:b] for a, b in itertools.pairwise(self.edges)])
         parts = np.split(np.reshape(sums, (len(sums), len(self.edges) - 1, 3, 3, -1)), len(self.counts), axis=-1)
         return {
@@ -468,10 +477,8 @@ def _windows(recording: Recording, sensors: _Sensors, known: np.ndarray | bool =
     turning = np.bincount(window, lengths(recording.rate[rows])) / np.bincount(window).clip(1)
     least = 0.5 * max(1.0, SPAN / float(np.median(np.diff(time))))
     vectors, used = [], {}
-    for name, (samples, strength) in sensors.items():
-        seen = (
-            np.isfinite(lengths(samples[rows])) & np.broadcast_to(known, recording.time.shape)[rows] & (strength > 0.0)
-        )
+    for name, (samples, strength, size) in sensors.items():
+        seen = np.isfinite(size[rows]) & np.broadcast_to(known, recording.time.shape)[rows] & (strength > 0.0)
         full = np.flatnonzero(np.bincount(window[seen], minlength=len(turning)) >= least)
         chosen = np.zeros(len(turning), bool)
         chosen[full[np.argsort(-turning[full])][:WINDOWS]] = True

@@ -27,7 +27,7 @@ SWING_TIME = 0.1
 """Time, s, over which a rate at the start is assumed to accelerate the unit: it adds to σ of the tilt."""
 MAX_TILT_SIGMA = 0.7
 """Maximum σ of the initial tilt, rad."""
-FACTORS = 0.4, 2.0
+VELOCITY_FACTORS = 0.4, 2.0
 """Limits of the factor on σ of the velocity by which the smoother follows the motion."""
 MAX_DEVIATION = 0.1
 """Maximum difference of the specific force at rest from gravity, m/s², with which σ of the accelerometer's bias is the usual one."""
@@ -259,7 +259,7 @@ def for_whole(recording: Recording, parameters: AhrsParameters, found: Rests) ->
     assert recording.specific_force is not None
     if parameters.usual_variation > 0.0:
         variation = float(np.nanstd(lengths(recording.specific_force)))
-        factor = float(np.clip(variation / parameters.usual_variation, *FACTORS))
+        factor = float(np.clip(variation / parameters.usual_variation, *VELOCITY_FACTORS))
         parameters = replace(parameters, velocity_sigma=factor * parameters.velocity_sigma)
     if parameters.accelerometer_bias_sigma > 0.0 and len(found.last):
         parts, part = rest_length(recording.interval)
