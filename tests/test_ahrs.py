@@ -828,7 +828,7 @@ def test_the_share_of_the_tilt_scales_the_tilt_alone():
     scaled = R @ P @ R.transpose(0, 2, 1)
     ratio = scaled / (own_R @ plain.covariance[:, :3, :3] @ own_R.transpose(0, 2, 1))
     tilt = np.sqrt(ratio[:, 0, 0])
-    np.testing.assert_allclose(tilt, np.sqrt(regions.TILT_SHARE), rtol=1e-6)
+    np.testing.assert_allclose(tilt, np.sqrt(unit.tilt_share), rtol=1e-6)
     np.testing.assert_allclose(ratio[:, 1, 1], tilt**2, rtol=1e-6)
     np.testing.assert_allclose(ratio[:, 2, 2], 1.0, rtol=1e-6)
     correlated = np.abs(scaled[:, 0, 2]) > 1e-3 * np.sqrt(scaled[:, 0, 0] * scaled[:, 2, 2])
@@ -922,6 +922,36 @@ def test_the_level_of_the_acceleration_and_the_innovations_variance_by_it():
     moved = dataclasses.replace(seen, innovation=np.full((steps, 3), np.sqrt(2.0)))
     as_modelled = dataclasses.replace(still, innovations={"accelerometer": moved})
     np.testing.assert_allclose(regions.acceleration_level(as_modelled, uncertain, interval), 1.0, rtol=1e-12)
+
+
+def test_disagreement_of_filter_and_smoother_widens_the_tilt_alone(monkeypatch):
+    """Tilts of 3° about x and 4° about y, whatever the heading; an accelerometer that reads 1 m/s² too much from half of the time on."""
+    heading = quaternion.exp(np.linspace(0.0, 3.0, 200)[:, None] * [0.0, 0.0, 1.0])
+    tilted = quaternion.multiply(quaternion.exp([3.0 * DEGREE, 4.0 * DEGREE, 0.0]), heading)
+    tilted[:20] = heading[:20]  # the start does not count
+    assert regions.disagreement(heading, tilted) == pytest.approx(12.5 * DEGREE**2, rel=1e-12)
+    plain = recording(60.0, noise=1.0)
+    later = plain.specific_force.copy()
+    later[len(later) // 2 :] += [0.0, 1.0, 0.0]
+    sudden = dataclasses.replace(plain, specific_force=later)
+    found = ahrs.estimate(sudden, smooth=True, full_covariance=True)
+    share = regions.DISAGREEMENT_SHARE
+    monkeypatch.setattr(regions, "DISAGREEMENT_SHARE", 0.0)
+    without = ahrs.estimate(sudden, smooth=True, full_covariance=True)
+    R = quaternion.to_matrix(found.estimate.attitude)
+    change = (found.estimate.covariance - without.estimate.covariance)[:, :3, :3]
+    added = np.einsum("kii->ki", R @ change @ R.transpose(0, 2, 1))
+    own = found.parameters.setup
+    blocks = own.states.blocks({one.sensor: one.kind for one in found.record.vectors})
+    arguments = found.record, own.process_noise, found.initial, blocks
+    smoothed, filtered = (
+        Rotation.from_quat(run(*arguments).attitude, scalar_first=True) for run in (estimation.smooth, estimation.run)
+    )
+    turn = (filtered * smoothed.inv()).as_rotvec()[len(smoothed) // 10 :, :2]
+    expected = share * (np.mean(turn**2) - regions.USUAL_DISAGREEMENT**2)
+    np.testing.assert_allclose(added[:, :2], expected, rtol=1e-6)
+    assert expected > (0.5 * DEGREE) ** 2
+    assert np.abs(added[:, 2]).max() < 1e-9 * expected
 
 
 def test_innovations_of_broad_are_as_large_as_their_variance_says(broad):

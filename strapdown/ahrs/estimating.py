@@ -27,6 +27,7 @@ from strapdown.ahrs.starting import (
 )
 from strapdown.calibration import UnitCalibration, with_gyro_states
 from strapdown.checks import Array
+from strapdown.estimation.forward import Options
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.schedule import joined
 from strapdown.kernels import recording_steps
@@ -147,8 +148,9 @@ def estimate(
     else:
         at_rest = informative(at_rest, used.time, parameters)
     options = _Options(gate, robust, smooth, full_covariance)
-    filtered = _run(prepared, parameters, faults.turn_variance, at_rest, options)
-    found = _at_stamps(filtered, used, prepared, parameters, delays, faults.turn_variance, options)
+    filtered, disagreement = _run(prepared, parameters, faults.turn_variance, at_rest, options)
+    scales = regions.scales(filtered, parameters, disagreement=disagreement)
+    found = _at_stamps(filtered, scales, used, prepared, parameters, delays, faults.turn_variance, options)
     scale = filtered.error_states.get("gyro scale")
     return AhrsEstimate(
         recording=used,
@@ -184,8 +186,8 @@ class _Options(NamedTuple):
 
 def _run(
     prepared: Prepared, parameters: AhrsParameters, turn_variance: Array, at_rest: Rests, options: _Options
-) -> Estimate:
-    """Return the filter's or the smoother's estimate at the steps.
+) -> tuple[Estimate, float | None]:
+    """Return the filter's or the smoother's estimate at the steps, and the smoother's disagreement with its filter.
 
     If the rotation over some sample intervals is uncertain (``turn_variance`` (n,), rad², is positive), the record is run in parts. The
     angle random walk of each part is that of the gyro plus that variance spread over the part. Each part is smoothed separately, because
@@ -206,20 +208,25 @@ def _run(
         rates = [(at_rest.rate[k], float(at_rest.sigma[k])) for k in np.flatnonzero(rested == last)]
         change = functools.partial(functools.reduce, _with_rate, rates) if rates else None
         spans.append(estimation.Span(last, float(np.sqrt(walk)), change))
-    shared: dict[str, Any] = {"gate": options.gate, "robust": options.robust}
+    judged: dict[str, Any] = {"gate": options.gate, "robust": options.robust}
     if not smooth:
-        found = estimation.run_spans(record, own.process_noise, prepared.initial, blocks, spans, **shared)
+        found = estimation.run_spans(record, own.process_noise, prepared.initial, blocks, spans, **judged)
         # Gaps are among the faults of the recording: the rotation over them is uncertain by more than the event says.
-        return replace(found, events=tuple(one for one in found.events if one.kind != "gap"))
-    shared |= {"full_covariance": True, "error_state_covariance": False}
-    state, parts = prepared.initial, []
+        return replace(found, events=tuple(one for one in found.events if one.kind != "gap")), None
+    shared = Options(full_covariance=True, error_state_covariance=False, **judged)
+    state = prepared.initial
+    parts: list[Estimate] = []
+    forward: list[Array] = []
     for (first, last), span in zip(itertools.pairwise(bounds), spans, strict=True):
         part = record if len(spans) == 1 else cut(record, first, last)
         noise = replace(own.process_noise, angle_random_walk=span.angle_random_walk)
-        parts.append(estimation.smooth(part, noise, state, blocks, **shared))
+        smoothed, filtered = estimation.smoothed_and_filtered(part, noise, state, blocks, shared)
+        parts.append(smoothed)
+        forward.append(filtered if not forward else filtered[1:])
         if last < len(extra):
-            _, state = estimation.run_part(part, noise, state, blocks, **shared)
-    return joined(parts)
+            _, state = estimation.run_part(part, noise, state, blocks, **judged)
+    whole = joined(parts)
+    return whole, regions.disagreement(whole.attitude, np.concatenate(forward))
 
 
 def _with_rate(state: estimation.State, measured: tuple[Array, float]) -> estimation.State:
@@ -234,6 +241,7 @@ def _over_steps(variance: Array, edge: np.ndarray) -> Array:
 
 def _at_stamps(
     filtered: Estimate,
+    scales: tuple[Array, Array, Array],
     used: Recording,
     prepared: Prepared,
     parameters: AhrsParameters,
@@ -249,7 +257,6 @@ def _at_stamps(
     ahead = -sensor_delays.turn_over(used, -late) if options.smooth else used.rate * late[:, None]
     interval = max(parameters.step, used.interval)
     level = regions.acceleration_level(filtered, _over_steps(turn_variance, edge) > 0.0, interval)
-    tilt, floor, heading = regions.scales(filtered, parameters, causal=not options.smooth)
     assert filtered.covariance is not None
     iron = np.zeros(len(edge))
     if prepared.field is not None:
@@ -257,7 +264,7 @@ def _at_stamps(
         force = first_vector(used.specific_force, prepared.turned, used.source, "accelerometer")
         field = first_vector(used.magnetic_field, prepared.turned, used.source, "magnetometer")
         iron[0] = headings.first_variance(force, field, parameters)
-    at_steps = (filtered.attitude, filtered.bias, filtered.variance, filtered.covariance, tilt, floor, heading, iron)
+    at_steps = (filtered.attitude, filtered.bias, filtered.variance, filtered.covariance, *scales, iron)
     compiled(recording_steps.carry_to_stamps)(
         recording_steps.Steps(edge, *map(read_only, at_steps)),
         recording_steps.Stamps(*map(read_only, (used.time, used.rate, prepared.turned, late, ahead))),

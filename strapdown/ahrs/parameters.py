@@ -74,9 +74,12 @@ class AhrsParameters:
         the specific force at rest and gravity if that is larger than 0.1 m/s².
     tilt_sigma : float, default 0.0
         σ of a horizontal error of the accelerometer, m/s², that is part of the reported σ of the tilt and is not estimated.
-    tilt_by_field : float, default 0.0
+    tilt_by_field, max_tilt_by_field : float, default 0.0
         σ of a further such error, m/s², where the field is disturbed as along the path of a phone indoors
-        (:mod:`strapdown.ahrs.regions`): the units that are carried so are those of phones.
+        (:mod:`strapdown.ahrs.regions`), and its maximum in fields that are disturbed more: the units that are carried so are those of
+        phones.
+    tilt_share : float, default 0.3
+        Reported variance of the tilt relative to that of the filter, whose acceleration is larger than that of most motion.
     heading_share, heading_by_field : float, default 1.0, 0.0
         Reported variance of the heading relative to that of the filter: in a clean field, and in addition in such a field.
     gyro_scale_sigma : float, default 0.0
@@ -108,6 +111,8 @@ class AhrsParameters:
     accelerometer_bias_sigma: float = 0.0
     tilt_sigma: float = 0.0
     tilt_by_field: float = 0.0
+    max_tilt_by_field: float = 0.0
+    tilt_share: float = 0.3
     heading_share: float = 1.0
     heading_by_field: float = 0.0
     gyro_scale_sigma: float = 0.0
@@ -121,6 +126,7 @@ class AhrsParameters:
             "hard_iron_sigma",
             "iron_sigma",
             "heading_by_field",
+            "max_tilt_by_field",
             "position_time",
             "rate_random_walk",
             "rest_bias_sigma",
@@ -176,10 +182,12 @@ HAND_HELD = AhrsParameters(
     velocity_sigma=0.7,
     acceleration_time=0.15,
     accelerometer_bias_sigma=0.02,
-    tilt_sigma=0.02,
+    tilt_sigma=0.054,
     tilt_by_field=0.3,
-    heading_share=0.1,
-    heading_by_field=1.0,
+    max_tilt_by_field=0.36,
+    tilt_share=0.08,
+    heading_share=0.05,
+    heading_by_field=1.1,
     gyro_scale_sigma=3e-3,
 )
 """A unit with a magnetometer in the hand, on a person or a small aircraft: its velocity is bounded. Chosen on the development halves of
@@ -192,10 +200,11 @@ HAND_HELD_SMOOTHED = replace(
     rate_random_walk=1.5e-4,
     velocity_sigma=1.0,
     usual_variation=1.4,
-    tilt_sigma=0.05,
-    tilt_by_field=0.12,
-    heading_share=0.05,
-    heading_by_field=0.7,
+    tilt_by_field=0.08,
+    max_tilt_by_field=0.165,
+    tilt_share=0.07,
+    heading_share=0.1,
+    heading_by_field=0.9,
     gyro_scale_sigma=4e-3,
 )
 """The same for the smoother, which weighs acceleration that lasts over all the time before and after, and follows the motion. Chosen on the
@@ -211,6 +220,7 @@ HAND_HELD_WITHOUT_MAGNETOMETER = replace(
     acceleration_time=0.1,
     accelerometer_bias_sigma=0.0,
     tilt_sigma=0.045,
+    tilt_share=0.15,
     gyro_scale_sigma=5e-3,
 )
 """Such a unit without a magnetometer. Acceleration that lasts, in body axes too, would otherwise be modelled as gyro bias about the

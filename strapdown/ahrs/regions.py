@@ -11,26 +11,27 @@ from dataclasses import replace
 
 import numpy as np
 
+from strapdown import quaternion
 from strapdown.ahrs.parameters import AhrsParameters
 from strapdown.checks import Array
 from strapdown.kernels import recording_steps
 from strapdown.kernels.machine import compiled, read_only
 from strapdown.recordings.hard_iron import low_pass
 from strapdown.records import Estimate, Innovations
-from strapdown.units import STANDARD_GRAVITY
+from strapdown.units import DEGREE, STANDARD_GRAVITY
 
 LEVEL_TIME = 5.0
 """Time constant of the average that gives the level of the acceleration, s; by it the innovations' variance is scaled."""
 OWN_SHARE = 0.1
 """Share of the modelled variance of an innovation that comes from the sensor's errors, whatever the acceleration's level."""
-TILT_SHARE = 0.3
-"""Variance of the tilt relative to that of the filter, whose acceleration is larger than that of most motion."""
-MAX_BY_FIELD = 0.25
-"""Maximum σ of the accelerometer's error computed from the level of the field's disturbance, m/s²."""
+DISAGREEMENT_SHARE = 0.8
+"""Variance added to that of the smoothed tilt, relative to the mean square difference between filtered and smoothed tilt."""
+USUAL_DISAGREEMENT = 0.15 * DEGREE
+"""Difference, rad, that a filter and a smoother whose model is right have too."""
+MAX_HEADING = 38.0
+"""Maximum factor on the variance of the heading from the measurements so far, whose mean NIS varies more than that of all."""
 FIELD_LEVEL = 0.02
 """Mean NIS of the magnetometer in a field disturbed as that along the path of a phone indoors."""
-MAX_HEADING = 38.0
-"""Maximum factor on the variance of the heading."""
 FIRST_LEVEL = (0.01, 15.0)
 """Mean NIS of the magnetometer assumed at first, and the number of measurements that weigh as much."""
 FIELD_MEMORY = 60.0
@@ -59,31 +60,45 @@ def scaled_innovations(filtered: Estimate, level: Array) -> dict[str, Innovation
     return {**filtered.innovations, "accelerometer": replace(own, variance=own.variance * share[:, None])}
 
 
-def scales(filtered: Estimate, parameters: AhrsParameters, *, causal: bool) -> tuple[Array, Array, Array]:
+def scales(
+    filtered: Estimate, parameters: AhrsParameters, *, disagreement: float | None = None
+) -> tuple[Array, Array, Array]:
     """Return the factor on σ of the tilt, the variance that is added to it, rad², and the factor on σ of the heading (k + 1,) each.
 
-    ``causal``: from the measurements before each step, otherwise from all.
+    From the measurements before each step or, if there is a ``disagreement``, from all: the mean square difference, rad², between the
+    smoother's tilt about one axis and its filter's (:func:`disagreement`). Errors of the model that last longer than σ allows show there.
     """
-    field = field_level(filtered, parameters, causal=causal)
+    field = field_level(filtered, parameters, causal=disagreement is None)
     shares = shares_of(parameters, magnetometer="magnetometer" in filtered.innovations)
+    if disagreement is not None:
+        shares = shares._replace(max_heading=np.inf)
     tilt, floor, heading = np.empty((3, len(field)))
     compiled(recording_steps.scale_factors)(read_only(field), shares, tilt, floor, heading)
+    if disagreement is not None:
+        floor += DISAGREEMENT_SHARE * max(disagreement - USUAL_DISAGREEMENT**2, 0.0)
     return tilt, floor, heading
 
 
 def shares_of(parameters: AhrsParameters, *, magnetometer: bool) -> recording_steps.Shares:
     """Return the constants for the kernel."""
     return recording_steps.Shares(
-        tilt=TILT_SHARE,
+        tilt=parameters.tilt_share,
         tilt_variance=parameters.tilt_sigma**2,
         tilt_by_field=parameters.tilt_by_field,
-        max_by_field=MAX_BY_FIELD,
+        max_tilt_by_field=parameters.max_tilt_by_field,
         heading=parameters.heading_share if magnetometer else 1.0,
         heading_by_field=parameters.heading_by_field,
         max_heading=MAX_HEADING,
         field_level=FIELD_LEVEL,
         gravity=STANDARD_GRAVITY,
     )
+
+
+def disagreement(smoothed: Array, filtered: Array) -> float:
+    """Return the mean square rotation about one level axis between two attitudes (k, 4), rad², after the first tenth of the rows."""
+    late = slice(len(smoothed) // 10, None)
+    turn = quaternion.log(quaternion.multiply(filtered[late], quaternion.conjugate(smoothed[late])))
+    return float(np.mean(turn[:, :2] ** 2))
 
 
 def field_level(filtered: Estimate, parameters: AhrsParameters, *, causal: bool) -> Array:

@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from strapdown.ahrs.estimating import AhrsEstimate
 from strapdown.recordings import Recording, gaps
 from strapdown.recordings.sensor_faults import stuck_words
+from strapdown.units import DEGREE
+
+MAX_BIAS = 4.0
+"""Gyro bias without a rest, relative to σ of its axes at the start, above which the start was too certain."""
 
 
 def fixed_frame(recording: Recording) -> str:
@@ -58,6 +64,15 @@ def _model(moved_by: str, result: AhrsEstimate) -> str:
         return words
     number, time = len(result.rests.last), result.recording.time
     if number == 0:
-        return f"{words} No second is quiet enough to measure the gyro's bias, so the heading may drift at first."
+        bias = float(np.linalg.norm(result.estimate.bias[-1]))
+        known = parameters.bias_sigma / DEGREE
+        beyond = (
+            f" Its estimate at the end, {bias / DEGREE:.2g} deg/s, is beyond what the model expects at the start (σ {known:.2g} deg/s per "
+            "axis): until it was known, errors may exceed their σ. Begin with a second at rest, or give a calibration."
+        )
+        return (
+            f"{words} No second is quiet enough to measure the gyro's bias, so the heading may drift at first."
+            f"{beyond if bias > MAX_BIAS * parameters.bias_sigma else ''}"
+        )
     at = ", ".join(f"{time[last]:.2f}" for last in result.rests.last[:4]) + (", …" if number > 4 else "")
     return f"{words} The gyro's bias is measured at rest, in {number} span{'s' if number > 1 else ''} of a second, ending at {at} s."

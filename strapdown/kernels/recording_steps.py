@@ -205,7 +205,7 @@ class Shares(NamedTuple):
     tilt_variance: float
     """(m/s²)²"""
     tilt_by_field: float
-    max_by_field: float
+    max_tilt_by_field: float
     """m/s²"""
     heading: float
     heading_by_field: float
@@ -218,11 +218,10 @@ def scale_factors(field_level, shares, tilt, floor, heading):
     """Write the factor on σ of the tilt, the variance that is added to it, and the factor on σ of the heading (k,) each."""
     for i in range(len(field_level)):
         field = field_level[i] / shares.field_level
-        by_field = min(shares.tilt_by_field * field, shares.max_by_field)
+        by_field = min(shares.tilt_by_field * field, shares.max_tilt_by_field)
         tilt[i] = math.sqrt(shares.tilt)
         floor[i] = (shares.tilt_variance + by_field * by_field) / (shares.gravity * shares.gravity)
-        by_field = shares.heading_by_field * field * math.sqrt(field)
-        heading[i] = math.sqrt(min(shares.heading + by_field, shares.max_heading))
+        heading[i] = math.sqrt(min(shares.heading + shares.heading_by_field * field, shares.max_heading))
 
 
 def low_pass(values, share, result):
