@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from strapdown import ahrs, quaternion
+from strapdown.ahrs import check_conventions
 from strapdown.recordings import Recording, sensor_faults
 from strapdown.records.recording import sampled
 from strapdown.units import DEGREE
@@ -253,18 +254,32 @@ def test_an_ordinary_recording_has_no_faults():
 
 
 @pytest.mark.parametrize(
-    ("rows", "value", "words"),
+    ("rows", "axes", "value", "words"),
     [
-        (slice(None), 0.0, "stuck about y: 0 °/s throughout"),
-        (slice(300, 700), 0.1, "stuck about y: 5.73 °/s from 3 to 6.99 s"),
-        (slice(300, 400), 0.1, ""),
+        (slice(None), 1, 0.0, "stuck about y: 0 °/s throughout"),
+        (slice(300, 700), 1, 0.1, "stuck about y: 5.73 °/s from 3 to 6.99 s"),
+        (slice(300, 400), 1, 0.1, ""),
+        (
+            slice(300, 700),
+            slice(None),
+            0.0,
+            "stuck about x: 0 °/s from 3 to 6.99 s",
+        ),  # the accelerometer shows the motion
     ],
 )
-def test_a_stuck_gyro_is_reported(rows, value, words):
-    rate = np.random.default_rng(1).normal(0.0, 0.5, (1000, 3))
-    rate[rows, 1] = value
-    said = sensor_faults.stuck_words(Recording(source="a", time=0.01 * np.arange(1000), rate=rate))
+def test_a_stuck_gyro_is_reported(rows, axes, value, words):
+    rng = np.random.default_rng(1)
+    rate, force = rng.normal(0.0, 0.5, (1000, 3)), rng.normal([0.0, 0.0, 9.8], 2.0, (1000, 3))
+    rate[rows, axes] = value
+    one = Recording(source="a", time=0.01 * np.arange(1000), rate=rate, specific_force=force)
+    said = sensor_faults.stuck_words(one)
     assert (words in said[0]) if words else not said
+    if words:
+        examined = check_conventions.examine(one)
+        assert said[0] in examined.warnings
+        assert examined.verdict == "cannot tell"
+    at_rest = dataclasses.replace(one, specific_force=np.tile([0.0, 0.0, 9.8], (1000, 1)))
+    assert bool(sensor_faults.stuck_words(at_rest)) == (axes == 1 and words != "")
 
 
 def test_a_coarse_gyro_at_rest_is_not_stuck():

@@ -29,6 +29,7 @@ from strapdown import coning, quaternion
 from strapdown.ahrs.starting import quiet_span
 from strapdown.checks import Array, Hint, InputError, lengths
 from strapdown.kernels.rotation import rotation_matrix
+from strapdown.recordings.sensor_faults import stuck_words
 from strapdown.records.recording import Recording, increments
 from strapdown.units import DEGREE, STANDARD_GRAVITY
 
@@ -216,7 +217,8 @@ def examine(recording: Recording) -> Examination:
         if vectors is not None
     }
     unit_changes, doubts = _force_unit(sensors["accelerometer"]) if "accelerometer" in sensors else ((), [])
-    doubts += _too_fast(recording)
+    stuck = stuck_words(recording)
+    doubts += _too_fast(recording) + stuck
     unsaid = [f"as it seems, {words}" for words in unit_changes]  # gravity alone shows it, whatever the turns do
     upright = at_rest(recording)
     found = (_without_reference if recording.true_attitude is None else _with_reference)(recording, sensors)
@@ -231,6 +233,8 @@ def examine(recording: Recording) -> Examination:
             doubts=tuple(upright + unsaid + doubts),
         )
     result = _concluded(recording.source, found, unit_changes, notes)
+    if stuck:
+        result = replace(result, verdict="cannot tell", reason="a gyro axis is stuck; see the warning")
     if upright and result.verdict == "as declared":
         result = replace(
             result, verdict="cannot tell", reason="the sensors agree with each other; see the warning on their sign"

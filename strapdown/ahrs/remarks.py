@@ -6,7 +6,6 @@ import numpy as np
 
 from strapdown.ahrs.estimating import AhrsEstimate
 from strapdown.recordings import Recording, gaps
-from strapdown.recordings.sensor_faults import stuck_words
 from strapdown.units import DEGREE
 
 MAX_BIAS = 4.0
@@ -30,7 +29,6 @@ def remarks(result: AhrsEstimate, motion: str) -> tuple[str, ...]:
         _model(motion, result),
         *delays.words,
         *(f"{one}." for one in result.faults.words),
-        *stuck_words(used),
     ]
     if result.hard_iron.any():
         iron = ", ".join(f"{value:.3g}" for value in result.hard_iron)

@@ -207,7 +207,6 @@ def doctor(
     """Test the axes, signs, frames and units of a recording against alternatives: exit status 0 as declared, 1 wrong, 3 cannot tell."""
     from strapdown import recordings
     from strapdown.ahrs import check_conventions
-    from strapdown.recordings.sensor_faults import stuck_words
 
     json_target(json, recording)
     source = recordings.read(recording, **layout.options(recording))
@@ -216,7 +215,6 @@ def doctor(
     say(
         f"{checked.source}: {checked.words}",
         *(f"warning: {words}." for words in checked.doubts),
-        *(f"warning: {words}" for words in stuck_words(source)),
         *(f"Note: {remark}" for remark in source.remarks),
     )
     if checked.candidates:

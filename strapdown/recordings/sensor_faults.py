@@ -247,28 +247,33 @@ def turn_variance_over(time: Array, rate: Array, length: float, usual: float) ->
 
 
 STUCK_TIME = 2.0
-"""Minimum time of equal gyro samples about an axis to be reported while the unit rotates about the others, s."""
+"""Minimum time of equal gyro samples about an axis to be reported while the unit moves, s."""
 STUCK_SAMPLES = 50
 """Minimum number of them."""
 ROTATES = 0.2
-"""RMS rate about the other axes above which a unit rotates, rad/s."""
+"""RMS rate about the other axes above which a unit moves, rad/s."""
+ACCELERATES = 1.0
+"""Standard deviation of the specific force above which a unit moves, m/s²."""
 
 
-def stuck_words(recording: Recording) -> tuple[str, ...]:
-    """Return a sentence for each gyro axis stuck at one value, throughout or for seconds in which the unit rotates about the others."""
-    time, found = recording.time, []
+def stuck_words(recording: Recording) -> list[str]:
+    """Return a warning for each gyro axis stuck at one value, throughout or for seconds in which the other sensors show motion."""
+    time, warnings = recording.time, []
     for axis, name in enumerate("xyz"):
         values = recording.rate[:, axis]
         edges = np.concatenate([[0], np.flatnonzero(np.diff(values)) + 1, [len(values)]])
         longest = int(np.argmax(np.diff(edges)))
         first, last = int(edges[longest]), int(edges[longest + 1]) - 1
-        others = np.delete(recording.rate[first : last + 1], axis, axis=1)
-        rotates = float(np.sqrt(np.mean(np.sum(others**2, axis=1)))) > ROTATES
+        span = slice(first, last + 1)
+        others = np.delete(recording.rate[span], axis, axis=1)
+        moves = float(np.sqrt(np.mean(np.sum(others**2, axis=1)))) > ROTATES
+        if recording.specific_force is not None and np.isfinite(force := recording.specific_force[span]).any():
+            moves |= float(np.sqrt(np.sum(np.nanvar(force, axis=0)))) > ACCELERATES
         whole = len(edges) == 2
-        if last - first + 1 < STUCK_SAMPLES or not (whole or (time[last] - time[first] >= STUCK_TIME and rotates)):
+        if last - first + 1 < STUCK_SAMPLES or not (whole or (time[last] - time[first] >= STUCK_TIME and moves)):
             continue
-        span = "throughout" if whole else f"from {time[first]:.6g} to {time[last]:.6g} s"
-        found.append(
-            f"The gyro is stuck about {name}: {values[first] / DEGREE:.4g} °/s {span}; the attitude is not tracked then. Check the sensor."
+        when = "throughout" if whole else f"from {time[first]:.6g} to {time[last]:.6g} s"
+        warnings.append(
+            f"the gyro is stuck about {name}: {values[first] / DEGREE:.4g} °/s {when}; the attitude is not tracked then; check the sensor"
         )
-    return tuple(found)
+    return warnings
