@@ -170,6 +170,7 @@ def _sensor(series: VectorMeasurements, shape: int, *, isotropic: bool) -> Senso
     place = "" if attitude else f" Reference in fixed axes: ({', '.join(f'{x:.6g}' for x in reference)})."
     angle = f" = {sigma / DEGREE:.4g} deg" if sigma > 0.1 * DEGREE else f" = {sigma / ARCSECOND:.4g} arcsec"
     unit = "" if series.kind == "vector" else f" rad{angle}"
+    of = " of the heading" if series.kind == "heading" else ""
     return Sensor(
         name=identifier(series.sensor),
         kind=KIND_CODES[series.kind],
@@ -178,7 +179,7 @@ def _sensor(series: VectorMeasurements, shape: int, *, isotropic: bool) -> Senso
         length=length,
         noise=noise,
         variances=tuple(np.diag(covariance).tolist()),
-        words=f"Update with {series.sensor}: {what}, body axes.{place} sigma {sigma:.6g}{unit}.",
+        words=f"Update with {series.sensor}: {what}, body axes.{place} sigma{of} {sigma:.6g}{unit}.",
     )
 
 

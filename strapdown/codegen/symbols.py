@@ -108,7 +108,7 @@ def type_of(kind: str, operands: tuple[Any, ...]) -> str:
     if kind not in INTEGER:
         return ""
     operands = operands[1:] if kind == "select" else operands
-    whole = (x.type == "int" if isinstance(x, Symbol) else float(x).is_integer() for x in operands)
+    whole = (x.type == "int" if isinstance(x, Symbol) else isinstance(x, int) for x in operands)
     return "int" if all(whole) else ""
 
 
@@ -137,8 +137,7 @@ class Trace:
 
     def symbol(self, kind: str, *operands: Any) -> Symbol:
         """Return the symbol of an operation."""
-        operands = tuple(float(x) if isinstance(x, int) and not isinstance(x, bool) else x for x in operands)
-        key = (kind, *operands)
+        key = (kind, type_of(kind, operands), *operands)
         known = self.symbols.get(key)
         if known is None:
             group = (operands[0],) if kind == "select" else ()
