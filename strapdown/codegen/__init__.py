@@ -3,8 +3,8 @@
 - ``design``: The setup and its sensors as a program; refusals.
 - ``program``: The filter sample by sample, with checks, flags and a gate, around the formulas of the kernels.
 - ``recording``: That of an IMU, around the filter's steps.
-- ``symbols``: Tracing of formulas.
-- ``interpreted``: Tracing of kernels with branches and loops.
+- ``symbols``: Operations, recorded.
+- ``interpreted``: Kernels executed on symbols.
 - ``functions``: A function of the target: statements, branches, calls.
 - ``regions``: The block to which each operation belongs.
 - ``target``: All functions of a filter, traced.
