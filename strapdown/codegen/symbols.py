@@ -1,4 +1,4 @@
-"""Symbols that trace formulas: executing a kernel on them (:mod:`strapdown.codegen.interpreted`) records its operations, equal ones once.
+"""Symbols that trace formulas: :mod:`strapdown.codegen.interpreted` executes kernels on them, each operation is recorded, equal ones once.
 
 A number that is known while tracing stays a Python float, and zeros and ones vanish as they do in the kernels. What differs between two outcomes
 without other effects becomes a selection, which :mod:`strapdown.codegen.regions` writes as an ``if``.
