@@ -1,7 +1,7 @@
-"""Symbols that trace formulas: :mod:`strapdown.codegen.interpreted` executes kernels on them, each operation is recorded, equal ones once.
+"""Symbols that trace formulas: :mod:`strapdown.codegen.interpreted` executes kernels on them, and equal operations are recorded once.
 
-A number that is known while tracing stays a Python float, and zeros and ones vanish as they do in the kernels. What differs between two outcomes
-without other effects becomes a selection, which :mod:`strapdown.codegen.regions` writes as an ``if``.
+A number that is known while tracing stays a Python float, and zeros and ones vanish as they do in the kernels. What differs between two
+outcomes without other effects becomes a selection, which :mod:`strapdown.codegen.regions` writes as an ``if``.
 """
 
 from __future__ import annotations
