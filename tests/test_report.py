@@ -5,9 +5,9 @@ import dataclasses
 import html.parser
 import json
 import re
-import shutil
-import subprocess
+import sys
 import zlib
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,9 +21,8 @@ from strapdown.estimation import setup
 from strapdown.montecarlo import campaign, coning_study, verdicts
 from strapdown.report import comparisons, page, tunings
 
-CHROMIUM = next(
-    (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
-)
+sys.path.append(str(Path(__file__).resolve().parents[1] / "docs"))
+import headless
 
 
 @pytest.fixture(scope="module")
@@ -412,8 +411,7 @@ def test_a_folder_without_a_name_is_no_result(place):
     assert isinstance(found.exception, InputError)
 
 
-PROBE = """<script>window.onerror = (message) => { document.body.dataset.error = message; };
-const wait = setInterval(async () => {
+PROBE = """const wait = setInterval(async () => {
   if (PAGE_HAS_CHARTS && !document.documentElement.dataset.drawn) return;
   clearInterval(wait);
   const found = {charts: document.querySelectorAll(".uplot canvas").length, images: document.images.length,
@@ -450,32 +448,23 @@ const wait = setInterval(async () => {
     found.ink = getComputedStyle(document.documentElement).getPropertyValue("--ink").trim();
   }
   document.title = JSON.stringify(found);
-}, 50);</script></head>"""
+}, 50);"""
 
 
-def shown_by_a_browser(content, tmp_path, width):
+def shown_by_a_browser(page, width):
     """Return what the probe finds on a page in headless Chromium, in the dark theme."""
-    charts = str('class="chart"' in content).lower()
-    probe = tmp_path / "probe.html"
-    probe.write_text(content.replace("</head>", PROBE.replace("PAGE_HAS_CHARTS", charts), 1), encoding="utf-8")
-    options = ["--headless", "--no-sandbox", "--no-first-run", f"--user-data-dir={tmp_path / 'profile'}"]
-    options += ["--disable-gpu", "--disable-background-networking", "--disable-component-update", "--disable-sync"]
-    options += ["--blink-settings=preferredColorScheme=0", "--enable-logging=stderr", f"--window-size={width},900"]
-    options += ["--virtual-time-budget=20000", "--dump-dom"]
-    shown = subprocess.run(
-        [str(CHROMIUM), *options, probe.as_uri()], capture_output=True, text=True, timeout=120, check=True
-    )
-    assert "data-error" not in shown.stdout[: shown.stdout.index("<style>") + 10] + shown.stdout[-3000:]
-    assert ":CONSOLE" not in shown.stderr, shown.stderr
-    found = re.search(r"<title>(\{.*?\})</title>", shown.stdout)
-    assert found, "the page did not finish drawing"
-    return json.loads(found.group(1).replace("&quot;", '"'))
+    if headless.CHROMIUM is None:
+        pytest.skip("no Chromium on this machine; install it to see the pages in a browser")
+    charts = str('class="chart"' in body(page)).lower()
+    dark = ("--blink-settings=preferredColorScheme=0", "--virtual-time-budget=20000")
+    found = headless.reported(page, PROBE.replace("PAGE_HAS_CHARTS", charts), width, *dark)
+    assert found["console"] == []
+    return found
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine; install it to see the pages in a browser")
 @pytest.mark.parametrize(("name", "width"), [("right", 1280), ("campaign", 390)])
-def test_a_browser_shows_figures_and_charts(folder, tmp_path, name, width):
-    found = shown_by_a_browser(body(folder / f"{name}.html"), tmp_path, width)
+def test_a_browser_shows_figures_and_charts(folder, name, width):
+    found = shown_by_a_browser(folder / f"{name}.html", width)
     assert found["hidden"] == 0
     assert found["images"] >= 1
     assert found["overflow"] <= 0
