@@ -6,22 +6,18 @@ this page and the first no script may fail and nothing may be wider than a phone
 
 from __future__ import annotations
 
-import json
-import re
-import shutil
-import subprocess
 import sys
-import tempfile
 from pathlib import Path
 from typing import Any
+
+import headless
 
 FRAME = 1000.0 / 30.0
 MAX_BYTES = 150_000
 
 # All at once, before the browser writes down the page: what waits for the next frame is done at once.
-PROBE = """<script>
-const found = {errors: []};
-addEventListener("error", (event) => found.errors.push(String(event.message)));
+PROBE = """
+const found = {};
 addEventListener("load", () => {
   const root = document.getElementById("coning-interactive");
   if (root) {
@@ -48,33 +44,14 @@ addEventListener("load", () => {
     });
   }
   found.overflow = document.documentElement.scrollWidth - innerWidth;
-  document.title = "FOUND " + JSON.stringify(found);
+  document.title = JSON.stringify(found);
 });
-</script></head>"""
-
-
-def opened(chromium: str, page: Path, width: int, copy: Path) -> dict[str, Any]:
-    """Return what the probe reports of a page in a window of this width."""
-    content = page.read_text(encoding="utf-8")
-    probe = page.with_name(f"probe-{page.name}")  # beside the page, for its relative links
-    probe.write_text(content.replace("</head>", PROBE, 1), encoding="utf-8")
-    options = ["--headless", "--no-sandbox", "--no-first-run", "--disable-gpu", f"--user-data-dir={copy}"]
-    options += ["--disable-background-networking", "--enable-logging=stderr", f"--window-size={width},900"]
-    try:
-        command = [chromium, *options, "--dump-dom", probe.resolve().as_uri()]
-        shown = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
-    finally:
-        probe.unlink()
-    title = re.search(r"<title>FOUND (\{.*?\})</title>", shown.stdout)
-    if title is None:
-        raise SystemExit(f"{page}: the probe did not end; standard error of the browser:\n{shown.stderr[-2000:]}")
-    found: dict[str, Any] = json.loads(title.group(1).replace("&quot;", '"').replace("&amp;", "&"))
-    return found
+"""
 
 
 def faults(found: dict[str, Any], width: int) -> list[str]:
     """Return what is wrong with a page."""
-    wrong = [f"a script failed: {error}" for error in found["errors"]]
+    wrong = [f"the console says: {line}" for line in found["console"]]
     if found["overflow"] > 0:
         wrong.append(f"the page is {found['overflow']} pixels wider than the window of {width}")
     if "first" in found:
@@ -98,15 +75,13 @@ def main() -> int:
     built = Path(sys.argv[1] if len(sys.argv) > 1 else "docs/_build")
     size = (built / "_static/coning.js").stat().st_size
     wrong = [f"coning.js has {size} bytes, more than {MAX_BYTES}"] if size > MAX_BYTES else []
-    chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-    if chromium is None:
+    if headless.CHROMIUM is None:
         print("no Chromium on this machine: the pages were not looked at in a browser")
     else:
-        with tempfile.TemporaryDirectory() as folder:
-            for name in ("index.html", "guide/coning.html"):
-                for width in (1280, 500):  # the least width of a headless window
-                    found = opened(chromium, built / name, width, Path(folder))
-                    wrong += [f"{name}, {width} pixels: {fault}" for fault in faults(found, width)]
+        for name in ("index.html", "guide/coning.html"):
+            for width in (1280, 500):  # the least width of a headless window
+                found = headless.reported(built / name, PROBE, width)
+                wrong += [f"{name}, {width} pixels: {fault}" for fault in faults(found, width)]
     print("\n".join(wrong) if wrong else f"coning.js has {size} bytes; pages as they should be")
     return int(bool(wrong))
 

@@ -747,6 +747,12 @@ def diagnose(
         Causes, the most likely first, and the verdict from statistics and causes together; None if the filter has more states.
     reason : str
         Feature of the filter that the search does not support, so that only the statistics count; empty if there is none.
+
+    Examples
+    --------
+    >>> import strapdown as sd
+    >>> record = sd.read("flight.h5")  # doctest: +SKIP
+    >>> causes, reason = sd.diagnose(sd.estimate(record), record)  # doctest: +SKIP
     """
     from strapdown.tuning import diagnosis
     from strapdown.tuning.residual_checks import accepted

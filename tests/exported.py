@@ -8,7 +8,7 @@ import math
 import shutil
 import subprocess
 from pathlib import Path
-from types import SimpleNamespace
+from types import FunctionType, SimpleNamespace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -16,6 +16,7 @@ import pytest
 
 from strapdown.codegen import c, design, recording
 from strapdown.codegen import program as body
+from strapdown.kernels import machine
 
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-ffp-contract=off")
 
@@ -28,6 +29,31 @@ def compiler():
 
 
 missing = (0.0, 0.0, 0.0)
+
+
+class PlainKernels:
+    """Kernels in plain Python, with other helpers."""
+
+    def __init__(self, module, helpers):
+        self.module, self.made = module, {}
+        self.helpers = helpers | {
+            "value_at": lambda array, i, like: array[i],
+            "put_at": lambda array, i, value: array.__setitem__(i, value),
+        }
+
+    def __getattr__(self, name):
+        value = getattr(self.module, name)
+        return self.bound(value) if isinstance(value, FunctionType) else value
+
+    def bound(self, kernel):
+        if kernel not in self.made:
+            names = kernel.__globals__ | self.helpers
+            self.made[kernel] = FunctionType(kernel.__code__, names, kernel.__name__, kernel.__defaults__)
+            for name in machine._names(kernel.__code__):
+                value = names.get(name)
+                if name not in self.helpers and getattr(value, "__module__", "").startswith("strapdown.kernels"):
+                    names[name] = self.bound(value) if isinstance(value, FunctionType) else value
+        return self.made[kernel]
 
 
 class LeftError(Exception):
@@ -44,7 +70,7 @@ class Plain:
             "select": lambda condition, a, b: a if condition else b,
             "any_lane": self.turned_far,
         }
-        self.kernels = body.Kernels(program.kernels, helpers, {})
+        self.kernels = PlainKernels(program.kernels, helpers)
         self.select, self.root, self.equal = helpers["select"], math.sqrt, lambda a, b: a == b
         self.whole, self.scratch = math.floor, dict
         self.f = SimpleNamespace(
@@ -73,13 +99,13 @@ class Plain:
         return None
 
     def start(self):
-        return self.run(recording.initialize)
+        return self.run(recording.init)
 
     def take(self, time, *vectors):
         return self.run(recording.update, time, *(missing if v is None else tuple(v) for v in vectors))
 
     def init(self, attitude):
-        return self.run(body.initialize, attitude)
+        return self.run(body.init, attitude)
 
     def predict(self, gyro, dt):
         return self.run(body.predict, tuple(gyro), dt)

@@ -430,7 +430,7 @@ def kernel(a, n, x):
 def test_kernels_with_branches_and_loops_are_those_of_python(tmp_path):
     gcc = compiler()
     m = Function("work", [("a", -12), ("n", "int"), ("x", 0)], returns="real")
-    m.give(Interpreter(m)(kernel, Member(m, "a", (6, 2)), m.argument("n"), m.argument("x")))
+    m.give(Interpreter(m, {})(kernel, Member(m, "a", (6, 2)), m.argument("n"), m.argument("x")))
     lines = "\n".join(Writer(m, c.language(single=False)).lines)
     source = (
         f"#include <math.h>\ntypedef double strapdown_real;\ndouble work(double *a, int n, double x) {{\n{lines}\n}}\n"

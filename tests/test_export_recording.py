@@ -251,6 +251,11 @@ def test_the_command_writes_a_filter_that_compiles_and_says_what_it_is(run, tmp_
         "export", "any", "--rate", "100", "--magnetometer", "--precision", "single", "--out", str(tmp_path)
     )
     assert (status, "IMU at 100 Hz" in out) == (0, True)
+    live = LiveAhrs(interval=0.01, magnetometer=True, parameters=of_motion("any", magnetometer=True))
+    for name, arguments in (("python", ("any", None)), ("live", (live, None))):
+        more = {"rate": 100.0, "magnetometer": True} if name == "python" else {}
+        for path in sd.export(*arguments, folder=tmp_path / name, precision="single", **more):
+            assert path.read_bytes() == (tmp_path / path.name).read_bytes()
     header = (tmp_path / "strapdown_filter.h").read_text(encoding="utf-8")
     for words in (
         sd.__version__,
@@ -269,10 +274,10 @@ def test_the_command_writes_a_filter_that_compiles_and_says_what_it_is(run, tmp_
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("hand",), "give their rate"),
-        (("hand", "satellite", "--rate", "100"), "its own sensors"),
+        (("hand",), "rate is missing"),
+        (("any", "spin", "--rate", "100"), "an IMU has its own"),
         (("hand", "--rate", "-1"), "rate is -1"),
-        (("filter.toml", "--rate", "100"), "needs a record or a scenario"),
+        (("filter.toml", "--rate", "100"), "rate and magnetometer are of an IMU"),
     ],
 )
 def test_the_command_refuses_what_does_not_belong_together(arguments, words, run):
@@ -285,5 +290,7 @@ def test_a_live_filter_has_its_sensors_and_a_setup_has_not(tmp_path):
     live, _ = case("white")
     with pytest.raises(InputError, match="has its own"):
         sd.export(live, [], folder=tmp_path)
+    with pytest.raises(InputError, match="of an IMU, with a motion: hand, "):
+        sd.export(live, folder=tmp_path, rate=100.0)
     with pytest.raises(InputError, match="no sensor"):
         sd.export(live.parameters.setup, folder=tmp_path)

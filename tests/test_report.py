@@ -5,9 +5,9 @@ import dataclasses
 import html.parser
 import json
 import re
-import shutil
-import subprocess
+import sys
 import zlib
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,9 +21,8 @@ from strapdown.estimation import setup
 from strapdown.montecarlo import campaign, coning_study, verdicts
 from strapdown.report import comparisons, page, tunings
 
-CHROMIUM = next(
-    (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
-)
+sys.path.append(str(Path(__file__).resolve().parents[1] / "docs"))
+import headless
 
 
 @pytest.fixture(scope="module")
@@ -201,17 +200,35 @@ def test_a_tuning_is_reported_from_its_json(folder, scenario, tmp_path):
         assert f"{value / parameter['si_per_unit']:.4g}" in content
     assert "the verdict is for all tests of a record together" in content
     assert tuned["held_out"]["after"]["judgements"][0]["verdict"].capitalize() in content.split("<h2>")[0]
-    assert content.count("data:image/png") == 2
+    assert "data:image/png" not in content  # the charts are drawn by the browser
     assert "[filter]" in content
+    slices, nis, nees, _ = charts_of(content)
+    x, high, _, fallen, tuned, _ = columns(slices)
+    assert slices["x"] == "star 1.sigma, arcsec"
+    assert np.abs(fallen[np.isfinite(tuned)]).max() < 0.01  # no decrease at the tuned value
+    np.testing.assert_allclose(x[np.isfinite(tuned)], parameter["value"] / parameter["si_per_unit"], rtol=1e-6)
+    edges = np.array([parameter["lower"], parameter["upper"]]) / parameter["si_per_unit"]
+    np.testing.assert_allclose(x[np.isfinite(high)][[0, -1]], edges, rtol=1e-6)
+    np.testing.assert_allclose(np.interp(edges, x, fallen), 3.84, rtol=0.2)  # one parameter: a likelihood ratio
+    for chart, course in zip(
+        (nis, nees), json.loads((tmp_path / "filter.json").read_text())["held_out"]["after"]["over_time"], strict=False
+    ):
+        assert chart["title"] == course["of"]
+        time, top, _, _, after = columns(chart)
+        np.testing.assert_allclose(time, course["time_s"], atol=1e-5)
+        np.testing.assert_allclose(top, course["bounds"][1], rtol=1e-9)
+        np.testing.assert_allclose(after, np.array(course["mean"], float), atol=1e-3)
+    if headless.CHROMIUM is not None:
+        found = headless.reported(tmp_path / "filter.html", DRAWN, 1000, "--virtual-time-budget=20000")
+        assert (found["drawn"], found["console"]) == ("4", [])
     with pytest.raises(InputError, match="give the JSON that `strapdown tune` writes"):
         report.write(folder / "right.report.json", tmp_path / "page.html")
     # A tuning without data held out, of the same name, leaves nothing of what was said of held-out data before.
-    figure = (tmp_path / "filter-heldout.png").read_bytes()
+    assert (tmp_path / "filter-heldout.png").exists()
     assert CliRunner().invoke(cli.app, [*tune, "--starts", "1"]).exit_code == 0
     assert not (tmp_path / "filter-heldout.png").exists()
-    (tmp_path / "filter-heldout.png").write_bytes(figure)
     content = body(report.write(tmp_path / "filter.json").page)
-    assert content.count("data:image/png") == 1
+    assert len(charts_of(content)) == 1
     assert "<strong>Consistent.</strong> The tuned filter agrees with the data used for tuning" in content
 
 
@@ -412,8 +429,13 @@ def test_a_folder_without_a_name_is_no_result(place):
     assert isinstance(found.exception, InputError)
 
 
-PROBE = """<script>window.onerror = (message) => { document.body.dataset.error = message; };
-const wait = setInterval(async () => {
+DRAWN = """const wait = setInterval(() => {
+  const drawn = document.documentElement.dataset.drawn;
+  if (!drawn) return;
+  clearInterval(wait);
+  document.title = JSON.stringify({drawn});
+}, 50);"""
+PROBE = """const wait = setInterval(async () => {
   if (PAGE_HAS_CHARTS && !document.documentElement.dataset.drawn) return;
   clearInterval(wait);
   const found = {charts: document.querySelectorAll(".uplot canvas").length, images: document.images.length,
@@ -450,32 +472,23 @@ const wait = setInterval(async () => {
     found.ink = getComputedStyle(document.documentElement).getPropertyValue("--ink").trim();
   }
   document.title = JSON.stringify(found);
-}, 50);</script></head>"""
+}, 50);"""
 
 
-def shown_by_a_browser(content, tmp_path, width):
+def shown_by_a_browser(page, width):
     """Return what the probe finds on a page in headless Chromium, in the dark theme."""
-    charts = str('class="chart"' in content).lower()
-    probe = tmp_path / "probe.html"
-    probe.write_text(content.replace("</head>", PROBE.replace("PAGE_HAS_CHARTS", charts), 1), encoding="utf-8")
-    options = ["--headless", "--no-sandbox", "--no-first-run", f"--user-data-dir={tmp_path / 'profile'}"]
-    options += ["--disable-gpu", "--disable-background-networking", "--disable-component-update", "--disable-sync"]
-    options += ["--blink-settings=preferredColorScheme=0", "--enable-logging=stderr", f"--window-size={width},900"]
-    options += ["--virtual-time-budget=20000", "--dump-dom"]
-    shown = subprocess.run(
-        [str(CHROMIUM), *options, probe.as_uri()], capture_output=True, text=True, timeout=120, check=True
-    )
-    assert "data-error" not in shown.stdout[: shown.stdout.index("<style>") + 10] + shown.stdout[-3000:]
-    assert ":CONSOLE" not in shown.stderr, shown.stderr
-    found = re.search(r"<title>(\{.*?\})</title>", shown.stdout)
-    assert found, "the page did not finish drawing"
-    return json.loads(found.group(1).replace("&quot;", '"'))
+    if headless.CHROMIUM is None:
+        pytest.skip("no Chromium on this machine; install it to see the pages in a browser")
+    charts = str('class="chart"' in body(page)).lower()
+    dark = ("--blink-settings=preferredColorScheme=0", "--virtual-time-budget=20000")
+    found = headless.reported(page, PROBE.replace("PAGE_HAS_CHARTS", charts), width, *dark)
+    assert found["console"] == []
+    return found
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine; install it to see the pages in a browser")
 @pytest.mark.parametrize(("name", "width"), [("right", 1280), ("campaign", 390)])
-def test_a_browser_shows_figures_and_charts(folder, tmp_path, name, width):
-    found = shown_by_a_browser(body(folder / f"{name}.html"), tmp_path, width)
+def test_a_browser_shows_figures_and_charts(folder, name, width):
+    found = shown_by_a_browser(folder / f"{name}.html", width)
     assert found["hidden"] == 0
     assert found["images"] >= 1
     assert found["overflow"] <= 0

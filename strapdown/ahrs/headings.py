@@ -25,7 +25,7 @@ VERTICAL_TIME = 1.0
 """Time constant of the low-pass filter for the vertical from which the field's dip is measured, s."""
 MEDIAN_INTERVAL = 0.3
 """Interval of the values of which running medians are computed, s."""
-MEDIAN_SAMPLES = 1024
+MEDIAN_SAMPLES = 256
 """Number of those values that are kept; above it every other one is dropped, and the interval doubled."""
 OWN_IRON = 1.5
 """Iron up to this multiple of the σ of the filter's states for it is left to them."""

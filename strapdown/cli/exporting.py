@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from typer import Argument, Option
 
-from strapdown.checks import InputError, positive
+from strapdown.checks import InputError
 from strapdown.cli.terminal import command, console, written
 
 
@@ -28,30 +28,16 @@ def export(
 ) -> None:
     """Export a filter as source code for a microcontroller or a web page."""
     import strapdown as sd
-    from strapdown.ahrs.parameters import MOTIONS, of_motion
     from strapdown.records import ImuRecord
 
-    if filter_file in MOTIONS:
-        if rate is None or sensors is not None:
-            raise InputError(
-                f"the filter of an IMU ({filter_file}) has its own sensors; give their rate alone, such as --rate 100"
-            )
-        parameters = of_motion(filter_file, magnetometer=magnetometer)
-        interval = 1.0 / positive("rate", rate, unit="Hz")
-        live = sd.LiveAhrs(interval=interval, magnetometer=magnetometer, parameters=parameters)
-        paths = sd.export(live, folder=out, to=to, precision=precision)
-        what = f"an IMU at {rate:g} Hz"
-    else:
-        if sensors is None or rate is not None or magnetometer:
-            raise InputError(
-                "a filter setup needs a record or a scenario of its sensors; rate and magnetometer are of an IMU"
-            )
+    source: Any = None
+    if sensors is not None:
         recorded = Path(sensors).suffix in (".h5", ".csv")
         source = sd.read(sensors) if recorded else sd.scenarios.load_scenario(sensors)
         if not isinstance(source, (ImuRecord, sd.Scenario)):
             raise InputError(f"{sensors} is no simulated record; give a record of `strapdown simulate`, or a scenario")
-        paths = sd.export(filter_file, source, folder=out, to=to, precision=precision)
-        what = f"the sensors of {sensors}"
+    paths = sd.export(filter_file, source, folder=out, rate=rate, magnetometer=magnetometer, to=to, precision=precision)
+    what = f"an IMU at {rate:g} Hz" if sensors is None else f"the sensors of {sensors}"
     console.print(f"Filter of {filter_file} with {what}, {precision} precision.")
     written(*paths)
 

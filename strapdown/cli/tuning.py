@@ -154,12 +154,13 @@ def tune(
     for place in places.values():  # of an earlier tuning, which may have had more of them, or in another format
         for other in ("png", "pdf", "svg"):
             place.with_suffix(f".{other}").unlink(missing_ok=True)
-    content = {"records": [path.name for path in records], **result.summary()}
+    with progress_bar("slices of the likelihood"):
+        slices = tuning.slices(objective, result)
+    content = {"records": [path.name for path in records], **result.summary(), "slices": slices.summary()}
     write_json(beside, content)
     answer, reason, _ = tunings.verdict(content)
     console.print(f"{answer}: {reason}.")
-    with progress_bar("figure of the likelihood"):
-        figures = {places["likelihood"]: drawing.likelihood_slices(tuning.slices(objective, result), result)}
+    figures = {places["likelihood"]: drawing.likelihood_slices(slices, result)}
     if result.comparison is not None:
         title = "Held-out part of the first record"
         figures[places["heldout"]] = drawing.before_and_after(result.comparison, title=title)

@@ -3,8 +3,8 @@
 - ``design``: The setup and its sensors as a program; refusals.
 - ``program``: The filter sample by sample, with checks, flags and a gate, around the formulas of the kernels.
 - ``recording``: That of an IMU, around the filter's steps.
-- ``symbols``: Tracing of formulas.
-- ``interpreted``: Tracing of kernels with branches and loops.
+- ``symbols``: Operations, recorded.
+- ``interpreted``: Kernels executed on symbols.
 - ``functions``: A function of the target: statements, branches, calls.
 - ``regions``: The block to which each operation belongs.
 - ``target``: All functions of a filter, traced.
@@ -25,7 +25,8 @@ from typing import TYPE_CHECKING, Literal
 
 import strapdown
 from strapdown.ahrs import LiveAhrs
-from strapdown.checks import InputError, one_of
+from strapdown.ahrs.parameters import MOTIONS, of_motion
+from strapdown.checks import InputError, instance, one_of, positive
 from strapdown.codegen import c, design, javascript
 from strapdown.estimation.setup import FilterSetup, read_setup, to_toml
 from strapdown.files import atomic_write, usable_folder, writable
@@ -45,6 +46,8 @@ def export(
     sensors: Sensors | Scenario | None = None,
     *,
     folder: str | os.PathLike[str],
+    rate: float | None = None,
+    magnetometer: bool = False,
     to: Literal["c", "js"] = "c",
     precision: Literal["double", "single"] = "double",
 ) -> tuple[Path, ...]:
@@ -56,14 +59,19 @@ def export(
 
     Parameters
     ----------
-    setup : FilterSetup, LiveAhrs or path
-        Noise of the gyro, initial σ, σ of sensors, error states and gate; or a TOML file of them. The samples of a ``LiveAhrs`` are left
-        out.
+    setup : FilterSetup, LiveAhrs, path or str
+        Noise of the gyro, initial σ, σ of sensors, error states and gate; or a TOML file of them. Or a motion of
+        :data:`strapdown.ahrs.MOTIONS` (``"hand"``, …): the filter of :func:`strapdown.estimate` for an IMU; with other parameters, a
+        ``LiveAhrs``, whose samples are left out.
     sensors : ImuRecord, Scenario or sequence of VectorSensor or VectorMeasurements, optional
-        Sensors of the filter: their names, kinds, references and σ. Of a record or scenario all are exported. A ``LiveAhrs`` has its own.
+        Sensors of the filter: their names, kinds, references and σ. Of a record or scenario all are exported. An IMU has its own.
     folder : path
         Folder of the files: ``strapdown_filter.h`` and ``.c``, ``main.c`` (an example) and ``CMakeLists.txt``; or
         ``strapdown_filter.mjs``. Files of these names are replaced.
+    rate : float, optional
+        Sample rate of the IMU, Hz, with a motion.
+    magnetometer : bool, default False
+        Whether the IMU has a magnetometer, with a motion.
     to : {"c", "js"}, default "c"
         Language.
     precision : {"double", "single"}, default "double"
@@ -87,18 +95,22 @@ def export(
     >>> up = sd.VectorSensor(name="accelerometer", reference_f=[0.0, 0.0, 1.0], sigma=0.02, rate=100.0)
     >>> setup = sd.FilterSetup(process_noise=noise, bias_sigma=1e-3)
     >>> sd.export(setup, [up], folder="firmware", precision="single")  # doctest: +SKIP
-    >>> sd.export(sd.LiveAhrs(interval=0.01), folder="firmware", precision="single")  # doctest: +SKIP
+    >>> sd.export("hand", rate=100.0, magnetometer=True, folder="firmware", precision="single")  # doctest: +SKIP
     """
     one_of("to", to, ("c", "js"))
     one_of("precision", precision, ("double", "single"))
     if to == "js" and precision == "single":
         raise InputError("precision is 'single', but numbers in JavaScript are double; use 'double'")
-    if not isinstance(setup, FilterSetup | LiveAhrs):
+    if isinstance(setup, str) and setup in MOTIONS:
+        setup = _of_motion(setup, rate, magnetometer=magnetometer)
+    elif rate is not None or magnetometer:
+        raise InputError(f"rate and magnetometer are of an IMU, with a motion: {', '.join(MOTIONS)}; leave them out")
+    elif not isinstance(setup, FilterSetup | LiveAhrs):
         setup = read_setup(setup)
     usable_folder("folder", folder)
     if isinstance(setup, LiveAhrs):
         if sensors is not None:
-            raise InputError("sensors are given, but a LiveAhrs has its own; leave them out")
+            raise InputError("sensors are given, but the filter of an IMU has its own; leave them out")
         program = design.program_of_live(setup, single=precision == "single")
     else:
         program = design.program_of(setup, _sensors_of(sensors), single=precision == "single")
@@ -110,6 +122,17 @@ def export(
         with atomic_write(path) as temporary:
             temporary.write_text(text, encoding="utf-8")
     return tuple(paths)
+
+
+def _of_motion(motion: str, rate: float | None, *, magnetometer: bool) -> LiveAhrs:
+    """Return the filter of an IMU for a motion."""
+    if rate is None:
+        raise InputError(f"rate is missing: the filter of an IMU ({motion}) needs the sample rate, such as 100 Hz")
+    interval = 1.0 / positive("rate", rate, unit="Hz")
+    instance("magnetometer", magnetometer, bool, "give True or False")
+    return LiveAhrs(
+        interval=interval, magnetometer=magnetometer, parameters=of_motion(motion, magnetometer=magnetometer)
+    )
 
 
 def _sensors_of(sensors: Sensors | Scenario | None) -> Sequence[VectorSensor | VectorMeasurements]:

@@ -102,10 +102,10 @@ def wrapped(text: str) -> str:
     """Return text as the lines inside a comment, which it cannot end."""
     lines: list[str] = []
     prose, _, setup = text.replace("*/", "* /").partition(SETUP)
-    for part in prose.split("\n"):
+    for part in prose.rstrip().split("\n"):
         lines += textwrap.wrap(part, 100) or [""]
     if setup:
-        lines += [SETUP, *setup.splitlines()[1:]]
+        lines += ["", SETUP, *setup.splitlines()[1:]]
     return "\n".join(f" * {line}".rstrip() for line in lines)
 
 

@@ -16,7 +16,7 @@ from strapdown.codegen.program import Program, Sensor, Table
 from strapdown.codegen.recording import Recording, Rest, Start
 from strapdown.estimation import forward, initial_state, temperature
 from strapdown.estimation import model as modelling
-from strapdown.estimation.live import template
+from strapdown.estimation.live import need_no_record, template
 from strapdown.estimation.setup import FilterSetup
 from strapdown.estimation.setup.running import with_sigma
 from strapdown.kernels.measurement import KIND_CODES
@@ -35,14 +35,10 @@ def program_of(setup: FilterSetup, sensors: Sequence[VectorSensor | VectorMeasur
     series = _series(setup, sensors)
     kinds: Mapping[str, Any] = {one.sensor: one.kind for one in series}
     error_states = () if setup.states is None else setup.states.blocks(kinds)
-    if temperature.slopes(error_states) is not None:
-        raise InputError("the setup has a bias driven by temperature, which predict does not receive; leave it out")
+    temperature.need_none(error_states, "the exported filter")
     isotropic = not any(one.anisotropic for one in series)
     model = modelling.assemble(error_states, kinds, isotropic=isotropic)
-    if model.levers.any() or model.varying:
-        raise InputError(
-            "the setup has a lever arm, or effects relative to a varying field magnitude, which need the whole record; leave them out"
-        )
+    need_no_record(model)
     noise = setup.process_noise
     variances = noise.angle_random_walk**2, noise.rate_random_walk**2
     numbers = forward.kernel_model(model, variances)
@@ -174,6 +170,7 @@ def _sensor(series: VectorMeasurements, shape: int, *, isotropic: bool) -> Senso
     place = "" if attitude else f" Reference in fixed axes: ({', '.join(f'{x:.6g}' for x in reference)})."
     angle = f" = {sigma / DEGREE:.4g} deg" if sigma > 0.1 * DEGREE else f" = {sigma / ARCSECOND:.4g} arcsec"
     unit = "" if series.kind == "vector" else f" rad{angle}"
+    of = " of the heading" if series.kind == "heading" else ""
     return Sensor(
         name=identifier(series.sensor),
         kind=KIND_CODES[series.kind],
@@ -182,7 +179,7 @@ def _sensor(series: VectorMeasurements, shape: int, *, isotropic: bool) -> Senso
         length=length,
         noise=noise,
         variances=tuple(np.diag(covariance).tolist()),
-        words=f"Update with {series.sensor}: {what}, body axes.{place} sigma {sigma:.6g}{unit}.",
+        words=f"Update with {series.sensor}: {what}, body axes.{place} sigma{of} {sigma:.6g}{unit}.",
     )
 
 

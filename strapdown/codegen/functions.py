@@ -107,12 +107,14 @@ class Function:
         return Values(self.trace, name)
 
     def argument(self, name: str) -> Any:
-        """Return a parameter: a symbol, or a tuple of them."""
+        """Return a parameter: a symbol, a tuple of them, or an array that the function writes."""
         size = dict(self.parameters)[name]
         if isinstance(size, str):
             number = self.trace.symbol("parameter", name)
             number.type = size
             return number
+        if size < 0:
+            return Member(self, name, (-size,))
         if size:
             return tuple(self.trace.symbol("load", f"{name}[{i}]", name) for i in range(size))
         return self.trace.symbol("parameter", name)

@@ -1,4 +1,4 @@
-"""Kernels with branches and loops, executed statement by statement on symbols.
+"""Kernels executed statement by statement on symbols.
 
 Their ``if``, ``while`` and ``for`` become those of the target, unless what decides them is known while tracing. A name that a branch or a
 loop changes is a variable of the target afterwards. Kernels in ``OWN`` become functions of the target, others are written where they are
@@ -13,7 +13,8 @@ import inspect
 import math
 import operator
 import textwrap
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from types import FunctionType, SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -22,17 +23,23 @@ from strapdown.codegen.symbols import KERNELS, Symbol, Trace
 
 OWN = ("look", "insert", "iron_step")
 """Kernels that are called several times, or return early; their arguments are numbers, vectors, and what is the same for all calls."""
+LOOPING = ("turned_by", "take_row", "minus_outer_by_elements")
+"""Kernels of the filter with loops of the target."""
 LONGEST_UNROLLED = 12
 """Maximum number of repetitions that are written one after the other."""
 
 LEAVING = (ast.Return, ast.Continue)
 
 
-class Range(NamedTuple):
+@dataclass(frozen=True)
+class Range:
     """Integers of a loop of the target."""
 
     start: Any
     stop: Any
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(range(self.start, self.stop))
 
 
 class Bind(NamedTuple):
@@ -135,6 +142,10 @@ def mathematics(trace: Trace) -> dict[str, Any]:
         "min": less,
         "max": greater,
         "square_root": trace.square_root,
+        "select": trace.select,
+        "any_lane": lambda condition: condition,
+        "value_at": lambda array, i, like: array[i],
+        "put_at": lambda array, i, value: array.__setitem__(i, value),
         "_select_": lambda c, a, b: trace.select(c, a(), b()) if isinstance(c, Symbol) else a() if c else b(),
         "_all_": lambda *x: functools.reduce(lambda a, b: trace.condition("&&", a, b), x),
         "_any_": lambda *x: functools.reduce(lambda a, b: trace.condition("||", a, b), x),
@@ -146,31 +157,43 @@ def mathematics(trace: Trace) -> dict[str, Any]:
 class Interpreter:
     """Executes kernels for a function of the target."""
 
-    def __init__(self, m: Any) -> None:
+    def __init__(self, m: Any, helpers: dict[str, Callable[..., Any]]) -> None:
         self.m, self.trace = m, m.trace
-        self.helpers = mathematics(m.trace) | {"range": self._range}
+        self.helpers = mathematics(m.trace) | {"range": self._range} | helpers
         self.outer = False
         """Whether the kernel is the function of the target, which may return anywhere."""
+        self.loops = True
+        """Whether long loops are loops of the target."""
 
     def _range(self, *bounds: Any) -> Any:
         if len(bounds) == 3:
             return range(*bounds)
         start, stop = bounds if len(bounds) == 2 else (0, bounds[0])
         known = not isinstance(start, Symbol) and not isinstance(stop, Symbol)
-        return range(start, stop) if known and stop - start <= LONGEST_UNROLLED else Range(start, stop)
+        unrolled = known and (not self.loops or stop - start <= LONGEST_UNROLLED)
+        return range(start, stop) if unrolled else Range(start, stop)
 
     def __call__(self, function: FunctionType, *arguments: Any) -> Any:
         """Return the result of a kernel."""
         if function.__name__ in OWN:
             return self._call_own(function, arguments)
-        before, self.outer = self.outer, False
+        before = self.outer, self.loops
+        self.outer, self.loops = False, self.loops or function.__name__ in LOOPING
         result = self._body(function, arguments)
-        self.outer = before
+        self.outer, self.loops = before
+        return result
+
+    def unrolled(self, function: FunctionType, *arguments: Any) -> Any:
+        """Return the result of a kernel whose loops are written one repetition after the other, except in those of ``LOOPING``."""
+        before, self.loops = self.loops, False
+        result = self(function, *arguments)
+        self.loops = before
         return result
 
     def _body(self, function: FunctionType, arguments: Sequence[Any]) -> Any:
         node = parsed(function)
-        env = dict(zip((a.arg for a in node.args.args), arguments, strict=True))
+        names, defaults = [a.arg for a in node.args.args], function.__defaults__ or ()
+        env = dict(zip(names, (*arguments, *defaults[len(arguments) + len(defaults) - len(names) :]), strict=True))
         env["_globals_"] = function.__globals__
         result = self._statements(list(node.body), env)
         return result[0] if result else None
@@ -215,8 +238,12 @@ class Interpreter:
             elif isinstance(node, ast.Continue):
                 return ()
             elif isinstance(node, ast.While):
-                parts = node.test.values if isinstance(node.test, ast.BoolOp) else [node.test]
-                self._loop(Statement("loop"), parts, node.body, env)
+                condition = self._value(node.test, env)
+                if isinstance(condition, Symbol):
+                    parts = node.test.values if isinstance(node.test, ast.BoolOp) else [node.test]
+                    self._loop(Statement("loop"), parts, node.body, env)
+                elif condition:
+                    items[:0] = [*node.body, node]
             elif isinstance(node, ast.For):
                 values = self._value(node.iter, env)
                 if isinstance(values, Range):
@@ -336,7 +363,7 @@ class Interpreter:
     def _count(self, values: Range, node: ast.For, env: dict[str, Any]) -> None:
         assert isinstance(node.target, ast.Name)
         name = self.m.new_name(node.target.id)
-        statement = Statement("for", name, values=tuple(values))
+        statement = Statement("for", name, values=(values.start, values.stop))
         counter = self.trace.symbol("parameter", name)
         counter.type = "int"
         self._loop(statement, [], node.body, env, (node.target.id, counter))
@@ -388,9 +415,8 @@ class Interpreter:
             words = (function.__doc__ or "").split("\n")[0]
             target = m.another(name, parameters, words)
             given = [target.argument(n) if n in numbers else target.spaces[n] for n in names]
-            interpreter = Interpreter(target)
-            interpreter.outer = True
-            result = interpreter._body(function, given)
+            target.kernel.outer = True
+            result = target.kernel._body(function, given)
             if isinstance(result, tuple):
                 target.parameters = [*parameters, ("result", -len(result))]
                 out = target.array(lambda i: f"result[{i}]")

@@ -6,17 +6,16 @@ Every function here asks a *machine* ``m`` for what depends on it: branches, cal
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
-from strapdown.codegen.symbols import rebound
 from strapdown.kernels import filter as filter_kernels
 from strapdown.kernels import machine
 from strapdown.kernels.algebra import dot, scale
 from strapdown.kernels.filter import ROWS_OF_KIND
 from strapdown.kernels.measurement import ATTITUDE, DIRECTION, VECTOR, degrees_of_freedom
+from strapdown.kernels.rotation import far_turn as far_turn_kernel
 from strapdown.kernels.series import LARGEST_ANGLE, SQUARED_RANGE
 from strapdown.kernels.structure import Measured, Model, Structure
 from strapdown.kernels.walk import turn_squared
@@ -113,28 +112,6 @@ class Program:
         return self.n * (self.n + 1) // 2
 
 
-class Kernels:
-    """Kernels whose helpers are those of a machine."""
-
-    def __init__(self, module: ModuleType, replaced: dict[str, Any], wrapped: dict[str, Callable[[Any], Any]]) -> None:
-        self.module, self.replaced, self.wrapped = module, replaced | {"value_at": value_at, "put_at": put_at}, wrapped
-        self.copies: dict[Any, Any] = {}
-
-    def __getattr__(self, name: str) -> Any:
-        value = getattr(self.module, name)
-        return rebound(value, self.replaced, self.wrapped, self.copies) if callable(value) else value
-
-
-def value_at(array: Any, i: int, like: Any) -> Any:
-    """Return an element of an array."""
-    return array[i]
-
-
-def put_at(array: Any, i: int, value: Any) -> None:
-    """Write an element of an array."""
-    array[i] = value
-
-
 def work_size(k: Any) -> int:
     """Return the number of values in the work space of an update."""
     return int(k.LINE * (k.ROUNDING + 1))
@@ -152,16 +129,23 @@ def place(n: int, i: int, j: int) -> int:
     return i * n - i * (i - 1) // 2 + j - i
 
 
+def far_turn(m: Any, program: Program, f: SimpleNamespace, x: Any, y: Any, z: Any, turn: Any) -> None:
+    """Quaternion and Jacobian of a rotation vector of any size, by doubling."""
+    q, J = m.kernel.unrolled(far_turn_kernel, (x, y, z))
+    for i, value in enumerate((*q, *J)):
+        turn[i] = value
+
+
 # ------------------------------------------------------------------------------------------------------------------------- prediction
 
 
 def predict(m: Any, program: Program, f: SimpleNamespace, gyro: Any, dt: Any) -> None:
-    """Propagate over a gyro sample: mean rate over dt."""
+    """Propagate over a gyro sample: the mean rate over the last dt."""
     propagate(m, program, f, scale(dt, gyro), dt)
 
 
 def propagate(m: Any, program: Program, f: SimpleNamespace, delta: Any, dt: Any) -> None:
-    """Propagate over a rotation vector."""
+    """Propagate over a rotation."""
     turn = turn_squared(delta, dt, tuple(f.x[4 + i] for i in range(3)))
     limit = program.model.limit
     within = turn <= SQUARED_RANGE
@@ -181,7 +165,7 @@ def propagate(m: Any, program: Program, f: SimpleNamespace, delta: Any, dt: Any)
 
 
 def step(m: Any, program: Program, f: SimpleNamespace, delta: Any, dt: Any) -> None:
-    """Propagate over a step."""
+    """Propagate over one step: delta is the rotation vector."""
     k = m.kernels
     if program.structure.chains:
         m.unless(m.equal(f.dt[0], dt), lambda: m.call("prepare", dt))
@@ -190,7 +174,7 @@ def step(m: Any, program: Program, f: SimpleNamespace, delta: Any, dt: Any) -> N
 
 
 def prepare(m: Any, program: Program, f: SimpleNamespace, dt: Any) -> None:
-    """Compute the coefficients of the states that decay or are driven, for steps of dt."""
+    """Coefficients of the states that decay, for steps of dt."""
     m.kernels.fill_coefficients(f.coefficients, dt, program.model)
     f.dt[0] = dt
 
@@ -272,26 +256,26 @@ def put_row(k: Any, work: Any, row: Any) -> None:
 
 
 def take_row(m: Any, program: Program, f: SimpleNamespace, residual: Any, variance: Any, work: Any) -> None:
-    """Update covariance and correction with the row in the work space, in Joseph's form."""
+    """Update P and the correction with the row in the work space, in Joseph's form."""
     k = m.kernels
     k.take_row(f.P, work, k.ROWS, residual, variance, 0.0)
 
 
 def subtract(m: Any, program: Program, f: SimpleNamespace, line: Any, work: Any) -> None:
-    """Subtract the outer product of a line of the work space from the covariance."""
+    """Subtract the outer product of a line of the work space from P."""
     m.kernels.minus_outer_by_elements(f.P, work, line, line, 1.0, 0.0)
 
 
 def apply_step(m: Any, program: Program, f: SimpleNamespace, work: Any) -> None:
-    """Correct the state by the step in the work space, and transform the covariance to the new tangent space."""
+    """Correct the state, and transform P to the tangent space of the corrected attitude."""
     m.kernels.apply_step(f.x, f.P, work, 0.0)
 
 
 # ------------------------------------------------------------------------------------------------------------------------------ start
 
 
-def initialize(m: Any, program: Program, f: SimpleNamespace, attitude: Any) -> None:
-    """Start at an attitude, with the setup's sigma."""
+def init(m: Any, program: Program, f: SimpleNamespace, attitude: Any) -> None:
+    """Start at an attitude, with the sigma of the setup and zero bias."""
     squared = sum((x * x for x in attitude[1:]), attitude[0] * attitude[0])
     usable = (squared >= SHORTEST_SQUARED) & (squared <= LONGEST_SQUARED)
     norm = m.root(squared)

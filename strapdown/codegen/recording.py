@@ -136,7 +136,7 @@ class Start(NamedTuple):
     gravity: float
 
 
-def initialize(m: Any, program: Any, f: SimpleNamespace) -> None:
+def init(m: Any, program: Any, f: SimpleNamespace) -> None:
     """Wait for the first sample."""
     r = program.recording
     for i in range(4):
@@ -158,7 +158,11 @@ def initialize(m: Any, program: Any, f: SimpleNamespace) -> None:
 
 
 def update(m: Any, program: Any, f: SimpleNamespace, time: Any, gyro: Any, force: Any, field: Any = None) -> None:
-    """Follow a sample."""
+    """Take a sample.
+
+    time: s, rising. gyro: rad/s, body axes. accelerometer: specific force, m/s^2, body axes; zero or null: missing. magnetometer: field,
+    any unit, body axes; zero or null: missing.
+    """
     r = program.recording
     usable = (time >= -1e15) & (time <= 1e15)
     for x in gyro:
@@ -324,7 +328,7 @@ def keep_for_rest(m: Any, r: Recording, f: SimpleNamespace, time: Any, gyro: Any
 
 
 def find_rest(m: Any, program: Any, f: SimpleNamespace) -> None:
-    """Measure the bias, if the unit was at rest over the last second."""
+    """Measure the bias at rest."""
     r = program.recording.rest
     tenths = [tuple(f.tenths[p, i] / r.part for i in range(3)) for p in range(r.parts)]
     rate = tuple(sum((tenth[i] for tenth in tenths[1:]), tenths[0][i]) / r.parts for i in range(3))
@@ -364,7 +368,7 @@ def find_rest(m: Any, program: Any, f: SimpleNamespace) -> None:
 
 
 def use_rest(m: Any, program: Any, f: SimpleNamespace) -> None:
-    """Correct the state by the last rate at rest: :func:`strapdown.ahrs.starting.with_rate_at_rest`."""
+    """Correct the state by a rate at rest."""
     k, n = m.kernels, program.n
     work = m.work()
     k.clear_step(work, 0.0)
@@ -403,7 +407,7 @@ def begin_step(m: Any, program: Any, f: SimpleNamespace) -> None:
 
 
 def end_step(m: Any, program: Any, f: SimpleNamespace) -> None:
-    """Filter a step: the mean of its samples in the axes of the body at its end."""
+    """Filter a step: the mean of its samples."""
     r = program.recording
     if r.rest is not None:
         m.branch(m.equal(f.resting[1], 2), lambda: m.call("use_rest"))
@@ -464,7 +468,7 @@ def end_field(m: Any, program: Any, f: SimpleNamespace, edges: Any, force: Any, 
 
 
 def carry(m: Any, program: Any, f: SimpleNamespace) -> None:
-    """Propagate the estimate at the start of the step to the last sample."""
+    """Propagate the estimate to the last sample."""
     r, n = program.recording, program.n
     P = [[f.P[body.place(n, min(i, j), max(i, j))] for j in range(6)] for i in range(6)]
     rate, none = tuple(f.rate[i] for i in range(3)), (0.0, 0.0, 0.0)

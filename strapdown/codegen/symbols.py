@@ -1,15 +1,13 @@
-"""Symbols that trace formulas: executing a kernel on them records its operations, equal ones once.
+"""Symbols that trace formulas: :mod:`strapdown.codegen.interpreted` executes kernels on them, and equal operations are recorded once.
 
-A number that is known while tracing stays a Python float, and zeros and ones vanish as they do in the kernels. A condition on symbols has
-no truth value: kernels with branches on them are executed by :mod:`strapdown.codegen.interpreted`. What differs between two outcomes
-without other effects becomes a selection, which :mod:`strapdown.codegen.regions` writes as an ``if``.
+A number that is known while tracing stays a Python float, and zeros and ones vanish as they do in the kernels. What differs between two
+outcomes without other effects becomes a selection, which :mod:`strapdown.codegen.regions` writes as an ``if``.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from types import CodeType, FunctionType
 from typing import Any, NamedTuple
 
 KERNELS = "strapdown.kernels"
@@ -32,7 +30,7 @@ class Symbol:
 
     def __bool__(self) -> bool:
         raise TypeError(
-            f"a condition ({self.kind}) that is known only on the target; a kernel must use any_lane or select"
+            f"a condition ({self.kind}) that is known only on the target; use the machine's branch or select"
         )
 
     def __add__(self, other: Any) -> Any:
@@ -108,7 +106,7 @@ def type_of(kind: str, operands: tuple[Any, ...]) -> str:
     if kind not in INTEGER:
         return ""
     operands = operands[1:] if kind == "select" else operands
-    whole = (x.type == "int" if isinstance(x, Symbol) else float(x).is_integer() for x in operands)
+    whole = (x.type == "int" if isinstance(x, Symbol) else isinstance(x, int) for x in operands)
     return "int" if all(whole) else ""
 
 
@@ -137,8 +135,7 @@ class Trace:
 
     def symbol(self, kind: str, *operands: Any) -> Symbol:
         """Return the symbol of an operation."""
-        operands = tuple(float(x) if isinstance(x, int) and not isinstance(x, bool) else x for x in operands)
-        key = (kind, *operands)
+        key = (kind, type_of(kind, operands), *operands)
         known = self.symbols.get(key)
         if known is None:
             group = (operands[0],) if kind == "select" else ()
@@ -223,36 +220,3 @@ class Version(NamedTuple):
     """Makes loads of one element at two places two symbols."""
 
     key: tuple[int, int]
-
-
-# --------------------------------------------------------------------------------------------------------- kernels with other helpers
-
-
-def names_in(code: CodeType) -> tuple[str, ...]:
-    """Return the global names in a function's code and in its generator expressions."""
-    inner = (names_in(part) for part in code.co_consts if isinstance(part, CodeType))
-    return sum(inner, code.co_names)
-
-
-def rebound(
-    function: FunctionType,
-    replaced: dict[str, Any],
-    wrapped: dict[str, Callable[[Any], Any]],
-    copies: dict[FunctionType, Any] | None = None,
-) -> Any:
-    """Return a copy of a kernel in which it and all kernels that it calls use other helpers.
-
-    ``replaced``: helpers by name; ``wrapped``: functions applied to the copies of the kernels of these names.
-    """
-    copies = {} if copies is None else copies
-    if function not in copies:
-        names = dict(function.__globals__)
-        copy = FunctionType(function.__code__, names, function.__name__, function.__defaults__)
-        copies[function] = wrapped.get(function.__name__, lambda x: x)(copy)
-        for name in names_in(function.__code__):
-            value = names.get(name)
-            if name in replaced:
-                names[name] = replaced[name]
-            elif isinstance(value, FunctionType) and value.__module__.startswith(KERNELS):
-                names[name] = rebound(value, replaced, wrapped, copies)
-    return copies[function]

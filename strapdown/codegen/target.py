@@ -5,19 +5,26 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable, Sequence
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 from strapdown.codegen import program as body
 from strapdown.codegen import recording
 from strapdown.codegen.functions import Function, Member, Statement
 from strapdown.codegen.interpreted import Interpreter
-from strapdown.codegen.program import Kernels, Program, work_size
-from strapdown.codegen.symbols import Symbol, Values, rebound
-from strapdown.kernels.rotation import far_turn
+from strapdown.codegen.program import Program, work_size
+from strapdown.codegen.symbols import Symbol, Values
 
-BRANCHING = ("turned_by", "take_row", "minus_outer_by_elements")
-"""Kernels of the filter with branches and loops of the target."""
+
+class Kernels:
+    """Kernels of a module, executed on symbols."""
+
+    def __init__(self, module: ModuleType, execute: Callable[..., Any]) -> None:
+        self.module, self.execute = module, execute
+
+    def __getattr__(self, name: str) -> Any:
+        value = getattr(self.module, name)
+        return functools.partial(self.execute, value) if callable(value) else value
 
 
 class Target(Function):
@@ -38,19 +45,14 @@ class Target(Function):
         self.functions: dict[str, Any] = {} if functions is None else functions
         """Kernels that are functions of the target, and the number of their results."""
         trace = self.trace
-        helpers = {
-            "square_root": trace.square_root,
-            "select": trace.select,
-            "any_lane": lambda condition: condition,
+        helpers: dict[str, Any] = {
             "far_turn": self._far_turn,
             "load": load,
             "broadcast": broadcast,
             "sum_lanes": sum_lanes,
-            "math": SimpleNamespace(expm1=lambda x: trace.symbol("expm1", x), nan=float("nan"), pi=3.141592653589793),
         }
-        self.kernel, self.spaces = Interpreter(self), {}
-        wrapped = dict.fromkeys(BRANCHING, lambda function: functools.partial(self.kernel, function))
-        self.kernels = Kernels(program.kernels, helpers, wrapped)
+        self.kernel, self.spaces = Interpreter(self, helpers), {}
+        self.kernels = Kernels(program.kernels, self.kernel.unrolled)
         self.select, self.root = trace.select, trace.square_root
         self.state = SimpleNamespace(
             x=self.array(name_of_state),
@@ -152,133 +154,49 @@ class Eight(list[Any]):
     __rmul__ = __mul__
 
 
-UPDATE = (
-    "Take a sample. time: s, rising. gyro: rad/s, body axes. accelerometer: specific force, m/s^2, body axes; zero or null: missing. "
-    "magnetometer: field, any unit, body axes; zero or null: missing."
-)
-
-
 def traced(program: Program) -> list[Target]:
     """Return the functions of the filter, in an order in which each calls only those before it."""
+    kernels: dict[str, Any] = {}
 
     def function(
-        name: str,
-        words: str,
-        parameters: Sequence[tuple[str, Any]],
-        returns: str,
         formula: Callable[..., None],
-        *more: Any,
+        *parameters: tuple[str, Any],
+        returns: str = "",
+        more: tuple[Any, ...] = (),
+        name: str = "",
+        words: str = "",
     ) -> Target:
-        m = Target(program, name, parameters, returns=returns, words=words, functions=kernels)
+        words = words or " ".join((formula.__doc__ or "").split())
+        m = Target(program, name or formula.__name__, parameters, returns=returns, words=words, functions=kernels)
         formula(m, program, m.state, *more, *(m.argument(parameter) for parameter, _ in parameters))
         m.flush()
         return m
 
-    kernels: dict[str, Any] = {}
-    made = [turn_function(program)]
-    if program.structure.chains:
-        made.append(
-            function(
-                "prepare", "Coefficients of the states that decay, for steps of dt.", [("dt", 0)], "", body.prepare
-            )
-        )
-    made += [
-        function(
-            "step", "Propagate over one step: delta is the rotation vector.", [("delta", 3), ("dt", 0)], "", body.step
-        ),
-        work_function(
-            program,
-            "take_row",
-            "Update P and the correction with the row in the work space, in Joseph's form.",
-            [("residual", 0), ("variance", 0)],
-            body.take_row,
-        ),
-        work_function(
-            program,
-            "subtract",
-            "Subtract the outer product of a line of the work space from P.",
-            [("line", "int")],
-            body.subtract,
-        ),
-        work_function(
-            program,
-            "apply_step",
-            "Correct the state, and transform P to the tangent space of the corrected attitude.",
-            [],
-            body.apply_step,
-        ),
+    r, work = program.recording, ("work", -work_size(program.kernels))
+    coefficients = [function(body.prepare, ("dt", 0))] if program.structure.chains else []
+    made = [
+        function(body.far_turn, ("x", 0), ("y", 0), ("z", 0), ("turn", -13)),
+        *coefficients,
+        function(body.step, ("delta", 3), ("dt", 0)),
+        function(body.take_row, ("residual", 0), ("variance", 0), work),
+        function(body.subtract, ("line", "int"), work),
+        function(body.apply_step, work),
     ]
-    vector = [("value", 3), ("sigma", 0)]
-    if program.recording is not None:
-        made.append(
-            function("propagate", "Propagate over a rotation.", [("delta", 3), ("dt", 0)], "status", body.propagate)
-        )
-        for index, sensor in enumerate(program.sensors):
-            name = f"update_{sensor.name}"
-            made.append(function(name, sensor.words, vector, "status", body.update, sensor, index))
-        last = []
-        if program.recording.rest is not None:
-            last.append(function("find_rest", "Measure the bias at rest.", [], "", recording.find_rest))
-            last.append(function("use_rest", "Correct the state by a rate at rest.", [], "", recording.use_rest))
-        last += [
-            function("carry", "Propagate the estimate to the last sample.", [], "", recording.carry),
-            function("end_step", "Filter a step: the mean of its samples.", [], "", recording.end_step),
-            function("init", "Wait for the first sample.", [], "status", recording.initialize),
-        ]
-        sample: list[tuple[str, Any]] = [("time", "wide"), ("gyro", 3), ("accelerometer", 3), ("magnetometer", 3)]
-        words = UPDATE if program.recording.magnetometer else UPDATE.partition(" magnetometer:")[0]
-        sample = sample[: 3 + program.recording.magnetometer]
-        last.append(function("update", words, sample, "status", recording.update))
-        return made + [target for target, _ in kernels.values()] + last
-    made += [
-        function(
-            "init",
-            "Start at an attitude, with the sigma of the setup and zero bias.",
-            [("attitude", 4)],
-            "status",
-            body.initialize,
-        ),
-        function(
-            "predict",
-            "Propagate over a gyro sample: the mean rate over the last dt.",
-            [("gyro", 3), ("dt", 0)],
-            "status",
-            body.predict,
-        ),
-    ]
+    if r is None:
+        made.append(function(body.init, ("attitude", 4), returns="status"))
+        made.append(function(body.predict, ("gyro", 3), ("dt", 0), returns="status"))
+    else:
+        made.append(function(body.propagate, ("delta", 3), ("dt", 0), returns="status"))
     for index, sensor in enumerate(program.sensors):
-        made.append(
-            function(
-                f"update_{sensor.name}", sensor.words, [("value", sensor.size)], "status", body.update, sensor, index
-            )
-        )
-    return made
-
-
-def work_function(
-    program: Program, name: str, words: str, parameters: Sequence[tuple[str, Any]], formula: Callable[..., None]
-) -> Target:
-    """Return a function with the work space of an update as its last parameter."""
-    size = work_size(program.kernels)
-    m = Target(program, name, [*parameters, ("work", -size)], returns="", words=words)
-    formula(m, program, m.state, *(m.argument(parameter) for parameter, _ in parameters), Member(m, "work", (size,)))
-    m.flush()
-    return m
-
-
-def turn_function(program: Program) -> Target:
-    """Return the rotation by a large correction."""
-    m = Target(
-        program,
-        "far_turn",
-        [("x", 0), ("y", 0), ("z", 0), ("turn", -13)],
-        returns="",
-        words="Quaternion and Jacobian of a rotation vector of any size, by doubling.",
-    )
-    turn = m.array(lambda i: f"turn[{i}]")
-    formula: Any = far_turn
-    q, J = rebound(formula, {"square_root": m.trace.square_root}, {})(tuple(m.argument(name) for name in "xyz"))
-    for i, value in enumerate((*q, *J)):
-        turn[i] = value
-    m.flush()
-    return m
+        values = [("value", sensor.size), *([] if r is None else [("sigma", 0)])]
+        named: dict[str, Any] = {"name": f"update_{sensor.name}", "words": sensor.words, "more": (sensor, index)}
+        made.append(function(body.update, *values, returns="status", **named))
+    if r is None:
+        return made
+    last = [] if r.rest is None else [function(recording.find_rest), function(recording.use_rest)]
+    last += [function(recording.carry), function(recording.end_step), function(recording.init, returns="status")]
+    sample = [("time", "wide"), ("gyro", 3), ("accelerometer", 3), ("magnetometer", 3)][: 3 + r.magnetometer]
+    words = " ".join((recording.update.__doc__ or "").split())
+    words = words if r.magnetometer else words.partition(" magnetometer:")[0]
+    last.append(function(recording.update, *sample, returns="status", words=words))
+    return made + [target for target, _ in kernels.values()] + last

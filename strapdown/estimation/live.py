@@ -127,10 +127,7 @@ class LiveFilter:
         # The kernels process each interval as a record; this one, without rotation, defines its arrays.
         record = ImuRecord(time=self._time + np.arange(2.0), increments=np.zeros((1, 3)), vectors=tuple(series))
         self._problem = forward.prepared(record, process_noise, initial, error_states)
-        if self._problem.model.levers.any() or self._problem.model.varying:
-            raise InputError(
-                "lever arms, and effects relative to a varying field magnitude, need the whole record; use estimation.run for them"
-            )
+        need_no_record(self._problem.model)
         options = Options(gate=gate, robust=robust)
         self._judge, self._judged = Judge(self._problem, options), options.judged
         self._writers = {one.sensor: (float(place), one.kind == "attitude") for place, one in enumerate(series)}
@@ -541,6 +538,14 @@ class _Interval(NamedTuple):
 
 
 # ----------------------------------------------------------------------------------------------------------- what the sensors declare
+
+
+def need_no_record(model: modelling.Model) -> None:
+    """Raise an error for effects that a filter of single samples cannot have."""
+    if model.levers.any() or model.varying:
+        raise InputError(
+            "lever arms, and effects relative to a varying field magnitude, need the whole record; use estimation.run for them"
+        )
 
 
 def template(sensor: VectorSensor | VectorMeasurements, time: float) -> VectorMeasurements:

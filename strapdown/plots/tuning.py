@@ -81,22 +81,15 @@ def likelihood_slices(slices: Slices, tuning: Tuning) -> Figure:
 
 def before_and_after(comparison: Comparison, *, title: str = "") -> Figure:
     """Draw NIS, and NEES if there is a truth, on the held-out data before and after tuning, with the bounds of a consistent filter."""
-    from strapdown.consistency import mean_bounds
-
     both = (("before", comparison.before, VERMILION), ("after", comparison.after, BLUE))
-    sets = [one.of for one in comparison.after.nees]
-    figure, axes = new_figure(1 + len(sets), 1, size=(9.0, 4.0 + 2.4 * len(sets)), squeeze=False, sharex=len(sets) > 0)
-    degrees = comparison.after.nis_degrees
-    typical = max(1, round(float(np.median(degrees[degrees > 0]))))
-    courses = [
-        (name, color, one.nis, one.nis_time, np.where(one.nis_degrees > 0, one.nis_course, np.nan))
-        for name, one, color in both
-    ]
-    _course(axes[0, 0], courses, mean_bounds(1, typical, 0.99), "NIS per degree of freedom")
-    for number, of in enumerate(sets):
-        pairs = [(name, color, one.nees[number]) for name, one, color in both]
-        courses = [(name, color, float(np.nanmean(one.mean)), one.time, one.mean) for name, color, one in pairs]
-        _course(axes[number + 1, 0], courses, comparison.after.nees[number].bounds, f"NEES of the {of}, per state")
+    rows = len(comparison.after.courses)
+    figure, axes = new_figure(rows, 1, size=(9.0, 1.6 + 2.4 * rows), squeeze=False, sharex=rows > 1)
+    for number, (of, _, _, bounds) in enumerate(comparison.after.courses):
+        courses = []
+        for name, one, color in both:
+            _, time, mean, _ = one.courses[number]
+            courses.append((name, color, float(np.nanmean(mean)) if number else one.nis, time, mean))
+        _course(axes[number, 0], courses, bounds, of)
     figure.suptitle(title)
     axes[-1, 0].set_xlabel("time, s")
     return figure

@@ -108,7 +108,14 @@ class Attitudes:
 
 
 def read_attitudes(path: str | os.PathLike[str], *, topic: str = "") -> Attitudes:
-    """Read the attitudes of a file, or of the folder of a ROS 2 bag; ``topic`` selects one if several have attitudes."""
+    """Read the attitudes of a file, or of the folder of a ROS 2 bag; ``topic`` selects one if several have attitudes.
+
+    Examples
+    --------
+    >>> import strapdown as sd
+    >>> reference = sd.read_attitudes("flight.bag", topic="/mocap/pose")  # doctest: +SKIP
+    >>> reference.attitude.shape  # doctest: +SKIP
+    """
     with reading.from_file(path):
         return _read(Path(path), topic)
 

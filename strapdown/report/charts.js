@@ -65,7 +65,7 @@
         width: Math.max(240, place.clientWidth),
         height: 260,
         cursor: { sync: named ? undefined : { key: content.x }, drag: { x: true, y: false } },
-        scales: { x: { time: false, range: named ? [-0.5, content.ticks.length - 0.5] : undefined }, y: vertical },
+        scales: { x: { time: false, distr: content.log_x ? 3 : 1, range: named ? [-0.5, content.ticks.length - 0.5] : undefined }, y: vertical },
         axes: [{ ...axis, label: named ? undefined : content.x, ...names }, { ...axis, label: content.unit, size: 70 }],
         series: [
           { label: content.x, value: named ? (u, value) => content.ticks[value] ?? "–" : shown },
@@ -86,6 +86,7 @@
     );
     plot.whole = [content.columns[0][0], content.columns[0][content.columns[0].length - 1]];
     plot.named = named;
+    plot.key = content.x; // charts of one axis are zoomed together
     // In the capture phase, before uPlot shows all of this chart alone.
     plot.over.addEventListener("dblclick", (event) => { event.stopImmediatePropagation(); reset(); }, true);
     place.setAttribute("role", "group");
@@ -114,7 +115,7 @@
     });
   }
 
-  const others = (plot) => (plot.named ? [plot] : drawn.map((one) => one.plot).filter((one) => !one.named));
+  const others = (plot) => (plot.named ? [plot] : drawn.map((one) => one.plot).filter((one) => one.key === plot.key));
 
   function show(plot, low, high) {
     others(plot).forEach((one) => {
@@ -206,11 +207,11 @@
 
   let charts = [];
   function all() {
-    const zoom = drawn.filter((one) => one.plot.zoomed).map(({ plot }) => [plot.scales.x.min, plot.scales.x.max])[0];
+    const zooms = drawn.filter((one) => one.plot.zoomed && !one.plot.named).map(({ plot }) => [plot.key, plot.scales.x.min, plot.scales.x.max]);
     drawn.splice(0).forEach((one) => one.plot.destroy());
     charts.forEach(draw);
     bodies.forEach((one) => picture(one, (one.k ??= one.content.columns[0].length - 1)));
-    if (zoom && drawn.length) show(drawn.find((one) => !one.plot.named).plot, ...zoom);
+    zooms.forEach(([key, low, high]) => show(drawn.find((one) => one.plot.key === key).plot, low, high));
   }
   async function begin() {
     if (typeof DecompressionStream === "undefined") {

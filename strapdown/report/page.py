@@ -163,6 +163,7 @@ def chart(
     x: str = "time, s",
     ticks: Sequence[str] = (),
     log: bool = False,
+    log_x: bool = False,
 ) -> str:
     """Return an interactive chart with its data, all samples as 16-bit numbers, compressed.
 
@@ -180,8 +181,8 @@ def chart(
         Label of the horizontal axis.
     ticks : sequence of str
         Names of the values 0, 1, … of the horizontal axis, if it has no numbers; lines are then drawn as points.
-    log : bool
-        Whether the vertical axis is logarithmic.
+    log, log_x : bool
+        Whether the vertical, the horizontal axis is logarithmic.
 
     Returns
     -------
@@ -203,6 +204,7 @@ def chart(
         "x": x,
         "ticks": list(ticks),
         "log": log,
+        "log_x": log_x,
         "series": [{"label": s.label, "colour": s.colour, "band": s.band, "dash": s.dash} for s in series],
         "range": None if reach is None else [-reach, reach],
         "time": packed_time(time[rows]),
@@ -251,8 +253,10 @@ def packed(values: Array) -> dict[str, Any]:
 
 
 def packed_time(time: Array) -> dict[str, Any]:
-    """Return times as differences of whole microseconds, or of longer ticks if 32 bits do not hold them, compressed."""
-    tick = max(1e-6, float(np.diff(time).max(initial=0.0)) / 2.0**30)
+    """Return times as differences of whole microseconds, or of other ticks if 32 bits or the intervals ask for them, compressed."""
+    intervals = np.diff(time)
+    least = float(intervals[intervals > 0.0].min(initial=1.0))
+    tick = max(min(1e-6, 1e-3 * least), float(intervals.max(initial=0.0)) / 2.0**30)
     ticks = np.rint((time - time[0]) / tick).astype(np.int64)
     return {
         "first": float(time[0]),

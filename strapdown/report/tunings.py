@@ -6,9 +6,12 @@ import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from strapdown.checks import Hint, InputError, count, finite, instance, one_of, positive
 from strapdown.consistency.judgement import INNOVATIONS
 from strapdown.files import reading
+from strapdown.plots.tuning import TALLEST
 from strapdown.report import page
 
 BOUNDS = (
@@ -43,6 +46,7 @@ _FILTER = {
     "anees_per_state?": (finite,),
     "attitude_rms_rad?": (finite,),
     "judgements": [_JUDGEMENT],
+    "over_time?": [{"of": _text, "time_s": [finite], "mean": [(finite,)], "bounds": [finite, finite]}],
 }
 _PARAMETER = {"name": _text, "note": _text, "identified": _flag, "unit?": _text, "si_per_unit?": positive}
 _TUNING = {
@@ -54,6 +58,7 @@ _TUNING = {
     "held_out?": ({"before": _FILTER, "after": _FILTER},),
     "gate?": ({"probability": (finite,), "lower": (finite,), "upper": (finite,), "thresholds": {"*": finite}},),
     "unmodelled?": [{"words": [_text]}],
+    "slices?": [{"name": _text, "values": [finite], "fallen": [(finite,)]}],
 }
 """Part of the JSON of `strapdown tune` that the page needs: a check of each value. ``?``: may be missing; (…,): may be null; [a]: of any
 length; [a, b]: of two values; ``*``: any keys."""
@@ -92,10 +97,12 @@ def report(path: Path, confidence_level: float) -> tuple[str, dict[str, Any]]:
         page.verdict(*answer),
         page.section("Parameters", *_parameters(content)),
     ]
+    if "slices" in content:
+        parts.append(
+            page.section("Likelihood along each parameter", *map(_slice, content["slices"], content["parameters"]))
+        )
     if held:
         parts.append(page.section("Held-out data", *_held_out(held)))
-    drawn = {name: caption for name, caption in _FIGURES.items() if held or name != "heldout"}
-    parts += [page.stored_figure(path.with_name(f"{path.stem}-{name}"), caption) for name, caption in drawn.items()]
     making = [page.provenance({"records": ", ".join(content["records"]), "units of the JSON": content["units"]})]
     if toml.exists():
         making += [page.paragraph(f"The filter, {toml.name}:"), page.code(reading.text(toml, link=False))]
@@ -111,12 +118,6 @@ def report(path: Path, confidence_level: float) -> tuple[str, dict[str, Any]]:
     )
     html = page.page(f"Tuning: {path.name}", subtitle, *parts)
     return html, {"source": path.name, "judgement": {"verdict": answer[0], "reason": answer[1]}, "tuning": content}
-
-
-_FIGURES = {
-    "likelihood": "Likelihood along each parameter, with its interval",
-    "heldout": "Statistics on the held-out data, before and after tuning",
-}
 
 
 def read(path: Path) -> dict[str, Any]:
@@ -219,4 +220,51 @@ def _held_out(held: dict[str, Any]) -> list[str]:
             )
         )
     head = ("filter", "log-likelihood per innovation", "NIS", "99 % bounds", "ANEES per state", "attitude RMS, rad")
-    return [page.table(head, rows, numbers=5), page.paragraph(f"{BOUNDS}.", faint=True)]
+    return [page.table(head, rows, numbers=5), page.paragraph(f"{BOUNDS}.", faint=True), *_over_time(held)]
+
+
+def _over_time(held: dict[str, Any]) -> list[str]:
+    """Return a chart of each statistic over the first record, before and after tuning, with the bounds of a consistent filter."""
+    charts = []
+    for before, after in zip(*(held[name].get("over_time", []) for name in ("before", "after")), strict=True):
+        time, (low, high) = np.array(after["time_s"]), after["bounds"]
+        means = [np.array(one["mean"], float) for one in (before, after)]
+        series = [
+            page.Series(
+                label="99 % bounds, each interval", value=np.full(len(time), high), colour="--faint", band=True
+            ),
+            page.Series(label="lower bound", value=np.full(len(time), low), colour="--faint", band=True),
+            page.Series(label="before", value=means[0], colour="--b", dash=True),
+            page.Series(label="after", value=means[1]),
+        ]
+        wide = np.nanmax(means) > 5.0 or np.nanmin(means) < 0.2
+        charts.append(page.chart(after["of"], "mean over the interval", time, series, log=bool(wide)))
+    return charts
+
+
+def _slice(one: dict[str, Any], parameter: dict[str, Any]) -> str:
+    """Return a chart of the likelihood along a parameter, with its interval, its tuned and its previous value."""
+    size, unit = parameter.get("si_per_unit", 1.0), parameter.get("unit", "")
+    values = np.array(one["values"]) / size
+    first, last = float(values[0]), float(values[-1])
+    value, before, low, high = (
+        float(np.nan if parameter[key] is None else parameter[key] / size)
+        for key in ("value", "start", "lower", "upper")
+    )
+    low, high = np.fmax(low, first), np.fmin(high, last)
+    # A vertical line is two points of one value.
+    marks = [x for x in (low, high, value, value, before, before) if first <= x <= last]
+    x = np.sort(np.concatenate([np.geomspace(first, last, 400), marks]))
+    fallen = np.interp(np.log(x), np.log(values), np.array(one["fallen"], float))
+    up = np.arange(len(x)) % 2 == 1
+    line = lambda at: np.where(x == at, np.where(up, TALLEST, 0.0), np.nan)  # noqa: E731
+    within = (x >= low) & (x <= high)
+    series = [
+        page.Series(label="95 % interval", value=np.where(within, TALLEST, np.nan), colour="--faint", band=True),
+        page.Series(label="its lower limit", value=np.where(within, 0.0, np.nan), colour="--faint", band=True),
+        page.Series(label="−2 Δ log likelihood", value=np.where(fallen <= TALLEST, fallen, np.nan)),
+        page.Series(label="tuned", value=line(value), colour="--c"),
+        page.Series(label="before", value=line(before), colour="--b", dash=True),
+    ]
+    axis = f"{one['name']}, {unit}" if unit else one["name"]
+    return page.chart(one["name"], "−2 Δ log likelihood", x, series, x=axis, log_x=last > 20.0 * first)

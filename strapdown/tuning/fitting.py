@@ -533,6 +533,11 @@ class Slices:
     fallen: Array
     """2 Δℓ: decrease of twice the log likelihood from its maximum (p, k)."""
 
+    def summary(self) -> list[dict[str, Any]]:
+        """Return the slices as values for JSON, in SI units."""
+        rows = zip(self.names, self.values, self.fallen, strict=True)
+        return plain([{"name": name, "values": x, "fallen": y} for name, x, y in rows])  # type: ignore[no-any-return]
+
 
 def slices(objective: Objective, tuning: Tuning, *, number: int = 25) -> Slices:
     """Return slices of the objective through the tuned point, somewhat wider than each interval, without priors.

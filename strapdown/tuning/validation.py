@@ -109,6 +109,15 @@ class Performance:
     """NEES over the time of the first record, of attitude and bias if their truth is known."""
 
     @property
+    def courses(self) -> list[tuple[str, Array, Array, tuple[float, float]]]:
+        """What is shown over the time of the first record: name, times, means, 99 % bounds of each."""
+        known = self.nis_degrees > 0
+        typical = max(1, round(float(np.median(self.nis_degrees[known]))))
+        nis = np.where(known, self.nis_course, np.nan)
+        found = [("NIS per degree of freedom", self.nis_time, nis, mean_bounds(1, typical, 0.99))]
+        return found + [(f"NEES of the {one.of}, per state", one.time, one.mean, one.bounds) for one in self.nees]
+
+    @property
     def row(self) -> tuple[Any, ...]:
         """Row of the table :meth:`Comparison.listing`."""
         verdicts = [judgement.verdict for judgement in self.judgements]
@@ -163,6 +172,9 @@ class Comparison(Listed):
                 "anees_per_state": one.anees,
                 "attitude_rms_rad": one.attitude_rms,
                 "nees_per_state": {course.of: np.nanmean(course.mean) for course in one.nees},
+                "over_time": [
+                    {"of": of, "time_s": time, "mean": mean, "bounds": bounds} for of, time, mean, bounds in one.courses
+                ],
                 "judgements": [judgement.summary() for judgement in one.judgements],
             }
             for name, one in (("before", self.before), ("after", self.after))
