@@ -16,7 +16,7 @@ import strapdown as sd
 from strapdown import quaternion, recordings
 from strapdown.checks import InputError
 from strapdown.cli import app
-from strapdown.recordings import Recording, read, trajectories
+from strapdown.recordings import Recording, formats, read, trajectories
 from strapdown.records import outputs
 
 START = 1_700_000_000_123_456_789
@@ -266,6 +266,15 @@ def test_a_cameras_log_without_gyro_samples_is_refused(tmp_path, monkeypatch, ro
     (tmp_path / "video.log").write_text(GCSV)
     with pytest.raises(InputError, match=r"video.log \(GoPro\) has no gyro samples; give a log with raw"):
         read(tmp_path / "video.log")
+
+
+@pytest.mark.parametrize("kept", [1, 2, 3])
+def test_a_table_is_text_wherever_its_beginning_is_cut(tmp_path, kept):
+    """A header whose character of four bytes lies across the end of the bytes by which a format is recognised."""
+    header = "time,gx [rad/s],gy,gz,"
+    header += "x" * (formats.HEAD - kept - len(header)) + "𝛚"
+    (tmp_path / "table.dat").write_text(header + "\n" + "".join(f"{k},1,2,3,0\n" for k in range(5)), encoding="utf-8")
+    assert read(tmp_path / "table.dat").rate.shape == (5, 3)
 
 
 def test_a_decoded_blackbox_is_a_table(tmp_path):
