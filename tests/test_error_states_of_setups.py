@@ -345,7 +345,7 @@ def test_faces_agree_with_force_and_gyro_scale_of_some_axes():
 
 IRON = error_states.VectorBias(sensor="mag", bias_sigma=3e-6, rate_random_walk=3e-8, unit="T")
 HELD = error_states.BoundedVelocity(
-    sensor="acc", velocity_time=2.0, velocity_sigma=0.1, acceleration_sigma=0.3, strength=1.0
+    sensor="acc", velocity_time=2.0, velocity_sigma=0.1, acceleration_sigma=0.3, position_time=9.0, strength=1.0
 )
 
 
