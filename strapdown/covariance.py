@@ -42,8 +42,7 @@ from strapdown.estimation.setup import (
 from strapdown.gyro import GyroSpec, flicker
 from strapdown.kernels import analysis
 from strapdown.kernels.machine import compiled, read_only
-from strapdown.kernels.measurement import KIND_CODES, Measurements
-from strapdown.kernels.structure import Sensor
+from strapdown.kernels.measurement import Measurements
 from strapdown.kernels.walk import walk
 from strapdown.randomness import generator
 from strapdown.records import ImuRecord
@@ -983,17 +982,9 @@ def _for_kernel(path: _Path, columns: Sequence[_Column], fixed: int, n: int) -> 
 
 
 def _model(problem: Problem) -> Model:
-    """Return the model of a filter with a covariance for each measurement.
-
-    Without error states its structure has all kinds of sensors, so that it is compiled only once.
-    """
+    """Return the model of a filter with a covariance for each measurement."""
     kinds = dict(zip(problem.events.sensors, problem.events.kinds, strict=True))
-    model = assemble(problem.error_states, kinds, isotropic=False)
-    if problem.error_states:
-        return model
-    sensors = tuple(Sensor(code, isotropic=False, states=()) for code in KIND_CODES.values())
-    shape = np.array([list(KIND_CODES).index(kind) for kind in problem.events.kinds], np.int64)
-    return dataclasses.replace(model, structure=model.structure._replace(sensors=sensors), shape=shape)
+    return assemble(problem.error_states, kinds, isotropic=False)
 
 
 def _measurements(events: Schedule) -> Measurements:

@@ -3,10 +3,14 @@
 import base64
 import functools
 import gc
+import os
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+"""Read when NumPy is imported: each worker has one core, for which threads of BLAS would compete, at ten times the CPU time."""
 
 import hypothesis
 import numpy as np

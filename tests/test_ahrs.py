@@ -680,6 +680,17 @@ def test_no_sensor_is_early():
     assert ahrs.estimate(late(gyro=0.012, field=-0.012), smooth=True, latency=0.0).delays.last_gyro == 0.0
 
 
+def test_delays_that_change_are_told_by_their_last_values():
+    found = sensor_delays.Delays(
+        gyro=np.array([1e-3, 2e-3, 4e-3]), sigma=1e-3, field=np.array([0.0, -8e-3, -5e-3]), field_sigma=2e-3, given=True
+    )
+    assert (found.last_gyro, found.last_field) == (4e-3, -5e-3)
+    assert found.words == (
+        "Samples are assumed to be stamped 4 ms late.",
+        "The magnetometer's samples come 5.0 ms before the gyro's, σ 2 ms, compensated.",
+    )
+
+
 def test_a_sample_is_the_mean_of_its_interval_where_no_latency_is_given():
     """A gyro that integrates gives what was half a sample ago."""
     found = ahrs.estimate(late(gyro=0.5 / RATE))

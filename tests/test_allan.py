@@ -6,9 +6,11 @@ The records come from this file's own simulator, not from the package's gyro.
 import functools
 import itertools
 import math
+import multiprocessing
 import re
 import threading
 import types
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import allantools
@@ -183,13 +185,13 @@ def test_robust_ignores_outliers_and_steps():
     assert np.all(plain.deviation[0] > 2.0 * expected)
 
 
-@pytest.mark.skipif(not Path("/proc/self/schedstat").exists(), reason="CPU time of threads is read from Linux's /proc")
-def test_long_sums_wake_no_threads_of_blas():
-    """Their CPU time while 200,000 samples are analysed; on a busy machine they made the modified deviation 20 times slower."""
+def times_of_other_threads():
+    """Return the CPU time, ns, that other threads of the process take for each of several analyses of up to 200,000 samples."""
     values = np.random.default_rng(1).standard_normal(200_000)
     gappy = np.where(np.arange(len(values)) % 90_000 == 0, np.nan, values)
     temperature = np.linspace(20.0, 30.0, 20_000)
     calls = [
+        functools.partial(np.linalg.qr, values.reshape(-1, 20)),  # by BLAS
         *(
             functools.partial(allan.allan_deviation, values, 0.01, estimator=name)
             for name in allan.deviation.ESTIMATORS
@@ -198,17 +200,28 @@ def test_long_sums_wake_no_threads_of_blas():
         functools.partial(allan.fit_noise, gappy, 0.01),
         functools.partial(allan.temperature.fit_temperature, values[:20_000], temperature, 0.01, order=2),
     ]
-    np.ones(1000) @ np.ones(1000)  # BLAS is loaded
 
     def of_other_threads():
         tasks = [one for one in Path("/proc/self/task").iterdir() if int(one.name) != threading.get_native_id()]
         return sum(int((one / "schedstat").read_text().split()[0]) for one in tasks)
 
+    times = []
     for call in calls:
         call()  # compiles and imports
         before = of_other_threads()
         call()
-        assert of_other_threads() - before < 1e6, call  # ns
+        times.append(of_other_threads() - before)
+    return times
+
+
+@pytest.mark.skipif(not Path("/proc/self/schedstat").exists(), reason="CPU time of threads is read from Linux's /proc")
+def test_long_sums_wake_no_threads_of_blas(monkeypatch):
+    """On a busy machine they made the modified deviation 20 times slower."""
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "2")
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as process:
+        of_blas, *times = process.submit(times_of_other_threads).result()
+    assert of_blas > 1e6
+    assert max(times) < 1e6, times
 
 
 def test_default_taus_and_rounding():
@@ -479,7 +492,8 @@ def test_intervals_cover_small_study():
     assert np.all(np.abs(np.sqrt(np.nanmean(error**2, axis=0)) / relative - 1.0) < 0.29), relative
 
 
-def test_intervals_cover_where_a_term_is_at_the_edge_of_being_seen():
+@pytest.mark.parametrize("records", [100, pytest.param(200, marks=pytest.mark.slow)])
+def test_intervals_cover_where_a_term_is_at_the_edge_of_being_seen(records):
     """Flicker between corners so near that the record shows it or not by chance: the bounds must hold as the intervals do.
 
     Coefficients are drawn as the model has them, N and B alone.
@@ -493,7 +507,7 @@ def test_intervals_cover_where_a_term_is_at_the_edge_of_being_seen():
     )
     generator = np.random.default_rng(12)
     inside, above, seen = [], [], []
-    for _ in range(200):
+    for _ in range(records):
         drawn = np.concatenate([[0.0], sigma * generator.standard_normal(samples - 1)])
         fit = allan.fit_noise(idct(drawn, norm="ortho"), 1.0, terms=terms)
         truth = np.array([N, B])

@@ -154,11 +154,11 @@ def test_the_fit_of_one_segment_is_that_of_its_samples_alone(options):
 
 
 def test_the_fit_over_stretches_covers_the_truth():
-    """N and K of 60 records with five long gaps: 95 % intervals hold 114 of 120; 105 is five σ below."""
+    """N and K of 30 records with five long gaps: 95 % intervals hold 57 of 60; 50 is four σ below."""
     dt, samples = 0.01, 6000
     N, K = 1e-3, 2e-3
     hits = 0
-    for seed in range(20):
+    for seed in range(10):
         random = np.random.default_rng(seed)
         walk = np.cumsum(K * np.sqrt(dt) * random.standard_normal((samples + 1, 3)), axis=0)
         x = 0.5 * (walk[1:] + walk[:-1]) + np.sqrt(N**2 / dt + K**2 * dt / 12.0) * random.standard_normal((samples, 3))
@@ -169,7 +169,7 @@ def test_the_fit_over_stretches_covers_the_truth():
             hits += int(np.sum((fit.lower[:, i] <= truth) & (truth <= fit.upper[:, i])))
         assert fit.samples < samples
         assert (fit.misfit_probability > 1e-6).all()
-    assert 105 <= hits <= 120
+    assert 50 <= hits <= 60
 
 
 def test_a_stretch_that_moves_is_seen():

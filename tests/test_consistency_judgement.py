@@ -287,9 +287,11 @@ def test_right_runs_are_consistent_and_wrong_ones_are_reported(plan):
     assert good.verdict == "consistent"
     assert {f.name for f in good.findings} == {"ANEES", "log-NEES", "mean error", "coverage", "NIS"}
     assert {f.of for f in good.findings if f.name == "NIS"} == {"star 1", "star 2"}
+    assert good.words == good.headline  # what a passing statistic would mean is not said
     sure = statistics_of(plan, measurement_sigma_factor=0.8).judge()
     assert sure.verdict == "not consistent"
     assert "optimistic" in sure.reason
+    assert sure.words.split("\n  - ")[1:] == [f.means for f in sure.findings if f.rejected and f.means]
     names = {f.name for f in sure.findings if f.rejected}
     assert {"ANEES", "log-NEES", "NIS", "coverage"} <= names
     assert "mean error" not in names

@@ -803,7 +803,10 @@ def test_the_kernels_are_compiled_once_for_a_structure():
         kernels = forward.instance_of(model) if blocks else six_states
         dispatchers = [machine.compiled(walk, kernels)]
         if blocks:
-            dispatchers.append(machine.compiled(smoother.smooth_back, kernels))
+            without = model.structure._replace(sensors=())  # of the smoother
+            dispatchers.append(
+                machine.compiled(smoother.smooth_back, machine.instance(filter_kernels, STRUCTURE=without))
+            )
         compiled = [list(dispatcher.signatures) for dispatcher in dispatchers]
         estimation.smooth(_laid_out_otherwise(record), NOISE, start(), others)
         assert [dispatcher.signatures for dispatcher in dispatchers] == compiled

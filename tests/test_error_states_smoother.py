@@ -324,11 +324,12 @@ def pushed(kind: str, runs: int) -> np.ndarray:
     return found
 
 
+@pytest.mark.parametrize("runs", [20, pytest.param(60, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("kind", slow(CARRIED, "velocity", "position"))
-def test_what_is_carried_is_consistent(kind):
+def test_what_is_carried_is_consistent(kind, runs):
     """Of a heading found at the end; without the turn carried along, the filter's push of several tenths of g was off by 3 of its σ."""
-    found = pushed(kind, 60)
-    assert_inside(found.mean(axis=0), CARRIED[kind].size, 60, 0.999)
+    found = pushed(kind, runs)
+    assert_inside(found.mean(axis=0), CARRIED[kind].size, runs, 0.999)
 
 
 NOISE = ProcessNoise(angle_random_walk=1e-3, rate_random_walk=1e-4)

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.signal
 import scipy.stats
 from measured import waves
 from scipy.spatial.transform import Rotation
@@ -651,6 +652,20 @@ def test_the_command_refuses(files, monkeypatch, capsys):
 def test_times_without_anything_in_common_are_refused(run):
     with pytest.raises(InputError, match="fewer than two times in common"):
         checked(run, time=run.estimate.time + 1e4, align="none")
+
+
+@pytest.mark.parametrize("phi", [0.0, 0.8])
+def test_the_p_value_of_a_constant_has_its_size_and_its_power(phi):
+    """By 200 series of two autoregressive scores: the mean is zero, or off by five of its σ."""
+    samples, mixed = 400, np.array([[2.0, 0.0], [0.5, 0.5]])
+    white = np.random.default_rng(5).standard_normal((200, samples, 2))
+    series = scipy.signal.lfilter([1.0], [1.0, -phi], white, axis=1) @ mixed.T
+    off = 5.0 * np.sqrt(samples) / (1.0 - phi) * mixed @ [0.6, 0.8]
+    for shift, (low, high) in ((0.0, (0.15, 0.6)), (off, (0.0, 0.005))):
+        p = [foreign._constant_p_value(x.sum(axis=0) + shift, x - x.mean(axis=0)) for x in series]
+        assert low < np.median(p) + 1e-9 < high
+        assert np.mean(np.array(p) < 0.05) < 0.1 or shift is off
+    assert foreign._constant_p_value(np.full(2, 1e6), white[0, : foreign.MIN_ROWS - 1]) == 1.0
 
 
 @pytest.mark.slow

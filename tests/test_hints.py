@@ -1,6 +1,7 @@
 """Library text names the arguments of Python; only the command line names options."""
 
 import ast
+import functools
 import re
 from pathlib import Path
 
@@ -16,17 +17,23 @@ from strapdown.cli.terminal import app
 PACKAGE = Path(strapdown.__file__).parent
 
 
+@functools.cache
 def options() -> set[str]:
     register()
     commands = typer.main.get_command(app).commands.values()
     return {name for one in commands for part in one.params for name in (*part.opts, *part.secondary_opts)}
 
 
+@functools.cache
 def outside_of_the_command_line():
-    for path in sorted(PACKAGE.rglob("*.py")):
-        if "cli" not in path.relative_to(PACKAGE).parts:
-            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-                yield path.relative_to(PACKAGE), node
+    """Texts, and calls of functions by their names: (file, node)."""
+    return [
+        (path.relative_to(PACKAGE), node)
+        for path in sorted(PACKAGE.rglob("*.py"))
+        if "cli" not in path.relative_to(PACKAGE).parts
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Constant | ast.Call)
+    ]
 
 
 def test_no_text_of_the_library_names_an_option():

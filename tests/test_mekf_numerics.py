@@ -94,6 +94,14 @@ def test_positive_definite_over_twelve_decades_of_noise_over_the_prior(exponent,
 
 
 SCALE = (GyroScale(scale_sigma=1e-3, misalignment_sigma=1e-3),)
+SILENT = tuple(
+    VectorMeasurements(sensor=kind, kind=kind, time=[], sigma=1.0, **value)
+    for kind, value in (
+        ("direction", {"vector_b": np.empty((0, 3)), "reference_f": STAR}),
+        ("attitude", {"attitude": np.empty((0, 4))}),
+    )
+)
+"""Sensors without measurements, with which tests of one kind of sensor share their kernels."""
 
 
 @pytest.mark.parametrize(
@@ -120,7 +128,7 @@ def test_what_needs_more_digits_than_a_covariance_has_is_refused(kind, gate, sta
         series |= (
             {"attitude": [quaternion.IDENTITY]} if kind == "attitude" else {"vector_b": [axis], "reference_f": axis}
         )
-        record = resting(VectorMeasurements(**series))
+        record = resting(*SILENT, VectorMeasurements(**series))
         start = initial_state(quaternion.IDENTITY, attitude_sigma=first, bias_sigma=0.1)
         if refused:
             with pytest.raises(InputError, match=REFUSED):
@@ -293,7 +301,7 @@ def test_the_covariance_is_carried_through_large_corrections():
         assert np.allclose(np.diag(f.P), estimate.variance[k + 1], rtol=1e-5)
 
 
-@pytest.mark.parametrize("states", [(), (GyroScale(scale_sigma=1e-3, misalignment_sigma=1e-3),)], ids=["six", "more"])
+@pytest.mark.parametrize("states", [(), SCALE], ids=["six", "more"])
 @pytest.mark.parametrize("angle", [0.3, 0.6, 0.95, 1.5])
 def test_a_large_correction_is_exact(states, angle):
     """P = σ²I and one measured attitude of variance r: the correction is φ σ²/(σ² + r), and P becomes σ² r/(σ² + r) J Jᵀ."""
@@ -305,7 +313,7 @@ def test_a_large_correction_is_exact(states, angle):
         attitude=[Rotation.from_rotvec(angle * axis).as_quat(scalar_first=True)],
         sigma=np.sqrt(r),
     )
-    record = ImuRecord(time=[0.0, 0.01], increments=np.zeros((1, 3)), vectors=(measured,))
+    record = ImuRecord(time=[0.0, 0.01], increments=np.zeros((1, 3)), vectors=(*SILENT, measured))
     start = initial_state(quaternion.IDENTITY, attitude_sigma=sigma, bias_sigma=1e-6)
     found = estimation.run(record, NOISE, start, states, full_covariance=True)
     share = sigma**2 / (sigma**2 + r)

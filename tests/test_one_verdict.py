@@ -37,7 +37,7 @@ def agree(result, file: Path) -> dict:
 SCENARIOS = [name for name in sd.scenarios.SCENARIOS if name != "rest"]  # which has no sensor besides the gyro
 
 
-QUICK = ("two-stars", "hand-held", "earth-observer")
+QUICK = ("two-stars", "earth-observer")
 """The other scenarios take 3 to 10 s each: they are long, or their filter has a structure of its own to compile."""
 
 

@@ -16,7 +16,7 @@ import strapdown as sd
 from strapdown import quaternion, recordings
 from strapdown.checks import InputError
 from strapdown.cli import app
-from strapdown.recordings import Recording, read, trajectories
+from strapdown.recordings import Recording, formats, read, trajectories
 from strapdown.records import outputs
 
 START = 1_700_000_000_123_456_789
@@ -253,9 +253,10 @@ def test_a_cameras_log_is_read(tmp_path):
     np.testing.assert_allclose(recording.time, [0.0, 1e-3, 2e-3], atol=1e-12)
     assert recording.magnetic_field is None
     assert "potatocam custom logger name" in recording.remarks[0]
-    (tmp_path / "none.mp4").write_bytes(b"\0\0\0\x18ftypmp42" + bytes(200))
-    with pytest.raises(InputError, match=r"none.mp4 (cannot be read as camera or flight log|.*has no gyro samples)"):
-        read(tmp_path / "none.mp4")
+    for name in ("none.mp4", "none.log"):  # a video by its ending, and by its content
+        (tmp_path / name).write_bytes(b"\0\0\0\x18ftypmp42" + bytes(200))
+        with pytest.raises(InputError, match=rf"{name} (cannot be read as camera or flight log|.*has no gyro samples)"):
+            read(tmp_path / name)
 
 
 @pytest.mark.parametrize("rows", [[], [{"timestamp_ms": 0.0, "gyro": [1, 2, 3]}], [{"timestamp_ms": 0.0}] * 3])
@@ -265,6 +266,15 @@ def test_a_cameras_log_without_gyro_samples_is_refused(tmp_path, monkeypatch, ro
     (tmp_path / "video.log").write_text(GCSV)
     with pytest.raises(InputError, match=r"video.log \(GoPro\) has no gyro samples; give a log with raw"):
         read(tmp_path / "video.log")
+
+
+@pytest.mark.parametrize("kept", [1, 2, 3])
+def test_a_table_is_text_wherever_its_beginning_is_cut(tmp_path, kept):
+    """A header whose character of four bytes lies across the end of the bytes by which a format is recognised."""
+    header = "time,gx [rad/s],gy,gz,"
+    header += "x" * (formats.HEAD - kept - len(header)) + "𝛚"
+    (tmp_path / "table.dat").write_text(header + "\n" + "".join(f"{k},1,2,3,0\n" for k in range(5)), encoding="utf-8")
+    assert read(tmp_path / "table.dat").rate.shape == (5, 3)
 
 
 def test_a_decoded_blackbox_is_a_table(tmp_path):

@@ -133,6 +133,8 @@ def assemble(
 
     ``isotropic``: whether one σ gives the noise of each sensor, or three variances that of an attitude. ``generic``: a structure that does
     not depend on the numbers except on which of them are zero; the slopes of the gyro's bias over temperature are an offset of 1 K.
+
+    Without error states, the structure has sensors of all kinds, so that its kernels are compiled only once.
     """
     decay, density = _stack(blocks, "decay", ()), _stack(blocks, "density", ())
     for name, values in (("decay", decay), ("density", density)):
@@ -167,6 +169,8 @@ def assemble(
     )
     sensors, vectors, varying = _on_sensors(blocks, kinds, numbers, isotropic=isotropic)
     shapes = tuple(dict.fromkeys(sensors))
+    if not blocks:
+        shapes = tuple(Sensor(code, isotropic, ()) for code in KIND_CODES.values())
     fastest = float(np.max(decay * np.where(entering, 5.0, 1.0), initial=0.0))
     return Model(
         structure=Structure(6 + len(decay), gyro, chains, vectors, shapes),

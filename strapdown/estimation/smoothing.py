@@ -370,7 +370,9 @@ class _ManyStates:
 
         ``starts``: index of the segment that starts at each stop.
         """
-        kernels = forward.instance_of(self.problem.model)
+        # The same for all sensors.
+        without = self.problem.model.structure._replace(sensors=())
+        kernels = forward.instance_of(replace(self.problem.model, structure=without))
         model = forward.kernel_model(self.problem.model, self.problem.variances)
         n = kernels.N
         if segments.shape[1] == 32:  # of the filter of six states: the blocks of P, not its triangle by rows
