@@ -106,7 +106,7 @@ class Linearization:
         behind = len(self.rows.residual) == 2 and self.rows.angle > 0.5 * math.pi and threshold < math.inf
         return self.converged and self.nis <= threshold and not behind
 
-    def correction(self) -> tuple[Array, float]:
+    def correction(self, robust: Robust | None) -> tuple[Array, float]:
         """Return the correction (n,) of one update, and the size that must fall below the tolerance.
 
         The size comprises the attitude correction, rad, and the effect of the optional states on the decorrelated rows. The residual of a
@@ -116,8 +116,9 @@ class Linearization:
         L = np.linalg.cholesky(noise)
         L = L / np.diag(L)
         stretch = np.array([arc, arc, 1.0])[: len(residual)]
+        weight = 1.0 if robust is None else self.weight(robust)
         innovation = L @ (stretch * np.linalg.solve(L, residual)) - H @ self.prior
-        step = self.prior + self.covariance @ H.T @ np.linalg.solve(self.predicted + noise, innovation)
+        step = self.prior + self.covariance @ H.T @ np.linalg.solve(self.predicted + noise / weight, innovation)
         on_rows = np.linalg.solve(L, H[:, 6:] @ step[6:])
         return step, math.sqrt(step[:3] @ step[:3] + on_rows @ on_rows)
 
@@ -147,6 +148,7 @@ def linearize(
     turning: Callable[[Array, Array], Array],
     passes: int,
     threshold: float,
+    robust: Robust | None = None,
 ) -> Linearization:
     """Return a measurement linearised at the state after its update (:mod:`strapdown.kernels.gate`).
 
@@ -163,6 +165,8 @@ def linearize(
     threshold : float
         Threshold of the gate. While the attitude is nearly unknown, a measurement that would be refused is linearised again from 120° to
         either side about the least certain axis.
+    robust : Robust, optional
+        The point of linearisation is the result of the weighted update.
     """
     zero = np.zeros(len(P))
     seen = first = Linearization(
@@ -174,7 +178,7 @@ def linearize(
     tolerance = MIN_CORRECTION_UNKNOWN if unknown else RELINEARIZED
     done, trials = 1, 0
     while True:
-        step, size = seen.correction()
+        step, size = seen.correction(robust)
         start = seen
         converged = size < tolerance
         if converged or done >= passes:
@@ -421,7 +425,8 @@ class GatedStepFilter(StepFilter):
         threshold = float(self._thresholds[KINDS[measurement.kind] - 1])
         others = np.concatenate([self.bias, self.values])
         rows = partial(self._rows_at, measurement, self._sensor_model(sensor, measurement.kind))
-        seen = linearize(rows, self.attitude, others, self.P, self._motion.turning_matrix, self._passes, threshold)
+        turning = self._motion.turning_matrix
+        seen = linearize(rows, self.attitude, others, self.P, turning, self._passes, threshold, self.robust)
         self.nis = seen.nis
         self.dim_z = len(seen.rows.residual)
         unknown = self._passes > 1 and measurement.kind == "heading" and tilt_unknown(self.attitude, self.P)

@@ -221,7 +221,7 @@ BODIES = [
     (filter_lanes, SEVERAL),
     (likelihood, OWN),
     (likelihood_outliers, likelihood, OWN),
-    (hypotheses,),
+    (hypotheses, FILTER),
     (complementary,),
 ]
 """What the walk is compiled with."""
@@ -247,7 +247,7 @@ def test_every_body_of_the_walk_is_listed_here():
         ("filter_lanes", "kernels"),
         ("kernels",),
         ("*bodies",),
-        ("hypotheses_kernel",),
+        ("kernel", "kernels"),
         ("complementary",),
     }
 

@@ -494,7 +494,6 @@ def test_every_face_refuses_what_is_no_argument(face, name):
         ({"bias_sigma": [1.0, 2.0]}, r"bias_sigma has shape \(2,\); give one number, or three"),
         ({"bias_sigma": -1.0}, "bias_sigma"),
         ({"bias": [0.0, 1.0]}, "bias has shape"),
-        ({"least_weight": "a"}, "least_weight"),
     ],
 )
 def test_the_bank_names_what_it_cannot_start_with(option, words):
