@@ -530,12 +530,7 @@ def reference_smoother(record, initial, blocks):
         for t, i in sorted(series):
             if t == now:
                 s, row = series[t, i]
-                if s.kind == "attitude":
-                    face.update_attitude(s.attitude[row], s.sigma_axes[row], s.sensor)
-                else:
-                    update = getattr(face, f"update_{s.kind}")
-                    noise = {"covariance": s.covariances[row]} if s.anisotropic else {"sigma": s.sigma[row]}
-                    update(s.vector_b[row], s.references_f[row], sensor=s.sensor, **noise)
+                face.update(s, row)
         filtered.append((face.attitude, face.bias, face.values.copy(), face.P.copy()))
         at_edge.append(now in record.time)
     rows = [filtered[-1]]

@@ -288,7 +288,7 @@ def test_the_covariance_is_carried_through_large_corrections():
         f.predict(record.increments[k], now - record.time[k])
         for s in record.vectors:
             for at in np.flatnonzero(s.time == now):
-                f.update_direction(s.vector_b[at], s.references_f[at], float(s.sigma[at]))
+                f.update(s, at)
         assert np.max(quaternion.angle_between(f.attitude, estimate.attitude[k + 1])) < 1e-9
         assert np.allclose(np.diag(f.P), estimate.variance[k + 1], rtol=1e-5)
 
