@@ -222,7 +222,7 @@ BODIES = [
     (likelihood, OWN),
     (likelihood_outliers, likelihood, OWN),
     (hypotheses, FILTER),
-    (complementary,),
+    (complementary, FILTER),
 ]
 """What the walk is compiled with."""
 
@@ -248,7 +248,7 @@ def test_every_body_of_the_walk_is_listed_here():
         ("kernels",),
         ("*bodies",),
         ("kernel", "kernels"),
-        ("complementary",),
+        ("complementary", "kernels"),
     }
 
 

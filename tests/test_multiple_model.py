@@ -148,7 +148,7 @@ def matched(x, P, weights):
     record = still(np.array([1.0, 0.0, 0.0, 0.0]), [[1.0, 0.0, 0.0]], 1e-3, np.random.default_rng(0))
     form = multiple_model.filter_form(problem_of(record, QUIET), x, P)
     out = np.empty(7), np.empty((6, 6)), np.empty((6, 6))
-    plain(hypotheses.moment_match, forward.instance_of(multiple_model.ANY_SENSOR))(form, weights, *out)
+    plain(hypotheses.moment_match, forward.instance_of(forward.ANY_SENSOR))(form, weights, *out)
     return out
 
 
@@ -182,7 +182,7 @@ def kernel_run(walked, record, process, x, P):
     """Run equally likely hypotheses that are never one over a record by the walk itself; return its outputs and what it says."""
     rows, number = len(record.time), len(x)
     problem = problem_of(record, process)
-    measured = multiple_model.measurements_from(problem.events, 0)
+    measured = forward.measurements_in_body_axes(problem.events)
     shapes = (rows, 7), (rows, 6, 6), (6, 6), (rows, number), (len(measured.time), 6), (len(measured.time),)
     out = hypotheses.Outputs._make(np.empty(shape) for shape in shapes)
     body = hypotheses.Body(
@@ -197,7 +197,7 @@ def kernel_run(walked, record, process, x, P):
         max_share=-1.0,  # a share that nothing is below
         first_row=0,
     )
-    kernels = forward.instance_of(multiple_model.ANY_SENSOR)
+    kernels = forward.instance_of(forward.ANY_SENSOR)
     walked = walked(walk, hypotheses, kernels)
     return out, walked(read_only(record.time), read_only(record.increments), measured, 1, body, out)
 

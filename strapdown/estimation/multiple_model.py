@@ -23,7 +23,6 @@ from strapdown.checks import Array, InputError, count
 from strapdown.estimation import forward
 from strapdown.estimation.forward import Problem
 from strapdown.estimation.gating import Gate, Robust
-from strapdown.estimation.model import assemble
 from strapdown.estimation.schedule import Schedule, innovations_by_sensor, joined
 from strapdown.estimation.states import ProcessNoise, State, check_arguments, initial_state
 from strapdown.kernels import gate_rules, measurement, structure
@@ -49,8 +48,6 @@ DOUBT = 1e-3
 at the threshold of a gate that refuses correct measurements with this probability."""
 CONSTANT = 1.0 * DEGREE
 """Maximum rotation of the references over a record at which they count as constant, rad."""
-ANY_SENSOR = assemble((), {kind: kind for kind in measurement.KIND_CODES}, isotropic=False)
-"""Model of attitude and gyro bias with sensors of every kind, by code: one compilation serves all records."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -274,8 +271,8 @@ class _Bank(NamedTuple):
             max_share=MAX_SHARE,
             first_row=first_row,
         )
-        measured = measurements_from(events, first + 1)
-        kernels = forward.instance_of(ANY_SENSOR)
+        measured = forward.measurements_in_body_axes(events, first + 1)
+        kernels = forward.instance_of(forward.ANY_SENSOR)
         rows, ended, used = compiled(walk, kernel, kernels)(
             read_only(edges), read_only(increments), measured, every, body, out
         )
@@ -296,20 +293,10 @@ class _Bank(NamedTuple):
 
 def filter_form(problem: Problem, x: Array, P: Array) -> structure.Body:
     """Return hypotheses (h, 7) with covariances (h, 6, 6) as the states of a filter, and one more as the kernel's work space."""
-    kernels = forward.instance_of(ANY_SENSOR)
-    shape = problem.events.codes.astype(np.int64)
-    form = forward.filter_body(replace(problem, model=replace(ANY_SENSOR, shape=shape)), {})
-    padded = np.zeros((len(x) + 1, 6, kernels.WIDTH_OF_ROW))
+    form = forward.filter_body(forward.with_any_sensor(problem), {})
+    padded = np.zeros((len(x) + 1, 6, forward.instance_of(forward.ANY_SENSOR).WIDTH_OF_ROW))
     padded[:-1, :, :6] = P
     return form._replace(x=np.append(x, np.zeros((1, 7)), axis=0), P=padded.reshape(len(padded), -1))
-
-
-def measurements_from(events: Schedule, first: int) -> measurement.Measurements:
-    """Return the measurements from number ``first`` on, in order of time, with their covariances in body axes."""
-    columns = {name: getattr(events.measurements, name)[first:] for name in ("time", "place", "sensor")}
-    noise = np.empty((len(events.time), 6))
-    noise[events.row] = events.body_noise
-    return events.measurements._replace(noise=read_only(noise), **columns)
 
 
 def start(problem: Problem, event: int, hypotheses: int, widening: float = 1.0) -> tuple[Array, Array, Array]:
