@@ -205,6 +205,8 @@ def kernel_run(walked, record, process, x, P):
 def test_for_small_errors_it_is_the_plain_filter():
     random = np.random.default_rng(8)
     record = still(np.array([1.0, 0.0, 0.0, 0.0]), [[1.0, 0.0, 0.0], [0.0, 1.0, 1.0]], 1e-4, random)
+    first, second = record.vectors
+    record = dataclasses.replace(record, vectors=(first, dataclasses.replace(second, sigma=np.full(20, 3e-4))))
     initial = estimation.initial_state(
         quaternion.exp(np.array([1e-4, -2e-4, 1e-4])), attitude_sigma=2e-4, bias_sigma=1e-6
     )
