@@ -145,7 +145,7 @@ def step_by_step(record: ImuRecord, few: int) -> Callable[[], None]:
         up = record.vectors[0]
         for k in range(few):
             f.predict(record.increments[k], 1.0 / RATE)
-            f.update_direction(up.vector_b[k], up.reference_f, 0.01)
+            f.update(up, k)
 
     return work
 

@@ -23,6 +23,7 @@ from strapdown.estimation import Gate, LiveFilter, ProcessNoise, StepFilter, ini
 from strapdown.estimation.error_states import GyroScale
 from strapdown.files import write_json
 from strapdown.kernels.machine import describe
+from strapdown.vectors import VectorMeasurements
 
 RATE = 100.0
 NOISE = ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-6)
@@ -53,10 +54,22 @@ def ours(rate: list[Any], force: list[Any], field: list[Any]) -> dict[str, tuple
         StepFilter(NOISE, START),
     )
 
+    directions = [
+        VectorMeasurements(
+            sensor=sensor.name,
+            kind="direction",
+            time=np.arange(float(n)),
+            vector_b=np.array(values) / np.linalg.norm(values, axis=1, keepdims=True),
+            reference_f=sensor.reference_f,
+            sigma=np.full(1, 0.01),
+        )
+        for sensor, values in zip(SENSORS, (force, field), strict=True)
+    ]
+
     def steps(k: int) -> None:
         step.predict(np.array(rate[k]) / RATE, 1.0 / RATE)
-        step.update_direction(np.array(force[k]) / np.linalg.norm(force[k]), UP, 0.01)
-        step.update_direction(np.array(field[k]) / np.linalg.norm(field[k]), FIELD, 0.01)
+        for series in directions:
+            step.update(series, k)
 
     stamps = itertools.count()
 

@@ -90,12 +90,15 @@ def simdkalman_ns(repeats: int) -> float | None:
 
 def filterpy_ns(repeats: int, few: int = 200) -> float:
     """Return ns per step of the filter's interface on filterpy."""
+    up = vectors.VectorMeasurements(
+        sensor="up", kind="direction", time=np.zeros(1), vector_b=np.eye(3)[2:], sigma=np.full(1, 0.01)
+    )
 
     def work() -> None:
         f = StepFilter(NOISE, initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=1e-2, bias_sigma=1e-3))
         for _ in range(few):
             f.predict((1e-3, 0.0, 0.0), 1.0 / RATE)
-            f.update_direction((0.0, 0.0, 1.0), (0.0, 0.0, 1.0), 0.01)
+            f.update(up)
 
     return least(work, max(repeats // 4, 2)) / few * 1e9
 

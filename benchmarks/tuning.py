@@ -68,7 +68,7 @@ def step_seconds(one: tuning.Case, chosen: setup.FilterSetup, samples: int) -> f
         if (k + 1) % every == 0:
             place = (k + 1) // every - 1
             for series in (first, second):
-                filter_.update_direction(series.vector_b[place], series.reference_f, float(series.sigma[place]))
+                filter_.update(series, place)
     return (time.process_time() - start) / samples
 
 

@@ -27,7 +27,7 @@ from strapdown.estimation.forward import gate_events, remembered, restart_states
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.states import GateMemory, State, check_arguments, restart_bias_variance
 from strapdown.estimation.step_filter import StepFilter
-from strapdown.kernels import filter, gate_rules, iterated_update, machine, structure
+from strapdown.kernels import filter, gate_rules, iterated_update, machine
 from strapdown.kernels.gate_rules import WIDE_PASSES
 from strapdown.kernels.iterated_update import (
     ACCEPTED,
@@ -41,7 +41,6 @@ from strapdown.kernels.iterated_update import (
     UNKNOWN,
     UNKNOWN_TILT,
 )
-from strapdown.kernels.walk import step_within, turn_squared
 from strapdown.records import Event
 from strapdown.vectors import KINDS
 
@@ -106,7 +105,7 @@ class Linearization:
         behind = len(self.rows.residual) == 2 and self.rows.angle > 0.5 * math.pi and threshold < math.inf
         return self.converged and self.nis <= threshold and not behind
 
-    def correction(self) -> tuple[Array, float]:
+    def correction(self, robust: Robust | None) -> tuple[Array, float]:
         """Return the correction (n,) of one update, and the size that must fall below the tolerance.
 
         The size comprises the attitude correction, rad, and the effect of the optional states on the decorrelated rows. The residual of a
@@ -116,8 +115,9 @@ class Linearization:
         L = np.linalg.cholesky(noise)
         L = L / np.diag(L)
         stretch = np.array([arc, arc, 1.0])[: len(residual)]
+        weight = 1.0 if robust is None else self.weight(robust)
         innovation = L @ (stretch * np.linalg.solve(L, residual)) - H @ self.prior
-        step = self.prior + self.covariance @ H.T @ np.linalg.solve(self.predicted + noise, innovation)
+        step = self.prior + self.covariance @ H.T @ np.linalg.solve(self.predicted + noise / weight, innovation)
         on_rows = np.linalg.solve(L, H[:, 6:] @ step[6:])
         return step, math.sqrt(step[:3] @ step[:3] + on_rows @ on_rows)
 
@@ -147,6 +147,7 @@ def linearize(
     turning: Callable[[Array, Array], Array],
     passes: int,
     threshold: float,
+    robust: Robust | None = None,
 ) -> Linearization:
     """Return a measurement linearised at the state after its update (:mod:`strapdown.kernels.gate`).
 
@@ -163,6 +164,8 @@ def linearize(
     threshold : float
         Threshold of the gate. While the attitude is nearly unknown, a measurement that would be refused is linearised again from 120° to
         either side about the least certain axis.
+    robust : Robust, optional
+        The point of linearisation is the result of the weighted update.
     """
     zero = np.zeros(len(P))
     seen = first = Linearization(
@@ -174,7 +177,7 @@ def linearize(
     tolerance = MIN_CORRECTION_UNKNOWN if unknown else RELINEARIZED
     done, trials = 1, 0
     while True:
-        step, size = seen.correction()
+        step, size = seen.correction(robust)
         start = seen
         converged = size < tolerance
         if converged or done >= passes:
@@ -383,32 +386,17 @@ class GatedStepFilter(StepFilter):
                 State(attitude=one.attitude, bias=bias, values=values, covariance=one.covariance)
             )
 
-    def _predict(self, increment: Array, step: float, end: float) -> None:
-        """Propagate the filter and the restart candidate in common sub-steps, as long as the series and decaying states allow."""
+    def _running(self) -> list[StepFilter]:
+        """Return the filter and the restart candidate."""
         candidate = self._supervision.candidate
-        running = [self] if candidate is None else [self, candidate]
-        left, limit = step, self._motion.limit
-        while left > 0.0:
-            squared = max(turn_squared(increment, left, one.bias) for one in running)
-            longest = float(min(step_within(squared, left), limit))
-            part = increment * (longest / left)
-            for one in running:
-                one._sub_step(part, longest)
-            increment, left = increment - part, left - longest if longest < left else 0.0
-        for one in running:
-            one.time = end
+        return [self] if candidate is None else [self, candidate]
 
     def _measure(self, measurement, sensor):
         """Update with a measurement; count the outcome for the gate."""
-        self._need_known(sensor)
-        if self.error_states and self._kinds.setdefault(sensor, measurement.kind) != measurement.kind:
-            raise InputError(
-                f"{sensor or 'the sensor'} gave kind {self._kinds[sensor]!r} before, now {measurement.kind!r}; name each sensor"
-            )
         has_direction = measurement.has_direction(self.attitude)
         outcome = self._correct(measurement, sensor)
         if not has_direction:
-            self._vertical[sensor] = self._vertical.get(sensor, 0) + 1
+            self._skip(sensor)
         elif outcome != ACCEPTED:
             self.refused[sensor] = self.refused.get(sensor, 0) + 1
         self._supervision.judge(self, sensor, outcome, lambda candidate: candidate._correct(measurement, sensor))
@@ -420,8 +408,9 @@ class GatedStepFilter(StepFilter):
             return PASSED_OVER
         threshold = float(self._thresholds[KINDS[measurement.kind] - 1])
         others = np.concatenate([self.bias, self.values])
-        rows = partial(self._rows_at, measurement, self._sensor_model(sensor, measurement.kind))
-        seen = linearize(rows, self.attitude, others, self.P, self._motion.turning_matrix, self._passes, threshold)
+        rows = partial(self._rows_at, measurement, self._model(sensor, measurement.kind))
+        turning = self._motion.turning_matrix
+        seen = linearize(rows, self.attitude, others, self.P, turning, self._passes, threshold, self.robust)
         self.nis = seen.nis
         self.dim_z = len(seen.rows.residual)
         unknown = self._passes > 1 and measurement.kind == "heading" and tilt_unknown(self.attitude, self.P)
@@ -470,9 +459,8 @@ class GatedStepFilter(StepFilter):
     def _rows_at(self, measurement: Any, model: Any, attitude: Array, others: Array) -> Rows:
         """Return a measurement's rows at an attitude (4,) and (b, c) (3 + m,), by the function of the kernels."""
         kernels = machine.instance(filter, STRUCTURE=model.structure)
-        measured = structure.Measured(measurement.z, measurement.frame, (), measurement.length, (0.0,) * 9)
         x, iterated = np.concatenate([attitude, others]), self._passes > 1
-        H, y, axes, (squared, along), _ = kernels.rows_and_axes(0, x, measured, model.numbers, 0.0, iterated)
+        H, y, axes, (squared, along), _ = kernels.rows_and_axes(0, x, measurement, model.numbers, 0.0, iterated)
         y, basis, sine = np.array(y), np.array(axes), math.sqrt(squared)
         angle = math.atan2(sine, along)
         arc = 1.0 if sine < 1e-9 else angle / sine
@@ -493,7 +481,7 @@ class GatedStepFilter(StepFilter):
         candidate = GatedStepFilter(
             self.process_noise, state, self.error_states, gate=self.gate, robust=self.robust, time=self.time
         )
-        candidate._sensor_models = self._sensor_models
+        candidate._models = self._models
         candidate._passes = WIDE_PASSES
         return candidate
 

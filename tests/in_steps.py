@@ -24,15 +24,6 @@ def transition_and_noise(phi, dt, process_noise):
     return F, covariance_matrices(np.array([*q11, *q12, q22, 0.0, 0.0, q22, 0.0, q22]))
 
 
-def update(f, series, k):
-    """Update a filter with sample k of a series; return whether it was used."""
-    noise = {"covariance": series.covariances[k]} if series.kind != "heading" else {"sigma": series.sigma[k]}
-    given = {"sensor": series.sensor, **noise}
-    if series.kind == "attitude":
-        return f.update_attitude(series.attitude[k], **given)
-    return getattr(f, f"update_{series.kind}")(series.vector_b[k], series.references_f[k], **given)
-
-
 def fed(f, record, after=lambda used: None):
     """Process a record, intervals split at the measurements; return attitudes, biases and covariances at the ends of the intervals.
 
@@ -48,7 +39,7 @@ def fed(f, record, after=lambda used: None):
             if t > now:
                 f.predict(delta * ((t - now) / whole), t - now)
                 now = t
-            after(update(f, record.vectors[i], k))
+            after(f.update(record.vectors[i], k))
         if end > now:
             f.predict(delta * ((end - now) / whole), end - now)
         rows.append((f.attitude, f.bias, f.P))
@@ -71,7 +62,7 @@ def run(record, process_noise, initial, error_states=(), **options):
                 f.predict(delta * ((t - now) / whole), time=t)
                 now = t
             series, skipped = record.vectors[i], sum(f.skipped.values())
-            update(f, series, k)
+            f.update(series, k)
             if sum(f.skipped.values()) == skipped:
                 seen[series.sensor].append((f.nis, f.weight, f.y, f.S))
         return now

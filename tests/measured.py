@@ -33,6 +33,11 @@ def series_of(sensor, kind, time, vector_b, reference_f, sigma) -> VectorMeasure
     )
 
 
+def sample(kind, value, reference_f, sigma, sensor="s") -> VectorMeasurements:
+    """Return one measurement as a series."""
+    return series_of(sensor, kind, [0.0], [value], reference_f, sigma)
+
+
 def resting(*vectors, time=(0.0, 1.0)) -> ImuRecord:
     """Return the record of a body that does not turn."""
     return ImuRecord(time=time, increments=np.zeros((len(time) - 1, 3)), vectors=vectors)

@@ -174,6 +174,26 @@ def test_a_coloured_bias_that_never_changes_is_nothing_but_initial_bias():
     assert np.abs(block / np.outer(reach, reach)).max() < 1e-12
 
 
+def test_a_coloured_bias_at_an_edge_is_the_mean_of_both_intervals():
+    """Without sensors the error is a sum over the rates f of the intervals: −h Σ (f_k − f₀) and (f_{n−1} + f_n)/2 − f₀."""
+    h, tau, white, steps = 10.0, 15.0, 1e-7, 6
+    spec = GyroSpec(markov_noise=white, markov_correlation_time=tau)
+    scenario = Scenario(motion=motion.rest(), gyro=spec, sensors=(), rate=1.0 / h, duration=steps * h)
+    found = covariance.analyse(scenario, BELIEF, epochs=steps)
+    block = found.contributions[:, found.sources.index("Gauss–Markov bias")]
+    k = np.arange(steps + 1)
+    C = 0.5 * tau * white**2 * np.exp(-h / tau * np.abs(k[:, None] - k))
+    for n, of_edge in zip(np.round(found.time / h).astype(int), block, strict=True):
+        rows = np.zeros((2, steps + 1))
+        rows[0, :n] -= h
+        rows[0, 0] += n * h
+        rows[1, [max(n - 1, 0), n]] += 0.5
+        rows[1, 0] -= 1.0
+        if n == 0:
+            rows[1] = 0.0
+        np.testing.assert_allclose(of_edge[::3, ::3], rows @ C @ rows.T, rtol=1e-9, atol=1e-24)
+
+
 def test_markov_noise_without_a_correlation_time_is_a_rate_random_walk():
     scenarios_ = (still_scenario(rate_random_walk=3e-7, markov_noise=4e-7), still_scenario(rate_random_walk=5e-7))
     one, other = (covariance.analyse(scenario, BELIEF, epochs=5).contributions for scenario in scenarios_)

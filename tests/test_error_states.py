@@ -237,6 +237,18 @@ def test_transition_and_noise_are_those_of_van_loan(option, turn):
     assert np.max(np.abs(correlation(face.Q - Q, sigma))) < tolerance
 
 
+def test_the_noise_of_the_bias_reaches_the_attitude_by_the_scale_factors():
+    """At scale factors of a tenth, which the rate (I + M)⁻¹ (w_measured − b) shows: Van Loan's covariance of attitude and bias."""
+    M, dt, w = 0.1 * np.random.default_rng(3).standard_normal((3, 3)), 0.02, np.array([0.3, -0.32, 0.24])
+    face = face_at(GYRO_OPTIONS["gyro scale"], np.concatenate([M.ravel(), np.zeros(3)]))
+    face.predict(((np.eye(3) + M) @ w + face.bias) * dt, dt)
+    A, G = np.zeros((6, 6)), np.zeros((6, 6))
+    A[:3, :3], A[:3, 3:] = -kinematics.skew(w), -np.linalg.inv(np.eye(3) + M)
+    G[3:, 3:] = NOISE.rate_random_walk * np.eye(3)
+    _, Q = filterpy.common.van_loan_discretization(A, G, dt)
+    np.testing.assert_allclose(face.Q[:3, 3:6], Q[:3, 3:], rtol=1e-6, atol=1e-9 * abs(Q[0, 3]))
+
+
 def measured(kind: str, sensor: str, q, values: dict, reference, estimated):
     """What an ideal sensor with these effects gives: a model of its own. What is carried is known relative to the estimated attitude."""
     offset = values.get((sensor, "offset_b"), np.zeros(3))
@@ -530,12 +542,7 @@ def reference_smoother(record, initial, blocks):
         for t, i in sorted(series):
             if t == now:
                 s, row = series[t, i]
-                if s.kind == "attitude":
-                    face.update_attitude(s.attitude[row], s.sigma_axes[row], s.sensor)
-                else:
-                    update = getattr(face, f"update_{s.kind}")
-                    noise = {"covariance": s.covariances[row]} if s.anisotropic else {"sigma": s.sigma[row]}
-                    update(s.vector_b[row], s.references_f[row], sensor=s.sensor, **noise)
+                face.update(s, row)
         filtered.append((face.attitude, face.bias, face.values.copy(), face.P.copy()))
         at_edge.append(now in record.time)
     rows = [filtered[-1]]

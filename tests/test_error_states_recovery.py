@@ -8,7 +8,20 @@ import in_steps
 import numpy as np
 import pytest
 from gated_steps import GatedStepFilter
-from measured import FIELD, HAND, STAR, UP, assert_inside, drawn_start, errors, recoveries, seen, series_of, unit
+from measured import (
+    FIELD,
+    HAND,
+    STAR,
+    UP,
+    assert_inside,
+    drawn_start,
+    errors,
+    recoveries,
+    sample,
+    seen,
+    series_of,
+    unit,
+)
 
 from strapdown import consistency, estimation, montecarlo, quaternion, records
 from strapdown.estimation import error_states, forward, setup
@@ -486,8 +499,8 @@ def test_attitude_and_hard_iron_from_nothing_are_the_batch_solution(seed):
     start = estimation.initial_state(guess, attitude_sigma=UNIFORM_SIGMA, bias_sigma=BIAS_SIGMA)
     face = GatedStepFilter(NOISE, start, (IRON,), sensors=("mag", "acc"))
     face._passes = WIDE_PASSES
-    assert face.update_vector(mag, FIELD, 3e-7, "mag")
-    assert face.update_vector(acc, UP, 0.05, "acc")
+    assert face.update(sample("vector", mag, FIELD, 3e-7, "mag"))
+    assert face.update(sample("vector", acc, UP, 0.05, "acc"))
 
     def residuals(p):
         q = quaternion.multiply(true, quaternion.exp(p[:3]))
@@ -613,10 +626,10 @@ def test_the_step_face_says_what_it_took():
     one = made("hard iron", 0, duration=1.0)
     face = GatedStepFilter(NOISE, one.initial, (IRON,), gate=Gate())
     mag = one.record.vectors[0]
-    assert face.update_vector(mag.vector_b[0], FIELD, 3e-7, "mag")
+    assert face.update(mag)
     assert (face.weight, face.refused) == (1.0, {})
     kept = face.attitude.copy(), face.P.copy(), face.values.copy()
-    assert not face.update_vector(-mag.vector_b[0], FIELD, 3e-7, "mag")
+    assert not face.update(dataclasses.replace(mag, vector_b=-mag.vector_b))
     assert (face.weight, face.refused) == (0.0, {"mag": 1})
     assert face.nis > 1e3
     for now, before in zip((face.attitude, face.P, face.values), kept, strict=True):

@@ -29,7 +29,7 @@ from strapdown.kernels.gate_rules import WIDE_PASSES
 from strapdown.recordings import Recording, read
 from strapdown.records import ImuRecord, Truth
 from strapdown.units import DEGREE
-from strapdown.vectors import Accelerometer
+from strapdown.vectors import Accelerometer, VectorMeasurements
 
 NOISE = ProcessNoise(angle_random_walk=2e-3, rate_random_walk=1e-4)
 HAND = waves(((1.1, 0.3, -0.4), 0.21), ((-0.4, 0.9, 0.8), 0.37, 0.4))
@@ -592,7 +592,8 @@ def test_a_correction_turns_what_is_carried(passes):
     face = StepFilter(NOISE, state, blocks, sensors=("acc", "star"))
     face._passes = passes
     turn = quaternion.exp([0.5, -0.7, 0.4])
-    assert face.update_attitude(turn, 1e-6, "star")
+    star = VectorMeasurements(sensor="star", kind="attitude", time=[0.0], attitude=[turn], sigma=1e-6)
+    assert face.update(star)
     np.testing.assert_allclose(quaternion.angle_between(face.attitude, turn), 0.0, atol=1e-9)
     R = quaternion.to_matrix(face.attitude)
     T = np.kron(R, np.eye(3))  # the states stand axis by axis

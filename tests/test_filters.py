@@ -163,25 +163,8 @@ def test_nis_is_that_of_the_whole_innovation(name, kind):
 # -------------------------------------------------------------------------------------------- the two-frames group and others
 
 
-def matrix_of(A, B, C):
-    P = np.empty((6, 6))
-    P[:3, :3], P[3:, 3:] = np.reshape(mekf_full(A), (3, 3)), np.reshape(mekf_full(C), (3, 3))
-    P[:3, 3:] = np.reshape(B, (3, 3))
-    P[3:, :3] = P[:3, 3:].T
-    return P
-
-
 def mekf_full(S):
     return (S[0], S[1], S[2], S[1], S[3], S[4], S[2], S[4], S[5])
-
-
-def blocks_of(P):
-    upper = np.triu_indices(3)
-    return (
-        tuple(map(float, P[:3, :3][upper])),
-        tuple(map(float, P[:3, 3:].ravel())),
-        tuple(map(float, P[3:, 3:][upper])),
-    )
 
 
 def test_invariant_filters_never_see_what_one_reference_hides():
@@ -677,10 +660,11 @@ def test_covariance_of_any_gain_is_josephs_form():
         K = np.vstack([g * np.eye(3), kappa * np.eye(3)])
         H = np.hstack([M, np.zeros((3, 3))])
         wanted = (np.eye(6) - K @ H) @ P @ (np.eye(6) - K @ H).T + K @ V @ K.T
-        got = complementary_kernel.corrected_covariance(
-            *blocks_of(P), tuple(map(float, M.ravel())), tuple(map(float, V[np.triu_indices(3)])), g, kappa
-        )
-        np.testing.assert_allclose(matrix_of(*got), wanted, rtol=1e-12, atol=1e-12)
+        got = np.zeros((6, complementary_kernel.WIDTH_OF_ROW))
+        got[:, :6] = P
+        both = tuple(map(float, M.ravel())), tuple(map(float, V[np.triu_indices(3)]))
+        complementary_kernel.correct_covariance(got.reshape(-1), np.empty((2, 6, 6)), *both, g, kappa)
+        np.testing.assert_allclose(got[:, :6], wanted, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("kind", ["direction", "attitude"])

@@ -221,8 +221,8 @@ BODIES = [
     (filter_lanes, SEVERAL),
     (likelihood, OWN),
     (likelihood_outliers, likelihood, OWN),
-    (hypotheses,),
-    (complementary,),
+    (hypotheses, FILTER),
+    (complementary, FILTER),
 ]
 """What the walk is compiled with."""
 
@@ -247,8 +247,8 @@ def test_every_body_of_the_walk_is_listed_here():
         ("filter_lanes", "kernels"),
         ("kernels",),
         ("*bodies",),
-        ("hypotheses_kernel",),
-        ("complementary",),
+        ("kernel", "kernels"),
+        ("complementary", "kernels"),
     }
 
 

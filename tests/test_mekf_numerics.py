@@ -2,6 +2,7 @@
 
 import functools
 import re
+from contextlib import nullcontext
 from dataclasses import replace
 
 import in_steps
@@ -18,10 +19,10 @@ from strapdown.checks import InputError
 from strapdown.estimation.error_states import GaussMarkov, GyroGaussMarkov, GyroScale, VectorBias
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.schedule import schedule
-from strapdown.estimation.states import ProcessNoise, covariance_matrices, initial_state, pack
+from strapdown.estimation.states import GateMemory, ProcessNoise, covariance_matrices, initial_state, pack
 from strapdown.estimation.step_filter import StepFilter
 from strapdown.gyro import GyroSpec
-from strapdown.kernels import six_states
+from strapdown.kernels import gate_rules, six_states
 from strapdown.kernels.gate_rules import CANDIDATE
 from strapdown.kernels.measurement import SIGMA_ORIGIN, VALUE_ORIGIN
 from strapdown.kernels.walk import walk
@@ -135,6 +136,25 @@ def test_what_needs_more_digits_than_a_covariance_has_is_refused(kind, gate, sta
                 estimation.run(record, NOISE, start, states, gate=gate)
         else:
             estimation.run(record, NOISE, start, states, gate=gate)
+
+
+@pytest.mark.parametrize("sigma", [1e-9, 1e-2])
+def test_a_filter_that_has_recovered_refuses_it_too(sigma):
+    """Its updates are iterated."""
+    series = VectorMeasurements(
+        sensor="star",
+        kind="direction",
+        time=[0.0],
+        sigma=sigma,
+        vector_b=[[0.0, 0.6, 0.8]],
+        reference_f=[0.0, 0.6, 0.8],
+    )
+    counts = np.zeros(gate_rules.MEMORY)
+    counts[gate_rules.PASSES] = gate_rules.WIDE_PASSES
+    memory = GateMemory(restart_bias_variance=np.ones(3), counts=counts, counters={})
+    start = replace(initial_state(quaternion.IDENTITY, attitude_sigma=1.0, bias_sigma=0.1), gate=memory)
+    with pytest.raises(InputError, match=REFUSED) if sigma < 1e-3 else nullcontext():
+        estimation.run(resting(series), NOISE, start, gate=OPTIONS)
 
 
 @pytest.mark.parametrize(("exponent", "gate"), DECADES, ids=NAMES)
@@ -296,7 +316,7 @@ def test_the_covariance_is_carried_through_large_corrections():
         f.predict(record.increments[k], now - record.time[k])
         for s in record.vectors:
             for at in np.flatnonzero(s.time == now):
-                f.update_direction(s.vector_b[at], s.references_f[at], float(s.sigma[at]))
+                f.update(s, at)
         assert np.max(quaternion.angle_between(f.attitude, estimate.attitude[k + 1])) < 1e-9
         assert np.allclose(np.diag(f.P), estimate.variance[k + 1], rtol=1e-5)
 

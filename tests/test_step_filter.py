@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from filterpy.common import Saver
 from gated_steps import GatedStepFilter
-from measured import resting, series_of
+from measured import resting, sample, series_of
 
 from strapdown import estimation, motion, quaternion, records
 from strapdown.checks import InputError
@@ -116,7 +116,7 @@ def test_the_clock_of_given_stamps_is_theirs():
         other.predict([0.0, 0.0, 1e-3], t - (stamps[k - 1] if k else 1.7e9))
         assert f.time == t
         for one in (f, other):
-            one.update_direction(X, X, 0.1)
+            one.update(sample("direction", X, X, 0.1))
     assert np.array_equal(f.P, other.P)
     assert other.time == pytest.approx(stamps[-1], abs=200 * np.spacing(1.7e9))
     f.predict([0.0, 0.0, 1e-3], time=stamps[-1])
@@ -152,27 +152,22 @@ def test_filterpys_own_updates_are_refused():
     f = StepFilter(NOISE, start())
     H = np.eye(6)[:2]
     for update in (f.update, f.predict_update):
-        with pytest.raises(InputError, match=r"use .*update_direction"):
-            update(np.array([0.5, 0.0]), lambda x: H, lambda x: H @ x)
+        with pytest.raises(InputError, match=r"series is .*not of class VectorMeasurements"):
+            update(np.array([0.5, 0.0]), lambda x: H)
     assert np.array_equal(f.x, np.zeros(6))
-    assert f.update_direction(X, X, 0.1)
+    assert f.update(sample("direction", X, X, 0.1))
 
 
 # ----------------------------------------------------------------------------------------- what the record refuses or skips
 
 
-def test_noise_is_given_by_sigma_or_by_covariance():
+def test_noise_is_given_by_axes_or_by_covariance():
     found = []
-    for noise in ({"sigma": [1e-2, 2e-2, 3e-2]}, {"covariance": np.diag([1e-4, 4e-4, 9e-4])}):
+    for noise in ({"sigma_axes": [[1e-2, 2e-2, 3e-2]]}, {"covariance": np.diag([1e-4, 4e-4, 9e-4])}):
         f = StepFilter(NOISE, begun(record_of(1.2), "plain"), (IRON,))
-        assert f.update_direction(X, X, sensor="a", **noise)
+        assert f.update(replace(sample("direction", X, X, 0.0, "a"), **noise))
         found.append(f.P)
     np.testing.assert_allclose(*found, rtol=1e-14)
-    for bad in ({}, {"sigma": 0.1, "covariance": np.eye(3)}):
-        with pytest.raises(InputError, match="either sigma or covariance"):
-            f.update_direction(X, X, sensor="a", **bad)
-    with pytest.raises(InputError, match=r"a: sigma has shape \(3, 3\).* as covariance"):
-        f.update_direction(X, X, np.eye(3), "a")
 
 
 @pytest.mark.parametrize("unit", [1.0, 2e-5])
@@ -180,7 +175,7 @@ def test_a_whole_vector_updates_in_its_own_unit_as_the_record_s(unit):
     """filterpy's y and S are in the unit of the reference, and what they lead to does not depend on it."""
     reference, value = unit * np.array([0.0, 0.6, -0.8]), unit * np.array([0.05, 0.58, -0.83])
     f = StepFilter(NOISE, start())
-    assert f.update_vector(value, reference, 0.01 * unit, "mag")
+    assert f.update(sample("vector", value, reference, 0.01 * unit, "mag"))
     series = series_of("mag", "vector", [0.0], [value], reference, 0.01 * unit)
     record = resting(series)
     found = estimation.run(record, NOISE, start(), full_covariance=True)
@@ -192,36 +187,24 @@ def test_a_whole_vector_updates_in_its_own_unit_as_the_record_s(unit):
         assert nis == pytest.approx(found.innovations["mag"].nis[0], rel=1e-9)
 
 
-def test_with_error_states_a_sensor_keeps_its_kind():
-    f = StepFilter(NOISE, begun(record_of(1.2), "plain"), (IRON,))
-    assert f.update_direction(X, X, 0.1, "a")
-    with pytest.raises(InputError, match="a gave kind 'direction' before, now 'vector'; name each sensor"):
-        f.update_vector(X, X, 0.1, "a")
-
-
 @pytest.mark.parametrize("name", ["", "Mag", "acc"])
-@pytest.mark.parametrize("kind", ["direction", "vector", "heading", "attitude", "missing"])
-def test_a_sensor_that_no_block_knows_is_refused_before_anything_changes(kind, name):
+@pytest.mark.parametrize("value", [X, np.full(3, np.nan)], ids=["measured", "missing"])
+def test_a_sensor_that_no_block_knows_is_refused_before_anything_changes(value, name):
     face = StepFilter(NOISE, start(), (error_states.VectorBias(sensor="mag", bias_sigma=0.01),))
     face.predict([0.0, 0.0, 0.01], 0.1)
     before = pickle.dumps(face.__dict__)
-    given = [1.0, 0.0, 0.0, 0.0] if kind == "attitude" else X
-    references = () if kind == "attitude" else (X,)
-    if kind == "missing":
-        kind, given = "direction", np.full(3, np.nan)
-    update = getattr(face, f"update_{kind}")
-    with pytest.raises(InputError, match=f"sensor is '{name}', which is none of mag; .*sensors="):
-        update(given, *references, 0.1, name)
+    with pytest.raises(InputError, match=f"sensor '{name}' is not known.* mag"):
+        face.update(sample("direction", value, X, 0.1, name))
     assert pickle.dumps(face.__dict__) == before
-    assert update(X, X, 0.1, "mag") if kind == "direction" else True
+    assert face.update(sample("direction", X, X, 0.1, "mag"))
 
 
 def test_the_sensors_of_a_filter_with_error_states_can_be_named():
     block = error_states.VectorBias(sensor="mag", bias_sigma=0.01)
     face = StepFilter(NOISE, start(), (block,), sensors=("acc", "mag"))
-    assert face.update_direction(UP, UP, 0.1, "acc")
-    with pytest.raises(InputError, match="sensor is 'up', which is none of acc, mag"):
-        face.update_direction(UP, UP, 0.1, "up")
+    assert face.update(sample("direction", UP, UP, 0.1, "acc"))
+    with pytest.raises(InputError, match="sensor 'up' is not known"):
+        face.update(sample("direction", UP, UP, 0.1, "up"))
     with pytest.raises(InputError, match=r"mag bias: sensor 'mag' is not known; did you mean 'Mag'"):
         StepFilter(NOISE, start(), (block,), sensors=("acc", "Mag"))
     for blocks in ((block,), ()):
@@ -229,44 +212,7 @@ def test_the_sensors_of_a_filter_with_error_states_can_be_named():
             StepFilter(NOISE, start(), blocks, sensors="mag")
     # Blocks that are about no sensor leave the names free.
     free = StepFilter(NOISE, start(), (error_states.GyroScale(scale_sigma=0.01, misalignment_sigma=0.01),))
-    assert free.update_direction(UP, UP, 0.1)
-    assert free.update_direction(UP, UP, 0.1, "any")
-
-
-def refusal(make):
-    with pytest.raises(InputError) as caught:
-        make()
-    return str(caught.value)
-
-
-REFUSED = {
-    "a direction of another length": ("direction", 9.8 * UP, UP, "has length 9.8; divide each vector by its length"),
-    "a heading of another length": ("heading", 1.5 * X, X, "has length 1.5; divide each vector by its length"),
-    "a heading of the vertical": ("heading", X, UP, "is vertical and shows no heading"),
-    "a nearly vertical one": ("heading", X, [1e-3, 0.0, 9.8], "is vertical and shows no heading"),
-    "a direction to nowhere": ("direction", X, np.zeros(3), "zero vector"),
-}
-
-
-@pytest.mark.parametrize("case", REFUSED)
-def test_the_step_face_refuses_what_the_record_refuses(case):
-    kind, value, reference, words = REFUSED[case]
-    f = StepFilter(NOISE, start())
-    update = f.update_direction if kind == "direction" else f.update_heading
-    series = {"sensor": "s", "kind": kind, "time": [0.0], "vector_b": [value], "reference_f": reference, "sigma": 0.1}
-    whole = refusal(lambda: VectorMeasurements(**series))
-    step = refusal(lambda: update(value, reference, 0.1, sensor="s"))
-    assert words in whole
-    assert words in step
-    assert step.startswith("s: ") or "zero" in words
-    assert np.array_equal(f.P, start().covariance)
-
-
-def test_a_reference_of_any_length_will_do_for_a_heading():
-    f, other = StepFilter(NOISE, start()), StepFilter(NOISE, start())
-    f.update_heading(X, [9.8, 0.1, 0.0], 0.1)
-    other.update_heading(X, np.array([9.8, 0.1, 0.0]) / np.hypot(9.8, 0.1), 0.1)
-    assert np.allclose(f.attitude, other.attitude, rtol=0.0, atol=1e-15)
+    assert free.update(sample("direction", UP, UP, 0.1, "any"))
 
 
 VERTICAL_OPTIONS = [{}, {"gate": Gate(recovery=2)}, {"robust": Robust()}]
@@ -278,11 +224,11 @@ def test_a_vertical_measured_heading_is_skipped_and_counted(options):
     f = GatedStepFilter(NOISE, start(), **options)
     for k in range(1, 6):
         f.predict(np.zeros(3), time=0.1 * k)
-        assert not f.update_heading(UP, X, 0.1, sensor="north")
+        assert not f.update(sample("heading", UP, X, 0.1, "north"))
     assert f.skipped == {"north": 5}
     assert f.refused == {}
     assert f.events == ()
-    assert f.update_heading(X, X, 0.1, sensor="north")
+    assert f.update(sample("heading", X, X, 0.1, "north"))
 
 
 UNBIASED = (error_states.VectorBias(sensor="up", bias_sigma=1e-3),)
@@ -314,13 +260,10 @@ def test_both_faces_skip_a_vertical_heading_and_a_missing_sample_alike(blocks, o
     f = GatedStepFilter(NOISE, start(), blocks, sensors=("north", "up"), **options)
     for k, t in enumerate(time):
         f.predict(np.zeros(3), time=t)
-        f.update_heading(seen[k], X, 0.1, sensor="north")
-        f.update_direction(up[k], UP, 0.1, sensor="up")
+        f.update(north, k)
+        f.update(level, k)
     assert f.skipped == both.skipped
     assert np.allclose(f.P[:6, :6], both.covariance[8], rtol=1e-10, atol=1e-18)
-
-
-NAN = np.full(3, np.nan)
 
 
 @pytest.mark.parametrize("blocks", [(), UNBIASED], ids=["no states", "states"])
@@ -328,17 +271,17 @@ NAN = np.full(3, np.nan)
 def test_a_missing_sample_is_skipped_and_counted(kind, blocks):
     f = StepFilter(NOISE, start(), blocks, sensors=("up", "s"))
     f.predict(np.zeros(3), time=0.5)
-    P, noise = f.P.copy(), np.nan
-    for value in (NAN, [0.0, np.nan, 1.0]):
+    P = f.P.copy()
+    for value in ([np.nan] * 3, [0.0, np.nan, 1.0]):
         if kind == "attitude":
-            taken = f.update_attitude([*value, 1.0], noise, sensor="s")
+            series = VectorMeasurements(sensor="s", kind=kind, time=[0.0], attitude=[[*value, 1.0]], sigma=0.1)
         else:
-            taken = getattr(f, f"update_{kind}")(value, NAN, noise, sensor="s")
-        assert taken is False
+            series = sample(kind, value, X, 0.1)
+        assert f.update(series) is False
     assert f.skipped == {"s": 2}
     assert np.array_equal(f.P, P)
-    for value, sigma in (([np.inf, 0.0, 0.0], 0.1), (X, np.nan)):
-        refusal(lambda value=value, sigma=sigma: f.update_direction(value, X, sigma, "s"))
+    with pytest.raises(IndexError):
+        f.update(series, 1)
 
 
 def test_missing_attitudes_are_counted_and_leave_the_others_as_they_are():
@@ -409,7 +352,7 @@ def test_saver_and_pickle(states):
             now, then = np.searchsorted(record.time, [f.time, t])
             f.predict(record.increments[now:then].sum(axis=0), time=t)
         for series in record.vectors:
-            f.update_direction(series.vector_b[k], series.references_f[k], 2e-3, series.sensor)
+            f.update(replace(series, sigma=np.full(len(series.time), 2e-3)), k)
         history.save()
     assert {event.kind for event in f.events} >= {"recovery"}
     assert f.refused
@@ -422,7 +365,7 @@ def test_saver_and_pickle(states):
     assert history.values.shape == (n, m)
     copy = pickle.loads(pickle.dumps(f))
     for one in (f, copy):
-        one.update_direction(X, X, 0.5, "a")
+        one.update(sample("direction", X, X, 0.5, "a"))
     assert np.array_equal(copy.P, f.P)
     assert np.array_equal(copy.attitude, f.attitude)
     assert copy.events == f.events
@@ -448,8 +391,6 @@ WRONG = {
         lambda: estimation.with_error_states(start(), UNBIASED[0]),
         "single declaration .*; give a tuple",
     ),
-    "sigma (2,)": (lambda: StepFilter(NOISE, start()).update_direction(X, X, [0.1, 0.1]), r"sigma has shape \(2,\)"),
-    "sigma (3, 3)": (lambda: StepFilter(NOISE, start()).update_direction(X, X, np.eye(3)), "as covariance"),
     "a bare series": (lambda: replace(RECORD, vectors=SERIES), r"\(series,\)"),
     "no series": (lambda: resting(X), r"vectors\[0\] is"),
     "an unknown algorithm": (lambda: records.compress(RECORD, "two-samples"), "did you mean 'two-sample'"),
@@ -494,7 +435,6 @@ def test_every_face_refuses_what_is_no_argument(face, name):
         ({"bias_sigma": [1.0, 2.0]}, r"bias_sigma has shape \(2,\); give one number, or three"),
         ({"bias_sigma": -1.0}, "bias_sigma"),
         ({"bias": [0.0, 1.0]}, "bias has shape"),
-        ({"least_weight": "a"}, "least_weight"),
     ],
 )
 def test_the_bank_names_what_it_cannot_start_with(option, words):

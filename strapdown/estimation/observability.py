@@ -89,39 +89,26 @@ class Observability(Listed):
         str
             States with large components in the direction, the largest first.
         """
-        direction = self.directions[k]
-        large = np.flatnonzero(np.abs(direction) >= NAMED * np.max(np.abs(direction)))
-        large = large[np.argsort(-np.abs(direction[large]), kind="stable")]
-        sign = np.sign(direction[large[0]])
-        parts = [
-            f"{sign * direction[i]:+.2f} {self.states[i]} ({abs(self.left[k, i]):.2g} {self.units[i]})" for i in large
-        ]
+        size = np.abs(self.directions[k])
+        large = [i for i in np.argsort(-size, kind="stable") if size[i] >= NAMED * size.max()]
+        relative = self.directions[k] * np.sign(self.directions[k, large[0]])
+        parts = [f"{relative[i]:+.2f} {self.states[i]} ({abs(self.left[k, i]):.2g} {self.units[i]})" for i in large]
         return " ".join(parts).removeprefix("+")
 
     def listing(self) -> Table:
         """Return the σ of each state, and each direction with its singular value, as a table."""
-        prior = self.prior_sigma
-        columns = (prior, self.start_sigma / prior, self.final_sigma / prior)
-        rows = [
-            (f"{state}, {unit}", *sigmas, part)
-            for state, unit, *sigmas, part in zip(self.states, self.units, *columns, self.unobserved, strict=True)
-        ]
-        n = len(self.states)
-        notes = ["singular value: the weakest directions, each state relative to its prior σ (and the remaining σ)"]
-        notes += [
-            f"{self.singular_values[k]:14.3g}: {self.words(k)}"
-            for k in range(n - 1, min(self.rank, n - WEAKEST) - 1, -1)
-        ]
-        title = f"{self.rank} of {len(self.states)} directions are observed (singular value {self.threshold:g} or more)"
+        n, prior = len(self.states), self.prior_sigma
+        sigmas = (prior, self.start_sigma / prior, self.final_sigma / prior)
+        weakest = range(n - 1, min(self.rank, n - WEAKEST) - 1, -1)
+        columns = (Column(label, digits=3) for label in ("prior σ", "start/prior", "final/prior"))
         return Table(
-            title,
-            (
-                "state",
-                *(Column(label, digits=3) for label in ("prior σ", "start/prior", "final/prior")),
-                Column("unobserved", shown="{:.2f}".format),
-            ),
-            rows,
-            notes,
+            f"{self.rank} of {n} directions are observed (singular value {self.threshold:g} or more)",
+            ("state", *columns, Column("unobserved", shown="{:.2f}".format)),
+            list(zip(map(", ".join, zip(self.states, self.units, strict=True)), *sigmas, self.unobserved, strict=True)),
+            [
+                "singular value: the weakest directions, each state relative to its prior σ (and the remaining σ)",
+                *(f"{self.singular_values[k]:14.3g}: {self.words(k)}" for k in weakest),
+            ],
         )
 
     def summary(self) -> dict[str, Any]:
@@ -132,26 +119,21 @@ class Observability(Listed):
         dict
             Rank and threshold, the σ of each state, and each direction with its singular value.
         """
+        sigmas = {
+            name: getattr(self, name).tolist() for name in ("prior_sigma", "start_sigma", "final_sigma", "unobserved")
+        }
+        states = {"state": self.states, "unit": self.units, **sigmas}
+        directions = {
+            "singular_value": self.singular_values.tolist(),
+            "in_prior_sigma": [dict(zip(self.states, one, strict=True)) for one in self.directions.tolist()],
+            "one_sigma_left": [dict(zip(self.states, one, strict=True)) for one in self.left.tolist()],
+        }
         return {
             "rank": self.rank,
             "threshold": self.threshold,
             "singular_value_unit": "prior sigma over sigma of the measurements",
-            "states": [
-                {"state": state, "unit": unit}
-                | {
-                    name: float(getattr(self, name)[i])
-                    for name in ("prior_sigma", "start_sigma", "final_sigma", "unobserved")
-                }
-                for i, (state, unit) in enumerate(zip(self.states, self.units, strict=True))
-            ],
-            "directions": [
-                {
-                    "singular_value": float(self.singular_values[k]),
-                    "in_prior_sigma": dict(zip(self.states, self.directions[k].tolist(), strict=True)),
-                    "one_sigma_left": dict(zip(self.states, self.left[k].tolist(), strict=True)),
-                }
-                for k in range(len(self.states))
-            ],
+            "states": [dict(zip(states, row, strict=True)) for row in zip(*states.values(), strict=True)],
+            "directions": [dict(zip(directions, row, strict=True)) for row in zip(*directions.values(), strict=True)],
         }
 
 

@@ -1,50 +1,56 @@
-"""The filter in single steps, on filterpy, for inspection.
-
-:class:`StepFilter` is the filter of :mod:`strapdown.estimation` with whole covariance matrices. Motion model and measurement rows are the
-kernels' functions, run as plain Python.
-"""
+"""The filter in single steps, on filterpy, for inspection."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
+from typing import NamedTuple
 
 import filterpy.kalman
 import numpy as np
 from numpy.typing import ArrayLike
 
 from strapdown import kinematics, quaternion
-from strapdown.checks import (
-    Array,
-    InputError,
-    array,
-    by_axis,
-    covariance,
-    finite,
-    non_negative,
-    one_of,
-    positive,
-    unit_quaternions,
-)
+from strapdown.checks import Array, InputError, array, finite, instance, non_negative, one_of
 from strapdown.estimation import model as modelling
 from strapdown.estimation.error_states import ErrorStates
 from strapdown.estimation.forward import kernel_model
+from strapdown.estimation.schedule import schedule
 from strapdown.estimation.states import ProcessNoise, State, check_arguments
 from strapdown.estimation.temperature import need_none
-from strapdown.kernels import filter, machine, structure
+from strapdown.kernels import filter, machine
 from strapdown.kernels.measurement import has_heading
 from strapdown.kernels.rotation import rotation_matrix
 from strapdown.kernels.walk import step_within, turn_squared
 from strapdown.records import LARGEST_TURN
-from strapdown.vectors import need_level, need_unit, triad
+from strapdown.vectors import VectorMeasurements
+
+
+class Measurement(NamedTuple):
+    """A measurement, as :func:`strapdown.kernels.filter.rows_and_axes` takes it."""
+
+    kind: str
+    z: tuple[float, ...]
+    """The measured vector over ``length``, body axes."""
+    frame: tuple[float, ...]
+    """The triad of the reference by rows, or the measured quaternion and zeros."""
+    noise: Array
+    """Covariance of ``z``, body axes (3, 3); for a heading its variance on the diagonal."""
+    length: float
+    """Length of a vector's reference; else 1."""
+    turning: tuple[float, ...] = (0.0,) * 9
+
+    def has_direction(self, attitude: Array) -> bool:
+        """Return whether the measurement has information: all except the heading of a vector that is vertical at this attitude."""
+        return self.kind != "heading" or bool(has_heading(rotation_matrix(tuple(attitude.tolist())), self.z))
 
 
 class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
     """Multiplicative extended Kalman filter in single steps: ``P``, ``F``, ``Q``, ``R``, ``y``, ``S``, ``K`` and ``Saver`` as in filterpy.
 
-    ``x`` is the error state (δθ, δb, δc) (n,): zero before and after each update, because the correction goes into ``attitude``, ``bias``
-    and ``values``; ``x_post`` stores the last correction. Rows of ``y`` and ``S`` are in the unit of the measurement, or rad.
+    It is the filter of :mod:`strapdown.estimation`; motion model and rows are the kernels' functions, run as plain Python. ``x`` is the
+    error state (δθ, δb, δc) (n,): zero before and after each update, because the correction goes into ``attitude``, ``bias`` and
+    ``values``; ``x_post`` stores the last correction. Rows of ``y`` and ``S`` are in the unit of the measurement, or rad.
 
     Parameters
     ----------
@@ -67,14 +73,14 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
     - ``attitude`` q_fb (4,), ``bias`` of the gyro (3,), rad/s, body axes, and ``values`` of the error states (m,), in the order of their
       declarations, all at ``time``, s;
     - ``nis`` of the last measurement that was not skipped;
-    - ``skipped``, by sensor: number of measurements that were missing (NaN) or headings of a vertical vector;
+    - ``skipped``, by sensor: number of measurements without information: missing (NaN) ones and headings of a vertical vector;
     - ``repeated``: number of gyro samples without duration.
 
     Examples
     --------
     >>> steps = StepFilter(noise, start)  # doctest: +SKIP
-    >>> steps.predict(delta_theta, time=10.02)  # doctest: +SKIP
-    >>> steps.update_direction(vector_b, reference_f, 1e-3, "star tracker")  # doctest: +SKIP
+    >>> steps.predict(record.increments[0], time=record.time[1])  # doctest: +SKIP
+    >>> steps.update(record.vectors[0], 0)  # doctest: +SKIP
     """
 
     def __init__(
@@ -89,51 +95,24 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         check_arguments(process_noise=process_noise)
         self.error_states = modelling.as_blocks(error_states)
         state = modelling.begin(initial, self.error_states)
+        need_none(self.error_states, "this filter")
         if isinstance(sensors, str):
             raise InputError(f"sensors is {sensors!r}; it must be a sequence of names, ({sensors!r},)")
-        self.sensors = self._sensors_of_states(tuple(sensors))
+        about = {sensor: block.name for block in self.error_states for sensor in block.effects}
+        for sensor, block in about.items() if sensors else ():
+            one_of(f"{block}: sensor", sensor, sensors)
+        self.sensors = (tuple(sensors) or tuple(about)) if self.error_states else ()
         n = 6 + len(state.values)
         super().__init__(dim_x=n, dim_z=2)
         self.x, self.x_prior, self.x_post = np.zeros((3, n))
         self.y, self.z, self.K = np.zeros(2), np.zeros(2), np.zeros((n, 2))
-        self.attitude: Array = state.attitude.copy()
-        self.bias: Array = state.bias.copy()
-        self.values: Array = state.values.copy()
-        self.P = state.covariance.copy()
-        self.process_noise = process_noise
+        self.attitude, self.bias, self.values = state.attitude.copy(), state.bias.copy(), state.values.copy()
+        self.P, self.process_noise = state.covariance.copy(), process_noise
         self.time = finite("time", time, unit="s")
-        self.nis = 0.0
-        self.repeated = 0
-        self._missing: dict[str, int] = {}
-        self._vertical: dict[str, int] = {}
-        self._kinds: dict[str, str] = {}
+        self.nis, self.repeated = 0.0, 0
+        self.skipped: dict[str, int] = {}
+        self._models: dict[tuple[str, str], modelling.Model] = {}
         self._motion = self._model("", "vector")
-        self._sensor_models: dict[tuple[str, str], modelling.Model] = {}
-
-    def _sensors_of_states(self, names: tuple[str, ...]) -> tuple[str, ...]:
-        """Return the only sensors accepted in updates; empty: any. Error states of other sensors are refused."""
-        about = {sensor: block.name for block in self.error_states for sensor in block.effects}
-        for sensor, block in about.items() if names else ():
-            one_of(f"{block}: sensor", sensor, names)
-        return (names or tuple(about)) if self.error_states else ()
-
-    def _model(self, sensor: str, kind: str) -> modelling.Model:
-        """Return the error states as arrays, in the order of their declarations, with their effects on one sensor only."""
-        need_none(self.error_states, "this filter")
-        kinds = {name: "vector" for block in self.error_states for name in block.effects} | {sensor: kind}
-        model = modelling.assemble(self.error_states, kinds, isotropic=False)
-        if model.levers.any() or model.varying:
-            raise InputError(
-                "lever arms, and effects relative to a varying field magnitude, need the whole record; use estimation.run for them"
-            )
-        here = model.structure.sensors[model.shape[list(kinds).index(sensor)]]
-        return replace(model, structure=model.structure._replace(sensors=(here,)))
-
-    @property
-    def skipped(self) -> dict[str, int]:
-        """Number of measurements without information, by sensor: missing (NaN) ones and headings of a vertical vector."""
-        names = dict.fromkeys((*self._missing, *self._vertical))
-        return {name: self._missing.get(name, 0) + self._vertical.get(name, 0) for name in names}
 
     def state(self) -> State:
         """Return the present state.
@@ -145,8 +124,6 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         """
         P = 0.5 * (self.P + self.P.T)
         return State(attitude=self.attitude, bias=self.bias, values=self.values, covariance=P)
-
-    # -------------------------------------------------------------------------------------------------------------- prediction
 
     def predict(self, delta_theta: ArrayLike, dt: float | None = None, *, time: float | None = None) -> None:
         """Propagate over one gyro increment.
@@ -170,35 +147,34 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
             raise InputError(
                 f"delta_theta is {increment}, too large for the rotation between two samples; it is the rate times dt, rad: check the unit"
             )
-        if dt is not None and time is None:
-            step = non_negative("dt", dt, unit="s")
-            end = self.time + step
-        elif time is not None and dt is None:
-            end = finite("time", time, unit="s")
-            step = end - self.time
-        else:
+        if (dt is None) == (time is None):
             raise InputError("give either dt, the duration of the step in s, or time, its end")
+        step = finite("time", time, unit="s") - self.time if dt is None else non_negative("dt", dt, unit="s")  # type: ignore[arg-type]
         if step < 0.0:
-            raise InputError(f"time is {end:.9g} s, before the filter's {self.time:.9g} s; give the samples in order")
-        if step == 0.0:
-            self.repeated += 1
-            return
-        self._predict(increment, step, end)
+            raise InputError(f"time is {time:.9g} s, before the filter's {self.time:.9g} s; give the samples in order")
+        self.repeated += step == 0.0
+        self._predict(increment, step)
+        self.time = self.time + step if time is None else float(time)
 
-    def _predict(self, increment: Array, step: float, end: float) -> None:
+    def _running(self) -> list[StepFilter]:
+        """Return the filters that are propagated together."""
+        return [self]
+
+    def _predict(self, increment: Array, left: float) -> None:
         """Propagate in sub-steps, each as long as the series and the decay rates of the states allow."""
-        left = step
         while left > 0.0:
-            squared = turn_squared(increment, left, self.bias)
+            squared = max(turn_squared(increment, left, one.bias) for one in self._running())
             longest = float(min(step_within(squared, left), self._motion.limit))
             part = increment * (longest / left)
-            self._sub_step(part, longest)
+            for one in self._running():
+                one._sub_step(part, longest)
             increment, left = increment - part, left - longest if longest < left else 0.0
-        self.time = end
 
     def _sub_step(self, part: Array, dt: float) -> None:
         """Propagate over an increment at constant rate, with the kernels' functions."""
-        kernels, model = machine.instance(filter, STRUCTURE=self._motion.structure), self._numbers()
+        kernels = machine.instance(filter, STRUCTURE=self._motion.structure)
+        variances = self.process_noise.angle_random_walk**2, self.process_noise.rate_random_walk**2
+        model = kernel_model(self._motion, variances)
         x, phi, n = np.concatenate([self.attitude, self.bias, self.values]), tuple(part.tolist()), len(self.x)
         coefficients = np.zeros(kernels.SET * max(len(model.last), 1))
         kernels.fill_coefficients(coefficients, dt, model)
@@ -213,200 +189,59 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         self.values = x[7:]
         self.attitude = quaternion.normalize(x[:4])
 
-    def _numbers(self) -> structure.Model:
-        """Return the numbers of the model as the kernels' arguments."""
-        variances = self.process_noise.angle_random_walk**2, self.process_noise.rate_random_walk**2
-        return kernel_model(self._motion, variances)
+    def update(self, series: VectorMeasurements, k: int = 0) -> bool:
+        """Update with a sample of a series, whatever its time.
 
-    # ---------------------------------------------------------------------------------------------------------------- updates
-
-    def update(self, *arguments: Any, **options: Any) -> None:
-        """Raise an error: filterpy's updates by an ``Hx`` would leave the correction in ``x``, outside ``attitude`` and ``bias``.
+        filterpy's updates by an ``Hx`` would leave the correction in ``x``, outside ``attitude`` and ``bias``.
 
         Parameters
         ----------
-        *arguments, **options
-            Ignored.
-        """
-        raise InputError(
-            "an update by HJacobian and Hx would leave its correction in x, not in the attitude; use update_direction, update_vector, "
-            "update_heading or update_attitude"
-        )
-
-    predict_update = update
-
-    def update_direction(
-        self,
-        vector_b: ArrayLike,
-        reference_f: ArrayLike,
-        sigma: ArrayLike | None = None,
-        sensor: str = "",
-        *,
-        covariance: ArrayLike | None = None,
-    ) -> bool:
-        """Update with a measured unit direction: two degrees of freedom.
-
-        Parameters
-        ----------
-        vector_b : array_like (3,)
-            Measured unit vector, body axes; NaN if it is missing.
-        reference_f : array_like (3,)
-            Reference direction, fixed axes, of any length.
-        sigma : array_like () or (3,), optional
-            Standard deviation across the direction, rad; one, or one per body axis.
-        sensor : str
-            Name of the sensor.
-        covariance : array_like (3, 3), optional
-            Covariance of the noise, body axes, instead of ``sigma``; only the part across the direction is used.
+        series : VectorMeasurements
+            Measurements of a sensor.
+        k : int, default 0
+            Number of the sample.
 
         Returns
         -------
         bool
-            Whether the measurement was used; false if it is missing.
+            Whether the measurement was used; false if it is missing, or the heading of a vertical vector.
 
         Raises
         ------
         InputError
-            If a shape is wrong, or the noise is missing or not positive.
+            If the sensor is none of those named, or its noise is zero.
         """
-        return self._update_by_vector("direction", vector_b, reference_f, (sigma, covariance), sensor)
+        instance("series", series, VectorMeasurements, "give a series, as in the vectors of a record")
+        if self.sensors:
+            one_of("sensor", series.sensor, self.sensors)
+        sample = series.taken([k])
+        events = schedule((sample,), -np.inf, np.inf, anisotropic=True)
+        if not len(events.time):
+            return self._skip(series.sensor)
+        C = np.zeros((3, 3))
+        C[np.triu_indices(3)] = C.T[np.triu_indices(3)] = events.body_noise[0]
+        z = (0.0, 0.0, 0.0) if series.kind == "attitude" else tuple(events.vector_b[0].tolist())
+        length = float(np.linalg.norm(sample.references_f[0])) if series.kind == "vector" else 1.0
+        return self._measure(Measurement(series.kind, z, tuple(events.triads[0].tolist()), C, length), series.sensor)
 
-    def update_vector(
-        self,
-        vector_b: ArrayLike,
-        reference_f: ArrayLike,
-        sigma: ArrayLike | None = None,
-        sensor: str = "",
-        *,
-        covariance: ArrayLike | None = None,
-    ) -> bool:
-        """Update with a measured vector: three degrees of freedom.
-
-        Parameters
-        ----------
-        vector_b : array_like (3,)
-            Measured vector in body axes, in the unit of ``reference_f``.
-        reference_f : array_like (3,)
-            The same vector in the fixed frame.
-        sigma, sensor, covariance : optional
-            As for :meth:`update_direction`, but of each component, in that unit.
-
-        Returns
-        -------
-        bool
-            As for :meth:`update_direction`.
-        """
-        return self._update_by_vector("vector", vector_b, reference_f, (sigma, covariance), sensor)
-
-    def update_heading(
-        self,
-        vector_b: ArrayLike,
-        reference_f: ArrayLike,
-        sigma: float,
-        sensor: str = "",
-    ) -> bool:
-        """Update with the heading of a measured unit vector's horizontal part: one degree of freedom.
-
-        Parameters
-        ----------
-        vector_b : array_like (3,)
-            Measured unit vector in body axes; one that is vertical at the estimate has no heading and is skipped.
-        reference_f : array_like (3,)
-            The same vector in the fixed frame, whose z axis is vertical.
-        sigma : float
-            σ of the heading, rad.
-        sensor : str, optional
-            Name of the sensor.
-
-        Returns
-        -------
-        bool
-            Whether the measurement was used; false if it is missing or vertical.
-        """
-        return self._update_by_vector("heading", vector_b, reference_f, (sigma, None), sensor)
-
-    def update_attitude(
-        self,
-        attitude: ArrayLike,
-        sigma: ArrayLike | None = None,
-        sensor: str = "",
-        *,
-        covariance: ArrayLike | None = None,
-    ) -> bool:
-        """Update with a measured attitude: three degrees of freedom.
-
-        Parameters
-        ----------
-        attitude : array_like (4,)
-            Measured q_fb.
-        sigma, sensor, covariance : optional
-            As for :meth:`update_direction`, but about all body axes.
-
-        Returns
-        -------
-        bool
-            As for :meth:`update_direction`.
-        """
-        name = _label(sensor, "attitude")
-        given = array(name, attitude, (4,), allow_nan=True)
-        if np.isnan(given).any():
-            return self._skip(sensor)
-        frame = (*unit_quaternions(name, given).tolist(), 0.0, 0.0, 0.0, 0.0, 0.0)
-        noise = _noise_covariance(sensor, sigma, covariance)
-        return self._measure(_Measurement(kind="attitude", z=(0.0, 0.0, 0.0), frame=frame, noise=noise), sensor)
-
-    def _update_by_vector(
-        self,
-        kind: str,
-        vector_b: ArrayLike,
-        reference_f: ArrayLike,
-        noise: tuple[ArrayLike | None, ArrayLike | None],
-        sensor: str,
-    ) -> bool:
-        name, reference = _label(sensor, "vector_b"), _label(sensor, "reference_f")
-        z = array(name, vector_b, (3,), allow_nan=True)
-        if np.isnan(z).any():
-            return self._skip(sensor)
-        if kind != "vector":
-            need_unit(name, z)
-        r = array(reference, reference_f, (3,))
-        frame = triad(r)
-        if kind == "heading":
-            need_level(reference, frame[2])
-            positive(_label(sensor, "sigma"), noise[0], unit="rad")  # type: ignore[arg-type]
-        length = float(np.linalg.norm(r)) if kind == "vector" else 1.0
-        C = _noise_covariance(sensor, *noise) / length**2
-        frame_9 = tuple(frame.ravel().tolist())
-        z_3 = tuple((z / length).tolist())
-        return self._measure(_Measurement(kind=kind, z=z_3, frame=frame_9, length=length, noise=C), sensor)
-
-    def _need_known(self, sensor: str) -> None:
-        if self.sensors and sensor not in self.sensors:
-            raise InputError(
-                f"sensor is {sensor!r}, which is none of {', '.join(self.sensors)}; give one of these names, or name all sensors in "
-                "StepFilter(sensors=…)"
-            )
+    predict_update = update
 
     def _skip(self, sensor: str) -> bool:
-        self._need_known(sensor)
-        self._missing[sensor] = self._missing.get(sensor, 0) + 1
+        self.skipped[sensor] = self.skipped.get(sensor, 0) + 1
         return False
 
-    def _measure(self, measurement: _Measurement, sensor: str) -> bool:
+    def _measure(self, measurement: Measurement, sensor: str) -> bool:
         """Update with a measurement."""
-        self._need_known(sensor)
-        if self.error_states and self._kinds.setdefault(sensor, measurement.kind) != measurement.kind:
-            raise InputError(
-                f"{sensor or 'the sensor'} gave kind {self._kinds[sensor]!r} before, now {measurement.kind!r}; name each sensor"
-            )
         if not measurement.has_direction(self.attitude):
-            self._vertical[sensor] = self._vertical.get(sensor, 0) + 1
-            return False
-        residual, H, noise = self._rows(measurement, sensor)
-        self.dim_z = len(residual)
-        self.nis = float(residual @ np.linalg.solve(H @ self.P @ H.T + noise, residual))
-        unit = measurement.length
-        correction = self._filterpy_update(unit * residual, unit * H, unit**2 * noise)
+            return self._skip(sensor)
+        model, x = self._model(sensor, measurement.kind), np.concatenate([self.attitude, self.bias, self.values])
+        kernels = machine.instance(filter, STRUCTURE=model.structure)
+        rows, residual, axes, _, _ = kernels.rows_and_axes(0, x, measurement, model.numbers, 0.0)
+        unit, T = measurement.length, np.array(axes)
+        y, H, R = unit * np.array(residual), unit * np.array(rows, np.float64), unit**2 * T @ measurement.noise @ T.T
+        self.dim_z = len(y)
+        self.nis = float(y @ np.linalg.solve(H @ self.P @ H.T + R, y))
+        correction = self._filterpy_update(y, H, R)
         G = np.eye(len(self.P))
         G[:3, :3] = kinematics.right_jacobian(correction[:3])
         self._move(correction, G @ self.P @ G.T)
@@ -424,56 +259,18 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         self.attitude = quaternion.normalize(quaternion.multiply(before, quaternion.exp(correction[:3])))
         self.bias, self.values = self.bias + correction[3:6], self.values + correction[6:]
         T = self._motion.turning_matrix(before, self.attitude)
-        self.values, P = T[6:, 6:] @ self.values, T @ P @ T.T
-        self.P = P
-        self.P_post = P.copy()
+        self.values, self.P = T[6:, 6:] @ self.values, T @ P @ T.T
+        self.P_post = self.P.copy()
 
-    def _sensor_model(self, sensor: str, kind: str) -> modelling.Model:
-        key = (sensor if self.error_states else "", kind)
-        if key not in self._sensor_models:
-            self._sensor_models[key] = self._model(*key)
-        return self._sensor_models[key]
-
-    def _rows(self, measurement: _Measurement, sensor: str) -> tuple[Array, Array, Array]:
-        """Return residual (d,), H (d, n) and noise (d, d) of a measurement, from the kernels' function."""
-        model, x = self._sensor_model(sensor, measurement.kind), np.concatenate([self.attitude, self.bias, self.values])
-        kernels = machine.instance(filter, STRUCTURE=model.structure)
-        measured = structure.Measured(measurement.z, measurement.frame, (), measurement.length, (0.0,) * 9)
-        rows, y, axes, _, _ = kernels.rows_and_axes(0, x, measured, model.numbers, 0.0)
-        T = np.array(axes)
-        return np.array(y), np.array(rows, np.float64), (T @ measurement.noise @ T.T)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Measurement:
-    """A measurement as the arguments of :func:`strapdown.kernels.filter.rows_and_axes`."""
-
-    kind: str
-    z: tuple[float, ...]
-    """The measured vector over ``length``, body axes."""
-    frame: tuple[float, ...]
-    """The triad of the reference by rows, or the measured quaternion and zeros."""
-    length: float = 1.0
-    """Length of a vector's reference; else 1."""
-    noise: Array
-    """Covariance of ``z``, body axes (3, 3); for a heading its variance on the diagonal."""
-
-    def has_direction(self, attitude: Array) -> bool:
-        """Return whether the measurement has information: all except the heading of a vector that is vertical at this attitude."""
-        if self.kind != "heading":
-            return True
-        return bool(has_heading(rotation_matrix(tuple(attitude.tolist())), self.z))
-
-
-def _label(sensor: str, name: str) -> str:
-    """Return the name of a value for messages."""
-    return f"{sensor}: {name}" if sensor else name
-
-
-def _noise_covariance(sensor: str, sigma: ArrayLike | None, covariance_b: ArrayLike | None) -> Array:
-    """Return the covariance (3, 3) in body axes from one σ, three σ, or itself."""
-    if (sigma is None) == (covariance_b is None):
-        raise InputError("give either sigma or covariance: the noise of the measurement")
-    if sigma is None:
-        return covariance(_label(sensor, "covariance"), np.asarray(covariance_b), 3)
-    return np.diag(by_axis(_label(sensor, "sigma"), sigma, ", or a matrix as covariance") ** 2)
+    def _model(self, sensor: str, kind: str) -> modelling.Model:
+        """Return the error states as arrays, in the order of their declarations, with their effects on one sensor only."""
+        if (sensor, kind) not in self._models:
+            kinds = {name: "vector" for block in self.error_states for name in block.effects} | {sensor: kind}
+            model = modelling.assemble(self.error_states, kinds, isotropic=False)
+            if model.levers.any() or model.varying:
+                raise InputError(
+                    "lever arms, and effects relative to a varying field magnitude, need the whole record; use estimation.run for them"
+                )
+            here = model.structure.sensors[model.shape[list(kinds).index(sensor)]]
+            self._models[sensor, kind] = replace(model, structure=model.structure._replace(sensors=(here,)))
+        return self._models[sensor, kind]

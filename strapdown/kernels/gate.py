@@ -283,6 +283,7 @@ def iterated_update(form, i, e, measured, passes, options):
     z = value_of(measured, place, sensor)
     degrees = degrees_of_freedom(kind)
     threshold = options.thresholds[degrees - 1]
+    parameter, numerator = options.parameters[degrees - 1, 0], options.parameters[degrees - 1, 1]
     state = load(form, i)
     q = attitude_of(state)
     R = rotation_matrix(q)
@@ -313,7 +314,13 @@ def iterated_update(form, i, e, measured, passes, options):
         if done == 1 and trials == 0:
             first_e = (e1, e2, e3)
             first_F = F
-        u = solved(F, (far * y[0] - p[0], far * y[1] - p[1], innovation[2]))
+        weight, weighted = 1.0, F
+        if options.robust > 0:
+            # Linearised at the result of the weighted update: that of an outlier lies elsewhere.
+            weight = robust_weight(options.robust, parameter, numerator, options.iterations, S, innovation, variance)
+            r = scale(1.0 / weight, variance)
+            weighted = factored((S[0] + r[0], S[1], S[2], S[3] + r[1], S[4], S[5] + r[2]))
+        u = solved(weighted, (far * y[0] - p[0], far * y[1] - p[1], innovation[2]))
         step, squared = step_of(form, i, state, rows, u, M, prior, q, now_q)
         converged = squared < tolerance * tolerance
         fresh = False
@@ -334,18 +341,13 @@ def iterated_update(form, i, e, measured, passes, options):
         M, prior = tangent_at(quaternion_multiply((q[0], -q[1], -q[2], -q[3]), now_q), A)
         relinearise(form, i, q, old_q, now_q, prior, fresh)
         done += 1
-    weight = 0.0
     lost = False
     outcome = REFUSED
     if kind == HEADING and tilt_variance(R, A) > UNKNOWN_TILT:
-        outcome = PASSED_OVER
+        outcome, weight = PASSED_OVER, 0.0
     elif accepted:
         outcome = ACCEPTED
-        weight = 1.0
         lost = min(F[3] * variance[0], F[4] * variance[1], F[5] * variance[2]) < 1.0 / MAX_PRECISION
-        if options.robust > 0:
-            parameter, numerator = options.parameters[degrees - 1, 0], options.parameters[degrees - 1, 1]
-            weight = robust_weight(options.robust, parameter, numerator, options.iterations, S, innovation, variance)
         state, taken = correct(form, i, state, rows, innovation, scale(1.0 / weight, variance))
         taken = add(prior, matrix_times_vector(M, taken))
         state = turn_tangent(form, i, state, M)
@@ -355,4 +357,6 @@ def iterated_update(form, i, e, measured, passes, options):
             _, G = seen_from(taken, A)
         state = turn_tangent(form, i, state, G)
         save(form, i, set_attitude(form, i, state, new_q, q))
+    else:
+        weight = 0.0
     return outcome, weight, (e1, e2, e3), (1.0 / F[3], 1.0 / F[4], 1.0 / F[5]), lost

@@ -12,14 +12,11 @@ from typing import NamedTuple
 import numpy as np
 
 from strapdown.kernels.algebra import (
-    combine,
     dot,
     matrix_times_vector,
-    symmetric_times_vector,
     transpose_times_vector,
 )
 from strapdown.kernels.lane_values import element, select
-from strapdown.kernels.rotation import logarithm, quaternion_multiply
 
 DIRECTION = 0
 """Kind: a unit direction, two degrees of freedom."""
@@ -112,16 +109,6 @@ def frame_of(measured, place, sensor):
     return frame_at(measured.triads, frame_row(measured, place, sensor))
 
 
-def noise_of(measured, place, sensor, kind, z):
-    """Return the covariance of a measurement in body axes (6-tuple); for a heading its first number is the variance."""
-    if len(measured.noise) > 0:
-        return six_at(measured.noise, place)
-    if kind == ATTITUDE:
-        return (z[0], 0.0, 0.0, z[1], 0.0, z[2])
-    sigma = sigma_of(measured, place, sensor)
-    return (sigma * sigma, 0.0, 0.0, sigma * sigma, 0.0, sigma * sigma)
-
-
 def degrees_of_freedom(kind):
     """Return the number of degrees of freedom of a measurement of a kind."""
     if kind == HEADING:
@@ -171,47 +158,6 @@ def heading_error(R, z, reference):
     """Return the angle about the fixed z axis from the horizontal part of R z to that of ``reference``, rad in (−π, π]."""
     x, y, _ = matrix_times_vector(R, z)
     return math.atan2(x * reference[1] - y * reference[0], x * reference[0] + y * reference[1])
-
-
-def measurement_rows(kind, q, R, z, frame, noise):
-    """Return (h1, h2, h3, y1, y2, y3, covariance of the rows); ``frame`` the triad of the reference by rows, or a measured quaternion.
-
-    ``noise`` is the covariance in body axes (6-tuple); for a heading its first number is the variance. A measurement of fewer than three
-    degrees of freedom is completed by rows of h = 0, y = 0 and unit variance, which have no effect. Scalars only.
-    """
-    none = (0.0, 0.0, 0.0)
-    if kind == ATTITUDE:
-        y = logarithm(quaternion_multiply((q[0], -q[1], -q[2], -q[3]), frame[:4]))
-        return (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), y[0], y[1], y[2], noise
-    if kind == HEADING:
-        error = heading_error(R, z, frame[6:])
-        return heading_row(R, z), none, none, error, 0.0, 0.0, (noise[0], 0.0, 0.0, 1.0, 0.0, 1.0)
-    h1, y1, h2, y2 = direction_rows(R, frame[:3], frame[3:6], z)
-    ub = h2
-    vb = (-h1[0], -h1[1], -h1[2])
-    nu = symmetric_times_vector(noise, ub)
-    nv = symmetric_times_vector(noise, vb)
-    if kind == VECTOR:
-        rb = transpose_times_vector(R, frame[6:])
-        nr = symmetric_times_vector(noise, rb)
-        covariance = (dot(ub, nu), dot(ub, nv), dot(ub, nr), dot(vb, nv), dot(vb, nr), dot(rb, nr))
-        return h1, h2, none, y1, y2, dot(rb, z) - 1.0, covariance
-    return h1, h2, none, y1, y2, 0.0, (dot(ub, nu), dot(ub, nv), 0.0, dot(vb, nv), 0.0, 1.0)
-
-
-def independent_rows(h1, h2, h3, y1, y2, y3, noise):
-    """Return the rows by L⁻¹ of ``noise = L D Lᵀ`` and the three variances D: exact decorrelation, units kept."""
-    l21 = noise[1] / noise[0]
-    l31 = noise[2] / noise[0]
-    d2 = noise[3] - l21 * noise[1]
-    m32 = noise[4] - l21 * noise[2]
-    l32 = m32 / d2
-    d3 = noise[5] - l31 * noise[2] - l32 * m32
-    h2 = combine(1.0, h2, -l21, h1)
-    y2 = y2 - l21 * y1
-    h3 = combine(1.0, combine(1.0, h3, -l31, h1), -l32, h2)
-    y3 = y3 - l31 * y1 - l32 * y2
-    return h1, h2, h3, y1, y2, y3, (noise[0], d2, d3)
 
 
 def merge_order(time, heads, ends, ordered, place, sensor):

@@ -64,7 +64,7 @@ OPEN = (
     "write_noise",
     "write_transition",
 )
-CALLED = ("factorise", "solve", "subtract_products", "load_segment", "gather_small_columns", "clear_rows", "copy_rows")
+CALLED = ("factorise", "solve", "subtract_products", "load_segment", "gather_small_columns", "clear_rows")
 
 
 class Models(NamedTuple):
@@ -216,8 +216,6 @@ def step_back(segments, k, models, space):
         clear_rows(work, kept, width)
     subtract_products(gain, later_P, work, n, noisy)
     rows_to_noisy(work, later_P)
-    if small:
-        copy_rows(later_P, kept, space.states, n, width)
     correct_filtered(x, error, later_x, later_P)
 
 
@@ -251,15 +249,6 @@ def clear_rows(A, kept, width):
     for r in range(len(kept)):
         for c in range(width):
             A[width * r + c] *= kept[r]
-
-
-def copy_rows(P, kept, states, n, width):
-    """Copy the rows of these states to their columns, whose elements are differences."""
-    for r in range(len(kept)):
-        if kept[r] == 0.0:
-            k = states[r]
-            for i in range(n):
-                P[width * i + k] = P[width * k + i]
 
 
 def reduce_error(error, gain, kept, states, n):

@@ -7,16 +7,17 @@ its gains, so that its consistency can be tested like that of the others.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from strapdown.checks import Array, array, count
-from strapdown.estimation.forward import gaps
-from strapdown.estimation.schedule import Schedule, innovations_by_sensor, schedule, skipped_too
-from strapdown.estimation.states import ProcessNoise, State, check_arguments, covariance_matrices, pack
-from strapdown.kernels import complementary
-from strapdown.kernels.machine import compiled, read_only
+from strapdown.estimation import forward
+from strapdown.estimation.schedule import Schedule, innovations_by_sensor, skipped_too
+from strapdown.estimation.states import ProcessNoise, State
+from strapdown.kernels import complementary, structure
+from strapdown.kernels.machine import compiled
 from strapdown.kernels.walk import walk
 from strapdown.records import Estimate, ImuRecord
 
@@ -73,29 +74,33 @@ def run(
     Default: Farrenkopf's for all sensors together, divided among them by information, with random walks increased by the initial
     standard deviations of attitude and bias over the record: a fixed gain must be suitable for the start as well as the end.
     """
-    check_arguments(record=record, process_noise=process_noise, initial=initial)
     count("every", every)
-    events = schedule(record.vectors, record.time[0], record.time[-1], anisotropic=True)
+    problem = forward.with_any_sensor(forward.prepared(record, process_noise, initial, ()))
+    events = problem.events
     chosen = _steady_gains(record, events, process_noise, initial) if gains is None else gains
-    states, innovation = np.empty((len(record.increments) // every + 1, 28)), np.empty((len(events.time), 6))
+    rows = len(record.increments) // every + 1
+    shapes = (
+        (rows, 7),
+        (rows, 6),
+        (rows if full_covariance else 0, 6, 6),
+        (0, 6),
+        (0, 6, 6),
+        (len(events.time), 6),
+        (0, 0),
+    )
+    out = structure.Outputs._make(np.empty(shape) for shape in shapes)
     body = complementary.Body(
-        state=pack(initial.attitude, initial.bias, initial.covariance),
-        angle_variance=process_noise.angle_random_walk**2,
-        rate_variance=process_noise.rate_random_walk**2,
+        form=forward.filter_body(problem, {}),
+        options=forward.gate_options(None, None)._replace(thresholds=np.full(3, -1.0)),
         gains=array("gains", chosen, (2, len(events.sensors))),
+        room=np.empty((2, 6, 6)),
     )
-    out = complementary.Outputs(states=states, innovation=innovation)
-    compiled(walk, complementary)(
-        read_only(record.time), read_only(record.increments), events.measurements, every, body, out
-    )
-    covariance, innovations = covariance_matrices(states[:, 7:]), innovations_by_sensor(events, innovation)
-    return Estimate(
-        time=record.time[::every],
-        attitude=states[:, :4],
-        bias=states[:, 4:7],
-        variance=np.diagonal(covariance, axis1=1, axis2=2).copy(),
-        covariance=covariance if full_covariance else None,
+    measured, kernels = forward.measurements_in_body_axes(events), forward.instance_of(problem.model)
+    compiled(walk, complementary, kernels)(*problem.gyro, measured, every, body, out)
+    innovations = innovations_by_sensor(events, out.innovation)
+    return replace(
+        forward.estimate_of(problem, every, out.x, out.variance, out.covariance if full_covariance else None),
         innovations=innovations,
         skipped=skipped_too(events, innovations),
-        events=tuple(gaps(record)),
+        events=tuple(forward.gaps(record)),
     )
