@@ -54,7 +54,6 @@ class _Model:
         help="TOML with a table named dispersions: initial errors and gyro parameters that differ from run to run.",
     )
     seed: int | None = Option(None, help="Seed. Default: that of the scenario.")
-    float32: bool = Option(False, "--float32", help="Compute in single precision; only with lanes.")
     states: bool | None = STATES
 
 
@@ -129,7 +128,7 @@ def _planned(source: Path, scenario: str, model: _Model, machine: str) -> tuple[
             raise InputError(f"{name} is given, but {source} contains its own; leave it out, or name a scenario")
         return held, held.plan
     given = None if model.filter_file is None or own is not None else read_setup(model.filter_file)
-    states = False if model.states is None and (model.float32 or machine == "lanes") else model.states
+    states = False if model.states is None and machine == "lanes" else model.states
     plan = workflows.plan(
         scenarios.load_scenario(scenario),
         gyro=None if model.gyro is None else read_spec(model.gyro),
@@ -137,7 +136,6 @@ def _planned(source: Path, scenario: str, model: _Model, machine: str) -> tuple[
         seed=model.seed,
         states=None if model.filter_file is not None and model.states is None else states,
         dispersions=None if model.dispersions is None else engine.read_dispersions(model.dispersions),
-        precision="float32" if model.float32 else "float64",
     )
     if states is None and model.filter_file is None and plan.setup.states is not None:
         console.print(workflows.state_words(plan.setup.states.names))

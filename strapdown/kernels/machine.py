@@ -248,5 +248,5 @@ def describe() -> dict[str, str]:
         "cpu": llvmlite.binding.get_host_cpu_name(),
         "numba": numba.__version__,
         "llvm": ".".join(str(part) for part in llvmlite.binding.llvm_version_info),
-        "lanes": "8 runs at once in float64, 16 in float32" if has_vectors() else "1 run at once: no vectors",
+        "lanes": "8 runs at once" if has_vectors() else "1 run at once: no vectors",
     }

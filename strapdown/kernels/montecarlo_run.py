@@ -1,4 +1,4 @@
-"""Monte Carlo runs in lanes (SIMD): gyro errors, sensors and filter of 1, 8 or 16 runs at once, along one common motion.
+"""Monte Carlo runs in lanes (SIMD): gyro errors, sensors and filter of 1 to 8 runs at once, along one common motion.
 
 Truth, times and all else common to the runs are plain arrays; values that differ between runs are lanes. Each run has its own random
 streams (:func:`strapdown.kernels.noise.stream_state`, with one key per source and the run's number), so it does not depend on its
@@ -26,12 +26,10 @@ from strapdown.kernels.algebra import (
 from strapdown.kernels.filter_step import predict, update_direction_and_judge, update_heading, update_residual
 from strapdown.kernels.lane_angles import arctangent, inverse_root, rotation_vector
 from strapdown.kernels.lane_values import (
-    flush_tiny,
     halves,
     lanes_of,
     load_like,
     narrowed,
-    restore_mode,
     select,
     store,
 )
@@ -443,7 +441,6 @@ def advance(pattern, numbers, keys, gyro, start, events, every, draws, out, deta
     """
     like = lanes_of(pattern)
     one = like + 1.0
-    mode = flush_tiny(like)
     count = len(events.time)
     edges = gyro.edges
     steps = len(gyro.increments)
@@ -497,4 +494,3 @@ def advance(pattern, numbers, keys, gyro, start, events, every, draws, out, deta
             keep(out.kept, row, like, q, b, A, B, C, bias)
             row += 1
         countdown -= 1
-    restore_mode(mode)

@@ -53,16 +53,14 @@ def choose(plan: Plan, machine: str = "auto") -> Choice:
     The choice depends only on the plan, because the machines draw different noise.
     """
     one_of("machine", machine, ("auto", *MACHINES))
-    reasons: dict[str, str] = {}
-    for name in MACHINES if machine == "auto" else (machine,):
-        reason = MACHINES[name].supports(plan)
-        if reason is None:
-            return Choice(machine=name, reason=reasons.get("lanes", ""))
-        reasons[name] = reason
-    refusals = "; ".join(f"{name}: {reason}" for name, reason in reasons.items())
-    raise InputError(
-        f"no machine covers this plan ({refusals}); use a simpler filter or scenario, or precision float64"
-    )
+    reason = None if machine == scalar.NAME else lanes.supports(plan)
+    if reason is None:
+        return Choice(machine=scalar.NAME if machine == scalar.NAME else lanes.NAME)
+    if machine == lanes.NAME:
+        raise InputError(
+            f"the lanes do not cover this plan: {reason}; use the machine scalar, or a simpler filter or scenario"
+        )
+    return Choice(machine=scalar.NAME, reason=reason)
 
 
 class Identity(NamedTuple):

@@ -1,4 +1,4 @@
-"""The lane machine: noise, sensors and filter of 8 runs (double precision) or 16 (single) at once, one per SIMD lane, compiled together.
+"""The lane machine: noise, sensors and filter of eight runs at once, one per SIMD lane, compiled together.
 
 The motion, the times of the measurements and all else common to the runs are computed once per plan; only the noise differs. Its random
 streams depend only on (seed, run, source), and the filter is the scalar machine's source, so run k is bitwise identical for any chunk,
@@ -7,10 +7,6 @@ number of lanes, threads and host (with fused multiply-add). The noise has the d
 Two things are simpler than in the simulator. With a coning algorithm of N samples the noise is drawn once per filter step, with exactly the
 distribution of the sum of N samples, and does not enter the cross products; their contribution is below the rotation over a sample times
 the noise. Flicker is generated at the filter's steps, not at the gyro's samples.
-
-In single precision the attitude is rounded to 6e-8 rad, which over the filter's steps adds up to a random walk. Error and covariance
-therefore agree with those of double precision only if both are above about 1e-5 rad; :func:`supports` refuses plans with more precise
-sensors.
 """
 
 from __future__ import annotations
@@ -59,8 +55,6 @@ GROUP = 8
 """Number of runs summed together: the same for every number of lanes."""
 LARGEST_START = 0.5
 """Maximum σ of the initial attitude error for which its rotation is accurate to rounding, rad."""
-FINEST_SINGLE = 2e-5
-"""Minimum σ of the most precise sensor for single precision, rad."""
 
 _SOURCES = ("gyro", "gyro flicker", "gyro markov", "gyro turn-on", "initial error", "dispersions")
 _NOT_OF_THE_GYRO = {
@@ -109,11 +103,8 @@ def _reasons(plan: Plan) -> Iterator[str]:
         yield f"an initial attitude error of more than {LARGEST_START} rad, 1 sigma"
     if plan.setup.integration.samples > 1 and plan.dispersions.of_the_gyro:
         yield "gyro parameters that differ from run to run with several gyro samples a filter step"
-    prepared = _prepared(plan)
-    if prepared.saturates:
+    if _prepared(plan).saturates:
         yield "a gyro range so close to the motion's rates that the gyro may saturate"
-    if plan.precision == "float32" and prepared.finest < FINEST_SINGLE:
-        yield f"float32 with a sensor of {prepared.finest:.2g} rad, finer than {FINEST_SINGLE:g} rad"
 
 
 # ---------------------------------------------------------------------------------------------- common to all runs
@@ -135,7 +126,6 @@ class _Prepared:
     """Degrees of freedom of one run by sensor and time bin (s, k)."""
     keys: np.ndarray
     saturates: bool
-    finest: float
 
 
 _PREPARED: weakref.WeakKeyDictionary[Plan, _Prepared] = weakref.WeakKeyDictionary()
@@ -179,13 +169,12 @@ def _prepare(plan: Plan) -> _Prepared:
     modelled = setup.modelled_record(replace(quiet, vectors=series), plan.setup)
     events = schedule(modelled.vectors, float(record.time[0]), float(record.time[-1]))
     values = [_exact(sensor, scenario, own) for sensor, own in zip(scenario.sensors, series, strict=True)]
-    real = _real(plan)
     gyro = montecarlo_run.Gyro(
         np.ascontiguousarray(record.time),
         _substeps(record),
-        np.ascontiguousarray(record.increments, real),
-        np.ascontiguousarray(turns.reshape(-1, n, 3).sum(axis=1), real),
-        np.ascontiguousarray(quiet.truth.bias[::n], real),
+        np.ascontiguousarray(record.increments),
+        np.ascontiguousarray(turns.reshape(-1, n, 3).sum(axis=1)),
+        np.ascontiguousarray(quiet.truth.bias[::n]),
         *_gyro_terms(plan, n * dt, len(record.increments)),
     )
     noise = plan.setup.process_noise
@@ -214,7 +203,6 @@ def _prepare(plan: Plan) -> _Prepared:
         degrees=degrees,
         keys=_keys(plan),
         saturates=bool(np.any(np.abs(turns) / dt + 10.0 * rate_sigma > spec.range)),
-        finest=float(np.sqrt(min(events.variance, default=1.0))),
     )
     return prepared
 
@@ -223,11 +211,6 @@ def _substeps(record: ImuRecord) -> Array:
     """Return, for each step of a record (n,), the longest time, s, over which the filter's polynomials hold: at most the step."""
     angle = np.linalg.norm(record.increments, axis=1)
     return np.asarray(record.intervals * np.minimum(1.0, LARGEST_ANGLE / np.maximum(angle, LARGEST_ANGLE)))
-
-
-def _real(plan: Plan) -> Any:
-    """Return the floating-point type of the runs. Common data have it too: converting a number at each step costs more than using it."""
-    return np.float32 if plan.precision == "float32" else np.float64
 
 
 def _keys(plan: Plan) -> np.ndarray:
@@ -264,7 +247,6 @@ def _gyro_terms(plan: Plan, dt: float, steps: int) -> tuple[Any, ...]:
         ]
     )
     shaping = flicker.shaping(steps)
-    real = _real(plan)
     flickers = bool(np.any(instability > 0.0))
     covariance = shaping.covariance
     scale = np.sqrt(np.diag(covariance))
@@ -274,9 +256,9 @@ def _gyro_terms(plan: Plan, dt: float, steps: int) -> tuple[Any, ...]:
     terms = np.array([np.any(walk > 0.0), np.any(markov > 0.0), flickers, np.any(dispersion > 0.0)])
     return (
         terms,
-        gyro.astype(real),
-        shaping.poles.astype(real),
-        shaping.gains.astype(real),
+        gyro,
+        shaping.poles,
+        shaping.gains,
         factor if flickers else np.empty((0, flicker.STATES)),
         dispersion,
     )
@@ -326,20 +308,19 @@ def _event_terms(plan: Plan, events: Schedule, values: list[tuple[Array, Array, 
             decay[mine[1:]] = np.exp(-np.diff(events.time[mine]) / faults.correlation_time)
             share[mine] = faults.correlated_sigma * length * np.sqrt(1.0 - decay[mine] ** 2)
     place = np.clip(np.searchsorted(plan.nis_edges, events.time, side="left") - 1, 0, plan.nis_bins - 1)
-    real = _real(plan)
     return montecarlo_run.Events(
         time=events.time,
         kind=events.kind,
         sensor=events.sensor.astype(np.int64),
         span=place.astype(np.int64),
-        exact=exact.astype(real),
-        sigma=sigma.astype(real),
-        variance=variance.astype(real),
-        decay=decay.astype(real),
-        share=share.astype(real),
+        exact=exact,
+        sigma=sigma,
+        variance=variance,
+        decay=decay,
+        share=share,
         number=number,
         frame=events.reference,
-        frames=events.triads.astype(real),
+        frames=events.triads,
         struck_below=struck,
         outlier_scale=scale,
     )
@@ -348,11 +329,9 @@ def _event_terms(plan: Plan, events: Schedule, values: list[tuple[Array, Array, 
 # ---------------------------------------------------------------------------------------------- running
 
 
-def width_of(precision: str) -> int:
-    """Return the number of runs computed at once on this processor: 8 or 16, or 1 if it has no SIMD vectors."""
-    if not _answered(machine.has_vectors):
-        return 1
-    return 16 if precision == "float32" else 8
+def runs_at_once() -> int:
+    """Return the number of runs computed at once on this processor: 8, or 1 if it has no SIMD vectors."""
+    return GROUP if _answered(machine.has_vectors) else 1
 
 
 @functools.cache
@@ -367,8 +346,7 @@ class _Group:
     def __init__(self, plan: Plan, width: int, *, every: int | None = None, detail: bool = False) -> None:
         self.prepared = _prepared(plan)
         self.width = width
-        real = _real(plan)
-        self.pattern = tuple(real(0.0) for _ in range(width))
+        self.pattern = (0.0,) * width
         self.every = plan.every if every is None else every
         steps, events, sensors = len(self.prepared.record.increments), len(self.prepared.events.time), len(plan.sensors)
         self.epochs = steps // self.every + 1
@@ -376,10 +354,10 @@ class _Group:
         self.draws = montecarlo_run.Draws(
             streams=np.empty(4 * len(self.prepared.keys) * width, np.uint64),
             ahead=np.empty(len(self.prepared.keys) * montecarlo_run.AHEAD * width, np.float32),
-            memory=np.empty(montecarlo_run.memory(sensors) * width, real),
+            memory=np.empty(montecarlo_run.memory(sensors) * width),
         )
         self.kept = np.empty(self.epochs * montecarlo_run.KEPT * width)
-        self.nis = np.zeros(self.places * width, real)
+        self.nis = np.zeros(self.places * width)
         # Without detail the kernel is compiled without the divisions that the innovations need.
         self.detail = (
             montecarlo_run.Detail(*(np.empty(size * width) for size in (3 * steps, 4 * events, 6 * events)))
@@ -407,7 +385,7 @@ class _Group:
 
 def run_chunk(plan: Plan, first_run: int, runs: int, *, width: int | None = None) -> Statistics:
     """Return the statistics of runs ``first_run`` to ``first_run + runs − 1``, ``width`` runs at once (default: that of the processor)."""
-    lanes = width_of(plan.precision) if width is None else width
+    lanes = runs_at_once() if width is None else width
     group = _Group(plan, lanes)
     m, s = plan.epochs + 1, len(plan.sensors)
     sums = np.zeros((m, montecarlo_statistics.SUMS, GROUP))

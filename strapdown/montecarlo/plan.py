@@ -14,13 +14,11 @@ from typing import Any
 import numpy as np
 
 from strapdown import scenarios
-from strapdown.checks import Array, InputError, array, count, non_negative, one_of
+from strapdown.checks import Array, InputError, array, count, non_negative
 from strapdown.estimation import setup
 from strapdown.estimation.setup import FilterSetup, need_setup
 from strapdown.files import tables
 from strapdown.scenarios import Scenario
-
-PRECISIONS = ("float64", "float32")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -124,8 +122,6 @@ class Plan:
     individuals : bool, default False
         Whether each run draws its own gyro and sensors (:func:`strapdown.scenarios.drawn`): the errors of the specification are then
         standard deviations, as in a filter with states for them. Otherwise every run has exactly those errors.
-    precision : {"float64", "float32"}, default "float64"
-        Floating-point format of the filter and the noise; "float32" only with a machine that supports it.
     """
 
     scenario: Scenario
@@ -135,13 +131,11 @@ class Plan:
     nis_bins: int = 100
     dispersions: Dispersions = field(default_factory=Dispersions)
     individuals: bool = False
-    precision: str = "float64"
 
     def __post_init__(self) -> None:
         """Check every field."""
         for name, least in (("seed", 0), ("epochs", 1), ("nis_bins", 1)):
             object.__setattr__(self, name, count(name, getattr(self, name), minimum=least))
-        one_of("precision", self.precision, PRECISIONS)
         need_setup(self.setup)
         if self.samples % (self.epochs * self.setup.integration.samples):
             raise InputError(
@@ -159,7 +153,7 @@ class Plan:
 
     def __hash__(self) -> int:
         """Return a hash that equal plans share."""
-        return hash((self.seed, self.epochs, self.nis_bins, self.precision))
+        return hash((self.seed, self.epochs, self.nis_bins))
 
     @property
     def samples(self) -> int:
@@ -207,7 +201,6 @@ class Plan:
             "epochs": self.epochs,
             "nis_bins": self.nis_bins,
             "dispersions": self.dispersions.to_table(),
-            "precision": self.precision,
             **({"individuals": True} if self.individuals else {}),
         }
 
@@ -227,7 +220,7 @@ def from_table(table: Mapping[str, Any]) -> Plan:
         setup=setup.from_table(table["filter"]),
         dispersions=_dispersions(table["dispersions"], "dispersions"),
         individuals=bool(table.get("individuals", False)),
-        **{name: table[name] for name in ("seed", "epochs", "nis_bins", "precision")},
+        **{name: table[name] for name in ("seed", "epochs", "nis_bins")},
     )
 
 

@@ -48,11 +48,6 @@ _TINY = float(np.finfo(np.float64).tiny)
 _OFF_DIAGONAL = ~np.eye(3, dtype=bool)
 
 
-def supports(plan: Plan) -> str | None:
-    """Return why this machine cannot compute a plan; None if it can."""
-    return None if plan.precision == "float64" else f"the scalar machine computes in float64, not {plan.precision}"
-
-
 def start(
     record: ImuRecord, filter_setup: FilterSetup, seed: int, run: int, dispersions: Dispersions | None = None
 ) -> estimation.State:
