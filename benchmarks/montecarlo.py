@@ -61,6 +61,22 @@ def with_states(seconds: float) -> Plan:
     return Plan(scenario=scenario, setup=setup, seed=1, epochs=100, nis_bins=100)
 
 
+def two_vectors(seconds: float) -> Plan:
+    """Return a plan with two directions per gyro sample and a gyro with error states for scale and misalignment: 15 states."""
+    rotation = motion.ConstantRate(rate=np.array([0.02, -0.03, 0.05]))
+    spec = GyroSpec(
+        angle_random_walk=1e-4, rate_random_walk=1e-6, scale_factor=np.full(3, 2e-4), turn_on_bias_sigma=1e-3
+    )
+    sensors = tuple(
+        vectors.VectorSensor(name=name, reference_f=r, sigma=0.01, rate=RATE)
+        for name, r in (("star", [0.3, 0.5, 1.0]), ("sun", [1.0, 0.0, 0.1]))
+    )
+    scenario = Scenario(motion=rotation, gyro=spec, sensors=sensors, rate=RATE, duration=seconds)
+    states = States(gyro_scale_sigma=3e-4, gyro_misalignment_sigma=1e-4)
+    setup = FilterSetup(process_noise=NOISE, attitude_sigma=0.02, bias_sigma=1e-3, states=states)
+    return Plan(scenario=scenario, setup=setup, seed=1, epochs=100, nis_bins=100)
+
+
 def least(work: Callable[[], Any], repeats: int) -> float:
     """Return the minimum process time of some calls after one to warm up, s."""
     work()
@@ -117,12 +133,19 @@ def main(*, steps: int = 10_000, runs: int = 160, repeats: int = 9) -> dict[str,
     one = plan(steps)
     # The first runs are kept as examples; later ones represent a campaign.
     full = least(lambda: lanes.run_chunk(one, 1000, runs), repeats) / runs / steps * 1e9
-    few, long = plan(2000), with_states(600.0)
+    few = plan(2000)
     peers = {
         "scalar machine": least(lambda: scalar.run_chunk(few, 100, 4), 3) / 4 / 2000 * 1e9,
-        "scalar machine, 12 error states, tracker at 2 Hz": least(lambda: scalar.run_chunk(long, 100, 4), 3)
-        / (4 * RATE * long.scenario.duration)
-        * 1e9,
+        **{
+            f"{name}, {count} error states, {words}": least(lambda p=one, m=run_chunk: m(p, 100, 8), 3)  # type: ignore[misc]
+            / (8 * one.samples)
+            * 1e9
+            for count, words, one in (
+                (12, "tracker at 2 Hz", with_states(600.0)),
+                (9, "two vectors", two_vectors(60.0)),
+            )
+            for name, run_chunk in (("lanes", lanes.run_chunk), ("scalar machine", scalar.run_chunk))
+        },
         "simdkalman 6x3": simdkalman_ns(repeats),
         "StepFilter on filterpy": filterpy_ns(repeats),
     }

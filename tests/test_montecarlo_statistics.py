@@ -418,7 +418,7 @@ def test_whole_epochs_cut_into_whole_steps():
 
 
 def test_gyro_dispersions_have_their_sigma_and_their_place():
-    gyros = [scalar.dispersed(SCENARIO.gyro, DISPERSED, 3, run) for run in range(500)]
+    gyros = [plan.dispersed(SCENARIO.gyro, DISPERSED, 3, run) for run in range(500)]
     off = ~np.eye(3, dtype=bool)
     draws = {
         1e-4: np.array([g.scale_factor - SCENARIO.gyro.scale_factor for g in gyros]),
@@ -431,14 +431,14 @@ def test_gyro_dispersions_have_their_sigma_and_their_place():
     correlation = np.corrcoef(together.T) - np.eye(12)
     assert np.abs(correlation).max() < 4.5 / np.sqrt(500)
     assert all(np.all(np.diag(g.misalignment) == 0.0) for g in gyros)
-    assert scalar.dispersed(SCENARIO.gyro, montecarlo.Dispersions(), 3, 1) is SCENARIO.gyro
+    assert plan.dispersed(SCENARIO.gyro, montecarlo.Dispersions(), 3, 1) is SCENARIO.gyro
 
 
 def test_a_dispersed_gyro_is_the_one_that_is_simulated():
     only = montecarlo.Dispersions(scale_factor_sigma=1e-3)
     record = scalar.record_of(planned(dispersions=only), 5)
     plain = scenarios.simulate(SCENARIO, PLAN.seed, 5)
-    spec = scalar.dispersed(SCENARIO.gyro, only, PLAN.seed, 5)
+    spec = plan.dispersed(SCENARIO.gyro, only, PLAN.seed, 5)
     turned = (record.increments - plain.increments).sum(axis=0) / np.deg2rad(60.0 * 2.4)
     assert turned[2] == pytest.approx(spec.scale_factor[2] - SCENARIO.gyro.scale_factor[2], rel=1e-6)
     origin = montecarlo.replay(planned(dispersions=only), 5, machine="scalar").record.origin

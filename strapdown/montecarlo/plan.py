@@ -8,7 +8,7 @@ import hashlib
 import json
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,8 @@ from strapdown.checks import Array, InputError, array, count, non_negative
 from strapdown.estimation import setup
 from strapdown.estimation.setup import FilterSetup, need_setup
 from strapdown.files import tables
+from strapdown.gyro import GyroSpec
+from strapdown.randomness import generator
 from strapdown.scenarios import Scenario
 
 
@@ -83,6 +85,21 @@ def initial_sigmas(dispersions: Dispersions, setup: FilterSetup) -> tuple[float,
     return (
         setup.attitude_sigma if dispersions.attitude_sigma is None else dispersions.attitude_sigma,
         setup.bias_sigma if dispersions.bias_sigma is None else dispersions.bias_sigma,
+    )
+
+
+def dispersed(spec: GyroSpec, dispersions: Dispersions, seed: int, run: int) -> GyroSpec:
+    """Return the gyro of one run: three scale factors, six misalignments by rows and three turn-on biases are drawn, in this order."""
+    if not dispersions.of_the_gyro:
+        return spec
+    draw = generator(seed, run, "dispersions").standard_normal(12)
+    misalignment = spec.misalignment.copy()
+    misalignment[~np.eye(3, dtype=bool)] += dispersions.misalignment_sigma * draw[3:9]
+    return replace(
+        spec,
+        scale_factor=spec.scale_factor + dispersions.scale_factor_sigma * draw[:3],
+        misalignment=misalignment,
+        turn_on_bias=spec.turn_on_bias + dispersions.turn_on_bias_sigma * draw[9:],
     )
 
 
@@ -209,6 +226,13 @@ class Plan:
         """SHA-256 of :meth:`to_table`."""
         text = json.dumps(self.to_table(), sort_keys=True, allow_nan=False, default=float)
         return hashlib.sha256(text.encode()).hexdigest()
+
+
+def unit(plan: Plan, run: int, scenario: Scenario | None = None) -> Scenario:
+    """Return the scenario of one run, with its own gyro and sensors; ``scenario``: the plan's, prepared."""
+    common = plan.scenario if scenario is None else scenario
+    own = scenarios.drawn(common, plan.seed, run) if plan.individuals else common
+    return replace(own, gyro=dispersed(own.gyro, plan.dispersions, plan.seed, run))
 
 
 def from_table(table: Mapping[str, Any]) -> Plan:
