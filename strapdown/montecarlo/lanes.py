@@ -24,7 +24,7 @@ import numpy as np
 
 from strapdown import estimation, quaternion, vectors
 from strapdown.checks import Array, count
-from strapdown.estimation import forward, setup, temperature
+from strapdown.estimation import forward, setup
 from strapdown.estimation.forward import Problem
 from strapdown.estimation.schedule import innovations_by_sensor, skipped_too
 from strapdown.estimation.states import covariance_matrices
@@ -112,14 +112,12 @@ def _reasons(plan: Plan) -> Iterator[str]:
             yield f"the filter's {option} option"
     if initial_sigmas(plan.dispersions, plan.setup)[0] > LARGEST_START:
         yield f"an initial attitude error of more than {LARGEST_START} rad, 1 sigma"
-    if plan.setup.integration.samples > 1 and _units_differ(plan):
-        yield "gyro parameters that differ from run to run with several gyro samples a filter step"
-    if plan.setup.integration.samples > 1 and (
-        np.isfinite(spec.range) or np.any(np.asarray(spec.rate_resolution) > 0.0)
-    ):
-        yield "a gyro of limited range or resolution with several gyro samples a filter step"
-    prepared = _prepared(plan)
-    if temperature.slopes(prepared.problem.error_states) is not None:
+    if plan.setup.integration.samples > 1:
+        if _units_differ(plan):
+            yield "gyro parameters that differ from run to run with several gyro samples a filter step"
+        if np.isfinite(spec.range) or np.any(np.asarray(spec.rate_resolution) > 0.0):
+            yield "a gyro of limited range or resolution with several gyro samples a filter step"
+    if plan.setup.states is not None and np.any(plan.setup.states.gyro_temperature_sigma):
         yield "a state of the gyro's bias over temperature"
 
 
@@ -419,27 +417,28 @@ class _Group:
 
     def advance(self, first: int) -> None:
         """Compute the runs from index ``first`` on."""
-        prepared, draws = self.prepared, self.draws
+        draws = self.draws
         draws.numbers[:] = np.arange(first, first + WIDTH)
         self.nis[:] = 0.0
         if _units_differ(self.plan):
-            draws.units.reshape(-1, WIDTH)[:] = np.transpose(
-                [_differences(self.plan, run) for run in range(first, first + WIDTH)]
-            )
+            differences = [_differences(self.plan, run) for run in range(first, first + WIDTH)]
+            draws.units[:] = np.transpose(differences).ravel()
         lost = self._run()
-        if (
-            self.levers
-        ):  # the angular acceleration is that of the samples around a measurement: the gyro's are drawn before
-            problem, increments = prepared.problem, draws.increments.reshape(-1, 3, WIDTH)
-            records = [
-                replace(problem.record, increments=np.ascontiguousarray(one)) for one in np.moveaxis(increments, -1, 0)
-            ]
-            turns = [forward.turns(replace(problem, record=record)) for record in records]
-            self.filters = self.filters._replace(turning=np.stack(turns, axis=-1).reshape(-1))
+        if self.levers:
+            # The angular acceleration is that of the samples around a measurement: the gyro's are drawn in the first pass.
+            self.filters = self.filters._replace(turning=self._turns())
             self.nis[:] = 0.0
             lost = self._run()
         if lost:
             raise forward.TooPreciseError
+
+    def _turns(self) -> Array:
+        """Return the measured motion of a lever arm at the events (events, 9, runs), flat, from the increments drawn."""
+        problem = self.prepared.problem
+        runs = np.moveaxis(self.draws.increments.reshape(-1, 3, WIDTH), -1, 0)
+        records = [replace(problem.record, increments=np.ascontiguousarray(one)) for one in runs]
+        turns = [forward.turns(replace(problem, record=record)) for record in records]
+        return np.stack(turns, axis=-1).reshape(-1)
 
     def _run(self) -> bool:
         prepared = self.prepared
@@ -458,17 +457,12 @@ class _Group:
 def _differences(plan: Plan, run: int) -> Array:
     """Return the differences of the gyro and the sensors of one run from those of the scenario, in the order of the kernel."""
     nominal, own = plan.scenario, unit(plan, run)
-    pairs: list[tuple[Any, Any, tuple[str, ...]]] = [
-        (own.gyro, nominal.gyro, (name,)) for name in ("error_matrix", "g_sensitivity", "turn_on_bias")
-    ]
-    for sensors in zip(own.sensors, nominal.sensors, strict=True):
-        pairs += [(*sensors, ("hard_iron", "bias")), (*sensors, ("lever_arm_b",))]
-    differences = (
-        [np.ravel(getattr(mine, name) - getattr(common, name)) for name in names if hasattr(mine, name)]
-        or [np.zeros(3)]
-        for mine, common, names in pairs
-    )
-    return np.concatenate([one for (one,) in differences])
+    parts = [getattr(own.gyro, n) - getattr(nominal.gyro, n) for n in ("error_matrix", "g_sensitivity", "turn_on_bias")]
+    for mine, common in zip(own.sensors, nominal.sensors, strict=True):
+        for names in (("hard_iron", "bias"), ("lever_arm_b",)):
+            known = [getattr(mine, name) - getattr(common, name) for name in names if hasattr(mine, name)]
+            parts.append(known[0] if known else np.zeros(3))
+    return np.concatenate([part.ravel() for part in parts])
 
 
 def run_chunk(plan: Plan, first_run: int, runs: int) -> Statistics:
