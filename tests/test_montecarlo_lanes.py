@@ -222,11 +222,12 @@ def test_flicker_is_the_simulators():
 
 def test_range_and_resolution_are_the_simulators():
     """Without noise both machines have the same record: clipped in places, rounded by axis."""
-    spec = GyroSpec(range=0.3, rate_resolution=np.array([0.01, 0.0, 0.003]), turn_on_bias=[0.1, 0.2, 0.3])
+    spec = GyroSpec(range=0.3, rate_resolution=np.array([0.01, 0.0, 0.003]), turn_on_bias=[0.1, 0.2, -0.3])
     plan = replace(PLAN, scenario=replace(SCENARIO, gyro=spec))
     found, wanted = lanes.replay(plan, 0).record.increments, scalar.record_of(plan, 0).increments
     limit = 0.3 / SCENARIO.rate
-    assert np.any(np.isclose(np.abs(wanted), limit, rtol=1e-9))
+    assert np.any(np.isclose(wanted, limit, rtol=1e-9))
+    assert np.any(np.isclose(wanted, -limit, rtol=1e-9))
     np.testing.assert_allclose(found, wanted, rtol=0.0, atol=1e-15)
 
 
