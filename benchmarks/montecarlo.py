@@ -32,7 +32,7 @@ NOISE = ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-6)
 RATE = 100.0
 
 
-def plan(steps: int, precision: str = "float64") -> Plan:
+def plan(steps: int) -> Plan:
     """Return a plan with one direction per gyro sample, angle and rate random walk, and 100 epochs."""
     scenario = Scenario(
         motion=motion.ConstantRate(rate=np.array([0.02, -0.03, 0.05])),
@@ -42,7 +42,7 @@ def plan(steps: int, precision: str = "float64") -> Plan:
         duration=steps / RATE,
     )
     setup = FilterSetup(process_noise=NOISE, attitude_sigma=0.02, bias_sigma=1e-3)
-    return Plan(scenario=scenario, setup=setup, seed=1, epochs=100, nis_bins=100, precision=precision)
+    return Plan(scenario=scenario, setup=setup, seed=1, epochs=100, nis_bins=100)
 
 
 def with_states(seconds: float) -> Plan:
@@ -58,6 +58,22 @@ def with_states(seconds: float) -> Plan:
     states = States(gyro_scale_sigma=3e-4, gyro_misalignment_sigma=1e-4, gyro_drift_sigma=1.5e-6, gyro_drift_time=300.0)
     noise = ProcessNoise(angle_random_walk=4e-5, rate_random_walk=1e-8)
     setup = FilterSetup(process_noise=noise, attitude_sigma=0.01, bias_sigma=1e-4, states=states)
+    return Plan(scenario=scenario, setup=setup, seed=1, epochs=100, nis_bins=100)
+
+
+def two_vectors(seconds: float) -> Plan:
+    """Return a plan with two directions per gyro sample and a gyro with error states for scale and misalignment: 15 states."""
+    rotation = motion.ConstantRate(rate=np.array([0.02, -0.03, 0.05]))
+    spec = GyroSpec(
+        angle_random_walk=1e-4, rate_random_walk=1e-6, scale_factor=np.full(3, 2e-4), turn_on_bias_sigma=1e-3
+    )
+    sensors = tuple(
+        vectors.VectorSensor(name=name, reference_f=r, sigma=0.01, rate=RATE)
+        for name, r in (("star", [0.3, 0.5, 1.0]), ("sun", [1.0, 0.0, 0.1]))
+    )
+    scenario = Scenario(motion=rotation, gyro=spec, sensors=sensors, rate=RATE, duration=seconds)
+    states = States(gyro_scale_sigma=3e-4, gyro_misalignment_sigma=1e-4)
+    setup = FilterSetup(process_noise=NOISE, attitude_sigma=0.02, bias_sigma=1e-3, states=states)
     return Plan(scenario=scenario, setup=setup, seed=1, epochs=100, nis_bins=100)
 
 
@@ -117,17 +133,22 @@ def threads_ratio(one: Plan, runs: int) -> float:
 
 def main(*, steps: int = 10_000, runs: int = 160, repeats: int = 9) -> dict[str, Any]:
     """Return all figures, in ns per run-step unless named otherwise."""
-    full = {}
-    for precision in ("float64", "float32"):
-        one = plan(steps, precision)
-        # The first runs are kept as examples; later ones represent a campaign.
-        full[precision] = least(lambda p=one: lanes.run_chunk(p, 1000, runs), repeats) / runs / steps * 1e9  # type: ignore[misc]
-    few, long = plan(2000), with_states(600.0)
+    one = plan(steps)
+    # The first runs are kept as examples; later ones represent a campaign.
+    full = least(lambda: lanes.run_chunk(one, 1000, runs), repeats) / runs / steps * 1e9
+    few = plan(2000)
     peers = {
         "scalar machine": least(lambda: scalar.run_chunk(few, 100, 4), 3) / 4 / 2000 * 1e9,
-        "scalar machine, 12 error states, tracker at 2 Hz": least(lambda: scalar.run_chunk(long, 100, 4), 3)
-        / (4 * RATE * long.scenario.duration)
-        * 1e9,
+        **{
+            f"{name}, {count} error states, {words}": least(lambda p=one, m=run_chunk: m(p, 100, 8), 3)  # type: ignore[misc]
+            / (8 * one.samples)
+            * 1e9
+            for count, words, one in (
+                (12, "tracker at 2 Hz", with_states(600.0)),
+                (9, "two vectors", two_vectors(60.0)),
+            )
+            for name, run_chunk in (("lanes", lanes.run_chunk), ("scalar machine", scalar.run_chunk))
+        },
         "simdkalman 6x3": simdkalman_ns(repeats),
         "StepFilter on filterpy": filterpy_ns(repeats),
     }
@@ -137,8 +158,8 @@ def main(*, steps: int = 10_000, runs: int = 160, repeats: int = 9) -> dict[str,
         "runs": runs,
         "full": full,
         "peers": peers,
-        "two_threads": threads_ratio(plan(steps), runs),
-        "ten_thousand_squared_s": {name: ns * 1e-9 * 1e8 / 2 for name, ns in full.items()},
+        "two_threads": threads_ratio(one, runs),
+        "ten_thousand_squared_s": full * 1e-9 * 1e8 / 2,
     }
 
 
@@ -151,12 +172,11 @@ if __name__ == "__main__":
     arguments = parser.parse_args()
     result = main(steps=arguments.steps, runs=arguments.runs, repeats=arguments.repeats)
     print(json.dumps(result["machine"]))
-    for name, ns in result["full"].items():
-        print(f"{name}: whole run-step {ns:.1f} ns")
-        print(f"    10000 runs of 10000 steps on two idle cores: {result['ten_thousand_squared_s'][name]:.1f} s")
+    print(f"whole run-step {result['full']:.1f} ns")
+    print(f"    10000 runs of 10000 steps on two idle cores: {result['ten_thousand_squared_s']:.1f} s")
     for name, ns in result["peers"].items():
         if ns is not None:
-            print(f"{name}: {ns:.0f} ns, {ns / result['full']['float64']:.0f} times the lanes' whole run-step")
+            print(f"{name}: {ns:.0f} ns, {ns / result['full']:.0f} times the lanes' whole run-step")
     print(f"two threads: {result['two_threads']:.2f} times one")
     if arguments.json:
         write_json(arguments.json, result)

@@ -844,7 +844,6 @@ def plan(
     seed: int | None = None,
     states: bool | None = None,
     dispersions: Dispersions | None = None,
-    precision: str = "float64",
 ) -> Plan:
     """Return the plan of a Monte Carlo: a scenario with the filter that matches it, or with another ``setup``.
 
@@ -866,7 +865,6 @@ def plan(
         epochs=montecarlo.whole_epochs(scenario, chosen),
         individuals=any(not name.endswith((".drift", ".correlated")) for name in names),
         dispersions=dispersions or montecarlo.Dispersions(),
-        precision=precision,  # type: ignore[arg-type]
     )
 
 

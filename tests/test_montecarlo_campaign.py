@@ -397,7 +397,7 @@ def test_the_command_resumes_extends_and_shows(command):
 def test_the_command_gives_the_filter_states_where_asked(command, tmp_path):
     status, said, error = command("short.toml", "--runs", 2, "--states")
     assert status == 3, error
-    assert "lanes do not cover gyro and sensors drawn anew for each run" in said
+    assert "short: 2 runs, seed 1, machine: lanes." in said
     held = campaign.read(tmp_path / "short-montecarlo.h5")
     assert held.plan.individuals
     assert held.plan.setup.states is not None

@@ -1,4 +1,4 @@
-"""Filters with error states over eight runs at once: each run is what the filter of the factor makes of it, and its own bits."""
+"""Filters with error states in the lanes: each run is what the filter of one record makes of it, in its own bits and with its own unit."""
 
 from dataclasses import replace
 from functools import cache
@@ -9,11 +9,11 @@ from measured import errors_at, waves
 from spin_plan import assert_same, different
 
 from strapdown import consistency, montecarlo, scenarios, vectors
-from strapdown.estimation import in_lanes, setup
+from strapdown.estimation import setup
 from strapdown.estimation.setup import FilterSetup, SensorStates, States
 from strapdown.estimation.states import ProcessNoise
 from strapdown.gyro import GyroSpec
-from strapdown.montecarlo import scalar
+from strapdown.montecarlo import lanes, scalar
 
 FIELD = np.array([20000.0, 3000.0, -43000.0])
 GYRO = GyroSpec(
@@ -90,6 +90,7 @@ MODELS = {
         States(
             gyro_drift_sigma=(2e-5,),
             gyro_drift_time=(20.0,),
+            gyro_fast_bias_sigma=3e-5,
             sensors={
                 "magnetometer": SensorStates(
                     bias_sigma=0.02, mounting_sigma=0.01, correlated_sigma=2e-3, correlation_time=5.0
@@ -109,118 +110,76 @@ def plan(name: str, **changes) -> montecarlo.Plan:
     return montecarlo.Plan(scenario=scenario, setup=chosen, seed=3, epochs=20, nis_bins=10, **changes)
 
 
-@cache
-def runs(name: str, number: int):
-    one = plan(name)
-    records = [scalar.record_of(one, run) for run in range(number)]
-    return records, [scalar.start(record, one.setup, one.seed, run) for run, record in enumerate(records)]
-
-
-def bits(estimate):
-    """All numbers of an estimate."""
-    innovations = [getattr(i, f) for i in estimate.innovations.values() for f in ("time", "innovation", "variance")]
-    states = [getattr(s, f) for s in estimate.error_states.values() for f in ("values", "variance")]
-    own = [getattr(estimate, f) for f in ("time", "attitude", "bias", "variance", "covariance")]
-    return b"".join(np.ascontiguousarray(one).tobytes() for one in (*own, *innovations, *states))
-
-
 def quick_or_slow(names) -> list:
     """Mark all models slow but that of a heading: the filter of each, and its lanes, take 6 to 9 s to compile."""
     return [pytest.param(name, marks=[] if name == "heading" else pytest.mark.slow) for name in names]
 
 
+def assert_filtered_alike(found, chosen):
+    """Assert that a replayed run is what the filter of one record, another loop and layout, makes of it: to 1e-8 of σ."""
+    one = found.estimate
+    other = setup.run(found.record, chosen, found.initial, full_covariance=True)
+    sigma = np.sqrt(other.variance)
+    apart = consistency.errors(one.attitude, one.bias, other.attitude, other.bias) / sigma
+    assert np.abs(apart).max() < 1e-8
+    P = (one.covariance - other.covariance) / (sigma[:, :, None] * sigma[:, None, :])
+    assert np.abs(P).max() < 1e-8
+    assert np.allclose(one.variance, other.variance, rtol=1e-8, atol=0.0)
+    assert one.skipped == other.skipped
+    for sensor, innovations in other.innovations.items():
+        mine = one.innovations[sensor]
+        assert np.array_equal(mine.time, innovations.time)
+        assert np.allclose(mine.variance, innovations.variance, rtol=1e-8, atol=0.0)
+        assert np.allclose(mine.nis, innovations.nis, rtol=1e-7, atol=1e-7)
+    for block, state in other.error_states.items():
+        mine = one.error_states[block]
+        assert np.abs((mine.values - state.values) / np.sqrt(state.variance)).max() < 1e-8
+        assert np.allclose(mine.variance, state.variance, rtol=1e-8, atol=0.0)
+
+
 @pytest.mark.parametrize("name", quick_or_slow(MODELS))
-def test_each_run_is_what_the_filter_alone_makes_of_it(name, monkeypatch):
-    """Errors, σ, correlations, NIS and error states, to 1e-8 of σ; none is left to the filter of one record."""
-    filtered, found = in_lanes._filtered, []
-    monkeypatch.setattr(in_lanes, "_filtered", lambda *given: found.extend(filtered(*given)) or found[-3:])
-    records, initials = runs(name, 3)
-    chosen = plan(name).setup
-    for every in (1, 50):
-        eight = setup.run_together(records, chosen, initials, every)
-        assert len(found) >= 3
-        assert None not in found
-        for record, initial, one in zip(records, initials, eight, strict=True):
-            other = setup.run(record, chosen, initial, every=every, full_covariance=True)
-            sigma = np.sqrt(other.variance)
-            apart = consistency.errors(one.attitude, one.bias, other.attitude, other.bias) / sigma
-            assert np.abs(apart).max() < 1e-8
-            P = (one.covariance - other.covariance) / (sigma[:, :, None] * sigma[:, None, :])
-            assert np.abs(P).max() < 1e-8
-            assert np.allclose(one.variance, other.variance, rtol=1e-8, atol=0.0)
-            assert one.skipped == other.skipped
-            for sensor, innovations in other.innovations.items():
-                mine = one.innovations[sensor]
-                assert np.array_equal(mine.time, innovations.time)
-                assert np.allclose(mine.variance, innovations.variance, rtol=1e-8, atol=0.0)
-                assert np.allclose(mine.nis, innovations.nis, rtol=1e-7, atol=1e-7)
-            for block, state in other.error_states.items():
-                mine = one.error_states[block]
-                assert np.abs((mine.values - state.values) / np.sqrt(state.variance)).max() < 1e-8
-                assert np.allclose(mine.variance, state.variance, rtol=1e-8, atol=0.0)
+def test_each_run_is_what_the_filter_alone_makes_of_it(name):
+    """Errors, σ, correlations, NIS and error states; also where the first measurements are far more precise than the state."""
+    one = plan(name)
+    assert montecarlo.choose(one).machine == "lanes"
+    vague = replace(one, setup=replace(one.setup, attitude_sigma=0.3))
+    for run in (0, 5):
+        assert_filtered_alike(montecarlo.replay(one, run), one.setup)
+        assert_filtered_alike(montecarlo.replay(vague, run), vague.setup)
+
+
+@pytest.mark.parametrize("name", quick_or_slow(["whole vectors", "heading"]))
+def test_the_units_of_the_runs_are_those_of_the_simulator(name):
+    """Without noise a run has the same gyro and sensors on both machines: error matrix, force, hard iron, lever arm."""
+    one = plan(
+        name, individuals=True, dispersions=montecarlo.Dispersions(scale_factor_sigma=1e-3, turn_on_bias_sigma=1e-4)
+    )
+    gyro = replace(GYRO, angle_random_walk=0.0, rate_random_walk=0.0, bias_instability=0.0)
+    sensors = tuple(replace(sensor, sigma=1e-9, faults=vectors.Faults()) for sensor in one.scenario.sensors)
+    sigma = {sensor.name: 0.01 for sensor in sensors}
+    one = replace(
+        one,
+        scenario=replace(one.scenario, gyro=gyro, sensors=sensors),
+        setup=replace(one.setup, sigma=sigma, states=plan(name).setup.states),
+    )
+    for run in (0, 11):
+        fast, slow = montecarlo.replay(one, run).record, scalar.record_of(one, run)
+        assert not np.allclose(fast.increments, scalar.record_of(one, run + 1).increments, atol=1e-7)
+        assert np.allclose(fast.increments, slow.increments, rtol=0.0, atol=1e-12)
+        assert np.allclose(fast.truth.bias, slow.truth.bias, rtol=0.0, atol=1e-12)
+        for mine, series in zip(fast.vectors, slow.vectors, strict=True):
+            assert np.allclose(mine.vector_b, series.vector_b, rtol=1e-9, atol=1e-8)
 
 
 @pytest.mark.parametrize("name", quick_or_slow(["gyro, star tracker", "heading"]))
 def test_a_run_has_the_same_bits_whatever_runs_beside_it(name):
-    """Full groups, short ones, runs in another order, and beside one that is lost or has other times, noise or references."""
-    records, initials = runs(name, 9)
-    chosen = plan(name).setup
-
-    def filtered(numbers, every=10):
-        return setup.run_together([records[k] for k in numbers], chosen, [initials[k] for k in numbers], every)
-
-    alone = [bits(filtered([k])[0]) for k in range(9)]
-    assert len(set(alone)) == 9
-    for numbers in (range(9), [8, 2, 5], [3, 3, 3, 3], range(8, -1, -1)):
-        assert [bits(one) for one in filtered(numbers)] == [alone[k] for k in numbers]
-    shorter = replace(records[0], vectors=tuple(series.taken(slice(0, 30)) for series in records[0].vectors))
-    lost = replace(initials[1], attitude=np.array([0.0, 1.0, 0.0, 0.0]), bias=np.full(3, 100.0))
-    mixed = setup.run_together([shorter, records[1], *records[2:4]], chosen, [initials[0], lost, *initials[2:4]], 10)
-    assert [bits(one) for one in mixed[2:]] == alone[2:4]
-    assert bits(mixed[0]) == bits(setup.run_together([shorter], chosen, initials[:1], 10)[0])
-    for change in (
-        lambda series: series.noise_scaled(2.0),
-        lambda series: series if series.attitude is not None else replace(series, reference_f=-series.reference_f),
-    ):
-        other = replace(records[0], vectors=tuple(change(series) for series in records[0].vectors))
-        pair = setup.run_together([records[2], other], chosen, [initials[2], initials[0]], 10)
-        assert bits(pair[0]) == alone[2]
-        assert bits(pair[1]) == bits(setup.run_together([other], chosen, initials[:1], 10)[0])
-    one = setup.run(records[1], chosen, lost, every=10, full_covariance=True)
-    assert bits(mixed[1]) == bits(one)  # a turn beyond the range of the polynomials: filtered alone
-    # What is kept does not change what is kept of it.
-    (whole,) = filtered([4], every=1)
-    assert np.array_equal(whole.covariance[::10], filtered([4])[0].covariance)
-
-
-@pytest.mark.parametrize(
-    "states",
-    [
-        None,
-        pytest.param(
-            States(
-                sensors={"accelerometer": SensorStates(velocity_time=1.0, velocity_sigma=0.1, acceleration_sigma=0.5)}
-            ),
-            marks=pytest.mark.slow,
-        ),
-        pytest.param(
-            States(sensors={"magnetometer": SensorStates(correlated_sigma=0.01, correlation_time=5.0, frame="fixed")}),
-            marks=pytest.mark.slow,
-        ),
-    ],
-    ids=["of the scenario", "chain", "fixed axes"],
-)
-def test_lanes_keep_the_digits_of_measurements_far_more_precise_than_the_state(states):
-    """Joseph's form in some lanes only: the same as alone, and no bit of a neighbour changes."""
-    chosen = plan("heading").setup
-    chosen = replace(chosen, states=states) if states else chosen
-    records, initials = runs("heading", 3)
-    vague = replace(initials[0], covariance=np.diag([0.3, 0.3, 0.3, *np.diag(initials[0].covariance)[3:]]))
-    alone = [bits(setup.run_together([r], chosen, [i], 50)[0]) for r, i in zip(records, initials, strict=True)]
-    mixed = setup.run_together(records, chosen, [vague, *initials[1:]], 50)
-    assert [bits(estimate) for estimate in mixed[1:]] == alone[1:]
-    other = setup.run(records[0], chosen, vague, every=50, full_covariance=True)
-    assert np.allclose(mixed[0].variance, other.variance, rtol=1e-7, atol=0.0)
+    one = plan(name, individuals=True)
+    whole = lanes.run_chunk(one, 0, 8)
+    for first in range(1, 8):
+        part = lanes.run_chunk(one, first, 9)
+        count = 8 - first
+        assert np.array_equal(part.example_error[:count], whole.example_error[first:])
+        assert np.array_equal(part.example_sigma[:count], whole.example_sigma[first:])
 
 
 def test_statistics_do_not_depend_on_chunks_and_threads_and_a_replay_is_the_run():
@@ -239,22 +198,6 @@ def test_statistics_do_not_depend_on_chunks_and_threads_and_a_replay_is_the_run(
         assert np.array_equal(np.sqrt(found.estimate.variance[rows]), whole.example_sigma[run])
 
 
-@pytest.mark.parametrize(
-    "fault", [{"sampling_jitter": 1e-4}, {"drop_probability": 0.02}], ids=lambda fault: next(iter(fault))
-)
-def test_runs_whose_times_differ_are_filtered_one_by_one(fault):
-    one = plan("heading")
-    one = replace(one, scenario=replace(one.scenario, gyro=replace(GYRO, **fault)))
-    found = scalar.run_chunk(one, 0, 2)
-    for run in range(2):
-        record = scalar.record_of(one, run)
-        initial = scalar.start(record, one.setup, one.seed, run)
-        each = setup.run(record, one.setup, initial, every=1, full_covariance=True)
-        last = np.sqrt(each.variance[-1])
-        assert np.allclose(found.example_sigma[run, -1], last, rtol=1e-12)
-        assert np.array_equal(montecarlo.replay(one, run).estimate.attitude, each.attitude)
-
-
 @pytest.mark.slow
 def test_the_filter_with_states_is_as_good_as_it_says():
     """Over individuals, whose errors are drawn as the states assume: ANEES inside its bounds, and outside with the states left out."""
@@ -263,6 +206,6 @@ def test_the_filter_with_states_is_as_good_as_it_says():
     for states in (True, False):
         chosen = setup.FilterSetup.for_scenario(scenario, states=states)
         one = montecarlo.Plan(scenario=scenario, setup=chosen, seed=8, epochs=10, nis_bins=5, individuals=True)
-        verdicts.append(montecarlo.run_plan(one, runs=96, machine="scalar").verdict(np.arange(2, 11, 2), "state"))
+        verdicts.append(montecarlo.run_plan(one, runs=96, machine="lanes").verdict(np.arange(2, 11, 2), "state"))
     assert verdicts[0].consistent, verdicts[0].mean
     assert not verdicts[1].consistent

@@ -54,7 +54,6 @@ class _Model:
         help="TOML with a table named dispersions: initial errors and gyro parameters that differ from run to run.",
     )
     seed: int | None = Option(None, help="Seed. Default: that of the scenario.")
-    float32: bool = Option(False, "--float32", help="Compute in single precision; only with lanes.")
     states: bool | None = STATES
 
 
@@ -88,7 +87,7 @@ def montecarlo(
 ) -> None:
     """Run many simulations of a scenario and judge the filter: exit status 0 consistent, 1 not, 3 cannot tell."""
     source, again = Path(scenario), computing.resume or computing.overwrite
-    held, plan = _planned(source, scenario, model, computing.machine)
+    held, plan = _planned(source, scenario, model)
     if held is not None and computing.machine == "auto":
         computing = replace(computing, machine=held.machine)
     target = out or (source if held is not None else Path(f"{source.stem}-montecarlo.h5"))
@@ -112,7 +111,7 @@ def montecarlo(
     raise typer.Exit(status)
 
 
-def _planned(source: Path, scenario: str, model: _Model, machine: str) -> tuple[Campaign | None, Plan]:
+def _planned(source: Path, scenario: str, model: _Model) -> tuple[Campaign | None, Plan]:
     """Return the campaign of a file, None if the source is no campaign file, and the plan."""
     from strapdown import montecarlo as engine
     from strapdown import scenarios, workflows
@@ -129,17 +128,15 @@ def _planned(source: Path, scenario: str, model: _Model, machine: str) -> tuple[
             raise InputError(f"{name} is given, but {source} contains its own; leave it out, or name a scenario")
         return held, held.plan
     given = None if model.filter_file is None or own is not None else read_setup(model.filter_file)
-    states = False if model.states is None and (model.float32 or machine == "lanes") else model.states
     plan = workflows.plan(
         scenarios.load_scenario(scenario),
         gyro=None if model.gyro is None else read_spec(model.gyro),
         setup=given if own is None else own,
         seed=model.seed,
-        states=None if model.filter_file is not None and model.states is None else states,
+        states=model.states,
         dispersions=None if model.dispersions is None else engine.read_dispersions(model.dispersions),
-        precision="float32" if model.float32 else "float64",
     )
-    if states is None and model.filter_file is None and plan.setup.states is not None:
+    if model.states is None and model.filter_file is None and plan.setup.states is not None:
         console.print(workflows.state_words(plan.setup.states.names))
     if plan.individuals:
         console.print("Each run draws its own gyro and sensors: specified constant errors are standard deviations.")

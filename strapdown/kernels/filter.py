@@ -1005,14 +1005,13 @@ def with_factors(shape, z, noise, f):
 
 def row_of_innovations(measured, e):
     """Return the row for the innovations of a measurement; the first if another kernel takes them from there."""
-    return 0 if PARAMETERS else measured.place[e]
+    return measured.place[e] if LANES == 1 else 0
 
 
 def measurement_in_lanes(s, body, measured, e, at, sensor):
     """Return the e-th measurement of several runs: ``value`` has four numbers of each run, a vector or an attitude."""
     shape, like = STRUCTURE.sensors[s], lanes_of((0.0,) * LANES)
-    value = tuple_at(measured.value, 4 * at, 4, like)
-    noise = six_at(measured.noise, at)
+    value, noise = tuple_at(measured.value, 0, 4, like), six_at(measured.noise, at)
     levers = any(t.lever for t in shape.states)
     turning = tuple_at(body.turning, 9 * e, 9, like) if levers else (0.0,) * 9
     length = body.length[e] if shape.states else 1.0
@@ -1374,6 +1373,7 @@ def transverse_rows_{s}(x, body, measured, e, like):
 def take_{s}(body, measured, e, innovation, like):
     g = gains_{s}(body, measured, e, None, like)
     store_innovations(innovation, row_of_innovations(measured, e), g.reported, g.variances)
+    {nis}
     if any_lane(g.precise):
         rows_{s}(body.x[0], body, measured, e, like)
         return {precise}
@@ -1437,8 +1437,9 @@ _PRECISE = {
     True: "take_precisely(body.x[0], body.P[0], body.work, {rows}, like)",
     False: "take_precisely_in_lanes(body, g.gain, g.steps, g.precise, {rows}, like)",
 }[LANES == 1]
+_NIS = "put_at(innovation, 6, g.nis)" if LANES > 1 and not PARAMETERS else ""
 _SOURCE = "\n".join(
-    _OF_A_SHAPE.format(s=s, rows=rows, precise=_PRECISE.format(rows=rows))
+    _OF_A_SHAPE.format(s=s, rows=rows, precise=_PRECISE.format(rows=rows), nis=_NIS)
     for s, rows in enumerate(ROWS_OF_KIND[t.kind] for t in STRUCTURE.sensors)
 )
 _SOURCE += _dispatch("take", "body, measured, e, innovation, like", "False")
@@ -1532,18 +1533,24 @@ def write_row(body, row, out):
         write_whole_bias(P, body.offsets, row, out)
 
 
+def whole_element(P, offsets, a, b, like):
+    """Return an element, a ≤ b, of the covariance of attitude and *whole* gyro bias, ``b + Σ c e`` over the states that are an offset."""
+    s = element_at(P, a, b, like)
+    for k in range(N - 6):
+        if b >= 3:
+            s = s + offsets[k, b - 3] * element_at(P, a, 6 + k, like)
+        if a >= 3:
+            s = s + offsets[k, a - 3] * element_at(P, b, 6 + k, like)
+            for j in range(N - 6):
+                s = s + offsets[k, a - 3] * offsets[j, b - 3] * element_at(P, 6 + k, 6 + j, like)
+    return s
+
+
 def write_whole_bias(P, offsets, row, out):
-    """Write variances and, if requested, covariance of attitude and *whole* gyro bias, ``b + Σ c e`` over the states that are an offset."""
+    """Write variances and, if requested, covariance of attitude and whole gyro bias."""
     for a in range(6):
         for b in range(a, 6):
-            s = P[W * a + b]
-            for k in range(N - 6):
-                if b >= 3:
-                    s += offsets[k, b - 3] * P[W * a + 6 + k]
-                if a >= 3:
-                    s += offsets[k, a - 3] * P[W * b + 6 + k]
-                    for j in range(N - 6):
-                        s += offsets[k, a - 3] * offsets[j, b - 3] * P[W * (6 + k) + 6 + j]
+            s = whole_element(P, offsets, a, b, 0.0)
             if a == b:
                 out.whole_variance[row, a] = s
             if row < len(out.whole_covariance):

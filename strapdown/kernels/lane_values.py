@@ -112,18 +112,6 @@ def signed_number(word):
     return np.asarray(word).view(np.int32).astype(np.float32)
 
 
-def flush_tiny(like):
-    """Have the machine take numbers below the smallest normal one for zero, if ``like`` is single precision; return the mode before.
-
-    They are met in covariances of small angles in single precision, each costs a hundred additions, and none counts.
-    """
-    return 0
-
-
-def restore_mode(mode):
-    """Undo :func:`flush_tiny`."""
-
-
 def broadcast(x):
     """Return a float in every lane."""
     return np.full(WIDTH, x)

@@ -10,7 +10,6 @@ from __future__ import annotations
 import inspect
 import math
 import operator
-import platform
 import sys
 from collections.abc import Callable
 from typing import Any
@@ -361,40 +360,6 @@ def _total(target: Any, builder: Any, sig: Any, value: Any) -> Any:
         n //= 2
         value = builder.fadd(*(_picked(builder, value, value, list(range(k, k + n))) for k in (0, n)))
     return builder.extract_element(value, ir.Constant(_INDEX, 0))
-
-
-_TO_ZERO = 0x8040
-"""Bits of the x86 control word: results and operands below the smallest normal number are zero."""
-_X86 = platform.machine() in ("x86_64", "AMD64")
-
-
-def _control(builder: Any, instruction: str, place: Any) -> None:
-    pointer = ir.IntType(8).as_pointer()
-    function = ir.FunctionType(ir.VoidType(), [pointer])
-    name = f"llvm.x86.sse.{instruction}"
-    builder.call(cgutils.get_or_insert_function(builder.module, function, name), [builder.bitcast(place, pointer)])
-
-
-@_instead_of(lane_values.flush_tiny, types.int32)
-def _flush_tiny(target: Any, builder: Any, sig: Any, like: Any) -> Any:
-    if sig.args[0].dtype != types.float32 or not _X86:
-        return target.get_constant(types.int32, 0)
-    place = cgutils.alloca_once(builder, ir.IntType(32))
-    _control(builder, "stmxcsr", place)
-    mode = builder.load(place)
-    builder.store(builder.or_(mode, ir.Constant(mode.type, _TO_ZERO)), place)
-    _control(builder, "ldmxcsr", place)
-    return mode
-
-
-@_instead_of(lane_values.restore_mode, lambda mode: types.void(types.int32))
-def _restore_mode(target: Any, builder: Any, sig: Any, mode: Any) -> None:
-    """Undo :func:`_flush_tiny`; a mode of 0 was never read."""
-    if _X86:
-        with builder.if_then(builder.icmp_unsigned("!=", mode, ir.Constant(mode.type, 0))):
-            place = cgutils.alloca_once(builder, ir.IntType(32))
-            builder.store(mode, place)
-            _control(builder, "ldmxcsr", place)
 
 
 # ------------------------------------------------------------------------------------------------ bits

@@ -229,7 +229,7 @@ def read_only(array: np.ndarray) -> np.ndarray:
 
 
 def has_vectors() -> bool:
-    """Return whether the CPU has SIMD vectors of doubles with fused multiply-add; if not, lanes are processed one at a time."""
+    """Return whether the CPU has SIMD vectors of doubles with fused multiply-add."""
     from numba.core.codegen import get_host_cpu_features
 
     features = set(get_host_cpu_features().split(","))
@@ -248,5 +248,5 @@ def describe() -> dict[str, str]:
         "cpu": llvmlite.binding.get_host_cpu_name(),
         "numba": numba.__version__,
         "llvm": ".".join(str(part) for part in llvmlite.binding.llvm_version_info),
-        "lanes": "8 runs at once in float64, 16 in float32" if has_vectors() else "1 run at once: no vectors",
+        "lanes": "8 runs at once" if has_vectors() else "8 runs at once, without vectors",
     }

@@ -1,11 +1,12 @@
-"""Monte Carlo runs in lanes (SIMD): gyro errors, sensors and filter of 1, 8 or 16 runs at once, along one common motion.
+"""Monte Carlo runs in lanes (SIMD): gyro errors, sensors and filter of eight runs at once along one motion, a body of the walk.
 
 Truth, times and all else common to the runs are plain arrays; values that differ between runs are lanes. Each run has its own random
 streams (:func:`strapdown.kernels.noise.stream_state`, with one key per source and the run's number), so it does not depend on its
-neighbours. Noise is exact in discrete time, by the formulas of :mod:`strapdown.kernels.gyro_errors`; the filter is that of
-:mod:`strapdown.kernels.filter_step`.
+neighbours. Noise is exact in discrete time, by the formulas of :mod:`strapdown.kernels.gyro_errors`. It is drawn before each interval and
+each measurement. The filter defines the functions in ``OPEN``: :mod:`strapdown.kernels.montecarlo_six` or
+:mod:`strapdown.kernels.montecarlo_filter`.
 
-In memory lanes are contiguous, so place p of a flat array begins at ``p · len(like)``.
+In memory lanes are contiguous, so place p of a flat array begins at ``p · WIDTH``.
 """
 
 from __future__ import annotations
@@ -14,118 +15,105 @@ from typing import NamedTuple
 
 import numpy as np
 
-from strapdown.kernels.algebra import (
-    add,
-    combine,
-    dot,
-    matrix_times_vector,
-    scale,
-    subtract,
-    transpose_times_vector,
-)
-from strapdown.kernels.filter_step import predict, update_direction_and_judge, update_heading, update_residual
-from strapdown.kernels.lane_angles import arctangent, inverse_root, rotation_vector
-from strapdown.kernels.lane_values import (
-    flush_tiny,
-    halves,
-    lanes_of,
-    load_like,
-    narrowed,
-    restore_mode,
-    select,
-    store,
-)
-from strapdown.kernels.measurement import ATTITUDE, HEADING, VECTOR, frame_at, heading_row, vector_at
+from strapdown.kernels.algebra import add, combine, dot, matrix_times_vector, scale, subtract
+from strapdown.kernels.lane_angles import inverse_root
+from strapdown.kernels.lane_values import WIDTH, broadcast, halves, lanes_of, load_like, narrowed, select, store
+from strapdown.kernels.measurement import ATTITUDE, KIND, VECTOR, frame_at, vector_at
 from strapdown.kernels.noise import next_word, single_normals, stream_state
-from strapdown.kernels.rotation import exponential, quaternion_multiply, rotation_matrix, unit
+from strapdown.kernels.rotation import exponential, quaternion_multiply, unit
+from strapdown.kernels.structure import Body as Filter
 
-GYRO, FLICKER, MARKOV, TURN_ON, START, DISPERSIONS, SENSORS = range(7)
+OPEN = ("start_filters", "propagated", "corrected", "keep_filters")
+PATTERN = (0.0,) * WIDTH
+"""Gives the number of runs."""
+
+GYRO, FLICKER, MARKOV, TURN_ON, START, SENSORS = range(6)
 """Sources of noise: random streams of a run. From SENSORS on there are two per sensor: its white noise and its faults."""
 
 STATES = 16
 """Number of flicker states of an axis."""
 
-# Offsets in the memory of a group of runs.
-_WALK, _MARKOV, _TURN_ON, _BEFORE, _MATRIX, _STATES = 0, 3, 6, 9, 12, 21
+# Places in the memory of a group of runs: of the gyro, then of each sensor its correlated noise.
+_WALK, _MARKOV, _TURN_ON, _BEFORE, _NOW, _STATES = 0, 3, 6, 9, 12, 15
 _SENSORS = _STATES + 3 * STATES
-_OF_A_SENSOR = 3
-"""Length of the memory of a sensor, its correlated noise."""
+
+# Places in what differs between units: gyro error matrix, sensitivity to specific force, turn-on bias; of each sensor offset, lever arm.
+_MATRIX, _FORCE, _CONSTANT, _OFFSETS = 0, 9, 18, 21
 
 TRIPLES = 32
 AHEAD = 3 * TRIPLES
 """Number of normals drawn ahead for each source: drawing many in one loop is faster than a few between the steps of the filter."""
 
 KEPT = 31
-"""Number of values stored at an epoch: q (4), b (3), P in blocks (21), true bias (3)."""
+"""Number of values stored at an epoch: q (4), whole bias (3), their covariance in blocks (21), true bias (3)."""
 
 WHITE_SIGMA, WALK_SIGMA, MARKOV_DECAY, MARKOV_SIGMA, MARKOV_MEAN, MARKOV_START, TURN_ON_SIGMA, FLICKER_SIZE = range(8)
-"""Rows of ``sizes``, the noise of a step by axis: σ of the increment given the bias at both ends, σ of the step of the random walk, decay
-of the Markov bias, σ of its step, weight of its end values in the increment, its initial σ, σ of the turn-on bias, flicker B."""
+RANGE, RESOLUTION = 8, 9
+"""Rows of ``sizes``, by axis: σ of the increment given the bias at both ends, σ of the step of the random walk, decay of the Markov bias, σ
+of its step, weight of its end values in the increment, its initial σ, σ of the turn-on bias, flicker B; maximum and resolution of the
+rate."""
+
+_ROUNDING = 6755399441055744.0
+"""1.5 · 2^52: added and subtracted, it rounds a number to the nearest integer."""
 
 
 class Gyro(NamedTuple):
-    """Gyro data over n steps of the filter."""
+    """Gyro over n steps of the filter; the walk has its increments without the errors that differ between runs."""
 
     edges: np.ndarray
     """Edges of the steps (n + 1,), s."""
     substeps: np.ndarray
     """Maximum duration of one prediction of the filter in each step (n,), s. A step beyond the range of the polynomials is divided; at
     constant rate the parts compose exactly, so the model is the same."""
-    increments: np.ndarray
-    """Gyro increments without the errors that differ between runs (n, 3), rad."""
     true_increments: np.ndarray
     """(n, 3), rad."""
+    true_force: np.ndarray
+    """Integrals of the specific force in body axes (n, 3), m/s; no rows if the runs do not differ in the gyro's sensitivity to it."""
     true_bias: np.ndarray
-    """Part of the bias common to all runs (n + 1, 3), rad/s."""
+    """Part of the bias common to all runs at the epochs kept (rows, 3), rad/s."""
     terms: np.ndarray
-    """Whether each noise is present (4,): random walk, Markov, flicker, error matrix."""
+    """Whether each term is present (6,): random walk, Markov, flicker, units that differ, limited range, resolution."""
     sizes: np.ndarray
-    """Sizes of the noises by axis (8, 3), rows :data:`WHITE_SIGMA` to :data:`FLICKER_SIZE`."""
+    """Sizes by axis (10, 3), rows :data:`WHITE_SIGMA` to :data:`RESOLUTION`."""
     poles: np.ndarray
     gains: np.ndarray
     poles_start: np.ndarray
     """Flicker (:class:`strapdown.gyro.flicker.Shaping`) (16,), (16,), and the root of its stationary covariance (16, 16) or (0, 16)."""
-    dispersion: np.ndarray
-    """σ of the entries of the error matrix (3, 3)."""
 
 
 class Start(NamedTuple):
-    """Initial state, at the first edge, and process noise of the filter."""
+    """Initial state, at the first edge."""
 
     attitude: np.ndarray
     """True attitude (4,)."""
     error: np.ndarray
     """True initial error (8,): σ of δθ and δb, then the part common to all runs (6)."""
-    variance: np.ndarray
-    """Initial variances of attitude and bias in the filter (2,)."""
-    noise: np.ndarray
-    """σ_v² and σ_u² of the filter (2,)."""
+    P: np.ndarray
+    """Initial covariance of the filter (n, n)."""
+    fast: float
+    """Variance of the bias with a bandwidth above that of the filter's states, which the initial covariance contains."""
 
 
 class Events(NamedTuple):
-    """Measurements in order of time (m,)."""
+    """Measurements in order of time (m,), beside the walk's."""
 
-    time: np.ndarray
-    kind: np.ndarray
-    """Code of :mod:`strapdown.kernels.measurement`."""
-    sensor: np.ndarray
     span: np.ndarray
     """Time bin of the NIS."""
     exact: np.ndarray
     """Value without noise (m, 4): a vector or a quaternion."""
     sigma: np.ndarray
     """True σ (m, 3)."""
-    variance: np.ndarray
-    """Variances in the filter (m, 3)."""
+    scale: np.ndarray
+    """Size of an offset of the sensor in the value."""
+    turning: np.ndarray
+    """Acceleration per lever arm, ``[ẇ] + [w]²`` by rows (m, 9); no rows if the runs do not differ in lever arms."""
     decay: np.ndarray
     share: np.ndarray
     """Decay of the correlated noise since the sensor's last measurement, and σ of its new part."""
     number: np.ndarray
     """Index among the measurements of its sensor."""
-    frame: np.ndarray
-    """Row of ``frames``."""
-    frames: np.ndarray
-    """Right-handed frames (u, v, r) by rows about the references (rows, 9)."""
+    boresight: np.ndarray
+    """For each sensor its boresight, and σ about it less σ across it (sensors, 4), 0 if the noise is independent by axis."""
     struck_below: np.ndarray
     """For each sensor, the random word below which a measurement is an outlier; 0: no outliers."""
     outlier_scale: np.ndarray
@@ -134,37 +122,73 @@ class Events(NamedTuple):
 class Draws(NamedTuple):
     """Random streams and memory of a group of runs, flat."""
 
+    numbers: np.ndarray
+    """Numbers of the runs, words (WIDTH,)."""
+    keys: np.ndarray
+    """Words (sources, 2)."""
     streams: np.ndarray
     """States of the streams."""
     ahead: np.ndarray
     """:data:`AHEAD` normals per source, in single precision."""
     memory: np.ndarray
     """See :func:`memory`."""
+    units: np.ndarray
+    """Differences of the runs' gyros and sensors from the common ones, see :func:`units`."""
+    innovation: np.ndarray
+    """Scratch: e₁, s₁, e₂, s₂, e₃, s₃ and the NIS of a measurement."""
+    increments: np.ndarray
+    """Measured increments, 3 per interval; empty except for a replay."""
+    longest: np.ndarray
+    """Scratch: longest prediction in the present step (1,), s."""
+
+
+class Body(NamedTuple):
+    """Filters and simulation of a group of runs."""
+
+    filters: Filter
+    gyro: Gyro
+    start: Start
+    events: Events
+    draws: Draws
 
 
 class Outputs(NamedTuple):
-    """Outputs of a group of runs, flat."""
+    """Outputs of a group of runs, flat; the last two are empty except for a replay."""
 
     kept: np.ndarray
     """:data:`KEPT` numbers per epoch."""
     nis: np.ndarray
     """Sum of the NIS by sensor and time bin; updates add to it."""
-
-
-class Detail(NamedTuple):
-    """Detailed outputs for the replay of runs, flat."""
-
-    increments: np.ndarray
-    """Measured increments, 3 per interval."""
     values: np.ndarray
-    """Measured values, 4 per measurement."""
-    innovations: np.ndarray
-    """e₁, s₁, e₂, s₂, e₃, s₃ of each measurement."""
+    """Measured value and innovations e₁, s₁, e₂, s₂, e₃, s₃ of each measurement, 10 numbers."""
+    states: np.ndarray
+    """Values, then variances, of the error states per epoch."""
+
+
+def start_filters(q, b, body, like):
+    """Return the filters with this attitude and bias and the initial covariance; ``lost`` of theirs: a measurement was too precise."""
+
+
+def propagated(state, part, dt, body, like):
+    """Return the filters after an increment."""
+
+
+def corrected(state, value, e, measured, body, like):
+    """Return the filters after measurement e, a vector or an attitude (4), its NIS, and e₁, s₁, e₂, s₂, e₃, s₃."""
+
+
+def keep_filters(state, row, body, out, like):
+    """Write q, b and the blocks of their covariance to a row of what is kept, and for a replay the error states to theirs."""
 
 
 def memory(sensors):
     """Return the number of places in the memory of a group."""
-    return _SENSORS + _OF_A_SENSOR * sensors
+    return _SENSORS + 3 * sensors
+
+
+def units(sensors):
+    """Return the number of places of what differs between the units of the runs."""
+    return _OFFSETS + 6 * sensors
 
 
 def triple(memory, place, like):
@@ -232,22 +256,23 @@ def normal_triple(streams, source, ahead, number, like):
     return drawn_triple(ahead, source, 3 * turn, like)
 
 
-def start_streams(keys, numbers, draws, like):
-    """Set the states of all streams of the runs ``numbers``, ``keys`` (sources, 2), and draw the normals of their initial values."""
-    number = load_like(numbers, 0, like)
+def start_streams(draws, like):
+    """Set the states of all streams of the runs, and draw the normals of their initial values."""
+    number, keys = load_like(draws.numbers, 0, like), draws.keys
     for source in range(len(keys)):
         store_several(draws.streams, 4 * source, like, stream_state(keys[source, 0], keys[source, 1], number))
-    for source in (FLICKER, TURN_ON, START, DISPERSIONS):
+    for source in (FLICKER, TURN_ON, START):
         refill(draws.streams, source, draws.ahead, 3 * STATES, like)
 
 
 def start_gyro(gyro, draws, like):
-    """Draw what a run's gyro starts with: turn-on bias, Markov bias, flicker states, error matrix."""
+    """Draw what a run's gyro starts with: turn-on bias, Markov bias, flicker states."""
     n = len(like)
-    sizes, poles_start, dispersion = gyro.sizes, gyro.poles_start, gyro.dispersion
+    sizes, poles_start = gyro.sizes, gyro.poles_start
     ahead, memory = draws.ahead, draws.memory
     store_several(memory, _WALK, like, (like, like, like))
-    store_several(memory, _TURN_ON, like, by_axis(drawn_triple(ahead, TURN_ON, 0, like), sizes, TURN_ON_SIGMA))
+    turn_on = by_axis(drawn_triple(ahead, TURN_ON, 0, like), sizes, TURN_ON_SIGMA)
+    store_several(memory, _TURN_ON, like, add(turn_on, triple(draws.units, _CONSTANT, like)))
     store_several(memory, _MARKOV, like, by_axis(drawn_triple(ahead, TURN_ON, 3, like), sizes, MARKOV_START))
     for i in range(3 * STATES):
         store(memory, (_STATES + i) * n, like)
@@ -260,9 +285,10 @@ def start_gyro(gyro, draws, like):
                     at = (_STATES + axis * STATES + i) * n
                     state = load_like(memory, at, like) + poles_start[i, j] * x0
                     store(memory, at, state + poles_start[i, j + 1] * x1)
-    for row in range(3):
-        x = drawn_triple(ahead, DISPERSIONS, 3 * row, like)
-        store_several(memory, _MATRIX + 3 * row, like, by_axis(x, dispersion, row))
+        for axis in range(3):
+            value = gyro.sizes[FLICKER_SIZE, axis] * flicker_value(gyro.gains, memory, axis, like)
+            store(memory, (_NOW + axis) * n, value)
+        draw_flicker(gyro, 0 * n, draws, like)
 
 
 def flicker_step(poles, gains, memory, axis, w, like):
@@ -291,14 +317,39 @@ def flicker_value(gains, memory, axis, like):
     return value
 
 
-def drift_step(gyro, k, dt, true_increment, draws, like):
-    """Draw interval k of the gyro; return the bias at its start, without its part common to all runs, and the noise of its increment."""
-    terms, sizes, poles, gains = gyro.terms, gyro.sizes, gyro.poles, gyro.gains
+def draw_flicker(gyro, number, draws, like):
+    """Draw the flicker of interval ``number``: it is drawn an interval ahead, for the mean over the two intervals at an edge."""
+    sizes, poles, gains, memory = gyro.sizes, gyro.poles, gyro.gains, draws.memory
+    x = normal_triple(draws.streams, FLICKER, draws.ahead, number, like)
+    store_several(memory, _BEFORE, like, triple(memory, _NOW, like))
+    now = (
+        sizes[FLICKER_SIZE, 0] * flicker_step(poles, gains, memory, 0, x[0], like),
+        sizes[FLICKER_SIZE, 1] * flicker_step(poles, gains, memory, 1, x[1], like),
+        sizes[FLICKER_SIZE, 2] * flicker_step(poles, gains, memory, 2, x[2], like),
+    )
+    store_several(memory, _NOW, like, now)
+
+
+def bias_now(gyro, row, draws, like):
+    """Return the true bias at the edge of a row of what is kept, the end of the last interval drawn."""
+    memory = draws.memory
+    bias = triple(memory, _TURN_ON, like)
+    if gyro.terms[0]:
+        bias = add(triple(memory, _WALK, like), bias)
+    if gyro.terms[1]:
+        bias = add(bias, triple(memory, _MARKOV, like))
+    if gyro.terms[2]:
+        bias = combine(1.0, bias, 0.5, add(triple(memory, _BEFORE, like), triple(memory, _NOW, like)))
+    return add(vector_at(gyro.true_bias, row), bias)
+
+
+def drift_step(gyro, k, draws, like):
+    """Draw interval k of the gyro; return the error of its increment, without the part common to all runs."""
+    terms, sizes, dt = gyro.terms, gyro.sizes, gyro.edges[k + 1] - gyro.edges[k]
     streams, ahead, memory = draws.streams, draws.ahead, draws.memory
-    walk = triple(memory, _WALK, like)
     turn_on = triple(memory, _TURN_ON, like)
-    bias = add(walk, turn_on)
     if terms[0]:
+        walk = triple(memory, _WALK, like)
         white = normal_triple(streams, GYRO, ahead, 2 * k, like)
         steps = normal_triple(streams, GYRO, ahead, 2 * k + 1, like)
         after = add(walk, by_axis(steps, sizes, WALK_SIGMA))
@@ -306,44 +357,95 @@ def drift_step(gyro, k, dt, true_increment, draws, like):
         drift = combine(dt, turn_on, 0.5 * dt, add(walk, after))
     else:
         white = normal_triple(streams, GYRO, ahead, k, like)
-        bias = turn_on
         drift = scale(dt, turn_on)
     if terms[1]:
         g = triple(memory, _MARKOV, like)
         x = normal_triple(streams, MARKOV, ahead, k, like)
         after = add(by_axis(g, sizes, MARKOV_DECAY), by_axis(x, sizes, MARKOV_SIGMA))
         store_several(memory, _MARKOV, like, after)
-        bias = add(bias, g)
         drift = add(drift, by_axis(add(g, after), sizes, MARKOV_MEAN))
     if terms[2]:
-        if k == 0:
-            for axis in range(3):
-                value = sizes[FLICKER_SIZE, axis] * flicker_value(gains, memory, axis, like)
-                store(memory, (_BEFORE + axis) * len(like), value)
-        x = normal_triple(streams, FLICKER, ahead, k, like)
-        before = triple(memory, _BEFORE, like)
-        now = (
-            sizes[FLICKER_SIZE, 0] * flicker_step(poles, gains, memory, 0, x[0], like),
-            sizes[FLICKER_SIZE, 1] * flicker_step(poles, gains, memory, 1, x[1], like),
-            sizes[FLICKER_SIZE, 2] * flicker_step(poles, gains, memory, 2, x[2], like),
-        )
-        store_several(memory, _BEFORE, like, now)
-        bias = combine(1.0, bias, 0.5, add(before, now))
-        drift = combine(1.0, drift, dt, now)
+        drift = combine(1.0, drift, dt, triple(memory, _NOW, like))
+        draw_flicker(gyro, k + 1, draws, like)
     if terms[3]:
-        drift = add(drift, matrix_times_vector(nine(memory, _MATRIX, like), true_increment))
-    return bias, add(drift, by_axis(white, sizes, WHITE_SIGMA))
+        units = draws.units
+        drift = add(drift, matrix_times_vector(nine(units, _MATRIX, like), vector_at(gyro.true_increments, k)))
+        if len(gyro.true_force) > 0:
+            drift = add(drift, matrix_times_vector(nine(units, _FORCE, like), vector_at(gyro.true_force, k)))
+    return add(drift, by_axis(white, sizes, WHITE_SIGMA))
 
 
-def sensor_noise(e, events, draws, like):
+def begin(body):
+    """Draw the initial values, and start the filters: at the truth minus the error drawn."""
+    like, start, draws = lanes_of(PATTERN), body.start, body.draws
+    start_streams(draws, like)
+    start_gyro(body.gyro, draws, like)
+    x = drawn_triple(draws.ahead, START, 0, like)
+    y = drawn_triple(draws.ahead, START, 3, like)
+    given = start.error
+    error = combine(given[0], x, 1.0, (given[2], given[3], given[4]))
+    attitude = (start.attitude[0], start.attitude[1], start.attitude[2], start.attitude[3])
+    q = unit(quaternion_multiply(attitude, exponential((-error[0], -error[1], -error[2]))))
+    offset = combine(given[1], y, 1.0, (given[5], given[6], given[7]))
+    b = subtract(bias_now(body.gyro, 0, draws, like), offset)
+    return start_filters(q, b, body, like)
+
+
+def clipped(increment, gyro, k):
+    """Return an increment of a rate within the gyro's range."""
+    dt = gyro.edges[k + 1] - gyro.edges[k]
+    most = tuple(dt * gyro.sizes[RANGE, i] for i in range(3))
+    upper = tuple(select(x > y, y, x) for x, y in zip(increment, most, strict=True))
+    return tuple(select(x < -y, -y, x) for x, y in zip(upper, most, strict=True))
+
+
+def rounded(increment, gyro, k):
+    """Return an increment of a rate that is an integer multiple of the gyro's resolution; 0: not rounded."""
+    dt = gyro.edges[k + 1] - gyro.edges[k]
+    step = tuple(dt * gyro.sizes[RESOLUTION, i] for i in range(3))
+    return tuple(
+        select(y > 0.0, ((x / y + _ROUNDING) - _ROUNDING) * y, x) for x, y in zip(increment, step, strict=True)
+    )
+
+
+def increment_over(increments, k, body):
+    """Draw interval k, and return its increments; zero for the interval before the first edge."""
+    like, draws = broadcast(0.0), body.draws
+    if k < 0:
+        return (like, like, like)
+    draws.longest[0] = body.gyro.substeps[k]
+    increment = add(vector_at(increments, k), drift_step(body.gyro, k, draws, like))
+    if body.gyro.terms[4]:
+        increment = clipped(increment, body.gyro, k)
+    if body.gyro.terms[5]:
+        increment = rounded(increment, body.gyro, k)
+    if len(draws.increments) > 0:
+        store_several(draws.increments, 3 * k, like, increment)
+    return increment
+
+
+def longest_step(state, part, dt, body):
+    """Return the longest step, s."""
+    return body.draws.longest[0]
+
+
+def predict(state, part, dt, body, out):
+    """Propagate all runs."""
+    return propagated(state, part, dt, body, broadcast(0.0))
+
+
+def sensor_noise(e, sensor, events, draws, like):
     """Return the noise of a measurement: white by component, outliers and correlated noise."""
     streams, ahead, memory = draws.streams, draws.ahead, draws.memory
-    sensor, number, share = events.sensor[e], events.number[e], events.share[e]
-    struck_below = events.struck_below[sensor]
-    mine = _SENSORS + _OF_A_SENSOR * sensor
+    number, share = events.number[e], events.share[e]
+    struck_below, boresight = events.struck_below[sensor], events.boresight[sensor]
+    mine = _SENSORS + 3 * sensor
     source = SENSORS + 2 * sensor
     white = normal_triple(streams, source, ahead, number, like)
     noise = by_axis(white, events.sigma, e)
+    if boresight[3] != 0.0:
+        b = (boresight[0], boresight[1], boresight[2])
+        noise = add(noise, scale(boresight[3] * dot(b, white), b))
     if struck_below > np.uint64(0) or share > 0.0:
         s0, s1, s2, s3 = four(streams, 4 * (source + 1), like)
         word, s0, s1, s2, s3 = next_word(s0, s1, s2, s3)
@@ -360,141 +462,52 @@ def sensor_noise(e, events, draws, like):
     return noise
 
 
-def keep(kept, row, like, q, b, A, B, C, bias):
-    """Write the :data:`KEPT` values of an epoch."""
-    store_several(kept, row * KEPT, like, (*q, *b, *A, *B, *C, *bias))
-
-
-def update(q, b, A, B, C, e, events, draws, out, detail, like):
-    """Draw measurement e, update the filter with it, and return its state; the NIS is added to that of its sensor and span of time."""
-    noise = sensor_noise(e, events, draws, like)
-    exact, kind = events.exact, events.kind[e]
-    spans = len(out.nis) // (len(like) * max(len(events.struck_below), 1))
-    place = events.sensor[e] * spans + events.span[e]
-    one = like + 1.0
-    e2 = like
-    s2 = one
-    e3 = like
-    s3 = one
-    z0 = like
+def measured_value(e, sensor, kind, body, like):
+    """Draw measurement e: an attitude, or a vector and a fourth number without meaning."""
+    events, draws = body.events, body.draws
+    noise, exact = sensor_noise(e, sensor, events, draws, like), events.exact
     if kind == ATTITUDE:
-        measured = quaternion_multiply((exact[e, 0], exact[e, 1], exact[e, 2], exact[e, 3]), exponential(noise))
-        y = rotation_vector(quaternion_multiply((q[0], -q[1], -q[2], -q[3]), measured))
-        q, b, A, B, C, e1, s1, e2, s2, e3, s3 = update_residual(q, b, A, B, C, y, vector_at(events.variance, e))
-        chi = e1 * e1 / s1 + e2 * e2 / s2 + e3 * e3 / s3
-        z = (measured[1], measured[2], measured[3])
-        z0 = measured[0]
-    else:
-        z = add(vector_at(exact, e), noise)
-        frame = frame_at(events.frames, events.frame[e])
-        R = rotation_matrix(q)
-        r = frame[6:]
-        variance = events.variance[e, 0]
-        if kind != VECTOR:
-            z = scale(inverse_root(dot(z, z)), z)
-        if kind == HEADING:
-            m = matrix_times_vector(R, z)
-            error = arctangent(m[0] * r[1] - m[1] * r[0], m[0] * r[0] + m[1] * r[1])
-            q, b, A, B, C, e1, s1 = update_heading(q, b, A, B, C, heading_row(R, z), error, variance)
-            chi = e1 * e1 / s1
-        else:
-            q, b, A, B, C, e1, s1, e2, s2, chi = update_direction_and_judge(
-                q, b, A, B, C, R, frame[:3], frame[3:6], z, variance
-            )
-            if kind == VECTOR:
-                e3 = dot(transpose_times_vector(R, r), z) - 1.0
-                s3 = variance * one
-                chi = chi + e3 * e3 / variance
-    store(out.nis, place * len(like), load_like(out.nis, place * len(like), like) + chi)
-    if detail is not None:
-        store_several(detail.values, 4 * e, like, (z0, z[0], z[1], z[2]))
-        store_several(detail.innovations, 6 * e, like, (e1, s1, e2, s2, e3, s3))
-    return q, b, A, B, C
+        true = (exact[e, 0], exact[e, 1], exact[e, 2], exact[e, 3])
+        return quaternion_multiply(true, exponential(noise))
+    z = add(vector_at(exact, e), noise)
+    if body.gyro.terms[3]:
+        at = _OFFSETS + 6 * sensor
+        z = combine(events.scale[e], triple(draws.units, at, like), 1.0, z)
+        if len(events.turning) > 0:
+            turned = matrix_times_vector(frame_at(events.turning, e), triple(draws.units, at + 3, like))
+            z = combine(events.scale[e], turned, 1.0, z)
+    if kind != VECTOR:
+        z = scale(inverse_root(dot(z, z)), z)
+    return (z[0], z[1], z[2], like)
 
 
-def filter_start(bias, start, draws, like):
-    """Return the initial attitude and bias of the filter: the truth minus the error drawn."""
-    x = drawn_triple(draws.ahead, START, 0, like)
-    y = drawn_triple(draws.ahead, START, 3, like)
-    given = start.error
-    error = combine(given[0], x, 1.0, (given[2], given[3], given[4]))
-    attitude = (start.attitude[0], start.attitude[1], start.attitude[2], start.attitude[3])
-    q = unit(quaternion_multiply(attitude, exponential((-error[0], -error[1], -error[2]))))
-    return q, subtract(bias, combine(given[1], y, 1.0, (given[5], given[6], given[7])))
+def update(state, e, now, measured, body, out):
+    """Draw measurement e and update all runs; the NIS is added to that of its sensor and span of time."""
+    like, sensor = broadcast(0.0), measured.sensor[e]
+    kind = measured.series[sensor, KIND]
+    value = measured_value(e, sensor, kind, body, like)
+    state, nis, innovations = corrected(state, value, e, measured, body, like)
+    spans = len(out.nis) // (WIDTH * len(body.events.struck_below))
+    at = (sensor * spans + body.events.span[e]) * WIDTH
+    store(out.nis, at, load_like(out.nis, at, like) + nis)
+    if len(out.values) > 0:
+        store_several(out.values, 10 * e, like, (*value, *innovations))
+    return state
 
 
-def advance(pattern, numbers, keys, gyro, start, events, every, draws, out, detail):
-    """Compute the ``len(pattern)`` runs ``numbers`` over a whole scenario.
+def keep(state, row, e, body, out):
+    """Write the :data:`KEPT` values of an epoch."""
+    like = broadcast(0.0)
+    keep_filters(state, row, body, out, like)
+    store_several(out.kept, row * KEPT + 28, like, bias_now(body.gyro, row, body.draws, like))
+    return state
 
-    Parameters
-    ----------
-    pattern : tuple of floats, one per run
-        Its length and type define the lanes.
-    numbers : array of words (W,)
-    keys : array of words (sources, 2)
-    gyro : Gyro
-    start : Start
-    events : Events
-    every : int
-        Number of steps between stored epochs.
-    draws : Draws
-    out : Outputs
-    detail : Detail or None
-    """
-    like = lanes_of(pattern)
-    one = like + 1.0
-    mode = flush_tiny(like)
-    count = len(events.time)
-    edges = gyro.edges
-    steps = len(gyro.increments)
-    start_streams(keys, numbers, draws, like)
-    start_gyro(gyro, draws, like)
-    q = (one, like, like, like)
-    b = (like, like, like)
-    A = (start.variance[0] * one, like, like, start.variance[0] * one, like, start.variance[0] * one)
-    B = (like, like, like, like, like, like, like, like, like)
-    C = (start.variance[1] * one, like, like, start.variance[1] * one, like, start.variance[1] * one)
-    theta = (like, like, like)
-    e = 0
-    countdown = 0
-    row = 0
-    now = edges[0]
-    whole = 0.0
-    longest = 1.0
-    for k in range(-1, steps):
-        end = edges[k + 1]
-        while k >= 0:
-            due = e < count and events.time[e] <= end
-            stop = events.time[e] if due else end
-            dt = stop - now
-            if dt > 0.0:
-                if dt > longest:
-                    dt = longest
-                    stop = now + dt
-                    due = False
-                part = theta
-                if dt < whole:
-                    part = scale(dt / whole, theta)
-                q, A, B, C = predict(q, b, A, B, C, part, dt, start.noise[0], start.noise[1])
-                now = stop
-            if due:
-                q, b, A, B, C = update(q, b, A, B, C, e, events, draws, out, detail, like)
-                e += 1
-            if now >= end and (e == count or events.time[e] > end):
-                break
-        i = min(k + 1, steps - 1)
-        whole = edges[i + 1] - edges[i]
-        bias, drift = drift_step(gyro, k + 1, whole, vector_at(gyro.true_increments, i), draws, like)
-        theta = add(vector_at(gyro.increments, i), drift)
-        bias = add(vector_at(gyro.true_bias, k + 1), bias)
-        longest = gyro.substeps[i]
-        if detail is not None and k + 1 < steps:
-            store_several(detail.increments, 3 * (k + 1), like, theta)
-        if k < 0:
-            q, b = filter_start(bias, start, draws, like)
-        if countdown == 0:
-            countdown = every
-            keep(out.kept, row, like, q, b, A, B, C, bias)
-            row += 1
-        countdown -= 1
-    restore_mode(mode)
+
+def stopped(state):
+    """Return false: the runs are independent, so the walk goes to the end."""
+    return False
+
+
+def finish(state, row, e, body):
+    """Return whether a measurement was too precise."""
+    return state.lost

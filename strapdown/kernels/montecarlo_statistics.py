@@ -30,7 +30,7 @@ from strapdown.kernels.lane_values import (
     select,
     store,
 )
-from strapdown.kernels.montecarlo_run import KEPT
+from strapdown.kernels.montecarlo_run import KEPT, PATTERN
 from strapdown.kernels.rotation import quaternion_multiply
 
 SUMS = 6 + 21 + 21 + 3 + 6
@@ -93,14 +93,13 @@ class Sums(NamedTuple):
     """Words (9 · 8,)."""
 
 
-def accumulate(pattern, kept, width, column, valid, truth, error_bins, nees_bins, out, score):
+def accumulate(kept, valid, truth, error_bins, nees_bins, out, score):
     """Add eight runs to the sums.
 
     Parameters
     ----------
-    pattern : tuple of 8 floats
     kept : array
-        Flat, of :func:`strapdown.kernels.montecarlo_run.advance` of ``width`` runs, of which those from ``column`` on are taken.
+        Flat, as :func:`strapdown.kernels.montecarlo_run.keep` writes it.
     valid : array (8,)
         1 for each run that counts, 0 for the others.
     truth : array (m, 4)
@@ -111,12 +110,12 @@ def accumulate(pattern, kept, width, column, valid, truth, error_bins, nees_bins
     score : array (8,)
         Largest NEES of each run; infinite if one was not finite.
     """
-    like = lanes_of(pattern)
+    like = lanes_of(PATTERN)
     n = len(like)
     counted = load_like(valid, 0, like) > 0.5
     worst = like
     for row in range(len(truth)):
-        state = kept_state(kept, row * KEPT * width + column, width, like)
+        state = kept_state(kept, row, like)
         q, P, C = state[:4], state[7:28], state[22:28]
         true = (truth[row, 0], truth[row, 1], truth[row, 2], truth[row, 3])
         e_theta = rotation_vector(quaternion_multiply((q[0], -q[1], -q[2], -q[3]), true))
@@ -146,9 +145,9 @@ def accumulate(pattern, kept, width, column, valid, truth, error_bins, nees_bins
     store(score, 0, worst)
 
 
-def kept_state(kept, at, width, like):
-    """Return the stored values of an epoch, which starts at ``at``; ``width`` is the number of runs."""
-    return tuple(load_like(kept, at + i * width, like) for i in range(KEPT))
+def kept_state(kept, row, like):
+    """Return the stored values of an epoch."""
+    return tuple(load_like(kept, (row * KEPT + i) * len(like), like) for i in range(KEPT))
 
 
 def products(a, b):

@@ -19,7 +19,7 @@ import strapdown
 from strapdown.checks import InputError, count, one_of
 from strapdown.estimation.setup import FilterSetup
 from strapdown.montecarlo import lanes, scalar
-from strapdown.montecarlo.plan import Plan
+from strapdown.montecarlo.plan import Plan, dispersed
 from strapdown.montecarlo.statistics import Replay, Statistics, merge
 from strapdown.records import Origin
 from strapdown.scenarios import Scenario
@@ -53,16 +53,14 @@ def choose(plan: Plan, machine: str = "auto") -> Choice:
     The choice depends only on the plan, because the machines draw different noise.
     """
     one_of("machine", machine, ("auto", *MACHINES))
-    reasons: dict[str, str] = {}
-    for name in MACHINES if machine == "auto" else (machine,):
-        reason = MACHINES[name].supports(plan)
-        if reason is None:
-            return Choice(machine=name, reason=reasons.get("lanes", ""))
-        reasons[name] = reason
-    refusals = "; ".join(f"{name}: {reason}" for name, reason in reasons.items())
-    raise InputError(
-        f"no machine covers this plan ({refusals}); use a simpler filter or scenario, or precision float64"
-    )
+    reason = None if machine == scalar.NAME else lanes.supports(plan)
+    if reason is None:
+        return Choice(machine=scalar.NAME if machine == scalar.NAME else lanes.NAME)
+    if machine == lanes.NAME:
+        raise InputError(
+            f"the lanes do not cover this plan: {reason}; use the machine scalar, or a simpler filter or scenario"
+        )
+    return Choice(machine=scalar.NAME, reason=reason)
 
 
 class Identity(NamedTuple):
@@ -98,19 +96,14 @@ def sources() -> str:
 
 
 def arithmetic() -> str:
-    """Return the processor features that rounding depends on: its family, vectors and fused multiply-add.
-
-    Numba contracts products and sums if the processor can, and the number of lanes follows the width of its vectors.
-    """
+    """Return the processor features that rounding depends on: numba contracts products and sums if the processor can."""
     import platform
 
     from numba.core.codegen import get_host_cpu_features
 
-    from strapdown.kernels.machine import has_vectors
-
     arm = platform.machine() in ("aarch64", "arm64")
     fused = arm or "+fma" in get_host_cpu_features().split(",")
-    return f"{platform.machine()}, {'vectors' if has_vectors() else 'no vectors'}, {'FMA' if fused else 'no FMA'}"
+    return f"{platform.machine()}, {'FMA' if fused else 'no FMA'}"
 
 
 def replay(plan: Plan, run: int, *, machine: str = "auto") -> Replay:
@@ -130,7 +123,7 @@ def replay(plan: Plan, run: int, *, machine: str = "auto") -> Replay:
         Record, initial state and estimate.
     """
     found: Replay = MACHINES[choose(plan, machine).machine].replay(plan, count("run", run, minimum=0))
-    spec = scalar.dispersed(plan.scenario.gyro, plan.dispersions, plan.seed, run)
+    spec = dispersed(plan.scenario.gyro, plan.dispersions, plan.seed, run)
     of_this_run = plan.scenario
     if spec is not plan.scenario.gyro:  # dispersed, so no longer a preset
         of_this_run = replace(plan.scenario, gyro=spec, gyro_preset="")

@@ -1,41 +1,50 @@
-"""The lane machine: noise, sensors and filter of 8 runs (double precision) or 16 (single) at once, one per SIMD lane, compiled together.
+"""The lane machine: noise, sensors and filter of eight runs at once, one per SIMD lane, compiled together.
 
-The motion, the times of the measurements and all else common to the runs are computed once per plan; only the noise differs. Its random
-streams depend only on (seed, run, source), and the filter is the scalar machine's source, so run k is bitwise identical for any chunk,
-number of lanes, threads and host (with fused multiply-add). The noise has the distribution of the simulator's, not its numbers.
+The motion, the times of the measurements and all else common to the runs are computed once per plan; only the noise and the units differ.
+The random streams depend only on (seed, run, source), and runs do not enter each other, so run k is bitwise identical for any chunk,
+threads and host (with fused multiply-add). The noise has the distribution of the simulator's, not its numbers; the units are the
+simulator's.
 
 Two things are simpler than in the simulator. With a coning algorithm of N samples the noise is drawn once per filter step, with exactly the
 distribution of the sum of N samples, and does not enter the cross products; their contribution is below the rotation over a sample times
 the noise. Flicker is generated at the filter's steps, not at the gyro's samples.
-
-In single precision the attitude is rounded to 6e-8 rad, which over the filter's steps adds up to a random walk. Error and covariance
-therefore agree with those of double precision only if both are above about 1e-5 rad; :func:`supports` refuses plans with more precise
-sensors.
 """
 
 from __future__ import annotations
 
-import functools
 import math
 import weakref
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 
 from strapdown import estimation, quaternion, vectors
 from strapdown.checks import Array, count
-from strapdown.estimation import setup
-from strapdown.estimation.schedule import Schedule, schedule
+from strapdown.estimation import forward, setup
+from strapdown.estimation.forward import Problem
+from strapdown.estimation.schedule import innovations_by_sensor, skipped_too
 from strapdown.estimation.states import covariance_matrices
 from strapdown.gyro import GyroSpec, flicker
-from strapdown.kernels import gyro_errors, machine, montecarlo_run, montecarlo_statistics
-from strapdown.kernels.machine import compiled
+from strapdown.kernels import (
+    filter,
+    gyro_errors,
+    machine,
+    montecarlo_filter,
+    montecarlo_run,
+    montecarlo_six,
+    montecarlo_statistics,
+)
+from strapdown.kernels.lane_values import WIDTH
+from strapdown.kernels.machine import compiled, read_only
+from strapdown.kernels.montecarlo_run import KEPT
 from strapdown.kernels.noise import minus_two_log
 from strapdown.kernels.series import LARGEST_ANGLE
-from strapdown.montecarlo.plan import Plan, initial_sigmas
+from strapdown.kernels.walk import walk
+from strapdown.montecarlo.plan import Plan, initial_sigmas, unit
 from strapdown.montecarlo.statistics import (
     BINS,
     ERROR_EXPONENT,
@@ -48,31 +57,33 @@ from strapdown.montecarlo.statistics import (
     worst,
 )
 from strapdown.randomness import generator
-from strapdown.records import Estimate, ImuRecord, Innovations, Truth, compress
+from strapdown.records import ImuRecord, Truth, compress
 from strapdown.scenarios import Scenario, simulate
-from strapdown.vectors import Accelerometer, AttitudeSensor, Magnetometer, VectorMeasurements, VectorSensor
+from strapdown.vectors import (
+    Accelerometer,
+    AttitudeSensor,
+    HorizonSensor,
+    Magnetometer,
+    VectorMeasurements,
+    VectorSensor,
+)
 
 NAME = "lanes"
 CHUNK = 200
 
-GROUP = 8
-"""Number of runs summed together: the same for every number of lanes."""
 LARGEST_START = 0.5
 """Maximum σ of the initial attitude error for which its rotation is accurate to rounding, rad."""
-FINEST_SINGLE = 2e-5
-"""Minimum σ of the most precise sensor for single precision, rad."""
 
-_SOURCES = ("gyro", "gyro flicker", "gyro markov", "gyro turn-on", "initial error", "dispersions")
+_SOURCES = ("gyro", "gyro flicker", "gyro markov", "gyro turn-on", "initial error")
 _NOT_OF_THE_GYRO = {
     "quantization": 0.0,
-    "rate_resolution": 0.0,
     "bandwidth": np.inf,
     "sampling_jitter": 0.0,
     "timestamp_error": 0.0,
     "timestamp_offset": 0.0,
     "drop_probability": 0.0,
 }
-_SENSORS = (VectorSensor, Magnetometer, Accelerometer, AttitudeSensor)
+_SENSORS = (VectorSensor, HorizonSensor, Magnetometer, Accelerometer, AttitudeSensor)
 
 
 def supports(plan: Plan) -> str | None:
@@ -90,30 +101,28 @@ def _reasons(plan: Plan) -> Iterator[str]:
     for sensor in plan.scenario.sensors:
         if type(sensor) not in _SENSORS:
             yield f"{sensor.name}: a sensor of class {type(sensor).__name__}"
-        elif isinstance(sensor, AttitudeSensor) and sensor.covariance is not None:
-            yield f"{sensor.name}: a boresight other than a body axis"
         elif sensor.faults.latency > 0.0:  # type: ignore[attr-defined]
             yield f"{sensor.name}: latency"
         elif sensor.faults.drop_probability > 0.0:  # type: ignore[attr-defined]
             yield f"{sensor.name}: lost samples"
-        elif isinstance(plan.setup.sigma.get(sensor.name), tuple) and not isinstance(sensor, AttitudeSensor):
-            yield f"{sensor.name}: a different sigma for each axis"
     if plan.setup.estimator != setup.MEKF:
         yield f"the estimator {plan.setup.estimator_name}"
-    if plan.individuals:
-        yield "gyro and sensors drawn anew for each run"
-    for option in ("gate", "robust", "states"):
+    for option in ("gate", "robust"):
         if getattr(plan.setup, option, None) is not None:
             yield f"the filter's {option} option"
     if initial_sigmas(plan.dispersions, plan.setup)[0] > LARGEST_START:
         yield f"an initial attitude error of more than {LARGEST_START} rad, 1 sigma"
-    if plan.setup.integration.samples > 1 and plan.dispersions.of_the_gyro:
-        yield "gyro parameters that differ from run to run with several gyro samples a filter step"
-    prepared = _prepared(plan)
-    if prepared.saturates:
-        yield "a gyro range so close to the motion's rates that the gyro may saturate"
-    if plan.precision == "float32" and prepared.finest < FINEST_SINGLE:
-        yield f"float32 with a sensor of {prepared.finest:.2g} rad, finer than {FINEST_SINGLE:g} rad"
+    if plan.setup.integration.samples > 1:
+        if _units_differ(plan):
+            yield "gyro parameters that differ from run to run with several gyro samples a filter step"
+        if np.isfinite(spec.range) or np.any(np.asarray(spec.rate_resolution) > 0.0):
+            yield "a gyro of limited range or resolution with several gyro samples a filter step"
+    if plan.setup.states is not None and np.any(plan.setup.states.gyro_temperature_sigma):
+        yield "a state of the gyro's bias over temperature"
+
+
+def _units_differ(plan: Plan) -> bool:
+    return plan.individuals or plan.dispersions.of_the_gyro
 
 
 # ---------------------------------------------------------------------------------------------- common to all runs
@@ -121,21 +130,32 @@ def _reasons(plan: Plan) -> Iterator[str]:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Prepared:
-    """Data common to all runs of a plan, as the kernels take them."""
+    """Data common to all runs of a plan."""
 
+    problem: Problem
+    """Record of the filter's steps without noise, with the filter's σ, and the filter."""
+    record: ImuRecord
+    """The same record with nominal σ."""
+    kernels: ModuleType
+    """Filter for several runs, for the structure of the model."""
+    parts: tuple[ModuleType, ...]
+    """Modules that define the filter for the kernel of the runs."""
     gyro: montecarlo_run.Gyro
     start: montecarlo_run.Start
-    events_of_runs: montecarlo_run.Events
-    record: ImuRecord
-    """Record of the filter's steps without noise; its series have nominal σ."""
-    events: Schedule
-    truth: Array
-    """True attitudes at the epochs (m, 4)."""
+    events: montecarlo_run.Events
+    filters: Any
+    """Filter as the kernels' argument, without the arrays of a group."""
+    noise: Array
+    """Covariances of the measurements in body axes (events, 6), one sensor after the other."""
     degrees: Counts
     """Degrees of freedom of one run by sensor and time bin (s, k)."""
     keys: np.ndarray
-    saturates: bool
-    finest: float
+
+    @property
+    def truth(self) -> Array:
+        """True attitudes at the filter's steps."""
+        assert self.record.truth is not None
+        return self.record.truth.attitude
 
 
 _PREPARED: weakref.WeakKeyDictionary[Plan, _Prepared] = weakref.WeakKeyDictionary()
@@ -153,81 +173,61 @@ def _quiet(spec: GyroSpec) -> GyroSpec:
     """Return the gyro without the errors that differ from run to run."""
     none = ("angle_random_walk", "rate_random_walk", "bias_instability", "markov_noise", "turn_on_bias_sigma")
     silent: dict[str, Any] = dict.fromkeys(none, 0.0)
-    return replace(spec, **silent, range=np.inf)
+    return replace(spec, **silent, range=np.inf, rate_resolution=0.0)
 
 
 def _prepare(plan: Plan) -> _Prepared:
     scenario, algorithm = plan.scenario, plan.setup.integration
-    spec = scenario.gyro
-    quiet = simulate(replace(scenario, gyro=_quiet(spec), sensors=()), plan.seed, 0)
-    turns = np.ascontiguousarray(scenario.motion.increments(scenario.edges))
-    dt = 1.0 / scenario.rate
-    assert quiet.truth is not None
-    rate_sigma = (
-        np.sqrt(np.square(spec.angle_random_walk) / dt)
-        + np.asarray(spec.turn_on_bias_sigma)
-        + np.sqrt(np.square(spec.rate_random_walk) * scenario.duration)
-        + 5.0 * np.asarray(spec.bias_instability)
-        + plan.dispersions.turn_on_bias_sigma
-    )
-    steps = quiet if algorithm.name == "one-sample" else compress(quiet, algorithm)
-    n = algorithm.samples
+    quiet = simulate(replace(scenario, gyro=_quiet(scenario.gyro), sensors=()), plan.seed, 0)
     # From one run: times, kinds, references and nominal σ are common to all runs.
     ends = scenario.motion, scenario.edges[0], scenario.edges[-1]
     series = tuple(one.observe(*ends, generator(plan.seed, 0, one.name)) for one in scenario.sensors)
-    record = replace(steps, vectors=series)
-    modelled = setup.modelled_record(replace(quiet, vectors=series), plan.setup)
-    events = schedule(modelled.vectors, float(record.time[0]), float(record.time[-1]))
-    values = [_exact(sensor, scenario, own) for sensor, own in zip(scenario.sensors, series, strict=True)]
-    real = _real(plan)
-    gyro = montecarlo_run.Gyro(
-        np.ascontiguousarray(record.time),
-        _substeps(record),
-        np.ascontiguousarray(record.increments, real),
-        np.ascontiguousarray(turns.reshape(-1, n, 3).sum(axis=1), real),
-        np.ascontiguousarray(quiet.truth.bias[::n], real),
-        *_gyro_terms(plan, n * dt, len(record.increments)),
-    )
-    noise = plan.setup.process_noise
-    start = montecarlo_run.Start(
-        attitude=np.ascontiguousarray(quiet.truth.attitude[0]),
-        error=np.array(
-            [
-                *initial_sigmas(plan.dispersions, plan.setup),
-                *plan.dispersions.attitude_error,
-                *plan.dispersions.bias_error,
-            ]
-        ),
-        variance=np.array([plan.setup.attitude_sigma, plan.setup.bias_sigma]) ** 2,
-        noise=np.array([noise.angle_random_walk, noise.rate_random_walk]) ** 2,
-    )
-    place = np.clip(np.searchsorted(plan.nis_edges, events.time, side="left") - 1, 0, plan.nis_bins - 1)
+    quiet = replace(quiet, vectors=series)
+    record = quiet if algorithm.name == "one-sample" else compress(quiet, algorithm)
+    assert record.truth is not None
+    initial = setup.initial_state(plan.setup, record.truth.attitude[0], record.truth.bias[0])
+    problem = setup.prepared(setup.modelled_record(quiet, plan.setup), plan.setup, initial)
+    events, model = problem.events, problem.model
+    kernels = machine.instance(filter, STRUCTURE=model.structure, LANES=WIDTH)
+    plain = not model.states and events.noise_by_axis is None
+    noise = np.empty((len(events.time), 6))
+    noise[events.row] = events.body_noise
+    span = np.clip(np.searchsorted(plan.nis_edges, events.time, side="left") - 1, 0, plan.nis_bins - 1)
     degrees = np.zeros((len(plan.sensors), plan.nis_bins), np.int64)
-    np.add.at(degrees, (events.sensor, place), np.array([vectors.KINDS[kind] for kind in events.kinds])[events.sensor])
-    prepared = _Prepared(
-        gyro=gyro,
-        start=start,
-        events_of_runs=_event_terms(plan, events, values),
+    np.add.at(degrees, (events.sensor, span), np.array([vectors.KINDS[kind] for kind in events.kinds])[events.sensor])
+    turns = np.ascontiguousarray(scenario.motion.increments(scenario.edges))
+    states = plan.setup.states
+    return _Prepared(
+        problem=problem,
         record=record,
-        events=events,
-        truth=np.ascontiguousarray(quiet.truth.attitude[:: n * plan.every]),
+        kernels=kernels,
+        parts=(montecarlo_six,) if plain else (montecarlo_filter, kernels),
+        gyro=_gyro_terms(plan, record, model.limit, turns),
+        start=montecarlo_run.Start(
+            attitude=np.ascontiguousarray(record.truth.attitude[0]),
+            error=np.array(
+                [
+                    *initial_sigmas(plan.dispersions, plan.setup),
+                    *plan.dispersions.attitude_error,
+                    *plan.dispersions.bias_error,
+                ]
+            ),
+            P=np.ascontiguousarray(problem.initial.covariance),
+            fast=0.0 if states is None else float(states.gyro_fast_bias_sigma) ** 2,
+        ),
+        events=_event_terms(plan, problem, series, span),
+        filters=forward.filter_body(problem, forward.unit_sigmas(problem.record, model, {})),
+        noise=read_only(noise),
         degrees=degrees,
         keys=_keys(plan),
-        saturates=bool(np.any(np.abs(turns) / dt + 10.0 * rate_sigma > spec.range)),
-        finest=float(np.sqrt(min(events.variance, default=1.0))),
     )
-    return prepared
 
 
-def _substeps(record: ImuRecord) -> Array:
+def _substeps(record: ImuRecord, limit: float) -> Array:
     """Return, for each step of a record (n,), the longest time, s, over which the filter's polynomials hold: at most the step."""
     angle = np.linalg.norm(record.increments, axis=1)
-    return np.asarray(record.intervals * np.minimum(1.0, LARGEST_ANGLE / np.maximum(angle, LARGEST_ANGLE)))
-
-
-def _real(plan: Plan) -> Any:
-    """Return the floating-point type of the runs. Common data have it too: converting a number at each step costs more than using it."""
-    return np.float32 if plan.precision == "float32" else np.float64
+    share = np.minimum(1.0, LARGEST_ANGLE / np.maximum(angle, LARGEST_ANGLE))
+    return np.asarray(np.minimum(record.intervals * share, limit))
 
 
 def _keys(plan: Plan) -> np.ndarray:
@@ -241,17 +241,23 @@ def _keys(plan: Plan) -> np.ndarray:
     )
 
 
-def _gyro_terms(plan: Plan, dt: float, steps: int) -> tuple[Any, ...]:
-    """Return the kernel's gyro parameters: terms, noise per step, flicker, dispersions."""
-    spec, given = plan.scenario.gyro, plan.dispersions
-    axes = [
+def _gyro_terms(plan: Plan, record: ImuRecord, limit: float, turns: Array) -> montecarlo_run.Gyro:
+    """Return the gyro for the kernel; ``turns``: true increments at the gyro's rate."""
+    scenario, spec, samples = plan.scenario, plan.scenario.gyro, plan.setup.integration.samples
+    dt, steps = samples / scenario.rate, len(record.increments)
+    white, walk, markov, instability, resolution = (
         np.broadcast_to(value, 3)
-        for value in (spec.angle_random_walk, spec.rate_random_walk, spec.markov_noise, spec.bias_instability)
-    ]
-    white, walk, markov, instability = axes
+        for value in (
+            spec.angle_random_walk,
+            spec.rate_random_walk,
+            spec.markov_noise,
+            spec.bias_instability,
+            spec.rate_resolution,
+        )
+    )
     tau = spec.markov_correlation_time
     decay, variance, mean, remainder = gyro_errors.markov_step(dt, tau)
-    gyro = np.array(
+    sizes = np.array(
         [
             np.sqrt(white**2 * dt + walk**2 * dt**3 / 12.0 + markov**2 * remainder),
             walk * np.sqrt(dt),
@@ -259,26 +265,41 @@ def _gyro_terms(plan: Plan, dt: float, steps: int) -> tuple[Any, ...]:
             markov * np.sqrt(variance),
             np.full(3, mean),
             markov * np.sqrt(0.5 * tau) if np.isfinite(tau) else np.zeros(3),
-            np.hypot(np.broadcast_to(spec.turn_on_bias_sigma, 3), given.turn_on_bias_sigma),
+            np.broadcast_to(spec.turn_on_bias_sigma, 3),
             instability,
+            np.full(3, spec.range),
+            resolution,
         ]
     )
     shaping = flicker.shaping(steps)
-    real = _real(plan)
     flickers = bool(np.any(instability > 0.0))
-    covariance = shaping.covariance
-    scale = np.sqrt(np.diag(covariance))
-    factor = scale[:, None] * np.linalg.cholesky(covariance / np.outer(scale, scale))
-    dispersion = np.full((3, 3), given.misalignment_sigma)
-    np.fill_diagonal(dispersion, given.scale_factor_sigma)
-    terms = np.array([np.any(walk > 0.0), np.any(markov > 0.0), flickers, np.any(dispersion > 0.0)])
-    return (
-        terms,
-        gyro.astype(real),
-        shaping.poles.astype(real),
-        shaping.gains.astype(real),
-        factor if flickers else np.empty((0, flicker.STATES)),
-        dispersion,
+    scale = np.sqrt(np.diag(shaping.covariance))
+    factor = scale[:, None] * np.linalg.cholesky(shaping.covariance / np.outer(scale, scale))
+    force = np.empty((0, 3))
+    if plan.individuals and np.any(spec.g_sensitivity != 0.0):
+        middle = 0.5 * (scenario.edges[1:] + scenario.edges[:-1])
+        force = vectors.specific_force(scenario.motion, middle, gravity_f=scenario.gravity_f) / scenario.rate
+    assert record.truth is not None
+    return montecarlo_run.Gyro(
+        edges=read_only(record.time),
+        substeps=_substeps(record, limit),
+        true_increments=np.ascontiguousarray(turns.reshape(-1, samples, 3).sum(axis=1)),
+        true_force=force,
+        true_bias=record.truth.bias,
+        terms=np.array(
+            [
+                np.any(walk > 0.0),
+                np.any(markov > 0.0),
+                flickers,
+                _units_differ(plan),
+                np.isfinite(spec.range),
+                np.any(resolution > 0.0),
+            ]
+        ),
+        sizes=sizes,
+        poles=shaping.poles,
+        gains=shaping.gains,
+        poles_start=factor if flickers else np.empty((0, flicker.STATES)),
     )
 
 
@@ -290,7 +311,7 @@ def _exact(sensor: Any, scenario: Scenario, series: VectorMeasurements) -> tuple
         changes.update(sigma_across=0.0, sigma_about=0.0)
     else:
         changes.update(sigma=0.0)
-        if not isinstance(sensor, VectorSensor):
+        if isinstance(sensor, Magnetometer | Accelerometer):
             changes.update(kind="vector")
     exact = replace(sensor, **changes).observe(
         scenario.motion, scenario.edges[0], scenario.edges[-1], generator(0, 0, sensor.name)
@@ -298,162 +319,176 @@ def _exact(sensor: Any, scenario: Scenario, series: VectorMeasurements) -> tuple
     m = len(series.time)
     if series.attitude is not None:
         assert exact.attitude is not None
-        return exact.attitude, np.broadcast_to(sensor.sigma_axes, (m, 3)), np.ones(m)
-    length = np.linalg.norm(exact.references_f, axis=1)
+        tilted = isinstance(sensor.boresight, tuple)
+        sigma = np.full(3, sensor.sigma_across) if tilted else sensor.sigma_axes
+        return exact.attitude, np.broadcast_to(sigma, (m, 3)), np.ones(m)
+    length = np.broadcast_to(np.linalg.norm(exact.reference_f, axis=-1), m)
     values = np.concatenate([exact.vector_b / length[:, None], np.zeros((m, 1))], axis=1)
     return values, np.repeat(sensor.sigma / length[:, None], 3, axis=1), 1.0 / length
 
 
-def _event_terms(plan: Plan, events: Schedule, values: list[tuple[Array, Array, Array]]) -> montecarlo_run.Events:
+def _event_terms(
+    plan: Plan, problem: Problem, series: tuple[VectorMeasurements, ...], span: np.ndarray
+) -> montecarlo_run.Events:
     """Return the measurements and sensors for the kernel."""
-    m = len(events.time)
-    exact, sigma = np.zeros((m, 4)), np.zeros((m, 3))
+    events, sensors = problem.events, plan.scenario.sensors
+    m, s = len(events.time), len(sensors)
+    exact, sigma, scale = np.zeros((m, 4)), np.zeros((m, 3)), np.ones(m)
     decay, share, number = np.zeros(m), np.zeros(m), np.zeros(m, np.int64)
-    variance = np.repeat(events.variance[:, None], 3, axis=1)
-    sensors = plan.scenario.sensors
-    struck, scale = np.zeros(len(sensors), np.uint64), np.ones(len(sensors))
-    for i, (sensor, (value, deviation, length)) in enumerate(zip(sensors, values, strict=True)):
+    struck, larger, boresight = np.zeros(s, np.uint64), np.ones(s), np.zeros((s, 4))
+    for i, (sensor, own) in enumerate(zip(sensors, series, strict=True)):
         faults: vectors.Faults = sensor.faults  # type: ignore[attr-defined]
         mine = np.flatnonzero(events.sensor == i)
-        assert len(mine) == len(value)
-        exact[mine], sigma[mine], number[mine] = value, deviation, np.arange(len(mine))
-        if events.kinds[i] == "attitude":
-            variance[mine] = events.vector_b[mine]
+        exact[mine], sigma[mine], scale[mine] = _exact(sensor, plan.scenario, own)
+        number[mine] = np.arange(len(mine))
+        if isinstance(sensor, AttitudeSensor) and isinstance(sensor.boresight, tuple):
+            boresight[i] = (*sensor.boresight, sensor.sigma_about - sensor.sigma_across)
         if faults.outlier_probability > 0.0:
             struck[i] = min(int(faults.outlier_probability * 2.0**64), 2**64 - 1)
-            scale[i] = faults.outlier_scale
+            larger[i] = faults.outlier_scale
         if faults.correlated_sigma > 0.0 and len(mine):
             decay[mine[1:]] = np.exp(-np.diff(events.time[mine]) / faults.correlation_time)
-            share[mine] = faults.correlated_sigma * length * np.sqrt(1.0 - decay[mine] ** 2)
-    place = np.clip(np.searchsorted(plan.nis_edges, events.time, side="left") - 1, 0, plan.nis_bins - 1)
-    real = _real(plan)
+            share[mine] = faults.correlated_sigma * scale[mine] * np.sqrt(1.0 - decay[mine] ** 2)
     return montecarlo_run.Events(
-        time=events.time,
-        kind=events.kind,
-        sensor=events.sensor.astype(np.int64),
-        span=place.astype(np.int64),
-        exact=exact.astype(real),
-        sigma=sigma.astype(real),
-        variance=variance.astype(real),
-        decay=decay.astype(real),
-        share=share.astype(real),
+        span=span.astype(np.int64),
+        exact=exact,
+        sigma=sigma,
+        scale=scale,
+        turning=_true_turning(plan, events.time),
+        decay=decay,
+        share=share,
         number=number,
-        frame=events.reference,
-        frames=events.triads.astype(real),
+        boresight=boresight,
         struck_below=struck,
-        outlier_scale=scale,
+        outlier_scale=larger,
     )
+
+
+def _true_turning(plan: Plan, time: Array) -> Array:
+    """Return ``[ẇ] + [w]²`` by rows (m, 9) at these times; no rows if the runs do not differ in lever arms."""
+    motion = plan.scenario.motion
+    if not plan.individuals or not any(np.any(getattr(one, "lever_arm_b", 0.0)) for one in plan.scenario.sensors):
+        return np.empty((0, 9))
+    rate, arms = np.cross(motion.body_rate(time)[:, None], np.eye(3)), np.eye(3)
+    columns = np.cross(motion.body_angular_acceleration(time)[:, None], arms)
+    columns += np.cross(motion.body_rate(time)[:, None], rate)
+    return np.ascontiguousarray(columns.transpose(0, 2, 1)).reshape(-1, 9)
 
 
 # ---------------------------------------------------------------------------------------------- running
 
 
-def width_of(precision: str) -> int:
-    """Return the number of runs computed at once on this processor: 8 or 16, or 1 if it has no SIMD vectors."""
-    if not _answered(machine.has_vectors):
-        return 1
-    return 16 if precision == "float32" else 8
-
-
-@functools.cache
-def _answered(question: Callable[[], bool]) -> bool:
-    """Return the cached answer about the processor: evaluating it takes as long as some thousand steps."""
-    return question()
-
-
 class _Group:
-    """Memory of several simultaneous runs, and the call that advances them."""
+    """Memory of eight simultaneous runs, and the call that advances them."""
 
-    def __init__(self, plan: Plan, width: int, *, every: int | None = None, detail: bool = False) -> None:
-        self.prepared = _prepared(plan)
-        self.width = width
-        real = _real(plan)
-        self.pattern = tuple(real(0.0) for _ in range(width))
+    def __init__(self, plan: Plan, *, every: int | None = None, detail: bool = False) -> None:
+        self.plan, self.prepared = plan, _prepared(plan)
         self.every = plan.every if every is None else every
-        steps, events, sensors = len(self.prepared.record.increments), len(self.prepared.events.time), len(plan.sensors)
+        prepared, kernels, sensors = self.prepared, self.prepared.kernels, len(plan.sensors)
+        steps, events, n = len(prepared.record.increments), len(prepared.problem.events.time), kernels.N
         self.epochs = steps // self.every + 1
-        self.places = sensors * plan.nis_bins
+        self.truth = np.ascontiguousarray(prepared.truth[:: self.every])
+        self.gyro = prepared.gyro._replace(true_bias=np.ascontiguousarray(prepared.gyro.true_bias[:: self.every]))
+        self.kept = np.empty(self.epochs * KEPT * WIDTH)
+        self.nis = np.zeros((sensors * plan.nis_bins, WIDTH))
+        self.levers = prepared.problem.model.levers.any()
+        sizes = (10 * events, 2 * (n - 6) * self.epochs) if detail else (0, 0)
+        self.detail = [np.zeros(size * WIDTH) for size in sizes]
         self.draws = montecarlo_run.Draws(
-            streams=np.empty(4 * len(self.prepared.keys) * width, np.uint64),
-            ahead=np.empty(len(self.prepared.keys) * montecarlo_run.AHEAD * width, np.float32),
-            memory=np.empty(montecarlo_run.memory(sensors) * width, real),
+            numbers=np.empty(WIDTH, np.uint64),
+            keys=prepared.keys,
+            streams=np.empty(4 * len(prepared.keys) * WIDTH, np.uint64),
+            ahead=np.empty(len(prepared.keys) * montecarlo_run.AHEAD * WIDTH, np.float32),
+            memory=np.zeros(montecarlo_run.memory(sensors) * WIDTH),
+            units=np.zeros(montecarlo_run.units(sensors) * WIDTH),
+            innovation=np.zeros(7 * WIDTH),
+            increments=np.zeros(3 * steps * WIDTH if detail or self.levers else 0),
+            longest=np.zeros(1),
         )
-        self.kept = np.empty(self.epochs * montecarlo_run.KEPT * width)
-        self.nis = np.zeros(self.places * width, real)
-        # Without detail the kernel is compiled without the divisions that the innovations need.
-        self.detail = (
-            montecarlo_run.Detail(*(np.empty(size * width) for size in (3 * steps, 4 * events, 6 * events)))
-            if detail
-            else None
+        self.filters = prepared.filters._replace(
+            x=np.zeros((2, (n + 1) * WIDTH)),
+            P=np.zeros((2, kernels.SIZE_OF_P)),
+            coefficients=np.zeros_like(prepared.filters.coefficients),
+            dt=np.zeros(1),
+            turning=np.zeros(prepared.filters.turning.size * WIDTH),
+            work=np.zeros(kernels.LINES * kernels.LINE * WIDTH),
         )
+        self.measured = prepared.problem.events.measurements._replace(value=np.zeros(4 * WIDTH), noise=prepared.noise)
 
     def advance(self, first: int) -> None:
         """Compute the runs from index ``first`` on."""
+        draws = self.draws
+        draws.numbers[:] = np.arange(first, first + WIDTH)
         self.nis[:] = 0.0
+        if _units_differ(self.plan):
+            differences = [_differences(self.plan, run) for run in range(first, first + WIDTH)]
+            draws.units[:] = np.transpose(differences).ravel()
+        lost = self._run()
+        if self.levers:
+            # The angular acceleration is that of the samples around a measurement: the gyro's are drawn in the first pass.
+            self.filters = self.filters._replace(turning=self._turns())
+            self.nis[:] = 0.0
+            lost = self._run()
+        if lost:
+            raise forward.TooPreciseError
+
+    def _turns(self) -> Array:
+        """Return the measured motion of a lever arm at the events (events, 9, runs), flat, from the increments drawn."""
+        problem = self.prepared.problem
+        runs = np.moveaxis(self.draws.increments.reshape(-1, 3, WIDTH), -1, 0)
+        records = [replace(problem.record, increments=np.ascontiguousarray(one)) for one in runs]
+        turns = [forward.turns(replace(problem, record=record)) for record in records]
+        return np.stack(turns, axis=-1).reshape(-1)
+
+    def _run(self) -> bool:
         prepared = self.prepared
-        compiled(montecarlo_run.advance)(
-            self.pattern,
-            np.arange(first, first + self.width, dtype=np.uint64),
-            prepared.keys,
-            prepared.gyro,
-            prepared.start,
-            prepared.events_of_runs,
-            self.every,
-            self.draws,
-            montecarlo_run.Outputs(self.kept, self.nis),
-            self.detail,
+        return bool(
+            compiled(walk, montecarlo_run, *prepared.parts)(
+                prepared.gyro.edges,
+                read_only(prepared.record.increments),
+                self.measured,
+                self.every,
+                montecarlo_run.Body(self.filters, self.gyro, prepared.start, prepared.events, self.draws),
+                montecarlo_run.Outputs(self.kept, self.nis.reshape(-1), *self.detail),
+            )
         )
 
 
-def run_chunk(plan: Plan, first_run: int, runs: int, *, width: int | None = None) -> Statistics:
-    """Return the statistics of runs ``first_run`` to ``first_run + runs − 1``, ``width`` runs at once (default: that of the processor)."""
-    lanes = width_of(plan.precision) if width is None else width
-    group = _Group(plan, lanes)
+def _differences(plan: Plan, run: int) -> Array:
+    """Return the differences of the gyro and the sensors of one run from those of the scenario, in the order of the kernel."""
+    nominal, own = plan.scenario, unit(plan, run)
+    parts = [getattr(own.gyro, n) - getattr(nominal.gyro, n) for n in ("error_matrix", "g_sensitivity", "turn_on_bias")]
+    for mine, common in zip(own.sensors, nominal.sensors, strict=True):
+        for names in (("hard_iron", "bias"), ("lever_arm_b",)):
+            known = [getattr(mine, name) - getattr(common, name) for name in names if hasattr(mine, name)]
+            parts.append(known[0] if known else np.zeros(3))
+    return np.concatenate([part.ravel() for part in parts])
+
+
+def run_chunk(plan: Plan, first_run: int, runs: int) -> Statistics:
+    """Return the statistics of runs ``first_run`` to ``first_run + runs − 1``."""
+    group = _Group(plan)
     m, s = plan.epochs + 1, len(plan.sensors)
-    sums = np.zeros((m, montecarlo_statistics.SUMS, GROUP))
+    sums = np.zeros((m, montecarlo_statistics.SUMS, WIDTH))
     sums[:, montecarlo_statistics.NEES_PRODUCT :: 2] = 1.0
     finite = np.zeros(m, np.int64)
     coverage, histogram = np.zeros((m, 6, 3), np.int64), np.zeros((m, 9, BINS), np.int64)
-    nis = np.zeros((group.places, GROUP))
-    scratch, score = np.zeros(9 * GROUP, np.uint64), np.zeros(GROUP)
+    nis = np.zeros_like(group.nis)
+    scratch, score = np.zeros(9 * WIDTH, np.uint64), np.zeros(WIDTH)
     bins = [np.array([0, BINS - 1], np.uint64) + np.uint64(first_bin(e)) for e in (ERROR_EXPONENT, NEES_EXPONENT)]
-    scores = np.empty(-(-runs // GROUP) * GROUP)
-    at_once = max(lanes, GROUP)
-    kept = group.kept if lanes >= GROUP else np.empty(m * montecarlo_run.KEPT * GROUP)
-    group_nis = np.empty((group.places, GROUP)) if lanes < GROUP else group.nis.reshape(-1, lanes)
-    valid, pattern = np.ones(GROUP), (0.0,) * GROUP
-    examples = []
-    for start in range(0, runs, at_once):
-        for lane in range(0, at_once, lanes):
-            group.advance(first_run + start + lane)
-            if lanes < GROUP:
-                kept.reshape(-1, GROUP)[:, lane : lane + lanes] = group.kept.reshape(-1, lanes)
-                group_nis[:, lane : lane + lanes] = group.nis.reshape(-1, lanes)
-        for column in range(0, min(at_once, runs - start), GROUP):
-            place = start + column
-            valid[runs - place :] = 0.0
-            compiled(montecarlo_statistics.accumulate)(
-                pattern,
-                kept,
-                at_once,
-                column,
-                valid,
-                group.prepared.truth,
-                *bins,
-                montecarlo_statistics.Sums(finite, sums.reshape(-1), coverage, histogram, scratch),
-                score,
-            )
-            scores[place : place + GROUP] = score
-            counted = min(GROUP, runs - place)
-            nis[:, :counted] += group_nis[:, column : column + counted]
-        if first_run + start < EXAMPLES:
-            own = kept.reshape(m, montecarlo_run.KEPT, -1)
-            examples += [
-                (first_run + start + k, *_example(own[:, :, k], group.prepared.truth))
-                for k in range(min(EXAMPLES - first_run - start, runs - start, own.shape[2]))
-            ]
-    numbers = np.arange(first_run, first_run + runs)
-    worst_run, worst_score = worst(numbers, scores[:runs])
+    out = montecarlo_statistics.Sums(finite, sums.reshape(-1), coverage, histogram, scratch)
+    scores, examples = np.empty(-(-runs // WIDTH) * WIDTH), []
+    for start in range(0, runs, WIDTH):
+        group.advance(first_run + start)
+        counted = min(WIDTH, runs - start)
+        valid = (np.arange(WIDTH) < counted).astype(np.float64)
+        compiled(montecarlo_statistics.accumulate)(group.kept, valid, group.truth, *bins, out, score)
+        scores[start : start + WIDTH] = score
+        nis[:, :counted] += group.nis[:, :counted]
+        for k in range(min(EXAMPLES - first_run - start, counted)):
+            kept = group.kept.reshape(m, KEPT, WIDTH)[:, :, k]
+            examples.append((first_run + start + k, *_example(kept, group.truth)))
+    worst_run, worst_score = worst(np.arange(first_run, first_run + runs), scores[:runs])
     products, binades = (sums[:, montecarlo_statistics.NEES_PRODUCT + k :: 2] for k in (0, 1))
     total = _total(sums)
     return Statistics(
@@ -496,43 +531,37 @@ def _example(kept: Array, truth: Array) -> tuple[Array, Array]:
     return np.concatenate([error, kept[:, 28:31] - kept[:, 4:7]], axis=1), np.sqrt(diagonal)
 
 
-def replay(plan: Plan, run: int, *, width: int = 1) -> Replay:
+def replay(plan: Plan, run: int) -> Replay:
     """Return one run in full detail, bitwise identical to that of the campaign."""
     number = count("run", run, minimum=0)
-    group = _Group(plan, width, every=1, detail=True)
+    group = _Group(plan, every=1, detail=True)
     group.advance(number)
-    prepared = group.prepared
-    assert group.detail is not None
-    kept = np.ascontiguousarray(group.kept.reshape(group.epochs, montecarlo_run.KEPT, width)[:, :, 0])
-    assert prepared.record.truth is not None
-    truth = Truth(attitude=prepared.record.truth.attitude, bias=kept[:, 28:31])
-    events = prepared.events
-    values = group.detail.values.reshape(-1, 4, width)[:, :, 0]
+    problem, record = group.prepared.problem, group.prepared.record
+    events, n = problem.events, group.prepared.kernels.N
+    assert record.truth is not None
+    lengths = (KEPT, 3, 10, 2 * (n - 6))
+    flat = zip((group.kept, group.draws.increments, *group.detail), lengths, strict=True)
+    kept, increments, values, states = (
+        np.ascontiguousarray(a.reshape(-1, width, WIDTH)[:, :, 0]) if width else np.empty((group.epochs, 0))
+        for a, width in flat
+    )
     record = replace(
-        prepared.record,
-        increments=np.ascontiguousarray(group.detail.increments.reshape(-1, 3, width)[:, :, 0]),
-        vectors=tuple(
-            _measured(series, values[events.sensor == i]) for i, series in enumerate(prepared.record.vectors)
-        ),
-        truth=truth,
+        record,
+        increments=increments,
+        vectors=tuple(_measured(series, values[events.sensor == i, :4]) for i, series in enumerate(record.vectors)),
+        truth=Truth(attitude=record.truth.attitude, bias=kept[:, 28:31]),
     )
     covariance = covariance_matrices(kept[:, 7:28])
-    rows = group.detail.innovations.reshape(-1, 6, width)[:, :, 0]
-    estimate = Estimate(
-        time=record.time,
-        attitude=kept[:, :4],
-        bias=kept[:, 4:7],
-        variance=kept[:, [7, 10, 12, 22, 25, 27]],
+    rows = np.empty((len(values), 6))
+    rows[events.row] = values[:, 4:]
+    innovations = innovations_by_sensor(events, rows)
+    x = np.concatenate([kept[:, :7], states[:, : n - 6]], axis=1)
+    variance = np.concatenate([kept[:, [7, 10, 12, 22, 25, 27]], states[:, n - 6 :]], axis=1)
+    estimate = replace(
+        forward.estimate_of(problem, 1, x, variance, None),
         covariance=covariance,
-        innovations={
-            name: Innovations(
-                time=events.time[events.sensor == i],
-                innovation=rows[events.sensor == i, : 2 * vectors.KINDS[kind] : 2],
-                variance=rows[events.sensor == i, 1 : 2 * vectors.KINDS[kind] : 2],
-            )
-            for i, (name, kind) in enumerate(zip(events.sensors, events.kinds, strict=True))
-        },
-        skipped=events.skipped,
+        innovations=innovations,
+        skipped=skipped_too(events, innovations),
     )
     initial = estimation.State(attitude=kept[0, :4], bias=kept[0, 4:7], covariance=covariance[0])
     return Replay(record=record, initial=initial, estimate=estimate)
@@ -542,6 +571,7 @@ def _measured(series: VectorMeasurements, values: Array) -> VectorMeasurements:
     """Return a series with the values of one run (m, 4), as used by the kernel."""
     if series.attitude is not None:
         return replace(series, attitude=quaternion.normalize(values))
+    z = values[:, :3]
     if series.kind == "vector":
-        return replace(series, vector_b=values[:, 1:] * np.linalg.norm(series.references_f, axis=1)[:, None])
-    return replace(series, vector_b=values[:, 1:] / np.linalg.norm(values[:, 1:], axis=1)[:, None])
+        return replace(series, vector_b=z * np.linalg.norm(series.references_f, axis=1)[:, None])
+    return replace(series, vector_b=z / np.linalg.norm(z, axis=1)[:, None])

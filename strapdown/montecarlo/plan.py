@@ -8,19 +8,19 @@ import hashlib
 import json
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from strapdown import scenarios
-from strapdown.checks import Array, InputError, array, count, non_negative, one_of
+from strapdown.checks import Array, InputError, array, count, non_negative
 from strapdown.estimation import setup
 from strapdown.estimation.setup import FilterSetup, need_setup
 from strapdown.files import tables
+from strapdown.gyro import GyroSpec
+from strapdown.randomness import generator
 from strapdown.scenarios import Scenario
-
-PRECISIONS = ("float64", "float32")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -88,6 +88,21 @@ def initial_sigmas(dispersions: Dispersions, setup: FilterSetup) -> tuple[float,
     )
 
 
+def dispersed(spec: GyroSpec, dispersions: Dispersions, seed: int, run: int) -> GyroSpec:
+    """Return the gyro of one run: three scale factors, six misalignments by rows and three turn-on biases are drawn, in this order."""
+    if not dispersions.of_the_gyro:
+        return spec
+    draw = generator(seed, run, "dispersions").standard_normal(12)
+    misalignment = spec.misalignment.copy()
+    misalignment[~np.eye(3, dtype=bool)] += dispersions.misalignment_sigma * draw[3:9]
+    return replace(
+        spec,
+        scale_factor=spec.scale_factor + dispersions.scale_factor_sigma * draw[:3],
+        misalignment=misalignment,
+        turn_on_bias=spec.turn_on_bias + dispersions.turn_on_bias_sigma * draw[9:],
+    )
+
+
 _FORM: tables.Form = {
     "attitude_sigma": tables.DEGREES,
     "bias_sigma": tables.DEGREES_PER_HOUR,
@@ -124,8 +139,6 @@ class Plan:
     individuals : bool, default False
         Whether each run draws its own gyro and sensors (:func:`strapdown.scenarios.drawn`): the errors of the specification are then
         standard deviations, as in a filter with states for them. Otherwise every run has exactly those errors.
-    precision : {"float64", "float32"}, default "float64"
-        Floating-point format of the filter and the noise; "float32" only with a machine that supports it.
     """
 
     scenario: Scenario
@@ -135,13 +148,11 @@ class Plan:
     nis_bins: int = 100
     dispersions: Dispersions = field(default_factory=Dispersions)
     individuals: bool = False
-    precision: str = "float64"
 
     def __post_init__(self) -> None:
         """Check every field."""
         for name, least in (("seed", 0), ("epochs", 1), ("nis_bins", 1)):
             object.__setattr__(self, name, count(name, getattr(self, name), minimum=least))
-        one_of("precision", self.precision, PRECISIONS)
         need_setup(self.setup)
         if self.samples % (self.epochs * self.setup.integration.samples):
             raise InputError(
@@ -159,7 +170,7 @@ class Plan:
 
     def __hash__(self) -> int:
         """Return a hash that equal plans share."""
-        return hash((self.seed, self.epochs, self.nis_bins, self.precision))
+        return hash((self.seed, self.epochs, self.nis_bins))
 
     @property
     def samples(self) -> int:
@@ -207,7 +218,6 @@ class Plan:
             "epochs": self.epochs,
             "nis_bins": self.nis_bins,
             "dispersions": self.dispersions.to_table(),
-            "precision": self.precision,
             **({"individuals": True} if self.individuals else {}),
         }
 
@@ -216,6 +226,13 @@ class Plan:
         """SHA-256 of :meth:`to_table`."""
         text = json.dumps(self.to_table(), sort_keys=True, allow_nan=False, default=float)
         return hashlib.sha256(text.encode()).hexdigest()
+
+
+def unit(plan: Plan, run: int, scenario: Scenario | None = None) -> Scenario:
+    """Return the scenario of one run, with its own gyro and sensors; ``scenario``: the plan's, prepared."""
+    common = plan.scenario if scenario is None else scenario
+    own = scenarios.drawn(common, plan.seed, run) if plan.individuals else common
+    return replace(own, gyro=dispersed(own.gyro, plan.dispersions, plan.seed, run))
 
 
 def from_table(table: Mapping[str, Any]) -> Plan:
@@ -227,7 +244,7 @@ def from_table(table: Mapping[str, Any]) -> Plan:
         setup=setup.from_table(table["filter"]),
         dispersions=_dispersions(table["dispersions"], "dispersions"),
         individuals=bool(table.get("individuals", False)),
-        **{name: table[name] for name in ("seed", "epochs", "nis_bins", "precision")},
+        **{name: table[name] for name in ("seed", "epochs", "nis_bins")},
     )
 
 

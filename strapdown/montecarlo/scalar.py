@@ -1,8 +1,4 @@
-"""The scalar machine: any scenario and any filter; each run is simulated, then filtered.
-
-Filters with error states run eight at once (:func:`strapdown.estimation.setup.run_together`). A run is bitwise identical whatever other
-runs are computed with it, in a campaign or a replay.
-"""
+"""The scalar machine: any scenario and any filter; each run is simulated, then filtered."""
 
 from __future__ import annotations
 
@@ -24,8 +20,7 @@ from strapdown.checks import Array, InputError, count
 from strapdown.estimation import setup
 from strapdown.estimation.filters.own import Own
 from strapdown.estimation.setup import FilterSetup
-from strapdown.gyro import GyroSpec
-from strapdown.montecarlo.plan import Dispersions, Plan, initial_sigmas
+from strapdown.montecarlo.plan import Dispersions, Plan, initial_sigmas, unit
 from strapdown.montecarlo.statistics import (
     BINS,
     ERROR_EXPONENT,
@@ -37,20 +32,13 @@ from strapdown.montecarlo.statistics import (
     worst,
 )
 from strapdown.motion import Motion
-from strapdown.randomness import generator
 from strapdown.records import Estimate, ImuRecord
-from strapdown.scenarios import Scenario, drawn, simulate
+from strapdown.scenarios import Scenario, simulate
 
 NAME = "scalar"
 CHUNK = 8
 
 _TINY = float(np.finfo(np.float64).tiny)
-_OFF_DIAGONAL = ~np.eye(3, dtype=bool)
-
-
-def supports(plan: Plan) -> str | None:
-    """Return why this machine cannot compute a plan; None if it can."""
-    return None if plan.precision == "float64" else f"the scalar machine computes in float64, not {plan.precision}"
 
 
 def start(
@@ -64,30 +52,13 @@ def start(
     )
 
 
-def dispersed(spec: GyroSpec, dispersions: Dispersions, seed: int, run: int) -> GyroSpec:
-    """Return the gyro of one run: three scale factors, six misalignments by rows and three turn-on biases are drawn, in this order."""
-    if not dispersions.of_the_gyro:
-        return spec
-    draw = generator(seed, run, "dispersions").standard_normal(12)
-    misalignment = spec.misalignment.copy()
-    misalignment[_OFF_DIAGONAL] += dispersions.misalignment_sigma * draw[3:9]
-    return replace(
-        spec,
-        scale_factor=spec.scale_factor + dispersions.scale_factor_sigma * draw[:3],
-        misalignment=misalignment,
-        turn_on_bias=spec.turn_on_bias + dispersions.turn_on_bias_sigma * draw[9:],
-    )
-
-
 def record_of(plan: Plan, run: int) -> ImuRecord:
     """Return the record of one run of a plan."""
     remembered = _SCENARIOS.get(plan)
     if remembered is None:
         remembered = replace(plan.scenario, motion=_Remembered(plan.scenario.motion))
         _SCENARIOS[plan] = remembered
-    one = drawn(remembered, plan.seed, run) if plan.individuals else remembered
-    spec = dispersed(one.gyro, plan.dispersions, plan.seed, run)
-    return simulate(replace(one, gyro=spec), plan.seed, run)
+    return simulate(unit(plan, run, remembered), plan.seed, run)
 
 
 class _Remembered:
@@ -128,7 +99,7 @@ def replay(plan: Plan, run: int) -> Replay:
     number = count("run", run, minimum=0)
     record = record_of(plan, number)
     initial = start(record, plan.setup, plan.seed, number, plan.dispersions)
-    (estimate,) = _estimates(plan, [record], [initial], every=1)
+    estimate = setup.run(record, plan.setup, initial, full_covariance=True)
     return Replay(record=record, initial=initial, estimate=estimate)
 
 
@@ -139,33 +110,12 @@ def run_chunk(plan: Plan, first_run: int, runs: int) -> Statistics:
 
 def run_chunks(plans: Sequence[Plan], first_run: int, runs: int) -> tuple[Statistics, ...]:
     """Return the statistics of several plans that differ only in the filter; each run is simulated once for all filters."""
-    one, end = plans[0], first_run + runs
     sums = [Sums(plan, runs) for plan in plans]
-    at_once = max(_at_once(plan) for plan in plans)
-    for first in range(first_run, end, at_once):
-        numbers = range(first, min(first + at_once, end))
-        records = [record_of(one, run) for run in numbers]
+    for run in range(first_run, first_run + runs):
+        record = record_of(plans[0], run)
         for part in sums:
-            part.add(numbers, records)
+            part.add(run, record)
     return tuple(part.statistics for part in sums)
-
-
-def _at_once(plan: Plan) -> int:
-    """Return the number of runs filtered at once: more than one if all have the same times."""
-    spec = plan.scenario.gyro
-    losses = [getattr(getattr(one, "faults", None), "drop_probability", 0.0) for one in plan.scenario.sensors]
-    differ = any((spec.sampling_jitter, spec.timestamp_error, spec.drop_probability, *losses))
-    return 1 if differ else setup.runs_at_once(plan.setup)
-
-
-def _estimates(
-    plan: Plan, records: Sequence[ImuRecord], initials: Sequence[estimation.State], every: int
-) -> list[Estimate]:
-    """Filter runs of a plan, and keep every ``every``-th state with its covariance."""
-    if _at_once(plan) > 1:
-        return setup.run_together(records, plan.setup, initials, every)
-    pairs = zip(records, initials, strict=True)
-    return [setup.run(record, plan.setup, initial, every=every, full_covariance=True) for record, initial in pairs]
 
 
 class Sums:
@@ -194,21 +144,14 @@ class Sums:
         self.scores: list[tuple[int, float]] = []
         self.examples: list[tuple[int, Array, Array]] = []
 
-    def add(self, runs: Sequence[int], records: Sequence[ImuRecord]) -> None:
-        """Filter runs and add their results."""
+    def add(self, run: int, record: ImuRecord) -> None:
+        """Filter a run and add its results."""
         plan = self.plan
-        initials = [
-            start(record, plan.setup, plan.seed, run, plan.dispersions)
-            for run, record in zip(runs, records, strict=True)
-        ]
+        initial = start(record, plan.setup, plan.seed, run, plan.dispersions)
         # With lost samples, or a user's filter that chooses its times, the epochs are at no fixed step: all steps are kept, then selected.
-        regular = [len(one.increments) == plan.samples and not isinstance(plan.setup.estimator, Own) for one in records]
-        estimates = _estimates(plan, records, initials, plan.every if all(regular) else 1)
-        for run, record, estimate, fixed in zip(runs, records, estimates, regular, strict=True):
-            self._add(run, record, estimate, regular=fixed)
-
-    def _add(self, run: int, record: ImuRecord, estimate: Estimate, *, regular: bool) -> None:
-        """Add the estimate of one run."""
+        regular = len(record.increments) == plan.samples and not isinstance(plan.setup.estimator, Own)
+        every = plan.every if regular else 1
+        estimate = setup.run(record, plan.setup, initial, every=every, full_covariance=True)
         assert record.truth is not None
         assert estimate.covariance is not None
         rows = slice(None) if regular else _at_epochs(estimate.time, self.sums.time)

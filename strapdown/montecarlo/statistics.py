@@ -6,8 +6,6 @@ A *machine* is a module of this package with
 
 ``NAME``, ``CHUNK``
     Its name in files and tables; its default number of runs per chunk.
-``supports(plan) -> str | None``
-    None if it computes every term of the plan, else the reason, as a phrase ("the gyro's flicker is not among its terms").
 ``run_chunk(plan, first_run, runs) -> Statistics``
     Runs ``first_run`` … ``first_run + runs − 1`` of the plan.
 ``replay(plan, run) -> Replay``

@@ -34,8 +34,6 @@ from strapdown.estimation.setup.running import modelled_record as modelled_recor
 from strapdown.estimation.setup.running import observability as observability
 from strapdown.estimation.setup.running import prepared as prepared
 from strapdown.estimation.setup.running import run_modelled as run_modelled
-from strapdown.estimation.setup.running import run_together as run_together
-from strapdown.estimation.setup.running import runs_at_once as runs_at_once
 from strapdown.estimation.setup.running import smooth_modelled as smooth_modelled
 from strapdown.estimation.setup.running import with_sigma as with_sigma
 from strapdown.estimation.setup.states import SensorStates, States

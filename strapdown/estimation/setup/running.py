@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -19,7 +18,6 @@ from strapdown.estimation.schedule import schedule
 from strapdown.estimation.setup.filter_setup import MEKF, FilterSetup, need_mekf
 from strapdown.estimation.setup.states import States
 from strapdown.estimation.states import State
-from strapdown.kernels.lane_values import WIDTH
 from strapdown.randomness import generator
 from strapdown.records import Estimate, ImuRecord, compress
 from strapdown.vectors import VectorMeasurements
@@ -135,33 +133,6 @@ def measured_motion(record: ImuRecord, setup: FilterSetup) -> tuple[Array, Array
     if not levers or np.any(states.gyro_temperature_sigma):
         return None
     return turning(record, schedule(record.vectors, record.time[0], record.time[-1], anisotropic=True).time)
-
-
-def runs_at_once(setup: FilterSetup) -> int:
-    """Return the number of records that :func:`run_together` filters at once: 1 for a filter that it does not support."""
-    judged = setup.gate is not None or setup.robust is not None
-    return WIDTH if setup.estimator == MEKF and setup.states is not None and not judged else 1
-
-
-def run_together(
-    records: Sequence[ImuRecord], setup: FilterSetup, initials: Sequence[State], every: int
-) -> list[Estimate]:
-    """Run the filter of a setup over several records, and store every ``every``-th state with its covariance.
-
-    The filter must be one for which :func:`runs_at_once` is above 1. A record's estimate is bit for bit independent of the other records,
-    and agrees with that of :func:`run` to rounding.
-    """
-    from strapdown.estimation import in_lanes
-
-    states = setup.states
-    assert states is not None
-    problems = [
-        prepared(modelled_record(record, setup), setup, initial)
-        for record, initial in zip(records, initials, strict=True)
-    ]
-    options = forward.Options(every=every, full_covariance=True, **WHOLE_BIAS)
-    estimates = in_lanes.run(problems, every, lambda problem: forward.filtered(problem, options).estimate)
-    return [_reported(estimate, states, initial) for estimate, initial in zip(estimates, initials, strict=True)]
 
 
 def _run_other(
