@@ -41,6 +41,7 @@ from strapdown.allan.spectrum import (
     segment,
 )
 from strapdown.checks import Array, InputError
+from strapdown.files import plain
 from strapdown.results import Column, Listed, Table, figure
 
 SYMBOLS = dict(zip(TERMS, "QNBKR", strict=True))
@@ -180,6 +181,11 @@ class NoiseFit(Listed):
         )
         title = f"Noise of the {self.sensor}, {self.samples} samples of {self.sample_interval:.6g} s, {100.0 * self.level:g} % intervals"
         return Table(title, columns, rows, self.warnings, left=3, name=f"{self.sensor}-noise")
+
+    def summary(self) -> dict[str, Any]:
+        """Return the coefficients, in the units of :data:`UNITS`, and the misfit of each axis as plain values for JSON."""
+        own = {name: getattr(self, name) for name in ("level", "misfit_probability", "misfit")}
+        return plain({"sample_interval_s": self.sample_interval, "coefficients": table(self), **own})  # type: ignore[no-any-return]
 
 
 def fit_noise(

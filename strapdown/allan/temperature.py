@@ -28,10 +28,7 @@ from strapdown.checks import Array, Hint, InputError
 from strapdown.gyro.temperature import BiasOverTemperature, to_table
 from strapdown.results import Table
 
-__all__ = [
-    "TemperatureFit",
-    "fit_temperature",
-]
+__all__ = ["TemperatureFit", "fit_temperature"]
 
 MAX_PASSES = 50
 """Maximum number of iterations for the noise terms."""
