@@ -83,6 +83,12 @@ class Table:
         return [{key: row[k] for key, k in self.keys.items()} for row in self.rows]
 
     @property
+    def as_text(self) -> dict[str, Any]:
+        """The table with its rows as text, as the arguments of another table."""
+        notes = list(self.notes)
+        return {"title": self.title, "columns": self.head, "rows": self.cells, "notes": notes, "left": self.left}
+
+    @property
     def text(self) -> str:
         """The table as lines of text."""
         cells = [self.head, *self.cells]

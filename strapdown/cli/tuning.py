@@ -128,23 +128,18 @@ def tune(
             **vars(search),
             progress=advance,
         )
-    listed = [one.listing() for one in (result, result.comparison) if one is not None]
+    listed = result.tables()
     ui.show(listed[0])
     ui.say(*result.words)
-    if result.comparison is not None:
-        ui.show(listed[1])
-        ui.say(f"{tunings.BOUNDS}.")
-        for judgement in result.comparison.after.judgements[:1]:
-            ui.say(*("After:" + line[3:] for line in judgement.words.splitlines()[1:]))
-        ui.say(result.comparison.advice(truth=goal.truth or goal.rmse))
+    ui.show(*listed[1:])
     write_text(out, to_toml(result.setup))
     for place in places.values():  # of an earlier tuning, which may have had more of them, or in another format
         for other in ("png", "pdf", "svg"):
             place.with_suffix(f".{other}").unlink(missing_ok=True)
     content = {"records": [path.name for path in records], **result.summary()}
     write_json(beside, content)
-    answer, reason, _ = tunings.verdict(content)
-    ui.say(f"{answer}: {reason}.")
+    answer, reason, details = sd.tuning.fitting.verdict(result)
+    ui.say(f"{answer}: {reason}.", *(f"  - {one}" for one in details if result.comparison is not None))
     with ui.progress_bar("figure of the likelihood"):
         figures = {places["likelihood"]: drawing.likelihood_slices(sd.tuning.slices(objective, result), result)}
     if result.comparison is not None:
