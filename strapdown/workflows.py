@@ -1106,7 +1106,7 @@ def allan_deviation(
         For an array: averages over each sample interval, or integrals.
     taus : array_like, optional
         Averaging times, s. Default: 12 per decade, up to a third of the record.
-    estimator : {"overlapping", "robust", "modified", "hadamard"}, default "overlapping"
+    estimator : {"overlapping", "robust"}, default "overlapping"
         Estimator (:func:`strapdown.allan.allan_deviation`).
     level : float, default 0.95
         Confidence of the band.

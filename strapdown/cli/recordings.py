@@ -70,7 +70,7 @@ def convert(
     target: Path = Argument(
         metavar="OUT",
         help="File whose suffix selects the format: .csv, .tsv, .parquet, .bag (ROS 1), .mcap or .db3 (ROS 2), .h5 (BROAD); for an "
-        "estimate .csv, .tsv, .parquet, .tum, .rrd.",
+        "estimate .csv, .tsv, .parquet, .tum.",
     ),
     layout: Layout,
     reference: Path | None = Option(None, help="TUM trajectory whose attitudes become the recording's reference."),
