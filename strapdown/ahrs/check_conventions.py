@@ -181,7 +181,13 @@ class Examination:
         return Table(title, columns, rows)
 
     def summary(self) -> dict[str, Any]:
-        """Return all fields as plain values for JSON."""
+        """Return all fields as plain values for JSON.
+
+        Returns
+        -------
+        dict
+            Fields of the examination.
+        """
         return plain(asdict(self))  # type: ignore[no-any-return]
 
 

@@ -183,7 +183,13 @@ class NoiseFit(Listed):
         return Table(title, columns, rows, self.warnings, left=3, name=f"{self.sensor}-noise")
 
     def summary(self) -> dict[str, Any]:
-        """Return the coefficients, in the units of :data:`UNITS`, and the misfit of each axis as plain values for JSON."""
+        """Return the coefficients and the misfit of each axis as plain values for JSON.
+
+        Returns
+        -------
+        dict
+            ``coefficients`` in the units of :data:`UNITS`, ``sample_interval_s``, ``level``, ``misfit_probability``, ``misfit``.
+        """
         own = {name: getattr(self, name) for name in ("level", "misfit_probability", "misfit")}
         return plain({"sample_interval_s": self.sample_interval, "coefficients": table(self), **own})  # type: ignore[no-any-return]
 

@@ -128,7 +128,7 @@ def tune(
             **vars(search),
             progress=advance,
         )
-    listed = result.tables()
+    listed = result.tables
     ui.show(listed[0])
     ui.say(*result.words)
     ui.show(*listed[1:])

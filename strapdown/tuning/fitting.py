@@ -271,7 +271,7 @@ class Tuning(Listed):
         if self.comparison is not None:
             content["held_out"] = self.comparison.summary()
         answer, reason, details = verdict(self)
-        shown = {"words": list(self.words), "tables": [one.as_text for one in self.tables()]}
+        shown = {"words": list(self.words), "tables": [one.as_text for one in self.tables]}
         content["report"] = {"verdict": answer, "reason": reason, "details": details, **shown}
         return plain(content)  # type: ignore[no-any-return]
 
@@ -287,8 +287,9 @@ class Tuning(Listed):
         worst = max(self.unmodelled, key=lambda one: one.severity, default=None)
         return (*found, *(() if worst is None else worst.words))
 
+    @property
     def tables(self) -> list[Table]:
-        """Return the table of the parameters, and that of the filter before and after on held-out data."""
+        """The table of the parameters, and that of the filter before and after on held-out data."""
         return [self.listing(), *([] if self.comparison is None else [self.comparison.listing()])]
 
     def listing(self) -> Table:
