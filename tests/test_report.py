@@ -230,11 +230,8 @@ def test_a_coning_study_is_reported_from_its_json(coning_json, tmp_path):
     content = body(report.write(coning_json).page)
     passing = sum(one["consistent"] for one in study["filter"])
     assert f"{passing} of {len(study['filter'])} algorithms give a consistent filter" in content.split("<h2>")[0]
-    drift = charts_of(content)[0]
-    assert drift["ticks"] == [one["algorithm"] for one in study["integration"]]
-    measured = [abs(one["drift_deg_per_hour"]) for one in study["integration"]]
-    np.testing.assert_allclose(columns(drift)[1][:3], measured[:3], rtol=2e-3)
-    assert np.isnan(columns(drift)[1][4])  # rounding
+    for one in study["integration"][:3]:
+        assert f">{one['drift_deg_per_hour']:.4g}<" in content
     for one in study["filter"]:
         shown = rows_of(content.split("The same filter")[-1], f"{one['integration']}")
         np.testing.assert_allclose(shown[2], one["bias_rms_deg_per_hour"], rtol=6e-4)

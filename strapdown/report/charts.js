@@ -49,12 +49,8 @@
   function draw({ holder, content }) {
     const place = holder.querySelector(".plot");
     place.textContent = "";
-    const named = content.ticks.length > 0;
     const axis = { stroke: colour("--ink"), grid: { stroke: colour("--line"), width: 1 }, ticks: { stroke: colour("--line") } };
     const shown = (u, value) => (value == null ? "–" : Number(value).toPrecision(5));
-    const names = named
-      ? { splits: () => content.ticks.map((_, k) => k), values: () => content.ticks, rotate: content.ticks.length > 6 ? -30 : 0, size: 70 }
-      : {};
     const vertical = content.range
       ? { range: (u, low, high) => (u.zoomed ? [low, high] : content.range) }
       : content.log ? { distr: 3 } : {};
@@ -64,28 +60,27 @@
       {
         width: Math.max(240, place.clientWidth),
         height: 260,
-        cursor: { sync: named ? undefined : { key: content.x }, drag: { x: true, y: false } },
-        scales: { x: { time: false, range: named ? [-0.5, content.ticks.length - 0.5] : undefined }, y: vertical },
-        axes: [{ ...axis, label: named ? undefined : content.x, ...names }, { ...axis, label: content.unit, size: 70 }],
+        cursor: { sync: { key: content.x }, drag: { x: true, y: false } },
+        scales: { x: { time: false }, y: vertical },
+        axes: [{ ...axis, label: content.x }, { ...axis, label: content.unit, size: 70 }],
         series: [
-          { label: content.x, value: named ? (u, value) => content.ticks[value] ?? "–" : shown },
-          ...content.series.map((one, k) => ({
+          { label: content.x, value: shown },
+          ...content.series.map((one) => ({
             label: one.label,
             stroke: colour(one.colour),
-            width: one.band || named ? 0 : 1.5, // the edges of a band would alias into a grey bar over the errors
+            width: one.band ? 0 : 1.5, // the edges of a band would alias into a grey bar over the errors
             dash: one.dash ? [6, 4] : undefined,
-            points: { show: one.band ? false : named ? true : undefined, size: named ? Math.max(5, 12 - 3 * k) : undefined, fill: named ? colour(one.colour) : undefined },
+            points: { show: one.band ? false : undefined },
             value: shown,
           })),
         ],
         bands,
-        hooks: { setSelect: [(u) => { u.zoomed = true; }], setCursor: [(u) => { if (!named) turn(u.posToVal(u.cursor.left, "x"), u.cursor.left); }] },
+        hooks: { setSelect: [(u) => { u.zoomed = true; }], setCursor: [(u) => { turn(u.posToVal(u.cursor.left, "x"), u.cursor.left); }] },
       },
       content.columns,
       place
     );
     plot.whole = [content.columns[0][0], content.columns[0][content.columns[0].length - 1]];
-    plot.named = named;
     // In the capture phase, before uPlot shows all of this chart alone.
     plot.over.addEventListener("dblclick", (event) => { event.stopImmediatePropagation(); reset(); }, true);
     place.setAttribute("role", "group");
@@ -93,7 +88,7 @@
     place.onkeydown = (event) => key(event, plot);
     const canvas = place.querySelector("canvas");
     canvas.setAttribute("role", "img");
-    canvas.setAttribute("aria-label", `${content.title}: ${content.unit} over ${named ? content.ticks.join(", ") : content.x}`);
+    canvas.setAttribute("aria-label", `${content.title}: ${content.unit} over ${content.x}`);
     place.querySelectorAll(".u-legend .u-series:not(:first-child) th").forEach((head) => legend(head));
     drawn.push({ plot, place });
   }
@@ -114,17 +109,16 @@
     });
   }
 
-  const others = (plot) => (plot.named ? [plot] : drawn.map((one) => one.plot).filter((one) => !one.named));
 
   function show(plot, low, high) {
-    others(plot).forEach((one) => {
+    drawn.forEach(({ plot: one }) => {
       one.zoomed = true;
       one.setScale("x", { min: Math.max(low, one.whole[0]), max: Math.min(high, one.whole[1]) });
     });
   }
 
   function reset() {
-    drawn.filter((one) => !one.plot.named).forEach(({ plot }) => {
+    drawn.forEach(({ plot }) => {
       plot.zoomed = false;
       plot.setScale("x", { min: plot.whole[0], max: plot.whole[1] });
     });
@@ -143,7 +137,7 @@
       Escape: reset,
     };
     const move = moves[event.key === "=" ? "+" : event.key];
-    if (move && !plot.named && !event.ctrlKey && !event.metaKey) {
+    if (move && !event.ctrlKey && !event.metaKey) {
       event.preventDefault();
       move();
     }
@@ -210,7 +204,7 @@
     drawn.splice(0).forEach((one) => one.plot.destroy());
     charts.forEach(draw);
     bodies.forEach((one) => picture(one, (one.k ??= one.content.columns[0].length - 1)));
-    if (zoom && drawn.length) show(drawn.find((one) => !one.plot.named).plot, ...zoom);
+    if (zoom && drawn.length) show(drawn[0].plot, ...zoom);
   }
   async function begin() {
     if (typeof DecompressionStream === "undefined") {

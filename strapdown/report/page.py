@@ -161,7 +161,6 @@ def chart(
     *,
     reach: float | None = None,
     x: str = "time, s",
-    ticks: Sequence[str] = (),
     log: bool = False,
 ) -> str:
     """Return an interactive chart with its data, all samples as 16-bit numbers, compressed.
@@ -178,8 +177,6 @@ def chart(
         The vertical axis is ±``reach`` at first. Default: the range of the data.
     x : str
         Label of the horizontal axis.
-    ticks : sequence of str
-        Names of the values 0, 1, … of the horizontal axis, if it has no numbers; lines are then drawn as points.
     log : bool
         Whether the vertical axis is logarithmic.
 
@@ -201,7 +198,6 @@ def chart(
         "title": title,
         "unit": unit,
         "x": x,
-        "ticks": list(ticks),
         "log": log,
         "series": [{"label": s.label, "colour": s.colour, "band": s.band, "dash": s.dash} for s in series],
         "range": None if reach is None else [-reach, reach],
