@@ -109,8 +109,7 @@
     });
   }
 
-
-  function show(plot, low, high) {
+  function show(low, high) {
     drawn.forEach(({ plot: one }) => {
       one.zoomed = true;
       one.setScale("x", { min: Math.max(low, one.whole[0]), max: Math.min(high, one.whole[1]) });
@@ -129,10 +128,10 @@
     const width = max - min;
     const middle = plot.cursor.left >= 0 ? plot.posToVal(plot.cursor.left, "x") : 0.5 * (min + max);
     const moves = {
-      "+": () => show(plot, middle - 0.5 * (middle - min), middle + 0.5 * (max - middle)),
-      "-": () => show(plot, middle - 2 * (middle - min), middle + 2 * (max - middle)),
-      ArrowLeft: () => show(plot, Math.max(min - 0.25 * width, plot.whole[0]), Math.max(max - 0.25 * width, plot.whole[0] + width)),
-      ArrowRight: () => show(plot, Math.min(min + 0.25 * width, plot.whole[1] - width), Math.min(max + 0.25 * width, plot.whole[1])),
+      "+": () => show(middle - 0.5 * (middle - min), middle + 0.5 * (max - middle)),
+      "-": () => show(middle - 2 * (middle - min), middle + 2 * (max - middle)),
+      ArrowLeft: () => show(Math.max(min - 0.25 * width, plot.whole[0]), Math.max(max - 0.25 * width, plot.whole[0] + width)),
+      ArrowRight: () => show(Math.min(min + 0.25 * width, plot.whole[1] - width), Math.min(max + 0.25 * width, plot.whole[1])),
       0: reset,
       Escape: reset,
     };
@@ -204,7 +203,7 @@
     drawn.splice(0).forEach((one) => one.plot.destroy());
     charts.forEach(draw);
     bodies.forEach((one) => picture(one, (one.k ??= one.content.columns[0].length - 1)));
-    if (zoom && drawn.length) show(drawn[0].plot, ...zoom);
+    if (zoom && drawn.length) show(...zoom);
   }
   async function begin() {
     if (typeof DecompressionStream === "undefined") {
