@@ -12,6 +12,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import scipy.stats
 from matplotlib.figure import Figure
 from typer.testing import CliRunner
 
@@ -22,6 +23,7 @@ from strapdown.estimation import setup
 from strapdown.montecarlo import campaign, coning_study, verdicts
 from strapdown.report import comparisons, page
 from strapdown.tuning import fitting
+from strapdown.units import DEGREE_PER_HOUR
 
 CHROMIUM = next(
     (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
@@ -167,6 +169,18 @@ def test_the_campaign_page_says_how_to_replay_its_worst_run(folder):
     assert f'sd.read("campaign.h5").plan, {statistics["worst_runs"][0]}' in html.unescape(
         body(folder / "campaign.html")
     )
+
+
+def test_the_campaign_page_draws_the_normal_quantiles_of_the_filters_sigma(folder):
+    statistics = sd.read(folder / "campaign.h5").statistics
+    (chart,) = (one for one in charts_of(body(folder / "campaign.html")) if one["title"].startswith("|bias y error|"))
+    assert chart["unit"].endswith("°/h")
+    assert [one["label"].split(" %")[0] for one in chart["series"]] == ["99", "50", "99", "50"]
+    sigma = statistics.sigma[:, 4] / DEGREE_PER_HOUR
+    quantiles = [statistics.error_quantile(share)[:, 4] / DEGREE_PER_HOUR for share in (0.99, 0.5)]
+    predicted = [scipy.stats.norm.ppf(0.5 + 0.5 * share) * sigma for share in (0.99, 0.5)]
+    for found, wanted in zip(columns(chart)[1:], [*quantiles, *predicted], strict=True):
+        np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=2e-5 * wanted.max())
 
 
 def test_the_campaign_page_says_what_the_filter_has_no_state_for(folder, scenario, filter_setup, tmp_path):

@@ -43,7 +43,6 @@ from strapdown.plots.innovations import (
 from strapdown.plots.statistics import (
     covariance_ellipses,
     coverage_by_state,
-    fan,
     nees_over_time,
     nis_over_time,
     runs_overview,
