@@ -141,35 +141,21 @@ __all__ = [
 ]
 
 _HOMES = {
-    "FilterSetup": "estimation.setup",
-    "Gate": "estimation",
-    "GyroSpec": "gyro",
-    "InputError": "checks",
-    "LiveAhrs": "ahrs",
-    "LiveFilter": "estimation",
-    "ProcessNoise": "estimation",
-    "Robust": "estimation",
-    "Scenario": "scenarios",
-    "StepFilter": "estimation",
-    "VectorSensor": "vectors",
-    "accuracy": "workflows",
-    "allan_deviation": "workflows",
-    "calibrate": "calibration",
-    "check": "workflows",
-    "covariance_analysis": "workflows",
-    "diagnose": "workflows",
-    "estimate": "workflows",
-    "export": "codegen",
-    "fit_noise": "workflows",
-    "initial_state": "estimation",
-    "integrate": "workflows",
-    "monte_carlo": "workflows",
-    "read": "workflows",
-    "read_attitudes": "workflows",
-    "simulate": "workflows",
-    "smooth": "workflows",
-    "tune": "workflows",
-    "write": "workflows",
+    name: home
+    for home, names in {
+        "ahrs": "LiveAhrs",
+        "calibration": "calibrate",
+        "checks": "InputError",
+        "codegen": "export",
+        "estimation": "Gate LiveFilter ProcessNoise Robust StepFilter initial_state",
+        "estimation.setup": "FilterSetup",
+        "gyro": "GyroSpec",
+        "scenarios": "Scenario",
+        "vectors": "VectorSensor",
+        "workflows": "accuracy allan_deviation check covariance_analysis diagnose estimate fit_noise integrate monte_carlo read "
+        "read_attitudes simulate smooth tune write",
+    }.items()
+    for name in names.split()
 }
 """Submodule of each name that is not a submodule."""
 

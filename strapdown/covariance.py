@@ -51,11 +51,7 @@ from strapdown.scenarios import Scenario
 from strapdown.units import DEGREE
 from strapdown.vectors import VectorMeasurements
 
-__all__ = [
-    "Analysis",
-    "Consider",
-    "analyse",
-]
+__all__ = ["Analysis", "Consider", "analyse"]
 
 AXES = ("x", "y", "z")
 

@@ -1,8 +1,8 @@
 """Base classes of frozen dataclasses of arrays: equality by value, and printing as a short table. Private.
 
-Specifications (of a gyro, a sensor, a filter) derive from :class:`ByValue`: they are written to files and read back, and are equal if their
-values are. So do results that are kept in files, of large arrays: :class:`ByContent`. Other data are compared by identity; for them
-``@dataclass(eq=False)`` is enough. Results derive from :class:`Listed`.
+Specifications (of a gyro, a sensor, a filter) and results that are kept in files derive from :class:`ByValue`: they are written and read
+back, and are equal if their values are. Other data are compared by identity; for them ``@dataclass(eq=False)`` is enough. Results derive
+from :class:`Listed`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-__all__ = ["ByContent", "ByValue", "Column", "Listed", "Table", "equal", "figure"]
+__all__ = ["ByValue", "Column", "Listed", "Table", "equal", "figure"]
 
 WIDTH = 88
 """Maximum number of characters in a line of a title or a note."""
@@ -81,6 +81,12 @@ class Table:
     def records(self) -> list[dict[str, Any]]:
         """Rows by the keys of the columns."""
         return [{key: row[k] for key, k in self.keys.items()} for row in self.rows]
+
+    @property
+    def as_text(self) -> dict[str, Any]:
+        """The table with its rows as text, as the arguments of another table."""
+        notes = list(self.notes)
+        return {"title": self.title, "columns": self.head, "rows": self.cells, "notes": notes, "left": self.left}
 
     @property
     def text(self) -> str:
@@ -192,41 +198,14 @@ def figure(value: float | None, digits: int = 4) -> str:
 
 
 class ByValue:
-    """Base of a frozen dataclass, declared with ``eq=False``, whose instances are equal if all their fields are.
+    """Base of a frozen dataclass, declared with ``eq=False``, whose instances are equal if all their fields are (:func:`equal`).
 
     Examples
     --------
     >>> import numpy as np
     >>> from dataclasses import dataclass
     >>> @dataclass(frozen=True, eq=False)
-    ... class Direction(ByValue):
-    ...     axis: np.ndarray
-    >>> Direction(np.array([0.0, 0.0, 1.0])) == Direction(np.array([0.0, 0.0, 1.0]))
-    True
-    """
-
-    def __eq__(self, other: object) -> bool:
-        """Compare all fields, arrays element by element."""
-        if type(self) is not type(other):
-            return NotImplemented
-        return _contents(self) == _contents(other)
-
-    def __hash__(self) -> int:
-        """Return a hash that equal instances share."""
-        return hash((type(self), _contents(self)))
-
-
-class ByContent:
-    """Base of a frozen dataclass of large arrays, declared with ``eq=False``, whose instances are equal if all their fields are.
-
-    Unlike :class:`ByValue`, missing numbers (NaN) at the same place are equal, and the hash is that of the type.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from dataclasses import dataclass
-    >>> @dataclass(frozen=True, eq=False)
-    ... class Course(ByContent):
+    ... class Course(ByValue):
     ...     values: np.ndarray
     >>> Course(np.array([1.0, np.nan])) == Course(np.array([1.0, np.nan]))
     True
@@ -240,8 +219,8 @@ class ByContent:
         return self is other or all(equal(getattr(self, name), getattr(other, name)) for name in names)
 
     def __hash__(self) -> int:
-        """Return a hash that equal instances share."""
-        return hash(ByContent)
+        """Return a hash that equal instances share: that of the names of the fields, since arrays and mappings have none."""
+        return hash(tuple(field.name for field in dataclasses.fields(self)))  # type: ignore[arg-type]
 
 
 def equal(one: Any, other: Any) -> bool:
@@ -255,21 +234,8 @@ def equal(one: Any, other: Any) -> bool:
         return len(one) == len(other) and all(map(equal, one, other))
     if isinstance(one, float) and isinstance(other, float) and math.isnan(one):
         return math.isnan(other)
+    if isinstance(one, types.MethodType) and isinstance(
+        other, types.MethodType
+    ):  # Python compares their objects by identity
+        return one.__func__ is other.__func__ and bool(one.__self__ == other.__self__)
     return bool(one == other)
-
-
-def _contents(instance: Any) -> tuple[Any, ...]:
-    return tuple(_plain(getattr(instance, field.name)) for field in dataclasses.fields(instance))
-
-
-def _plain(value: Any) -> Any:
-    """Return a value with arrays and sequences as tuples and mappings as sets of items, which compare and hash by value."""
-    if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
-    if isinstance(value, Mapping):
-        return frozenset((key, _plain(content)) for key, content in value.items())
-    if isinstance(value, (list, tuple)):
-        return tuple(_plain(one) for one in value)
-    if isinstance(value, types.MethodType):  # Python compares the objects of two methods by identity
-        return value.__func__, value.__self__
-    return value

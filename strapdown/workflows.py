@@ -305,24 +305,10 @@ def estimate(
     >>> estimate = sd.estimate(sd.simulate("two-stars"))  # doctest: +SKIP
     >>> estimate.attitude[-1], estimate.sigma[-1]  # doctest: +SKIP
     """
+    options = locals()
     if isinstance(source, Recording):
         _doubt(source)
-    return run(
-        source,
-        noise=noise,
-        setup=setup,
-        initial=initial,
-        states=states,
-        every=every,
-        gate=gate,
-        robust=robust,
-        motion=motion,
-        latency=latency,
-        calibration=calibration,
-        temperature=temperature,
-        full_covariance=full_covariance,
-        smooth=smooth,
-    ).estimate
+    return run(**options).estimate
 
 
 def run(
@@ -459,15 +445,29 @@ def _run_recording(
     return Run(estimate, result.record, result.parameters.setup, result.initial, result.calibration)
 
 
-def smooth(source: ImuRecord | Recording, **options: Any) -> Estimate:
+def smooth(
+    source: ImuRecord | Recording,
+    *,
+    noise: GyroSpec | NoiseFit | ProcessNoise | None = None,
+    setup: FilterSetup | None = None,
+    initial: State | ArrayLike | str | None = None,
+    states: bool | Sequence[str] | None = None,
+    gate: Gate | float | None = None,
+    robust: Robust | str | None = None,
+    motion: str | None = None,
+    latency: float | None = None,
+    calibration: UnitCalibration | None = None,
+    temperature: BiasOverTemperature | None = None,
+    full_covariance: bool | None = None,
+) -> Estimate:
     """Estimate attitude and gyro bias at each epoch from all measurements, before and after it (fixed-interval smoother).
 
     Parameters
     ----------
     source : ImuRecord or Recording
         Result of :func:`simulate` or :func:`read`, or a record made from your own data.
-    **options
-        Options of :func:`estimate`, except ``smooth``.
+    noise, setup, initial, states, gate, robust, motion, latency, calibration, temperature, full_covariance : optional
+        As for :func:`estimate`; ``latency`` in s, bias over ``temperature`` in °C.
 
     Returns
     -------
@@ -489,7 +489,7 @@ def smooth(source: ImuRecord | Recording, **options: Any) -> Estimate:
     >>> smooth(record).attitude.shape  # doctest: +SKIP
     (30001, 4)
     """
-    return estimate(source, **options, smooth=True)
+    return estimate(**locals(), smooth=True)
 
 
 def _doubt(source: Recording) -> None:
@@ -983,23 +983,9 @@ def tune(
     >>> tuned = sd.tune(record, free=["gyro.arw", "star 1.sigma"])  # doctest: +SKIP
     >>> estimate = sd.estimate(record, setup=tuned.setup)  # doctest: +SKIP
     """
+    options = locals()
     given = [sources] if isinstance(sources, (ImuRecord, Recording, str, os.PathLike)) else list(sources)
-    result = tuned(
-        given,
-        setup=setup,
-        free=free,
-        states=states,
-        priors=priors,
-        truth=truth,
-        rmse=rmse,
-        gate=gate,
-        spacing=spacing,
-        holdout=holdout,
-        holdout_by=holdout_by,
-        starts=starts,
-        seed=seed,
-        threads=threads,
-    )
+    result = tuned(**{**options, "sources": given})
     for one in given:
         if isinstance(one, Recording):
             _doubt(one)
@@ -1110,7 +1096,7 @@ def allan_deviation(
         For an array: averages over each sample interval, or integrals.
     taus : array_like, optional
         Averaging times, s. Default: 12 per decade, up to a third of the record.
-    estimator : {"overlapping", "robust", "modified", "hadamard"}, default "overlapping"
+    estimator : {"overlapping", "robust"}, default "overlapping"
         Estimator (:func:`strapdown.allan.allan_deviation`).
     level : float, default 0.95
         Confidence of the band.

@@ -50,9 +50,7 @@ def test_help_shows_options_in_groups_and_examples_that_parse(run):
                 commands[name].callback.__module__ == f"strapdown.cli.{module}"
             )  # the only one that is imported for it
             for line in lines:
-                program, command, *words = line.split()
-                assert (program, command) == ("strapdown", name)
-                commands[name].make_context(name, words)
+                commands[name].make_context(name, line.split())
     said = " ".join(run("estimate", "--help")[1].split())
     assert (
         said.index("─ Filter ─")

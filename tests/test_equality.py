@@ -15,6 +15,7 @@ import strapdown
 from strapdown import estimation, gyro, motion, scenarios, tuning, vectors
 from strapdown.estimation import setup
 from strapdown.motion.orbit import CircularOrbit
+from strapdown.results import equal
 from strapdown.tuning.diagnosis import Cause
 
 FOR_CHECKERS = {
@@ -106,6 +107,14 @@ def test_specifications_are_compared_by_value():
     assert chosen == dataclasses.replace(chosen)
     assert hash(chosen) == hash(dataclasses.replace(chosen))
     assert chosen != dataclasses.replace(chosen, sigma={"star": 1e-3})
+
+
+def test_methods_are_equal_if_function_and_object_are():
+    """A magnetometer whose field is that of an orbit is written to a file and read back."""
+    field, same, other = (CircularOrbit(altitude=h).magnetic_field for h in (5e5, 5e5, 6e5))
+    assert equal(field, same)
+    assert not equal(field, other)
+    assert not equal(field, CircularOrbit(altitude=5e5).position)
 
 
 def test_results_are_compared_by_identity():

@@ -50,23 +50,6 @@ def test_the_steady_variance_of_frequent_measurements(white, walk, density):
     assert gyro.best_bandwidth(spec, density) == pytest.approx(math.sqrt(-P[0, 1] / density), rel=1e-9)
 
 
-@pytest.mark.parametrize("m", [1, 2, 5, 16])
-def test_modified_and_hadamard_variance_of_angle_random_walk(m):
-    """(1 + 1/m²)/2 N²/τ and N²/τ, from the definitions of NIST SP 1065 applied to white samples of variance N²/dt, dt = 1."""
-    phase = np.tril(np.ones((4 * m, 4 * m)))  # rows: angle after each sample, as weights of the samples
-    phase = np.vstack([np.zeros(4 * m), phase])
-    second = phase[2 * m : 3 * m] - 2.0 * phase[m : 2 * m] + phase[:m]
-    modified = np.sum(second.mean(axis=0) ** 2) / (2.0 * m**2)
-    third = phase[3 * m] - 3.0 * phase[2 * m] + 3.0 * phase[m] - phase[0]
-    hadamard = np.sum(third**2) / (6.0 * m**2)
-    assert modified == pytest.approx(0.5 * (1.0 + 1.0 / m**2) / m, rel=1e-12)
-    assert hadamard == pytest.approx(1.0 / m, rel=1e-12)
-    record = np.random.default_rng(5).standard_normal(400_000)
-    for estimator, variance in (("modified", modified), ("hadamard", hadamard)):
-        found = allan.allan_deviation(record, 1.0, taus=[float(m)], estimator=estimator)
-        assert found.deviation[0, 0] == pytest.approx(math.sqrt(variance), rel=5.0 / math.sqrt(2.0 * found.edf[0, 0]))
-
-
 def test_the_floor_of_bias_instability():
     """0.664 B: √(2 ln 2/π), the limit of the Allan deviation of flicker."""
     floor = float(mp.sqrt(2 * mp.log(2) / mp.pi))

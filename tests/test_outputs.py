@@ -244,38 +244,6 @@ def test_the_command_writes_further_files(tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_a_rerun_recording_holds_curves_and_turns(case, tmp_path):
-    """Read back by the library's own reader."""
-    reader = pytest.importorskip("rerun.chunk", reason="rerun-sdk is not installed: pip install 'strapdown[rerun]'")
-    from dataclasses import replace
-
-    from strapdown.records import Innovations
-
-    estimate, recording = case
-    seen = Innovations(time=estimate.time[::2], innovation=np.arange(10.0)[:, None], variance=np.full((10, 1), 4.0))
-    estimate = replace(estimate, innovations={"accelerometer": seen})
-    recordings.write(estimate, tmp_path / "x.rrd", recording=recording)
-    found: dict[str, list] = {}
-    for chunk in reader.RrdReader(tmp_path / "x.rrd").stream():
-        batch = chunk.to_record_batch()
-        for name in batch.schema.names:
-            if (
-                name.startswith(("Scalars", "Transform3D"))
-                or ":Scalars" in name
-                or "scalars" in name
-                or "quaternion" in name
-            ):
-                found.setdefault(str(chunk.entity_path), []).extend(batch.column(name).to_pylist())
-    yaw = estimate.table()["yaw_deg"]
-    np.testing.assert_allclose(np.ravel(found["/angles/yaw/value"]), yaw, rtol=1e-12)
-    np.testing.assert_allclose(np.ravel(found["/innovations/accelerometer/0/plus_3_sigma"]), 6.0, rtol=1e-12)
-    np.testing.assert_allclose(
-        np.ravel(found["/rate/x"]), np.degrees(recording.rate[10:, 0] - estimate.bias[:, 0]), rtol=1e-12
-    )
-    turns = np.array(found["/body"]).reshape(-1, 4)
-    np.testing.assert_allclose(turns, estimate.attitude[:, [1, 2, 3, 0]], atol=1e-6)
-
-
 @pytest.mark.parametrize(("frame", "expected"), [("ENU", (1.0, 2.0, 3.0)), ("NED", (2.0, 1.0, -3.0))])
 def test_the_free_acceleration_of_a_table_is_along_the_axes_of_its_frame(frame, expected):
     """A body whose axes are East, North, up accelerates by 1, 2, 3 m/s² along them."""

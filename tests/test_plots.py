@@ -32,7 +32,6 @@ from strapdown import (
 from strapdown.checks import InputError
 from strapdown.estimation import setup
 from strapdown.montecarlo.coning_study import Drift, FilterOutcome
-from strapdown.montecarlo.statistics import BINS_PER_OCTAVE
 from strapdown.plots import decimation, estimates, style, tuning
 from strapdown.records.estimate import ErrorStateEstimate, Estimate
 
@@ -168,8 +167,6 @@ def test_every_function_draws_into_the_axes_it_is_given(run, statistics):
         lambda ax: plots.innovation_autocorrelation(consistency.autocorrelation(white), ax),
         lambda ax: plots.nis_over_record(innovations, consistency.mean_bounds(2, 1), ax),
         lambda ax: plots.error_distribution(size, ax),
-        lambda ax: plots.fan(statistics, 0, ax),
-        lambda ax: plots.fan(statistics, 4, ax),
         lambda ax: plots.coverage_by_state(statistics, -1, ax),
         lambda ax: plots.covariance_ellipses(statistics.covariance[-1], statistics.mean_square_error[-1], (0, 4), ax),
         lambda ax: plots.nees_over_time([("filter", statistics)], (0.8, 1.2), "bias", ax),
@@ -270,16 +267,6 @@ def test_coverage_is_drawn_at_its_epoch(statistics, epoch):
     for k, span in enumerate(ax.patches, start=1):
         ends = scipy.stats.binom.ppf([0.005, 0.995], 24, 2.0 * scipy.stats.norm.cdf(k) - 1.0) / 24
         np.testing.assert_allclose([span.get_y(), span.get_y() + span.get_height()], 100.0 * ends, rtol=1e-9)
-
-
-def test_a_fan_has_the_normal_quantiles_of_the_filters_sigma(statistics):
-    ax = plots.fan(statistics, 4)
-    assert ax.get_ylabel().endswith(" °/h")
-    for line, band, share in zip(ax.lines, ax.collections, (0.99, 0.9, 0.5), strict=True):
-        predicted = scipy.stats.norm.ppf(0.5 + 0.5 * share) * statistics.sigma[:, 4] / units.DEGREE_PER_HOUR
-        np.testing.assert_allclose(line.get_ydata(), predicted, rtol=1e-4)
-        top = statistics.error_quantile(share)[:, 4].max() / units.DEGREE_PER_HOUR
-        assert band.get_paths()[0].vertices[:, 1].max() == pytest.approx(top)
 
 
 def test_errors_are_drawn_in_the_unit_of_their_label(run):
@@ -417,7 +404,6 @@ def figures(run, statistics, outcomes):
         ),
         "coning errors": plots.coning_errors(outcomes),
         "coning consistency": plots.coning_consistency(outcomes),
-        "fan": single(lambda ax: plots.fan(statistics, 0, ax)),
         "coverage": single(lambda ax: plots.coverage_by_state(statistics, -1, ax)),
         "histogram": single(lambda ax: plots.innovation_histogram(innovations.whitened, ax)),
         "nis": single(lambda ax: plots.nis_over_record(innovations, (0.1, 4.0), ax)),
@@ -578,17 +564,8 @@ def test_angle_units_are_those_that_are_read_best():
     assert units.rate_unit(np.array([0.1]))[0] == "°/s"
 
 
-def test_axes_beside_each_other_are_in_one_unit(statistics):
-    """Of three attitude errors of which one is large none is printed in arcseconds."""
-    histogram = statistics.histogram.copy()
-    for state in (2, 5):
-        histogram[:, state] = np.roll(histogram[:, state], 12 * BINS_PER_OCTAVE, axis=-1)
-    uneven = dataclasses.replace(statistics, histogram=histogram)
-    quantile = uneven.error_quantile(0.99)[-1]
-    assert quantile[2] > 1e3 * statistics.error_quantile(0.99)[-1, 2]
-    for first in (0, 3):
-        labels = {plots.fan(uneven, first + k).get_ylabel().rsplit(", ")[-1] for k in range(3)}
-        assert len(labels) == 1
+def test_axes_beside_each_other_are_in_one_unit():
+    """Of attitude errors of which one is large none is printed in arcseconds."""
     P = np.diag([1e-5, 1e-5, 1e-1, 1e-7, 1e-7, 1e-2]) ** 2
     ax = plots.covariance_ellipses(P, P, (0, 2))
     assert ax.get_xlabel().endswith(", °")

@@ -8,9 +8,11 @@ import re
 import sys
 import zlib
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import scipy.stats
 from matplotlib.figure import Figure
 from typer.testing import CliRunner
 
@@ -19,7 +21,9 @@ from strapdown import cli, coning, gyro, montecarlo, plots, quaternion, records,
 from strapdown.checks import InputError
 from strapdown.estimation import setup
 from strapdown.montecarlo import campaign, coning_study, verdicts
-from strapdown.report import comparisons, page, tunings
+from strapdown.report import comparisons, page
+from strapdown.tuning import fitting
+from strapdown.units import DEGREE_PER_HOUR
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "docs"))
 import headless
@@ -166,6 +170,18 @@ def test_the_campaign_page_says_how_to_replay_its_worst_run(folder):
     )
 
 
+def test_the_campaign_page_draws_the_normal_quantiles_of_the_filters_sigma(folder):
+    statistics = sd.read(folder / "campaign.h5").statistics
+    (chart,) = (one for one in charts_of(body(folder / "campaign.html")) if one["title"].startswith("|bias y error|"))
+    assert chart["unit"].endswith("°/h")
+    assert [one["label"].split(" %")[0] for one in chart["series"]] == ["99", "50", "99", "50"]
+    sigma = statistics.sigma[:, 4] / DEGREE_PER_HOUR
+    quantiles = [statistics.error_quantile(share)[:, 4] / DEGREE_PER_HOUR for share in (0.99, 0.5)]
+    predicted = [scipy.stats.norm.ppf(0.5 + 0.5 * share) * sigma for share in (0.99, 0.5)]
+    for found, wanted in zip(columns(chart)[1:], [*quantiles, *predicted], strict=True):
+        np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=2e-5 * wanted.max())
+
+
 def test_the_campaign_page_says_what_the_filter_has_no_state_for(folder, scenario, filter_setup, tmp_path):
     assert "no state for" not in body(folder / "campaign.html")
     assert ">reason<" not in body(folder / "campaign.html")
@@ -195,9 +211,9 @@ def test_a_tuning_is_reported_from_its_json(folder, scenario, tmp_path):
     tuned = json.loads((tmp_path / "filter.json").read_text())
     (parameter,) = tuned["parameters"]
     assert (parameter["unit"], parameter["si_per_unit"]) == ("arcsec", pytest.approx(np.pi / 648000.0))
-    assert "<td>star 1.sigma, arcsec</td>" in content
+    assert "<td>star 1.sigma</td><td>arcsec</td>" in content
     for value in (parameter["value"], parameter["lower"], parameter["upper"]):
-        assert f"{value / parameter['si_per_unit']:.4g}" in content
+        assert f">{value / parameter['si_per_unit']:.3g}<" in content
     assert "the verdict is for all tests of a record together" in content
     assert tuned["held_out"]["after"]["judgements"][0]["verdict"].capitalize() in content.split("<h2>")[0]
     assert "data:image/png" not in content  # the charts are drawn by the browser
@@ -303,18 +319,21 @@ def test_a_second_estimate_is_interpolated_by_rotation_at_constant_rate():
 
 
 def test_the_verdict_of_a_tuning_is_the_worst_on_held_out_data():
-    verdicts = [{"verdict": one, "reason": one, "findings": []} for one in ("consistent", "cannot tell")]
-    verdicts[0]["findings"] = [{"rejected": True, "means": "odd"}, {"rejected": False, "means": "even"}]
-    held = {"before": {"log_likelihood_per_innovation": 2.0}}
-    held["after"] = {"log_likelihood_per_innovation": 1.0, "judgements": verdicts}
-    answer, reason, details = tunings.verdict({"held_out": held})
+    findings = [SimpleNamespace(rejected=True, means="odd"), SimpleNamespace(rejected=False, means="even")]
+    verdicts = [SimpleNamespace(verdict=one, reason=one, findings=[]) for one in ("consistent", "cannot tell")]
+    verdicts[0].findings = findings
+    after = SimpleNamespace(judgements=verdicts, attitude_rms=1.0)
+    comparison = SimpleNamespace(before=SimpleNamespace(attitude_rms=1.0), after=after, better=False)
+    tuned = SimpleNamespace(comparison=comparison, measure="likelihood")
+    answer, reason, details = fitting.verdict(tuned)
     assert (answer, reason) == ("cannot tell", "cannot tell, on held-out data")
     assert details == ["odd", "on the held-out data the likelihood has decreased: keep the previous filter"]
-    held["before"]["log_likelihood_per_innovation"] = 0.5
-    assert tunings.verdict({"held_out": held})[2] == ["odd"]
-    objective = {"name": "a", "before": 2.0, "after": 0.5, "attitude_rms_rad": [np.pi / 180.0, np.pi / 360.0]}
-    words = " ".join(tunings._parameters({"parameters": [], "objective": objective}))
-    assert "RMS attitude error: 1° before, 0.5° after." in words
+    comparison.better = True
+    assert fitting.verdict(tuned)[2] == ["odd"]
+    after.attitude_rms = 1.1
+    assert fitting.verdict(tuned)[2] == [
+        "odd", "on the held-out data the attitude error has increased: keep the previous filter"
+    ]  # fmt: skip
 
 
 def test_packed_numbers_are_read_back():

@@ -621,7 +621,7 @@ def test_a_split_by_time_tunes_on_the_beginning_and_judges_the_end():
     assert compared.after.log_likelihood == pytest.approx(expected, rel=1e-9)
     verdict = compared.after.judgements[0].verdict
     assert verdict in ("consistent", "cannot tell")
-    before, after = str(compared).splitlines()[-2:]
+    before, after = (line for line in str(compared).splitlines() if line.startswith(("before", "after")))
     assert before.split()[0] == "before"
     assert (after.split()[:2], after.endswith(verdict)) == (["after", f"{compared.after.log_likelihood:.4f}"], True)
     assert f"{np.degrees(compared.after.attitude_rms):.3g}"[:4] in after

@@ -49,7 +49,7 @@ def test_a_scale_factor_that_the_walk_of_the_bias_stands_for_is_found_with_its_s
         found = tuning.unmodelled(bare, result.setup)
         assert found.moves_with_the_rate
         size = found.scale_factor
-        assert np.all(np.abs(size.value - 1e-3) < 4.0 * size.standard_error)
+        assert np.all(np.abs(size.estimate - 1e-3) < 4.0 * size.standard_error)
         assert np.all(size.standard_error[:2] < 4e-4)
         assert any("scale factor of the gyro" in words for words in found.words)
         notes = {parameter.name: parameter.note for parameter in tuning.with_misfit_flag(result, found).parameters}
@@ -78,7 +78,7 @@ def test_the_p_value_is_that_of_three_degrees_of_freedom_at_each_level():
     found = residual_checks.scale_factor(
         setup.modelled_record(one.record, result.setup), result.setup.process_noise, one.initial
     )
-    assert found.p_value == pytest.approx(3.0 * chi2.sf(found.gain, 3), rel=1e-9)
+    assert found.finding.p_value == pytest.approx(3.0 * chi2.sf(found.gain, 3), rel=1e-9)
 
 
 def test_the_turns_are_those_of_the_body_without_its_bias():
@@ -125,16 +125,16 @@ def test_noise_explains_nothing(changes, seeds):
     for seed in seeds:
         one = tuning.record_case(scenarios.simulate(chosen, seed), filter_setup, seed=seed)
         found = residual_checks.scale_factor(one.record, filter_setup.process_noise, one.initial)
-        assert found.p_value > 0.05
-        assert np.abs(found.value).max() < 5.0 * turning.PLAUSIBLE
-        assert changes is STILL or np.all(np.abs(found.value) < 3.0 * found.standard_error)
+        assert found.finding.p_value > 0.05
+        assert np.abs(found.estimate).max() < 5.0 * turning.PLAUSIBLE
+        assert changes is STILL or np.all(np.abs(found.estimate) < 3.0 * found.standard_error)
 
 
 def test_a_walk_that_was_left_too_large_is_no_scale_factor():
     one, result = tuned(4)
     large = tuning.with_values(result.setup, {"gyro.rrw": 2e-6})
     found = residual_checks.scale_factor(one.record, large.process_noise, one.initial)
-    assert found.p_value > 0.05
+    assert found.finding.p_value > 0.05
 
 
 def test_what_the_gate_refuses_is_left_out():

@@ -20,7 +20,7 @@ import functools
 import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -28,9 +28,11 @@ import numpy as np
 from strapdown import coning, quaternion
 from strapdown.ahrs.starting import quiet_span
 from strapdown.checks import Array, Hint, InputError, lengths
+from strapdown.files import plain
 from strapdown.kernels.rotation import rotation_matrix
 from strapdown.recordings.sensor_faults import stuck_words
 from strapdown.records.recording import Recording, increments
+from strapdown.results import Column, Table
 from strapdown.units import DEGREE, STANDARD_GRAVITY
 
 __all__ = [
@@ -168,25 +170,26 @@ class Examination:
         """Warnings for an estimate, in which wrong axes, signs or units are easily overlooked."""
         return (f"probably {self.reason}",) if self.verdict == "wrong convention" else self.doubts
 
+    def listing(self) -> Table:
+        """Return the best explanations as a table; the hints to their remedies are in the verdict."""
+        plain_words = lambda text: Hint.replaced(text, lambda _: "").replace(" ()", "").replace("; )", ")")  # noqa: E731
+        short = lambda name: name.replace("accelerometer", "acc").replace("magnetometer", "mag").replace(" and ", "–")  # noqa: E731
+        names = list(self.candidates[0].misfit)
+        columns = [Column("explanation"), Column("score", shown="{:.1f}".format)]
+        columns += [Column(short(name), shown="{:.3f}".format) for name in names]
+        rows = [(plain_words(one.words), one.score, *one.misfit.values()) for one in self.candidates[:8]]
+        title = "Explanations: score (log-likelihood) and misfit, 0 perfect, 1 unrelated, 2 opposite"
+        return Table(title, columns, rows)
+
     def summary(self) -> dict[str, Any]:
-        """Return everything as plain values for JSON.
+        """Return all fields as plain values for JSON.
 
         Returns
         -------
         dict
             Fields of the examination.
         """
-        return {
-            "source": self.source,
-            "verdict": self.verdict,
-            "reason": self.reason,
-            "candidates": [
-                {"changes": list(one.changes), "score": one.score, "misfit": dict(one.misfit)}
-                for one in self.candidates
-            ],
-            "notes": list(self.notes),
-            "doubts": list(self.doubts),
-        }
+        return plain(asdict(self))  # type: ignore[no-any-return]
 
 
 def examine(recording: Recording) -> Examination:

@@ -13,29 +13,20 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
-from strapdown.allan.deviation import TERMS as TERMS
-from strapdown.allan.deviation import AllanDeviation as AllanDeviation
-from strapdown.allan.deviation import allan_deviation as allan_deviation
-from strapdown.allan.deviation import flicker_variance as flicker_variance
-from strapdown.allan.deviation import model_deviation as model_deviation
-from strapdown.allan.noise_fit import UNITS as UNITS
-from strapdown.allan.noise_fit import NoiseFit as NoiseFit
-from strapdown.allan.noise_fit import curves_by_axis as curves_by_axis
-from strapdown.allan.noise_fit import expected_errors as expected_errors
-from strapdown.allan.noise_fit import fit_noise as fit_noise
-from strapdown.allan.noise_fit import table as table
-from strapdown.allan.noise_fit import to_gyro_parameters as to_gyro_parameters
-from strapdown.allan.noise_fit import upper_bounds as upper_bounds
-from strapdown.allan.power_laws import NOISE_TYPES as NOISE_TYPES
-from strapdown.allan.power_laws import equivalent_degrees_of_freedom as equivalent_degrees_of_freedom
+from strapdown.allan.deviation import TERMS, AllanDeviation, allan_deviation, flicker_variance, model_deviation
+from strapdown.allan.noise_fit import (
+    UNITS,
+    NoiseFit,
+    curves_by_axis,
+    expected_errors,
+    fit_noise,
+    table,
+    to_gyro_parameters,
+    upper_bounds,
+)
+from strapdown.allan.power_laws import NOISE_TYPES, equivalent_degrees_of_freedom
 
-__all__ = [
-    "AllanDeviation",
-    "NoiseFit",
-    "allan_deviation",
-    "fit_noise",
-    "to_gyro_parameters",
-]
+__all__ = ["AllanDeviation", "NoiseFit", "allan_deviation", "fit_noise", "to_gyro_parameters"]
 
 
 def __getattr__(name: str) -> Any:

@@ -1,4 +1,4 @@
-"""Allan deviation of a gyro record at rest: overlapping, robust, modified, or Hadamard, with χ² confidence bands.
+"""Allan deviation of a gyro record at rest, overlapping or robust, with χ² confidence bands.
 
 Noise terms and the Allan variance σ²(τ) of samples that average the rate over the sample interval (exact at every τ; bias: the
 minimum):
@@ -31,7 +31,6 @@ from strapdown.allan.power_laws import (
     ESTIMATORS,
     MANY_BLOCKS,
     NOISE_TYPES,
-    differences_of,
     equivalent_degrees_of_freedom,
     power_law,
 )
@@ -52,14 +51,12 @@ _MEDIAN_EFFICIENCY = (
 
 _MAX_BLOCKS = 1 << 17
 
-_STRETCH = 1 << 16
-
 _FLICKER_SUM_LIMIT = 4096
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class AllanDeviation(Listed):
-    """Allan, modified Allan or Hadamard deviation of a record with its confidence band.
+    """Allan deviation of a record with its confidence band.
 
     Attributes
     ----------
@@ -120,7 +117,7 @@ def allan_deviation(
     estimator: str = "overlapping",
     level: float = 0.95,
 ) -> AllanDeviation:
-    """Return the Allan, modified Allan or Hadamard deviation of a record with its confidence band.
+    """Return the Allan deviation of a record with its confidence band.
 
     Parameters
     ----------
@@ -133,7 +130,7 @@ def allan_deviation(
     taus : array_like, optional
         Averaging times, s, each rounded to a multiple of the sample interval, with gaps up to 6 % less; duplicates are dropped. Default: 12
         per decade, up to a third of the record, with gaps to a tenth.
-    estimator : {"overlapping", "robust", "modified", "hadamard"}, default "overlapping"
+    estimator : {"overlapping", "robust"}, default "overlapping"
         Estimator, see the notes.
     level : float, default 0.95
         Confidence of the band, 0.5 to 1.
@@ -145,9 +142,7 @@ def allan_deviation(
 
     Notes
     -----
-    The overlapping estimator equals ``allantools.oadev``, the modified one ``allantools.mdev`` and the Hadamard one
-    ``allantools.ohdev``. The table in the module docstring is for the Allan variance only (for angle random walk, N²/τ, the modified
-    variance is smaller by the factor (1 + 1/m²)/2 at m samples, and the Hadamard variance is equal).
+    The overlapping estimator equals ``allantools.oadev``.
 
     The robust estimator is the median magnitude of the second differences divided by its value for a Gaussian. It is robust to outliers,
     bursts and bias steps if they affect well under half of all intervals of 2τ, that is, to few of them at long τ. It is not suitable for
@@ -167,7 +162,7 @@ def allan_deviation(
         noise_type = np.vectorize(NOISE_TYPES.__getitem__)(found.pop("alphas"))
         return AllanDeviation(**found, noise_type=noise_type, level=level, estimator="gaps", sample_interval=dt)
     samples = record.shape[0]
-    multiples = _multiples(taus, samples, dt, differences_of(estimator))
+    multiples = _multiples(taus, samples, dt)
     deviation = np.empty((record.shape[1], len(multiples)))
     edf = np.empty_like(deviation)
     alphas = np.empty(deviation.shape, dtype=int)
@@ -179,7 +174,7 @@ def allan_deviation(
         alpha = _power_law(phase, max(1, min(int(multiples[0]), samples // MANY_BLOCKS)), 0)
         for i, m in enumerate(int(m) for m in multiples):
             alpha = alphas[axis, i] = _power_law(phase, m, alpha)
-            edf[axis, i] = equivalent_degrees_of_freedom(alpha, samples, m, estimator)
+            edf[axis, i] = equivalent_degrees_of_freedom(alpha, samples, m)
         deviation[axis] = _deviation(phase, multiples, alphas[axis], estimator)
     if estimator == "robust":
         edf *= _MEDIAN_EFFICIENCY
@@ -205,27 +200,9 @@ def _deviation(phase: Array, multiples: NDArray[np.int64], alphas: NDArray[np.in
     samples = len(phase) - 1
     if estimator == "robust":
         return np.array([_median_deviation(phase, int(m), int(a)) for m, a in zip(multiples, alphas, strict=True)])
-    if estimator == "overlapping":
-        squares = np.empty(len(multiples))
-        compiled(second_difference_squares)(phase, multiples, np.empty(512), np.empty(len(multiples)), squares)
-        return np.asarray(np.sqrt(squares / (2.0 * (samples + 1 - 2 * multiples))) / multiples)
-    if estimator == "hadamard":
-        return np.array([math.sqrt(_third_differences(phase, int(m)) / 6.0) / m for m in multiples])
-    summed = np.empty(samples + 2)
-    compiled(accumulate)(read_only(phase), float(np.mean(phase)), summed)
-    return np.array([math.sqrt(_third_differences(summed, int(m)) / 2.0) / m**2 for m in multiples])
-
-
-def _third_differences(series: Array, m: int) -> float:
-    """Return the mean of (y[k + 3m] − 3 y[k + 2m] + 3 y[k + m] − y[k])² over all k, block by block."""
-    count = len(series) - 3 * m
-    total = 0.0
-    for start in range(0, count, _STRETCH):
-        end = min(start + _STRETCH, count)
-        a, b, c, d = (series[start + j * m : end + j * m] for j in range(4))
-        difference = (d - a) - 3.0 * (c - b)
-        total += inner(difference, difference)
-    return total / count
+    squares = np.empty(len(multiples))
+    compiled(second_difference_squares)(phase, multiples, np.empty(512), np.empty(len(multiples)), squares)
+    return np.asarray(np.sqrt(squares / (2.0 * (samples + 1 - 2 * multiples))) / multiples)
 
 
 def _median_deviation(phase: Array, m: int, alpha: int) -> float:
@@ -308,15 +285,15 @@ def averaged(values: ArrayLike, sample_interval: float, kind: str) -> tuple[Arra
     return record, dt, 1.0 if kind == "rate" else 1.0 / dt
 
 
-def _multiples(taus: ArrayLike | None, samples: int, dt: float, order: int) -> NDArray[np.int64]:
+def _multiples(taus: ArrayLike | None, samples: int, dt: float) -> NDArray[np.int64]:
     if taus is None:
         return gaps.spread_multiples(samples // 3)
     wanted = np.atleast_1d(checks.array("taus", taus, (...,))).ravel()
     multiples = np.round(wanted / dt)
     for tau, m in zip(wanted, multiples, strict=True):
-        if not 1 <= m <= samples // order:
+        if not 1 <= m <= samples // 2:
             raise InputError(
-                f"taus holds {tau:g} s; with {samples} samples of {dt:g} s it must be between {dt:g} s and {samples // order * dt:g} s"
+                f"taus holds {tau:g} s; with {samples} samples of {dt:g} s it must be between {dt:g} s and {samples // 2 * dt:g} s"
             )
     if len(multiples) == 0:
         raise InputError("taus is empty; leave it out for the default")

@@ -38,9 +38,11 @@ from strapdown.allan.spectrum import (
     last_coefficient,
     mean_power,
     ramp_coefficients,
+    scored,
     segment,
 )
 from strapdown.checks import Array, InputError
+from strapdown.files import plain
 from strapdown.results import Column, Listed, Table, figure
 
 SYMBOLS = dict(zip(TERMS, "QNBKR", strict=True))
@@ -180,6 +182,17 @@ class NoiseFit(Listed):
         )
         title = f"Noise of the {self.sensor}, {self.samples} samples of {self.sample_interval:.6g} s, {100.0 * self.level:g} % intervals"
         return Table(title, columns, rows, self.warnings, left=3, name=f"{self.sensor}-noise")
+
+    def summary(self) -> dict[str, Any]:
+        """Return the coefficients and the misfit of each axis as plain values for JSON.
+
+        Returns
+        -------
+        dict
+            ``coefficients`` in the units of :data:`UNITS`, ``sample_interval_s``, ``level``, ``misfit_probability``, ``misfit``.
+        """
+        own = {name: getattr(self, name) for name in ("level", "misfit_probability", "misfit")}
+        return plain({"sample_interval_s": self.sample_interval, "coefficients": table(self), **own})  # type: ignore[no-any-return]
 
 
 def fit_noise(
@@ -408,34 +421,14 @@ def _loss(bins: Bins, theta: Array, slope: float | None, restricted: bool) -> Op
 def _maximise(
     bins: Bins, start: Array, free: NDArray[np.bool_], *, slope: float | None = None, restricted: bool = True
 ) -> Optimum:
-    """Return the maximum-likelihood theta ≥ 0 by Fisher scoring, each step a non-negative least-squares problem, with step halving."""
-    from scipy.optimize import nnls
+    """Return the maximum-likelihood theta ≥ 0 for a slope that is given or profiled."""
 
-    held = np.where(free, 0.0, start)
-    point = _loss(bins, start, slope, restricted)
-    if not free.any():
-        return point
-    for _ in range(100):
-        variance = point.variance
-        power = bins.square - 2.0 * point.slope * bins.product + point.slope**2 * bins.ramp
-        if slope is None and restricted:
-            power = power + bins.ramp / np.sum(bins.ramp / variance)
-        weight = np.sqrt(bins.number) / variance
-        residual = power / bins.number - held @ bins.basis
-        design = (bins.basis[free] * weight).T
-        norm = np.linalg.norm(design, axis=0)
-        target = start.copy()
-        target[free] = nnls(design / norm, residual * weight)[0] / norm
-        step, trial = 1.0, _loss(bins, target, slope, restricted)
-        while trial.loss > point.loss and step > 1e-6:
-            step *= 0.5
-            trial = _loss(bins, point.theta + step * (target - point.theta), slope, restricted)
-        gain = point.loss - trial.loss
-        if gain > 0.0:
-            point = trial
-        if gain < 1e-9:
-            break
-    return point
+    def power(point: Optimum) -> Array:
+        square = bins.square - 2.0 * point.slope * bins.product + point.slope**2 * bins.ramp
+        return square + bins.ramp / np.sum(bins.ramp / point.variance) if slope is None and restricted else square
+
+    at = lambda theta: _loss(bins, theta, slope, restricted)  # noqa: E731
+    return scored(bins, at, power, start, free)
 
 
 def _first_guess(bins: Bins) -> Array:

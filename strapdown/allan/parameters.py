@@ -30,13 +30,7 @@ from strapdown.allan import noise_fit
 from strapdown.allan.noise_fit import UNITS, NoiseFit, name
 from strapdown.checks import InputError
 
-__all__ = [
-    "to_kalibr",
-    "to_matlab",
-    "to_px4",
-    "to_specification",
-    "to_toml",
-]
+__all__ = ["to_kalibr", "to_matlab", "to_px4", "to_specification", "to_toml"]
 
 _KEYS = {"mm/s": "mm_per_s", "µg/√Hz": "ug_per_sqrt_hz", "µg": "ug", "µg/√h": "ug_per_sqrt_hour", "µg/h": "ug_per_hour"}
 _KEYS |= {"nT s": "nt_s", "nT/√Hz": "nt_per_sqrt_hz", "nT": "nt", "nT/√h": "nt_per_sqrt_hour", "nT/h": "nt_per_hour"}

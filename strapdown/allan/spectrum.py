@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -169,3 +169,36 @@ def binned(coefficients: Sequence[Array], segments: Sequence[Segment], dt: float
         for name in ("number", "square", "product", "ramp", "basis")
     }
     return each, Bins(**joined, first_slope=slope)
+
+
+MAX_PASSES, SMALLEST_GAIN, SHORTEST_STEP = 100, 1e-9, 1e-6
+"""Limits of the passes of :func:`scored`: number, gain of the log-likelihood, part of a step."""
+Fit = TypeVar("Fit", bound=Any)
+
+
+def scored(
+    bins: Any, at: Callable[[Array], Fit], power: Callable[[Fit], Array], start: Array, free: NDArray[np.bool_]
+) -> Fit:
+    """Return the maximum of the likelihood of bins over the free noise terms θ ≥ 0, by Fisher scoring.
+
+    Each step is a non-negative least-squares problem of the ``power`` expected in the bins, with step halving. ``at`` is the fit at some θ,
+    of which ``loss``, ``theta`` and ``variance`` are used.
+    """
+    from scipy.optimize import nnls
+
+    fit, held = at(start), np.where(free, 0.0, start) @ bins.basis
+    for _ in range(MAX_PASSES if free.any() else 0):
+        weight = np.sqrt(bins.number) / fit.variance
+        design = (bins.basis[free] * weight).T
+        norm = np.linalg.norm(design, axis=0)
+        target = start.copy()
+        target[free] = nnls(design / norm, (power(fit) / bins.number - held) * weight)[0] / norm
+        step, trial = 1.0, at(target)
+        while trial.loss > fit.loss and step > SHORTEST_STEP:
+            step *= 0.5
+            trial = at(fit.theta + step * (target - fit.theta))
+        gain = fit.loss - trial.loss
+        fit = trial if gain > 0.0 else fit
+        if gain < SMALLEST_GAIN:
+            break
+    return fit

@@ -23,21 +23,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from strapdown import checks
 from strapdown.allan.deviation import TERMS
-from strapdown.allan.spectrum import bin_starts, mean_power
+from strapdown.allan.spectrum import bin_starts, mean_power, scored
 from strapdown.checks import Array, Hint, InputError
 from strapdown.gyro.temperature import BiasOverTemperature, to_table
 from strapdown.results import Table
 
-__all__ = [
-    "TemperatureFit",
-    "fit_temperature",
-]
+__all__ = ["TemperatureFit", "fit_temperature"]
 
-MAX_PASSES = 50
-"""Maximum number of iterations for the noise terms."""
-LIKELIHOOD_TOLERANCE = 1e-6
-"""Smallest increase of the log-likelihood of a further iteration."""
-SHORTEST_STEP = 1e-6
 FLICKER, WALK = TERMS.index("bias_instability"), TERMS.index("rate_random_walk")
 SUPPORT = 4.8
 """Log-likelihood ratio that supports flicker: probability 1e-3 without it, as in :mod:`strapdown.allan.noise_fit`."""
@@ -225,32 +217,17 @@ def _fitted(bins: _Bins, theta: Array) -> _Fit:
 
 
 def _maximised(bins: _Bins, start: Array, free: NDArray[np.bool_]) -> _Fit:
-    """Return the fit at the maximum of the restricted likelihood over the free noise terms, by Fisher scoring.
+    """Return the fit at the maximum of the restricted likelihood over the free noise terms.
 
     The noise terms are fitted to the squared residuals, each with the expected reduction by the regression added back.
     """
-    from scipy.optimize import nnls
 
-    fit = _fitted(bins, start)
-    held = np.where(free, 0.0, start) @ bins.basis
-    for _ in range(MAX_PASSES):
+    def power(fit: _Fit) -> Array:
         c, C = fit.coefficients, fit.covariance
-        power = bins.square - 2.0 * bins.product @ c + np.einsum("bij,ij->b", bins.gram, np.outer(c, c) + C)
-        weight = np.sqrt(bins.number) / fit.variance
-        design = (bins.basis[free] * weight).T
-        norm = np.linalg.norm(design, axis=0)
-        target = start.copy()
-        target[free] = nnls(design / norm, (power / bins.number - held) * weight)[0] / norm
-        step, trial = 1.0, _fitted(bins, target)
-        while trial.loss > fit.loss and step > SHORTEST_STEP:
-            step *= 0.5
-            trial = _fitted(bins, fit.theta + step * (target - fit.theta))
-        gain = fit.loss - trial.loss
-        if gain > 0.0:
-            fit = trial
-        if gain < LIKELIHOOD_TOLERANCE:
-            break
-    return fit
+        return np.asarray(bins.square - 2.0 * bins.product @ c + np.einsum("bij,ij->b", bins.gram, np.outer(c, c) + C))
+
+    at = lambda theta: _fitted(bins, theta)  # noqa: E731
+    return scored(bins, at, power, start, free)
 
 
 def _over_walk(bins: _Bins) -> tuple[list[_Fit], Array]:

@@ -8,8 +8,7 @@
 
 from __future__ import annotations
 
-from strapdown.calibration.calibrating import calibrate as calibrate
-from strapdown.calibration.unit import SensorErrors, UnitCalibration, read, write
-from strapdown.calibration.unit import with_gyro_states as with_gyro_states
+from strapdown.calibration.calibrating import calibrate
+from strapdown.calibration.unit import SensorErrors, UnitCalibration, read, with_gyro_states, write
 
 __all__ = ["SensorErrors", "UnitCalibration", "calibrate", "read", "write"]

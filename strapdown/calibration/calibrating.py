@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -192,20 +192,10 @@ def _unit(v: Array) -> Array:
     return np.asarray(v / np.linalg.norm(v))
 
 
-def _sensor_errors(x: Array, bias: Array, strength: float, matrix: Callable[[Array], Array]) -> SensorErrors:
-    """Return sensor errors, or their σ, from a vector; ``matrix`` makes one from the six numbers of the accelerometer's."""
-    full = np.zeros(fitting.DIP.stop)
-    full[: len(x)] = x
-    return SensorErrors(
-        gyro_bias=bias,
-        gyro_matrix=full[fitting.GYRO].reshape(3, 3),
-        accelerometer_bias=full[fitting.BIAS],
-        accelerometer_matrix=matrix(full[fitting.FORCE]).reshape(3, 3),
-        hard_iron=full[fitting.IRON] * strength,
-        magnetometer_matrix=full[fitting.FIELD].reshape(3, 3),
-        accelerometer_delay=float(full[fitting.FORCE_DELAY][0]),
-        magnetometer_delay=float(full[fitting.FIELD_DELAY][0]),
-    )
+def _sensor_errors(x: Array, bias: Array, strength: float) -> SensorErrors:
+    """Return sensor errors, or their σ, from a vector of unknowns."""
+    errors = fitting.unpacked(x)
+    return SensorErrors(gyro_bias=bias, **errors._replace(hard_iron=errors.hard_iron * strength)._asdict())
 
 
 def _result(fit: Fit, prior: Prior, strength: float, recordings: Sequence[Recording]) -> UnitCalibration:
@@ -220,11 +210,10 @@ def _result(fit: Fit, prior: Prior, strength: float, recordings: Sequence[Record
         J[fitting.FIELD, fitting.FIELD] = (np.eye(9) - np.outer(A / mean, np.eye(3).ravel()) / 3.0) / mean
         covariance = J @ covariance @ J.T
     sigma = np.sqrt(np.diag(covariance))
-    symmetric: Callable[[Array], Array] = lambda entries: fitting.SYMMETRIC @ entries  # noqa: E731
-    values = _sensor_errors(x, fit.unknowns.bias[-1], strength, symmetric)
+    values = _sensor_errors(x, fit.unknowns.bias[-1], strength)
     found = UnitCalibration(
         **vars(values),
-        sigma=_sensor_errors(sigma[:-3], sigma[-3:], strength, symmetric),
+        sigma=_sensor_errors(sigma[:-3], sigma[-3:], strength),
         magnetic_unit=recordings[0].magnetic_unit if len(prior.mean) > fitting.IRON.start else "",
         source=", ".join(dict.fromkeys(one.source for one in recordings)),
     )

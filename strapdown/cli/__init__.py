@@ -24,7 +24,7 @@ from typing import Any
 import typer
 
 from strapdown.checks import OF_YOUR_OWN, InputError
-from strapdown.cli.layout import register as register
+from strapdown.cli.layout import register
 from strapdown.cli.progress import be_quiet, errors
 from strapdown.cli.terminal import app, console
 

@@ -12,21 +12,10 @@ from typing import TYPE_CHECKING, Any
 import typer
 from typer import Argument, Option
 
+import strapdown as sd
 from strapdown.checks import InputError, count
-from strapdown.cli.progress import progress_bar, rate_text
-from strapdown.cli.terminal import (
-    GYRO,
-    SCENARIO,
-    STATES,
-    TABLES,
-    check_files,
-    command,
-    console,
-    counted,
-    options_given,
-    show,
-    written,
-)
+from strapdown.cli import terminal as ui
+from strapdown.cli.progress import rate_text
 from strapdown.files import write_json
 
 if TYPE_CHECKING:
@@ -48,13 +37,13 @@ class _Model:
         help="TOML with a table named filter, as of `strapdown tune`; or FILE.py:NAME, your own filter, which is executed. Default: a "
         "matched one.",
     )
-    gyro: Path | None = GYRO
+    gyro: Path | None = ui.GYRO
     dispersions: Path | None = Option(
         None,
         help="TOML with a table named dispersions: initial errors and gyro parameters that differ from run to run.",
     )
     seed: int | None = Option(None, help="Seed. Default: that of the scenario.")
-    states: bool | None = STATES
+    states: bool | None = ui.STATES
 
 
 @dataclass(frozen=True)
@@ -75,15 +64,15 @@ class _Computing:
     overwrite: bool = Option(False, "--overwrite", help="Start from the beginning even if the file exists.")
 
 
-@command
+@ui.command
 def montecarlo(
     *,
-    scenario: str = Argument(help=f"{SCENARIO[:-1]}, or the HDF5 file of a campaign, with its plan."),
+    scenario: str = Argument(help=f"{ui.SCENARIO[:-1]}, or the HDF5 file of a campaign, with its plan."),
     model: _Model,
     computing: _Computing,
     out: Path | None = Option(None, help="HDF5 file. Default: NAME-montecarlo.h5 with the name of the scenario."),
     replay: int | None = Option(None, help="Repeat this run and write its record and estimate."),
-    tables: Path | None = TABLES,
+    tables: Path | None = ui.TABLES,
 ) -> None:
     """Run many simulations of a scenario and judge the filter: exit status 0 consistent, 1 not, 3 cannot tell."""
     source, again = Path(scenario), computing.resume or computing.overwrite
@@ -96,27 +85,25 @@ def montecarlo(
         raise InputError("--resume and --overwrite exclude each other; give one of them")
     if beside.exists() and not target.exists() and not computing.overwrite and replay is None:
         raise InputError(f"{beside} exists and would be replaced; move it, choose another --out, or give --overwrite")
-    check_files(target, suffixes=_SUFFIXES)
-    check_files(beside, tables=tables)
+    ui.check_files(target, suffixes=_SUFFIXES)
+    ui.check_files(beside, tables=tables)
     if replay is not None:
         _replay(plan, replay, computing.machine, target)
         return
     if held is not None and target == source and not again:
         status, _, listed = _print_result(held)
-        written(tables=(tables, listed))
+        ui.written(tables=(tables, listed))
     else:
         status, content, listed = _print_result(_computed(plan, target, source.stem, computing))
         write_json(beside, content)
-        written(target, beside, tables=(tables, listed))
+        ui.written(target, beside, tables=(tables, listed))
     raise typer.Exit(status)
 
 
 def _planned(source: Path, scenario: str, model: _Model) -> tuple[Campaign | None, Plan]:
     """Return the campaign of a file, None if the source is no campaign file, and the plan."""
-    from strapdown import montecarlo as engine
-    from strapdown import scenarios, workflows
+    from strapdown import workflows
     from strapdown.estimation.setup import read_setup
-    from strapdown.gyro import read_spec
     from strapdown.montecarlo import campaign as campaigns
 
     own = _own_filter(model.filter_file)
@@ -124,22 +111,22 @@ def _planned(source: Path, scenario: str, model: _Model) -> tuple[Campaign | Non
         held = campaigns.read(source)
         if own is not None:
             held, model = campaigns.with_filter(held, own, source), replace(model, filter_file=None)
-        for name in options_given(model):
+        for name in ui.options_given(model):
             raise InputError(f"{name} is given, but {source} contains its own; leave it out, or name a scenario")
         return held, held.plan
     given = None if model.filter_file is None or own is not None else read_setup(model.filter_file)
     plan = workflows.plan(
-        scenarios.load_scenario(scenario),
-        gyro=None if model.gyro is None else read_spec(model.gyro),
+        sd.scenarios.load_scenario(scenario),
+        gyro=None if model.gyro is None else sd.gyro.read_spec(model.gyro),
         setup=given if own is None else own,
         seed=model.seed,
         states=model.states,
-        dispersions=None if model.dispersions is None else engine.read_dispersions(model.dispersions),
+        dispersions=None if model.dispersions is None else sd.montecarlo.read_dispersions(model.dispersions),
     )
     if model.states is None and model.filter_file is None and plan.setup.states is not None:
-        console.print(workflows.state_words(plan.setup.states.names))
+        ui.say(workflows.state_words(plan.setup.states.names))
     if plan.individuals:
-        console.print("Each run draws its own gyro and sensors: specified constant errors are standard deviations.")
+        ui.say("Each run draws its own gyro and sensors: specified constant errors are standard deviations.")
     return None, plan
 
 
@@ -149,22 +136,21 @@ def _own_filter(place: Path | None) -> Own | None:
 
     if place is None or not (place.suffix == ".py" or ".py:" in place.name):
         return None
-    console.print(f"Executing {place.name.partition(':')[0]} with your permissions.")
+    ui.say(f"Executing {place.name.partition(':')[0]} with your permissions.")
     return read_filter(place)
 
 
 def _computed(plan: Plan, target: Path, name: str, options: _Computing) -> Campaign:
     """Compute the runs, in threads or on Dask, and write each chunk to the file."""
-    from strapdown import montecarlo as engine
     from strapdown.montecarlo import campaign as campaigns
 
     runs = options.runs
     if runs is None:
         runs = campaigns.read(target).runs if options.resume and target.exists() else _RUNS
-    choice = engine.choose(plan, options.machine)
+    choice = sd.montecarlo.choose(plan, options.machine)
     count("runs", runs)
-    engine.in_threads(options.threads)  # checks the number
-    console.print(f"{plan.scenario.name or name}: {counted(runs, 'run')}, seed {plan.seed}, machine: {choice}.")
+    sd.montecarlo.in_threads(options.threads)  # checks the number
+    ui.say(f"{plan.scenario.name or name}: {ui.counted(runs, 'run')}, seed {plan.seed}, machine: {choice}.")
     with contextlib.ExitStack() as stack:
         workers = None
         if options.workers is not None or options.cluster is not None:
@@ -172,9 +158,9 @@ def _computed(plan: Plan, target: Path, name: str, options: _Computing) -> Campa
 
             client = stack.enter_context(dask_client(workers=options.workers, address=options.cluster))
             workers = on_dask(client)
-            console.print(f"Dask at {client.scheduler.address}: {sum(client.nthreads().values())} worker threads.")
+            ui.say(f"Dask at {client.scheduler.address}: {sum(client.nthreads().values())} worker threads.")
         stop_if_asked = stack.enter_context(asked_to_stop())
-        advance = stack.enter_context(progress_bar("runs", runs))
+        advance = stack.enter_context(ui.progress_bar("runs", runs))
 
         def advanced(number: int) -> None:
             advance(number)
@@ -184,7 +170,7 @@ def _computed(plan: Plan, target: Path, name: str, options: _Computing) -> Campa
         try:
             return campaigns.run(plan, target, runs=runs, workers=workers, progress=advanced, **how)
         except KeyboardInterrupt:
-            console.print(f"The completed runs are in {target}; continue with --resume.")
+            ui.say(f"The completed runs are in {target}; continue with --resume.")
             raise
 
 
@@ -216,46 +202,47 @@ def asked_to_stop() -> Iterator[Callable[[], None]]:
 
 def _print_result(campaign: Campaign) -> tuple[int, dict[str, Any], list[Any]]:
     """Print the statistics and the verdict of `strapdown check`; return the exit status, the content of the JSON file, and the tables."""
-    import strapdown as sd
-    from strapdown.cli.judgement import status_of
     from strapdown.estimation.setup import MEKF
     from strapdown.montecarlo.verdicts import bound_of, tables
 
     if campaign.statistics is None:
         raise InputError("no chunk of the campaign is completed; continue it with --resume")
     if not campaign.finished:
-        console.print(f"{campaign.statistics.runs} of {campaign.runs} runs are completed.")
+        ui.say(f"{campaign.statistics.runs} of {campaign.runs} runs are completed.")
     report = sd.montecarlo.summary(campaign.statistics, bound=bound_of(campaign.plan))
     judgement = sd.check(campaign)
     listed = tables(report)
-    show(*listed)
-    console.print("Use --replay to examine a run.")
+    ui.show(*listed)
+    ui.say("Use --replay to examine a run.")
     rate = ""
     if campaign.seconds > 0.0:
         rate = f" ({rate_text(campaign.statistics.runs / campaign.seconds)} runs/s, including compilation)"
-    console.print(
-        f"{counted(report['runs'], 'run')}, {campaign.seconds:.3g} s{rate}. The verdict combines all {len(judgement.findings)} "
+    ui.say(
+        f"{ui.counted(report['runs'], 'run')}, {campaign.seconds:.3g} s{rate}. The verdict combines all {len(judgement.findings)} "
         f"statistics of `strapdown check`: a consistent filter passes with {100.0 * report['confidence_level']:g} %."
     )
-    console.print(judgement.words)
+    ui.say(judgement.words)
     if judgement.verdict == "cannot tell":
-        console.print("More runs (--runs, with --resume) are needed for a decision.")
+        ui.say("More runs (--runs, with --resume) are needed for a decision.")
     if judgement.unmodelled and campaign.plan.setup.states is None and campaign.plan.setup.estimator == MEKF:
-        console.print("--states adds states for most of these errors to the filter.")
-    return status_of(judgement), {**campaign.summary(), "judgement": judgement.summary(), **report}, listed
+        ui.say("--states adds states for most of these errors to the filter.")
+    return (
+        ui.STATUS.get(judgement.verdict, ui.CANNOT_TELL),
+        {**campaign.summary(), "judgement": judgement.summary(), **report},
+        listed,
+    )
 
 
 def _replay(plan: Plan, run: int, machine: str, target: Path) -> None:
-    import strapdown as sd
 
     paths = [target.with_name(f"{target.stem}-run-{run}-{what}.h5") for what in ("record", "estimate")]
-    check_files(*paths)
+    ui.check_files(*paths)
     again = sd.montecarlo.replay(plan, run, machine=machine)
     sd.write(again.record, paths[0], attributes=again.estimate.details)
     sd.write(again.estimate, paths[1])
     nees, worst = again.largest_nees(plan.time)
-    console.print(
+    ui.say(
         f"Run {run} of seed {plan.seed}, machine: {sd.montecarlo.choose(plan, machine)}. Its maximum NEES at the {plan.epochs} epochs of "
         f"the campaign is {nees:.1f} ({'six' if again.estimate.has_bias else 'three'} states), at {worst:g} s."
     )
-    written(*paths)
+    ui.written(*paths)

@@ -8,24 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 from typer import Argument, Option
 
+import strapdown as sd
 from strapdown.checks import InputError, array, non_negative, one_of
-from strapdown.cli.progress import progress_bar
+from strapdown.cli import terminal as ui
 from strapdown.cli.reading import RECORDING_HELP, Layout
-from strapdown.cli.terminal import (
-    FILTER,
-    FORMAT,
-    GYRO,
-    STATES,
-    Format,
-    check_files,
-    command,
-    console,
-    options_given,
-    say,
-    show,
-    warn_about_conventions,
-    written,
-)
 from strapdown.files import reading, writable, write_json
 
 if TYPE_CHECKING:
@@ -43,7 +29,7 @@ ABOUT_IT = ("estimate.html", "estimate.report.json")
 class _Shared:
     """Filter."""
 
-    gyro: Path | None = GYRO
+    gyro: Path | None = ui.GYRO
     gate: float | None = Option(None, help="Reject measurements beyond this quantile of chi-squared, and recover.")
     robust: str | None = Option(None, help="Weight measurements by their innovations: huber or student.")
     full_covariance: bool | None = Option(
@@ -57,8 +43,8 @@ class _Shared:
 class _Specified:
     """With a specification, as in recordings of `strapdown simulate`."""
 
-    filter_file: Path | None = FILTER
-    states: bool | None = STATES
+    filter_file: Path | None = ui.FILTER
+    states: bool | None = ui.STATES
     state: list[str] | None = Option(None, help="Only this state, such as gyro.scale or SENSOR.bias; repeatable.")
     attitude: str | None = Option(None, help="Initial attitude, w,x,y,z. Default: from the first measurements.")
     from_truth: bool = Option(False, "--from-truth", help="Start from the truth with errors drawn from the filter's σ.")
@@ -98,15 +84,15 @@ class _Output:
     out: Path = Option(Path("estimate-results"), help="Folder for estimate.h5, errors.json and the figures.")
     to: list[Path] | None = Option(
         None,
-        help="Also write this file: .csv, .tsv, .parquet, .tum, .rrd; of a recording .bag, .mcap, .db3; repeatable.",
+        help="Also write this file: .csv, .tsv, .parquet, .tum; of a recording .bag, .mcap, .db3; repeatable.",
     )
     euler: str | None = Option(None, help="With --to a table: sequence of the Euler angles. Default: ZYX.")
     frame: str | None = Option(None, help="With --to: fixed frame, enu (default) or ned; body axes are not changed.")
     figures: bool = Option(False, "--figures", help="Draw the estimate, its states and errors; --format does too.")
-    form: Format | None = Option(None, "--format", help=FORMAT.help)
+    form: ui.Format | None = Option(None, "--format", help=ui.FORMAT.help)
 
 
-@command
+@ui.command
 def estimate(
     *,
     recording: Path = Argument(help=f"{RECORDING_HELP}; or a record of `strapdown simulate`."),
@@ -121,23 +107,20 @@ def estimate(
     The accelerometer gives the vertical and the magnetometer the heading. If the recording contains its specification, like those of
     `strapdown simulate`, the filter matches it.
     """
-    import strapdown as sd
-    from strapdown import calibration, workflows
+    from strapdown import workflows
     from strapdown.estimation.setup import observability, read_setup
-    from strapdown.gyro import read_spec, temperature
-    from strapdown.recordings import is_record
 
     out, form = output.out, output.form or ("png" if output.figures else None)
     names = (*FILES, *(f"{name}.{form or 'png'}" for name in FIGURES))
     inputs = (recording, shared.gyro, specified.filter_file, recorded.calibration, recorded.temperature)
     kind = lambda path: reading.kind(path) == "strapdown estimate"  # noqa: E731
-    check_files(*(out / name for name in names), sources=inputs, own=kind, command="estimate")
+    ui.check_files(*(out / name for name in names), sources=inputs, own=kind, command="estimate")
     exports = _exports(output, recording, changed=bool(layout.axes or layout.invert))
-    simulated = is_record(recording)
-    for name in options_given(recorded if simulated else specified):
+    simulated = sd.recordings.is_record(recording)
+    for name in ui.options_given(recorded if simulated else specified):
         raise InputError(f"{name} goes with a record{'ing' if simulated else ' of `strapdown simulate`'}; leave it out")
     options: dict[str, Any] = {"gate": shared.gate, "robust": shared.robust, "smooth": shared.smooth}
-    options |= {"noise": shared.gyro and read_spec(shared.gyro), "full_covariance": shared.full_covariance}
+    options |= {"noise": shared.gyro and sd.gyro.read_spec(shared.gyro), "full_covariance": shared.full_covariance}
     if simulated:
         states: Any = specified.state or specified.states
         setup = specified.filter_file and read_setup(specified.filter_file)
@@ -147,36 +130,36 @@ def estimate(
         options |= {
             "motion": recorded.motion,
             "latency": None if late is None else 1e-3 * non_negative("--latency", late, unit="ms"),
-            "calibration": recorded.calibration and calibration.read(recorded.calibration),
-            "temperature": recorded.temperature and temperature.read(recorded.temperature),
+            "calibration": recorded.calibration and sd.calibration.read(recorded.calibration),
+            "temperature": recorded.temperature and sd.gyro.temperature.read(recorded.temperature),
             "walks": shared.observability,
         }
         one_of("--motion", recorded.motion or "hand", sd.ahrs.MOTIONS)
-    with progress_bar("reading"):
+    with ui.progress_bar("reading"):
         source: Any = sd.read(recording, **layout.options(recording))
     if not simulated:
-        warn_about_conventions(source, recording)
-    with progress_bar("smoothing" if shared.smooth else "filtering"):
+        ui.warn_about_conventions(source, recording)
+    with ui.progress_bar("smoothing" if shared.smooth else "filtering"):
         run = workflows.run(source, **options)
     result = run.estimate
     if simulated:
         vectors = ", ".join(f"{len(one.time)} of {one.sensor}" for one in source.vectors) or "no measurements"
         length = source.time[-1] - source.time[0]
-        console.print(f"{recording.name}: {len(source.increments)} gyro samples over {length:.6g} s, {vectors}.")
-    say(*result.remarks)
-    show(result.listing())
+        ui.say(f"{recording.name}: {len(source.increments)} gyro samples over {length:.6g} s, {vectors}.")
+    ui.say(*result.remarks)
+    ui.show(result.listing())
     _clear(out)
     contents: dict[str, Any] = {}
     if result.error_states:
         contents["states.json"] = {name: states.summary() for name, states in result.error_states.items()}
     if shared.observability:
-        with progress_bar("observability"):
+        with ui.progress_bar("observability"):
             shown = observability(run.record, run.setup, run.initial)
-        console.print(str(shown))
+        ui.say(str(shown))
         contents["observability.json"] = shown.summary()
     if result.truth is not None:
         accuracy = sd.accuracy(result)
-        show(accuracy.listing())
+        ui.show(accuracy.listing())
         contents["errors.json"] = accuracy.summary()
     paths = [sd.write(result, out / FILES[0])]
     for file, content in contents.items():
@@ -184,19 +167,18 @@ def estimate(
         paths.append(out / file)
     if run.calibration is not None:
         paths.append(out / "calibration.toml")
-        calibration.write(run.calibration, paths[-1])
+        sd.calibration.write(run.calibration, paths[-1])
     for target, how in exports.items():
         paths.append(sd.write(result, target, recording=None if simulated else source, **how))
     if form is not None:
         paths += _drawn(out, form, result, recording.name)
-    written(*paths)
+    ui.written(*paths)
     if result.innovations:
-        console.print(f"Test the filter with `strapdown check {paths[0]}`.")
+        ui.say(f"Test the filter with `strapdown check {paths[0]}`.")
 
 
 def _exports(output: _Output, recording: Path, *, changed: bool) -> dict[Path, dict[str, Any]]:
     """Return the additional files of an estimate with the options of their writers; raise an error for those that cannot be written."""
-    from strapdown import recordings
     from strapdown.records import outputs
 
     frame = None if output.frame is None else one_of("--frame", output.frame.upper(), outputs.FRAMES)
@@ -208,10 +190,10 @@ def _exports(output: _Output, recording: Path, *, changed: bool) -> dict[Path, d
     exports = {}
     for target in output.to or ():
         writable("to", target, sources=(recording,))
-        chosen = recordings.estimate_format(target, wanted, recording=not recordings.is_record(recording))
+        chosen = sd.recordings.estimate_format(target, wanted, recording=not sd.recordings.is_record(recording))
         exports[target] = dict[str, Any](wanted)
         # If the axes were changed, the samples in a copy of the file would not be in those of the orientation.
-        if "source" in chosen.estimate_options and recordings.format_of(recording) is chosen and not changed:
+        if "source" in chosen.estimate_options and sd.recordings.format_of(recording) is chosen and not changed:
             exports[target]["source"] = recording
     return exports
 
@@ -223,17 +205,14 @@ def _clear(out: Path) -> None:
         (out / name).unlink(missing_ok=True)
 
 
-def _drawn(out: Path, form: Format, result: Estimate, title: str) -> list[Path]:
+def _drawn(out: Path, form: ui.Format, result: Estimate, title: str) -> list[Path]:
     """Draw the estimate, its optional states, and its errors relative to a truth or a reference; return the files."""
-    from strapdown import plots
-    from strapdown.plots.style import save_as
-
     truth = result.truth
-    figures = {out / "estimate": plots.estimate_overview(result, title=title, fixed_frame=result.fixed_frame)}
+    figures = {out / "estimate": sd.plots.estimate_overview(result, title=title, fixed_frame=result.fixed_frame)}
     if result.error_states:
-        figures[out / "states"] = plots.states_over_time(result, title=title)
+        figures[out / "states"] = sd.plots.states_over_time(result, title=title)
     if truth is not None and truth.has_bias:
-        figures[out / "errors"] = plots.error_overview(result, truth, title=title)
+        figures[out / "errors"] = sd.plots.error_overview(result, truth, title=title)
     elif truth is not None:
-        figures[out / "errors"] = plots.recording_errors(result, truth.attitude, truth.movement)
-    return save_as(figures, form)
+        figures[out / "errors"] = sd.plots.recording_errors(result, truth.attitude, truth.movement)
+    return sd.plots.save_as(figures, form)

@@ -7,11 +7,12 @@ from typing import Any, Literal
 
 from typer import Argument, Option
 
+import strapdown as sd
 from strapdown.checks import InputError
-from strapdown.cli.terminal import command, console, written
+from strapdown.cli import terminal as ui
 
 
-@command
+@ui.command
 def export(
     filter_file: str = Argument(
         metavar="FILTER",
@@ -27,7 +28,6 @@ def export(
     out: Path = Option(Path("strapdown-filter"), help="Folder of the source code."),
 ) -> None:
     """Export a filter as source code for a microcontroller or a web page."""
-    import strapdown as sd
     from strapdown.records import ImuRecord
 
     source: Any = None
@@ -38,16 +38,16 @@ def export(
             raise InputError(f"{sensors} is no simulated record; give a record of `strapdown simulate`, or a scenario")
     paths = sd.export(filter_file, source, folder=out, rate=rate, magnetometer=magnetometer, to=to, precision=precision)
     what = f"an IMU at {rate:g} Hz" if sensors is None else f"the sensors of {sensors}"
-    console.print(f"Filter of {filter_file} with {what}, {precision} precision.")
-    written(*paths)
+    ui.say(f"Filter of {filter_file} with {what}, {precision} precision.")
+    ui.written(*paths)
 
 
-@command
+@ui.command
 def info() -> None:
     """Print the versions and the processor features used by compiled code."""
     import strapdown
     from strapdown.kernels.machine import describe
 
-    console.print(f"strapdown {strapdown.__version__}")
+    ui.say(f"strapdown {strapdown.__version__}")
     for name, value in describe().items():
-        console.print(f"{name}: {value}")
+        ui.say(f"{name}: {value}")

@@ -1,4 +1,4 @@
-"""Verdicts: whether a filter is consistent, and which conventions a recording follows."""
+"""The verdict on a filter, and reports of results."""
 
 from __future__ import annotations
 
@@ -9,19 +9,15 @@ from typing import TYPE_CHECKING, Any
 import typer
 from typer import Argument, Option
 
-from strapdown.checks import Hint, InputError
-from strapdown.cli.progress import progress_bar
-from strapdown.cli.reading import RECORDING_HELP, Layout
-from strapdown.cli.terminal import command, console, counted, json_target, options_given, put_json, say, show, written
+import strapdown as sd
+from strapdown.checks import InputError
+from strapdown.cli import terminal as ui
 from strapdown.files import reading, writable
-from strapdown.results import Column, Table
+from strapdown.files.reading import existing_file
 
 if TYPE_CHECKING:
     from strapdown.consistency import Judgement
     from strapdown.records import Estimate
-
-CONSISTENT, NOT, CANNOT_TELL = 0, 1, 3
-"""Exit status of a verdict; 2 is that of bad usage or input."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +35,7 @@ class _Foreign:
     aligned: Path | None = Option(None, help="HDF5 file for the aligned estimate, which `strapdown report` reads.")
 
 
-@command
+@ui.command
 def check(
     *,
     result: Path = Argument(
@@ -60,59 +56,53 @@ def check(
     """
     from strapdown.consistency.bounds import tail
 
-    json_target(json, result, record, filter_file, foreign.truth)
+    ui.json_target(json, result, record, filter_file, foreign.truth)
     if record is None and filter_file is not None:
         raise InputError("--filter goes with --record: the record is needed to search for causes")
     tail(confidence_level)
     how: dict[str, Any] = {"confidence_level": confidence_level, "detectable_error": detectable_error}
     # A missing file is reported as one of this package.
-    own = (
-        not result.exists()
-        or result.suffix.lower() in (".h5", ".hdf5")
-        or (result.is_file() and reading.is_hdf5(result))
-    )
-    own = own and foreign.truth is None
+    hdf5 = result.suffix.lower() in (".h5", ".hdf5") or (result.is_file() and reading.is_hdf5(result))
+    own = (hdf5 or not result.exists()) and foreign.truth is None
     if record is not None and not own:
         raise InputError(
             "--record goes with an estimate of `strapdown estimate` without --truth; leave out --truth or --record"
         )
-    for name in options_given(foreign) if foreign.truth is None else ():
+    for name in ui.options_given(foreign) if foreign.truth is None else ():
         raise InputError(f"{name} goes with --truth; give a reference, or leave it out")
     if own:
         held, judgement, content = _judged_own(result, how)
-        words = judgement.words
-        _show_statistics(judgement)
-        if record is not None:
-            content["diagnosis"], judgement, words = _diagnosed(held, record, filter_file, judgement)
     else:
         judgement, content = _judged_foreign(result, topic or "", foreign, how)
-        words = judgement.words
-        _show_statistics(judgement)
-    console.print(words)
-    put_json(json, content | judgement.summary())
+    table, words = judgement.listing(), judgement.words
+    if judgement.findings:
+        ui.show(table, title="Statistics of the filter and their bounds for a consistent filter")
+    else:
+        ui.say(*table.notes)
+    if record is not None:
+        content["diagnosis"], judgement, words = _diagnosed(held, record, filter_file, judgement)
+    ui.say(words)
+    ui.put_json(json, content | judgement.summary())
     if foreign.aligned is not None:
-        written(foreign.aligned)
-    raise typer.Exit(status_of(judgement))
+        ui.written(foreign.aligned)
+    raise typer.Exit(ui.STATUS.get(judgement.verdict, ui.CANNOT_TELL))
 
 
 def _judged_own(result: Path, how: dict[str, Any]) -> tuple[Any, Judgement, dict[str, Any]]:
     """Judge a result of this package; return it, the verdict and the start of the JSON content."""
-    import strapdown as sd
-
     held: Any = sd.read(result)
     kind = reading.kind(result)
     if kind == "strapdown montecarlo":
         if held.statistics is None:
             raise InputError(f"{result} has no completed run yet; resume it with `strapdown montecarlo --resume`")
-        console.print(f"{result.name}: {held.statistics.runs} of {counted(held.runs, 'run')}, machine {held.machine}.")
+        ui.say(f"{result.name}: {held.statistics.runs} of {ui.counted(held.runs, 'run')}, machine {held.machine}.")
     elif kind == "strapdown estimate":
         truth = "no truth"
         if held.truth is not None:
             truth = "with its truth" if held.truth.has_bias else "with a reference attitude"
-        console.print(
-            f"{result.name}: {len(held.time)} epochs over {held.time[-1] - held.time[0]:.6g} s, "
-            f"{sum(len(one.time) for one in held.innovations.values())} measurements, {truth}."
-        )
+        number = sum(len(one.time) for one in held.innovations.values())
+        length = held.time[-1] - held.time[0]
+        ui.say(f"{result.name}: {len(held.time)} epochs over {length:.6g} s, {number} measurements, {truth}.")
     else:
         raise InputError(
             f"{result} is {f'a {kind}' if kind else 'a recording'}; give a result of `strapdown estimate` or `strapdown montecarlo`"
@@ -120,112 +110,77 @@ def _judged_own(result: Path, how: dict[str, Any]) -> tuple[Any, Judgement, dict
     return held, sd.check(held, **how), {"source": result.name, "kind": kind}
 
 
-def status_of(judgement: Judgement) -> int:
-    """Return the exit status of a verdict."""
-    return {"consistent": CONSISTENT, "not consistent": NOT}.get(judgement.verdict, CANNOT_TELL)
-
-
 def _judged_foreign(
     result: Path, topic: str, options: _Foreign, how: dict[str, Any]
 ) -> tuple[Judgement, dict[str, Any]]:
     """Judge an estimate of another program; return the verdict and the start of the JSON content."""
-    import strapdown as sd
-    from strapdown import consistency
-    from strapdown.records import Origin
-
     if options.aligned is not None:
         writable("aligned", options.aligned, suffixes=(".h5", ".hdf5"), sources=(result, options.truth))
     own = sd.read_attitudes(result, topic=topic)
     if reading.kind(result) == "strapdown estimate":
         own = replace(own, innovations=sd.read(result).innovations)  # type: ignore[union-attr]
     length = (own.stamps_ns[-1] - own.stamps_ns[0]) / 1e9
-    console.print(f"{own.source}: {len(own.stamps_ns)} attitudes over {length:.6g} s.")
-    say(*own.remarks)
+    ui.say(f"{own.source}: {len(own.stamps_ns)} attitudes over {length:.6g} s.")
+    ui.say(*own.remarks)
     content: dict[str, Any] = {"source": own.source, "kind": "estimate from elsewhere"}
     reference = None if options.truth is None else sd.read_attitudes(options.truth)
     if reference is not None:
-        console.print(f"Truth: {reference.source}, {len(reference.stamps_ns)} attitudes.")
-    checked = consistency.check_attitudes(own, reference, error_frame=options.error_frame, align=options.align, **how)
+        ui.say(f"Truth: {reference.source}, {len(reference.stamps_ns)} attitudes.")
+    checked = sd.consistency.check_attitudes(
+        own, reference, error_frame=options.error_frame, align=options.align, **how
+    )
     if reference is None:
         return checked.judgement, content
-    say(*(f"Note: {remark}." for remark in checked.remarks))
-    show(
+    ui.say(*(f"Note: {remark}." for remark in checked.remarks))
+    ui.show(
         *([checked.accuracy.listing()] if checked.accuracy else []),
         *([checked.listing()] if checked.explanations else []),
     )
     if options.aligned is not None:
-        origin, details = Origin(source=own.source), {"truth": reference.source}
+        origin, details = sd.records.Origin(source=own.source), {"truth": reference.source}
         sd.write(replace(checked.estimate, truth=checked.truth, origin=origin, details=details), options.aligned)
     return checked.judgement, content | checked.summary()
-
-
-def _show_statistics(judgement: Judgement) -> None:
-    table = judgement.listing()
-    if judgement.findings:
-        show(table, title="Statistics of the filter and their bounds for a consistent filter")
-    else:
-        say(*table.notes)
 
 
 def _diagnosed(
     held: Estimate, record: Path, filter_file: Path | None, judgement: Judgement
 ) -> tuple[dict[str, Any], Judgement, str]:
     """Print the causes found from a record; return them for JSON, and the verdict and its words, combined with them if possible."""
-    import strapdown as sd
     from strapdown.estimation.setup import read_setup
     from strapdown.estimation.setup.for_record import unmodelled_errors
-    from strapdown.recordings import recordfiles
-    from strapdown.records import Estimate
+    from strapdown.recordings.recordfiles import read_record
     from strapdown.workflows import no_state_words
 
-    if not isinstance(held, Estimate):
+    if not isinstance(held, sd.records.Estimate):
         raise InputError("--record and --filter go with an estimate; for a Monte Carlo, replay a run first")
-    source = recordfiles.read_record(record)
+    source = read_record(record)
     chosen = held.setup if filter_file is None else read_setup(filter_file)
     missing = () if chosen is None else unmodelled_errors(source.origin, chosen)
-    say(*no_state_words(missing, chosen))
-    with progress_bar("searching for causes"), reading.from_file(record):
+    ui.say(*no_state_words(missing, chosen))
+    with ui.progress_bar("searching for causes"), reading.from_file(record):
         diagnosis, reason = sd.diagnose(held, source, setup=chosen, judgement=judgement)
     if diagnosis is None:
-        console.print(f"Causes were not searched for: {reason}.")
-        return {"not_looked_for": reason, "without_a_state": list(missing)}, judgement, judgement.words
-    show(diagnosis.listing(), title="Causes by their effect on the likelihood", notes=False)
-    content = {**diagnosis.summary(), "without_a_state": list(missing)}
+        ui.say(f"Causes were not searched for: {reason}.")
+        return {"not_looked_for": reason, "without_a_state": missing}, judgement, judgement.words
+    ui.show(diagnosis.listing(), title="Causes by their effect on the likelihood", notes=False)
+    content = {**diagnosis.summary(), "without_a_state": missing}
     if reason:
-        say(f"{reason}; therefore the verdict is based on the statistics only.", diagnosis.cause_words)
+        ui.say(f"{reason}; therefore the verdict is based on the statistics only.", diagnosis.cause_words)
         return content, judgement, judgement.words
     return content, diagnosis.judgement, diagnosis.words
 
 
-@command
-def doctor(
-    *,
-    recording: Path = Argument(help=f"{RECORDING_HELP}."),
-    layout: Layout,
-    json: Path | None = Option(None, "--json", help="File for the explanations and scores; - for standard output."),
+@ui.command
+def report(
+    result: Path = Argument(help="HDF5 of `estimate` or `montecarlo`, or JSON of `tune` or `coning`."),
+    other: Path | None = Argument(None, help="A second estimate of the same motion: both, with their difference."),
+    out: Path | None = Option(None, "--out", "-o", help="The page, .html. Default: beside the result."),
 ) -> None:
-    """Test the axes, signs, frames and units of a recording against alternatives: exit status 0 as declared, 1 wrong, 3 cannot tell."""
-    from strapdown import recordings
-    from strapdown.ahrs import check_conventions
-
-    json_target(json, recording)
-    source = recordings.read(recording, **layout.options(recording))
-    with progress_bar("testing conventions"):
-        checked = check_conventions.examine(source)
-    say(
-        f"{checked.source}: {checked.words}",
-        *(f"warning: {words}." for words in checked.doubts),
-        *(f"Note: {remark}" for remark in source.remarks),
-    )
-    if checked.candidates:
-        names = list(checked.candidates[0].misfit)
-        plain = lambda words: Hint.replaced(words, lambda hint: "").replace(" ()", "").replace("; )", ")")  # noqa: E731
-        short = lambda name: name.replace("accelerometer", "acc").replace("magnetometer", "mag").replace(" and ", "–")  # noqa: E731
-        columns = [Column("explanation"), Column("score", shown="{:.1f}".format)]
-        columns += [Column(short(name), shown="{:.3f}".format) for name in names]  # hints are in the verdict
-        rows = [(plain(one.words), one.score, *one.misfit.values()) for one in checked.candidates[:8]]
-        title = "Explanations: score (log-likelihood) and misfit, 0 perfect, 1 unrelated, 2 opposite"
-        show(Table(title, columns, rows))
-    say(*(f"Note: {note}." for note in checked.notes))
-    put_json(json, checked.summary())
-    raise typer.Exit({"as declared": CONSISTENT, "wrong convention": NOT}.get(checked.verdict, CANNOT_TELL))
+    """Write a self-contained HTML page about a result: verdict, numbers, figures, provenance; and the statistics as JSON."""
+    existing_file(result)
+    page = result.with_suffix(".html") if out is None else out
+    ui.check_files(page, page.with_suffix(".report.json"), sources=(result, other))
+    with ui.progress_bar("judging, drawing"):
+        done = sd.report.write(result, out, other=other)
+    ui.say(f"{result.name}: {done.verdict}.")
+    ui.written(done.page, done.statistics)

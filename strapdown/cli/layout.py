@@ -9,55 +9,41 @@ from strapdown.cli.terminal import app
 COMMANDS: dict[str, dict[str, tuple[str, ...]]] = {
     "Simulate, estimate, judge": {
         "scenarios": ("sensors",),
-        "keys": ("sensors", "strapdown keys sensors", "strapdown keys coning"),
-        "simulate": (
-            "sensors",
-            "strapdown simulate two-stars",
-            "strapdown simulate satellite.toml --seed 2 --out flight.h5",
-        ),
+        "keys": ("sensors", "sensors", "coning"),
+        "simulate": ("sensors", "two-stars", "satellite.toml --seed 2 --out flight.h5"),
         "estimate": (
             "estimation",
-            "strapdown estimate two-stars.h5",
-            "strapdown estimate walk.csv --gyro-unit deg/s --accelerometer-unit g --to angles.csv",
+            "two-stars.h5",
+            "walk.csv --gyro-unit deg/s --accelerometer-unit g --to angles.csv",
         ),
-        "check": (
-            "judgement",
-            "strapdown check estimate-results/estimate.h5",
-            "strapdown check other.csv --truth flight.h5",
-        ),
-        "report": ("reporting", "strapdown report estimate-results/estimate.h5"),
-        "montecarlo": (
-            "campaigns",
-            "strapdown montecarlo satellite.toml --runs 400",
-            "strapdown montecarlo satellite.toml --filter mine.py:run",
-        ),
-        "covariance": ("studies", "strapdown covariance satellite.toml --consider scale_factor=300"),
+        "check": ("judgement", "estimate-results/estimate.h5", "other.csv --truth flight.h5"),
+        "report": ("judgement", "estimate-results/estimate.h5"),
+        "montecarlo": ("campaigns", "satellite.toml --runs 400", "satellite.toml --filter mine.py:run"),
+        "covariance": ("studies", "satellite.toml --consider scale_factor=300"),
     },
     "Noise and tuning": {
-        "allan": ("allan", "strapdown allan rest.csv --gyro-unit deg/s"),
-        "tune": ("tuning", "strapdown tune one.h5 two.h5 --filter guess.toml --holdout 0.4"),
+        "allan": ("allan", "rest.csv --gyro-unit deg/s"),
+        "tune": ("tuning", "one.h5 two.h5 --filter guess.toml --holdout 0.4"),
     },
     "Recordings": {
-        "doctor": ("judgement", "strapdown doctor walk.csv --gyro-unit deg/s --accelerometer-unit g"),
+        "doctor": ("recordings", "walk.csv --gyro-unit deg/s --accelerometer-unit g"),
         "calibrate": (
-            "calibrating",
-            "strapdown calibrate turned.csv --gyro-unit deg/s --accelerometer-unit g",
-            "strapdown calibrate slow.h5 fast.h5 --out calibration.toml",
+            "recordings",
+            "turned.csv --gyro-unit deg/s --accelerometer-unit g",
+            "slow.h5 fast.h5 --out calibration.toml",
         ),
-        "convert": ("conversion", "strapdown convert walk.bag walk.csv"),
+        "convert": ("recordings", "walk.bag walk.csv"),
     },
     "Integration of the gyro": {
-        "coning": ("studies", "strapdown coning", "strapdown coning --algorithm mine.toml --runs 20"),
-        "integrate": ("integration", "strapdown integrate flight.h5 --algorithm three-sample"),
-        "algorithms": ("integration",),
-        "coning-budget": ("integration", "strapdown coning-budget --psd psd.csv --rate 200"),
+        "coning": ("studies", "", "--algorithm mine.toml --runs 20"),
+        "integrate": ("studies", "flight.h5 --algorithm three-sample"),
+        "algorithms": ("studies",),
+        "coning-budget": ("studies", "--psd psd.csv --rate 200"),
     },
-    "On a microcontroller": {
-        "export": ("exporting", "strapdown export filter.toml satellite.toml --precision single --out firmware"),
-    },
+    "On a microcontroller": {"export": ("exporting", "filter.toml satellite.toml --precision single --out firmware")},
     "This installation": {"info": ("exporting",)},
 }
-"""Commands by group: the module that registers each, and examples."""
+"""Commands by group: the module that registers each, and arguments of examples."""
 
 
 def register(command: str | None = None) -> None:
@@ -65,8 +51,10 @@ def register(command: str | None = None) -> None:
     places = {name: (title, *place) for title, group in COMMANDS.items() for name, place in group.items()}
     for module in dict.fromkeys(place[1] for name, place in places.items() if name == command or command not in places):
         importlib.import_module(f"strapdown.cli.{module}")
-    name_of = lambda one: one.name or one.callback.__name__.replace("_", "-")  # noqa: E731
+    name_of = lambda one: one.callback.__name__.replace("_", "-")  # noqa: E731
     app.registered_commands.sort(key=lambda one: list(places).index(name_of(one)))
     for one in app.registered_commands:
-        one.rich_help_panel, _, *examples = places[name_of(one)]
-        one.epilog = "\n\n".join(("Examples:", *(f"  {line}" for line in examples))) if examples else None
+        name = name_of(one)
+        one.rich_help_panel, _, *examples = places[name]
+        lines = (f"  strapdown {name} {arguments}".rstrip() for arguments in examples)
+        one.epilog = "\n\n".join(("Examples:", *lines)) if examples else None

@@ -44,6 +44,9 @@ STATES: Any = Option(
     help="A state for each specified error, or none. Default: if the matched filter needs them.",
 )
 GYRO: Any = Option(None, help="TOML with a table named gyro, as of `strapdown allan`: the gyro noise of the filter.")
+CANNOT_TELL = 3
+STATUS = {"consistent": 0, "as declared": 0, "not consistent": 1, "wrong convention": 1}
+"""Exit status of a verdict, otherwise :data:`CANNOT_TELL`; 2 is that of bad usage or input."""
 SCENARIO = "Name of a built-in scenario, or a TOML file."
 
 

@@ -8,22 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 from typer import Argument, Option
 
+import strapdown as sd
 from strapdown.checks import InputError, count
-from strapdown.cli.progress import progress_bar
+from strapdown.cli import terminal as ui
 from strapdown.cli.reading import Layout
-from strapdown.cli.terminal import (
-    FILTER,
-    FORMAT,
-    TABLES,
-    Format,
-    check_files,
-    command,
-    console,
-    say,
-    show,
-    warn_about_conventions,
-    written,
-)
 from strapdown.files import write_json, write_text
 
 if TYPE_CHECKING:
@@ -45,7 +33,7 @@ class _Filter:
         "initial.bias, gate.probability; or only filter.scale. Default: the two of the gyro and the sigma of every sensor; for a recording "
         "without --truth or --rmse only filter.scale is allowed.",
     )
-    filter_file: Path | None = FILTER
+    filter_file: Path | None = ui.FILTER
     states: bool = Option(
         False,
         "--states",
@@ -66,11 +54,11 @@ class _Filter:
     @property
     def spec(self) -> GyroSpec | None:
         """The gyro of the prior, if given."""
-        from strapdown.gyro import datasheets, read_spec
-
         if self.prior is None:
             return None
-        return read_spec(self.prior) if Path(self.prior).suffix == ".toml" else datasheets.preset(self.prior).spec
+        if Path(self.prior).suffix == ".toml":
+            return sd.gyro.read_spec(self.prior)
+        return sd.gyro.datasheets.preset(self.prior).spec
 
 
 @dataclass(frozen=True)
@@ -94,7 +82,7 @@ class _Search:
     threads: int | None = Option(None, help="Number of threads. Default: one per core.")
 
 
-@command
+@ui.command
 def tune(
     *,
     records: list[Path] = Argument(help="Records or recordings (BROAD HDF5, CSV), all of one unit."),
@@ -103,14 +91,13 @@ def tune(
     search: _Search,
     layout: Layout,
     out: Path = Option(Path("filter.toml"), "--out", "-o", help="TOML for --filter; beside it JSON and figures."),
-    form: Format = FORMAT,
-    tables: Path | None = TABLES,
+    form: ui.Format = ui.FORMAT,
+    tables: Path | None = ui.TABLES,
 ) -> None:
     """Tune the filter by maximum likelihood, with a confidence interval for each parameter."""
-    from strapdown import tuning, workflows
+    from strapdown import workflows
     from strapdown.estimation.setup import read_setup, to_toml
     from strapdown.plots import tuning as drawing
-    from strapdown.plots.style import save_as
     from strapdown.report import tunings
 
     count("seed", search.seed, minimum=0)
@@ -120,16 +107,16 @@ def tune(
     free, beside = start.names, out.with_suffix(".json")
     places = {name: out.with_name(f"{out.stem}-{name}.{form}") for name in FIGURES}
     inputs, own = (*records, start.filter_file), lambda _: bool(tunings.read(beside))
-    check_files(out, suffixes=(".toml",), sources=inputs, own=own, command="tune")
-    check_files(beside, *places.values(), tables=tables, sources=inputs, own=own, command="tune")
+    ui.check_files(out, suffixes=(".toml",), sources=inputs, own=own, command="tune")
+    ui.check_files(beside, *places.values(), tables=tables, sources=inputs, own=own, command="tune")
     chosen = None if start.filter_file is None else read_setup(start.filter_file)
     sources = _sources(records, chosen, start, layout)
     if chosen is not None and (chosen.gate or chosen.robust) and not (goal.truth or goal.gate):
-        console.print(
+        ui.say(
             "The filter's gate and weights are not applied: a narrower gate would always increase the likelihood. --gate models outliers, "
             "and --truth tunes the filter with its gate and weights."
         )
-    with progress_bar("searches") as advance:
+    with ui.progress_bar("searches") as advance:
         result, objective, _ = workflows.tuned(
             sources,
             names=[path.name for path in records],
@@ -141,35 +128,30 @@ def tune(
             **vars(search),
             progress=advance,
         )
-    listed = [one.listing() for one in (result, result.comparison) if one is not None]
-    show(listed[0])
-    say(*result.words)
-    if result.comparison is not None:
-        show(listed[1])
-        console.print(f"{tunings.BOUNDS}.")
-        for judgement in result.comparison.after.judgements[:1]:
-            say(*("After:" + line[3:] for line in judgement.words.splitlines()[1:]))
-        say(result.comparison.advice(truth=goal.truth or goal.rmse))
+    listed = result.tables
+    ui.show(listed[0])
+    ui.say(*result.words)
+    ui.show(*listed[1:])
     write_text(out, to_toml(result.setup))
     for place in places.values():  # of an earlier tuning, which may have had more of them, or in another format
         for other in ("png", "pdf", "svg"):
             place.with_suffix(f".{other}").unlink(missing_ok=True)
-    with progress_bar("slices of the likelihood"):
-        slices = tuning.slices(objective, result)
+    with ui.progress_bar("slices of the likelihood"):
+        slices = sd.tuning.slices(objective, result)
     content = {"records": [path.name for path in records], **result.summary(), "slices": slices.summary()}
     write_json(beside, content)
-    answer, reason, _ = tunings.verdict(content)
-    console.print(f"{answer}: {reason}.")
+    answer, reason, details = sd.tuning.fitting.verdict(result)
+    ui.say(f"{answer}: {reason}.", *(f"  - {one}" for one in details if result.comparison is not None))
     figures = {places["likelihood"]: drawing.likelihood_slices(slices, result)}
     if result.comparison is not None:
         title = "Held-out part of the first record"
         figures[places["heldout"]] = drawing.before_and_after(result.comparison, title=title)
-    written(out, beside, *save_as(figures, form), tables=(tables, listed))
+    ui.written(out, beside, *sd.plots.save_as(figures, form), tables=(tables, listed))
 
 
 def _sources(paths: list[Path], chosen: FilterSetup | None, start: _Filter, layout: Layout) -> list[Any]:
     """Return the records; say what the filter of the first does not model."""
-    from strapdown import ahrs, recordings, workflows
+    from strapdown import workflows
     from strapdown.recordings import recordfiles
 
     sources: list[Any] = []
@@ -177,13 +159,13 @@ def _sources(paths: list[Path], chosen: FilterSetup | None, start: _Filter, layo
         if recordfiles.is_record(path):
             source: Any = recordfiles.read_record(path)
             if chosen is None and not any(isinstance(one, type(source)) for one in sources):
-                say(*workflows.matched_filter(source, states=start.states)[1])
+                ui.say(*workflows.matched_filter(source, states=start.states)[1])
         else:
             if start.states:
                 raise InputError(f"{path} is a recording, which specifies no errors; --states is for simulated records")
-            source = recordings.read(path, **layout.options(path))
-            say(source.left_out_words)
-            ahrs.need_accelerometer(source)
-            warn_about_conventions(source, path)
+            source = sd.recordings.read(path, **layout.options(path))
+            ui.say(source.left_out_words)
+            sd.ahrs.need_accelerometer(source)
+            ui.warn_about_conventions(source, path)
         sources.append(source)
     return sources

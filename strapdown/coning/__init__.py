@@ -15,17 +15,16 @@ rotation of one radian per sample; ``"matched-2-8"`` 2.1 times, ``"matched-1-8-8
 package: :func:`strapdown.coning.coefficients.matched_correction`.
 """
 
-from strapdown.coning.algorithms import ALGORITHMS, Algorithm, read_algorithms
-from strapdown.coning.algorithms import algorithm_table as algorithm_table
-from strapdown.coning.algorithms import named as named
-from strapdown.coning.drift import VibrationLine as VibrationLine
-from strapdown.coning.drift import predicted_coning_drift
-from strapdown.coning.drift import read_vibration as read_vibration
-from strapdown.coning.drift import small_angle_drift as small_angle_drift
-from strapdown.coning.drift import vibration_drift as vibration_drift
-from strapdown.coning.drift import vibration_table as vibration_table
-from strapdown.coning.stepping import increments_from_rates, integrate, rotation_vectors
-from strapdown.coning.stepping import time_per_sample as time_per_sample
+from strapdown.coning.algorithms import ALGORITHMS, Algorithm, algorithm_table, named, read_algorithms
+from strapdown.coning.drift import (
+    VibrationLine,
+    predicted_coning_drift,
+    read_vibration,
+    small_angle_drift,
+    vibration_drift,
+    vibration_table,
+)
+from strapdown.coning.stepping import increments_from_rates, integrate, rotation_vectors, time_per_sample
 
 # Names imported as themselves above and not listed here are for use within the package.
 __all__ = [

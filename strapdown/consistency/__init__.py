@@ -11,31 +11,29 @@
   :meth:`strapdown.montecarlo.Statistics.judge`.
 """
 
-from strapdown.consistency.accuracy import Accuracy, reference_errors
-from strapdown.consistency.accuracy import ReferenceErrors as ReferenceErrors
-from strapdown.consistency.accuracy import convergence_time as convergence_time
-from strapdown.consistency.bounds import Verdict as Verdict
-from strapdown.consistency.bounds import log_mean_bounds as log_mean_bounds
-from strapdown.consistency.bounds import log_mean_p_value as log_mean_p_value
-from strapdown.consistency.bounds import log_moments as log_moments
-from strapdown.consistency.bounds import mean_bounds
-from strapdown.consistency.bounds import mean_p_value as mean_p_value
+from strapdown.consistency.accuracy import Accuracy, ReferenceErrors, convergence_time, reference_errors
+from strapdown.consistency.bounds import (
+    Verdict,
+    log_mean_bounds,
+    log_mean_p_value,
+    log_moments,
+    mean_bounds,
+    mean_p_value,
+)
 from strapdown.consistency.foreign import Checked, check_attitudes
-from strapdown.consistency.judgement import DETECTABLE as DETECTABLE
-from strapdown.consistency.judgement import Finding, Judgement, judge
-from strapdown.consistency.judgement import concluded as concluded
-from strapdown.consistency.manifold import SUBSETS as SUBSETS
-from strapdown.consistency.manifold import errors, nees
-from strapdown.consistency.manifold import whitened as whitened
-from strapdown.consistency.timeaverage import time_average as time_average
-from strapdown.consistency.whiteness import Autocorrelation as Autocorrelation
-from strapdown.consistency.whiteness import QuantilePairs as QuantilePairs
-from strapdown.consistency.whiteness import anderson_darling as anderson_darling
-from strapdown.consistency.whiteness import autocorrelation as autocorrelation
-from strapdown.consistency.whiteness import cross_correlation_p_value as cross_correlation_p_value
-from strapdown.consistency.whiteness import ljung_box as ljung_box
-from strapdown.consistency.whiteness import mean_innovation_p_value as mean_innovation_p_value
-from strapdown.consistency.whiteness import quantile_pairs as quantile_pairs
+from strapdown.consistency.judgement import DETECTABLE, Finding, Judgement, concluded, judge
+from strapdown.consistency.manifold import SUBSETS, errors, nees, whitened
+from strapdown.consistency.timeaverage import time_average
+from strapdown.consistency.whiteness import (
+    Autocorrelation,
+    QuantilePairs,
+    anderson_darling,
+    autocorrelation,
+    cross_correlation_p_value,
+    ljung_box,
+    mean_innovation_p_value,
+    quantile_pairs,
+)
 
 __all__ = [
     "Accuracy",

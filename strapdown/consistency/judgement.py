@@ -189,6 +189,11 @@ class Judgement(Listed):
     unmodelled: tuple[str, ...] = ()
 
     @property
+    def innovations_untested(self) -> bool:
+        """Whether the innovations of a sensor are too few to detect the error ``required``."""
+        return any(one.of.startswith(INNOVATIONS) and one.detectable_error > self.required for one in self.parts)
+
+    @property
     def headline(self) -> str:
         """Verdict and reason, as the terminal, the JSON file and the report print them."""
         return f"{self.verdict}: {self.reason}"

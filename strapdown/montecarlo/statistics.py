@@ -44,7 +44,7 @@ from strapdown.consistency.judgement import (
 )
 from strapdown.montecarlo.plan import Plan
 from strapdown.records import Estimate, ImuRecord
-from strapdown.results import ByContent, Listed, Table, figure
+from strapdown.results import ByValue, Listed, Table, figure
 
 Counts = NDArray[np.int64]
 
@@ -112,7 +112,7 @@ class Replay:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Statistics(ByContent, Listed):
+class Statistics(ByValue, Listed):
     """Sums over independent runs at each epoch.
 
     Errors are e = (δθ, δb): rad in the body frame, rad/s. The sums at an epoch exclude runs that are not finite there.

@@ -18,7 +18,6 @@ from strapdown.montecarlo.statistics import COVERED, judged_epochs
 from strapdown.plots.style import (
     AXES,
     CYCLE,
-    SKY,
     VERMILION,
     axes_or_new,
     ink,
@@ -147,44 +146,6 @@ def runs_overview(statistics: Statistics, probability: float = 0.99) -> Figure:
 def state_unit(state: int, value: Array) -> tuple[str, float]:
     """Return the unit in which an error of a state (0 to 5) of this magnitude is printed."""
     return angle_unit(value) if state < 3 else rate_unit(value)
-
-
-def fan(statistics: Statistics, state: int, ax: Axes | None = None) -> Axes:
-    """Draw quantiles of |error| of a ``state`` (0 to 5) over the runs, and those predicted by the filter; new axes have the legend."""
-    alone, ax = ax is None, axes_or_new(ax)
-    shares = ((0.99, 2.5758), (0.9, 1.6449), (0.5, 0.6745))
-    settled = max(1, len(statistics.time) // 20)
-    quantiles = [statistics.error_quantile(share)[:, state] for share, _ in shares]
-    # The same unit for the three axes.
-    unit, size = state_unit(
-        state, statistics.error_quantile(shares[0][0])[settled:, state // 3 * 3 : state // 3 * 3 + 3]
-    )
-    for k, ((share, normal), quantile) in enumerate(zip(shares, quantiles, strict=True)):
-        ax.fill_between(
-            statistics.time,
-            0.0,
-            quantile / size,
-            color=SKY,
-            alpha=(0.25, 0.45, 0.7)[k],
-            linewidth=0,
-            label=f"{100 * share:g} % quantile of the runs",
-        )
-        ax.plot(
-            statistics.time,
-            normal * statistics.sigma[:, state] / size,
-            color=VERMILION,
-            linewidth=(0.8, 1.1, 1.4)[k],
-            linestyle=(":", "--", "-")[k],
-            label=f"{100 * share:g} % predicted by the filter",
-        )
-    top = max(float(np.nanmax(quantiles[0][settled:])), 2.6 * float(statistics.sigma[settled:, state].max()))
-    ax.set_ylim(0.0, 1.15 * top / size)
-    ax.set_xlim(statistics.time[0], statistics.time[-1])
-    ax.set_xlabel("time, s")
-    ax.set_ylabel(f"|{STATES[state]} error|, {unit}")
-    if alone:
-        legend_above(ax, ncols=2)
-    return ax
 
 
 def coverage_by_state(statistics: Statistics, epoch: int = -1, ax: Axes | None = None) -> Axes:

@@ -22,37 +22,23 @@ from __future__ import annotations
 
 # Names imported "as" themselves and not listed in __all__ are for use within the package only.
 from strapdown.recordings.attitudes import Attitudes
-from strapdown.recordings.body_axes import SENSORS as SENSORS
-from strapdown.recordings.body_axes import axes_matrix as axes_matrix
-from strapdown.recordings.body_axes import with_axes as with_axes
-from strapdown.recordings.columns import parse_mapping as parse_mapping
+from strapdown.recordings.body_axes import SENSORS, axes_matrix, with_axes
+from strapdown.recordings.columns import parse_mapping
 from strapdown.recordings.dataframes import from_table
-from strapdown.recordings.formats import FORMATS, read, write
-from strapdown.recordings.formats import estimate_format as estimate_format
-from strapdown.recordings.formats import format_of as format_of
-from strapdown.recordings.formats import from_record as from_record
-from strapdown.recordings.formats import is_estimate as is_estimate
-from strapdown.recordings.formats import is_record as is_record
-from strapdown.recordings.formats import not_held as not_held
-from strapdown.recordings.formats import writers as writers
-from strapdown.recordings.samples import GyroSamples, read_samples
-from strapdown.recordings.samples import samples_of as samples_of
-from strapdown.recordings.trajectories import read_tum as read_tum
-from strapdown.recordings.trajectories import with_reference as with_reference
-from strapdown.records.recording import FORCE_UNITS as FORCE_UNITS
-from strapdown.records.recording import RATE_UNITS as RATE_UNITS
-from strapdown.records.recording import TIME_UNITS as TIME_UNITS
-from strapdown.records.recording import Recording
-from strapdown.records.recording import gaps as gaps
-from strapdown.records.recording import increments as increments
+from strapdown.recordings.formats import (
+    FORMATS,
+    estimate_format,
+    format_of,
+    from_record,
+    is_estimate,
+    is_record,
+    not_held,
+    read,
+    write,
+    writers,
+)
+from strapdown.recordings.samples import GyroSamples, read_samples, samples_of
+from strapdown.recordings.trajectories import read_tum, with_reference
+from strapdown.records.recording import FORCE_UNITS, RATE_UNITS, TIME_UNITS, Recording, gaps, increments
 
-__all__ = [
-    "FORMATS",
-    "Attitudes",
-    "GyroSamples",
-    "Recording",
-    "from_table",
-    "read",
-    "read_samples",
-    "write",
-]
+__all__ = ["FORMATS", "Attitudes", "GyroSamples", "Recording", "from_table", "read", "read_samples", "write"]

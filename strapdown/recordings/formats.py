@@ -115,12 +115,6 @@ FORMATS: tuple[Format, ...] = (
         estimate_options=("frame",),
     ),
     Format(
-        name="Rerun recording",
-        endings=(".rrd",),
-        recognised=_starts(b"RRF"),
-        write_estimate="estimates:write_rerun",
-    ),
-    Format(
         name="BROAD",
         endings=(".hdf5", ".h5"),
         recognised=_starts(b"\x89HDF\r\n\x1a\n"),

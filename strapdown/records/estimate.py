@@ -25,7 +25,7 @@ from strapdown.checks import (
 from strapdown.records import outputs
 from strapdown.records.record import Origin, Truth
 from strapdown.records.recording import Recording
-from strapdown.results import ByContent, Column, Listed, Table, figure
+from strapdown.results import ByValue, Column, Listed, Table, figure
 from strapdown.units import DEGREE, DEGREE_PER_HOUR, error_state_unit
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Innovations(ByContent):
+class Innovations(ByValue):
     """Innovations of one sensor, in the order of its measurements.
 
     Parameters
@@ -133,7 +133,7 @@ class Event:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class ErrorStateEstimate(ByContent):
+class ErrorStateEstimate(ByValue):
     """Estimate of one group of error states (:mod:`strapdown.estimation.error_states`) at the stored edges.
 
     Parameters
@@ -193,7 +193,7 @@ def _checked(sensor: str, given: Innovations) -> Innovations:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Estimate(ByContent, Listed):
+class Estimate(ByValue, Listed):
     """Attitude and gyro bias with their covariance, at the stored epochs of a filter run.
 
     Parameters

@@ -22,11 +22,7 @@ from strapdown.checks import Array, InputError, array, one_of, unit_quaternions
 from strapdown.kinematics import skew
 from strapdown.units import STANDARD_GRAVITY
 
-__all__ = [
-    "Angles",
-    "euler",
-    "heading",
-]
+__all__ = ["Angles", "euler", "heading"]
 
 FRAMES = ("ENU", "NED")
 NED_OF_ENU = np.array([0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0])

@@ -16,7 +16,7 @@ import numpy as np
 
 from strapdown import coning
 from strapdown.checks import Array, InputError, array, increasing, instance, unit_quaternions
-from strapdown.results import ByContent, Listed, Table
+from strapdown.results import ByValue, Listed, Table
 from strapdown.vectors import VectorMeasurements
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ LARGEST_TURN = 1e6
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Truth(ByContent):
+class Truth(ByValue):
     """True attitude and bias, known from a simulation or a reference system.
 
     Parameters
@@ -85,7 +85,7 @@ class Truth(ByContent):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Origin(ByContent):
+class Origin(ByValue):
     """Origin of a record or a result; fields that are not known are None.
 
     Parameters

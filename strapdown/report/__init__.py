@@ -23,9 +23,7 @@ from strapdown.files import write_json, write_text
 from strapdown.files.reading import existing_file, from_file, json_file
 from strapdown.report import campaigns, comparisons, conings, estimates, tunings
 
-__all__ = [
-    "write",
-]
+__all__ = ["write"]
 
 _WRITERS: dict[str, Callable[[Path, float], tuple[str, dict[str, Any]]]] = {
     "strapdown estimate": estimates.report,

@@ -13,6 +13,7 @@ from strapdown.estimation import setup
 from strapdown.plots.estimates import angle_labels
 from strapdown.plots.style import AXES
 from strapdown.records import Estimate
+from strapdown.records.recording import interpolated
 from strapdown.report import page
 from strapdown.units import DEGREE, angle_unit, rate_unit
 
@@ -67,10 +68,8 @@ def _at(estimate: Estimate, time: Array) -> tuple[Array, Array, Array]:
     """Return attitude, σ and bias of an estimate at times within its own; the attitude by rotation at constant rate between two epochs."""
     k = np.clip(np.searchsorted(estimate.time, time, side="right") - 1, 0, len(estimate.time) - 2)
     share = (time - estimate.time[k]) / (estimate.time[k + 1] - estimate.time[k])
-    start, end = estimate.attitude[k], estimate.attitude[k + 1]
-    step = quaternion.log(quaternion.multiply(quaternion.conjugate(start), end))
-    attitude = quaternion.multiply(start, quaternion.exp(share[:, None] * step))
     between = lambda rows: rows[k] + share[:, None] * (rows[k + 1] - rows[k])  # noqa: E731
+    attitude = interpolated(time, estimate.time, estimate.attitude, np.inf)
     return attitude, between(estimate.sigma), between(estimate.bias)
 
 

@@ -28,14 +28,7 @@ from strapdown.records import ImuRecord, Origin, Truth
 from strapdown.results import Column, Table
 from strapdown.vectors import Sensor
 
-__all__ = [
-    "SCENARIOS",
-    "Scenario",
-    "Temperature",
-    "drawn",
-    "load_scenario",
-    "simulate",
-]
+__all__ = ["SCENARIOS", "Scenario", "Temperature", "drawn", "load_scenario", "simulate"]
 
 _BUILTIN = Path(__file__).parent / "builtin"
 

@@ -22,34 +22,16 @@ tune only ``filter.scale``, which scales the σ and leaves the estimates unchang
 (:func:`contaminated_likelihood`), and an error without a state appears as noise of the gyro (:func:`unmodelled` tests for it).
 """
 
-from strapdown.tuning.errors import error_objective as error_objective
-from strapdown.tuning.fitting import Slices as Slices
-from strapdown.tuning.fitting import Tuning, fit
-from strapdown.tuning.fitting import rescaled as rescaled
-from strapdown.tuning.fitting import search as search
-from strapdown.tuning.fitting import slices as slices
-from strapdown.tuning.initialization import by_innovations as by_innovations
-from strapdown.tuning.initialization import one_gyro as one_gyro
-from strapdown.tuning.initialization import record_case, recording_case
-from strapdown.tuning.initialization import recording_setup as recording_setup
+from strapdown.tuning.errors import error_objective
+from strapdown.tuning.fitting import Slices, Tuning, fit, rescaled, search, slices
+from strapdown.tuning.initialization import by_innovations, one_gyro, record_case, recording_case, recording_setup
 from strapdown.tuning.innovations import likelihood
 from strapdown.tuning.objective import Case
-from strapdown.tuning.outliers import TunedGate as TunedGate
-from strapdown.tuning.outliers import contaminated_likelihood as contaminated_likelihood
-from strapdown.tuning.outliers import log_likelihood as log_likelihood
-from strapdown.tuning.outliers import tuned_gate as tuned_gate
-from strapdown.tuning.parameters import Prior, priors_from_gyro
-from strapdown.tuning.parameters import default_names as default_names
-from strapdown.tuning.parameters import unit_of as unit_of
-from strapdown.tuning.parameters import values_of as values_of
-from strapdown.tuning.parameters import with_values as with_values
-from strapdown.tuning.procedure import GATED as GATED
-from strapdown.tuning.procedure import tune
-from strapdown.tuning.residual_checks import Unmodelled as Unmodelled
-from strapdown.tuning.residual_checks import unmodelled as unmodelled
-from strapdown.tuning.residual_checks import with_misfit_flag as with_misfit_flag
-from strapdown.tuning.validation import Comparison as Comparison
-from strapdown.tuning.validation import compare, split
+from strapdown.tuning.outliers import TunedGate, contaminated_likelihood, log_likelihood, tuned_gate
+from strapdown.tuning.parameters import Prior, default_names, priors_from_gyro, unit_of, values_of, with_values
+from strapdown.tuning.procedure import GATED, tune
+from strapdown.tuning.residual_checks import Unmodelled, unmodelled, with_misfit_flag
+from strapdown.tuning.validation import Comparison, compare, split
 
 __all__ = [
     "Case",

@@ -42,6 +42,8 @@ MIN_INFORMATION = 1e-10
 NEGLIGIBLE = 1e-3
 """Gain of the log likelihood that is negligible."""
 NOT_IDENTIFIED = "not identified"
+WORSE = 1.05
+"""An increase of the attitude error on the held-out data by more than this factor is reported."""
 MISFIT = 1.6
 """Ratio of the sandwich error to that of the information above which the innovations contradict the filter's model."""
 
@@ -243,7 +245,8 @@ class Tuning(Listed):
         Returns
         -------
         dict
-            Parameters with their intervals, objective, searches, errors not modelled, gate, and performance on held-out data.
+            Parameters with their intervals, objective, searches, errors not modelled, gate, and performance on held-out data; as text for
+            a report the verdict, tables and words.
         """
         content: dict[str, Any] = {
             "parameters": [
@@ -267,6 +270,9 @@ class Tuning(Listed):
             }
         if self.comparison is not None:
             content["held_out"] = self.comparison.summary()
+        answer, reason, details = verdict(self)
+        shown = {"words": list(self.words), "tables": [one.as_text for one in self.tables]}
+        content["report"] = {"verdict": answer, "reason": reason, "details": details, **shown}
         return plain(content)  # type: ignore[no-any-return]
 
     @property
@@ -280,6 +286,11 @@ class Tuning(Listed):
             found.append(self.gate.words)
         worst = max(self.unmodelled, key=lambda one: one.severity, default=None)
         return (*found, *(() if worst is None else worst.words))
+
+    @property
+    def tables(self) -> list[Table]:
+        """The table of the parameters, and that of the filter before and after on held-out data."""
+        return [self.listing(), *([] if self.comparison is None else [self.comparison.listing()])]
 
     def listing(self) -> Table:
         """Return the parameters with their intervals, as a table."""
@@ -320,6 +331,32 @@ class Tuning(Listed):
         """Return the parameter with this name."""
         known_keys("tuning", [name], [one.name for one in self.parameters])
         return next(one for one in self.parameters if one.name == name)
+
+
+VERDICTS = ("consistent", "cannot tell", "not consistent")
+
+
+def verdict(tuning: Tuning) -> tuple[str, str, list[str]]:
+    """Return the verdict on the tuned filter, its reason, and findings against it; with held-out data, the worst of its judgements."""
+    comparison = tuning.comparison
+    if comparison is None:
+        prove = f"{Hint('holdout')} validates a tuning on held-out data"
+        details = [words for one in tuning.unmodelled for words in one.words]
+        if tuning.misfit or details:
+            return "not consistent", f"the tuned filter does not agree with the data used for tuning; {prove}", details
+        if any(one.judgement.innovations_untested for one in tuning.unmodelled):
+            return "cannot tell", f"the data used for tuning are too few to judge the filter; {prove}", []
+        return "consistent", f"the tuned filter agrees with the data used for tuning; {prove}", []
+    after = comparison.after.judgements
+    if not after:
+        return "cannot tell", "the held-out data were not judged", []
+    worst = max(after, key=lambda one: VERDICTS.index(one.verdict))
+    details = [finding.means for one in after for finding in one.findings if finding.rejected]
+    if not comparison.better and tuning.measure == "likelihood":
+        details.append("on the held-out data the likelihood has decreased: keep the previous filter")
+    elif comparison.after.attitude_rms > WORSE * comparison.before.attitude_rms:
+        details.append("on the held-out data the attitude error has increased: keep the previous filter")
+    return worst.verdict, f"{worst.reason}, on held-out data", details
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

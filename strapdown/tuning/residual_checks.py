@@ -2,10 +2,9 @@
 
 Tuning gives every parameter its most likely value even if the model is wrong. A gyro's scale-factor error changes its apparent bias with
 the rate, so the random walk of the bias is tuned large enough to cover that; it appears identified, and the innovations appear white. The
-test is then whether a scale factor explains the innovations better. The scale factor θ of each axis is estimated by one step of
-Gauss–Newton on the whitened innovations, which is Rao's score test (1948), with the tuned random walk and with smaller ones, which a filter
-that models the scale factor would have. Its gain is twice the log-likelihood ratio to the tuned filter, χ² with three degrees of freedom if
-θ is zero.
+test is then whether a scale factor explains the innovations better: the hypothesis of :mod:`strapdown.tuning.diagnosis`, with the tuned
+random walk and with smaller ones, which a filter that models the scale factor would have. Its gain is twice the log-likelihood ratio to the
+tuned filter, χ² with three degrees of freedom if the scale factor is zero.
 
 The rate that θ multiplies is the gyro's, without its bias and noise (:func:`strapdown.tuning.diagnosis.turning.turns`), because noise must
 not explain itself. A prior of ``PLAUSIBLE`` bounds θ if the rates are too small to determine it.
@@ -21,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from strapdown import estimation
-from strapdown.checks import Array, Hint
+from strapdown.checks import Hint
 from strapdown.consistency import Judgement
 from strapdown.consistency.bounds import tail
 from strapdown.consistency.judgement import concluded
@@ -33,7 +32,8 @@ from strapdown.files import plain
 from strapdown.records import Estimate, ImuRecord, cut
 from strapdown.tuning import diagnosis
 from strapdown.tuning.diagnosis import Cause
-from strapdown.tuning.diagnosis.likelihood import Model, log_p, run
+from strapdown.tuning.diagnosis.hypotheses import GYRO_ERRORS, gyro_error
+from strapdown.tuning.diagnosis.likelihood import Model, by_mean, log_p, run
 from strapdown.tuning.diagnosis.turning import PLAUSIBLE, turns
 from strapdown.tuning.fitting import Tuning
 from strapdown.tuning.objective import Case, of_sensors
@@ -42,26 +42,10 @@ from strapdown.tuning.validation import performance
 
 LEVELS = (1.0, 0.2, 0.04)
 """Multiples of the tuned random walk of the bias with which a scale factor is tested."""
-STEP = 1e-4
-"""Step of a scale factor for finite differences."""
 MAX_REPORTED = 2
 """Maximum number of failed tests that are reported individually."""
 SHAPES = ("whiteness", "normality", "mean innovation", "cross-correlation")
 """Tests of innovations that tuning σ cannot make pass."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class ScaleFactor:
-    """A gyro's scale factor as an explanation of what the tuned filter models as noise."""
-
-    value: Array
-    """θ of each axis (3,): the gyro measures 1 + θ of the rate."""
-    standard_error: Array
-    """Standard error of θ (3,)."""
-    gain: float
-    """Twice the gain in log-likelihood over the tuned filter."""
-    p_value: float
-    """Probability of as large a gain for a correct filter, over all levels tested."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,7 +56,8 @@ class Unmodelled:
     """Name of the record."""
     judgement: Judgement
     """Judgement of the tuned filter on its tuning data; of its errors too if there is a truth."""
-    scale_factor: ScaleFactor
+    scale_factor: Cause
+    """A gyro's scale factor as an explanation of what the filter models as noise; its p-value is over all levels tested."""
     causes: tuple[Cause, ...] = ()
     """Likely causes, if a test in :data:`SHAPES` fails."""
     missing: tuple[str, ...] = ()
@@ -83,7 +68,7 @@ class Unmodelled:
     def moves_with_the_rate(self) -> bool:
         """Whether a scale factor explains the innovations better than the noise of the gyro and than any other cause."""
         other = max((cause.gain for cause in self.causes), default=0.0)
-        return self.scale_factor.p_value < 1.0 - self.probability and self.scale_factor.gain > other
+        return self.scale_factor.finding.p_value < 1.0 - self.probability and self.scale_factor.gain > other
 
     @property
     def failed(self) -> tuple[str, ...]:
@@ -113,11 +98,11 @@ class Unmodelled:
         if self.moves_with_the_rate:
             one = self.scale_factor
             sizes = ", ".join(
-                f"{1e6 * x:.0f} ± {1e6 * e:.0f}" for x, e in zip(one.value, one.standard_error, strict=True)
+                f"{1e6 * x:.0f} ± {1e6 * e:.0f}" for x, e in zip(one.estimate, one.standard_error, strict=True)
             )
             sentences.append(
                 f"A scale factor of the gyro of [{sizes}] ppm explains the innovations better than its noise does (gain {one.gain:.3g}, "
-                f"p = {one.p_value:.1g}): the tuned noise of the gyro covers it. Calibrate it, or add a state for it."
+                f"p = {one.finding.p_value:.1g}): the tuned noise of the gyro covers it. Calibrate it, or add a state for it."
             )
         sentences += [f"{what[0].upper()}{what[1:]}." for what in self.failed[:MAX_REPORTED]]
         if len(self.failed) > MAX_REPORTED:
@@ -135,12 +120,14 @@ class Unmodelled:
 
     def summary(self) -> dict[str, Any]:
         """Return everything as plain values for JSON."""
+        scale = self.scale_factor
+        numbers = {"value": scale.estimate, "standard_error": scale.standard_error, "gain": scale.gain}
         return {
             "record": self.record,
             "suspected": self.suspected,
             "words": list(self.words),
             "moves_with_the_rate": self.moves_with_the_rate,
-            "scale_factor": plain(vars(self.scale_factor)),
+            "scale_factor": plain({**numbers, "p_value": scale.finding.p_value}),
             "causes": [cause.words for cause in self.causes],
             "judgement": self.judgement.summary(),
         }
@@ -203,36 +190,21 @@ def accepted(record: ImuRecord, estimate: Estimate) -> ImuRecord:
     return replace(record, vectors=tuple(kept))
 
 
-def scale_factor(record: ImuRecord, noise: ProcessNoise, initial: estimation.State) -> ScaleFactor:
+def scale_factor(record: ImuRecord, noise: ProcessNoise, initial: estimation.State) -> Cause:
     """Return the gyro's scale factor of largest gain, with this noise or a smaller random walk of the bias."""
-    rate_angle = turns(record, noise, initial)
+    hypothesis = gyro_error(turns(record, noise, initial), *GYRO_ERRORS[0])
     levels = LEVELS if noise.rate_random_walk > 0.0 else LEVELS[:1]
     tuned = run(Model(record=record, noise=noise, initial=initial))
-    found: list[tuple[float, Array, Array]] = []
+    found = []
     for level in levels:
         less = replace(noise, rate_random_walk=level * noise.rate_random_walk)
         model = Model(record=record, noise=less, initial=initial)
-
-        def moved(theta: Array, model: Model = model) -> Model:
-            return replace(model, record=replace(record, increments=record.increments - rate_angle * theta))
-
         base = tuned if level == 1.0 else run(model)
-        J = np.stack([(run(moved(step)).white - base.white) / STEP for step in STEP * np.eye(3)], axis=1)
-        known = np.isfinite(J).all(axis=1) & np.isfinite(base.white)
-        information = J[known].T @ J[known] + np.eye(3) / PLAUSIBLE**2
-        theta = np.asarray(-np.linalg.solve(information, J[known].T @ base.white[known]), np.float64)
-        spread = np.asarray(np.sqrt(np.diag(np.linalg.inv(information))), np.float64)
+        cause = by_mean(model, base, hypothesis)
         # The gain of a smaller random walk alone, if it was not tuned, is not due to the scale factor.
-        better = max(base.gain_over(tuned), 0.0)
-        gain = run(moved(theta)).gain_over(tuned) - better - float(np.sum((theta / PLAUSIBLE) ** 2))
-        found.append((gain, theta, spread))
-    gain, theta, spread = max(found, key=lambda one: one[0])
-    return ScaleFactor(
-        value=theta,
-        standard_error=spread,
-        gain=gain,
-        p_value=min(1.0, len(levels) * math.exp(log_p(gain, 3))),
-    )
+        gain = cause.gain + min(base.gain_over(tuned), 0.0) - float(np.sum((cause.estimate / PLAUSIBLE) ** 2))
+        found.append(replace(cause, gain=gain, log_p=min(0.0, log_p(gain, 3) + math.log(len(levels)))))
+    return max(found, key=lambda one: one.gain)
 
 
 def with_misfit_flag(tuning: Tuning, found: Unmodelled) -> Tuning:

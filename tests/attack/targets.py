@@ -226,25 +226,15 @@ probability_ratio = 0.999
 [filter.robust]
 kind = "huber"
 """
-_JUDGEMENT = {
-    "verdict": "consistent",
-    "reason": "all is well",
-    "findings": [{"rejected": False, "means": "", "value": None}],
-}
-_SIDE = {
-    "log_likelihood_per_innovation": 1.0, "nis_per_degree": 1.0, "nis_bounds": [0.9, 1.1], "anees_per_state": None,
-    "attitude_rms_rad": 1e-3, "judgements": [_JUDGEMENT],
-}  # fmt: skip
+_TABLE = {"title": "Parameters", "columns": ["name", "value"], "rows": [["sigma", "2"]], "notes": ["seen"], "left": 1}
 _TUNING = {
     "records": ["a.h5"],
-    "parameters": [
-        {"name": "sigma", "note": "seen", "identified": True, "start": 1.0, "value": 2.0, "lower": None, "upper": 3.0, "unit": "arcsec",
-         "si_per_unit": 5e-6}
-    ],
     "units": "SI",
-    "objective": {"name": "likelihood", "before": 2.0, "after": 1.0},
-    "searches": {"number": 3, "at_the_best_point": 2},
-    "unmodelled": [{"record": "a.h5", "words": ["nothing"]}],
-    "gate": {"probability": 0.99, "lower": 0.9, "upper": 1.0, "thresholds": {"star": 9.2}},
-    "held_out": {"before": _SIDE, "after": _SIDE},
-}  # fmt: skip
+    "report": {
+        "verdict": "consistent",
+        "reason": "all is well",
+        "details": ["none"],
+        "words": ["done"],
+        "tables": [_TABLE, _TABLE],
+    },
+}

@@ -19,11 +19,7 @@ by a more accurate integration algorithm, and compared with the filter's σ of t
 """
 
 from strapdown.tuning.diagnosis.causes import Cause, Diagnosis
-from strapdown.tuning.diagnosis.commutation import commutation_drift as commutation_drift
+from strapdown.tuning.diagnosis.commutation import commutation_drift
 from strapdown.tuning.diagnosis.diagnosing import diagnose
 
-__all__ = [
-    "Cause",
-    "Diagnosis",
-    "diagnose",
-]
+__all__ = ["Cause", "Diagnosis", "diagnose"]

@@ -40,7 +40,7 @@ def mean_hypotheses(model: Model) -> Iterator[Hypothesis]:
     if len(seen) > 1:
         yield _time_offset("gyro", tuple(series.sensor for series in seen), interval)
     turned = turns(record, model.noise, model.initial)
-    yield from (_gyro_errors(turned, *kind) for kind in GYRO_ERRORS)
+    yield from (gyro_error(turned, *kind) for kind in GYRO_ERRORS)
     for part, unit, rows in (("attitude", "rad", slice(0, 3)), ("bias", "rad/s", slice(3, 6))):
         sigma = np.sqrt(np.diag(model.initial.covariance)[rows])
         yield Hypothesis(
@@ -198,9 +198,11 @@ GYRO_ERRORS: tuple[tuple[str, str, int, Callable[[Array], Array], Callable[[Arra
 """Errors M of a gyro that measures (I + M) w: name, unit, dimension of θ, M(θ), and description."""
 
 
-def _gyro_errors(
+def gyro_error(
     turned: Array, name: str, unit: str, size: int, matrix: Callable[[Array], Array], words: Callable[[Array], str]
 ) -> Hypothesis:
+    """Return the hypothesis of an error of :data:`GYRO_ERRORS`; ``turned`` are the rotations on which it acts."""
+
     def apply(model: Model, theta: Array) -> Model:
         # Increments times (I + M)⁻¹ would also change their noise and bias.
         excess = turned @ (np.eye(3) - np.linalg.inv(np.eye(3) + matrix(theta))).T
