@@ -30,7 +30,7 @@ from strapdown.files import reading
 from strapdown.montecarlo import campaign, engine
 from strapdown.recordings import recordfiles
 from strapdown.records import ImuRecord
-from strapdown.report import tunings
+from strapdown.report import page, tunings
 
 UNITS = {"gyro": "rad/s"}
 
@@ -283,24 +283,24 @@ def test_data_of_other_files_are_refused(tmp_path, refer, words, sealed):
         recordfiles.read_record(tmp_path / "record.h5")
 
 
-@pytest.mark.parametrize("suffix", [".toml", "-likelihood.png"])
-def test_a_report_does_not_show_what_a_link_beside_the_result_leads_to(known, tmp_path, suffix):
+@pytest.mark.parametrize("name", ["filter.toml", "errors.png"])
+def test_a_report_does_not_show_what_a_link_beside_the_result_leads_to(known, tmp_path, name):
     (tmp_path / "secret").write_bytes(b"\x89PNG\r\n\x1a\n secret")
     (tmp_path / "filter.json").write_bytes(known["tuning.json"].content)
-    beside = tmp_path / f"filter{suffix}"
-    beside.write_bytes((tmp_path / "secret").read_bytes() if suffix.endswith("png") else b"[filter]\n")
-    assert tunings.report(tmp_path / "filter.json", 0.99)
+    beside = tmp_path / name
+    beside.write_bytes((tmp_path / "secret").read_bytes() if name.endswith("png") else b"[filter]\n")
+    show = lambda: (tunings.report(tmp_path / "filter.json", 0.99), page.stored_figure(tmp_path / "errors", "errors"))  # noqa: E731
+    assert show()
     beside.unlink()
     beside.symlink_to(tmp_path / "secret")
-    with pytest.raises(InputError, match=rf"filter{suffix} is a symbolic link"):
-        tunings.report(tmp_path / "filter.json", 0.99)
+    with pytest.raises(InputError, match=rf"{name} is a symbolic link"):
+        show()
 
 
-def test_what_lies_beside_a_result_and_is_no_figure_is_not_shown(known, tmp_path):
-    (tmp_path / "filter.json").write_bytes(known["tuning.json"].content)
-    (tmp_path / "filter-likelihood.png").write_bytes(b"root:x:0:0")
-    with pytest.raises(InputError, match=r"filter-likelihood\.png is not a PNG"):
-        tunings.report(tmp_path / "filter.json", 0.99)
+def test_what_lies_beside_a_result_and_is_no_figure_is_not_shown(tmp_path):
+    (tmp_path / "errors.png").write_bytes(b"root:x:0:0")
+    with pytest.raises(InputError, match=r"errors\.png is not a PNG"):
+        page.stored_figure(tmp_path / "errors", "errors")
 
 
 def test_a_file_that_the_user_names_may_be_a_link(tmp_path):

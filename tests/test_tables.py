@@ -201,17 +201,15 @@ def test_figures_are_written_in_the_format_asked_for(written):
     }
 
 
-def test_the_report_of_a_tuning_shows_svg_and_names_pdf(written, tmp_path):
-    from strapdown import report
+def test_a_report_shows_svg_and_names_pdf(written, tmp_path):
+    from strapdown.report import page
 
-    content = report.write(written / "filter.json", tmp_path / "page.html").page.read_text(encoding="utf-8")
-    assert content.count("data:image/svg+xml;base64,") == 2
-    for path in written.glob("filter.*"):
-        shutil.copy(path, tmp_path)
-    (tmp_path / "filter-likelihood.pdf").write_bytes(b"%PDF-")
-    content = report.write(tmp_path / "filter.json").page.read_text(encoding="utf-8")
+    shutil.copy(written / "filter-likelihood.svg", tmp_path / "errors.svg")
+    assert "data:image/svg+xml;base64," in page.stored_figure(tmp_path / "errors", "errors")
+    (tmp_path / "errors.pdf").write_bytes(b"%PDF-")
+    content = page.stored_figure(tmp_path / "errors", "errors")
     assert "data:image" not in content
-    assert "In filter-likelihood.pdf, beside the result" in content
+    assert "In errors.pdf, beside the result" in content
 
 
 def test_what_cannot_be_written_is_refused_before_anything_is_computed(tmp_path, monkeypatch):

@@ -31,7 +31,7 @@ LONGEST_UNROLLED = 12
 LEAVING = (ast.Return, ast.Continue)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Range:
     """Integers of a loop of the target."""
 

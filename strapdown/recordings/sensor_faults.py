@@ -270,7 +270,8 @@ def stuck_words(recording: Recording) -> list[str]:
         if recording.specific_force is not None and np.isfinite(force := recording.specific_force[span]).any():
             moves |= float(np.sqrt(np.sum(np.nanvar(force, axis=0)))) > ACCELERATES
         whole = len(edges) == 2
-        if last - first + 1 < STUCK_SAMPLES or not (whole or (time[last] - time[first] >= STUCK_TIME and moves)):
+        long = last - first + 1 >= STUCK_SAMPLES and time[last] - time[first] >= STUCK_TIME
+        if not (long and (whole or moves)):
             continue
         when = "throughout" if whole else f"from {time[first]:.6g} to {time[last]:.6g} s"
         warnings.append(

@@ -17,11 +17,11 @@ from strapdown.tuning.fitting import VERDICTS
 
 def report(path: Path, confidence_level: float) -> tuple[str, dict[str, Any]]:
     """Return the page and the statistics for the JSON of a tuning; ``confidence_level`` is not used, since the verdict is in the JSON."""
-    content, tables, charts = read(path)
+    content, listed, charts = read(path)
     shown, toml = content["report"], path.with_suffix(".toml")
     parts = [
         page.verdict(shown["verdict"], shown["reason"], shown["details"]),
-        *map(findings.listed, tables),
+        *listed,
         *map(page.paragraph, shown["words"]),
     ]
     parts += [page.section(title, *drawn) for title, drawn in charts.items()]
@@ -42,8 +42,8 @@ def report(path: Path, confidence_level: float) -> tuple[str, dict[str, Any]]:
     }
 
 
-def read(path: Path) -> tuple[dict[str, Any], list[Table], dict[str, list[str]]]:
-    """Read the JSON of a tuning, its tables, and its charts by the title of their section."""
+def read(path: Path) -> tuple[dict[str, Any], list[str], dict[str, list[str]]]:
+    """Read the JSON of a tuning; return it with the HTML of its tables, and of its charts by the title of their section."""
     content = reading.json_file(path)
     try:
         shown = content["report"]
@@ -53,14 +53,17 @@ def read(path: Path) -> tuple[dict[str, Any], list[Table], dict[str, list[str]]]
         texts += [text for one in tables for row in ([one.title], one.columns, one.notes, *one.rows) for text in row]
         if not all(isinstance(text, str) for text in texts) or not all(isinstance(one.left, int) for one in tables):
             raise TypeError("what is no text")
-        charts = {"Likelihood along each parameter": list(map(_slice, content["slices"], content["parameters"]))}
+        listed = [findings.listed(one) for one in tables]
+        charts = {}
+        if "slices" in content:  # of the command
+            charts["Likelihood along each parameter"] = list(map(_slice, content["slices"], content["parameters"]))
         if content.get("held_out"):
             charts["Held-out data"] = _over_time(content["held_out"])
-    except (KeyError, TypeError, ValueError) as error:
+    except (AttributeError, LookupError, TypeError, ValueError) as error:
         raise InputError(
             f"{path}: {error} does not fit a tuning; give the JSON that `strapdown tune` writes beside its filter.toml"
         ) from None
-    return content, tables, charts
+    return content, listed, charts
 
 
 def _over_time(held: dict[str, Any]) -> list[str]:
