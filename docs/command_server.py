@@ -1,8 +1,7 @@
-"""The program ``strapdown`` and the kernel of a page, without their start: a server that has the package loaded forks for each call.
+"""The program ``strapdown`` for the pages of a build, without its start: a server that has it loaded forks for each call.
 
-``start(folder)`` writes a ``strapdown`` into a folder, for PATH, and a kernel ``python3``, for JUPYTER_PATH, and starts the server. A call
-passes its arguments, folder, environment and standard streams over a socket, runs :func:`strapdown.cli.main` or the kernel in a fork, and
-ends with its exit status.
+``start(folder)`` writes a ``strapdown`` into a folder, for PATH, and starts the server. A call passes its arguments, folder, environment
+and standard streams over a socket, runs :func:`strapdown.cli.main` in a fork, and ends with its exit status.
 """
 
 from __future__ import annotations
@@ -29,8 +28,6 @@ call.sendmsg([len(words).to_bytes(4, "big")], [(socket.SOL_SOCKET, socket.SCM_RI
 call.sendall(words)
 sys.exit(int(call.recv(16)))
 """
-KERNEL = "--kernel"
-"""First argument of the call for the kernel of a page."""
 
 
 def start(folder: Path) -> None:
@@ -39,10 +36,6 @@ def start(folder: Path) -> None:
     Path(client).write_text(CLIENT.format(address=address), encoding="utf-8")
     Path(program).write_text(f'#!/bin/sh\nexec "{sys.executable}" -I -S "{client}" "$@"\n', encoding="utf-8")
     Path(program).chmod(Path(program).stat().st_mode | stat.S_IXUSR)
-    kernel = folder / "kernels/python3/kernel.json"
-    kernel.parent.mkdir(parents=True)
-    words = {"argv": [program, KERNEL, "{connection_file}"], "display_name": "Python", "language": "python"}
-    kernel.write_text(json.dumps(words), encoding="utf-8")
     server = subprocess.Popen([sys.executable, __file__, address])
     atexit.register(server.wait)
     atexit.register(server.terminate)  # runs first
@@ -54,9 +47,6 @@ def start(folder: Path) -> None:
 
 def _warm() -> None:
     """Load modules and compiled code by a first use, as a notebook that has run for a while would have."""
-    import ipykernel.kernelapp  # noqa: F401
-    import matplotlib.pyplot  # noqa: F401
-
     from strapdown import cli
 
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
@@ -102,9 +92,11 @@ def _answer(call: socket.socket) -> None:
         os.environ.clear()
         os.environ.update(request["environment"])
         sys.argv = ["strapdown", *request["arguments"]]
+        from strapdown import cli
+
         status = 0
         try:
-            _run()
+            cli.main()
         except SystemExit as done:
             status = done.code if isinstance(done.code, int) else int(done.code is not None)
         sys.stdout.flush()
@@ -112,19 +104,6 @@ def _answer(call: socket.socket) -> None:
         os._exit(status)
     call.sendall(str(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])).encode())
     os._exit(0)
-
-
-def _run() -> None:
-    """Run the kernel of a page, or the program."""
-    if sys.argv[1:2] == [KERNEL]:
-        from ipykernel.kernelapp import launch_new_instance
-
-        sys.argv = ["kernel", "-f", sys.argv[2]]
-        launch_new_instance()
-    else:
-        from strapdown import cli
-
-        cli.main()
 
 
 if __name__ == "__main__":

@@ -61,15 +61,13 @@ os.environ.update(
 )
 os.environ.pop("MPLBACKEND", None)  # pages draw inline
 command_server.start(Path(_programs.name))
-os.environ["JUPYTER_PATH"] = _programs.name
 _profile = tempfile.TemporaryDirectory()
 os.environ["IPYTHONDIR"] = _profile.name
 (Path(_profile.name) / "profile_default").mkdir()
 (Path(_profile.name) / "profile_default/ipython_kernel_config.py").write_text(
-    "c.IPKernelApp.log_level = 50\n"
+    "c.IPKernelApp.log_level = 40\n"
     f"import sys; sys.path.insert(0, {str(DOCS)!r})\n"
     "c.InteractiveShellApp.extensions = ['shell_cells']\n"
-    "c.InteractiveShellApp.matplotlib = 'inline'\n"
     "c.InlineBackend.figure_formats = {'svg'}\n"
     "c.InlineBackend.rc = {'figure.figsize': (6.4, 3.6), 'font.size': 9.0, 'svg.fonttype': 'path'}\n"
 )
