@@ -15,8 +15,11 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+import jupyter_client
+import traitlets
 from docutils import nodes
 from docutils.utils.math import MathError, latex2mathml
+from nbclient import NotebookClient
 from sphinx.errors import ExtensionError
 
 DOCS = Path(__file__).resolve().parent
@@ -71,6 +74,20 @@ os.environ["IPYTHONDIR"] = _profile.name
     "c.InlineBackend.figure_formats = {'svg'}\n"
     "c.InlineBackend.rc = {'figure.figsize': (6.4, 3.6), 'font.size': 9.0, 'svg.fonttype': 'path'}\n"
 )
+
+
+class _KernelManager(jupyter_client.AsyncKernelManager):
+    """Kernels of pages listen on files: a TCP port that was free may be taken by another connection before the kernel listens on it."""
+
+    transport = traitlets.Unicode("ipc")
+    ip = traitlets.Unicode()
+
+    @traitlets.default("ip")
+    def _files(self) -> str:
+        return os.path.join(tempfile.mkdtemp(dir=_profile.name), "kernel")
+
+
+NotebookClient._kernel_manager_class_default = lambda _: _KernelManager
 
 nb_execution_mode = "force"
 nb_execution_in_temp = True
