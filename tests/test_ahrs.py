@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from sims import hand_held
 from strapdown import ahrs, consistency, estimation, quaternion
-from strapdown.ahrs import AhrsParameters, regions, starting
+from strapdown.ahrs import AhrsParameters, regions, remarks, starting
 from strapdown.checks import InputError
 from strapdown.consistency import reference_errors
 from strapdown.estimation import setup
@@ -933,6 +933,19 @@ def test_the_level_of_the_acceleration_and_the_innovations_variance_by_it():
     moved = dataclasses.replace(seen, innovation=np.full((steps, 3), np.sqrt(2.0)))
     as_modelled = dataclasses.replace(still, innovations={"accelerometer": moved})
     np.testing.assert_allclose(regions.acceleration_level(as_modelled, uncertain, interval), 1.0, rtol=1e-12)
+
+
+@pytest.mark.parametrize(("bias", "said"), [(0.05, True), (0.001, False)])
+def test_a_bias_that_the_start_did_not_expect_is_said(bias, said):
+    """2.9 °/s about each axis, of a unit that never rests."""
+    plain = dataclasses.replace(
+        recording(60.0, bias=(bias, bias, bias), noise=1.0), magnetic_field=None, magnetic_unit=""
+    )
+    moving = dataclasses.replace(ahrs.HAND_HELD_WITHOUT_MAGNETOMETER, bias_sigma=0.25 * DEGREE)
+    result = ahrs.estimate(plain, moving)
+    result = dataclasses.replace(result, rests=starting.NO_REST)
+    words = " ".join(remarks.remarks(result, "hand"))
+    assert ("is beyond what the model expects" in words) == said
 
 
 def test_disagreement_of_filter_and_smoother_widens_the_tilt_alone(monkeypatch):
