@@ -71,11 +71,10 @@ def scales(
     field = field_level(filtered, parameters, causal=disagreement is None)
     shares = shares_of(parameters, magnetometer="magnetometer" in filtered.innovations)
     if disagreement is not None:
-        shares = shares._replace(max_heading=np.inf)
+        added = DISAGREEMENT_SHARE * max(disagreement - USUAL_DISAGREEMENT**2, 0.0) * STANDARD_GRAVITY**2
+        shares = shares._replace(max_heading=np.inf, tilt_variance=shares.tilt_variance + added)
     tilt, floor, heading = np.empty((3, len(field)))
     compiled(recording_steps.scale_factors)(read_only(field), shares, tilt, floor, heading)
-    if disagreement is not None:
-        floor += DISAGREEMENT_SHARE * max(disagreement - USUAL_DISAGREEMENT**2, 0.0)
     return tilt, floor, heading
 
 
