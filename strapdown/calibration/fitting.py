@@ -24,7 +24,7 @@ import scipy.sparse
 from scipy.sparse.linalg import SuperLU, splu
 from scipy.spatial.transform import Rotation
 
-from strapdown.calibration.intervals import Errors, Intervals, predicted, right_jacobian, skew
+from strapdown.calibration.intervals import Errors, Intervals, Prediction, predicted, right_jacobian, skew
 from strapdown.checks import Array
 from strapdown.units import DEGREE
 
@@ -177,6 +177,7 @@ class Problem:
         self.size = 15 if intervals.field is not None else 12
         nodes = len(intervals.time)
         self.errors_at = self.size * nodes
+        self._last: tuple[Unknowns, Prediction] | None = None
         self.activity = np.full(nodes, 1.0)
         self.floor = {"rotation": intervals.gyro_noise, "bias": 1e-6, "force": FORCE_FLOOR, "velocity": 0.02}
         self.noise = {"rotation": 10.0 * intervals.gyro_noise, "bias": 2e-4, "force": 0.05, "velocity": 1.0}
@@ -186,7 +187,7 @@ class Problem:
 
     def measure_activity(self, x: Unknowns) -> None:
         """Set σ of the velocity at the nodes from the RMS acceleration over the second around each."""
-        mean = predicted(self.intervals, unpacked(x.errors), self._bias(x)).force.value
+        mean = self._predicted(x).force.value
         acceleration = np.einsum("kij,kj->ki", x.attitude[self.intervals.node], mean) - self.gravity * np.eye(3)[2]
         noise = self.noise["force"] ** 2 / self.intervals.length
         square = np.maximum(np.mean(acceleration**2, axis=1) - noise, 0.0)
@@ -197,14 +198,18 @@ class Problem:
         activity[np.isnan(activity)] = activity[np.flatnonzero(np.isnan(activity)) - 1]
         self.activity = activity
 
-    def _bias(self, x: Unknowns) -> Array:
-        node = self.intervals.node
-        return np.asarray(0.5 * (x.bias[node] + x.bias[node + 1]))
+    def _predicted(self, x: Unknowns) -> Prediction:
+        """Return the prediction at some unknowns; the last one is kept, because it does not depend on the noise."""
+        if self._last is None or self._last[0] is not x:
+            node = self.intervals.node
+            bias = np.asarray(0.5 * (x.bias[node] + x.bias[node + 1]))
+            self._last = x, predicted(self.intervals, unpacked(x.errors), bias)
+        return self._last[1]
 
     def equations(self, x: Unknowns) -> _Equations:
         """Return the equations linearised at some unknowns."""
         iv, size, noise = self.intervals, self.size, self.noise
-        errors, p = unpacked(x.errors), predicted(iv, unpacked(x.errors), self._bias(x))
+        errors, p = unpacked(x.errors), self._predicted(x)
         node, length, unit = iv.node, iv.length, np.eye(3)
         here, there = size * node, size * (node + 1)
         rotation, glob = x.attitude[node], self.errors_at
