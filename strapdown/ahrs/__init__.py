@@ -10,6 +10,7 @@ from __future__ import annotations
 from strapdown.ahrs import check_conventions as check_conventions
 from strapdown.ahrs.estimating import AhrsEstimate, estimate
 from strapdown.ahrs.live import LiveAhrs
+from strapdown.ahrs.magnetic_field import FieldComparison, MagneticField
 from strapdown.ahrs.parameters import HAND_HELD as HAND_HELD
 from strapdown.ahrs.parameters import HAND_HELD_SMOOTHED as HAND_HELD_SMOOTHED
 from strapdown.ahrs.parameters import HAND_HELD_WITHOUT_MAGNETOMETER as HAND_HELD_WITHOUT_MAGNETOMETER
@@ -26,6 +27,8 @@ __all__ = [
     "MOTIONS",
     "AhrsEstimate",
     "AhrsParameters",
+    "FieldComparison",
     "LiveAhrs",
+    "MagneticField",
     "estimate",
 ]

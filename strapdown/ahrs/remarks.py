@@ -11,11 +11,14 @@ from strapdown.units import DEGREE
 MAX_BIAS = 4.0
 """Gyro bias without a rest, relative to σ of its axes at the start, above which the start was too certain."""
 
+MAGNETIC_NORTH = "East-North-Up, magnetic North"
+"""Fixed frame of an estimate with a magnetometer."""
+
 
 def fixed_frame(recording: Recording) -> str:
     """Return the fixed frame of the estimate of a recording."""
     if recording.magnetic_field is not None:
-        return "East-North-Up, magnetic North"
+        return MAGNETIC_NORTH
     return "z up, heading arbitrary (no magnetometer)"
 
 

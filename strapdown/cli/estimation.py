@@ -17,7 +17,7 @@ from strapdown.files import reading, writable, write_json
 if TYPE_CHECKING:
     from strapdown.records import Estimate
 
-FILES = ("estimate.h5", "errors.json", "states.json", "observability.json", "calibration.toml")
+FILES = ("estimate.h5", "errors.json", "states.json", "observability.json", "field.json", "calibration.toml")
 """Files that the command may write to its folder, in addition to figures."""
 FIGURES = ("estimate", "errors", "states")
 """Figures that it may write there, without the suffix of their format."""
@@ -75,6 +75,26 @@ class _Recorded:
     latency: float | None = Option(None, help="Delay of the gyro's samples, ms. Default: half a sample interval.")
     calibration: Path | None = Option(None, help="calibration.toml of the unit; a new one is written.")
     temperature: Path | None = Option(None, help="TOML of `strapdown allan --temperature`: bias to subtract.")
+    place: str | None = Option(
+        None,
+        help="LATITUDE,LONGITUDE[,HEIGHT], degrees and m: use true North, and report samples unlike the field there.",
+    )
+    date: str | None = Option(None, help="Day of the recording, such as 2026-11-28, for --place.")
+
+    @property
+    def field(self) -> sd.ahrs.MagneticField | None:
+        """The Earth's field at the place."""
+        if self.place is None and self.date is None:
+            return None
+        if self.place is None or self.date is None:
+            raise InputError("--place and --date go together: the field drifts; give both")
+        try:
+            latitude, longitude, *height = (float(part) for part in self.place.split(","))
+        except ValueError:
+            latitude, longitude, *height = (0.0,) * 4
+        if len(height) > 1:
+            raise InputError(f"--place is {self.place!r}; give LATITUDE,LONGITUDE or LATITUDE,LONGITUDE,HEIGHT")
+        return sd.ahrs.MagneticField.at(latitude, longitude, *height, date=self.date)
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,13 +155,16 @@ def estimate(
             "walks": shared.observability,
         }
         one_of("--motion", recorded.motion or "hand", sd.ahrs.MOTIONS)
+    field = recorded.field
     with ui.progress_bar("reading"):
         source: Any = sd.read(recording, **layout.options(recording))
     if not simulated:
+        if field is not None and source.magnetic_field is None:
+            raise InputError(f"--place is for the field, and {recording} has no magnetometer; leave it out")
         ui.warn_about_conventions(source, recording)
     with ui.progress_bar("smoothing" if shared.smooth else "filtering"):
         run = workflows.run(source, **options)
-    result = run.estimate
+    result = run.estimate if field is None else field.to_true_north(run.estimate)
     if simulated:
         vectors = ", ".join(f"{len(one.time)} of {one.sensor}" for one in source.vectors) or "no measurements"
         length = source.time[-1] - source.time[0]
@@ -150,6 +173,10 @@ def estimate(
     ui.show(result.listing())
     _clear(out)
     contents: dict[str, Any] = {}
+    if field is not None:
+        compared = field.compared(source, result)
+        ui.say(str(compared))
+        contents["field.json"] = compared.summary()
     if result.error_states:
         contents["states.json"] = {name: states.summary() for name, states in result.error_states.items()}
     if shared.observability:
