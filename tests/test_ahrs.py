@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from sims import hand_held
 from strapdown import ahrs, consistency, estimation, quaternion
-from strapdown.ahrs import AhrsParameters, regions, remarks, starting
+from strapdown.ahrs import AhrsParameters, estimating, regions, remarks, starting
 from strapdown.checks import InputError
 from strapdown.consistency import reference_errors
 from strapdown.estimation import setup
@@ -246,6 +246,47 @@ def test_running_medians_are_those_of_numpy(capacity, tolerance):
     for k, value in enumerate(values):
         kernels.insert(memory, 2, value, k, 1)
         np.testing.assert_allclose(memory.median[2], np.median(values[: k + 1]), atol=tolerance)
+
+
+def in_a_hurry(duration, lever_arm=0.0, seed=3):
+    """A recording of :func:`brisk`, its sensors ``lever_arm`` m along x from the point about which the unit turns."""
+    time = 100.0 + np.arange(round(duration * RATE)) / RATE
+    attitude = brisk(time - 100.0)
+    rate = rates(time - 100.0, brisk)
+    arm = np.array([lever_arm, 0.0, 0.0])
+    turning = np.cross(np.gradient(rate, 1.0 / RATE, axis=0), arm) + np.cross(rate, np.cross(rate, arm))
+    random = np.random.default_rng(seed)
+    noise = random.standard_normal((3, len(time), 3))
+    return Recording(
+        source="a hurry",
+        time=time,
+        rate=rate + np.array([0.01, -0.02, 0.015]) + 2e-3 * noise[0],
+        specific_force=attitude.inv().apply([0.0, 0.0, 9.80665]) + turning + 0.03 * noise[1],
+        magnetic_field=attitude.inv().apply([0.0, 20.0 * np.cos(DIP), -20.0 * np.sin(DIP)]) + 0.1 * noise[2],
+        true_attitude=attitude.as_quat()[:, [3, 0, 1, 2]],
+    )
+
+
+def test_after_a_dropout_the_field_before_it_is_forgotten():
+    whole = in_a_hurry(30.0)
+    part = rows_of(whole, (whole.time < 120.0) | (whole.time > 120.5))
+    error = quaternion.angle_between(ahrs.estimate(part, latency=0.0).estimate.attitude, part.true_attitude) / DEGREE
+    lost, found = (part.time > 120.0) & (part.time < 120.6), part.time > 122.5
+    assert error[lost].max() > 35.0  # the rotation over the dropout is unknown
+    assert np.sqrt(np.mean(error[found] ** 2)) < 1.5
+
+
+def test_the_smoother_recovers_the_attitude_of_a_start_in_motion(monkeypatch):
+    whole = in_a_hurry(30.0, lever_arm=0.4)
+    part = rows_of(whole, whole.time > 112.3)
+    largest = []
+    for starts in (estimating.MAX_STARTS, 1):
+        monkeypatch.setattr(estimating, "MAX_STARTS", starts)
+        result = ahrs.estimate(part, latency=0.0, smooth=True)
+        largest.append(quaternion.angle_between(result.estimate.attitude, part.true_attitude).max() / DEGREE)
+    assert quaternion.angle_between(result.initial.attitude, part.true_attitude[0]) > 90.0 * DEGREE
+    assert largest[0] < 3.0
+    assert largest[1] > 10.0
 
 
 def test_the_steeper_the_field_the_less_it_says():

@@ -10,10 +10,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from strapdown import estimation
+from strapdown import estimation, quaternion
 from strapdown.ahrs import headings, regions
 from strapdown.ahrs.parameters import AhrsParameters, of_motion
-from strapdown.ahrs.preparing import Prepared, prepare
+from strapdown.ahrs.preparing import Prepared, over_steps, prepare
 from strapdown.ahrs.starting import (
     Rests,
     first_vector,
@@ -37,6 +37,12 @@ from strapdown.recordings.sensor_delays import Delays
 from strapdown.recordings.sensor_faults import Faults
 from strapdown.records import ErrorStateEstimate, Estimate, ImuRecord, cut
 from strapdown.records.recording import sampled
+from strapdown.units import DEGREE
+
+FAR_START = 20.0 * DEGREE
+"""Rotation by which the smoother corrects the attitude at the start, rad, above which it is linearised about the corrected one again."""
+MAX_STARTS = 3
+"""Maximum number of such starts."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -142,7 +148,7 @@ def estimate(
     at_rest = rests(used, parameters)
     if smooth:
         parameters = for_whole(used, parameters, at_rest)
-    prepared = prepare(used, parameters, delays.field, causal=not smooth, turned=turned)
+    prepared = prepare(used, parameters, delays.field, faults.turn_variance, causal=not smooth, turned=turned)
     if smooth:
         prepared = prepared._replace(initial=with_all_rests(prepared.initial, at_rest, used.time, parameters))
     else:
@@ -197,7 +203,7 @@ def _run(
     record, own, smooth = prepared.record, parameters.setup, options.smooth
     kinds = {series.sensor: series.kind for series in record.vectors}
     blocks = () if own.states is None else own.states.blocks(kinds)
-    extra = _over_steps(turn_variance, prepared.edge)
+    extra = over_steps(turn_variance, prepared.edge)
     rested = np.searchsorted(prepared.edge, [] if smooth else at_rest.last)
     bounds = np.unique([0, *(np.flatnonzero(np.diff(extra > 0.0)) + 1), *rested, len(extra)]).tolist()
     spans = []
@@ -220,7 +226,11 @@ def _run(
     for (first, last), span in zip(itertools.pairwise(bounds), spans, strict=True):
         part = record if len(spans) == 1 else cut(record, first, last)
         noise = replace(own.process_noise, angle_random_walk=span.angle_random_walk)
-        smoothed, filtered = estimation.smoothed_and_filtered(part, noise, state, blocks, shared)
+        for _ in range(MAX_STARTS):
+            smoothed, filtered = estimation.smoothed_and_filtered(part, noise, state, blocks, shared)
+            if quaternion.angle_between(smoothed.attitude[0], state.attitude) < FAR_START:
+                break
+            state = replace(state, attitude=smoothed.attitude[0])
         parts.append(smoothed)
         forward.append(filtered if not forward else filtered[1:])
         if last < len(extra):
@@ -232,11 +242,6 @@ def _run(
 def _with_rate(state: estimation.State, measured: tuple[Array, float]) -> estimation.State:
     """Return the state corrected by a mean rate at rest and its σ."""
     return with_rate_at_rest(state, *measured)
-
-
-def _over_steps(variance: Array, edge: np.ndarray) -> Array:
-    """Return the sum over each step (k,) of a variance of each sample interval (n − 1,)."""
-    return np.asarray(np.add.reduceat(variance, edge[:-1].astype(np.intp)))
 
 
 def _at_stamps(
@@ -256,7 +261,7 @@ def _at_stamps(
     late = np.broadcast_to(delays.gyro, used.time.shape)
     ahead = -sensor_delays.turn_over(used, -late) if options.smooth else used.rate * late[:, None]
     interval = max(parameters.step, used.interval)
-    level = regions.acceleration_level(filtered, _over_steps(turn_variance, edge) > 0.0, interval)
+    level = regions.acceleration_level(filtered, over_steps(turn_variance, edge) > 0.0, interval)
     assert filtered.covariance is not None
     iron = np.zeros(len(edge))
     if prepared.field is not None:

@@ -143,7 +143,7 @@ class LiveAhrs:
         constants = headings.constants_of(parameters, max(parameters.step, self.interval))
         memory = headings.memory_of(constants)
         head_frame, head_end, head_length, head_time = np.zeros((1, 4)), np.zeros((1, 4)), np.zeros(1), np.zeros(1)
-        of_step = (field_total, field_number, head_length, head_frame, total, number, head_end, head_time)
+        of_step = (field_total, field_number, head_length, head_frame, total, number, head_end, head_time, np.zeros(1))
         head_steps = k_headings.Steps(*map(read_only, of_step))
         found = k_headings.Found(np.zeros((1, 3)), np.zeros(1), np.zeros((1, 2)), np.zeros((1, 3)), np.zeros(1))
         shares = regions.shares_of(parameters, magnetometer=self.magnetometer)

@@ -42,6 +42,7 @@ def prepare(
     recording: Recording,
     parameters: AhrsParameters,
     field_delay: Array | float = 0.0,
+    turn_variance: Array | float = 0.0,
     *,
     causal: bool = True,
     turned: Array | None = None,
@@ -49,7 +50,8 @@ def prepare(
     """Return the record that the filter runs on, and its initial state.
 
     ``field_delay`` is that of the magnetometer relative to the gyro, s, one number or one per sample; each sample is rotated forward
-    by the gyro. ``causal``: a heading's noise depends only on the samples up to it. ``turned`` (n, 4): attitude from the gyro only, if
+    by the gyro. ``turn_variance``: variance of the rotation over each sample interval in addition to the gyro's noise, rad², one number or
+    (n − 1,). ``causal``: a heading's noise depends only on the samples up to it. ``turned`` (n, 4): attitude from the gyro only, if
     already computed.
     """
     if turned is None:
@@ -83,7 +85,11 @@ def prepare(
         field, seen = sums(recording.magnetic_field, frame, edge)
         middle = frame[(edge[:-1] + edge[1:] + 1) // 2]
         if causal:
-            rows = kernel.Steps(field, seen, seen * interval, middle, total, number, turned[edge[1:]], time[1:])
+            variance = over_steps(np.broadcast_to(turn_variance, len(turned) - 1), edge)
+            variance[1:] += variance[:-1]  # most of a step's samples may precede the uncertain rotation
+            rows = kernel.Steps(
+                field, seen, seen * interval, middle, total, number, turned[edge[1:]], time[1:], variance
+            )
             found = headings.online(rows, float(time[0]), parameters, max(parameters.step, interval))
         else:
             samples = headings.FieldSteps(
@@ -124,6 +130,11 @@ def edges(time: Array, step: float, interval: float) -> np.ndarray:
     bins = np.floor((time + interval - time[0]) / step + 1e-6)
     inner = np.flatnonzero(bins[1:] != bins[:-1]) + 1
     return np.concatenate([[0], inner[inner < len(time) - 1], [len(time) - 1]])
+
+
+def over_steps(variance: Array, edge: np.ndarray) -> Array:
+    """Return the sum over each step (k,) of a variance of each sample interval (n − 1,)."""
+    return np.asarray(np.add.reduceat(variance, edge[:-1].astype(np.intp)))
 
 
 def sums(samples: Array, frame: Array, edge: Array) -> tuple[Array, Array]:

@@ -449,6 +449,7 @@ def end_field(m: Any, program: Any, f: SimpleNamespace, edges: Any, force: Any, 
         force_number=(force_number[0],),
         end=Table([tuple(f.turned[i] for i in range(4))]),
         time=(f.clock[0],),
+        turn_variance=(0.0,),
     )
     shapes = {"direction": (1, 3), "sigma": (1,), "usual": (1, 2), "variance": (1,)}
     found = SimpleNamespace(

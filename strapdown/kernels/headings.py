@@ -76,13 +76,15 @@ class Steps(NamedTuple):
     """Attitude by the gyro at the end of the step (k, 4)."""
     time: np.ndarray
     """Time of the end, s (k,)."""
+    turn_variance: np.ndarray
+    """Variance of the rotation by the gyro over the step in addition to its noise, rad² per axis: gaps, clipping (k,)."""
 
 
 class Memory(NamedTuple):
     """What lasts from one step to the next."""
 
     counted: np.ndarray
-    """1 with a field, 2 with a force, 3 with both so far; number of steps since there were both (2,)."""
+    """1 with a field, 2 with a force, 3 with both so far; steps since there were both, and since the last uncertain rotation (3,)."""
     start: np.ndarray
     """Time of the first sample, s, and interval of the headings of the last step (2,)."""
     strength: np.ndarray
@@ -166,17 +168,26 @@ def look_at_field(constants, steps, memory, found, k, known):
     """Add the direction of the field of step k to the heading, with the information that its deviation leaves."""
     field = vector_at(memory.held, 0)
     frame = quaternion_at(steps.frame, k)
-    low_passed(constants.vertical_share, memory.vertical, 0, vector_at(memory.held, 1), memory.counted[1])
-    low_passed(constants.vertical_share, memory.vertical, 1, vector_at(memory.vertical, 0), memory.counted[1])
+    # After an uncertain rotation, directions before it are as uncertain in the frame fixed by the gyro: they are forgotten.
+    variance = steps.turn_variance[k]
+    forgotten = variance / (variance + constants.field_deviation * constants.field_deviation)
+    if forgotten > 0.5:
+        memory.counted[2] = 0
+        for i in range(len(memory.ring)):
+            memory.ring[i, 7] = 0.0
+    memory.counted[2] += 1
+    share = max(constants.vertical_share, 1.0 / memory.counted[2])
+    low_passed(share, memory.vertical, 0, vector_at(memory.held, 1), memory.counted[1])
+    low_passed(share, memory.vertical, 1, vector_at(memory.vertical, 0), memory.counted[1])
     up = vector_at(memory.vertical, 1)
     up = scale(1.0 / math.sqrt(dot(up, up)), up)
-    look(constants, memory, 0, field, up)
+    look(constants, memory, 0, field, up, forgotten)
     if memory.counted[1] == 0:
         memory.strength[0] = memory.median[0]
     strength = memory.strength[0]
     iron = iron_step(constants, field, frame, known, steps.time[k], strength, memory)
     R = rotation_matrix(frame)
-    look(constants, memory, 1, subtract(field, matrix_times_vector(R, iron)), up)
+    look(constants, memory, 1, subtract(field, matrix_times_vector(R, iron)), up, forgotten)
     # Iron may have been attached or removed: it is subtracted only where that does not increase the deviation of the field.
     odds = min(max((memory.deviation[0] - memory.deviation[1]) / constants.deviation_odds, -50.0), 0.0)
     iron = scale(2.0 / (1.0 + math.exp(-odds)), iron)
@@ -186,7 +197,7 @@ def look_at_field(constants, steps, memory, found, k, known):
         iron = (0.0, 0.0, 0.0)
     store_row(found.iron, k, iron)
     field = subtract(field, matrix_times_vector(R, iron))
-    size = look(constants, memory, 2, field, up)
+    size = look(constants, memory, 2, field, up, forgotten)
     found.usual[k, 0], found.usual[k, 1] = memory.median[4], memory.median[5]
     if known:
         steep = min(abs(memory.median[5]), constants.max_dip)
@@ -220,7 +231,7 @@ def low_passed(share, values, row, new, count):
         values[row, i] = new[i] if count == 0 else values[row, i] + share * (new[i] - values[row, i])
 
 
-def look(constants, memory, which, field, up):
+def look(constants, memory, which, field, up, forgotten):
     """Update usual magnitude and dip and the deviation from them; return the magnitude."""
     count = memory.counted[1]
     size = math.sqrt(dot(field, field))
@@ -229,7 +240,7 @@ def look(constants, memory, which, field, up):
     dip = math.asin(min(max(-dot(field, up) / size, -1.0), 1.0))
     insert(memory, 2 * which, size, count, constants.every)
     insert(memory, 2 * which + 1, dip, count, constants.every)
-    low_passed(constants.change_share, memory.mean, which, field, count)
+    low_passed(max(constants.change_share, forgotten), memory.mean, which, field, count)
     change = subtract(field, vector_at(memory.mean, which))
     usual = memory.median[2 * which]
     relative, steeper = size / usual - 1.0, dip - memory.median[2 * which + 1]

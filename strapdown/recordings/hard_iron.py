@@ -85,7 +85,7 @@ def parts(interval: float) -> dict[str, Any]:
 def memory(lag: int, capacity: int) -> headings.Memory:
     """Return the memory of the kernel at the start, with room for this number of values of each running median."""
     return headings.Memory(
-        counted=np.zeros(2, np.int64),
+        counted=np.zeros(3, np.int64),
         start=np.zeros(2),
         strength=np.zeros(1),
         held=np.zeros((2, 3)),
