@@ -27,7 +27,8 @@ def start_filters(q, b, body, like):
     for i in range(n):
         for j in range(i, n):
             put_element(P, i, j, like + body.start.P[i, j])
-    return Progress(n < 0)
+    lost = n < 0  # False, not as a literal: numba would compile the loop for its type too
+    return Progress(lost)
 
 
 def propagated(state, part, dt, body, like):

@@ -34,7 +34,8 @@ def start_filters(q, b, body, like):
     P = body.start.P
     A = (like + P[0, 0], like, like, like + P[1, 1], like, like + P[2, 2])
     C = (like + P[3, 3], like, like, like + P[4, 4], like, like + P[5, 5])
-    return State(q, b, A, (like, like, like, like, like, like, like, like, like), C, len(P) < 0)
+    lost = len(P) < 0  # False, not as a literal: numba would compile the loop for its type too
+    return State(q, b, A, (like, like, like, like, like, like, like, like, like), C, lost)
 
 
 def propagated(state, part, dt, body, like):
