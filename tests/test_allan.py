@@ -26,6 +26,7 @@ from scipy.stats import chi2, norm
 from sims import allan as sim
 from strapdown import allan, units
 from strapdown.checks import InputError
+from strapdown.consistency.timeaverage import effective_samples
 from strapdown.kernels.allan import accumulate, second_difference_sizes, second_difference_squares
 from strapdown.kernels.machine import compiled
 
@@ -191,6 +192,7 @@ def times_of_other_threads():
         functools.partial(allan.allan_deviation, gappy[70_000:110_000], 0.01),
         functools.partial(allan.fit_noise, gappy, 0.01),
         functools.partial(allan.temperature.fit_temperature, values[:20_000], temperature, 0.01, order=2),
+        functools.partial(effective_samples, values.reshape(-1, 20)),
     ]
 
     def of_other_threads():
