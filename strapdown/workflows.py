@@ -1079,7 +1079,6 @@ def allan_deviation(
     sensor: str = "gyro",
     kind: str = "rate",
     taus: ArrayLike | None = None,
-    estimator: str = "overlapping",
     level: float = 0.95,
 ) -> AllanDeviation:
     """Return the Allan deviation of a sensor at rest, with its confidence band.
@@ -1087,7 +1086,7 @@ def allan_deviation(
     Parameters
     ----------
     source : Recording, ImuRecord, GyroSamples or array_like (n,) or (n, axes)
-        Missing samples are NaN (:mod:`strapdown.allan.gaps`).
+        Missing samples are NaN (:func:`strapdown.allan.allan_deviation`).
     sample_interval : float, optional
         For an array: time between its samples, s.
     sensor : {"gyro", "accelerometer", "magnetometer"}
@@ -1096,8 +1095,6 @@ def allan_deviation(
         For an array: averages over each sample interval, or integrals.
     taus : array_like, optional
         Averaging times, s. Default: 12 per decade, up to a third of the record.
-    estimator : {"overlapping", "robust"}, default "overlapping"
-        Estimator (:func:`strapdown.allan.allan_deviation`).
     level : float, default 0.95
         Confidence of the band.
 
@@ -1116,7 +1113,7 @@ def allan_deviation(
     0.1
     """
     values, interval, what = _samples(source, sample_interval, sensor, kind)
-    return allan.allan_deviation(values, interval, kind=what, taus=taus, estimator=estimator, level=level)
+    return allan.allan_deviation(values, interval, kind=what, taus=taus, level=level)
 
 
 def fit_noise(
