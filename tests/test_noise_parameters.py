@@ -396,7 +396,7 @@ def test_flicker_is_covered_at_every_frequency_that_the_filter_of_the_tilt_follo
     """At the natural frequency ω of the filter the covering spectrum σ_v² + σ_u²/ω² is at least 2/π of the flicker's, B²/ω."""
     spec = gyro.GyroSpec(angle_random_walk=1e-4, bias_instability=FLICKER)
     for parameters in itertools.chain(*ahrs.MOTIONS.values()):
-        found = workflows.with_gyro_noise(parameters, spec)
+        found = workflows.filters.with_gyro_noise(parameters, spec)
         white = found.angle_random_walk**2 - spec.angle_random_walk**2
         walk = found.rate_random_walk**2
         assert white > 0.0
@@ -410,5 +410,5 @@ def test_flicker_is_covered_at_every_frequency_that_the_filter_of_the_tilt_follo
 
 def test_a_gyro_without_flicker_keeps_its_own_noise():
     spec = gyro.GyroSpec(angle_random_walk=1e-4, rate_random_walk=2e-6)
-    found = workflows.with_gyro_noise(ahrs.HAND_HELD, spec)
+    found = workflows.filters.with_gyro_noise(ahrs.HAND_HELD, spec)
     assert (found.angle_random_walk, found.rate_random_walk) == (1e-4, 2e-6)

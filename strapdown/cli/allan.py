@@ -116,8 +116,8 @@ def _identify(
     if gaps:
         shortest = sd.allan.noise_fit.SHORTEST
         ui.say(
-            f"Because of gaps the fit uses {fit.samples} samples in segments of {shortest} or more; the deviation uses averages with most of "
-            "their samples."
+            f"Because of gaps the fit uses {fit.samples} samples in segments of {shortest} or more; the deviation uses averages that have "
+            "most of their samples."
         )
     table = fit.listing()
     ui.show(table, title=f"Noise coefficients with {100.0 * fit.level:g} % intervals", notes=False)

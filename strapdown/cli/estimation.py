@@ -107,8 +107,8 @@ def estimate(
     The accelerometer gives the vertical and the magnetometer the heading. If the recording contains its specification, like those of
     `strapdown simulate`, the filter matches it.
     """
-    from strapdown import workflows
     from strapdown.estimation.setup import observability, read_setup
+    from strapdown.workflows.estimating import run as run_filter
 
     out, form = output.out, output.form or ("png" if output.figures else None)
     names = (*FILES, *(f"{name}.{form or 'png'}" for name in FIGURES))
@@ -140,7 +140,7 @@ def estimate(
     if not simulated:
         ui.warn_about_conventions(source, recording)
     with ui.progress_bar("smoothing" if shared.smooth else "filtering"):
-        run = workflows.run(source, **options)
+        run = run_filter(source, **options)
     result = run.estimate
     if simulated:
         vectors = ", ".join(f"{len(one.time)} of {one.sensor}" for one in source.vectors) or "no measurements"
