@@ -175,8 +175,8 @@ def smooth(
 
     Examples
     --------
-    >>> record = simulate("two-stars", seed=1)
-    >>> smooth(record).attitude.shape  # doctest: +SKIP
+    >>> import strapdown as sd
+    >>> sd.smooth(sd.simulate("two-stars", seed=1)).attitude.shape  # doctest: +SKIP
     (30001, 4)
     """
     return estimate(**locals(), smooth=True)
