@@ -26,7 +26,8 @@ from scipy.stats import chi2, norm
 from sims import allan as sim
 from strapdown import allan, units
 from strapdown.checks import InputError
-from strapdown.kernels.allan import accumulate, second_difference_sizes, second_difference_squares
+from strapdown.consistency.timeaverage import effective_samples
+from strapdown.kernels.allan import accumulate, second_difference_squares
 from strapdown.kernels.machine import compiled
 
 # Records of known noise
@@ -122,9 +123,6 @@ def test_kernels_compiled_and_plain_agree_with_exact_sums():
             plain[2 * m :] - plain[m : len(plain) - m] - (plain[m : len(plain) - m] - plain[: len(plain) - 2 * m])
         )
         expected.append(math.fsum(differences**2))
-        sizes = np.empty(len(differences[::7]))
-        second_difference_sizes(plain, m, 7, sizes)
-        assert np.array_equal(sizes, np.abs(differences[::7]))
     for function, width in ((second_difference_squares, 8), (compiled(second_difference_squares), 64)):
         squares = np.empty(4)
         function(plain, multiples, np.empty(width), np.empty(4), squares)
@@ -145,38 +143,6 @@ def test_phase_keeps_its_digits_over_a_long_record():
     assert phase[-1] == math.fsum(rate)
 
 
-@pytest.mark.parametrize("alpha", NOISES)
-def test_robust_is_consistent_for_gaussian_noise(alpha):
-    record = np.stack([pure(alpha, [seed, 1], 40_000) for seed in range(3)], axis=1)
-    taus = np.array([1.0, 2.0, 10.0, 50.0])
-    plain = allan.allan_deviation(record, 1.0, taus=taus)
-    robust = allan.allan_deviation(record, 1.0, taus=taus, estimator="robust")
-    assert np.all(np.abs(np.log(robust.deviation / plain.deviation).mean(axis=0)) < 4.0 / np.sqrt(6.0 * robust.edf[0]))
-    assert np.all(robust.edf < plain.edf)
-
-
-def test_robust_takes_every_span_of_white_phase():
-    rate = pure(2, [1, 5], 5000)
-    phase = np.concatenate([[0.0], np.cumsum(rate)])
-    expected = np.median(np.abs(phase[200:] - 2.0 * phase[100:-100] + phase[:-200])) / (
-        norm.ppf(0.75) * math.sqrt(2.0) * 100
-    )
-    assert_allclose(allan.allan_deviation(rate, 1.0, taus=[100.0], estimator="robust").deviation, expected, rtol=1e-9)
-
-
-def test_robust_ignores_outliers_and_steps():
-    clean = simulate(11, 50_000, 1.0, N=1.0)
-    spoiled = clean.copy()
-    spoiled[::1009] += 300.0
-    spoiled[20_000:] += 50.0
-    taus = np.array([1.0, 3.0, 10.0, 30.0])
-    expected = taus**-0.5
-    robust = allan.allan_deviation(spoiled, 1.0, taus=taus, estimator="robust")
-    plain = allan.allan_deviation(spoiled, 1.0, taus=taus)
-    assert_allclose(robust.deviation[0], expected, rtol=0.12)
-    assert np.all(plain.deviation[0] > 2.0 * expected)
-
-
 def times_of_other_threads():
     """Return the CPU time, ns, that other threads of the process take for each of several analyses of up to 200,000 samples."""
     values = np.random.default_rng(1).standard_normal(200_000)
@@ -184,13 +150,11 @@ def times_of_other_threads():
     temperature = np.linspace(20.0, 30.0, 20_000)
     calls = [
         functools.partial(np.linalg.qr, values.reshape(-1, 20)),  # by BLAS
-        *(
-            functools.partial(allan.allan_deviation, values, 0.01, estimator=name)
-            for name in allan.deviation.ESTIMATORS
-        ),
+        functools.partial(allan.allan_deviation, values, 0.01),
         functools.partial(allan.allan_deviation, gappy[70_000:110_000], 0.01),
         functools.partial(allan.fit_noise, gappy, 0.01),
         functools.partial(allan.temperature.fit_temperature, values[:20_000], temperature, 0.01, order=2),
+        functools.partial(effective_samples, values.reshape(-1, 20)),
     ]
 
     def of_other_threads():
@@ -771,13 +735,11 @@ RECORD = np.random.default_rng(0).standard_normal(200)
     [
         (lambda: allan.allan_deviation(RECORD, 0.0), "sample_interval"),
         (lambda: allan.allan_deviation(RECORD, 0.1, kind="rates"), "did you mean 'rate'"),
-        (lambda: allan.allan_deviation(RECORD, 0.1, estimator="robst"), "did you mean 'robust'"),
         (lambda: allan.allan_deviation(RECORD, 0.1, taus=[0.01]), "taus holds 0.01 s"),
         (lambda: allan.allan_deviation(RECORD, 0.1, taus=[1.0, 11.0]), "taus holds 11 s"),
         (lambda: allan.allan_deviation(RECORD, 0.1, taus=[]), "empty"),
         (lambda: allan.allan_deviation(RECORD, 0.1, level=95.0), "level is 95"),
         (lambda: allan.allan_deviation(RECORD.reshape(4, 50), 0.1), "50 axes"),
-        (lambda: allan.allan_deviation(np.append(RECORD, np.nan), 0.1, estimator="robust"), "has gaps"),
         (lambda: allan.allan_deviation([1.0, 2.0], 0.1), "2 samples"),
         (lambda: allan.fit_noise(RECORD[:50], 0.1), "50 samples"),
         (lambda: allan.fit_noise(RECORD, 0.1, terms=["angle_walk"]), "did you mean 'angle_random_walk'"),

@@ -97,7 +97,9 @@ def test_a_factor_on_sigma_is_likely_where_it_shows(m, factor, likely):
     error *= factor / np.sqrt(np.mean(error**2))
     time, attitude = np.arange(float(m)), quaternion.normalize(draw.standard_normal((m, 4)))
     truth, P = Truth(attitude=attitude, bias=np.zeros((m, 3))), np.tile(1e-6 * np.eye(6), (m, 1, 1))
-    known = foreign.explanations(1e-3 * error, {"body": P}, "body", {"body": 1.0}, truth, time, attitude)
+    known = foreign.explanations(
+        1e-3 * error, {"body": P}, "body", {"body": 1.0}, truth, alignment.Series(time, attitude)
+    )
     (found,) = (one for one in known if one.name == foreign.SCALE)
     assert float(found.value) == pytest.approx(factor, rel=1e-3)
     assert found.likely == likely
@@ -125,7 +127,7 @@ def test_of_right_filters_one_in_a_hundred_is_given_a_cause(memory):
         attitude, true = correlated(draw, memory)
         error = quaternion.log(quaternion.multiply(quaternion.conjugate(attitude), true))
         truth = Truth.of_reference(true)
-        found = foreign.explanations(error, {"body": P}, "body", {"body": 1.0}, truth, time, attitude)
+        found = foreign.explanations(error, {"body": P}, "body", {"body": 1.0}, truth, alignment.Series(time, attitude))
         blamed += any(one.likely for one in found)
     assert blamed <= 4
 

@@ -237,7 +237,7 @@ def test_a_g_sensitive_gyro_feels_gravity_and_not_in_free_fall():
     ],
 )
 def test_what_is_wrong_in_a_file_is_reported_with_the_file_and_as_typed(tmp_path, change, words):
-    text = scenarios._BUILTIN.joinpath("two-stars.toml").read_text(encoding="utf-8")
+    text = scenarios.toml.BUILTIN.joinpath("two-stars.toml").read_text(encoding="utf-8")
     assert change[0] in text
     (tmp_path / "two.toml").write_text(text.replace(*change, 1), encoding="utf-8")
     with pytest.raises(InputError, match=words):

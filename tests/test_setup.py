@@ -285,7 +285,7 @@ def test_a_record_is_modelled_once_also_if_the_filter_starts_late(smooth, monkey
     modelled = setup.modelled_record(record, chosen)
     calls = []
     monkeypatch.setattr(setup.running, "compress", lambda *given: calls.append(given) or records.compress(*given))
-    found = workflows.run(record, setup=chosen, smooth=smooth)
+    found = workflows.estimating.run(record, setup=chosen, smooth=smooth)
     assert len(calls) == 1
     first = len(modelled.increments) - len(found.record.increments)
     assert first > 0

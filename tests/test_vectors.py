@@ -14,7 +14,7 @@ from strapdown.gyro import GyroSpec
 from strapdown.motion import orbit
 from strapdown.randomness import generator
 from strapdown.vectors import Accelerometer, AttitudeSensor, Faults, HeadingPair, Magnetometer, VectorSensor, triad
-from strapdown.vectors.sensors import sample_times
+from strapdown.vectors.sensor import sample_times
 
 CONE = motion.Coning(angle=0.3, frequency=0.7)
 FIELD = np.array([2e-5, 1e-5, -4e-5])

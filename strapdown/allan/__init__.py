@@ -2,7 +2,6 @@
 
 - ``deviation``: :func:`allan_deviation` with confidence intervals.
 - ``noise_fit``: :func:`fit_noise` by maximum likelihood, on the ``spectrum`` of the cosine transform.
-- ``gaps``: Allan deviation of a record with gaps.
 - ``power_laws``: The power law of the noise, and degrees of freedom under it.
 - ``temperature``: Bias as a polynomial in temperature.
 - ``parameters``: Noise parameters of a six-axis unit in the formats of Kalibr, PX4 and MATLAB.
@@ -31,6 +30,6 @@ __all__ = ["AllanDeviation", "NoiseFit", "allan_deviation", "fit_noise", "to_gyr
 
 def __getattr__(name: str) -> Any:
     """Load a submodule on first use (PEP 562)."""
-    if name in ("gaps", "parameters", "temperature"):
+    if name in ("parameters", "temperature"):
         return import_module(f"{__name__}.{name}")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

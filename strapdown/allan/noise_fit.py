@@ -256,11 +256,32 @@ def fit_noise(
     record, dt, scale = averaged(values, sample_interval, kind)
     level = confidence(level)
     checks.one_of("sensor", sensor, SENSORS)
-    chosen = tuple(checks.one_of("terms: term", term, TERMS) for term in terms)
-    chosen = tuple(term for term in TERMS if term in chosen)
+    given = [checks.one_of("terms: term", term, TERMS) for term in terms]
+    chosen = tuple(term for term in TERMS if term in given)
     random_terms = tuple(term for term in chosen if term != "rate_ramp")
     if not random_terms:
         raise InputError("terms names no random noise; add one of quantization, angle_random_walk, …")
+    segments = _segments(record, dt, random_terms, highest_frequency)
+    fits, misfits = [], []
+    for axis in range(record.shape[1]):
+        coefficients = [cosine_transform(record[one.place, axis], scale) for one in segments]
+        each, whole = binned(coefficients, segments, dt)
+        largest = scale * float(max(np.nanmax(record[:, axis]), -np.nanmin(record[:, axis])))
+        if not np.any(whole.square > (1e-13 * largest) ** 2 * whole.number):
+            raise InputError(
+                f"values, axis {axis}, has no noise (it is constant or a straight line); pass a recorded sensor"
+            )
+        fits.append(fit_axis(whole, "rate_ramp" in chosen))
+        misfits.append(_worst_misfit(coefficients, each, fits[-1].best, random_terms, segments, dt))
+    samples = sum(one.place.stop - one.place.start for one in segments)
+    fit = _of_axes(chosen, fits, misfits, level=level, samples=samples, sample_interval=dt)
+    return replace(fit, sensor=sensor)
+
+
+def _segments(
+    record: Array, dt: float, random_terms: tuple[str, ...], highest_frequency: float | None
+) -> list[Segment]:
+    """Return the segments of a record between its gaps, which have enough coefficients below the highest frequency."""
     places = without_gaps(np.asarray(~np.isnan(record).any(axis=1)))
     if not places:
         raise InputError(
@@ -271,22 +292,7 @@ def fit_noise(
         raise InputError(
             f"highest_frequency is {highest_frequency:g} Hz: only {sum(lasts)} coefficients are below it; raise it"
         )
-    segments = [segment(place, dt, random_terms, highest_frequency) for place in places]
-    fits, misfits = [], []
-    for axis in range(record.shape[1]):
-        rate = record[:, axis]
-        coefficients = [cosine_transform(rate[place], scale) for place in places]
-        each, whole = binned(coefficients, segments, dt)
-        largest = scale * float(max(np.nanmax(rate), -np.nanmin(rate)))
-        if not np.any(whole.square > (1e-13 * largest) ** 2 * whole.number):
-            raise InputError(
-                f"values, axis {axis}, has no noise (it is constant or a straight line); pass a recorded sensor"
-            )
-        fits.append(fit_axis(whole, "rate_ramp" in chosen))
-        misfits.append(_worst_misfit(coefficients, each, fits[-1].best, random_terms, segments, dt))
-    samples = sum(place.stop - place.start for place in places)
-    fit = _of_axes(chosen, fits, misfits, level=level, samples=samples, sample_interval=dt)
-    return replace(fit, sensor=sensor)
+    return [segment(place, dt, random_terms, highest_frequency) for place in places]
 
 
 def without_gaps(known: NDArray[np.bool_]) -> list[slice]:

@@ -23,12 +23,6 @@ NOISE_TYPES = {
 }
 """Name of each power law; the key is the exponent of f in the PSD of the rate."""
 
-ESTIMATORS = {
-    "overlapping": "overlapping Allan deviation, OADEV",
-    "robust": "Allan deviation by the median of second differences",
-}
-"""Estimators of :func:`allan_deviation`."""
-
 _FEWEST_BLOCKS = 30  # with fewer the lag-1 autocorrelation is too uncertain (SP 1065, §5.5.6)
 
 MANY_BLOCKS = 128

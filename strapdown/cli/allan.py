@@ -27,7 +27,6 @@ class _Identification:
     sensor: list[str] | None = Option(None, help="gyro (default), accelerometer or magnetometer; may be repeated.")
     rate: float | None = Option(None, help="Sample rate of an NPY file, Hz.")
     highest_frequency: float | None = Option(None, help="Maximum frequency of the fit, Hz.")
-    robust: bool = Option(False, "--robust", help="Compute the deviation from medians; does not affect the fit.")
     temperature: int | None = Option(
         None,
         metavar="ORDER",
@@ -101,19 +100,14 @@ def _identify(
     source = sd.recordings.read_samples(recording, sensor, rate=options.rate, gaps=True, **layout)
     interval, values, temperature = source.sample_interval, source.values, ""
     gaps = bool(np.isnan(values).any())
-    if gaps and options.robust:
-        raise InputError(f"{recording.name} has gaps, which --robust does not support; leave it out")
     try:
         if options.temperature is not None:
             values, listing, temperature = sd.allan.temperature.regressed(source, sensor, options.temperature)
             ui.show(listing)
         with ui.progress_bar("fit, deviation, figure"):
-            how: dict[str, Any] = {"kind": source.kind}
-            fit = sd.allan.fit_noise(
-                values, interval, sensor=sensor, highest_frequency=options.highest_frequency, **how
-            )
-            estimator = "robust" if options.robust else "overlapping"
-            deviation = sd.allan.allan_deviation(values, interval, estimator=estimator, **how)
+            highest = options.highest_frequency
+            fit = sd.allan.fit_noise(values, interval, kind=source.kind, sensor=sensor, highest_frequency=highest)
+            deviation = sd.allan.allan_deviation(values, interval, kind=source.kind)
             figure = sd.plots.allan_overview(deviation, fit)
     except InputError as error:
         raise InputError(f"{recording.name}: {error}") from None
@@ -122,14 +116,15 @@ def _identify(
     if gaps:
         shortest = sd.allan.noise_fit.SHORTEST
         ui.say(
-            f"Because of gaps the fit uses {fit.samples} samples in segments of {shortest} or more; the deviation uses all samples."
+            f"Because of gaps the fit uses {fit.samples} samples in segments of {shortest} or more; the deviation uses averages that have "
+            "most of their samples."
         )
     table = fit.listing()
     ui.show(table, title=f"Noise coefficients with {100.0 * fit.level:g} % intervals", notes=False)
     ui.say("For a term not detected in this record, the last column is an upper bound.")
     write_text(specification, sd.allan.parameters.to_specification(fit, f"{recording.name}, {length}"))
     unit = sd.allan.temperature.UNITS[sensor][1]
-    curve = {"estimator": deviation.estimator, "tau_s": deviation.taus, f"deviation_{unit}": deviation.deviation}
+    curve = {"tau_s": deviation.taus, f"deviation_{unit}": deviation.deviation}
     write_json(numbers, plain({"source": recording.name, **fit.summary(), **curve}))
     if temperature:
         write_text(warm, temperature)

@@ -105,6 +105,7 @@ def _planned(source: Path, scenario: str, model: _Model) -> tuple[Campaign | Non
     from strapdown import workflows
     from strapdown.estimation.setup import read_setup
     from strapdown.montecarlo import campaign as campaigns
+    from strapdown.workflows import filters
 
     own = _own_filter(model.filter_file)
     if source.suffix.lower() in _SUFFIXES:
@@ -124,7 +125,7 @@ def _planned(source: Path, scenario: str, model: _Model) -> tuple[Campaign | Non
         dispersions=None if model.dispersions is None else sd.montecarlo.read_dispersions(model.dispersions),
     )
     if model.states is None and model.filter_file is None and plan.setup.states is not None:
-        ui.say(workflows.state_words(plan.setup.states.names))
+        ui.say(filters.state_words(plan.setup.states.names))
     if plan.individuals:
         ui.say("Each run draws its own gyro and sensors: specified constant errors are standard deviations.")
     return None, plan

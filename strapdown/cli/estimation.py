@@ -16,6 +16,7 @@ from strapdown.files import reading, writable, write_json
 
 if TYPE_CHECKING:
     from strapdown.records import Estimate
+    from strapdown.workflows import Run
 
 FILES = ("estimate.h5", "errors.json", "states.json", "observability.json", "field.json", "calibration.toml")
 """Files that the command may write to its folder, in addition to figures."""
@@ -38,6 +39,13 @@ class _Shared:
     observability: bool = Option(False, "--observability", help="Report the observability of each state.")
     smooth: bool = Option(False, "--smooth", help="Also use the samples after each time (fixed-interval smoother).")
 
+    @property
+    def options(self) -> dict[str, Any]:
+        """Options of :func:`strapdown.estimate`."""
+        noise = self.gyro and sd.gyro.read_spec(self.gyro)
+        plain = {name: getattr(self, name) for name in ("gate", "robust", "smooth", "full_covariance")}
+        return plain | {"noise": noise}
+
 
 @dataclass(frozen=True, eq=False)
 class _Specified:
@@ -49,6 +57,15 @@ class _Specified:
     attitude: str | None = Option(None, help="Initial attitude, w,x,y,z. Default: from the first measurements.")
     from_truth: bool = Option(False, "--from-truth", help="Start from the truth with errors drawn from the filter's σ.")
     every: int = Option(1, help="Store every n-th filter step.")
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Options of :func:`strapdown.estimate`."""
+        from strapdown.estimation.setup import read_setup
+
+        setup = self.filter_file and read_setup(self.filter_file)
+        states: Any = self.state or self.states
+        return {"setup": setup, "states": states, "initial": self.initial, "every": self.every}
 
     @property
     def initial(self) -> Any:
@@ -96,6 +113,18 @@ class _Recorded:
             raise InputError(f"--place is {self.place!r}; give LATITUDE,LONGITUDE or LATITUDE,LONGITUDE,HEIGHT")
         return sd.ahrs.MagneticField.at(latitude, longitude, *height, date=self.date)
 
+    @property
+    def options(self) -> dict[str, Any]:
+        """Options of :func:`strapdown.estimate`."""
+        one_of("--motion", self.motion or "hand", sd.ahrs.MOTIONS)
+        late = self.latency
+        return {
+            "motion": self.motion,
+            "latency": None if late is None else 1e-3 * non_negative("--latency", late, unit="ms"),
+            "calibration": self.calibration and sd.calibration.read(self.calibration),
+            "temperature": self.temperature and sd.gyro.temperature.read(self.temperature),
+        }
+
 
 @dataclass(frozen=True, eq=False)
 class _Output:
@@ -127,8 +156,7 @@ def estimate(
     The accelerometer gives the vertical and the magnetometer the heading. If the recording contains its specification, like those of
     `strapdown simulate`, the filter matches it.
     """
-    from strapdown import workflows
-    from strapdown.estimation.setup import observability, read_setup
+    from strapdown.workflows.estimating import run as run_filter
 
     out, form = output.out, output.form or ("png" if output.figures else None)
     names = (*FILES, *(f"{name}.{form or 'png'}" for name in FIGURES))
@@ -139,22 +167,7 @@ def estimate(
     simulated = sd.recordings.is_record(recording)
     for name in ui.options_given(recorded if simulated else specified):
         raise InputError(f"{name} goes with a record{'ing' if simulated else ' of `strapdown simulate`'}; leave it out")
-    options: dict[str, Any] = {"gate": shared.gate, "robust": shared.robust, "smooth": shared.smooth}
-    options |= {"noise": shared.gyro and sd.gyro.read_spec(shared.gyro), "full_covariance": shared.full_covariance}
-    if simulated:
-        states: Any = specified.state or specified.states
-        setup = specified.filter_file and read_setup(specified.filter_file)
-        options |= {"setup": setup, "states": states, "initial": specified.initial, "every": specified.every}
-    else:
-        late = recorded.latency
-        options |= {
-            "motion": recorded.motion,
-            "latency": None if late is None else 1e-3 * non_negative("--latency", late, unit="ms"),
-            "calibration": recorded.calibration and sd.calibration.read(recorded.calibration),
-            "temperature": recorded.temperature and sd.gyro.temperature.read(recorded.temperature),
-            "walks": shared.observability,
-        }
-        one_of("--motion", recorded.motion or "hand", sd.ahrs.MOTIONS)
+    options = shared.options | (specified.options if simulated else recorded.options)
     field = recorded.field
     with ui.progress_bar("reading"):
         source: Any = sd.read(recording, **layout.options(recording))
@@ -163,32 +176,22 @@ def estimate(
             raise InputError(f"--place is for the field, and {recording} has no magnetometer; leave it out")
         ui.warn_about_conventions(source, recording)
     with ui.progress_bar("smoothing" if shared.smooth else "filtering"):
-        run = workflows.run(source, **options)
-    result = run.estimate if field is None else field.to_true_north(run.estimate)
+        run = run_filter(source, walks=shared.observability, **options)
+    if field is not None:
+        run = run._replace(estimate=field.to_true_north(run.estimate))
     if simulated:
         vectors = ", ".join(f"{len(one.time)} of {one.sensor}" for one in source.vectors) or "no measurements"
         length = source.time[-1] - source.time[0]
         ui.say(f"{recording.name}: {len(source.increments)} gyro samples over {length:.6g} s, {vectors}.")
-    ui.say(*result.remarks)
-    ui.show(result.listing())
+    ui.say(*run.estimate.remarks)
+    ui.show(run.estimate.listing())
     _clear(out)
-    contents: dict[str, Any] = {}
+    contents = _shown(run, observability=shared.observability)
     if field is not None:
-        compared = field.compared(source, result)
+        compared = field.compared(source, run.estimate)
         ui.say(str(compared))
         contents["field.json"] = compared.summary()
-    if result.error_states:
-        contents["states.json"] = {name: states.summary() for name, states in result.error_states.items()}
-    if shared.observability:
-        with ui.progress_bar("observability"):
-            shown = observability(run.record, run.setup, run.initial)
-        ui.say(str(shown))
-        contents["observability.json"] = shown.summary()
-    if result.truth is not None:
-        accuracy = sd.accuracy(result)
-        ui.show(accuracy.listing())
-        contents["errors.json"] = accuracy.summary()
-    paths = [sd.write(result, out / FILES[0])]
+    paths = [sd.write(run.estimate, out / FILES[0])]
     for file, content in contents.items():
         write_json(out / file, {"source": recording.name, **content})
         paths.append(out / file)
@@ -196,12 +199,31 @@ def estimate(
         paths.append(out / "calibration.toml")
         sd.calibration.write(run.calibration, paths[-1])
     for target, how in exports.items():
-        paths.append(sd.write(result, target, recording=None if simulated else source, **how))
+        paths.append(sd.write(run.estimate, target, recording=None if simulated else source, **how))
     if form is not None:
-        paths += _drawn(out, form, result, recording.name)
+        paths += _drawn(out, form, run.estimate, recording.name)
     ui.written(*paths)
-    if result.innovations:
+    if run.estimate.innovations:
         ui.say(f"Test the filter with `strapdown check {paths[0]}`.")
+
+
+def _shown(run: Run, *, observability: bool) -> dict[str, Any]:
+    """Print observability and errors of an estimate; return these and its error states as contents of JSON files."""
+    from strapdown.estimation import setup
+
+    contents: dict[str, Any] = {}
+    if run.estimate.error_states:
+        contents["states.json"] = {name: states.summary() for name, states in run.estimate.error_states.items()}
+    if observability:
+        with ui.progress_bar("observability"):
+            found = setup.observability(run.record, run.setup, run.initial)
+        ui.say(str(found))
+        contents["observability.json"] = found.summary()
+    if run.estimate.truth is not None:
+        accuracy = sd.accuracy(run.estimate)
+        ui.show(accuracy.listing())
+        contents["errors.json"] = accuracy.summary()
+    return contents
 
 
 def _exports(output: _Output, recording: Path, *, changed: bool) -> dict[Path, dict[str, Any]]:

@@ -149,7 +149,7 @@ def _diagnosed(
     from strapdown.estimation.setup import read_setup
     from strapdown.estimation.setup.for_record import unmodelled_errors
     from strapdown.recordings.recordfiles import read_record
-    from strapdown.workflows import no_state_words
+    from strapdown.workflows.filters import no_state_words
 
     if not isinstance(held, sd.records.Estimate):
         raise InputError("--record and --filter go with an estimate; for a Monte Carlo, replay a run first")

@@ -102,7 +102,7 @@ def covariance(
 ) -> None:
     """Predict the errors of a filter and their budget by source, by a covariance analysis without random noise."""
     from strapdown.estimation import setup
-    from strapdown.workflows import filter_for_scenario, state_words
+    from strapdown.workflows.filters import filter_for_scenario, state_words
 
     body = sd.scenarios.load_scenario(scenario)
     files = (out / "covariance.json", out / f"budget.{form}")

@@ -95,10 +95,10 @@ def tune(
     tables: Path | None = ui.TABLES,
 ) -> None:
     """Tune the filter by maximum likelihood, with a confidence interval for each parameter."""
-    from strapdown import workflows
     from strapdown.estimation.setup import read_setup, to_toml
     from strapdown.plots import tuning as drawing
     from strapdown.report import tunings
+    from strapdown.workflows.tuning import tuned
 
     count("seed", search.seed, minimum=0)
     for k, path in enumerate(records):
@@ -117,7 +117,7 @@ def tune(
             "and --truth tunes the filter with its gate and weights."
         )
     with ui.progress_bar("searches") as advance:
-        result, objective, _ = workflows.tuned(
+        result, objective, _ = tuned(
             sources,
             names=[path.name for path in records],
             setup=chosen,
@@ -151,15 +151,15 @@ def tune(
 
 def _sources(paths: list[Path], chosen: FilterSetup | None, start: _Filter, layout: Layout) -> list[Any]:
     """Return the records; say what the filter of the first does not model."""
-    from strapdown import workflows
     from strapdown.recordings import recordfiles
+    from strapdown.workflows.filters import matched_filter
 
     sources: list[Any] = []
     for path in paths:
         if recordfiles.is_record(path):
             source: Any = recordfiles.read_record(path)
             if chosen is None and not any(isinstance(one, type(source)) for one in sources):
-                ui.say(*workflows.matched_filter(source, states=start.states)[1])
+                ui.say(*matched_filter(source, states=start.states)[1])
         else:
             if start.states:
                 raise InputError(f"{path} is a recording, which specifies no errors; --states is for simulated records")

@@ -10,7 +10,7 @@ between frames and a constant error of the filter are indistinguishable.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -241,8 +241,8 @@ def _checked(
         judgement = judge(estimate, truth, **how)
         assert whole.covariance is not None
         whole = replace(whole, covariance=read_as(chosen, whole.covariance, whole.attitude))
-        level = how["confidence_level"]
-        explained = explanations(error, readings, chosen, found, truth, own.time, aligned, own.bias, level)
+        moved, level = Series(own.time, aligned, bias=own.bias), how["confidence_level"]
+        explained = explanations(error, readings, chosen, found, truth, moved, confidence_level=level)
     return Checked(
         judgement=judgement,
         estimate=estimate,
@@ -350,25 +350,38 @@ def explanations(
     chosen: str,
     probabilities: Mapping[str, float],
     truth: Truth,
-    time: Array,
-    attitude: Array,
-    bias: Array | None = None,
+    own: Series,
+    *,
     confidence_level: float = 0.99,
 ) -> tuple[Explanation, ...]:
     """Return differences that would explain the errors, (m, 3) of the attitude, better than the covariance, the most likely first.
 
-    For a consistent filter none is likely with ``confidence_level``.
+    ``own`` is the aligned estimate. For a consistent filter none is likely with ``confidence_level``.
     """
-    P = readings[chosen][:, :3, :3]
-    white = whitened(error, P)
-    factor = np.linalg.cholesky(P)
-    whole = jacobian(time, attitude, truth)
+    P = readings[chosen]
+    found = [
+        *_constant_differences(error, P[:, :3, :3], jacobian(own.time, own.attitude, truth)),
+        _wrong_scale(whitened(error, P[:, :3, :3])),
+        *_zero_bias(own, truth, P),
+        *_other_frames(error, readings, chosen, probabilities),
+    ]
+    order = sorted(found, key=lambda one: one.p_value)
+    for rank, one in enumerate(order):  # Holm
+        if one.p_value > (1.0 - confidence_level) / (len(order) - rank):
+            break
+        order[rank] = replace(one, likely=True)
+    # Specific causes come before a factor on σ, which would absorb all of them.
+    return tuple(sorted(order, key=lambda one: (not one.likely, one.name == SCALE, one.p_value)))
+
+
+def _constant_differences(error: Array, P: Array, derivatives: Array) -> Iterator[Explanation]:
+    """Yield constant rotations of the frames and a clock offset; ``derivatives`` (m, 3, 7) are those of the error with respect to them."""
+    white, factor = whitened(error, P), np.linalg.cholesky(P)
     designs = {
-        "constant rotation of the fixed frame (heading, gravity)": whole[:, :, :3],
-        "constant rotation of the body frame (mounting)": whole[:, :, 3:6],
-        "offset of the clock, delay": whole[:, :, 6:],
+        "constant rotation of the fixed frame (heading, gravity)": derivatives[:, :, :3],
+        "constant rotation of the body frame (mounting)": derivatives[:, :, 3:6],
+        "offset of the clock, delay": derivatives[:, :, 6:],
     }
-    found = []
     for name, J in designs.items():
         A = np.linalg.solve(factor, J)
         N = np.einsum("mij,mik->jk", A, A)
@@ -378,36 +391,42 @@ def explanations(
         left = white - np.einsum("mij,j->mi", A, x)
         size = f"{1e3 * x[0]:.4g} ms" if len(x) == 1 else f"{', '.join(f'{v / DEGREE:.3g}' for v in x)}°"
         p_value = _constant_p_value(N @ x, np.einsum("mij,mi->mj", A, left))
-        found.append(Explanation(name=name, value=size, nees=float(np.mean(left**2)), p_value=p_value))
+        yield Explanation(name=name, value=size, nees=float(np.mean(left**2)), p_value=p_value)
+
+
+def _wrong_scale(white: Array) -> Explanation:
+    """Return one factor on σ as the explanation of whitened errors (m, 3)."""
     average = time_average(white, np.broadcast_to(np.eye(3), (len(white), 3, 3))) if len(white) > MIN_ROWS else None
     p_value, scale = 1.0, math.sqrt(float(np.mean(white * white)))
     if average is not None and average.reliable:
         p_value = mean_p_value(average.mean, 3, average.effective, certainty=average.certainty)
-    found.append(Explanation(name=SCALE, value=f"{scale:.3g}", nees=1.0, p_value=p_value))
-    if bias is not None and not bias.any() and truth.has_bias:
-        rms = float(np.sqrt(np.mean(np.sum(truth.bias**2, axis=1))))
-        sigma = np.sqrt(float(np.mean(np.trace(readings[chosen][:, 3:, 3:], axis1=1, axis2=2))))
-        value = f"{rms / DEGREE_PER_HOUR:.3g} °/h"
-        found.append(Explanation(name=NO_BIAS, value=value, nees=math.nan, p_value=0.0 if rms > 3.0 * sigma else 1.0))
-    for name, P_other in readings.items():
+    return Explanation(name=SCALE, value=f"{scale:.3g}", nees=1.0, p_value=p_value)
+
+
+def _zero_bias(own: Series, truth: Truth, P: Array) -> Iterator[Explanation]:
+    """Yield a gyro bias that the filter holds at zero, if the truth has one."""
+    if own.bias is None or own.bias.any() or not truth.has_bias:
+        return
+    rms = float(np.sqrt(np.mean(np.sum(truth.bias**2, axis=1))))
+    sigma = np.sqrt(float(np.mean(np.trace(P[:, 3:, 3:], axis1=1, axis2=2))))
+    value = f"{rms / DEGREE_PER_HOUR:.3g} °/h"
+    yield Explanation(name=NO_BIAS, value=value, nees=math.nan, p_value=0.0 if rms > 3.0 * sigma else 1.0)
+
+
+def _other_frames(
+    error: Array, readings: Mapping[str, Array], chosen: str, probabilities: Mapping[str, float]
+) -> Iterator[Explanation]:
+    """Yield the definitions of the covariance that the errors fit better than the one used."""
+    for name, P in readings.items():
         if name == chosen or probabilities[name] <= probabilities[chosen]:
             continue
-        other = whitened(error, P_other[:, :3, :3])
-        found.append(
-            Explanation(
-                name=f"covariance meant as {name}",
-                value=f"{100.0 * probabilities[name]:.3g} %",
-                nees=float(np.mean(other * other)),
-                p_value=min(1.0, probabilities[chosen] / max(probabilities[name], 1e-300)),
-            )
+        white = whitened(error, P[:, :3, :3])
+        yield Explanation(
+            name=f"covariance meant as {name}",
+            value=f"{100.0 * probabilities[name]:.3g} %",
+            nees=float(np.mean(white * white)),
+            p_value=min(1.0, probabilities[chosen] / max(probabilities[name], 1e-300)),
         )
-    order = sorted(found, key=lambda one: one.p_value)
-    for rank, one in enumerate(order):  # Holm
-        if one.p_value > (1.0 - confidence_level) / (len(order) - rank):
-            break
-        order[rank] = replace(one, likely=True)
-    # Specific causes come before a factor on σ, which would absorb all of them.
-    return tuple(sorted(order, key=lambda one: (not one.likely, one.name == SCALE, one.p_value)))
 
 
 def _constant_p_value(total: Array, scores: Array) -> float:

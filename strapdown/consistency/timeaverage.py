@@ -117,7 +117,9 @@ def effective_samples(white: ArrayLike, first: int | None = None) -> float:
     z = array("white", white, ("m", "n"))
     m, n = z.shape
     k = n if first is None else first
-    A = np.linalg.lstsq(z[:-1], z[1:], rcond=None)[0].T
+    # The normal equations by einsum: BLAS and LAPACK would wake threads for the long sums, at many times the cost of the sums.
+    gram, lagged = np.einsum("ki,kj->ij", z[:-1], z[:-1]), np.einsum("ki,kj->ij", z[:-1], z[1:])
+    A = np.linalg.lstsq(gram, lagged, rcond=None)[0].T
     # Least squares underestimates the autoregression of a series of known mean by a fraction 2/m (Kendall 1954).
     A = A * (1.0 + 2.0 / m)
     powers, lags = A[None], np.arange(1, POWERS + 1)

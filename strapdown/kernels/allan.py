@@ -1,4 +1,4 @@
-"""Record loops of the Allan variance: the phase of a rate record, second differences of the phase, and pairs of samples around gaps."""
+"""Record loops of the Allan variance: the phase of a rate record, and second differences of the phase."""
 
 from __future__ import annotations
 
@@ -56,38 +56,3 @@ def second_difference_squares(phase, multiples, lanes, carries, squares):
             raised = squares[j] + total
             carries[j] = (raised - squares[j]) - total
             squares[j] = raised
-
-
-def second_difference_sizes(phase, m, stride, sizes):
-    """Fill sizes with |x[k + 2m] − 2 x[k + m] + x[k]| at k = 0, stride, 2 stride and so on."""
-    for i in range(sizes.shape[0]):
-        k = i * stride
-        sizes[i] = abs((phase[k + 2 * m] - phase[k + m]) - (phase[k + m] - phase[k]))
-
-
-def variance_of_pairs(values, excess, known, half, sums, counts, variance):
-    """Fill variance (s,) with the Allan variance of averages of ``half`` of the values (s, n) of each series, from pairs of known ones.
-
-    Over all windows of 2 half values, ``(x_i − x_j)²`` has a mean for each pair of places in the window; NaN if a pair is never known. Each
-    square is reduced by ``excess`` (s, n) of both values. ``known`` (n,) is 1 or 0; ``sums`` and ``counts`` (n + 1,) are scratch.
-    """
-    count = values.shape[1]
-    windows = count - 2 * half + 1
-    sums[0] = 0.0
-    counts[0] = 0.0
-    for j in range(variance.shape[0]):
-        variance[j] = 0.0
-    for lag in range(1, 2 * half):
-        for i in range(count - lag):
-            counts[i + 1] = counts[i] + known[i] * known[i + lag]
-        for j in range(variance.shape[0]):
-            for i in range(count - lag):
-                difference = values[j, i] - values[j, i + lag]
-                square = difference * difference - excess[j, i] - excess[j, i + lag]
-                sums[i + 1] = sums[i] + known[i] * known[i + lag] * square
-            total = 0.0
-            for place in range(2 * half - lag):
-                number = counts[place + windows] - counts[place]
-                mean = (sums[place + windows] - sums[place]) / number
-                total += mean if place < half <= place + lag else -mean
-            variance[j] += 0.5 * total / (half * half)

@@ -303,11 +303,9 @@ def iterated_update(form, i, e, measured, passes, options):
     while True:
         rows, y, p, variance, far, along = linearised(form, i, e, now_q, q, M, measured, kind, sensor, prior)
         S = innovation_covariance(form, i, state, rows)
-        F = factored((S[0] + variance[0], S[1], S[2], S[3] + variance[1], S[4], S[5] + variance[2]))
+        F = factored(with_noise(S, variance))
         innovation = (y[0] - p[0], y[1] - p[1], y[2] - p[2])
-        e1 = innovation[0]
-        e2 = innovation[1] - F[0] * e1
-        e3 = innovation[2] - F[1] * e1 - F[2] * e2
+        e1, e2, e3 = independent(F, innovation)
         accepted = e1 * e1 * F[3] + e2 * e2 * F[4] + e3 * e3 * F[5] <= threshold
         if kind == DIRECTION and along < 0.0 and threshold < math.inf:
             accepted = False  # more than 90° from the predicted one, which the transverse rows cannot detect
@@ -318,8 +316,7 @@ def iterated_update(form, i, e, measured, passes, options):
         if options.robust > 0:
             # Linearised at the result of the weighted update: that of an outlier lies elsewhere.
             weight = robust_weight(options.robust, parameter, numerator, options.iterations, S, innovation, variance)
-            r = scale(1.0 / weight, variance)
-            weighted = factored((S[0] + r[0], S[1], S[2], S[3] + r[1], S[4], S[5] + r[2]))
+            weighted = factored(with_noise(S, scale(1.0 / weight, variance)))
         u = solved(weighted, (far * y[0] - p[0], far * y[1] - p[1], innovation[2]))
         step, squared = step_of(form, i, state, rows, u, M, prior, q, now_q)
         converged = squared < tolerance * tolerance
@@ -349,14 +346,30 @@ def iterated_update(form, i, e, measured, passes, options):
         outcome = ACCEPTED
         lost = min(F[3] * variance[0], F[4] * variance[1], F[5] * variance[2]) < 1.0 / MAX_PRECISION
         state, taken = correct(form, i, state, rows, innovation, scale(1.0 / weight, variance))
-        taken = add(prior, matrix_times_vector(M, taken))
-        state = turn_tangent(form, i, state, M)
-        A = attitude_covariance(form, i, state)
-        new_q, G = moved(now_q, taken)
-        if A[0] + A[3] + A[5] > KNOWN:
-            _, G = seen_from(taken, A)
-        state = turn_tangent(form, i, state, G)
-        save(form, i, set_attitude(form, i, state, new_q, q))
+        reset_from(form, i, state, q, now_q, add(prior, matrix_times_vector(M, taken)), M)
     else:
         weight = 0.0
     return outcome, weight, (e1, e2, e3), (1.0 / F[3], 1.0 / F[4], 1.0 / F[5]), lost
+
+
+def with_noise(S, variance):
+    """Return an innovation covariance, upper triangle (6,), with the noise of its rows added."""
+    return S[0] + variance[0], S[1], S[2], S[3] + variance[1], S[4], S[5] + variance[2]
+
+
+def independent(F, innovation):
+    """Return the innovations (3,) made independent by the factors of their covariance."""
+    e1 = innovation[0]
+    e2 = innovation[1] - F[0] * e1
+    return e1, e2, innovation[2] - F[1] * e1 - F[2] * e2
+
+
+def reset_from(form, i, state, q, now_q, step, M):
+    """Move the attitude of the linearisation by a step, and the covariance to the tangent space of the result."""
+    state = turn_tangent(form, i, state, M)
+    A = attitude_covariance(form, i, state)
+    new_q, G = moved(now_q, step)
+    if A[0] + A[3] + A[5] > KNOWN:
+        _, G = seen_from(step, A)
+    state = turn_tangent(form, i, state, G)
+    save(form, i, set_attitude(form, i, state, new_q, q))

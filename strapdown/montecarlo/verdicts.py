@@ -10,6 +10,7 @@ import numpy as np
 
 from strapdown import consistency, covariance, units
 from strapdown.checks import Array, InputError
+from strapdown.consistency import Finding
 from strapdown.estimation.setup import MEKF, FilterSetup
 from strapdown.files import plain
 from strapdown.montecarlo.plan import Plan, initial_sigmas
@@ -70,37 +71,18 @@ def summary(
     chosen = judged_epochs(len(statistics.time) - 1) if epochs is None else epochs
     judgement = statistics.judge(epochs=chosen, confidence_level=confidence_level)
     found = {(one.name, one.of): one for one in judgement.findings}
-    nees = {}
-    for subset in statistics.subsets:
-        mean, one = statistics.verdict(chosen, subset).mean, found["ANEES", subset]
-        nees[subset] = {
-            "anees": mean.mean(),
-            "least": mean.min(),
-            "greatest": mean.max(),
-            "bounds": [one.low, one.high],
-            "epochs_outside": int(np.sum(~((mean >= one.low) & (mean <= one.high)))),
-            "consistent": not one.rejected,
-        }
-    nis = [
-        {
-            "sensor": sensor,
-            "nis": statistics.sensor_nis[i],
-            "bounds": [test.low, test.high],
-            "degrees_of_freedom": int(statistics.sensor_degrees[i].sum()),
-            "refused": int(statistics.sensor_refused[i].sum()),
-            "consistent": not test.rejected,
-        }
-        for i, sensor in enumerate(statistics.sensors)
-        if (test := found.get(("NIS", sensor))) is not None
-    ]
     covered = statistics.covered[chosen]
     table = {
         "runs": statistics.runs,
         "failed_runs": statistics.failed,
         "confidence_level": confidence_level,
         "epochs_judged": len(chosen),
-        "nees": nees,
-        "nis": nis,
+        "nees": {subset: _nees(statistics, chosen, subset, found["ANEES", subset]) for subset in statistics.subsets},
+        "nis": [
+            _nis(statistics, i, found["NIS", name])
+            for i, name in enumerate(statistics.sensors)
+            if ("NIS", name) in found
+        ],
         "coverage": {
             "expected": list(COVERED),
             "attitude": covered[:, :3].mean(axis=(0, 1)),
@@ -115,6 +97,31 @@ def summary(
         "consistent": statistics.failed == 0 and judgement.verdict != "not consistent",
     }
     return plain(table)  # type: ignore[no-any-return]
+
+
+def _nees(statistics: Statistics, epochs: Counts, subset: str, finding: Finding) -> dict[str, Any]:
+    """Return the ANEES of a subset of the states at these epochs."""
+    mean = statistics.verdict(epochs, subset).mean
+    return {
+        "anees": mean.mean(),
+        "least": mean.min(),
+        "greatest": mean.max(),
+        "bounds": [finding.low, finding.high],
+        "epochs_outside": int(np.sum(~((mean >= finding.low) & (mean <= finding.high)))),
+        "consistent": not finding.rejected,
+    }
+
+
+def _nis(statistics: Statistics, sensor: int, finding: Finding) -> dict[str, Any]:
+    """Return the NIS per degree of freedom of a sensor."""
+    return {
+        "sensor": statistics.sensors[sensor],
+        "nis": statistics.sensor_nis[sensor],
+        "bounds": [finding.low, finding.high],
+        "degrees_of_freedom": int(statistics.sensor_degrees[sensor].sum()),
+        "refused": int(statistics.sensor_refused[sensor].sum()),
+        "consistent": not finding.rejected,
+    }
 
 
 def tables(summary: Mapping[str, Any]) -> list[Table]:

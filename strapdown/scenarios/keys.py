@@ -18,12 +18,14 @@ from typing import Any, Literal
 
 import numpy as np
 
-from strapdown import gyro, motion, scenarios, vectors
+from strapdown import gyro, motion, vectors
 from strapdown.checks import InputError
 from strapdown.files import tables
 from strapdown.gyro import datasheets
 from strapdown.motion import orbit
 from strapdown.results import Table
+from strapdown.scenarios import toml
+from strapdown.scenarios.scenario import Scenario, Temperature
 
 SYMBOLS = {
     "": "",
@@ -95,15 +97,15 @@ def sections() -> list[Section]:
     list of Section
         Tables in the order of a file, one for each type of motion and of sensor.
     """
-    said = _meanings(scenarios.Scenario)
+    said = _meanings(Scenario)
     names = (_text(name, said.get(name, "")) for name in ("name", "description"))
-    keys = (*names, *_keys(scenarios.Scenario, scenarios._TOP_FORM))
+    keys = (*names, *_keys(Scenario, toml.TOP_FORM))
     top = Section(group="top", header="top of the file", summary="before the first table.", keys=keys)
     warm = Section(
         group="gyro",
         header="[temperature]",
-        summary=_summary(scenarios.Temperature),
-        keys=_keys(scenarios.Temperature, scenarios._TEMPERATURE),
+        summary=_summary(Temperature),
+        keys=_keys(Temperature, toml.TEMPERATURE),
     )
     return [top, *_motions(), _gyro(), warm, *_sensors()]
 
@@ -177,8 +179,8 @@ def _motions() -> list[Section]:
     def keys_of(word: str, kind: type, form: tables.Form) -> tuple[Key, ...]:
         return tuple(replace(k, **lists.get(k.name, {})) if word == "sampled" else k for k in _keys(kind, form))
 
-    found = [section(word, kind, keys_of(word, kind, form)) for word, (kind, form) in scenarios._MOTIONS.items()]
-    harmonic = _keys(motion.Harmonic, scenarios._HARMONIC)
+    found = [section(word, kind, keys_of(word, kind, form)) for word, (kind, form) in toml.MOTIONS.items()]
+    harmonic = _keys(motion.Harmonic, toml.HARMONIC)
     start = _keys(motion.ConstantRate, {"initial_attitude": tables.PLAIN})
     parts = " Each is a table with a `type` and keys of its own: `[motion.base]`, `[motion.vibration]`."
     return [
@@ -207,9 +209,9 @@ def _sensors() -> list[Section]:
 
     found = [
         section(word, kind, (*_keys(kind, form), *_keys(vectors.Faults, faults)))
-        for word, (kind, form, faults) in scenarios._SENSORS.items()
+        for word, (kind, form, faults) in toml.SENSORS.items()
     ]
-    return [*found, section("", orbit.CircularOrbit, _keys(orbit.CircularOrbit, scenarios._ORBIT), "[sensors.orbit]")]
+    return [*found, section("", orbit.CircularOrbit, _keys(orbit.CircularOrbit, toml.ORBIT), "[sensors.orbit]")]
 
 
 # ------------------------------------------------------------------------------------------------------- from the dataclasses

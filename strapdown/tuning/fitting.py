@@ -441,33 +441,46 @@ def fit(
     ranges = stage.each("intervals", interval, range(len(points[0])), threads)
     stage.what = "parameters not identified"
     point = _with_means(objective, best.point, ranges, known)
-    misfit = errors.misfit and not objective.composite
     return Tuning(
         parameters=tuple(
-            Estimated(
-                name=name,
-                start=float(np.exp(objective.start[j])),
-                value=float(np.exp(point[j])),
-                most_likely=float(np.exp(best.point[j])) if not best.local.settled[j] else 0.0,
-                lower=ranges[j].lower,
-                upper=ranges[j].upper,
-                standard_error=float(errors.standard[j]),
-                identified=ranges[j].identified,
-                note=_note(name, ranges[j], float(errors.standard[j]), best.local, j, known, doubtful=misfit),
-                unit=objective.unit(name),
-            )
-            for j, name in enumerate(objective.names)
+            _estimated(objective, best, j, point, ranges[j], errors, known) for j in range(len(objective.names))
         ),
         setup=objective.setup(point),
         point=point,
         before=local_at(objective, objective.start, known).value,
         after=best.local.value,
         covariance=errors.covariance,
-        misfit=misfit,
+        misfit=errors.misfit and not objective.composite,
         composite=objective.composite,
         starts=points,
         optima=np.array([optimum.point for optimum in optima]),
         agreeing=sum(1 for optimum in optima if optimum.local.value < best.local.value + NEGLIGIBLE),
+    )
+
+
+def _estimated(
+    objective: Objective,
+    best: Optimum,
+    j: int,
+    point: Array,
+    interval: _Known,
+    errors: _Errors,
+    priors: Mapping[str, Prior],
+) -> Estimated:
+    """Return parameter j with its interval; ``point`` has the values used in the filter."""
+    name, error = objective.names[j], float(errors.standard[j])
+    doubtful = errors.misfit and not objective.composite
+    return Estimated(
+        name=name,
+        start=float(np.exp(objective.start[j])),
+        value=float(np.exp(point[j])),
+        most_likely=float(np.exp(best.point[j])) if not best.local.settled[j] else 0.0,
+        lower=interval.lower,
+        upper=interval.upper,
+        standard_error=error,
+        identified=interval.identified,
+        note=_note(name, interval, error, best.local, j, priors, doubtful=doubtful),
+        unit=objective.unit(name),
     )
 
 

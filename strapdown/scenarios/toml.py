@@ -1,0 +1,345 @@
+"""Scenarios as TOML files with the units in the names of their keys; the built-in ones are such files in this package."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import os
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from strapdown import gyro, motion, vectors
+from strapdown.checks import InputError, instance, known_keys, one_of
+from strapdown.files import reading, tables
+from strapdown.files.tables import Form
+from strapdown.gyro import GyroSpec
+from strapdown.motion import Motion
+from strapdown.motion.orbit import CircularOrbit
+from strapdown.results import Column, Table
+from strapdown.scenarios.scenario import Scenario, Temperature
+from strapdown.vectors import Sensor
+
+BUILTIN = Path(__file__).parent / "builtin"
+
+SCENARIOS: tuple[str, ...] = tuple(sorted(path.stem for path in BUILTIN.glob("*.toml")))
+"""Names of the built-in scenarios."""
+
+_OWN = ("harmonics", "faults", "orbit", "acceleration_f")
+"""Fields that are not keys: tables, and functions, which cannot be written to a file."""
+
+
+def _form(kind: Any, units: Form) -> Form:
+    """Return the keys of a class; a field that is not in ``units`` is a plain number or word."""
+    return {one.name: units.get(one.name, tables.PLAIN) for one in dataclasses.fields(kind) if one.name not in _OWN}
+
+
+_OF_MOTIONS: Form = {
+    **dict.fromkeys(("angle", "rock_angle", "rock_phase", "rotation_vector"), tables.DEGREES),
+    **dict.fromkeys(("rate", "spin_rate", "precession_rate", "initial_rate", "mean"), tables.DEGREES_PER_SECOND),
+    **dict.fromkeys(("frequency", "rock_frequency"), tables.HERTZ),
+    **dict.fromkeys(("duration", "start", "time"), tables.SECONDS),
+    "inertia": (("kg_m2", 1.0),),
+    "ends": tables.TEXT,
+}
+MOTIONS: dict[str, tuple[type, Form]] = {
+    word: (kind, _form(kind, _OF_MOTIONS))
+    for word, kind in {
+        "coning": motion.Coning,
+        "spin-cone": motion.SpinCone,
+        "constant-rate": motion.ConstantRate,
+        "spin-rock": motion.SpinRock,
+        "slew": motion.Slew,
+        "torque-free": motion.TorqueFree,
+        "sampled": motion.SampledAttitude,
+        "harmonic-rates": motion.HarmonicRates,
+    }.items()
+}
+"""Motions by their ``type`` in a file, in addition to "rest" and "composed" (tables ``base`` and ``vibration``)."""
+
+HARMONIC: Form = {"amplitude": tables.DEGREES_PER_SECOND, "frequency": tables.HERTZ, "phase": tables.DEGREES}
+ORBIT: Form = {
+    "altitude": (("km", 1e3), ("m", 1.0)),
+    "inclination": tables.DEGREES,
+    "phase": tables.DEGREES,
+}
+
+_OF_SENSORS: dict[str, tables.Choice] = {
+    **dict.fromkeys(("name", "kind"), tables.TEXT),
+    "rate": tables.HERTZ,
+    **dict.fromkeys(("phase", "latency", "outages", "correlation_time", "duty_period"), tables.SECONDS),
+    **dict.fromkeys(("field_f", "hard_iron"), tables.NANOTESLAS),
+    **dict.fromkeys(("bias", "gravity_f"), tables.METRES_PER_SECOND_SQUARED),
+    **dict.fromkeys(("lever_arm_b", "baseline_b"), tables.METRES),
+}
+SENSORS: dict[str, tuple[type, Form, Form]] = {
+    word: (
+        kind,
+        _form(kind, _OF_SENSORS | dict.fromkeys(("sigma", "sigma_across", "sigma_about"), unit)),
+        _form(vectors.Faults, _OF_SENSORS | {"correlated_sigma": unit}),
+    )
+    for word, (kind, unit) in {
+        "direction": (vectors.VectorSensor, tables.ARCSECONDS),
+        "attitude": (vectors.AttitudeSensor, tables.ARCSECONDS),
+        "magnetometer": (vectors.Magnetometer, tables.NANOTESLAS),
+        "accelerometer": (vectors.Accelerometer, tables.METRES_PER_SECOND_SQUARED),
+        "horizon": (vectors.HorizonSensor, tables.ARCSECONDS),
+        "heading-pair": (vectors.HeadingPair, tables.METRES),
+    }.items()
+}
+"""Sensors by their ``type`` in a file: class, keys, keys of its faults. A horizon sensor has a table ``orbit``, and a magnetometer may have
+one instead of its field."""
+
+TOP_FORM: Form = {
+    "seed": tables.PLAIN,
+    "rate": tables.HERTZ,
+    "duration": tables.SECONDS,
+    "gravity_f": tables.METRES_PER_SECOND_SQUARED,
+}
+_TOP = ("name", "description", *tables.keys(TOP_FORM), "motion", "gyro", "temperature", "sensors")
+TEMPERATURE: Form = {"start": tables.DEGREES_CELSIUS, "end": tables.DEGREES_CELSIUS, "time_constant": tables.SECONDS}
+
+
+def load_scenario(name_or_path: str | os.PathLike[str]) -> Scenario:
+    """Return a built-in scenario by its name, or the scenario of a TOML file.
+
+    Parameters
+    ----------
+    name_or_path : str or path
+        A name of :data:`SCENARIOS`, or a path.
+
+    Returns
+    -------
+    Scenario
+        Scenario in SI units and radians, whatever the units of the keys.
+
+    Examples
+    --------
+    >>> from strapdown import scenarios
+    >>> scenarios.load_scenario("two-stars").rate
+    100.0
+    """
+    text = os.fspath(name_or_path)
+    path = Path(text)
+    if not path.exists():
+        if path.suffix == ".toml":
+            raise InputError(f"{path} does not exist; give a TOML file, or a built-in name: {', '.join(SCENARIOS)}")
+        path = BUILTIN / f"{one_of('scenario', text, SCENARIOS)}.toml"
+    with reading.from_file(path):
+        return _from_table(reading.toml(path), path.name)
+
+
+def scenario_from_toml(text: str, place: str = "scenario") -> Scenario:
+    """Return the scenario in a TOML text."""
+    return _from_table(reading.from_toml(text, place), place)
+
+
+LARGEST_NUMBER = 1e30
+"""Maximum of a number in a file, in any unit; squares and products of larger ones overflow."""
+MAX_MEASUREMENTS = 1e8
+"""Maximum number of measurements of one sensor; more do not fit into memory."""
+
+
+def _numbers(place: str, content: Any) -> Iterator[tuple[str, float]]:
+    """Yield the numbers in a TOML table with their places."""
+    if isinstance(content, dict):
+        for key, value in content.items():
+            yield from _numbers(f"{place}.{key}" if place else key, value)
+    elif isinstance(content, list):
+        for k, value in enumerate(content):
+            yield from _numbers(f"{place}[{k}]", value)
+    elif isinstance(content, (int, float)) and not isinstance(content, bool):
+        yield place, content
+
+
+def _from_table(table: dict[str, Any], place: str) -> Scenario:
+    for key, number in _numbers("", table):
+        if (
+            LARGEST_NUMBER < abs(number) <= float(np.finfo(float).max)
+        ):  # infinity is valid, as for a time that never comes
+            raise InputError(f"{place}: {key} is {number:g}, which is impossible; check it and its unit")
+    known_keys(place, table, _TOP)
+    for key in ("rate_hz", "duration_s", "motion"):
+        if key not in table:
+            raise InputError(f"{place}: {key} is missing; add it")
+    for key in ("name", "description"):
+        if not isinstance(table.get(key, ""), str):
+            raise InputError(f"{place}: {key} is {table[key]!r}; it must be a string")
+    preset, spec = _read_gyro(tables.subtable(table.get("gyro", {}), f"{place}: gyro"), f"{place}: gyro")
+    sensors = table.get("sensors", [])
+    if not isinstance(sensors, list):
+        raise InputError(f"{place}: sensors is one table; write [[sensors]] with two brackets")
+    values = {
+        "name": table.get("name", ""),
+        "description": table.get("description", ""),
+        "seed": table.get("seed", 0),
+        "rate": table["rate_hz"],
+        "duration": table["duration_s"],
+        "gravity_f": table.get("gravity_f_m_per_s2", vectors.GRAVITY_F),
+        "motion": _read_motion(tables.subtable(table["motion"], f"{place}: motion"), f"{place}: motion"),
+        "gyro": spec,
+        "gyro_preset": preset,
+        "sensors": tuple(_read_sensor(entry, f"{place}: sensors[{i}]") for i, entry in enumerate(sensors)),
+    }
+    if "temperature" in table:
+        where = f"{place}: temperature"
+        values["temperature"] = tables.build(
+            Temperature, tables.subtable(table["temperature"], where), TEMPERATURE, where
+        )
+    made: Scenario = tables.construct(Scenario, values, table, TOP_FORM, place)
+    if made.duration * made.rate < 1.0:
+        raise InputError(
+            f"{place}: {made.duration:g} s at {made.rate:g} Hz are less than one gyro sample; increase the duration or the rate"
+        )
+    for sensor in made.sensors:
+        number = made.duration * getattr(sensor, "rate", 0.0)
+        if number > MAX_MEASUREMENTS:
+            raise InputError(
+                f"{place}: {sensor.name} would measure {number:.3g} times, more than {MAX_MEASUREMENTS:.0e}; lower its rate or the duration"
+            )
+    return made
+
+
+def _word(table: dict[str, Any], place: str, choices: Any) -> str:
+    if "type" not in table:
+        raise InputError(f"{place}: type is missing; add one of {', '.join(choices)}")
+    return one_of(f"{place}: type", table.pop("type"), choices)
+
+
+def _read_motion(table: dict[str, Any], place: str) -> Motion:
+    word = _word(table, place, [*MOTIONS, "rest", "composed"])
+    if word == "rest":
+        form: Form = {"initial_attitude": tables.PLAIN}
+        return tables.construct(motion.rest, tables.decode(table, form, place), table, form, place)  # type: ignore[no-any-return]
+    if word == "composed":
+        known_keys(place, table, ("base", "vibration"))
+        parts = {
+            key: _read_motion(tables.subtable(table.get(key), f"{place}: {key}"), f"{place}: {key}")
+            for key in ("base", "vibration")
+        }
+        return motion.Composed(**parts)
+    kind, form = MOTIONS[word]
+    more: dict[str, Any] = {}
+    if kind is motion.HarmonicRates:
+        entries = table.pop("harmonics", [])
+        if not isinstance(entries, list):
+            raise InputError(f"{place}: harmonics is one table; write [[motion.harmonics]] with two brackets")
+        more["harmonics"] = tuple(
+            tables.build(
+                motion.Harmonic, tables.subtable(h, f"{place}: harmonics[{i}]"), HARMONIC, f"{place}: harmonics[{i}]"
+            )
+            for i, h in enumerate(entries)
+        )
+    return tables.build(kind, table, form, place, **more)  # type: ignore[no-any-return]
+
+
+def _write_motion(body: Motion) -> dict[str, Any]:
+    if isinstance(body, motion.Composed):
+        return {"type": "composed", "base": _write_motion(body.base), "vibration": _write_motion(body.vibration)}
+    for word, (kind, form) in MOTIONS.items():
+        if type(body) is kind:
+            table = {"type": word, **tables.encode(body, form)}
+            if isinstance(body, motion.HarmonicRates):
+                table["harmonics"] = [tables.encode(h, HARMONIC) for h in body.harmonics]
+            return table
+    raise InputError(f"a motion of class {type(body).__name__} cannot be written to a file; keep it in Python")
+
+
+def _read_gyro(table: dict[str, Any], place: str) -> tuple[str, GyroSpec]:
+    name = table.pop("preset", "")
+    if not name:
+        return "", gyro.from_table(table, place)
+    from strapdown.gyro import datasheets
+
+    spec = datasheets.PRESETS[one_of(f"{place}: preset", name, datasheets.PRESETS)].spec
+    return ("", gyro.from_table(table, place, spec)) if table else (name, spec)
+
+
+def _read_sensor(entry: Any, place: str) -> Sensor:
+    table = tables.subtable(entry, place)
+    word = _word(table, place, SENSORS)
+    kind, form, faults = SENSORS[word]
+    orbit = table.pop("orbit", None) if word in ("magnetometer", "horizon") else None
+    known_keys(place, table, {**tables.keys(form), **tables.keys(faults)})
+    amiss = {key: table.pop(key) for key in list(table) if key in tables.keys(faults)}
+    more: dict[str, Any] = {"faults": tables.build(vectors.Faults, amiss, faults, place)}
+    if orbit is not None:
+        orbit_place = f"{place}: orbit"
+        found = tables.build(CircularOrbit, tables.subtable(orbit, orbit_place), ORBIT, orbit_place)
+        more.update({"orbit": found} if word == "horizon" else {"field_f": found.magnetic_field})
+    elif word == "horizon":
+        raise InputError(f"{place}: orbit is missing; add the table [sensors.orbit]")
+    return tables.build(kind, table, form, place, **more)  # type: ignore[no-any-return]
+
+
+def _write_sensor(sensor: Any) -> dict[str, Any]:
+    word = next((word for word, (kind, _, _) in SENSORS.items() if type(sensor) is kind), None)
+    if word is None:
+        raise InputError(f"a sensor of class {type(sensor).__name__} cannot be written to a file; keep it in Python")
+    _, form, faults = SENSORS[word]
+    field, orbit = getattr(sensor, "field_f", None), getattr(sensor, "orbit", None)
+    if callable(field):
+        orbit = getattr(field, "__self__", None)
+        form = {name: choice for name, choice in form.items() if name != "field_f"}
+    for name in ("acceleration_f", "field_f"):
+        if callable(getattr(sensor, name, None)) and not isinstance(orbit, CircularOrbit):
+            raise InputError(
+                f"{sensor.name}: {name} is a function, which cannot be written to a file; keep it in Python"
+            )
+    table = {"type": word, **tables.encode(sensor, form), **tables.encode(sensor.faults, faults)}
+    return table if orbit is None else {**table, "orbit": tables.encode(orbit, ORBIT)}
+
+
+def scenario_to_table(scenario: Scenario) -> dict[str, Any]:
+    """Return a scenario as the table of its TOML file."""
+    table: dict[str, Any] = {}
+    for key in ("name", "description"):
+        if getattr(scenario, key):
+            table[key] = getattr(scenario, key)
+    table.update(seed=scenario.seed, rate_hz=scenario.rate, duration_s=scenario.duration)
+    if scenario.gravity_f != tuple(vectors.GRAVITY_F):
+        table["gravity_f_m_per_s2"] = list(scenario.gravity_f)
+    table["motion"] = _write_motion(scenario.motion)
+    table["gyro"] = {"preset": scenario.gyro_preset} if scenario.gyro_preset else gyro.to_table(scenario.gyro)
+    if scenario.temperature is not None:
+        table["temperature"] = tables.encode(scenario.temperature, TEMPERATURE)
+    table["sensors"] = [_write_sensor(sensor) for sensor in scenario.sensors]
+    return table
+
+
+def scenario_to_toml(scenario: Scenario) -> str:
+    """Return a scenario as TOML text, with the unit in each key; reading it gives a bitwise equal scenario."""
+    import tomli_w
+
+    text = tomli_w.dumps(scenario_to_table(scenario))
+    # A list of numbers on one line.
+    return re.sub(
+        r"\[\n((?: +[^\[\]{}\"\n]+,\n)+) *\]", lambda found: f"[{' '.join(found[1].split()).rstrip(',')}]", text
+    )
+
+
+def as_scenario(scenario: Scenario | str | os.PathLike[str]) -> Scenario:
+    """Return a scenario from a Scenario, a built-in name, or the path of its TOML file."""
+    instance(
+        "scenario",
+        scenario,
+        (Scenario, str, os.PathLike),
+        "give a Scenario, a built-in name, or the path of a TOML file",
+    )
+    return scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
+
+
+@functools.cache
+def builtin() -> Table:
+    """Return the built-in scenarios as a table."""
+    contents = {name: reading.toml(BUILTIN / f"{name}.toml") for name in SCENARIOS}
+    rows = [
+        (name, one["duration_s"], one["rate_hz"], one["gyro"].get("preset", "own figures"))
+        for name, one in contents.items()
+    ]
+    columns = ("name", Column("s", digits=6), Column("Hz", digits=6), "gyro")
+    notes = [f"{name}: {one['description']}" for name, one in contents.items()]
+    return Table("Built-in scenarios: `strapdown simulate NAME`", columns, rows, notes)

@@ -1,0 +1,322 @@
+"""Estimation of a record or a recording."""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from strapdown import (
+    ahrs,
+    quaternion,
+    records,
+    units,
+)
+from strapdown.ahrs.remarks import fixed_frame, remarks
+from strapdown.checks import Hint, InputError, array, count, instance
+from strapdown.estimation import setup as setups
+from strapdown.estimation.gating import Gate, Robust
+from strapdown.estimation.setup import FilterSetup, for_record
+from strapdown.estimation.states import ProcessNoise, State
+from strapdown.gyro import GyroSpec
+from strapdown.recordings import Recording
+from strapdown.records import Estimate, ImuRecord, Origin, Truth
+
+if TYPE_CHECKING:
+    from strapdown.allan import NoiseFit
+    from strapdown.calibration import UnitCalibration
+    from strapdown.gyro.temperature import BiasOverTemperature
+from strapdown.workflows.filters import filter_for_record, specification_of, with_gyro_noise
+
+SOURCE = "give an ImuRecord or a Recording, as simulate and read return them"
+
+
+class Run(NamedTuple):
+    """An estimate with what it was made from."""
+
+    estimate: Estimate
+    record: ImuRecord
+    """Input of the filter, from its start on (:func:`strapdown.estimation.setup.modelled_record`)."""
+    setup: FilterSetup
+    """The filter without gate and weights."""
+    initial: State
+    calibration: UnitCalibration | None = None
+    """Calibration of the unit that a recording yields."""
+
+
+def estimate(
+    source: ImuRecord | Recording,
+    *,
+    noise: GyroSpec | NoiseFit | ProcessNoise | None = None,
+    setup: FilterSetup | None = None,
+    initial: State | ArrayLike | str | None = None,
+    states: bool | Sequence[str] | None = None,
+    every: int = 1,
+    gate: Gate | float | None = None,
+    robust: Robust | str | None = None,
+    motion: str | None = None,
+    latency: float | None = None,
+    calibration: UnitCalibration | None = None,
+    temperature: BiasOverTemperature | None = None,
+    full_covariance: bool | None = None,
+    smooth: bool = False,
+) -> Estimate:
+    """Estimate attitude and gyro bias with a multiplicative extended Kalman filter, as the command ``strapdown estimate`` does.
+
+    For a simulated record, the filter matches the scenario and is initialised from the first measurements. For a recording, the
+    accelerometer gives the vertical and the magnetometer the heading (:mod:`strapdown.ahrs`), from the first sample on.
+
+    Parameters
+    ----------
+    source : ImuRecord or Recording
+        Result of :func:`simulate` or :func:`read`, or a record made from your own data.
+    noise : GyroSpec, NoiseFit or ProcessNoise, optional
+        Noise of the gyro: a specification, an Allan fit (:func:`fit_noise`), or the two coefficients of the filter. Default: that of the
+        record's origin; for a recording that of :data:`strapdown.ahrs.MOTIONS`.
+    setup : FilterSetup, optional
+        For a record: the complete filter, for example from :func:`tune`, in place of ``noise`` and ``states``.
+    initial : State, array_like (4,) or "truth", optional
+        For a record: initial state (:func:`initial_state`) at the first edge; an attitude q_fb, with the filter's σ; or the truth with
+        errors drawn from the filter's σ. Default: from the first measurements.
+    states : bool or sequence of str, optional
+        For a record: whether to add an error state for each error that the scenario specifies (scale factor, misalignment, hard iron, …),
+        or the names of those to add. Default: True if the scenario specifies such errors.
+    every : int, default 1
+        For a record: store every n-th filter step.
+    gate : Gate or float, optional
+        Reject measurements beyond this quantile of χ² (such as 0.999), and recover from a lost attitude.
+    robust : Robust or {"huber", "student"}, optional
+        Weight measurements by the size of their innovations.
+    motion : {"hand", "vehicle", "vessel", "any"}, optional
+        For a recording: model of the motion. ``"hand"``, the default: bounded velocity, as of a hand, a person or a small aircraft;
+        ``"vehicle"``: acceleration that lasts for seconds; ``"vessel"``: bounded position, as on waves; ``"any"``: white noise.
+    latency : float, optional
+        For a recording: delay of the gyro's samples, s. Default: half a sample interval.
+    calibration : UnitCalibration, optional
+        For a recording: calibration of the unit, from :func:`strapdown.calibrate`; the bias is then that of the corrected rates.
+    temperature : BiasOverTemperature, optional
+        For a recording: the gyro's bias over temperature (°C), which is subtracted first. Default: that of ``noise``.
+    full_covariance : bool, optional
+        Whether to store covariance matrices rather than their diagonals. Default: True, but for a recording without a reference attitude.
+    smooth : bool, default False
+        Whether to estimate each epoch from all measurements: see :func:`smooth`.
+
+    Returns
+    -------
+    Estimate
+        At the edges of the filter's steps (record) or at the stamps of the recording: ``time`` (m,) s, ``attitude`` (m, 4) q_fb,
+        ``bias`` (m, 3) rad/s, ``variance`` (m, 6) rad² and (rad/s)². The fixed frame of a recording is East-North-Up with magnetic North.
+        It has its filter (``setup``), its ``truth`` or reference if the source has one, and ``remarks``.
+
+    Raises
+    ------
+    InputError
+        If the gyro's noise is unknown, the initial attitude is not observable from the measurements, a recording has no accelerometer, or
+        an option does not apply to the source.
+
+    Warns
+    -----
+    UserWarning
+        If units, axes or signs of a recording seem wrong.
+
+    Examples
+    --------
+    >>> import strapdown as sd
+    >>> estimate = sd.estimate(sd.simulate("two-stars"))  # doctest: +SKIP
+    >>> estimate.attitude[-1], estimate.sigma[-1]  # doctest: +SKIP
+    """
+    options = locals()
+    if isinstance(source, Recording):
+        warn_about_conventions(source)
+    return run(**options).estimate
+
+
+def smooth(
+    source: ImuRecord | Recording,
+    *,
+    noise: GyroSpec | NoiseFit | ProcessNoise | None = None,
+    setup: FilterSetup | None = None,
+    initial: State | ArrayLike | str | None = None,
+    states: bool | Sequence[str] | None = None,
+    gate: Gate | float | None = None,
+    robust: Robust | str | None = None,
+    motion: str | None = None,
+    latency: float | None = None,
+    calibration: UnitCalibration | None = None,
+    temperature: BiasOverTemperature | None = None,
+    full_covariance: bool | None = None,
+) -> Estimate:
+    """Estimate attitude and gyro bias at each epoch from all measurements, before and after it (fixed-interval smoother).
+
+    Parameters
+    ----------
+    source : ImuRecord or Recording
+        Result of :func:`simulate` or :func:`read`, or a record made from your own data.
+    noise, setup, initial, states, gate, robust, motion, latency, calibration, temperature, full_covariance : optional
+        As for :func:`estimate`; ``latency`` in s, bias over ``temperature`` in °C.
+
+    Returns
+    -------
+    Estimate
+        Smoothed estimate at the same epochs and with the same fields as that of :func:`estimate`.
+
+    Raises
+    ------
+    InputError
+        As for :func:`estimate`, or if the record is too long for the memory.
+
+    References
+    ----------
+    H. E. Rauch, F. Tung, C. T. Striebel, Maximum likelihood estimates of linear dynamic systems, AIAA Journal 3(8), 1965.
+
+    Examples
+    --------
+    >>> import strapdown as sd
+    >>> sd.smooth(sd.simulate("two-stars", seed=1)).attitude.shape  # doctest: +SKIP
+    (30001, 4)
+    """
+    return estimate(**locals(), smooth=True)
+
+
+def run(
+    source: ImuRecord | Recording,
+    *,
+    gate: Gate | float | None = None,
+    robust: Robust | str | None = None,
+    walks: bool = False,
+    **options: Any,
+) -> Run:
+    """Return the estimate of :func:`estimate` with what it was made from; ``walks``: model the bias slope's error as a random walk."""
+    gate = Gate(probability=gate) if isinstance(gate, (int, float)) else gate
+    robust = Robust(kind=robust) if isinstance(robust, str) else robust  # type: ignore[arg-type]
+    instance("source", source, (ImuRecord, Recording), SOURCE)
+    recorded = isinstance(source, Recording)
+    others = ("motion", "latency", "calibration", "temperature")
+    for name in ("setup", "initial", "states", "every") if recorded else others:
+        value = options.pop(name, None) if recorded or name in others else None
+        if value not in (None, False) and not (name == "every" and value == 1):
+            raise InputError(f"{Hint(name)} goes with a record{'' if recorded else 'ing'}; leave it out")
+    if isinstance(source, Recording):
+        return _run_recording(source, gate, robust, walks=walks, **options)
+    changes = {name: value for name, value in (("gate", gate), ("robust", robust)) if value is not None}
+    return _run_record(source, changes, **options)
+
+
+def _run_record(
+    record: ImuRecord,
+    changes: Mapping[str, Any],
+    *,
+    noise: GyroSpec | NoiseFit | ProcessNoise | None = None,
+    setup: FilterSetup | None = None,
+    initial: State | ArrayLike | str | None = None,
+    states: bool | Sequence[str] | None = None,
+    every: int = 1,
+    full_covariance: bool | None = None,
+    smooth: bool = False,
+) -> Run:
+    """Run the filter over a record; ``changes``: the gate and the weights."""
+    if smooth and count("every", every) > 1:
+        raise InputError(f"{Hint('every')} stores some filter steps, but the smoother needs all; leave one of them out")
+    chosen, notes = filter_for_record(record, noise, setup, initial, states)
+    chosen = dataclasses.replace(chosen, **changes)
+    modelled = setups.modelled_record(record, chosen)
+    if every > len(modelled.increments):
+        raise InputError(
+            f"every is {every}, more than the {len(modelled.increments)} filter steps of the record; only the first epoch would be kept"
+        )
+    if initial is None:
+        begin = for_record.start(modelled, chosen)
+    elif isinstance(initial, str) and initial == "truth":
+        begin = for_record.drawn_start(record, chosen)
+    elif isinstance(initial, State):
+        begin = for_record.Start(initial, "Started from the state given.")
+    else:
+        q = array("initial", initial, (4,))  # type: ignore[arg-type]
+        if not q.any():
+            raise InputError("initial is the zero quaternion; give w, x, y, z of an attitude")
+        begin = for_record.Start(
+            setups.initial_state(chosen, quaternion.normalize(q)), "Started from the attitude given."
+        )
+    if begin.edge > 0:
+        modelled = records.cut(modelled, begin.edge, len(modelled.increments))
+        if every > len(modelled.increments):
+            raise InputError(
+                f"every is {every}, more than the {len(modelled.increments)} filter steps after the start of the filter"
+            )
+    full = full_covariance is not False
+    if smooth:
+        result = setups.smooth_modelled(modelled, chosen, begin.state, full_covariance=full)
+    else:
+        result = setups.run_modelled(modelled, chosen, begin.state, every=every, full_covariance=full)
+    truth = None if modelled.truth is None else modelled.truth.taken(np.searchsorted(modelled.time, result.time))
+    result = dataclasses.replace(
+        result, setup=chosen, origin=record.origin, truth=truth, smoothed=smooth, remarks=(begin.words, *notes)
+    )
+    return Run(result, modelled, chosen, begin.state)
+
+
+def _run_recording(
+    source: Recording,
+    gate: Gate | None,
+    robust: Robust | None,
+    *,
+    noise: GyroSpec | NoiseFit | ProcessNoise | None = None,
+    temperature: BiasOverTemperature | None = None,
+    motion: str | None = None,
+    walks: bool = False,
+    full_covariance: bool | None = None,
+    smooth: bool = False,
+    **options: Any,
+) -> Run:
+    """Run the filter over a recording; its estimate has the setup, the reference, and remarks on the start, the motion and the samples."""
+    motion = motion or "hand"
+    ahrs.need_accelerometer(source)
+    parameters, notes = ahrs.of_motion(motion, magnetometer=source.magnetic_field is not None, smooth=smooth), []
+    if isinstance(noise, ProcessNoise):
+        parameters = dataclasses.replace(
+            parameters, angle_random_walk=noise.angle_random_walk, rate_random_walk=noise.rate_random_walk
+        )
+    elif noise is not None:
+        spec = specification_of(noise)
+        parameters, temperature = with_gyro_noise(parameters, spec), temperature or spec.temperature
+        arw = parameters.angle_random_walk / units.DEGREE_PER_ROOT_HOUR
+        rrw = parameters.rate_random_walk / units.DEGREE_PER_HOUR_PER_ROOT_HOUR
+        notes = [f"Gyro noise, flicker included: {arw:.3g} °/√h, bias random walk {rrw:.3g} °/h/√h."]
+    if temperature is not None:
+        source, parameters = ahrs.without_temperature(source, parameters, temperature, walks=walks or smooth)
+    reference = source.true_attitude
+    if reference is not None and source.movement is not None:
+        judged = np.isfinite(reference).all(axis=1) & source.movement
+        if not judged.any():
+            raise InputError(
+                f"{source.source}: no sample to judge has a reference attitude; check its movement mask and its reference"
+            )
+    full = reference is not None if full_covariance is None else full_covariance
+    result = ahrs.estimate(source, parameters, gate=gate, robust=robust, full_covariance=full, smooth=smooth, **options)
+    used = result.recording
+    estimate = dataclasses.replace(
+        result.estimate,
+        setup=dataclasses.replace(result.parameters.setup, gate=gate, robust=robust),
+        origin=Origin(source=used.source),
+        truth=None if used.true_attitude is None else Truth.of_reference(used.true_attitude, used.movement),
+        fixed_frame=fixed_frame(used),
+        motion=motion,
+        smoothed=smooth,
+        remarks=(*remarks(result, motion), *notes),
+        details={
+            **{f"parameter.{name}": value for name, value in vars(result.parameters).items()},
+            "latency": result.delays.last_gyro,
+            "magnetometer_latency": result.delays.last_field,
+        },
+    )
+    return Run(estimate, result.record, result.parameters.setup, result.initial, result.calibration)
+
+
+def warn_about_conventions(source: Recording) -> None:
+    """Warn the caller of the calling function if axes, signs or units of a recording seem wrong."""
+    for words in ahrs.check_conventions.examine(source).warnings:
+        warnings.warn(f"{source.source}: {words}", stacklevel=3)

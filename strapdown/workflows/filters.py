@@ -1,0 +1,143 @@
+"""The filter that a record or a scenario gets, and what is said of its error states."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from strapdown import (
+    ahrs,
+    allan,
+    gyro,
+    units,
+)
+from strapdown.checks import Hint, InputError, instance
+from strapdown.estimation import setup as setups
+from strapdown.estimation.setup import FilterSetup, for_record
+from strapdown.estimation.states import ProcessNoise, State
+from strapdown.gyro import GyroSpec
+from strapdown.records import ImuRecord
+from strapdown.scenarios import Scenario
+
+if TYPE_CHECKING:
+    from strapdown.allan import NoiseFit
+
+
+def specification_of(noise: GyroSpec | NoiseFit) -> GyroSpec:
+    """Return the specification of a gyro, which may be given as a fit of its noise."""
+    if isinstance(noise, allan.NoiseFit):
+        return GyroSpec(**allan.to_gyro_parameters(noise))  # type: ignore[arg-type]
+    if not isinstance(noise, GyroSpec):
+        raise InputError(f"noise is {type(noise).__name__}; give a GyroSpec, a NoiseFit or a ProcessNoise")
+    return noise
+
+
+def with_gyro_noise(parameters: ahrs.AhrsParameters, spec: GyroSpec) -> ahrs.AhrsParameters:
+    """Return the parameters of a recorded unit with the noise of its gyro; flicker is approximated for the accuracy of the tilt."""
+    density = (parameters.specific_force_noise / units.STANDARD_GRAVITY) ** 2  # rad² s
+    noise: dict[str, Any] = gyro.matched_process_noise(spec, density)
+    return dataclasses.replace(parameters, **noise)
+
+
+def filter_for_record(
+    record: ImuRecord,
+    noise: GyroSpec | NoiseFit | ProcessNoise | None,
+    setup: FilterSetup | None,
+    initial: State | ArrayLike | str | None,
+    states: bool | Sequence[str] | None,
+) -> tuple[FilterSetup, list[str]]:
+    """Return the filter for a record, and remarks on its error states and on errors that it does not model."""
+    if setup is not None:
+        remedy = "give a FilterSetup, as setup.FilterSetup.for_scenario or tune returns it"
+        instance("setup", setup, FilterSetup, remedy)
+        need_alone(noise, states)
+        need_angles(setup, record)
+        return setup, no_state_words(for_record.unmodelled_errors(record.origin, setup), setup)
+    if not isinstance(noise, ProcessNoise):
+        return matched_filter(record, None if noise is None else specification_of(noise), states=states)
+    if not isinstance(initial, State):
+        raise InputError(
+            "noise is a ProcessNoise, which has no σ of the initial gyro bias; give initial= too, or a GyroSpec as noise"
+        )
+    if states:
+        raise InputError(
+            "states goes with a specified gyro; declare the states of your own filter in setup=; leave it out"
+        )
+    sigma = np.sqrt(np.diag(initial.covariance))
+    return FilterSetup(
+        process_noise=noise, attitude_sigma=float(np.max(sigma[:3])), bias_sigma=float(np.max(sigma[3:6]))
+    ), []
+
+
+def need_alone(noise: Any, states: Any) -> None:
+    """Raise an error for options that go with a matched filter, if a complete one is given."""
+    for name, value in (("states", states), ("noise", noise)):
+        if value is not None:
+            raise InputError(
+                f"{Hint('setup')} is the complete filter, with its noise and states; leave {Hint(name)} out"
+            )
+
+
+def need_angles(setup: FilterSetup, record: ImuRecord) -> None:
+    """Raise an error for σ of the record's sensors that cannot be in rad, unless the record's own are as large."""
+    fine = {one.sensor: one.kind for one in record.vectors if len(one.time) and np.max(one.sigma) <= np.pi}
+    setups.need_angles(setup, fine, "filter")
+
+
+def matched_filter(
+    record: ImuRecord, spec: GyroSpec | None = None, *, states: bool | Sequence[str] | None = None
+) -> tuple[FilterSetup, list[str]]:
+    """Return the filter that matches a record's specifications, and remarks on its error states and on errors without one."""
+    chosen = setups.FilterSetup.for_record(record, spec, states=states)
+    missing = for_record.unmodelled_errors(record.origin, chosen)
+    if states is False or (states is None and chosen.states is None):
+        return chosen, no_state_words(missing, chosen)
+    notes = []
+    if record.origin is None or record.origin.scenario is None:
+        notes.append(
+            "The record does not contain its scenario, so the errors of its sensors are unknown: no state for them."
+        )
+    if chosen.states is None:
+        notes.append("No errors are specified that need optional states; the filter has none.")
+    elif states is None:
+        notes.append(state_words(chosen.states.names))
+    else:
+        notes.append(f"Optional states: {', '.join(chosen.states.names)}.")
+    return chosen, [*notes, *([f"Still without a state: {', '.join(missing)}."] if missing else [])]
+
+
+def filter_for_scenario(
+    scenario: Scenario,
+    *,
+    setup: FilterSetup | None = None,
+    gyro: GyroSpec | None = None,
+    states: bool | Sequence[str] | None = None,
+) -> FilterSetup:
+    """Return the filter for a scenario: ``setup``, or one that matches it, assuming another ``gyro`` if given."""
+    if setup is None:
+        assumed = scenario if gyro is None else dataclasses.replace(scenario, gyro=gyro)
+        return setups.FilterSetup.for_scenario(assumed, states=states)
+    setups.need_setup(setup)
+    need_alone(gyro, states)
+    kinds = {sensor.name: str(getattr(sensor, "kind", "attitude")) for sensor in scenario.sensors}
+    setups.need_angles(setup, kinds, "filter")
+    return setup
+
+
+def state_words(names: Sequence[str]) -> str:
+    """Return the reason why a filter has error states by default."""
+    return (
+        f"The filter has states for the specified errors, {', '.join(names)}: without them its σ would be too small "
+        f"({Hint('states', False)} omits them)."
+    )
+
+
+def no_state_words(missing: Sequence[str], chosen: FilterSetup) -> list[str]:
+    """Return a message about errors for which a filter has no state, with a remedy; empty if there are none."""
+    remedy = "" if chosen.states is not None else f"; {Hint('states', True)} adds states for most of them"
+    said = f"The record specifies errors for which this filter has no state: {', '.join(missing)}{remedy}."
+    return [said] if missing else []

@@ -1,0 +1,154 @@
+"""Tuning of a filter from records or recordings."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from strapdown.checks import Hint, InputError, count, instance
+from strapdown.estimation import setup as setups
+from strapdown.estimation.setup import FilterSetup
+from strapdown.gyro import GyroSpec
+from strapdown.recordings import Recording
+from strapdown.records import ImuRecord
+
+if TYPE_CHECKING:
+    from strapdown.tuning import Prior, Tuning
+    from strapdown.tuning.procedure import Tuned
+from strapdown.workflows.estimating import SOURCE, warn_about_conventions
+from strapdown.workflows.filters import need_angles
+
+
+def tune(
+    sources: ImuRecord | Recording | Sequence[ImuRecord | Recording],
+    *,
+    setup: FilterSetup | None = None,
+    free: Sequence[str] | None = None,
+    states: bool | None = None,
+    priors: Mapping[str, Prior] | GyroSpec | None = None,
+    truth: bool = False,
+    rmse: bool = False,
+    gate: bool = False,
+    spacing: float = 0.0,
+    holdout: float | None = None,
+    holdout_by: str = "time",
+    starts: int = 4,
+    seed: int = 0,
+    threads: int | None = None,
+) -> Tuning:
+    """Tune noise parameters of a filter by maximum likelihood of its innovations, with confidence intervals.
+
+    Parameters
+    ----------
+    sources : ImuRecord, Recording, or sequence of them
+        Records of one unit.
+    setup : FilterSetup, optional
+        Initial filter. Default: matched to the first record, or that of recordings.
+    free : sequence of str, optional
+        Parameters to tune: ``"gyro.arw"``, ``"gyro.rrw"``, ``"SENSOR.sigma"``, …. Default: the two of the gyro and the σ of every sensor;
+        for recordings without ``truth`` or ``rmse`` only ``"filter.scale"``.
+    states : bool, optional
+        Whether the matched filter has an error state for each error that the record specifies. Default: if there are such errors.
+    priors : mapping of str to Prior, or GyroSpec, optional
+        Prior distributions of parameters, by name; or a gyro, for weak priors of its noise.
+    truth : bool, default False
+        Whether to tune by the likelihood of the errors relative to the truth, in place of that of the innovations.
+    rmse : bool, default False
+        Whether to tune by the RMS attitude error against the truth, and then to scale all σ by the innovations.
+    gate : bool, default False
+        Whether to model the fraction and scale of outliers too, for the filter's gate.
+    spacing : float, default 0.0
+        Interval between the samples of a sensor that are used, with the weight of all, s: for correlated disturbances.
+    holdout : float, optional
+        Fraction of the data held out, for comparing the filter before and after tuning (``Tuning.comparison``).
+    holdout_by : {"time", "record"}, default "time"
+        Whether the end of each record is held out, or complete records.
+    starts : int, default 4
+        Number of searches: one from the initial filter, the others from random initial values.
+    seed : int, default 0
+        Seed of the random initial values.
+    threads : int, optional
+        Number of threads. Default: one per core.
+
+    Returns
+    -------
+    Tuning
+        ``setup`` is the tuned filter, for :func:`estimate` and :func:`monte_carlo`; ``words`` say what it does not model.
+
+    Examples
+    --------
+    >>> import strapdown as sd
+    >>> tuned = sd.tune(record, free=["gyro.arw", "star 1.sigma"])  # doctest: +SKIP
+    >>> estimate = sd.estimate(record, setup=tuned.setup)  # doctest: +SKIP
+    """
+    options = locals()
+    given = [sources] if isinstance(sources, (ImuRecord, Recording, str, os.PathLike)) else list(sources)
+    result = tuned(**{**options, "sources": given})
+    for one in given:
+        if isinstance(one, Recording):
+            warn_about_conventions(one)
+    return result.tuning
+
+
+def tuned(
+    sources: Sequence[ImuRecord | Recording],
+    *,
+    names: Sequence[str] = (),
+    setup: FilterSetup | None = None,
+    free: Sequence[str] | None = None,
+    states: bool | None = None,
+    priors: Mapping[str, Prior] | GyroSpec | None = None,
+    holdout: float | None = None,
+    holdout_by: str = "time",
+    threads: int | None = None,
+    **options: Any,
+) -> Tuned:
+    """Return the tuning of :func:`tune` with its objective; ``names``: those of the sources, in messages."""
+    from strapdown import tuning
+
+    if not sources:
+        raise InputError("sources is empty; give at least one record or recording")
+    labels = list(names) or [f"record {k}" if len(sources) > 1 else "" for k in range(len(sources))]
+    own, cases = setup is not None, []
+    for one, label in zip(sources, labels, strict=True):
+        instance("sources", one, (ImuRecord, Recording), SOURCE)
+        if isinstance(one, ImuRecord):
+            if setup is None:
+                if one.origin is None or one.origin.gyro is None:
+                    raise InputError(
+                        f"{label or 'the record'} does not contain its gyro's specification; give a filter, {Hint('setup')}"
+                    )
+                setup = setups.FilterSetup.for_record(one, states=states)
+            elif own and states:
+                if setup.states is not None:
+                    raise InputError(f"{Hint('setup')} contains the filter's states; leave {Hint('states')} out")
+                added = setups.FilterSetup.for_record(one, states=True).states
+                setup, states = dataclasses.replace(setup, states=added), None
+            need_angles(setup, one)
+            cases.append(tuning.record_case(one, setup, name=label))
+        else:
+            setup = setup or tuning.recording_setup()
+            cases.append(tuning.recording_case(one))
+    assert setup is not None
+    if not (options.get("truth") or options.get("rmse") or all(isinstance(one, ImuRecord) for one in sources)):
+        free, options["spacing"] = tuning.by_innovations(
+            free, options.get("spacing", 0.0), gate=options.get("gate"), priors=priors
+        )
+    train, held = (tuple(cases), ()) if holdout is None else tuning.split(cases, holdout, holdout_by)  # type: ignore[arg-type]
+    wanted = [name for name in free or () if name not in tuning.GATED]
+    wanted = wanted or list(tuning.default_names([case.record for case in cases]))
+    if not own or any(name.startswith(("gyro.", "filter.")) for name in wanted):
+        specified = (
+            (label, one.origin) for label, one in zip(labels, sources, strict=True) if isinstance(one, ImuRecord)
+        )
+        tuning.one_gyro(
+            {label: origin.gyro for label, origin in specified if origin is not None and origin.gyro is not None}
+        )
+    if isinstance(priors, GyroSpec):
+        by_gyro = tuning.priors_from_gyro(priors, train[0].record)
+        priors = {name: prior for name, prior in by_gyro.items() if name in wanted}
+    gate = options.pop("gate", False) or any(name in tuning.GATED for name in free or ())
+    workers = count("threads", threads if threads is not None else os.cpu_count() or 1)
+    return tuning.tune(train, setup, wanted, held=held, priors=priors, gate=gate, threads=workers, **options)
