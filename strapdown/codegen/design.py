@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from strapdown.ahrs import LiveAhrs, regions, starting
+from strapdown.ahrs import LiveAhrs
 from strapdown.ahrs.live import arrays_of
 from strapdown.checks import InputError
 from strapdown.codegen.c import identifier
 from strapdown.codegen.program import Program, Sensor, Table
-from strapdown.codegen.recording import Recording, Rest, Start
+from strapdown.codegen.recording import Recording
 from strapdown.estimation import forward, initial_state, temperature
 from strapdown.estimation import model as modelling
 from strapdown.estimation.live import need_no_record, template
@@ -22,7 +22,7 @@ from strapdown.estimation.setup.running import with_sigma
 from strapdown.kernels.measurement import KIND_CODES
 from strapdown.kernels.structure import MAX_PRECISION, Model
 from strapdown.records import ImuRecord
-from strapdown.units import ARCSECOND, DEGREE, STANDARD_GRAVITY
+from strapdown.units import ARCSECOND, DEGREE
 from strapdown.vectors import VectorMeasurements, VectorSensor, triad
 
 MAX_PRECISION_SINGLE = 1.0 / float(np.finfo(np.float32).eps)
@@ -67,47 +67,13 @@ def program_of(setup: FilterSetup, sensors: Sequence[VectorSensor | VectorMeasur
 
 def program_of_live(live: LiveAhrs, *, single: bool) -> Program:
     """Return the program of the filter of an IMU."""
-    parameters, (imu, sensors) = live.parameters, arrays_of(live)
-    program = program_of(parameters.setup, sensors, single=single)
-    constants = imu.head.arguments[0]
-    memory = imu.head.arguments[2]
-    first, weight = regions.FIRST_LEVEL
+    imu, sensors = arrays_of(live)
+    program = program_of(live.parameters.setup, sensors, single=single)
     return replace(
         program,
         sensors=tuple(replace(sensor, noise=()) for sensor in program.sensors),
         recording=Recording(
-            magnetometer=live.magnetometer,
-            interval=live.interval,
-            step=parameters.step,
-            most=len(imu.force),
-            noise=parameters.specific_force_noise,
-            late=imu.late,
-            timing=imu.carry.arguments[2],
-            largest_rate=imu.largest_rate,
-            constants=constants,
-            capacity=memory.ordered.shape[1],
-            shares=imu.scale.arguments[1],
-            forgotten=parameters.heading_interval / regions.FIELD_MEMORY,
-            first_level=(first, first * weight, weight),
-            start=Start(
-                attitude_sigma=parameters.attitude_sigma,
-                swing_time=starting.SWING_TIME,
-                max_tilt=starting.MAX_TILT_SIGMA,
-                first_heading=starting.FIRST_HEADING,
-                iron_sigma=parameters.iron_sigma,
-                gravity=STANDARD_GRAVITY,
-            ),
-            rest=None
-            if parameters.rest_bias_sigma == 0.0
-            else Rest(
-                *starting.rest_length(live.interval),
-                sigma=parameters.rest_bias_sigma,
-                max_sigma=starting.MAX_REST_SIGMA,
-                turning_rate=starting.TURNING_RATE,
-                span=starting.QUIET_SPAN,
-                bias_sigma=parameters.bias_sigma,
-                rate_random_walk=parameters.rate_random_walk,
-            ),
+            magnetometer=live.magnetometer, interval=live.interval, parameters=live.parameters, imu=imu
         ),
     )
 
