@@ -4,6 +4,7 @@ import ctypes
 import dataclasses
 import functools
 import subprocess
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -325,7 +326,7 @@ def test_sanitizers_find_nothing(name, tmp_path):
     updates = " ".join(f"strapdown_update_{sensor.name}(&f, v);" for sensor in program.sensors)
     for file, text in {**sources(name), "main.c": SANITIZED.replace("UPDATES", updates)}.items():
         (tmp_path / file).write_text(text, encoding="utf-8")
-    sanitize = ["-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+    sanitize = ["-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-Wno-conversion"]
     build = subprocess.run(
         [gcc, *STRICT, *sanitize, "main.c", "strapdown_filter.c", "-o", "run", "-lm"],
         cwd=tmp_path,
@@ -360,6 +361,52 @@ def test_the_example_and_the_header_of_the_export(tmp_path):
     subprocess.run([gcc, *STRICT, "main.c", "strapdown_filter.c", "-o", "run", "-lm"], cwd=tmp_path, check=True)
     run = subprocess.run(["./run"], cwd=tmp_path, capture_output=True, text=True, check=True)
     assert run.stdout.startswith("attitude ")
+
+
+ARDUINO = "#include <stdint.h>\nunsigned long micros();\n"
+AROUND_A_SKETCH = """
+#include "Arduino.h"
+#include "strapdown_filter.h"
+void readSensors(strapdown_real *gyro, strapdown_real *force, strapdown_real *field = nullptr) {
+    for (int i = 0; i < 3; i++) {
+        gyro[i] = 0;
+        force[i] = i == 2 ? strapdown_real(9.81) : 0;
+        if (field) field[i] = i == 0 ? 0 : i == 1 ? 20 : -40;
+    }
+}
+SKETCH
+unsigned long micros() {
+    static unsigned long time = 4294900000;
+    return (time += 10000) & 0xffffffff;
+}
+int main() {
+    setup();
+    for (int k = 0; k < 100; k++) loop();
+    return int(strapdown_status(&f));
+}
+"""
+
+
+@pytest.mark.parametrize("place", [0, 1])
+def test_the_sketches_of_the_guide_compile_and_run(place, tmp_path):
+    guide = Path(__file__).parents[1] / "docs" / "guide" / "embedded.md"
+    sketches = [part.partition("```")[0] for part in guide.read_text(encoding="utf-8").split("```cpp\n")[1:]]
+    assert len(sketches) == 2
+    if place == 0:
+        record, setup, _ = case("heading bias")
+        sd.export(setup, record, folder=tmp_path, precision="single")
+    else:
+        sd.export("any", rate=100.0, folder=tmp_path, precision="single")
+    (tmp_path / "Arduino.h").write_text(ARDUINO, encoding="utf-8")
+    text = AROUND_A_SKETCH.replace("SKETCH", sketches[place])
+    (tmp_path / "sketch.cpp").write_text(text, encoding="utf-8")
+    for build in (
+        [compiler(), *STRICT, "-c", "strapdown_filter.c"],
+        [compiler("C++"), "-std=c++11", "-Wall", "-Wextra", "-Werror", "sketch.cpp", "strapdown_filter.o", "-lm"],
+    ):
+        done = subprocess.run(build, cwd=tmp_path, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+    assert subprocess.run(["./a.out"], cwd=tmp_path, check=False).returncode == 0
 
 
 @pytest.mark.parametrize(

@@ -430,7 +430,7 @@ def end_field(m: Any, program: Any, f: SimpleNamespace, edges: Any, force: Any, 
     m.kernel(headings.heading_steps, r.constants, steps, f, found)
 
     def turned() -> None:
-        status = m.call("update_magnetometer", row(found.direction), found.sigma[0], result="int")
+        status = m.call("update_magnetometer", row(found.direction), found.sigma[0], result="status")
         nis = m.select(m.equal(status, 0), f.nis[1], 0.0)
         m.kernel(recording_steps.running_mean, (nis,), r.imu.field_mean.arguments[1], f.field_sums, f.field_level)
 

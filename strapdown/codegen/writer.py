@@ -40,8 +40,8 @@ class Language:
     """A status of the filter."""
     whole: Callable[[str], str]
     """A number rounded down."""
-    narrow: Callable[[str], str]
-    """A duration: the difference of two times."""
+    real: Callable[[str], str]
+    """An integer, or a duration (the difference of two times), as a number of the usual type."""
     quotient: Callable[[str], str]
     """A quotient of positive integers rounded down."""
 
@@ -214,7 +214,7 @@ class Writer:
             self.indent += 1
             self._symbols(self.placement.needed((m.operands[i] for m in members), arm, self.written), arm)
             for name, member in zip(names, members, strict=True):
-                self.line(f"{name} = {self._operand(member.operands[i], 0, right=False)};")
+                self.line(f"{name} = {self._as(member.type, member.operands[i], 0, right=False)};")
             self.indent -= 1
         self.line("}")
         for name, member in zip(names, members, strict=True):
@@ -277,6 +277,12 @@ class Writer:
         text = self.text(value, kind)
         return f"({text})" if text.startswith("-") else text
 
+    def _as(self, result: str, value: Any, level: float, *, right: bool, kind: str = "") -> str:
+        """Return an operand of an operation with a result of a type."""
+        if result == "" and isinstance(value, Symbol) and value.type == "int":
+            return self.language.real(self._operand(value, 6, right=True))
+        return self._operand(value, level, right=right, kind=kind)
+
     def _expression(self, symbol: Symbol) -> str:
         kind, operands, language = symbol.kind, symbol.operands, self.language
         if kind in PRECEDENCE:
@@ -287,22 +293,22 @@ class Writer:
             array = self._member(operands[0]) if kind == "at" else self.names[operands[0]]
             return f"{array}[{self._operand(operands[1], 0, right=False, kind='int')}]"
         if kind == "select":
-            c, a, b = (self._operand(x, 5, right=True) for x in operands)
-            return f"{c} ? {a} : {b}"
+            a, b = (self._as(symbol.type, x, 5, right=True) for x in operands[1:])
+            return f"{self._operand(operands[0], 5, right=True)} ? {a} : {b}"
         if kind in ("neg", "not"):
             inner = self._operand(operands[0], 6 if kind == "neg" else 0, right=kind == "neg")
             return f"-{inner}" if kind == "neg" else f"!({inner})"
-        inner = ", ".join(self._operand(x, 0, right=False) for x in operands)
+        inner = ", ".join(self._as(symbol.type, x, 0, right=False) for x in operands)
         return f"{language.function(kind)}({inner})" if kind in FUNCTIONS else language.whole(inner)
 
     def _binary(self, symbol: Symbol) -> str:
         kind, operands, language = symbol.kind, symbol.operands, self.language
         level, types = PRECEDENCE[kind], [x.type for x in operands if isinstance(x, Symbol)]
-        own = "wide" if "wide" in types else "int" if "int" in types and kind != "/" else ""
-        pair = [self._operand(x, level, right=i > 0, kind=own) for i, x in enumerate(operands)]
+        own = "wide" if "wide" in types else "int" if {"int", "status"} & {*types} and kind != "/" else ""
+        pair = [self._as(symbol.type, x, level, right=i > 0, kind=own) for i, x in enumerate(operands)]
         left, right = (f"({x})" if kind == "||" and "&&" in x else x for x in pair)
         if "wide" in types and symbol.type == "":
-            return language.narrow(f"{left} - {right}")
+            return language.real(f"({left} - {right})")
         if kind == "//":
             return language.quotient(f"{left} / {right}")
         return f"{left} {kind} {right}"
