@@ -3,6 +3,7 @@
 import ctypes
 import dataclasses
 import functools
+import re
 import subprocess
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from strapdown.codegen.functions import Function, Member
 from strapdown.codegen.interpreted import Interpreter
 from strapdown.codegen.writer import Writer
 from strapdown.estimation import setup as setups
+from strapdown.estimation.features import FEATURES
 from strapdown.estimation.setup import SensorStates, States
 
 NOISE = sd.ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-5)
@@ -409,21 +411,38 @@ def test_the_sketches_of_the_guide_compile_and_run(place, tmp_path):
     assert subprocess.run(["./a.out"], cwd=tmp_path, check=False).returncode == 0
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"gate": sd.Gate()}, "recovery"),
-        ({"robust": sd.Robust()}, "robust"),
-        ({"integration": sd.coning.ALGORITHMS["three-sample"]}, "one gyro sample"),
-        ({"states": States(gyro_temperature_sigma=1e-5)}, "temperature"),
-        ({"states": States(sensors={"star": SensorStates(lever_arm_sigma=0.1)})}, "lever arm"),
-    ],
-)
-def test_what_cannot_be_exported_is_refused_before_anything_is_written(change, words, tmp_path):
+REFUSED = {
+    "recovery": {"gate": sd.Gate()},
+    "robust": {"robust": sd.Robust()},
+    "integration": {"integration": sd.coning.ALGORITHMS["three-sample"]},
+    "estimator": {"estimator": "mahony"},
+    "temperature": {"states": States(gyro_temperature_sigma=1e-5)},
+    "record": {"states": States(sensors={"star": SensorStates(lever_arm_sigma=0.1)})},
+    "varying": {},
+}
+
+
+@pytest.mark.parametrize("name", FEATURES)
+def test_features_that_an_exported_or_a_live_filter_lacks_are_refused_before_anything_is_written(name, tmp_path):
     record, setup, _ = case("direction")
+    setup, sensors = dataclasses.replace(setup, **REFUSED[name]), record.vectors
+    if name == "varying":
+        series = sensors[0]
+        sensors = [dataclasses.replace(series, sigma=np.linspace(0.01, 0.02, len(series.time)))]
+    words = re.escape(f"the exported filter has no {FEATURES[name].words}; {FEATURES[name].remedy}")
     with pytest.raises(InputError, match=words):
-        sd.export(dataclasses.replace(setup, **change), record, folder=tmp_path / "out")
+        sd.export(setup, sensors, folder=tmp_path / "out")
     assert not (tmp_path / "out").exists()
+    if name in ("integration", "estimator"):
+        return  # LiveFilter has no argument for them
+    start = sd.initial_state([1.0, 0.0, 0.0, 0.0], attitude_sigma=0.1, bias_sigma=1e-3)
+    blocks = () if setup.states is None else setup.states.blocks({"star": "direction"})
+    options = {"sensors": sensors, "gate": setup.gate, "robust": setup.robust}
+    if FEATURES[name].live:
+        sd.LiveFilter(setup.process_noise, start, blocks, **options)
+    else:
+        with pytest.raises(InputError, match=f"has no {FEATURES[name].words}"):
+            sd.LiveFilter(setup.process_noise, start, blocks, **options)
 
 
 def test_refusals_of_arguments(tmp_path):
@@ -443,10 +462,6 @@ def test_refusals_of_arguments(tmp_path):
     ):
         with pytest.raises(InputError, match=words):
             sd.export(setup, sensors, folder=tmp_path)
-    series = record.vectors[0]
-    growing = dataclasses.replace(series, sigma=np.linspace(0.01, 0.02, len(series.time)))
-    with pytest.raises(InputError, match="sigma varies"):
-        sd.export(setup, [growing], folder=tmp_path)
 
 
 def kernel(a, n, x):

@@ -16,7 +16,8 @@ from strapdown.codegen.program import Program, Sensor, Table
 from strapdown.codegen.recording import Recording
 from strapdown.estimation import forward, initial_state, temperature
 from strapdown.estimation import model as modelling
-from strapdown.estimation.live import need_no_record, template
+from strapdown.estimation.features import refuse
+from strapdown.estimation.live import template
 from strapdown.estimation.setup import FilterSetup
 from strapdown.estimation.setup.running import with_sigma
 from strapdown.kernels.measurement import KIND_CODES
@@ -25,6 +26,7 @@ from strapdown.records import ImuRecord
 from strapdown.units import ARCSECOND, DEGREE
 from strapdown.vectors import VectorMeasurements, VectorSensor, triad
 
+EXPORTED = "the exported filter"
 MAX_PRECISION_SINGLE = 1.0 / float(np.finfo(np.float32).eps)
 """The same limit as :data:`strapdown.kernels.structure.MAX_PRECISION` in single precision."""
 
@@ -35,10 +37,10 @@ def program_of(setup: FilterSetup, sensors: Sequence[VectorSensor | VectorMeasur
     series = _series(setup, sensors)
     kinds: Mapping[str, Any] = {one.sensor: one.kind for one in series}
     error_states = () if setup.states is None else setup.states.blocks(kinds)
-    temperature.need_none(error_states, "the exported filter")
+    temperature.need_none(error_states, EXPORTED)
     isotropic = not any(one.anisotropic for one in series)
     model = modelling.assemble(error_states, kinds, isotropic=isotropic)
-    need_no_record(model)
+    refuse(EXPORTED, record=model.of_record)
     noise = setup.process_noise
     variances = noise.angle_random_walk**2, noise.rate_random_walk**2
     numbers = forward.kernel_model(model, variances)
@@ -80,20 +82,13 @@ def program_of_live(live: LiveAhrs, *, single: bool) -> Program:
 
 def _need_exportable(setup: FilterSetup) -> None:
     """Refuse what the exported filter does not have."""
-    if setup.estimator_name != "mekf":
-        raise InputError(f"the estimator is {setup.estimator_name}; only the mekf can be exported")
-    if setup.robust is not None:
-        raise InputError("robust updates iterate a weight, which the exported filter does not; use a gate, or none")
-    if setup.gate is not None and setup.gate.recovery is not None:
-        raise InputError(
-            "recovery of the gate runs a second filter beside the first, which the exported filter does not; give a gate with "
-            "recovery None, and start again by init when the status reports rejections in a row"
-        )
-    if setup.integration.samples != 1 or setup.integration.name != "one-sample":
-        raise InputError(
-            f"the integration is {setup.integration.name}, but predict takes one gyro sample at a time; use one-sample, or correct "
-            "the increments for coning before they are given to predict"
-        )
+    refuse(f"the estimator is {setup.estimator_name}, but {EXPORTED}", estimator=setup.estimator_name != "mekf")
+    refuse(EXPORTED, robust=setup.robust is not None)
+    refuse(EXPORTED, recovery=setup.gate is not None and setup.gate.recovery is not None)
+    refuse(
+        f"the integration is {setup.integration.name}, but {EXPORTED}",
+        integration=setup.integration.samples != 1 or setup.integration.name != "one-sample",
+    )
 
 
 def _series(setup: FilterSetup, sensors: Sequence[VectorSensor | VectorMeasurements]) -> tuple[VectorMeasurements, ...]:
@@ -107,8 +102,7 @@ def _series(setup: FilterSetup, sensors: Sequence[VectorSensor | VectorMeasureme
                 ("reference_f", one.references_f),
                 ("covariance", one.covariances),
             ):
-                if np.any(values != values[0]):
-                    raise InputError(f"{one.sensor}: {name} varies from sample to sample; give one for all")
+                refuse(f"{one.sensor}: {name} varies, but {EXPORTED}", varying=bool(np.any(values != values[0])))
     series = [template(one, 0.0) for one in sensors]
     record = ImuRecord(time=np.arange(2.0), increments=np.zeros((1, 3)), vectors=tuple(series))
     identifiers = [identifier(one.sensor) for one in record.vectors]
