@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -229,24 +230,19 @@ class Writer:
             return False
         return symbol in self.user_here and len(self._expression(symbol)) <= LONGEST
 
-    @property
+    @functools.cached_property
     def user_here(self) -> set[Symbol]:
         """Operations whose users are in the same slot, outside the arms of a selection."""
-        if not hasattr(self, "_user_here"):
-            places, groups = self.placement.places, self.placement.groups
-            self._user_here = set()
-            for user in self.placement.alive:
-                if user not in groups and user.kind not in PINNED:
-                    self._user_here |= {x for x in user.operands if isinstance(x, Symbol) and places[x] is places[user]}
-                elif user in groups:
-                    arms = groups[user].arms
-                    assert arms is not None
-                    self._user_here |= {
-                        x
-                        for x, arm in zip(user.operands[1:], arms, strict=True)
-                        if isinstance(x, Symbol) and places[x] is arm
-                    }
-        return self._user_here
+        places, groups, here = self.placement.places, self.placement.groups, set()
+        for user in self.placement.alive:
+            group = groups.get(user)
+            if group is not None:
+                assert group.arms is not None
+                pairs = list(zip(user.operands[1:], group.arms, strict=True))
+            else:
+                pairs = [] if user.kind in PINNED else [(x, places[user]) for x in user.operands]
+            here |= {x for x, slot in pairs if isinstance(x, Symbol) and places[x] is slot}
+        return here
 
     def _new(self, stem: str) -> str:
         number = self.used[stem] = self.used.get(stem, 0) + 1
