@@ -18,14 +18,15 @@ from strapdown.codegen import c, design, recording
 from strapdown.codegen import program as body
 from strapdown.kernels import machine
 
-STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-ffp-contract=off")
+STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-Werror", "-pedantic", "-ffp-contract=off")
 
 
-def compiler():
-    gcc = shutil.which("gcc") or shutil.which("cc")
-    if gcc is None:
-        pytest.skip("no C compiler on this machine")
-    return gcc
+def compiler(language="C"):
+    names = {"C": ("gcc", "cc"), "C++": ("g++", "c++")}[language]
+    path = next(filter(None, map(shutil.which, names)), None)
+    if path is None:
+        pytest.skip(f"no {language} compiler on this machine")
+    return path
 
 
 missing = (0.0, 0.0, 0.0)
@@ -170,6 +171,7 @@ class Compiled:
     def __init__(self, program, folder, *, single=False, flags=("-O2",)):
         folder = Path(folder)
         files = c.files(program, "test", single=single)
+        flags = (*flags, "-Wdouble-promotion") if single else flags
         for name, text in files.items():
             (folder / name).write_text(text, encoding="utf-8")
         key = (*files.items(), *flags)

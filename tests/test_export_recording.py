@@ -236,7 +236,7 @@ def test_sanitizers_find_nothing(name, tmp_path):
         "main.c": text,
     }.items():
         (tmp_path / file).write_text(content, encoding="utf-8")
-    sanitize = ["-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+    sanitize = ["-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-Wno-conversion"]
     build = [gcc, *STRICT, *sanitize, "main.c", "strapdown_filter.c", "-o", "run", "-lm"]
     done = subprocess.run(build, cwd=tmp_path, capture_output=True, text=True, check=False)
     if "cannot find" in done.stderr:

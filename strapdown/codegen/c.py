@@ -13,7 +13,7 @@ from strapdown.codegen.target import Target, traced
 from strapdown.codegen.writer import Language, Writer
 
 PUBLIC = ("init", "predict")
-TYPES = {"": "strapdown_real", "int": "int", "wide": "double"}
+TYPES = {"": "strapdown_real", "int": "int", "wide": "double", "status": "unsigned"}
 
 
 def _number(x: float, single: bool) -> str:
@@ -37,7 +37,7 @@ def language(*, single: bool) -> Language:
         array=lambda name, size: f"strapdown_real {name}[{size}];",
         status=lambda name: f"STRAPDOWN_{name}",
         whole=lambda text: f"(strapdown_real)(int)({text})",
-        narrow=lambda text: f"(strapdown_real)({text})",
+        real=lambda text: f"(strapdown_real){text}",
         quotient=lambda text: text,
     )
 
@@ -60,7 +60,7 @@ def signature(function: Target) -> str:
         else:
             constant = "const " if size > 0 else ""
             parameters.append(f"{constant}strapdown_real {parameter}[{abs(size)}]")
-    result = {"status": "unsigned", "real": "strapdown_real", "": "void"}[function.returns]
+    result = {**TYPES, "real": "strapdown_real", "": "void"}[function.returns]
     return f"{'' if public else 'static '}{result} {name}({', '.join(parameters)})"
 
 

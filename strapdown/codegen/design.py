@@ -8,23 +8,25 @@ from typing import Any
 
 import numpy as np
 
-from strapdown.ahrs import LiveAhrs, regions, starting
+from strapdown.ahrs import LiveAhrs
 from strapdown.ahrs.live import arrays_of
 from strapdown.checks import InputError
 from strapdown.codegen.c import identifier
 from strapdown.codegen.program import Program, Sensor, Table
-from strapdown.codegen.recording import Recording, Rest, Start
+from strapdown.codegen.recording import Recording
 from strapdown.estimation import forward, initial_state, temperature
 from strapdown.estimation import model as modelling
-from strapdown.estimation.live import need_no_record, template
+from strapdown.estimation.features import refuse
+from strapdown.estimation.live import template
 from strapdown.estimation.setup import FilterSetup
 from strapdown.estimation.setup.running import with_sigma
 from strapdown.kernels.measurement import KIND_CODES
 from strapdown.kernels.structure import MAX_PRECISION, Model
 from strapdown.records import ImuRecord
-from strapdown.units import ARCSECOND, DEGREE, STANDARD_GRAVITY
+from strapdown.units import ARCSECOND, DEGREE
 from strapdown.vectors import VectorMeasurements, VectorSensor, triad
 
+EXPORTED = "the exported filter"
 MAX_PRECISION_SINGLE = 1.0 / float(np.finfo(np.float32).eps)
 """The same limit as :data:`strapdown.kernels.structure.MAX_PRECISION` in single precision."""
 
@@ -35,10 +37,10 @@ def program_of(setup: FilterSetup, sensors: Sequence[VectorSensor | VectorMeasur
     series = _series(setup, sensors)
     kinds: Mapping[str, Any] = {one.sensor: one.kind for one in series}
     error_states = () if setup.states is None else setup.states.blocks(kinds)
-    temperature.need_none(error_states, "the exported filter")
+    temperature.need_none(error_states, EXPORTED)
     isotropic = not any(one.anisotropic for one in series)
     model = modelling.assemble(error_states, kinds, isotropic=isotropic)
-    need_no_record(model)
+    refuse(EXPORTED, record=model.of_record)
     noise = setup.process_noise
     variances = noise.angle_random_walk**2, noise.rate_random_walk**2
     numbers = forward.kernel_model(model, variances)
@@ -67,67 +69,26 @@ def program_of(setup: FilterSetup, sensors: Sequence[VectorSensor | VectorMeasur
 
 def program_of_live(live: LiveAhrs, *, single: bool) -> Program:
     """Return the program of the filter of an IMU."""
-    parameters, (imu, sensors) = live.parameters, arrays_of(live)
-    program = program_of(parameters.setup, sensors, single=single)
-    constants = imu.head.arguments[0]
-    memory = imu.head.arguments[2]
-    first, weight = regions.FIRST_LEVEL
+    imu, sensors = arrays_of(live)
+    program = program_of(live.parameters.setup, sensors, single=single)
     return replace(
         program,
         sensors=tuple(replace(sensor, noise=()) for sensor in program.sensors),
         recording=Recording(
-            magnetometer=live.magnetometer,
-            interval=live.interval,
-            step=parameters.step,
-            most=len(imu.force),
-            noise=parameters.specific_force_noise,
-            late=imu.late,
-            timing=imu.carry.arguments[2],
-            largest_rate=imu.largest_rate,
-            constants=constants,
-            capacity=memory.ordered.shape[1],
-            shares=imu.scale.arguments[1],
-            forgotten=parameters.heading_interval / regions.FIELD_MEMORY,
-            first_level=(first, first * weight, weight),
-            start=Start(
-                attitude_sigma=parameters.attitude_sigma,
-                swing_time=starting.SWING_TIME,
-                max_tilt=starting.MAX_TILT_SIGMA,
-                first_heading=starting.FIRST_HEADING,
-                iron_sigma=parameters.iron_sigma,
-                gravity=STANDARD_GRAVITY,
-            ),
-            rest=None
-            if parameters.rest_bias_sigma == 0.0
-            else Rest(
-                *starting.rest_length(live.interval),
-                sigma=parameters.rest_bias_sigma,
-                max_sigma=starting.MAX_REST_SIGMA,
-                turning_rate=starting.TURNING_RATE,
-                span=starting.QUIET_SPAN,
-                bias_sigma=parameters.bias_sigma,
-                rate_random_walk=parameters.rate_random_walk,
-            ),
+            magnetometer=live.magnetometer, interval=live.interval, parameters=live.parameters, imu=imu
         ),
     )
 
 
 def _need_exportable(setup: FilterSetup) -> None:
     """Refuse what the exported filter does not have."""
-    if setup.estimator_name != "mekf":
-        raise InputError(f"the estimator is {setup.estimator_name}; only the mekf can be exported")
-    if setup.robust is not None:
-        raise InputError("robust updates iterate a weight, which the exported filter does not; use a gate, or none")
-    if setup.gate is not None and setup.gate.recovery is not None:
-        raise InputError(
-            "recovery of the gate runs a second filter beside the first, which the exported filter does not; give a gate with "
-            "recovery None, and start again by init when the status reports rejections in a row"
-        )
-    if setup.integration.samples != 1 or setup.integration.name != "one-sample":
-        raise InputError(
-            f"the integration is {setup.integration.name}, but predict takes one gyro sample at a time; use one-sample, or correct "
-            "the increments for coning before they are given to predict"
-        )
+    refuse(f"the estimator is {setup.estimator_name}, but {EXPORTED}", estimator=setup.estimator_name != "mekf")
+    refuse(EXPORTED, robust=setup.robust is not None)
+    refuse(EXPORTED, recovery=setup.gate is not None and setup.gate.recovery is not None)
+    refuse(
+        f"the integration is {setup.integration.name}, but {EXPORTED}",
+        integration=setup.integration.samples != 1 or setup.integration.name != "one-sample",
+    )
 
 
 def _series(setup: FilterSetup, sensors: Sequence[VectorSensor | VectorMeasurements]) -> tuple[VectorMeasurements, ...]:
@@ -141,8 +102,7 @@ def _series(setup: FilterSetup, sensors: Sequence[VectorSensor | VectorMeasureme
                 ("reference_f", one.references_f),
                 ("covariance", one.covariances),
             ):
-                if np.any(values != values[0]):
-                    raise InputError(f"{one.sensor}: {name} varies from sample to sample; give one for all")
+                refuse(f"{one.sensor}: {name} varies, but {EXPORTED}", varying=bool(np.any(values != values[0])))
     series = [template(one, 0.0) for one in sensors]
     record = ImuRecord(time=np.arange(2.0), increments=np.zeros((1, 3)), vectors=tuple(series))
     identifiers = [identifier(one.sensor) for one in record.vectors]

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from strapdown.codegen.symbols import Symbol, Trace, Values, Version
+from strapdown.codegen.symbols import Symbol, Trace, Values
 
 
 @dataclass(eq=False)
@@ -57,7 +57,7 @@ class Member(Values):
             return super().__getitem__(int(place))
         self.function.flush()
         self.loads += 1
-        value = self.trace.symbol("at", self.base, place, Version((id(self), self.loads)))
+        value = self.trace.symbol("at", self.base, place, (id(self), self.loads))
         value.type = self.type
         return value
 
@@ -118,11 +118,6 @@ class Function:
         if size:
             return tuple(self.trace.symbol("load", f"{name}[{i}]", name) for i in range(size))
         return self.trace.symbol("parameter", name)
-
-    def local(self, name: str, size: int) -> Values:
-        """Return a local array, initially zero."""
-        self.add(Statement("array", name, values=(size,)))
-        return self.array(lambda i: f"{name}[{i}]")
 
     def new_name(self, stem: str) -> str:
         """Return a name for a variable."""

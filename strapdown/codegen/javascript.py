@@ -17,7 +17,7 @@ LANGUAGE = Language(
     array=lambda name, size: f"const {name} = new Float64Array({size});",
     status=lambda name: f"STATUS.{name}",
     whole=lambda text: f"Math.floor({text})",
-    narrow=lambda text: text,
+    real=lambda text: text,
     quotient=lambda text: f"Math.floor({text})",
 )
 

@@ -9,11 +9,15 @@ from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
+from strapdown.ahrs import regions, starting
+from strapdown.ahrs.parameters import AhrsParameters
 from strapdown.codegen import program as body
 from strapdown.codegen.program import Table
 from strapdown.kernels import headings, recording_steps
 from strapdown.kernels.algebra import cross, dot, scale, square_root
+from strapdown.kernels.live_imu import Imu
 from strapdown.kernels.rotation import unit
+from strapdown.units import STANDARD_GRAVITY
 
 MIN_HORIZONTAL_SQUARED = 1e-6
 """Minimum squared sine of the angle between the first field and the vertical."""
@@ -31,34 +35,28 @@ class Array(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Recording:
-    """What the filter of an IMU does around its steps."""
+    """The filter of an IMU in Python: of its arrays, only shapes and constants are used."""
 
     magnetometer: bool
     interval: float
-    step: float
-    most: int
-    """Maximum number of samples in a step, and one."""
-    noise: float
-    """Noise density of the specific force, m/s²/√Hz."""
-    late: float
-    timing: float
-    """Delay of the samples, s, and its variance, s²."""
-    largest_rate: float
-    constants: Any
-    """Of the headings, with its ``capacity`` for medians."""
-    capacity: int
-    shares: Any
-    forgotten: float
-    first_level: tuple[float, float, float]
-    """Mean nis of the magnetometer at the start, and its sums."""
-    start: Start
-    rest: Rest | None
-    """None: the bias at rest is not measured."""
+    """Interval of the samples, s."""
+    parameters: AhrsParameters
+    imu: Imu
+
+    @property
+    def rest(self) -> tuple[int, int] | None:
+        """Number of parts of a span in which rest is looked for, and of samples of a part; None: the bias at rest is not measured."""
+        return starting.rest_length(self.interval) if self.parameters.rest_bias_sigma else None
+
+    @property
+    def constants(self) -> headings.Constants:
+        """Constants of the headings."""
+        return self.imu.head.arguments[0]  # type: ignore[no-any-return]
 
     @property
     def arrays(self) -> tuple[Array, ...]:
         """Arrays of the state, after those of the filter."""
-        most, lag = self.most, self.constants.lag
+        most, memory = len(self.imu.force), self.imu.head.arguments[2]
         field = (
             Array("field", (most, 3), "field at the samples of this step"),
             Array("held", (2, 3), "last mean field and specific force"),
@@ -67,9 +65,9 @@ class Recording:
                 "mean", (3, 3), "mean field: as measured, without the iron that appears, without the iron subtracted"
             ),
             Array("deviation", (3,), "square deviation of each"),
-            Array("ordered", (6, self.capacity), "values of magnitude and dip of each, in order of size"),
+            Array("ordered", memory.ordered.shape, "values of magnitude and dip of each, in order of size"),
             Array("median", (6,), "their medians"),
-            Array("ring", (lag, 8), "field, attitude by the gyro and whether known of the last second"),
+            Array("ring", memory.ring.shape, "field, attitude by the gyro and whether known of the last second"),
             Array("sums", (9,), "normal equations of the iron"),
             Array("iron", (3,), "iron"),
             Array("total", (4,), "sum of the directions of a heading, and of their information"),
@@ -77,25 +75,20 @@ class Recording:
             Array("field_level", (1,), "mean nis of the magnetometer"),
             Array("field_sums", (2,), "its sums"),
             Array("start", (2,), "time of the first sample, s; number of the last heading's interval", "wide"),
-            Array("ring_time", (lag,), "times of the last second, s", "wide"),
+            Array("ring_time", memory.ring_time.shape, "times of the last second, s", "wide"),
             Array("counted", (2,), "of the field's memory", "int"),
             Array("stride", (6, 2), "of the values in order", "int"),
         )
         rest: tuple[Array, ...] = ()
         if self.rest is not None:
             rest = (
-                Array("tenths", (self.rest.parts, 3), "sums of the rate over the parts of this second"),
+                Array("tenths", (self.rest[0], 3), "sums of the rate over the parts of this second"),
                 Array("halves", (4, 3), "sums of specific force and field over its halves"),
                 Array("rest_rate", (3,), "last rate at rest, rad/s"),
                 Array("rest_variance", (2,), "its variance, and that of the bias by all rests"),
                 Array("rest_clock", (2,), "time of the first sample of this second, and of the last rest, s", "wide"),
                 Array("halves_number", (4,), "number of samples in the halves", "int"),
-                Array(
-                    "resting",
-                    (2,),
-                    "samples in this second; 1: a rest is found, 2: the next step begins with it",
-                    "int",
-                ),
+                Array("resting", (2,), "samples in this second; 1: a rest, 2: the next step begins with it", "int"),
             )
         return (
             Array("q", (4,), "attitude at the last sample"),
@@ -110,30 +103,6 @@ class Recording:
             Array("clock", (3,), "time of the last sample, of the start of the step, of the first sample, s", "wide"),
             Array("samples", (2,), "whether the filter has started; samples in the step", "int"),
         )
-
-
-class Rest(NamedTuple):
-    """Numbers of the measurement of the bias at rest: :mod:`strapdown.ahrs.starting`."""
-
-    parts: int
-    part: int
-    sigma: float
-    max_sigma: float
-    turning_rate: float
-    span: float
-    bias_sigma: float
-    rate_random_walk: float
-
-
-class Start(NamedTuple):
-    """Numbers of the initial state."""
-
-    attitude_sigma: float
-    swing_time: float
-    max_tilt: float
-    first_heading: float
-    iron_sigma: float
-    gravity: float
 
 
 def init(m: Any, program: Any, f: SimpleNamespace) -> None:
@@ -153,7 +122,7 @@ def init(m: Any, program: Any, f: SimpleNamespace) -> None:
     if r.rest is not None:
         clear_span(m, r, f)
         f.resting[1] = 0
-        f.rest_variance[1] = r.rest.bias_sigma**2
+        f.rest_variance[1] = r.parameters.bias_sigma**2
     m.leave("OK")
 
 
@@ -166,7 +135,7 @@ def update(m: Any, program: Any, f: SimpleNamespace, time: Any, gyro: Any, force
     r = program.recording
     usable = (time >= -1e15) & (time <= 1e15)
     for x in gyro:
-        usable = usable & (abs(x) <= r.largest_rate)
+        usable = usable & (abs(x) <= r.imu.largest_rate)
     vectors = (force, field) if r.magnetometer else (force,)
     for vector in vectors:
         square = dot(vector, vector)
@@ -175,7 +144,7 @@ def update(m: Any, program: Any, f: SimpleNamespace, time: Any, gyro: Any, force
     m.branch(m.equal(f.samples[0], 0), lambda: begin(m, program, f, time, gyro, vectors))
     before, first = f.clock[0], f.clock[2]
     dt, n = time - before, f.samples[1] + 1
-    m.unless((dt > 0.0) & (dt <= body.MAX_INTERVAL) & (n < r.most), lambda: m.leave("BAD_INPUT"))
+    m.unless((dt > 0.0) & (dt <= body.MAX_INTERVAL) & (n < len(r.imu.force)), lambda: m.leave("BAD_INPUT"))
     m.comment("attitude by the gyro alone")
     times, rates, attitude = (0.0, dt), Table([tuple(f.rate[i] for i in range(3)), gyro]), m.scratch()
     for i in range(4):
@@ -192,7 +161,7 @@ def update(m: Any, program: Any, f: SimpleNamespace, time: Any, gyro: Any, force
     for i in range(4):
         f.turned[i] = f.frame[n, i] = turned[i]
     m.comment("a step of the filter ends with the last sample before a multiple of its interval")
-    old, new = (m.lowest((t + r.interval - first) / r.step + 1e-6) for t in (before, time))
+    old, new = (m.lowest((t + r.interval - first) / r.imu.step + 1e-6) for t in (before, time))
     m.unless(m.equal(old, new), lambda: m.call("end_step"))
     m.call("carry")
     if r.rest is not None:
@@ -222,13 +191,13 @@ def begin(m: Any, program: Any, f: SimpleNamespace, time: Any, gyro: Any, vector
         level = 1.0 - sine * sine
         m.unless(level > MIN_HORIZONTAL_SQUARED, lambda: m.leave("NO_HEADING"))
     q = m.kernel(first_attitude, up, north)
-    s, moved, swing = r.start, size / r.start.gravity - 1.0, r.start.swing_time * m.root(dot(gyro, gyro))
-    tilt = m.root(s.attitude_sigma**2 + moved * moved + swing * swing)
-    tilt = m.select(tilt < s.max_tilt, tilt, s.max_tilt)
+    moved, swing = size / STANDARD_GRAVITY - 1.0, starting.SWING_TIME * m.root(dot(gyro, gyro))
+    tilt = m.root(r.parameters.attitude_sigma**2 + moved * moved + swing * swing)
+    tilt = m.select(tilt < starting.MAX_TILT_SIGMA, tilt, starting.MAX_TILT_SIGMA)
     heading = 0.0
     if r.magnetometer:
         steep = m.select(level > 0.07, level, 0.07)
-        heading = (sine * sine * (tilt * tilt) + s.first_heading**2) / steep
+        heading = (sine * sine * (tilt * tilt) + starting.FIRST_HEADING**2) / steep
     for i in range(4):
         f.x[i] = q[i]
         f.turned[i] = f.frame[0, i] = 1.0 if i == 0 else 0.0
@@ -241,8 +210,9 @@ def begin(m: Any, program: Any, f: SimpleNamespace, time: Any, gyro: Any, vector
     iron = 0.0
     if r.magnetometer:
         f.start[0] = time
-        f.field_level[0], f.field_sums[0], f.field_sums[1] = r.first_level
-        iron = s.iron_sigma**2 / m.select(level > 1e-12, level, 1e-12)
+        first_level, weight = regions.FIRST_LEVEL
+        f.field_level[0], f.field_sums[0], f.field_sums[1] = first_level, first_level * weight, weight
+        iron = r.parameters.iron_sigma**2 / m.select(level > 1e-12, level, 1e-12)
     f.scales[3] = iron
     f.samples[0], f.samples[1] = 1, 0
     begin_step(m, program, f)
@@ -309,8 +279,8 @@ def keep_for_rest(m: Any, r: Recording, f: SimpleNamespace, time: Any, gyro: Any
     assert r.rest is not None
     k = f.resting[0]
     m.branch(m.equal(k, 0), lambda: put(f.rest_clock, 0, time))
-    k = f.resting[0]
-    tenth, half = k // r.rest.part, k // ((r.rest.parts * r.rest.part + 1) // 2)
+    k, (parts, part) = f.resting[0], r.rest
+    tenth, half = k // part, k // ((parts * part + 1) // 2)
     for i in range(3):
         f.tenths[tenth, i] = f.tenths[tenth, i] + gyro[i]
     for v, vector in enumerate(vectors):
@@ -324,20 +294,21 @@ def keep_for_rest(m: Any, r: Recording, f: SimpleNamespace, time: Any, gyro: Any
         m.call("find_rest")
         clear_span(m, r, f)
 
-    m.branch(m.equal(k + 1, r.rest.parts * r.rest.part), last)
+    m.branch(m.equal(k + 1, parts * part), last)
 
 
 def find_rest(m: Any, program: Any, f: SimpleNamespace) -> None:
     """Measure the bias at rest."""
-    r = program.recording.rest
-    tenths = [tuple(f.tenths[p, i] / r.part for i in range(3)) for p in range(r.parts)]
-    rate = tuple(sum((tenth[i] for tenth in tenths[1:]), tenths[0][i]) / r.parts for i in range(3))
+    r = program.recording
+    parts, part = r.rest
+    tenths = [tuple(f.tenths[p, i] / part for i in range(3)) for p in range(parts)]
+    rate = tuple(sum((tenth[i] for tenth in tenths[1:]), tenths[0][i]) / parts for i in range(3))
     spread = 0.0
     for tenth in tenths:
         spread = spread + sum((tenth[i] - rate[i]) * (tenth[i] - rate[i]) for i in range(3))
-    variance = r.sigma**2 + spread / r.parts
+    variance = r.parameters.rest_bias_sigma**2 + spread / parts
     agree, square = 0.0, 0.0
-    for v in range(2 if program.recording.magnetometer else 1):
+    for v in range(2 if r.magnetometer else 1):
         counts = f.halves_number[2 * v], f.halves_number[2 * v + 1]
         sums = [tuple(f.halves[2 * v + half, i] for i in range(3)) for half in range(2)]
         total = tuple(x + y for x, y in zip(*sums, strict=True))
@@ -347,15 +318,15 @@ def find_rest(m: Any, program: Any, f: SimpleNamespace) -> None:
             tuple(x / (m.select(some, size, 1.0) * m.select(some, count, 1.0)) for x in half)
             for half, count in zip(sums, counts, strict=True)
         )
-        expected = cross(rate, tuple(-0.25 * r.span * (x + y) for x, y in zip(first, second, strict=True)))
+        expected = cross(rate, tuple(-0.25 * starting.QUIET_SPAN * (x + y) for x, y in zip(first, second, strict=True)))
         seen = tuple(y - x for x, y in zip(first, second, strict=True))
         agree = agree + m.select(some, dot(seen, expected), 0.0)
         square = square + m.select(some, dot(expected, expected), 0.0)
-    turning = dot(rate, rate) > r.turning_rate**2
-    still = (variance < r.max_sigma**2) & (f.clock[0] - f.rest_clock[0] < 1.5 * r.span)
-    still = still & (f.halves_number[0] + f.halves_number[1] > r.parts * r.part // 2)
+    turning = dot(rate, rate) > starting.TURNING_RATE**2
+    still = (variance < starting.MAX_REST_SIGMA**2) & (f.clock[0] - f.rest_clock[0] < 1.5 * starting.QUIET_SPAN)
+    still = still & (f.halves_number[0] + f.halves_number[1] > parts * part // 2)
     still = still & m.no(turning & (agree > 0.5 * square))
-    drifted = f.rest_variance[1] + r.rate_random_walk**2 * (f.clock[0] - f.rest_clock[1])
+    drifted = f.rest_variance[1] + r.parameters.rate_random_walk**2 * (f.clock[0] - f.rest_clock[1])
 
     def found() -> None:
         f.resting[1] = 1
@@ -402,7 +373,7 @@ def begin_step(m: Any, program: Any, f: SimpleNamespace) -> None:
     r = program.recording
     tilt, floor, heading = m.scratch(), m.scratch(), m.scratch()
     level = (f.field_level[0],) if r.magnetometer else (0.0,)
-    m.kernel(recording_steps.scale_factors, level, r.shares, tilt, floor, heading)
+    m.kernel(recording_steps.scale_factors, level, r.imu.scale.arguments[1], tilt, floor, heading)
     f.scales[0], f.scales[1], f.scales[2] = tilt[0], floor[0], heading[0]
 
 
@@ -420,7 +391,7 @@ def end_step(m: Any, program: Any, f: SimpleNamespace) -> None:
     known = number[0] > 0
 
     def measured() -> None:
-        sigma = r.noise / m.root(number[0] * r.interval) / program.sensors[0].length
+        sigma = r.imu.noise / m.root(number[0] * r.interval) / program.sensors[0].length
         m.call("update_accelerometer", row(mean), sigma)
 
     m.branch(known, measured)
@@ -460,9 +431,9 @@ def end_field(m: Any, program: Any, f: SimpleNamespace, edges: Any, force: Any, 
     m.kernel(headings.heading_steps, r.constants, steps, f, found)
 
     def turned() -> None:
-        status = m.call("update_magnetometer", row(found.direction), found.sigma[0], result="int")
+        status = m.call("update_magnetometer", row(found.direction), found.sigma[0], result="status")
         nis = m.select(m.equal(status, 0), f.nis[1], 0.0)
-        m.kernel(recording_steps.running_mean, (nis,), r.forgotten, f.field_sums, f.field_level)
+        m.kernel(recording_steps.running_mean, (nis,), r.imu.field_mean.arguments[1], f.field_sums, f.field_level)
 
     m.branch(found.sigma[0] > 0.0, turned)
     f.scales[3] = found.variance[0]
@@ -485,11 +456,11 @@ def carry(m: Any, program: Any, f: SimpleNamespace) -> None:
         time=(f.clock[1], f.clock[0]),
         rate=Table([none, rate]),
         turned=Table([[f.frame[0, i] for i in range(4)], [f.turned[i] for i in range(4)]]),
-        late=(r.late, r.late),
-        ahead=Table([none, scale(r.late, rate)]),
+        late=(r.imu.late, r.imu.late),
+        ahead=Table([none, scale(r.imu.late, rate)]),
     )
     out = SimpleNamespace(attitude=m.scratch(), bias=m.scratch(), variance=m.scratch(), covariance=())
-    m.kernel(recording_steps.carry_to_stamps, steps, stamps, r.timing, out)
+    m.kernel(recording_steps.carry_to_stamps, steps, stamps, r.imu.carry.arguments[2], out)
     for i in range(4):
         f.q[i] = out.attitude[1, i]
     for i in range(6):

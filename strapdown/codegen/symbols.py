@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 KERNELS = "strapdown.kernels"
 PINNED = ("load", "at", "result", "parameter")
@@ -194,6 +194,7 @@ class Values:
         self.loaded: dict[Any, Any] = {}
         """Elements as they are on the target."""
         self.loads = 0
+        """Number of loads, by which those of one element at two places are two symbols."""
         trace.arrays.append(self)
 
     def __getitem__(self, i: Any) -> Any:
@@ -202,7 +203,7 @@ class Values:
                 raise KeyError(f"element {i} is read before it is written")
             if i not in self.loaded:
                 self.loads += 1
-                self.loaded[i] = self.trace.symbol("load", self.name(i), Version((id(self), self.loads)))
+                self.loaded[i] = self.trace.symbol("load", self.name(i), (id(self), self.loads))
                 self.loaded[i].type = self.type
             self.known[i] = self.loaded[i]
         return self.known[i]
@@ -214,9 +215,3 @@ class Values:
         """Forget the elements: the target may have other values now."""
         if self.name is not None:
             self.known, self.changed, self.loaded = {}, {}, {}
-
-
-class Version(NamedTuple):
-    """Makes loads of one element at two places two symbols."""
-
-    key: tuple[int, int]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -40,8 +41,8 @@ class Language:
     """A status of the filter."""
     whole: Callable[[str], str]
     """A number rounded down."""
-    narrow: Callable[[str], str]
-    """A duration: the difference of two times."""
+    real: Callable[[str], str]
+    """An integer, or a duration (the difference of two times), as a number of the usual type."""
     quotient: Callable[[str], str]
     """A quotient of positive integers rounded down."""
 
@@ -214,7 +215,7 @@ class Writer:
             self.indent += 1
             self._symbols(self.placement.needed((m.operands[i] for m in members), arm, self.written), arm)
             for name, member in zip(names, members, strict=True):
-                self.line(f"{name} = {self._operand(member.operands[i], 0, right=False)};")
+                self.line(f"{name} = {self._as(member.type, member.operands[i], 0, right=False)};")
             self.indent -= 1
         self.line("}")
         for name, member in zip(names, members, strict=True):
@@ -229,24 +230,19 @@ class Writer:
             return False
         return symbol in self.user_here and len(self._expression(symbol)) <= LONGEST
 
-    @property
+    @functools.cached_property
     def user_here(self) -> set[Symbol]:
         """Operations whose users are in the same slot, outside the arms of a selection."""
-        if not hasattr(self, "_user_here"):
-            places, groups = self.placement.places, self.placement.groups
-            self._user_here = set()
-            for user in self.placement.alive:
-                if user not in groups and user.kind not in PINNED:
-                    self._user_here |= {x for x in user.operands if isinstance(x, Symbol) and places[x] is places[user]}
-                elif user in groups:
-                    arms = groups[user].arms
-                    assert arms is not None
-                    self._user_here |= {
-                        x
-                        for x, arm in zip(user.operands[1:], arms, strict=True)
-                        if isinstance(x, Symbol) and places[x] is arm
-                    }
-        return self._user_here
+        places, groups, here = self.placement.places, self.placement.groups, set()
+        for user in self.placement.alive:
+            group = groups.get(user)
+            if group is not None:
+                assert group.arms is not None
+                pairs = list(zip(user.operands[1:], group.arms, strict=True))
+            else:
+                pairs = [] if user.kind in PINNED else [(x, places[user]) for x in user.operands]
+            here |= {x for x, slot in pairs if isinstance(x, Symbol) and places[x] is slot}
+        return here
 
     def _new(self, stem: str) -> str:
         number = self.used[stem] = self.used.get(stem, 0) + 1
@@ -277,6 +273,12 @@ class Writer:
         text = self.text(value, kind)
         return f"({text})" if text.startswith("-") else text
 
+    def _as(self, result: str, value: Any, level: float, *, right: bool, kind: str = "") -> str:
+        """Return an operand of an operation with a result of a type."""
+        if result == "" and isinstance(value, Symbol) and value.type == "int":
+            return self.language.real(self._operand(value, 6, right=True))
+        return self._operand(value, level, right=right, kind=kind)
+
     def _expression(self, symbol: Symbol) -> str:
         kind, operands, language = symbol.kind, symbol.operands, self.language
         if kind in PRECEDENCE:
@@ -287,22 +289,22 @@ class Writer:
             array = self._member(operands[0]) if kind == "at" else self.names[operands[0]]
             return f"{array}[{self._operand(operands[1], 0, right=False, kind='int')}]"
         if kind == "select":
-            c, a, b = (self._operand(x, 5, right=True) for x in operands)
-            return f"{c} ? {a} : {b}"
+            a, b = (self._as(symbol.type, x, 5, right=True) for x in operands[1:])
+            return f"{self._operand(operands[0], 5, right=True)} ? {a} : {b}"
         if kind in ("neg", "not"):
             inner = self._operand(operands[0], 6 if kind == "neg" else 0, right=kind == "neg")
             return f"-{inner}" if kind == "neg" else f"!({inner})"
-        inner = ", ".join(self._operand(x, 0, right=False) for x in operands)
+        inner = ", ".join(self._as(symbol.type, x, 0, right=False) for x in operands)
         return f"{language.function(kind)}({inner})" if kind in FUNCTIONS else language.whole(inner)
 
     def _binary(self, symbol: Symbol) -> str:
         kind, operands, language = symbol.kind, symbol.operands, self.language
         level, types = PRECEDENCE[kind], [x.type for x in operands if isinstance(x, Symbol)]
-        own = "wide" if "wide" in types else "int" if "int" in types and kind != "/" else ""
-        pair = [self._operand(x, level, right=i > 0, kind=own) for i, x in enumerate(operands)]
+        own = "wide" if "wide" in types else "int" if {"int", "status"} & {*types} and kind != "/" else ""
+        pair = [self._as(symbol.type, x, level, right=i > 0, kind=own) for i, x in enumerate(operands)]
         left, right = (f"({x})" if kind == "||" and "&&" in x else x for x in pair)
         if "wide" in types and symbol.type == "":
-            return language.narrow(f"{left} - {right}")
+            return language.real(f"({left} - {right})")
         if kind == "//":
             return language.quotient(f"{left} / {right}")
         return f"{left} {kind} {right}"

@@ -11,6 +11,7 @@ tangent space.
 - ``forward``: The filter over whole records.
 - ``smoothing``: The smoothers; ``recovery_segments``: smoothing across recoveries.
 - ``observability``: Information of a record about each state.
+- ``features``: What filters of single samples and exported ones have not, with the remedy.
 - ``live``: The compiled filter for data in real time.
 - ``step_filter``: The filter in single steps, on filterpy.
 - ``multiple_model``: Unknown initial attitude, by multiple-model estimation.

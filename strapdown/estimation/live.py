@@ -32,6 +32,7 @@ from strapdown.checks import (
 from strapdown.estimation import forward
 from strapdown.estimation import model as modelling
 from strapdown.estimation.error_states import ErrorStates
+from strapdown.estimation.features import refuse
 from strapdown.estimation.forward import Judge, Options, gate_events
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.states import ProcessNoise, State, check_arguments, covariance_matrices
@@ -127,7 +128,7 @@ class LiveFilter:
         # The kernels process each interval as a record; this one, without rotation, defines its arrays.
         record = ImuRecord(time=self._time + np.arange(2.0), increments=np.zeros((1, 3)), vectors=tuple(series))
         self._problem = forward.prepared(record, process_noise, initial, error_states)
-        need_no_record(self._problem.model)
+        refuse("a filter of single samples", record=self._problem.model.of_record)
         options = Options(gate=gate, robust=robust)
         self._judge, self._judged = Judge(self._problem, options), options.judged
         self._writers = {one.sensor: (float(place), one.kind == "attitude") for place, one in enumerate(series)}
@@ -538,14 +539,6 @@ class _Interval(NamedTuple):
 
 
 # ----------------------------------------------------------------------------------------------------------- what the sensors declare
-
-
-def need_no_record(model: modelling.Model) -> None:
-    """Raise an error for effects that a filter of single samples cannot have."""
-    if model.levers.any() or model.varying:
-        raise InputError(
-            "lever arms, and effects relative to a varying field magnitude, need the whole record; use estimation.run for them"
-        )
 
 
 def template(sensor: VectorSensor | VectorMeasurements, time: float) -> VectorMeasurements:

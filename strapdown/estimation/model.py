@@ -91,6 +91,11 @@ class Model:
         """Number of error states."""
         return len(self.decay)
 
+    @property
+    def of_record(self) -> bool:
+        """Whether effects need the whole record: a lever arm, or a measured magnitude that varies."""
+        return bool(self.levers.any() or self.varying)
+
     def turning_matrix(self, before: Array, after: Array) -> Array:
         """Return the matrix (n, n) by which a correction of the attitude from one q_fb to another transforms the other states."""
         T = np.eye(self.structure.n)

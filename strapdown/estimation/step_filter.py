@@ -14,6 +14,7 @@ from strapdown import kinematics, quaternion
 from strapdown.checks import Array, InputError, array, finite, instance, non_negative, one_of
 from strapdown.estimation import model as modelling
 from strapdown.estimation.error_states import ErrorStates
+from strapdown.estimation.features import refuse
 from strapdown.estimation.forward import kernel_model
 from strapdown.estimation.schedule import schedule
 from strapdown.estimation.states import ProcessNoise, State, check_arguments
@@ -267,10 +268,7 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         if (sensor, kind) not in self._models:
             kinds = {name: "vector" for block in self.error_states for name in block.effects} | {sensor: kind}
             model = modelling.assemble(self.error_states, kinds, isotropic=False)
-            if model.levers.any() or model.varying:
-                raise InputError(
-                    "lever arms, and effects relative to a varying field magnitude, need the whole record; use estimation.run for them"
-                )
+            refuse("a filter of single samples", record=model.of_record)
             here = model.structure.sensors[model.shape[list(kinds).index(sensor)]]
             self._models[sensor, kind] = replace(model, structure=model.structure._replace(sensors=(here,)))
         return self._models[sensor, kind]

@@ -15,6 +15,7 @@ import numpy as np
 
 from strapdown.checks import Array, InputError
 from strapdown.estimation.error_states import ErrorStates, GyroTemperature, spans
+from strapdown.estimation.features import refuse
 from strapdown.estimation.states import State
 from strapdown.records import Estimate, ImuRecord
 
@@ -31,8 +32,7 @@ def slopes(error_states: Sequence[ErrorStates]) -> slice | None:
 
 def need_none(error_states: Sequence[ErrorStates], what: str) -> None:
     """Raise an error if there are slopes, which this estimator does not use."""
-    if slopes(error_states) is not None:
-        raise InputError(f"{what} has no bias driven by temperature; leave the gyro temperature states out")
+    refuse(what, temperature=slopes(error_states) is not None)
 
 
 def of(record: ImuRecord) -> Array:
