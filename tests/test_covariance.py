@@ -763,6 +763,14 @@ def test_axes_of_a_gyro_may_differ():
 # ------------------------------------------------------------------------------------------------------- the command line
 
 
+def test_the_initial_bias_contains_the_part_too_fast_for_a_state():
+    scenario = load_scenario("hand-held")
+    chosen = FilterSetup.for_scenario(scenario)
+    assert chosen.states.gyro_fast_bias_sigma > 0.0
+    found = covariance.analyse(scenario, chosen, epochs=2)
+    np.testing.assert_allclose(found.filter_sigma[0, 3:], chosen.bias_sigma, rtol=1e-9)
+
+
 def test_the_command_prints_a_budget_and_writes_it(succeeds, tmp_path):
     options = ("--epochs", 10, "--consider", "misalignment=0.1", "--consider", "star.delay=2")
     said = succeeds("covariance", "spin", "--no-states", *options)
