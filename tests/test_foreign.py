@@ -668,6 +668,43 @@ def test_the_p_value_of_a_constant_has_its_size_and_its_power(phi):
     assert foreign._constant_p_value(np.full(2, 1e6), white[0, : foreign.MIN_ROWS - 1]) == 1.0
 
 
+RAMP = np.arange(203.0)
+WHITE = np.random.default_rng(9).standard_normal((203, 2)) @ [[2.0, 0.3], [0.5, 0.5]]
+SCORES = {
+    "white": WHITE,
+    "high frequencies": scipy.signal.lfilter([1.0, -0.9], [1.0], WHITE, axis=0),
+    "low frequencies": scipy.signal.lfilter([1.0], [1.0, -0.8], WHITE, axis=0),
+    "both": scipy.signal.lfilter([1.0, -1.8], [1.0, -0.995], WHITE, axis=0),
+    "ramp": np.stack([RAMP, np.diff(WHITE[:, 1], prepend=0.0)], axis=1),
+    "ramps": np.stack([RAMP, np.cos(0.03 * RAMP)], axis=1),
+}
+
+
+@pytest.mark.parametrize("kind", SCORES)
+@pytest.mark.parametrize("samples", [80, 203])
+def test_the_p_value_of_a_constant_is_that_of_the_autocovariances(kind, samples):
+    """Hotelling's T² by SciPy: autocovariances of the fitted autoregression are summed, and the F distribution is SciPy's."""
+    x = SCORES[kind][:samples] - SCORES[kind][:samples].mean(axis=0)
+    densities = []
+    for length in [n for n in (1, 2, 4) if samples // n >= 40]:
+        sums = np.stack([x[i : i + length].sum(axis=0) for i in range(0, samples - length + 1, length)])
+        m = len(sums)
+        B = (1.0 + 2.0 / m) * np.linalg.solve(sums[:-1].T @ sums[:-1], sums[:-1].T @ sums[1:]).T
+        B *= min(1.0, 0.99 / np.abs(np.linalg.eigvals(B)).max())
+        noise = sums[1:] - np.einsum("ij,tj->ti", B, sums[:-1])
+        covariance = scipy.linalg.solve_discrete_lyapunov(B, noise.T @ noise / (m - 1))
+        ahead, density = covariance, covariance.copy()
+        for _ in range(3000):
+            ahead = B @ ahead
+            density += ahead + ahead.T
+        densities.append(density / length)
+    density = max(densities, key=np.linalg.det)
+    n = samples * np.sqrt(np.linalg.det(x.T @ x / samples) / np.linalg.det(density))
+    total = np.sqrt(samples) * np.linalg.cholesky(density) @ [1.2, 1.6]  # T² = 4
+    expected = scipy.stats.f.sf(4.0 * (n - 2.0) / (2.0 * (n - 1.0)), 2, n - 2.0) if n > 3.0 else 1.0
+    assert foreign._constant_p_value(total, x) == pytest.approx(expected, rel=1e-6)
+
+
 @pytest.mark.slow
 def test_peers_are_right_where_all_is_and_found_out_where_it_is_not():
     """Over 40 runs; the errors are on the body side, as smsfusion's source says."""
