@@ -43,6 +43,7 @@ HEADERS = {
     "logger": "loggingTime(s),gyroRotationX(deg/s),gyroRotationY(deg/s),gyroRotationZ(deg/s),accelerometerAccelerationX(G),"
     "accelerometerAccelerationY(G),accelerometerAccelerationZ(G),magnetometerX(µT),magnetometerY(µT),magnetometerZ(µT)",
     "joined": "seconds_elapsed,wx [deg/s],wy,wz,accx [g],accy,accz,magx [uT],magy,magz",
+    "joined, unit": "time,gyrox_dps,gyroy_dps,gyroz_dps,accx_g,accy_g,accz_g,magx_uT,magy_uT,magz_uT",
 }
 
 
@@ -75,6 +76,8 @@ def test_a_flight_log_as_csv_has_its_axes_in_brackets(table):
     path = table(header, values=values)
     with pytest.raises(InputError, match=r"stamps of timestamp are 4000 apart.*not plausible in seconds.*\[us\]"):
         read(path)
+    with pytest.raises(InputError, match=r"stamps of timestamp are 2.5 apart.*not plausible in seconds"):
+        read(table(header, values=VALUES[:, :7] * [2.5, 1, 1, 1, 1, 1, 1], name="slow.csv"))
     recording = read(path, units={"time": "us"})
     np.testing.assert_allclose(recording.time, values[:, 0] * 1e-6, rtol=1e-15)
     np.testing.assert_array_equal(recording.rate, VALUES[:, 1:4])

@@ -196,6 +196,9 @@ def test_an_array_has_the_rate_and_the_unit_that_are_given(tmp_path):
     found = recordings.read_samples(tmp_path / "rest.npy", "gyro", rate=200.0, units={"gyro": "deg/s"})
     assert found.sample_interval == pytest.approx(0.005)
     np.testing.assert_allclose(found.values, np.pi)
+    np.save(tmp_path / "one.npy", np.arange(5.0))  # one axis
+    found = recordings.read_samples(tmp_path / "one.npy", "gyro", rate=200.0, units={"gyro": "rad/s"})
+    np.testing.assert_array_equal(found.values, np.arange(5.0)[:, None])
 
 
 def test_rows_of_times_are_those_of_their_stamps():
