@@ -650,6 +650,16 @@ def test_the_command_refuses(files, monkeypatch, capsys):
         assert message in error
 
 
+def test_an_alignment_is_described_with_its_sigma():
+    sigma = np.array([*np.full(3, 2.0 * DEGREE), *np.full(3, 5.0 * DEGREE), 0.25])
+    fixed, body = np.array([0.0, 3.0, 4.0]) * DEGREE, np.array([6.0, 0.0, 0.0]) * DEGREE
+    known = {"covariance": np.diag(sigma**2), "estimated": ("time", "fixed", "body"), "residual": 0.0}
+    clock, *frames = alignment.Alignment(offset=1.5, fixed=fixed, body=body, sigma=sigma, **known).words
+    assert clock.startswith("clocks differ by 1.5 s ± 0.25 s")
+    assert frames[0].startswith("the fixed frames differ by 5° (rotation vector 0, 3, 4°) ± 2° an axis")
+    assert frames[1].startswith("the body frames differ by 6° (rotation vector 6, 0, 0°) ± 5° an axis")
+
+
 def test_times_without_anything_in_common_are_refused(run):
     with pytest.raises(InputError, match="fewer than two times in common"):
         checked(run, time=run.estimate.time + 1e4, align="none")
