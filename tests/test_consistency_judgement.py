@@ -64,6 +64,7 @@ def of_a_recording(result):
 def test_a_right_filter_is_consistent():
     judgement = consistency.judge(*estimate())
     assert judgement.verdict == "consistent"
+    assert judgement.required == 1.5
     assert not any(finding.rejected for finding in judgement.findings)
     assert {finding.name for finding in judgement.findings} == {
         "NIS",

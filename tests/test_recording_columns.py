@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from strapdown import recordings
 from strapdown.checks import InputError
 from strapdown.cli import app
-from strapdown.recordings import columns, read
+from strapdown.recordings import columns, delimited, read
 
 DEGREE = np.pi / 180.0
 G = 9.80665
@@ -261,3 +261,8 @@ def test_commands_take_columns_and_say_what_they_guessed(table, tmp_path):
         other = CliRunner().invoke(app, [command, str(odd), *out, "--columns", mapping])
         assert other.exit_code == said.exit_code, other.output
         assert "Columns assigned" not in other.output
+
+
+@pytest.mark.parametrize(("line", "numeric"), [("1;a", True), ("1,a,b", False), ('"1.5",, a ', True), (",;", False)])
+def test_a_line_is_of_numbers_if_half_of_its_fields_are(line, numeric):
+    assert delimited._numeric(line) == numeric

@@ -11,7 +11,7 @@ from strapdown.checks import InputError
 from strapdown.cli import app
 from strapdown.recordings import Recording, read, recordfiles, samples
 from strapdown.records import ImuRecord
-from strapdown.records.recording import at_nearest
+from strapdown.records.recording import at_nearest, gaps
 
 HEADER = "time,gx [rad/s],gy,gz,ax [m/s2],ay,az"
 ROWS = ("0.00,0.1,0.2,0.3,1,2,9", "0.01,0.4,0.5,0.6,3,4,8", "0.02,0.7,0.8,0.9,5,6,7")
@@ -536,3 +536,7 @@ def test_samples_of_a_simulated_record_are_its_increments_and_what_its_sensors_m
     other = recordings.read_samples(tmp_path / "record.h5", "accelerometer")
     np.testing.assert_array_equal(other.values, force.vector_b)
     assert (other.kind, other.sample_interval) == ("rate", pytest.approx(0.04, rel=1e-12))
+
+
+def test_gaps_are_intervals_of_more_than_five_median_ones():
+    assert gaps([0.0, 1.0, 2.0, 3.0, 9.0, 10.0, 15.0]) == [(3.0, 6.0)]
