@@ -178,6 +178,10 @@ def test_autocorrelation_by_the_sum():
     assert np.all(found.simultaneous_bounds > found.bounds)
 
 
+def test_the_usual_lags_are_a_fiftieth_of_the_samples_from_1_to_20():
+    assert [whiteness.usual_lags(n) for n in (3, 99, 100, 999, 1000, 10_000)] == [1, 1, 2, 19, 20, 20]
+
+
 def test_ljung_box_of_one_component_is_the_textbook_one():
     z = np.random.default_rng(7).standard_normal(300)
     r = [np.sum(z[lag:] * z[:-lag]) / np.sum(z * z) for lag in range(1, 7)]

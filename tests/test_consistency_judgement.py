@@ -64,6 +64,7 @@ def of_a_recording(result):
 def test_a_right_filter_is_consistent():
     judgement = consistency.judge(*estimate())
     assert judgement.verdict == "consistent"
+    assert judgement.required == 1.5
     assert not any(finding.rejected for finding in judgement.findings)
     assert {finding.name for finding in judgement.findings} == {
         "NIS",
@@ -110,6 +111,16 @@ def test_an_error_that_hardly_moves_is_not_averaged_over_the_run_and_that_is_rep
     averaged = {finding.of for finding in judgement.findings if finding.name == "time-averaged NEES"}
     assert "bias" not in averaged
     assert "attitude" in averaged
+
+
+def test_epochs_without_a_reference_do_not_count():
+    result, truth = estimate()
+    known = np.arange(200) % 3 > 0
+    rows = {name: getattr(result, name)[known] for name in ("time", "attitude", "bias", "variance", "covariance")}
+    part = consistency.judge(replace(result, **rows), Truth(attitude=truth.attitude[known], bias=truth.bias[known]))
+    gaps = consistency.judge(result, replace(truth, attitude=np.where(known[:, None], truth.attitude, np.nan)))
+    assert gaps.findings == part.findings
+    assert {"NEES at the end", "time-averaged NEES"} <= {finding.name for finding in gaps.findings}
 
 
 @pytest.mark.parametrize(

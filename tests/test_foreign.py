@@ -545,8 +545,8 @@ def test_odometry_and_poses_are_read_from_bags(run, tmp_path):
             stamp=t["builtin_interfaces/msg/Time"](sec=whole // 10**9, nanosec=whole % 10**9), frame_id="map"
         )
 
-    def pose(k):
-        w, x, y, z = e.attitude[k]
+    def pose(k, known=True):
+        w, x, y, z = known * e.attitude[k]
         return t["geometry_msgs/msg/PoseWithCovariance"](
             pose=t["geometry_msgs/msg/Pose"](
                 position=t["geometry_msgs/msg/Point"](x=0.0, y=0.0, z=0.0),
@@ -564,7 +564,8 @@ def test_odometry_and_poses_are_read_from_bags(run, tmp_path):
             header=header(k), child_frame_id="base_link", pose=pose(k), twist=twist
         ),
         "geometry_msgs/msg/PoseWithCovarianceStamped": lambda k: t["geometry_msgs/msg/PoseWithCovarianceStamped"](
-            header=header(k), pose=pose(k)
+            header=header(k),
+            pose=pose(k, known=k < 2),
         ),
     }
     folder = tmp_path / "bag"
@@ -575,10 +576,10 @@ def test_odometry_and_poses_are_read_from_bags(run, tmp_path):
                 writer.write(connection, k, store.serialize_cdr(make(k), kind))
     with pytest.raises(InputError, match="several topics with orientations"):
         read_attitudes(folder)
-    for topic in ("/odometry", "/posewithcovariancestamped"):
+    for topic, number in (("/odometry", 30), ("/posewithcovariancestamped", 2)):
         read = read_attitudes(folder, topic=topic)
-        np.testing.assert_allclose(read.attitude, e.attitude[:30], atol=1e-12)
-        np.testing.assert_array_equal(read.covariance, np.tile(P[3:, 3:], (30, 1, 1)))
+        np.testing.assert_allclose(read.attitude, e.attitude[:number], atol=1e-12)
+        np.testing.assert_array_equal(read.covariance, np.tile(P[3:, 3:], (number, 1, 1)))
         assert read.stamps_ns[1] - read.stamps_ns[0] == 10**8
     storage = next(one for one in folder.iterdir() if one.suffix != ".yaml")
     storage.write_bytes(storage.read_bytes()[: storage.stat().st_size // 2])
@@ -651,6 +652,25 @@ def test_the_command_refuses(files, monkeypatch, capsys):
         assert message in error
 
 
+def test_a_definition_of_the_covariance_that_thousands_of_errors_show_is_certain():
+    """σ of 1, 1 and 10, by 5000 independent errors: the log-likelihoods differ by 26,000, which no exponential holds."""
+    error = np.random.default_rng(2).standard_normal((5000, 3)) * [1.0, 1.0, 10.0]
+    readings = {name: np.tile(np.diag(P), (5000, 1, 1)) for name, P in (("body", [1, 1, 100]), ("fixed", [100, 1, 1]))}
+    probability = foreign.frame_probabilities(error, readings)
+    assert probability["body"] == 1.0
+    assert 0.0 < probability["fixed"] < 1e-300
+
+
+def test_an_alignment_is_described_with_its_sigma():
+    sigma = np.array([*np.full(3, 2.0 * DEGREE), *np.full(3, 5.0 * DEGREE), 0.25])
+    fixed, body = np.array([0.0, 3.0, 4.0]) * DEGREE, np.array([6.0, 0.0, 0.0]) * DEGREE
+    known = {"covariance": np.diag(sigma**2), "estimated": ("time", "fixed", "body"), "residual": 0.0}
+    clock, *frames = alignment.Alignment(offset=1.5, fixed=fixed, body=body, sigma=sigma, **known).words
+    assert clock.startswith("clocks differ by 1.5 s ± 0.25 s")
+    assert frames[0].startswith("the fixed frames differ by 5° (rotation vector 0, 3, 4°) ± 2° an axis")
+    assert frames[1].startswith("the body frames differ by 6° (rotation vector 6, 0, 0°) ± 5° an axis")
+
+
 def test_times_without_anything_in_common_are_refused(run):
     with pytest.raises(InputError, match="fewer than two times in common"):
         checked(run, time=run.estimate.time + 1e4, align="none")
@@ -668,6 +688,43 @@ def test_the_p_value_of_a_constant_has_its_size_and_its_power(phi):
         assert low < np.median(p) + 1e-9 < high
         assert np.mean(np.array(p) < 0.05) < 0.1 or shift is off
     assert foreign._constant_p_value(np.full(2, 1e6), white[0, : foreign.MIN_ROWS - 1]) == 1.0
+
+
+RAMP = np.arange(203.0)
+WHITE = np.random.default_rng(9).standard_normal((203, 2)) @ [[2.0, 0.3], [0.5, 0.5]]
+SCORES = {
+    "white": WHITE,
+    "high frequencies": scipy.signal.lfilter([1.0, -0.9], [1.0], WHITE, axis=0),
+    "low frequencies": scipy.signal.lfilter([1.0], [1.0, -0.8], WHITE, axis=0),
+    "both": scipy.signal.lfilter([1.0, -1.8], [1.0, -0.995], WHITE, axis=0),
+    "ramp": np.stack([RAMP, np.diff(WHITE[:, 1], prepend=0.0)], axis=1),
+    "ramps": np.stack([RAMP, np.cos(0.03 * RAMP)], axis=1),
+}
+
+
+@pytest.mark.parametrize("kind", SCORES)
+@pytest.mark.parametrize("samples", [80, 203])
+def test_the_p_value_of_a_constant_is_that_of_the_autocovariances(kind, samples):
+    """Hotelling's T² by SciPy: autocovariances of the fitted autoregression are summed, and the F distribution is SciPy's."""
+    x = SCORES[kind][:samples] - SCORES[kind][:samples].mean(axis=0)
+    densities = []
+    for length in [n for n in (1, 2, 4) if samples // n >= 40]:
+        sums = np.stack([x[i : i + length].sum(axis=0) for i in range(0, samples - length + 1, length)])
+        m = len(sums)
+        B = (1.0 + 2.0 / m) * np.linalg.solve(sums[:-1].T @ sums[:-1], sums[:-1].T @ sums[1:]).T
+        B *= min(1.0, 0.99 / np.abs(np.linalg.eigvals(B)).max())
+        noise = sums[1:] - np.einsum("ij,tj->ti", B, sums[:-1])
+        covariance = scipy.linalg.solve_discrete_lyapunov(B, noise.T @ noise / (m - 1))
+        ahead, density = covariance, covariance.copy()
+        for _ in range(3000):
+            ahead = B @ ahead
+            density += ahead + ahead.T
+        densities.append(density / length)
+    density = max(densities, key=np.linalg.det)
+    n = samples * np.sqrt(np.linalg.det(x.T @ x / samples) / np.linalg.det(density))
+    total = np.sqrt(samples) * np.linalg.cholesky(density) @ [1.2, 1.6]  # T² = 4
+    expected = scipy.stats.f.sf(4.0 * (n - 2.0) / (2.0 * (n - 1.0)), 2, n - 2.0) if n > 3.0 else 1.0
+    assert foreign._constant_p_value(total, x) == pytest.approx(expected, rel=1e-6)
 
 
 @pytest.mark.slow

@@ -313,6 +313,8 @@ def test_seconds_since_1970_keep_their_digits(tmp_path):
     tum = tmp_path / "walk.tum"
     tum.write_text("1700000000.123456789 0 0 0 0 0 0 1\n1700000000.123456790 0 0 0 0 0 0 1\n")
     assert trajectories.read_tum(tum)[0].tolist() == [1700000000123456789, 1700000000123456790]
+    tum.write_text("1 0 0 0 0 0 0 1\n1.0 0 0 0 0 0 0 1\n")
+    refused(tum, "data row 2 is not after the one before", trajectories.read_tum)
 
 
 # ------------------------------------------------------------------------------------------------------------------ interruption

@@ -218,6 +218,9 @@ def test_flicker_is_the_simulators():
     for lag in (0, 1, 10, 100):
         got, wanted = (np.mean((x[lag:] - x[: len(x) - lag]) ** 2) if lag else np.mean(x**2) for x in (b, slow))
         assert got == pytest.approx(wanted, rel=0.12 if lag else 0.25)
+    record = lanes.replay(plan, 0).record  # the bias at an edge is the mean of the drift before it and after it
+    drift = record.increments * SCENARIO.rate
+    np.testing.assert_allclose(record.truth.bias[1:-1], 0.5 * (drift[1:] + drift[:-1]), rtol=0.0, atol=1e-15)
 
 
 def test_range_and_resolution_are_the_simulators():

@@ -122,6 +122,7 @@ def cut(share):
         (edited(lambda file: file.attrs.update(format=2)), "layout 2"),
         (edited(lambda file: file.attrs.pop("format")), "cannot be read"),
         (edited(lambda file: file.pop("increments")), "increments is missing"),
+        (edited(lambda file: file.attrs.update(scenario=3)), "scenario is .*3.*; it must be TOML text"),
         (edited(lambda file: file["truth/attitude"].__setitem__(3, 5.0)), "norm"),
         (edited(lambda file: file.pop("vectors/0/sigma")), r"vectors/0 \(.*\) has no sigma; give each"),
     ],

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from strapdown import recordings
 from strapdown.checks import InputError
 from strapdown.cli import app
-from strapdown.recordings import columns, read
+from strapdown.recordings import columns, delimited, read
 
 DEGREE = np.pi / 180.0
 G = 9.80665
@@ -43,6 +43,7 @@ HEADERS = {
     "logger": "loggingTime(s),gyroRotationX(deg/s),gyroRotationY(deg/s),gyroRotationZ(deg/s),accelerometerAccelerationX(G),"
     "accelerometerAccelerationY(G),accelerometerAccelerationZ(G),magnetometerX(µT),magnetometerY(µT),magnetometerZ(µT)",
     "joined": "seconds_elapsed,wx [deg/s],wy,wz,accx [g],accy,accz,magx [uT],magy,magz",
+    "joined, unit": "time,gyrox_dps,gyroy_dps,gyroz_dps,accx_g,accy_g,accz_g,magx_uT,magy_uT,magz_uT",
 }
 
 
@@ -75,6 +76,8 @@ def test_a_flight_log_as_csv_has_its_axes_in_brackets(table):
     path = table(header, values=values)
     with pytest.raises(InputError, match=r"stamps of timestamp are 4000 apart.*not plausible in seconds.*\[us\]"):
         read(path)
+    with pytest.raises(InputError, match=r"stamps of timestamp are 2.5 apart.*not plausible in seconds"):
+        read(table(header, values=VALUES[:, :7] * [2.5, 1, 1, 1, 1, 1, 1], name="slow.csv"))
     recording = read(path, units={"time": "us"})
     np.testing.assert_allclose(recording.time, values[:, 0] * 1e-6, rtol=1e-15)
     np.testing.assert_array_equal(recording.rate, VALUES[:, 1:4])
@@ -258,3 +261,8 @@ def test_commands_take_columns_and_say_what_they_guessed(table, tmp_path):
         other = CliRunner().invoke(app, [command, str(odd), *out, "--columns", mapping])
         assert other.exit_code == said.exit_code, other.output
         assert "Columns assigned" not in other.output
+
+
+@pytest.mark.parametrize(("line", "numeric"), [("1;a", True), ("1,a,b", False), ('"1.5",, a ', True), (",;", False)])
+def test_a_line_is_of_numbers_if_half_of_its_fields_are(line, numeric):
+    assert delimited._numeric(line) == numeric

@@ -315,8 +315,10 @@ def euroc(folder, truth: str = "state_groundtruth_estimate0"):
     turns = Rotation.from_rotvec(np.outer((at - at[0]) / 1e9, [0.3, -0.5, 0.8]))
     q = turns.as_quat()[:, [3, 0, 1, 2]] * np.where(np.arange(len(at)) % 3, 1.0, -1.0)[:, None]  # of either sign
     (folder / "mav0" / truth).mkdir()
+    more = [] if truth == "mocap0" else ["0.5"] * 9  # velocity, biases
     lines = "\n".join(
-        ",".join([str(s), "1.0", "2.0", "3.0", *map(repr, p)]) for s, p in zip(at.tolist(), q.tolist(), strict=True)
+        ",".join([str(s), "1.0", "2.0", "3.0", *map(repr, p), *more])
+        for s, p in zip(at.tolist(), q.tolist(), strict=True)
     )
     (folder / "mav0" / truth / "data.csv").write_text(f"#timestamp, p_x, p_y, p_z, q_w, q_x, q_y, q_z\n{lines}\n")
     return folder, stamps, values, (at, turns)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+from contextlib import nullcontext
 
 import h5py
 import numpy as np
@@ -73,12 +74,26 @@ def test_records_are_frozen_and_lists_are_welcome():
             r"truth.attitude\[0\] has norm 2",
         ),
         ({"truth": Truth(attitude=random_attitudes(3), bias=np.zeros(3))}, r"truth.bias has shape \(3,\)"),
+        ({"vectors": None}, r"vectors is None.*give a tuple of series, empty for none"),
+        (
+            {"increments": [[0, 0, 0], [0, -1e10, 0]]},
+            r"increments\[1, 1\] is -1e\+10 rad in 0.5 s, more than 1e\+06 rad between",
+        ),
+        ({"increments": np.ma.masked_equal([[7, 0, 0], [7, 0, 7]], 0)}, r"increments\[0, 1\] is masked"),
+        (
+            lambda: compress(record(3), coning.ALGORITHMS["four-sample"]),
+            "record has 3 intervals; four-sample needs at least 4",
+        ),
+        *(
+            (lambda edges=edges: cut(record(), *edges), "cut from edge .* with edges 0 to 12; choose 0 ≤ first < last")
+            for edges in ((-1, 5), (3, 3), (5, 3), (0, 13))
+        ),
     ],
 )
 def test_bad_records_are_refused(changes, words):
-    given = {"time": [0.0, 1.0, 2.0], "increments": np.zeros((2, 3))} | changes
+    given = {"time": [0.0, 0.5, 1.0], "increments": np.zeros((2, 3))}
     with pytest.raises(InputError, match=words):
-        ImuRecord(**given)
+        changes() if callable(changes) else ImuRecord(**(given | changes))
 
 
 # ---------------------------------------------------------------------------------------------------- compressing
@@ -99,11 +114,6 @@ def test_compress(name):
         even = compress(dataclasses.replace(r, time=5.0 + np.arange(14.0)), algorithm)
         first, second = r.increments[0:26:2][:kept], r.increments[1:26:2][:kept]
         np.testing.assert_allclose(even.increments, first + second + 2.0 / 3.0 * np.cross(first, second), atol=1e-16)
-
-
-def test_compress_refuses_a_record_shorter_than_a_step():
-    with pytest.raises(InputError, match="record has 3 intervals; four-sample needs at least 4"):
-        compress(record(3), coning.ALGORITHMS["four-sample"])
 
 
 # ---------------------------------------------------------------------------------------------------- cutting
@@ -136,12 +146,6 @@ def test_cut_keeps_what_belongs_to_each_sample():
     np.testing.assert_array_equal(part.time, time[inside])
     np.testing.assert_allclose(part.reference_f, (moving / np.linalg.norm(moving, axis=1)[:, None])[inside], rtol=1e-15)
     np.testing.assert_array_equal(part.arrival, (time + 0.2)[inside])
-
-
-@pytest.mark.parametrize(("first", "last"), [(-1, 5), (3, 3), (5, 3), (0, 13)])
-def test_cut_refuses_edges_that_are_not_there(first, last):
-    with pytest.raises(InputError, match=r"cut from edge .* with edges 0 to 12; choose 0 ≤ first < last"):
-        cut(record(), first, last)
 
 
 # ---------------------------------------------------------------------------------------------------- the estimate's file
@@ -255,24 +259,23 @@ def test_truncated_files_are_refused(tmp_path, share):
 
 
 def test_foreign_files_are_refused(tmp_path):
-    text, other, half = (tmp_path / name for name in ("text.h5", "other.h5", "half.h5"))
-    text.write_text("time,gx\n0,1\n")
-    with h5py.File(other, "w") as file:
+    (tmp_path / "text.h5").write_text("time,gx\n0,1\n")
+    with h5py.File(tmp_path / "other.h5", "w") as file:
         file["imu_gyr"] = np.zeros((3, 3))
-    with h5py.File(half, "w") as file:
+    with h5py.File(tmp_path / "half.h5", "w") as file:
         file.attrs["kind"] = "strapdown estimate"
         file["time"] = np.arange(3.0)
-    with pytest.raises(InputError, match=r"text\.h5 cannot be read as HDF5"):
-        read_estimate(text)
-    with pytest.raises(InputError, match=r"other\.h5 is not a strapdown estimate"):
-        read_estimate(other)
-    with (
-        pytest.warns(reading.NoDigestWarning, match=r"half\.h5 has no digest"),
-        pytest.raises(InputError, match=r"half\.h5.* attitude"),
+    for name, words in (
+        ("text", "cannot be read as HDF5"),
+        ("other", "is not a strapdown estimate"),
+        ("none", "does not exist; check the path"),
+        ("half", ".* attitude"),
     ):
-        read_estimate(half)
-    with pytest.raises(InputError, match=r"none\.h5 does not exist; check the path"):
-        read_estimate(tmp_path / "none.h5")
+        digest = (
+            pytest.warns(reading.NoDigestWarning, match=r"half\.h5 has no digest") if name == "half" else nullcontext()
+        )
+        with digest, pytest.raises(InputError, match=rf"{name}\.h5 ?{words}"):
+            read_estimate(tmp_path / f"{name}.h5")
 
 
 @pytest.mark.parametrize(
@@ -349,22 +352,3 @@ def test_the_listing_of_an_estimate_has_sigma_at_its_end_and_at_its_start():
             for value, last, first in (("10", "7", "1"), ("-20", "8", "2"), ("30", "9", "3"))
         ],
     ]
-
-
-def test_a_turn_that_nothing_makes_is_reported_by_its_place():
-    """Deep inside it would end as an attitude of NaN."""
-    increments = np.zeros((4, 3))
-    increments[2, 1] = -1e10
-    with pytest.raises(InputError, match=r"increments\[2, 1\] is -1e\+10 rad in 0.5 s, more than 1e\+06 rad between"):
-        ImuRecord(time=0.5 * np.arange(5), increments=increments)
-
-
-def test_vectors_that_are_none_are_reported():
-    with pytest.raises(InputError, match=r"vectors is None.*give a tuple of series, empty for none"):
-        ImuRecord(time=[0.0, 1.0], increments=np.zeros((1, 3)), vectors=None)
-
-
-def test_masked_increments_are_refused_by_their_place():
-    increments = np.ma.masked_array(np.full((4, 3), 7.0), mask=np.eye(4, 3) > 0.0)
-    with pytest.raises(InputError, match=r"increments\[0, 0\] is masked"):
-        ImuRecord(time=np.arange(5.0), increments=increments)

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation
 
 from strapdown import ahrs, quaternion
@@ -108,6 +109,10 @@ def test_the_variance_of_a_restored_turn_is_spread_over_its_intervals():
     expected = np.zeros(len(variance))
     for first, stop in np.flatnonzero(np.diff(at[:, 0].astype(int))).reshape(-1, 2) + 1:
         turn = np.sum(np.abs(rate[first:stop, 0]) - 5.0) / RATE
+        slopes = RATE * np.diff(only_x.rate[[first - 2, first - 1, stop, stop + 1], 0])[[0, 2]]
+        ends = [first - 1, stop]
+        cubic = CubicHermiteSpline(plain.time[ends], only_x.rate[ends, 0], slopes)(plain.time[first:stop])
+        np.testing.assert_allclose(np.abs(rate[first:stop, 0]), np.maximum(np.abs(cubic), 5.0), rtol=1e-9)
         expected[first - 1 : stop] += (0.5 * turn) ** 2 / (stop - first + 1)
     np.testing.assert_allclose(variance, expected, rtol=1e-9, atol=1e-18)
     assert np.count_nonzero(variance) > 1000
@@ -227,6 +232,12 @@ def test_a_gap_filled_by_interpolation_is_a_gap(smooth):
     assert np.mean(nees < 7.81) > 0.9
     assert not np.intersect1d(found.rests.last, gap).size
     assert np.abs(found.estimate.bias[-1]).max() < 0.5 * DEGREE
+
+
+def test_the_turn_over_a_long_gap_has_a_variance_of_one():
+    """No more is known of it than that it is a turn."""
+    variance = sensor_faults.find(filled(swing(80.0), (5.0, 35.0))).turn_variance
+    assert variance.sum() == pytest.approx(1.0, rel=1e-9)
 
 
 def test_straight_lines_of_a_still_or_noisy_gyro_are_no_gaps():

@@ -514,3 +514,15 @@ def test_the_nis_of_directions_is_too_small_by_that_share_and_that_of_whole_vect
     for kind, expected in (("direction", variance_across(sigma) / sigma**2), ("vector", 1.0)):
         mean, degrees = observed(kind, sigma, 40_000)
         assert mean == pytest.approx(expected, abs=4.0 * math.sqrt(2.0 / degrees))
+
+
+def test_triads_of_several_vectors_are_those_of_each_whatever_its_length():
+    several = np.random.default_rng(3).standard_normal((20, 3)) * np.geomspace(1e-3, 1e3, 20)[:, None]
+    np.testing.assert_allclose(triad(several), np.stack([triad(one) for one in several]), atol=1e-14)
+
+
+def test_a_baseline_is_one_vector():
+    given = {"name": "antennas", "sigma": 0.01, "rate": 4.0}
+    assert HeadingPair(baseline_b=[2, 0, 0], **given).baseline_b.dtype == np.float64
+    with pytest.raises(InputError, match=r"antennas: baseline_b has shape \(1, 3\), wanted \(3,\)"):
+        HeadingPair(baseline_b=[[2.0, 0.0, 0.0]], **given)
