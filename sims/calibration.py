@@ -167,7 +167,7 @@ def main(*, units: int = 20, duration: float = 120.0, seed: int = 1, out: Path |
 
 def draw(result: Result, path: Path) -> Path:
     """Draw each error with its ±1.96 σ and write the figure."""
-    figure, grid = plots.new_figure(2, 3, size=(12.0, 6.0))
+    figure, grid = plots.new_figure(2, 3, size=(10.0, 6.0))
     for ax, name in zip(grid.flat, GROUPS, strict=False):
         words, unit = GROUPS[name]
         error, bound = (x.ravel() / unit for x in (result.errors[name], 1.96 * result.sigma[name]))
@@ -176,7 +176,7 @@ def draw(result: Result, path: Path) -> Path:
         for kept, colour in ((inside, BLUE), (~inside, VERMILION)):
             ax.errorbar(place[kept], error[kept], bound[kept], fmt=".", color=colour, markersize=4, linewidth=0.6)
         ax.axhline(0.0, color="black", linewidth=0.7)
-        ax.set(title=f"{words}: {np.mean(inside):.0%} contain the truth", xticks=[])
+        ax.set(title=f"{words}:\n{100 * np.mean(inside):.0f} % contain the truth", xticks=[])
     for ax in grid[1]:
         ax.set_xlabel("entries of all units")
     for ax in grid[:, 0]:

@@ -91,7 +91,7 @@ def compare(
 
 def draw(comparisons: tuple[Comparison, ...], path: Path) -> Path:
     """Draw predicted and actual RMS and NEES over time and write the figure."""
-    figure, axes = plots.new_figure(1, 3, size=(13.0, 4.4))
+    figure, axes = plots.new_figure(1, 3, size=(10.5, 4.4))
     for k, c in enumerate(comparisons):
         a, colour = c.analysis, style.CYCLE[k]
         for ax, part, unit in ((axes[0], slice(0, 3), ARCSECOND), (axes[1], slice(3, 6), DEGREE_PER_HOUR)):

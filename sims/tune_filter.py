@@ -119,7 +119,7 @@ def searches(tuned, shown, ax, *, label):
     ax.plot(*end, "o", color=style.BLUE, markersize=6, label="end of a search" if label else None)
     names = [f"{one.name}, {unit.name}" for one, unit in zip(tuned.parameters, shown, strict=False)]
     ax.set(xscale="log", yscale="log", xlabel=names[0], ylabel=names[1])
-    style.legend_above(ax)
+    style.legend_above(ax, ncols=2)
 
 
 def values(result, ax):
@@ -141,7 +141,7 @@ def values(result, ax):
         bottom=np.exp(-half),
         width=0.6,
         alpha=0.2,
-        label="Cramér–Rao bound, 95 % about 1",
+        label="95 % of the Cramér–Rao bound",
     )
     ax.axhline(1.0, lw=0.8, color="k")
     ax.set_xticks(place, FREE)
@@ -150,7 +150,7 @@ def values(result, ax):
     ticks = (0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.5)
     ax.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
     ax.set_yticks([], minor=True)
-    legend_above(ax)
+    legend_above(ax, ncols=2)
 
 
 if __name__ == "__main__":

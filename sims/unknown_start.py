@@ -142,7 +142,7 @@ def study(name: str, *, runs: int, duration: float, seed: int) -> Outcome:
 
 def draw(outcomes: Sequence[Outcome], path: Path) -> Path:
     """Draw error and ANEES over time and write the figure."""
-    figure, (left, middle, right) = plots.new_figure(1, 3, size=(14.0, 4.6))
+    figure, (left, middle, right) = plots.new_figure(1, 3, size=(10.5, 4.6))
     for o in outcomes:
         hours = o.time / 3600.0
         line: dict[str, Any] = {"color": COLOURS.get(o.filter, style.ORANGE), "linewidth": 1.5}

@@ -223,7 +223,7 @@ def test_a_slice_of_the_likelihood_is_drawn_in_the_unit_of_its_axis(start):
     if start == 2e-4:
         assert levels["before"].get_xdata()[0] * units.DEGREE_PER_HOUR == pytest.approx(2e-4)
     else:
-        assert ax.texts[0].get_text() == f"before: {start / units.DEGREE_PER_HOUR:.3g}"
+        assert ax.get_xlabel() == f"°/h  (before: {start / units.DEGREE_PER_HOUR:.3g})"
 
 
 def test_an_allan_deviation_is_drawn_with_the_terms_of_its_axis():

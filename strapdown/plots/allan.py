@@ -75,7 +75,7 @@ def allan_overview(deviation: AllanDeviation, fit: NoiseFit) -> Figure:
     """
     unit, scale = UNITS[fit.sensor]["bias_instability"]
     number = len(deviation.deviation)
-    figure, axes = new_figure(1, number, size=(1.5 + 4.2 * number, 4.8), sharey=True, squeeze=False)
+    figure, axes = new_figure(1, number, size=(1.2 + 3.0 * number, 4.2), sharey=True, squeeze=False)
     for axis, curves in enumerate(curves_by_axis(fit, deviation)):
         ax = allan_axis(deviation, fit, curves, axis, axes[0, axis])
         ax.set_title(f"{AXES[axis]} axis", loc="left")

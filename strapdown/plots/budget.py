@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from strapdown.checks import Array
 from strapdown.covariance import Analysis
-from strapdown.plots.style import BLUE, CYCLE, VERMILION, YELLOW, legend_above, new_figure
+from strapdown.plots.style import BLUE, CYCLE, VERMILION, YELLOW, legend_above, log_scale, new_figure
 from strapdown.units import angle_unit, rate_unit
 
 _SHADES = (*CYCLE, YELLOW, "#666666", "#8C564B", "#17BECF", "#AEC7E8", "#C5B0D5")
@@ -31,7 +31,7 @@ def error_budget(analysis: Analysis, *, title: str = "") -> Figure:
     Figure
         Sources below 1 % of both mean squares at all times are combined, and so are errors that are the same in every run.
     """
-    figure, axes = new_figure(2, 2, size=(11.0, 7.0), sharex=True, height_ratios=(1.0, 1.25))
+    figure, axes = new_figure(2, 2, size=(9.0, 6.6), sharex=True, height_ratios=(1.0, 1.25))
     parts = (slice(0, 3), slice(3, 6))
     shares = [_shares(analysis, part) for part in parts]
     names = [name for name in shares[0] if max(_largest(share[name]) for share in shares) >= _MIN_SHARE]
@@ -44,10 +44,11 @@ def error_budget(analysis: Analysis, *, title: str = "") -> Figure:
         sigma = np.sqrt(np.mean(analysis.filter_sigma[:, part] ** 2, axis=1))
         # The unit is chosen for the converged filter; the initial σ is orders of magnitude larger.
         unit, size = (angle_unit if column == 0 else rate_unit)(rms[len(rms) // 2 :])
-        top.semilogy(
+        top.plot(
             analysis.time, np.where(rms > 0.0, rms / size, np.nan), color=VERMILION, linewidth=2.4, label="RMS error"
         )
-        top.semilogy(analysis.time, sigma / size, color=BLUE, linewidth=1.2, label="σ of the filter")
+        top.plot(analysis.time, sigma / size, color=BLUE, linewidth=1.2, label="σ of the filter")
+        log_scale(top)
         top.set_ylabel(f"{what} error, one axis, {unit}")
         shown = {name: share[name] for name in names}
         rest = 1.0 - np.sum(list(shown.values()), axis=0)

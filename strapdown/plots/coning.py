@@ -76,7 +76,7 @@ def coning_errors(outcomes: Sequence[FilterOutcome]) -> Figure:
     """Draw the errors about the cone's axis with the filter's ±3σ for each integration algorithm: attitude above, bias below."""
     rows = -(-len(outcomes) // MAX_COLUMNS)
     columns = -(-len(outcomes) // rows)
-    figure, grid = new_figure(2 * rows, columns, size=(3.1 * columns, 5.2 * rows), sharex=True, squeeze=False)
+    figure, grid = new_figure(2 * rows, columns, size=(2.2 * max(columns, 3), 5.2 * rows), sharex=True, squeeze=False)
     # Attitude above bias, in as many pairs of rows as needed: (2, columns of all rows).
     axes = np.stack([np.concatenate(grid[0::2]), np.concatenate(grid[1::2])])
     for ax in axes[:, len(outcomes) :].ravel():
@@ -87,7 +87,7 @@ def coning_errors(outcomes: Sequence[FilterOutcome]) -> Figure:
         for ax, state, unit in ((axes[0, j], 2, ARCSECOND), (axes[1, j], 5, DEGREE_PER_HOUR)):
             errors_in_envelope(s.time, s.example_error[:, :, state] / unit, s.sigma[:, state] / unit, ax)
         verdict = "consistent" if outcome.consistent else "NOT consistent"
-        axes[0, j].set_title(f"{outcome.integration}: {verdict}", loc="left")
+        axes[0, j].set_title(f"{outcome.integration}:\n{verdict}", loc="left")
         late = s.sigma[len(s.time) // 10 :]
         axes[0, j].set_ylim(-1.3 * 3.0 * late[:, 2].max() / ARCSECOND, 1.3 * 3.0 * late[:, 2].max() / ARCSECOND)
         top = max(1.6 * 3.0 * late[:, 5].max(), 1.25 * float(np.abs(s.example_error[:, len(s.time) // 10 :, 5]).max()))
@@ -100,14 +100,14 @@ def coning_errors(outcomes: Sequence[FilterOutcome]) -> Figure:
         axes[1, first].set_ylabel("bias error, °/h")
     legend_below(figure, [axes[0, 0]])
     figure.suptitle(
-        "Errors about the cone's axis. The integration drift is a constant rate, which the filter estimates as gyro bias."
+        "Errors about the cone's axis. The integration drift is a constant rate,\nwhich the filter estimates as gyro bias."
     )
     return figure
 
 
 def coning_consistency(outcomes: Sequence[FilterOutcome]) -> Figure:
     """Draw NEES of attitude and of bias and NIS over time for each integration algorithm, with the bounds of a consistent filter."""
-    figure, axes = new_figure(1, 3, size=(12.0, 4.6))
+    figure, axes = new_figure(1, 3, size=(10.5, 4.6))
     named = [(outcome.integration, outcome.statistics) for outcome in outcomes]
     first = outcomes[0]
     percent = f"{100 * first.probability:g} %"
@@ -127,7 +127,7 @@ def coning_consistency(outcomes: Sequence[FilterOutcome]) -> Figure:
         passed = [one for one, verdict in zip(outcomes, verdicts, strict=True) if verdict.consistent]
         title = f"{subset.capitalize()}: {len(passed)} of {len(outcomes)} pass"
         if any(_leaves(one, subset, bounds) for one in passed):
-            title += "\nOutside the bounds only at epochs not judged"
+            title += "\nOutside the bounds only\nat epochs not judged"
         ax.set_title(title, loc="left")
     low, high = axes[0].get_ylim()
     axes[0].set_ylim(min(0.3, low), max(3.0, min(high, 30.0)))
@@ -148,7 +148,7 @@ FREQUENCIES = 60
 
 def algorithms_compared(study: ConingStudy) -> Figure:
     """Draw the drift of each algorithm over the coning frequency, and its maximum error over manoeuvres; the user's algorithms are bold."""
-    figure, (left, right) = new_figure(1, 2, size=(12.0, 4.8))
+    figure, (left, right) = new_figure(1, 2, size=(10.5, 4.8))
     p = study.parameters
     frequencies = np.geomspace(0.01, 0.4, FREQUENCIES) * p.rate
     for k, algorithm in enumerate(p.algorithms):

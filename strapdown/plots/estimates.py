@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, MultipleLocator, NullLocator
+from matplotlib.ticker import MultipleLocator
 from numpy.typing import NDArray
 
 from strapdown import quaternion
@@ -24,6 +24,7 @@ from strapdown.plots.style import (
     ink,
     legend_above,
     legend_below,
+    log_scale,
     new_figure,
 )
 from strapdown.records import Estimate, Truth
@@ -134,10 +135,8 @@ def estimate_overview(estimate: Estimate, *, title: str = "", fixed_frame: str =
     axes[4].set_ylabel(f"attitude σ, {unit}")
     axes[4].set_title(words, loc="right", fontsize="small")
     if total.max() > 5.0 * total[settled].max():  # a large initial σ would make the rest unreadable
-        axes[4].set_yscale("log")
-        axes[4].yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=8))
-        axes[4].yaxis.set_major_formatter("{x:g}")
-        axes[4].yaxis.set_minor_locator(NullLocator())
+        log_scale(axes[4])
+        axes[4].set_ylim(bottom=0.4 * total.min() / size)  # a label below the curve
     else:
         axes[4].set_ylim(bottom=0.0)
     axes[4].set_xlabel("time, s")

@@ -118,7 +118,7 @@ STATES = tuple(f"{what} {axis}" for what in ("attitude", "bias") for axis in AXE
 
 def runs_overview(statistics: Statistics, probability: float = 0.99) -> Figure:
     """Draw ANEES of attitude and bias, and the NIS, over time, with the bounds of a consistent filter; dots are the tested epochs."""
-    figure, axes = new_figure(1, 3, size=(12.0, 4.2))
+    figure, axes = new_figure(1, 3, size=(10.5, 4.2))
     axes[1].set_visible(statistics.has_bias)
     findings = statistics.judge(confidence_level=probability).findings
     judged = judged_epochs(len(statistics.time) - 1)

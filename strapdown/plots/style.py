@@ -14,6 +14,7 @@ import numpy as np
 from cycler import cycler
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullLocator
 
 from strapdown.checks import one_of
 from strapdown.files import atomic_write
@@ -137,6 +138,14 @@ def save_as(figures: Mapping[Path, Figure], form: str) -> list[Path]:
         for other in set(FORMATS) - {form}:
             path.with_suffix(f".{other}").unlink(missing_ok=True)
     return written
+
+
+def log_scale(ax: Axes) -> None:
+    """Make the vertical axis logarithmic, with labels in steps of 1, 2, 5: powers of ten alone may leave one label."""
+    ax.set_yscale("log")
+    ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=8))
+    ax.yaxis.set_major_formatter("{x:g}")
+    ax.yaxis.set_minor_locator(NullLocator())
 
 
 def axes_or_new(ax: Axes | None) -> Axes:

@@ -10,7 +10,17 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
 from strapdown.checks import Array
-from strapdown.plots.style import BLUE, SKY, VERMILION, axes_or_new, ink, legend_above, legend_below, new_figure
+from strapdown.plots.style import (
+    BLUE,
+    SKY,
+    VERMILION,
+    axes_or_new,
+    ink,
+    legend_above,
+    legend_below,
+    log_scale,
+    new_figure,
+)
 from strapdown.tuning import Comparison, Slices, Tuning
 
 TALLEST = 15.0
@@ -37,17 +47,9 @@ def likelihood_slice(slices: Slices, tuning: Tuning, number: int, ax: Axes | Non
     )
     ax.axvline(one.value / unit.factor, color=BLUE, linewidth=0.8, label="tuned")
     before = one.start / unit.factor
-    if values[0] <= before <= values[-1]:
+    drawn = values[0] <= before <= values[-1]
+    if drawn:
         ax.axvline(before, color=VERMILION, linewidth=1.0, linestyle="--", label="before")
-    else:
-        side = "left" if before < values[0] else "right"
-        ax.annotate(
-            f"before: {before:.3g}",
-            (0.02 if side == "left" else 0.98, 0.9),
-            xycoords="axes fraction",
-            ha=side,
-            color=VERMILION,
-        )
     ax.set_xlim(values[0], values[-1])
     ax.xaxis.set_minor_formatter(NullFormatter())
     if values[-1] < 10.0 * values[0]:
@@ -58,7 +60,7 @@ def likelihood_slice(slices: Slices, tuning: Tuning, number: int, ax: Axes | Non
         ax.xaxis.set_major_formatter(lambda value, _: f"{value:.4g}")
     ax.set_ylim(0.0, TALLEST)
     ax.set_title(one.name)
-    ax.set_xlabel(unit.name)
+    ax.set_xlabel(unit.name if drawn else f"{unit.name}  (before: {before:.3g})")
     return ax
 
 
@@ -108,8 +110,7 @@ def _course(
     ax.axhspan(*bounds, color=ink(), alpha=0.12, linewidth=0, label="99 % bounds, each interval")
     seen = np.concatenate([values[np.isfinite(values)] for *_, values in courses])
     if seen.max() > 5.0 or seen.min() < 0.2:
-        ax.set_yscale("log")
-        ax.yaxis.set_minor_formatter(NullFormatter())
+        log_scale(ax)
         label += " (log scale)"
     ax.axhline(1.0, color=ink(), linewidth=0.6, linestyle=":")
     ax.set_ylabel(label)
