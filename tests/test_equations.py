@@ -59,17 +59,6 @@ def test_the_floor_of_bias_instability():
     )
 
 
-def test_efficiency_of_the_median_of_gaussian_sizes():
-    """8 (z φ(z))² at z = Φ⁻¹(3/4): variance of the median of |x|, 1/(4 n f²), against that of the root mean square, 1/(2 n)."""
-    with mp.workdps(30):
-        z = mp.findroot(lambda x: mp.ncdf(x) - mp.mpf(3) / 4, 0.67)
-        f = 2 * mp.npdf(z)  # density of |x| at its median
-        efficiency = (1 / mp.mpf(2)) / (1 / (4 * f**2) / z**2)
-        assert efficiency == pytest.approx(float(8 * (z * mp.npdf(z)) ** 2), rel=1e-20)
-        assert pytest.approx(float(efficiency), rel=2e-4) == allan.deviation._MEDIAN_EFFICIENCY
-        assert pytest.approx(float(z), rel=1e-15) == allan.deviation._MEDIAN_OF_NORMAL
-
-
 @pytest.mark.parametrize(("name", "gain"), [("matched-4-11", 24.0), ("matched-2-8", 2.1), ("matched-1-8-8", 0.12)])
 def test_noise_beside_a_steady_rotation_counts_as_often_as_the_module_says(name, gain):
     """Change each increment of the window: the change of the step across both, over rotation and change, root sum of squares."""

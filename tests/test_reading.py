@@ -494,7 +494,7 @@ def test_a_missing_library_is_no_damage_of_the_file(known, tmp_path, monkeypatch
     def lacking(*_):
         raise ModuleNotFoundError("No module named 'scipy'", name="scipy")
 
-    monkeypatch.setattr(scenarios, "_from_table", lacking)
+    monkeypatch.setattr("strapdown.scenarios.toml._from_table", lacking)
     words = r"scenario\.toml is not read: .* \(No module named 'scipy'\); install strapdown again with pip"
     with pytest.raises(InputError, match=words) as caught:
         scenarios.load_scenario(path)
