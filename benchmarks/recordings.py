@@ -44,7 +44,7 @@ def ours(recording: Recording, *, smooth: bool = False) -> tuple[Array, Array]:
     """Return the estimate of this package at the stamps of the recording."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        found = sd.estimate(recording, full_covariance=True, smooth=smooth)
+        found = (sd.smooth if smooth else sd.estimate)(recording, full_covariance=True)
     assert found.covariance is not None
     return found.attitude, found.covariance[:, :3, :3]
 

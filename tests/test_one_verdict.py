@@ -75,13 +75,13 @@ def test_a_recording_with_a_reference_by_every_way(trial, tmp_path):
 
 def test_a_smoothed_and_a_gated_estimate_by_every_way(tmp_path):
     source = sd.write(sd.simulate("spin", seed=5), tmp_path / "record.h5")
-    for name, flags, options in (
-        ("smooth", ("--smooth",), {"smooth": True}),
-        ("gate", ("--gate", "0.99"), {"gate": 0.99}),
-        ("huber", ("--robust", "huber", "--no-states"), {"robust": "huber", "states": False}),
+    for name, flags, estimator, options in (
+        ("smooth", ("--smooth",), sd.smooth, {}),
+        ("gate", ("--gate", "0.99"), sd.estimate, {"gate": 0.99}),
+        ("huber", ("--robust", "huber", "--no-states"), sd.estimate, {"robust": "huber", "states": False}),
     ):
         assert run("estimate", source, "--out", tmp_path / name, *flags) == 0
-        result = sd.estimate(sd.read(source), **options)
+        result = estimator(sd.read(source), **options)
         assert sd.read(tmp_path / name / "estimate.h5") == result
         agree(result, tmp_path / name / "estimate.h5")
 

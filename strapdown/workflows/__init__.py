@@ -8,11 +8,11 @@ Each function chooses gyro noise, filter and initial state from the data and the
 from strapdown.covariance import analyse as covariance_analysis
 from strapdown.recordings.attitudes import read_attitudes
 from strapdown.scenarios import simulate
+from strapdown.workflows.campaigns import monte_carlo, plan
 from strapdown.workflows.estimating import Run, estimate, smooth
 from strapdown.workflows.files import read, write
 from strapdown.workflows.integrating import AttitudeHistory, integrate
 from strapdown.workflows.judging import accuracy, check, diagnose
-from strapdown.workflows.monte_carlos import monte_carlo, plan
 from strapdown.workflows.noise import allan_deviation, fit_noise
 from strapdown.workflows.tuning import tune
 

@@ -63,7 +63,6 @@ def estimate(
     calibration: UnitCalibration | None = None,
     temperature: BiasOverTemperature | None = None,
     full_covariance: bool | None = None,
-    smooth: bool = False,
 ) -> Estimate:
     """Estimate attitude and gyro bias with a multiplicative extended Kalman filter, as the command ``strapdown estimate`` does.
 
@@ -102,8 +101,6 @@ def estimate(
         For a recording: the gyro's bias over temperature (°C), which is subtracted first. Default: that of ``noise``.
     full_covariance : bool, optional
         Whether to store covariance matrices rather than their diagonals. Default: True, but for a recording without a reference attitude.
-    smooth : bool, default False
-        Whether to estimate each epoch from all measurements: see :func:`smooth`.
 
     Returns
     -------
@@ -179,7 +176,10 @@ def smooth(
     >>> sd.smooth(sd.simulate("two-stars", seed=1)).attitude.shape  # doctest: +SKIP
     (30001, 4)
     """
-    return estimate(**locals(), smooth=True)
+    options = locals()
+    if isinstance(source, Recording):
+        warn_about_conventions(source)
+    return run(**options, smooth=True).estimate
 
 
 def run(
