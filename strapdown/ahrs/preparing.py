@@ -50,9 +50,9 @@ def prepare(
     """Return the record that the filter runs on, and its initial state.
 
     ``field_delay`` is that of the magnetometer relative to the gyro, s, one number or one per sample; each sample is rotated forward
-    by the gyro. ``turn_variance``: variance of the rotation over each sample interval in addition to the gyro's noise, rad², one number or
-    (n − 1,). ``causal``: a heading's noise depends only on the samples up to it. ``turned`` (n, 4): attitude from the gyro only, if
-    already computed.
+    by the gyro. ``causal``: a heading's noise depends only on the samples up to it, and on ``turn_variance``, the variance of the rotation
+    over each sample interval in addition to the gyro's noise, rad², one number or (n − 1,). ``turned`` (n, 4): attitude from the gyro only,
+    if already computed.
     """
     if turned is None:
         turned = sensor_delays.gyro_attitude(recording)

@@ -76,7 +76,7 @@ class Recording:
             Array("field_sums", (2,), "its sums"),
             Array("start", (2,), "time of the first sample, s; number of the last heading's interval", "wide"),
             Array("ring_time", memory.ring_time.shape, "times of the last second, s", "wide"),
-            Array("counted", (3,), "of the field's memory", "int"),
+            Array("counted", memory.counted.shape, "of the field's memory", "int"),
             Array("stride", (6, 2), "of the values in order", "int"),
         )
         rest: tuple[Array, ...] = ()
