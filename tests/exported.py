@@ -168,7 +168,7 @@ class Compiled:
 
     _libraries: ClassVar[dict[Any, ctypes.CDLL]] = {}
 
-    def __init__(self, program, folder, *, single=False, flags=("-O2",)):
+    def __init__(self, program, folder, *, single=False, flags=("-O1",)):
         folder = Path(folder)
         files = c.files(program, "test", single=single)
         flags = (*flags, "-Wdouble-promotion") if single else flags

@@ -95,10 +95,11 @@ def parsed(function: FunctionType) -> ast.FunctionDef:
 
 
 @functools.cache
-def code_of(node: ast.expr) -> Any:
-    """Return an expression as code."""
+def code_of(node: ast.expr) -> tuple[Any, tuple[str, ...]]:
+    """Return an expression as code, with the names in it; that of a target reads its value."""
     tree = ast.Expression(Expressions().visit(ast.parse(ast.unparse(node), mode="eval").body))
-    return compile(ast.fix_missing_locations(tree), "<kernel>", "eval")
+    names = {x.id for x in ast.walk(tree) if isinstance(x, ast.Name)}
+    return compile(ast.fix_missing_locations(tree), "<kernel>", "eval"), tuple(sorted(names))
 
 
 def assigned(statements: Sequence[ast.stmt]) -> set[str]:
@@ -200,8 +201,9 @@ class Interpreter:
 
     def _value(self, node: ast.expr, env: dict[str, Any]) -> Any:
         """Return the value of an expression."""
+        code, used = code_of(node)
         names = {}
-        for name in {x.id for x in ast.walk(node) if isinstance(x, ast.Name)}:
+        for name in used:
             if name in env:
                 names[name] = env[name]
             elif name in self.helpers:
@@ -211,7 +213,7 @@ class Interpreter:
                 kernel = isinstance(value, FunctionType) and value.__module__.startswith(KERNELS)
                 names[name] = functools.partial(self, value) if kernel else value
         try:
-            return eval(code_of(node), {**self.helpers, **names})
+            return eval(code, names)
         except Exception as error:
             error.add_note(f"in a kernel: {ast.unparse(node)}")
             raise
@@ -270,8 +272,7 @@ class Interpreter:
         return ()
 
     def _augmented(self, node: ast.AugAssign, env: dict[str, Any]) -> Any:
-        target: Any = ast.parse(ast.unparse(node.target), mode="eval").body
-        old, value = self._value(target, env), self._value(node.value, env)
+        old, value = self._value(node.target, env), self._value(node.value, env)
         if isinstance(node.op, ast.BitOr):
             return self.trace.symbol("|", old, value)
         operations: dict[type, Any] = {ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul}
