@@ -260,14 +260,20 @@ def test_a_trajectory_without_covariance_is_not_judged(files, monkeypatch, capsy
     assert "cannot tell" in said
 
 
-def test_what_was_judged_can_be_reported(files, run, monkeypatch, capsys):
-    out = files / "aligned.h5"
+@pytest.mark.parametrize(("suffix", "verdict"), [("csv", "consistent"), ("tum", "No covariance: nothing to test")])
+def test_what_was_judged_can_be_reported(suffix, verdict, files, run, monkeypatch, capsys):
+    out, truth = files / f"aligned-{suffix}.h5", files / "record.h5"
     status, _, _ = command(
-        monkeypatch, capsys, "check", files / "estimate.csv", "--truth", files / "record.h5", "--aligned", out
+        monkeypatch, capsys, "check", files / f"estimate.{suffix}", "--truth", truth, "--aligned", out
     )
     assert command(monkeypatch, capsys, "check", out)[0] == status == 3
-    report.write(out, files / "aligned.html")
-    assert "consistent" in (files / "aligned.html").read_text(encoding="utf-8")
+    report.write(out, out.with_suffix(".html"))
+    page = out.with_suffix(".html").read_text(encoding="utf-8")
+    assert verdict in page
+    assert "attitude error x, " in page
+    held = setup.read_estimate(out)
+    assert held.covariance.shape == (len(held.time), 6, 6)
+    assert np.isnan(held.covariance).any() == (suffix == "tum")
 
 
 def test_an_estimate_without_a_bias_is_kept_and_reported(files, run, tmp_path):

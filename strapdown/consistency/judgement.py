@@ -317,7 +317,7 @@ def judge(
     truth = estimate.truth if truth is None else truth
     if truth is None:
         limits.append(WITHOUT_TRUTH)
-    else:
+    elif not without:
         findings += _of_errors(estimate, truth, limits, untested)
     if estimate.error_states:
         names = tuple(estimate.error_states)

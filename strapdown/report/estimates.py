@@ -78,16 +78,17 @@ def _over_time(estimate: Estimate, truth: Truth | None, error: Array | None) -> 
         for what, (states, unit_of) in zip(("Attitude error", "Bias error"), _parts(estimate), strict=False):
             if not np.isfinite(error[:, states]).any():
                 continue
-            unit, size = unit_of(3.0 * sigma[settled, states])
+            known = bool(np.isfinite(sigma[:, states]).any())  # an estimate of another program may have no covariance
+            unit, size = unit_of(3.0 * sigma[settled, states] if known else error[settled, states])
             for k, axis in enumerate(AXES):
                 state = states.start + k
                 bound, value = 3.0 * sigma[:, state] / size, error[:, state] / size
                 series: tuple[page.Series, ...] = (
                     page.Series(label="+3σ (99.7 %)", value=bound, colour="--faint", band=True),
                     page.Series(label="−3σ", value=-bound, colour="--faint", band=True),
-                    page.Series(label=f"{what.lower()} {axis}", value=value, colour=_COLOURS[k]),
-                )
-                reach = 1.3 * max(float(bound[settled].max()), float(np.nanmax(np.abs(value[settled]), initial=0.0)))
+                )[: 2 * known]
+                series += (page.Series(label=f"{what.lower()} {axis}", value=value, colour=_COLOURS[k]),)
+                reach = 1.3 * float(np.nanmax([np.abs(value[settled]), bound[settled]], initial=0.0))
                 label = f"{what.lower()} {axis}, {unit}"
                 charts.append(page.chart(f"{what} {axis}", label, estimate.time, series, reach=reach))
     else:

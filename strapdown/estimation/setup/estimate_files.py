@@ -52,7 +52,10 @@ def write_estimate(path: str | os.PathLike[str], estimate: Estimate) -> None:
         path, "estimate", {**attributes, **origin_attributes(estimate.origin), **estimate.details}
     ) as file:
         size = 6 if estimate.has_bias else 3
+        known = np.isfinite(estimate.variance).any()  # an estimate of another program may be without
         for name, unit in _VALUES.items():
+            if name in ("variance", "covariance") and not known:
+                continue
             value = getattr(estimate, name)
             if name in ("variance", "covariance") and value is not None:
                 value = value[:, :size] if name == "variance" else value[:, :size, :size]
@@ -113,16 +116,21 @@ def read_estimate(path: str | os.PathLike[str]) -> Estimate:
         rows = len(time)
         attitude = _attitudes(file, "attitude", rows)
         size = 6 if "bias" in file else 3  # an estimate of another program may have none
-        covariance = _numbers(file, "covariance", (rows, size, size)) if "covariance" in file else None
-        if covariance is not None:
+        variance = np.full((rows, 6), np.nan)  # an estimate of another program may have no covariance
+        covariance: Array | None = np.full((rows, 6, 6), np.nan)
+        if "variance" in file or "covariance" in file:
+            covariance = None
+            variance = _above_zero(_place(file, "variance"), _numbers(file, "variance", (rows, size)))
+            variance = _padded(variance, ((0, 0), (0, 6 - size)))
+        if "covariance" in file:
+            covariance = _numbers(file, "covariance", (rows, size, size))
             _above_zero(f"{_place(file, 'covariance')}, diagonal", np.diagonal(covariance, axis1=1, axis2=2))
             covariance = _padded(covariance, ((0, 0), (0, 6 - size), (0, 6 - size)))
-        variance = _above_zero(_place(file, "variance"), _numbers(file, "variance", (rows, size)))
         return Estimate(
             time=time,
             attitude=attitude,
             bias=_biases(file, "bias", rows) if size == 6 else np.full((rows, 3), np.nan),
-            variance=_padded(variance, ((0, 0), (0, 6 - size))),
+            variance=variance,
             covariance=covariance,
             whole_covariance=_numbers(file, "whole_covariance", (rows, "n", "n"))
             if "whole_covariance" in file
