@@ -159,6 +159,16 @@ def test_what_a_file_says_of_itself_cannot_break_the_page(folder):
     assert "<pre>x = 1\ny = 2</pre>" in content
 
 
+def test_the_title_names_the_recording(folder, tmp_path):
+    estimate = setup.read_estimate(folder / "right.h5")
+    named = dataclasses.replace(estimate, origin=records.Origin(source="walk.csv"))
+    setup.write_estimate(tmp_path / "estimate.h5", named)
+    report.write(tmp_path / "estimate.h5", tmp_path / "estimate.html")
+    content = (tmp_path / "estimate.html").read_text(encoding="utf-8")
+    assert "<title>Estimate of walk.csv</title>" in content
+    assert "estimate.h5: " in content
+
+
 def test_without_truth_the_page_says_what_it_cannot_show(folder):
     assert "without a truth only the innovations are judged" in body(folder / "blind.html")
 

@@ -37,9 +37,10 @@ def report(path: Path, confidence_level: float) -> tuple[str, dict[str, Any]]:
     table = None if truth is None else workflows.accuracy(estimate)
     span = estimate.time[-1] - estimate.time[0]
     used = sum(len(one.time) for one in estimate.innovations.values())
+    source = "" if estimate.origin is None else estimate.origin.source
     content = page.page(
-        f"Estimate: {path.name}",
-        f"{len(estimate.time)} epochs over {span:g} s, {used} measurements of {len(estimate.innovations)} "
+        f"Estimate of {source}" if source else f"Estimate {path.name}",
+        f"{path.name}: {len(estimate.time)} epochs over {span:g} s, {used} measurements of {len(estimate.innovations)} "
         f"sensor{'' if len(estimate.innovations) == 1 else 's'}, "
         f"{'without truth' if truth is None else 'with truth' if truth.has_bias else 'with a reference attitude'}; "
         f"strapdown {attributes.get('version', '')}",
