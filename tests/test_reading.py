@@ -554,7 +554,6 @@ with locked(sys.argv[1]):
 """
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="no such lock there")
 def test_of_two_processes_on_one_output_the_second_is_reported_who_writes(known, tmp_path):
     path = tmp_path / "runs.h5"
     other = subprocess.Popen(

@@ -70,34 +70,24 @@ def whole_hdf5(path: str | os.PathLike[str]) -> Iterator[Any]:
 def locked(path: str | os.PathLike[str]) -> Iterator[None]:
     """Prevent other processes from writing the same output; if one is writing it already, raise an InputError.
 
-    The lock is a file ``.NAME.lock`` in the folder of the output; it is released when the process ends in any way. Not on Windows.
+    The lock is a file ``.NAME.lock`` in the folder of the output; it is released when the process ends in any way.
     """
-    try:
-        import fcntl
-    except ModuleNotFoundError:
-        yield
-        return
+    from filelock import FileLock, Timeout
+
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
     lock = target.with_name(f".{target.name}.lock")
     try:
-        handle = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK | os.O_NOFOLLOW, 0o666)
+        held = FileLock(lock, timeout=0).acquire()
+    except Timeout:
+        raise InputError(f"{target} is being written by another process; wait for it, or choose another file") from None
     except OSError as error:
         raise InputError(f"{lock} cannot be locked ({error.strerror}); remove it") from None
-    try:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            held = os.path.samestat(os.fstat(handle), os.stat(lock))  # the process that held it may have removed it
-        except (BlockingIOError, FileNotFoundError):
-            held = False
-        if not held:
-            raise InputError(f"{target} is being written by another process; wait for it, or choose another file")
+    with held:
         try:
             yield
         finally:
             lock.unlink(missing_ok=True)
-    finally:
-        os.close(handle)
 
 
 def _user_block(content: bytes | memoryview) -> bytes:
