@@ -217,7 +217,7 @@ def examine(recording: Recording) -> Examination:
             f"{recording.source} has only a gyro; a reference attitude, an accelerometer or a magnetometer is needed too"
         )
     sensors = {
-        name: _Sensor(vectors, float(np.nanmedian(size := lengths(vectors))), size)
+        name: _sensor(vectors)
         for name, vectors in (("accelerometer", recording.specific_force), ("magnetometer", recording.magnetic_field))
         if vectors is not None
     }
@@ -379,12 +379,14 @@ def _force_unit(force: _Sensor) -> tuple[tuple[str, ...], list[str]]:
     if not strength > 0.0:
         return (), ["the accelerometer reads zero throughout"]
     words, gravity = _gravity(strength)
-    if abs(math.log(strength / gravity)) > 0.5 + float(np.nanstd(force.size)) / strength:
+    if abs(math.log(strength / gravity)) > 0.5 + float(np.std(force.size)) / strength:
         return (), [f"the median specific force, {strength:.3g} m/s², fits neither m/s² nor g"]
     return ((words,) if words else ()), []
 
 
 def _too_fast(recording: Recording) -> list[str]:
+    if np.max(np.abs(recording.rate)) <= FASTEST / math.sqrt(3.0):
+        return []
     speed = lengths(recording.rate)
     k = int(np.argmax(speed))
     if speed[k] <= FASTEST:
@@ -416,7 +418,7 @@ def _floors(relations: Iterable[str], floor: float, sensors: _Sensors) -> dict[s
     acceleration = 0.0
     force = sensors.get("accelerometer")
     if force is not None and force.strength > 0.0:
-        acceleration = float(np.nanmean((force.size / _gravity(force.strength)[1] - 1.0) ** 2))
+        acceleration = float(np.mean((force.size / _gravity(force.strength)[1] - 1.0) ** 2))
     return {name: floor + acceleration * ("accelerometer" in name) for name in relations}
 
 
@@ -434,13 +436,19 @@ class _Sensor(NamedTuple):
     """Samples of a vector."""
 
     vectors: Array
-    strength: float
-    """Median of the magnitudes."""
     size: Array
-    """Magnitudes."""
+    """Magnitudes of its samples, of those that there are."""
+    strength: float
+    """Their median."""
 
 
 _Sensors = Mapping[str, _Sensor]
+
+
+def _sensor(vectors: Array) -> _Sensor:
+    size = lengths(vectors)
+    size = size[np.isfinite(size)]
+    return _Sensor(vectors, size, float(np.median(size)))
 
 
 class _Windows(NamedTuple):
@@ -481,23 +489,24 @@ def _windows(recording: Recording, sensors: _Sensors, known: np.ndarray | bool =
     turning = np.bincount(window, lengths(recording.rate[rows])) / np.bincount(window).clip(1)
     least = 0.5 * max(1.0, SPAN / float(np.median(np.diff(time))))
     known = np.broadcast_to(known, recording.time.shape)[rows]
-    vectors, used = np.zeros((len(time), WIDTH)), {}
-    for name, (samples, strength, size) in sensors.items():
-        seen = np.isfinite(size[rows]) & known & (strength > 0.0)
+    side_by_side, used = np.zeros((len(time), WIDTH)), {}
+    for name, (vectors, _, strength) in sensors.items():
+        samples = vectors[rows]
+        seen = np.isfinite(lengths(samples)) & known & (strength > 0.0)
         full = np.flatnonzero(np.bincount(window[seen], minlength=len(turning)) >= least)
         chosen = np.zeros(len(turning), bool)
         chosen[full[np.argsort(-turning[full])][:WINDOWS]] = True
         if chosen.any():
             used[name] = seen & chosen[window]
             columns = slice(3 * len(used) - 3, 3 * len(used))
-            vectors[used[name], columns] = samples[rows][used[name]] / strength
+            side_by_side[used[name], columns] = samples[used[name]] / strength
     if not used:
         return None
     evaluated = np.bincount(window[np.any([*used.values()], axis=0)], minlength=len(turning)) > 0
     kept = np.flatnonzero(evaluated[window] & known)
     begin = np.flatnonzero(np.diff(window[kept], prepend=-1))
     counts = {name: np.add.reduceat(one[kept], begin, dtype=int) for name, one in used.items()}
-    return _Windows(step * kept, np.append(begin, len(kept)), vectors[kept], counts)
+    return _Windows(step * kept, np.append(begin, len(kept)), side_by_side[kept], counts)
 
 
 # ------------------------------------------------------------------------------------------------------------------ with a reference
