@@ -29,7 +29,9 @@ from strapdown import coning, quaternion
 from strapdown.ahrs.starting import quiet_span
 from strapdown.checks import Array, Hint, InputError, lengths
 from strapdown.files import plain
-from strapdown.kernels.rotation import rotation_matrix
+from strapdown.kernels import recording_steps
+from strapdown.kernels.lane_values import WIDTH
+from strapdown.kernels.machine import compiled, read_only
 from strapdown.recordings.sensor_faults import stuck_words
 from strapdown.records.recording import Recording, increments
 from strapdown.results import Column, Table
@@ -215,7 +217,7 @@ def examine(recording: Recording) -> Examination:
             f"{recording.source} has only a gyro; a reference attitude, an accelerometer or a magnetometer is needed too"
         )
     sensors = {
-        name: _Sensor(vectors, float(np.nanmedian(size := lengths(vectors))), size)
+        name: _sensor(vectors)
         for name, vectors in (("accelerometer", recording.specific_force), ("magnetometer", recording.magnetic_field))
         if vectors is not None
     }
@@ -377,12 +379,14 @@ def _force_unit(force: _Sensor) -> tuple[tuple[str, ...], list[str]]:
     if not strength > 0.0:
         return (), ["the accelerometer reads zero throughout"]
     words, gravity = _gravity(strength)
-    if abs(math.log(strength / gravity)) > 0.5 + float(np.nanstd(force.size)) / strength:
+    if abs(math.log(strength / gravity)) > 0.5 + float(np.std(force.size)) / strength:
         return (), [f"the median specific force, {strength:.3g} m/s², fits neither m/s² nor g"]
     return ((words,) if words else ()), []
 
 
 def _too_fast(recording: Recording) -> list[str]:
+    if np.max(np.abs(recording.rate)) <= FASTEST / math.sqrt(3.0):
+        return []
     speed = lengths(recording.rate)
     k = int(np.argmax(speed))
     if speed[k] <= FASTEST:
@@ -414,7 +418,7 @@ def _floors(relations: Iterable[str], floor: float, sensors: _Sensors) -> dict[s
     acceleration = 0.0
     force = sensors.get("accelerometer")
     if force is not None and force.strength > 0.0:
-        acceleration = float(np.nanmean((force.size / _gravity(force.strength)[1] - 1.0) ** 2))
+        acceleration = float(np.mean((force.size / _gravity(force.strength)[1] - 1.0) ** 2))
     return {name: floor + acceleration * ("accelerometer" in name) for name in relations}
 
 
@@ -432,13 +436,19 @@ class _Sensor(NamedTuple):
     """Samples of a vector."""
 
     vectors: Array
-    strength: float
-    """Median of the magnitudes."""
     size: Array
-    """Magnitudes."""
+    """Magnitudes of its samples, of those that there are."""
+    strength: float
+    """Their median."""
 
 
 _Sensors = Mapping[str, _Sensor]
+
+
+def _sensor(vectors: Array) -> _Sensor:
+    size = lengths(vectors)
+    size = size[np.isfinite(size)]
+    return _Sensor(vectors, size, float(np.median(size)))
 
 
 class _Windows(NamedTuple):
@@ -446,31 +456,26 @@ class _Windows(NamedTuple):
 
     rows: np.ndarray
     """Rows of the samples in the recording (m,)."""
-    edges: list[int]
+    edges: np.ndarray
     """First sample of each window, and m."""
     vectors: Array
-    """Vectors of all sensors side by side, relative to their median magnitude (m, 3 sensors); 0 if not used."""
+    """Vectors of all sensors side by side, relative to their median magnitude (m, 8); 0 if not used."""
     counts: dict[str, np.ndarray]
     """Number of samples used of each sensor in each window."""
 
-    def means(self, attitudes: Iterable[Array]) -> dict[str, Array]:
-        """Return for each sensor the means over each window of R_ab v_c (attitudes, windows, 3, 3, 3), R of attitudes at the rows."""
-        sums = []
-        for attitude in attitudes:
-            # By entry, (9, m), not by row: a third of the time.
-            entries = np.stack(rotation_matrix(tuple(attitude.T)))
-            sums.append([entries[:, a:b] @ self.vectors[a:b] for a, b in itertools.pairwise(self.edges)])
-        parts = np.split(np.reshape(sums, (len(sums), len(self.edges) - 1, 3, 3, -1)), len(self.counts), axis=-1)
+    def means(self, attitudes: Array) -> dict[str, Array]:
+        """Return for each sensor the means over each window of R_ab v_c (attitudes, windows, 3, 9), R of attitudes at the rows."""
+        sums = np.empty((len(attitudes), len(self.edges) - 1, 9, self.vectors.shape[1]))
+        compiled(recording_steps.rotated_sums)(*map(read_only, (attitudes, self.vectors, self.edges)), sums)
         return {
-            name: part[:, n > 0] / n[n > 0, None, None, None]
-            for part, (name, n) in zip(parts, self.counts.items(), strict=True)
+            name: (sums[:, n > 0, :, 3 * k : 3 * k + 3] / n[n > 0, None, None]).reshape(len(sums), -1, 3, 9)
+            for k, (name, n) in enumerate(self.counts.items())
         }
 
 
-def _turned(means: Array, axes: Array) -> Array:
-    """Return the mean of R A v over each window (..., windows, 3) for axes A (..., 3, 3)."""
-    flat = (one.reshape(*one.shape[:-2], 9) for one in (means, axes))
-    return np.asarray(np.einsum("...wik,...k->...wi", *flat))
+def _turned(means: Array) -> Array:
+    """Return the mean of R A v over each window (..., 48, windows, 3) for all axes A, from the means of R_ab v_c (..., windows, 3, 9)."""
+    return np.moveaxis(means @ _ALL.reshape(-1, 9).T, -1, -3)
 
 
 def _windows(recording: Recording, sensors: _Sensors, known: np.ndarray | bool = True) -> _Windows | None:
@@ -483,21 +488,25 @@ def _windows(recording: Recording, sensors: _Sensors, known: np.ndarray | bool =
     window = np.floor((time - time[0]) / SPAN).astype(int)
     turning = np.bincount(window, lengths(recording.rate[rows])) / np.bincount(window).clip(1)
     least = 0.5 * max(1.0, SPAN / float(np.median(np.diff(time))))
-    vectors, used = [], {}
-    for name, (samples, strength, size) in sensors.items():
-        seen = np.isfinite(size[rows]) & np.broadcast_to(known, recording.time.shape)[rows] & (strength > 0.0)
+    known = np.broadcast_to(known, recording.time.shape)[rows]
+    side_by_side, used = np.zeros((len(time), WIDTH)), {}
+    for name, (vectors, _, strength) in sensors.items():
+        samples = vectors[rows]
+        seen = np.isfinite(lengths(samples)) & known & (strength > 0.0)
         full = np.flatnonzero(np.bincount(window[seen], minlength=len(turning)) >= least)
         chosen = np.zeros(len(turning), bool)
         chosen[full[np.argsort(-turning[full])][:WINDOWS]] = True
         if chosen.any():
             used[name] = seen & chosen[window]
-            vectors.append(np.where(used[name][:, None], samples[rows] / strength, 0.0))
+            columns = slice(3 * len(used) - 3, 3 * len(used))
+            side_by_side[used[name], columns] = samples[used[name]] / strength
     if not used:
         return None
-    kept = np.flatnonzero(np.any([*used.values()], axis=0))
+    evaluated = np.bincount(window[np.any([*used.values()], axis=0)], minlength=len(turning)) > 0
+    kept = np.flatnonzero(evaluated[window] & known)
     begin = np.flatnonzero(np.diff(window[kept], prepend=-1))
     counts = {name: np.add.reduceat(one[kept], begin, dtype=int) for name, one in used.items()}
-    return _Windows(step * kept, [*begin.tolist(), len(kept)], np.hstack(vectors)[kept], counts)
+    return _Windows(step * kept, np.append(begin, len(kept)), side_by_side[kept], counts)
 
 
 # ------------------------------------------------------------------------------------------------------------------ with a reference
@@ -527,7 +536,7 @@ def _with_reference(recording: Recording, sensors: _Sensors) -> _Explanations | 
     to_enu = np.stack([one.T for one in FRAMES.values()])[:, None]
     windows = _windows(recording, sensors, known)
     for name, means in ({} if windows is None else windows.means(at(windows.rows))).items():
-        v = np.stack([_turned(one, _ALL) for one in means])[:, None] @ to_enu  # (readings, frames, 48, windows, 3)
+        v = _turned(means)[:, None] @ to_enu  # (readings, frames, 48, windows, 3)
         parts[name] = (_force_fits if name == "accelerometer" else _field_fits)(v).reshape(-1, len(AXES))
     return _combined(parts, _floors(parts, FLOORS["reference"], sensors))
 
@@ -637,37 +646,37 @@ def _without_reference(recording: Recording, sensors: _Sensors) -> _Explanations
     windows = _windows(recording, sensors)
     if windows is None:
         return None
-    turns = increments(recording)
-    attitudes = (
-        coning.integrate(sign * factor * turns)[windows.rows] for factor in GYRO_UNITS.values() for sign in (1.0, -1.0)
-    )
+    # Only within each window: the turns from one to the next have no effect on the misfits.
+    rows = windows.rows
+    turns = np.empty((len(rows) - 1, 3))
+    compiled(recording_steps.turns_between)(*map(read_only, (recording.time, recording.rate, rows)), turns)
+    attitudes = [coning.integrate(sign * factor * turns) for factor in GYRO_UNITS.values() for sign in (1.0, -1.0)]
     which, axes, changes = _one_wrong(tuple(windows.counts))
-    means = {name: one[which] for name, one in windows.means(attitudes).items()}
+    vectors = {name: _turned(one)[which, axes[name]] for name, one in windows.means(np.stack(attitudes)).items()}
     number = np.array([len(one) for one in changes])
-    misfit = _fixed_misfits(means, axes)
+    misfit = _fixed_misfits(vectors)
     return _Explanations(misfit, number, changes.__getitem__, _floors(misfit, FLOORS["vectors"], sensors))
 
 
 @functools.cache
-def _one_wrong(names: tuple[str, ...]) -> tuple[np.ndarray, dict[str, Array], list[tuple[str, ...]]]:
-    """Return explanations with one wrong sensor: which attitude by the gyro, the axes of each vector, and the changes."""
+def _one_wrong(names: tuple[str, ...]) -> tuple[np.ndarray, dict[str, np.ndarray], list[tuple[str, ...]]]:
+    """Return explanations with one wrong sensor: which attitude by the gyro, which axes of each vector, and the changes."""
     found = []
+    place = {matrix.tobytes(): k for k, matrix in enumerate(AXES)}
     for which, sign in enumerate((1.0, -1.0) * len(GYRO_UNITS)):
         for k, matrix in enumerate(AXES):
             if np.linalg.det(matrix) * sign > 0.0:
                 changes = _settings("gyro")[k * len(GYRO_UNITS) + which // 2]
-                found.append((which, [sign * matrix.T for _ in names], changes))
+                found.append((which, [place[(sign * matrix.T + 0.0).tobytes()]] * len(names), changes))
             if k and which == 0:
                 for name in names:
-                    own = [matrix if other == name else AXES[0] for other in names]
-                    found.append((which, own, _settings(name)[k]))
+                    found.append((which, [k * (other == name) for other in names], _settings(name)[k]))
     attitudes, axes, words = zip(*found, strict=True)
-    return np.array(attitudes), dict(zip(names, np.stack(axes, axis=1), strict=True)), list(words)
+    return np.array(attitudes), dict(zip(names, np.transpose(axes), strict=True)), list(words)
 
 
-def _fixed_misfits(means: dict[str, Array], axes: dict[str, Array]) -> dict[str, Array]:
-    """Return the relative loss of magnitude of the means, and the spread of the angle between two of them."""
-    vectors = {name: _turned(mean, axes[name]) for name, mean in means.items()}
+def _fixed_misfits(vectors: dict[str, Array]) -> dict[str, Array]:
+    """Return the relative loss of magnitude of the means (..., windows, 3), and the spread of the angle between two of them."""
     length = {name: lengths(v) for name, v in vectors.items()}
     misfit = {f"gyro and {name}": np.maximum(0.0, 1.0 - np.mean(size, axis=-1)) for name, size in length.items()}
     if len(vectors) == 2:

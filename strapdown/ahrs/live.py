@@ -311,7 +311,7 @@ class LiveAhrs:
         """Measure the bias, if the unit was at rest over the last span."""
         imu, parameters = self._imu, self.parameters
         parts, part = starting.rest_length(self.interval)
-        mean, sigma = starting.mean_rates(imu.span_rate.reshape(1, parts, part, 3), parameters)
+        mean, sigma = starting.mean_rates(imu.span_rate, parts, part, parameters)
         if not sigma[0] < starting.MAX_REST_SIGMA:
             return
         if starting.are_rests(imu.span_time[None], (imu.span_force[None], imu.span_field[None]), mean)[0]:

@@ -10,6 +10,8 @@ import numpy as np
 from strapdown import estimation, quaternion
 from strapdown.ahrs.parameters import AhrsParameters
 from strapdown.checks import Array, Hint, InputError, lengths
+from strapdown.kernels import recording_samples
+from strapdown.kernels.machine import compiled, read_only
 from strapdown.kernels.rotation import moved, unit
 from strapdown.recordings import Recording
 from strapdown.units import DEGREE, STANDARD_GRAVITY
@@ -75,14 +77,18 @@ def quiet_span(recording: Recording) -> slice:
         As :func:`samples_in_span`.
     """
     length = samples_in_span(recording)
-    blocks = len(recording.time) // length
-    axes = recording.rate[: blocks * length].T.copy().reshape(3, blocks, length)
-    mean = axes.mean(axis=2)
-    varying = axes - mean[:, :, None]
+    mean, square = _blocks(recording.rate, length)
     # The mean is added to the spread so that a constant rate is not mistaken for rest; half weight, because it may be bias.
-    restless = np.sqrt(np.einsum("abk,abk->b", varying, varying) / length) + 0.5 * lengths(mean.T)
+    restless = np.sqrt(square / length) + 0.5 * lengths(mean)
     first = int(np.argmax(restless <= 2.0 * restless.min()))
     return slice(first * length, (first + 1) * length)
+
+
+def _blocks(samples: Array, length: int) -> tuple[Array, Array]:
+    """Return the mean (k, 3) of each block of that many samples (n, 3), and the sum of the squared deviations from it (k,)."""
+    mean, square = np.empty((len(samples) // length, 3)), np.empty(len(samples) // length)
+    compiled(recording_samples.block_statistics)(read_only(samples), length, mean, square)
+    return mean, square
 
 
 def first_vector(samples: Array | None, turned: Array, source: str, sensor: str) -> Array:
@@ -94,9 +100,12 @@ def first_vector(samples: Array | None, turned: Array, source: str, sensor: str)
         If there is none, or all are zero.
     """
     assert samples is not None
-    size = lengths(samples)
-    valid = np.isfinite(size) & (size > 0.0)
-    if not valid.any():
+    for rows in (samples[:1], samples):  # nearly always the first row
+        size = lengths(rows)
+        valid = np.isfinite(size) & (size > 0.0)
+        if valid.any():
+            break
+    else:
         state = "is zero and gives no direction" if np.isfinite(size).any() else "has no valid sample"
         raise InputError(
             f"{source}: the {sensor} {state}; cut the recording to a part where it has, or leave its columns out"
@@ -154,7 +163,7 @@ def rests(recording: Recording, parameters: AhrsParameters) -> Rests:
     parts, part = rest_length(recording.interval)
     length = parts * part
     n = len(recording.time) // length
-    mean, sigma = mean_rates(_spans(recording.rate, n, length).reshape(n, parts, part, 3), parameters)
+    mean, sigma = mean_rates(recording.rate[: n * length], parts, part, parameters)
     quiet = np.flatnonzero(sigma < MAX_REST_SIGMA)
     vectors = (recording.specific_force, recording.magnetic_field)
     taken = (None if samples is None else _spans(samples, n, length)[quiet] for samples in vectors)
@@ -174,11 +183,11 @@ def rest_length(interval: float) -> tuple[int, int]:
     return parts, length // parts
 
 
-def mean_rates(rate: Array, parameters: AhrsParameters) -> tuple[Array, Array]:
-    """Return the mean rates (n, 3) of spans (n, parts, samples, 3), and their σ (n,) as measurements of the bias at rest."""
-    tenths = rate.mean(axis=2)
+def mean_rates(rate: Array, parts: int, part: int, parameters: AhrsParameters) -> tuple[Array, Array]:
+    """Return the mean rates (n, 3) of spans, each of ``parts`` parts of ``part`` samples, and their σ (n,) as measurements of the bias."""
+    tenths = _blocks(rate, part)[0].reshape(-1, parts, 3)
     mean = tenths.mean(axis=1)
-    spread = np.sum((tenths - mean[:, None]) ** 2, axis=(1, 2)) / rate.shape[1]
+    spread = np.sum((tenths - mean[:, None]) ** 2, axis=(1, 2)) / parts
     return mean, np.hypot(parameters.rest_bias_sigma, np.sqrt(spread))
 
 
@@ -197,14 +206,12 @@ def are_rests(time: Array, vectors: tuple[Array | None, ...], rate: Array) -> np
     for k, samples in enumerate(vectors):
         if samples is None:
             continue
-        known = np.asarray(np.isfinite(samples[turning]).all(axis=2))
-        number = known.sum(axis=1)
-        first = known & (2 * np.cumsum(known, axis=1) <= number[:, None] + 1)
-        share = np.stack([first, known & ~first], axis=1)
-        halves = share.astype(np.float64) @ np.where(known[:, :, None], samples[turning], 0.0)
+        halves, number = np.empty((len(turning), 2, 3)), np.empty(len(turning))
+        compiled(recording_samples.halves)(read_only(samples[turning]), halves, number)
         size = lengths(halves.sum(axis=1)) / np.maximum(number, 1)
         seen = np.asarray((number > 1) & (size > 0.0))
-        halves = halves[seen] / (share.sum(axis=2)[seen] * size[seen, None])[:, :, None]
+        share = np.stack([np.ceil(0.5 * number[seen]), np.floor(0.5 * number[seen])], axis=1)
+        halves = halves[seen] / (share * size[seen, None])[:, :, None]
         columns = slice(3 * k, 3 * k + 3)
         change[seen, columns] = halves[:, 1] - halves[:, 0]
         expected[seen, columns] = -0.5 * QUIET_SPAN * np.cross(rate[turning[seen]], 0.5 * halves.sum(axis=1))

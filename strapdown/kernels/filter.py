@@ -1245,14 +1245,15 @@ def product_by_parts(P, work, row, line, like):
 
 
 def minus_outer_by_parts(P, work, left, right, factor, like):
-    """Subtract an outer product, eight columns at once, and copy the upper triangle to the lower one."""
+    """Subtract an outer product, eight columns at once: below the diagonal its transpose, whose bits are those above."""
     columns = tuple(load_like(work, right + c, lanes_of(EIGHT)) for c in PARTS)
+    rows = tuple(factor * load_like(work, left + c, lanes_of(EIGHT)) for c in PARTS)
     for i in STATES:
-        f = factor * work[left + i]
-        for c, column in zip(PARTS, columns, strict=True):
-            put_part(P, i, c, part(P, i, c, like) - f * column)
+        f, g = factor * work[left + i], work[right + i]
+        for c, column, row in zip(PARTS, columns, rows, strict=True):
+            put_part(P, i, c, part(P, i, c, like) - (g * row if c + 8 <= i else f * column))
     for i in STATES:
-        for j in STATES[i + 1 :]:
+        for j in STATES[i + 1 : 8 * (i // 8) + 8]:  # the parts that the diagonal crosses
             P[W * j + i] = P[W * i + j]
 
 

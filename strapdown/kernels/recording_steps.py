@@ -18,9 +18,10 @@ from strapdown.kernels.algebra import (
     transpose_times_vector,
 )
 from strapdown.kernels.integration import large_exponential
+from strapdown.kernels.lane_values import WIDTH, broadcast, load
 from strapdown.kernels.measurement import quaternion_at, vector_at
 from strapdown.kernels.rotation import logarithm, moved, quaternion_multiply, renormalized, rotation_matrix, unit
-from strapdown.kernels.state import store_row
+from strapdown.kernels.state import store_row, store_several
 
 
 def follow_gyro(time, rate, attitude):
@@ -94,6 +95,37 @@ def turn_over(time, rate, late, sums, turn):
         for c in range(3):
             step = share * (sums[k + 1, c] - sums[k, c]) if inside else beyond * rate[k, c]
             turn[i, c] = sums[i, c] - (sums[k, c] + step)
+
+
+def turns_between(time, rate, rows, turns):
+    """Write the rotation vector (m − 1, 3) from each of the ``rows`` (m,) to the next, by the trapezoidal rule."""
+    for k in range(len(turns)):
+        x, y, z = 0.0, 0.0, 0.0
+        for i in range(rows[k], rows[k + 1]):
+            half = 0.5 * (time[i + 1] - time[i])
+            x += half * (rate[i, 0] + rate[i + 1, 0])
+            y += half * (rate[i, 1] + rate[i + 1, 1])
+            z += half * (rate[i, 2] + rate[i + 1, 2])
+        store_row(turns, k, (x, y, z))
+
+
+def add_products(sums, factors, lanes):
+    """Return sums of lanes, each increased by a factor times ``lanes``."""
+    return tuple(total + factor * lanes for total, factor in zip(sums, factors, strict=True))
+
+
+def rotated_sums(attitudes, vectors, edges, sums):
+    """Write the sums of R_ab v_c over the rows of each window (attitudes, windows, 9, c), R of ``attitudes`` (…, m, 4).
+
+    ``vectors`` (m, ``WIDTH``) has those of two sensors side by side.
+    """
+    windows = len(edges) - 1
+    for n in range(len(attitudes)):
+        for w in range(windows):
+            total = add_products((0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0), (0.0,) * 9, broadcast(0.0))
+            for k in range(edges[w], edges[w + 1]):
+                total = add_products(total, rotation_matrix(quaternion_at(attitudes[n], k)), load(vectors, WIDTH * k))
+            store_several(sums, 9 * WIDTH * (windows * n + w), total)
 
 
 def turn_back(attitude, turn, result):

@@ -10,11 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from strapdown import quaternion
 from strapdown.checks import Array, Hint, InputError, non_negative
-from strapdown.kernels import recording_steps
+from strapdown.kernels import recording_samples, recording_steps
 from strapdown.kernels.machine import compiled, read_only
-from strapdown.records.recording import Recording, sampled
+from strapdown.records.recording import Recording
 
 FIELD_SPAN = 0.2
 """Time difference over which the change of the field, in the frame fixed by the integrated gyro, is fitted for the delay, s."""
@@ -139,37 +138,33 @@ def gyro_attitude(recording: Recording) -> Array:
 
 def _evidence(recording: Recording, turned: Array) -> tuple[Array, Array, Array, Array]:
     """Return times (m,), s, of pairs of field samples, and the products c·w, w·w, c·c of their change c and that by a unit delay, w."""
-    time, none = recording.time, (np.empty(0),) * 4
+    time = recording.time
     assert recording.magnetic_field is not None
     lag = int(np.searchsorted(time, time[0] + FIELD_SPAN))
     if len(time) < 10 * lag:
-        return none
+        return (np.empty(0),) * 4
     stride = max(1, lag // PAIRS_IN_SPAN)
     lag = max(1, lag // stride)
-    attitude, rate, field = (each[::stride] for each in (turned, recording.rate, recording.magnetic_field))
-    known = sampled(field)
-    field = np.where(known[:, None], field, 0.0)
-    still = quaternion.rotate(attitude, field)
-    (x, y, z), (fx, fy, fz) = rate.T, field.T
-    late = quaternion.rotate(attitude, np.stack([y * fz - z * fy, z * fx - x * fz, x * fy - y * fx], axis=1))
-    pairs = known[lag:] & known[:-lag]
-    change, wanted = (still[lag:] - still[:-lag])[pairs], (late[lag:] - late[:-lag])[pairs]
-    products = (np.einsum("ki,ki->k", a, b) for a, b in ((change, wanted), (wanted, wanted), (change, change)))
-    return time[::stride][lag:][pairs], *products
+    at = time[::stride]
+    still, late, products = np.empty((len(at), 3)), np.empty((len(at), 3)), np.empty((len(at) - lag, 3))
+    given = (read_only(one) for one in (recording.rate, recording.magnetic_field, turned))
+    compiled(recording_samples.field_changes)(*given, stride, lag, still, late, products)
+    pairs = np.isfinite(products[:, 1])
+    return at[lag:][pairs], *products[pairs].T.copy()
 
 
 def _fitted(across: Array, along: Array, total: Array) -> tuple[float, float]:
     """Return the delay τ, s, of the fit c = τ w without outliers, and its σ, from c·w, w·w and c·c of each pair (m,)."""
-    kept, low, high = np.full(len(total), True), (len(total) - 1) // 2, len(total) // 2
+    kept, low, high = np.ones(len(total)), (len(total) - 1) // 2, len(total) // 2
     for _ in range(4):
-        information = float(np.sum(along[kept]))
+        information = float(along @ kept)
         if information == 0.0:
             return 0.0, np.inf
-        delay = float(np.sum(across[kept])) / information
+        delay = float(across @ kept) / information
         left = total - 2.0 * delay * across + delay**2 * along
         ordered = np.partition(left, (low, high))
         middle = 0.5 * float(ordered[low] + ordered[high])
-        kept = left <= 2.5**2 * middle
+        kept = (left <= 2.5**2 * middle).astype(np.float64)
     # The median norm of a normal residual with three components is 1.54 σ; the pairs of one span overlap and are not independent.
     return delay, float(np.sqrt(max(middle, 0.0) * PAIRS_IN_SPAN / information)) / 1.54
 

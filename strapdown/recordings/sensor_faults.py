@@ -13,13 +13,14 @@ uncertain as over a gap, and the other sensors' samples there are left out (:fun
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from strapdown.checks import Array
+from strapdown.kernels import recording_samples
+from strapdown.kernels.machine import compiled, read_only
 from strapdown.records.recording import Recording
 from strapdown.units import DEGREE
 
@@ -129,14 +130,20 @@ def interpolated(rate: Array) -> list[tuple[int, int]]:
 
     Noise never draws such a line; held samples of a gyro at rest are level.
     """
-    bend = functools.reduce(np.maximum, np.abs(np.diff(rate, n=2, axis=0)).T)
-    if not bend.any():
+    bend = np.empty(max(len(rate) - 2, 0))
+    compiled(recording_samples.bends)(read_only(rate), bend)
+    most = bend.max(initial=0.0)
+    if most == 0.0 or not _runs(bend <= STRAIGHT * most):  # saves the median of nearly every recording
         return []
     usual = np.median(bend[bend > 0.0])
-    straight = bend <= STRAIGHT * usual
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], straight.astype(int), [0]]))).reshape(-1, 2)
-    runs = [(first, stop + 1) for first, stop in edges.tolist() if stop + 2 - first >= MIN_STRAIGHT]
+    runs = _runs(bend <= STRAIGHT * usual)
     return [(first, last) for first, last in runs if np.max(np.abs(rate[last] - rate[first])) > usual]
+
+
+def _runs(straight: np.ndarray) -> list[tuple[int, int]]:
+    """Return first and last sample of each long run of samples that are on a line with both beside them (n − 2,)."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], straight, [False]]))).reshape(-1, 2)
+    return [(first, stop + 1) for first, stop in edges.tolist() if stop + 2 - first >= MIN_STRAIGHT]
 
 
 def truncation_step(rate: Array) -> float | None:
@@ -167,7 +174,10 @@ def truncation_step(rate: Array) -> float | None:
 def _quantisation(rate: Array) -> float | None:
     """Return the step of which nearly all small rates among (n, 3) are multiples, including zero; None if there is none."""
     sizes = np.abs(rate)
-    slow, number = np.unique(np.rint(1e7 * sizes[sizes < SLOW_RATE]), return_counts=True)
+    slow = np.rint(1e7 * sizes[sizes < SLOW_RATE])
+    if np.count_nonzero(slow == 0.0) < 3:
+        return None
+    slow, number = np.unique(slow, return_counts=True)
     slow /= 1e7
     frequent = slow[number >= 3]
     if len(frequent) < BINS or frequent[0] != 0.0:
@@ -187,11 +197,12 @@ def untruncated(rate: Array, step: float) -> Array:
 def clipped_samples(samples: Array, least: float) -> np.ndarray:
     """Return a mask of the samples (n, 3) at the limit of their sensor: those that repeat the extreme of their axis, beyond ``least``."""
     found = np.zeros(samples.shape, bool)
-    for k, axis in enumerate(samples.T.copy()):
-        extremes = [axis == end for end in (np.nanmax(axis, initial=-np.inf), np.nanmin(axis, initial=np.inf))]
-        repeated = [np.count_nonzero(at) >= MIN_CLIPPED and abs(axis[np.argmax(at)]) >= least for at in extremes]
-        if not any(repeated):
-            continue
+    ends = np.empty((3, 2, 2))
+    compiled(recording_samples.extremes)(read_only(samples), ends)
+    reached = (ends[:, :, 1] >= MIN_CLIPPED) & (np.abs(ends[:, :, 0]) >= least)
+    for k in np.flatnonzero(reached.any(axis=1)):
+        axis = samples[:, k].copy()
+        extremes, repeated = [axis == end for end in ends[k, :, 0]], reached[k]
         same = np.append(False, axis[1:] == axis[:-1])
         between = ~(extremes[0] | extremes[1])
         if not between.any() or np.mean(same[between]) > MAX_REPEATS:
@@ -258,23 +269,22 @@ ACCELERATES = 1.0
 
 def stuck_words(recording: Recording) -> list[str]:
     """Return a warning for each gyro axis stuck at one value, throughout or for seconds in which the other sensors show motion."""
-    time, warnings = recording.time, []
-    for axis, name in enumerate("xyz"):
-        values = recording.rate[:, axis]
-        edges = np.concatenate([[0], np.flatnonzero(np.diff(values)) + 1, [len(values)]])
-        longest = int(np.argmax(np.diff(edges)))
-        first, last = int(edges[longest]), int(edges[longest + 1]) - 1
+    time, warnings, runs = recording.time, [], np.empty((3, 2), np.int64)
+    compiled(recording_samples.longest_runs)(read_only(recording.rate), runs)
+    for axis, (first, last) in enumerate(runs.tolist()):
+        if last - first + 1 < STUCK_SAMPLES or time[last] - time[first] < STUCK_TIME:
+            continue
         span = slice(first, last + 1)
         others = np.delete(recording.rate[span], axis, axis=1)
         moves = float(np.sqrt(np.mean(np.sum(others**2, axis=1)))) > ROTATES
         if recording.specific_force is not None and np.isfinite(force := recording.specific_force[span]).any():
             moves |= float(np.sqrt(np.sum(np.nanvar(force, axis=0)))) > ACCELERATES
-        whole = len(edges) == 2
-        long = last - first + 1 >= STUCK_SAMPLES and time[last] - time[first] >= STUCK_TIME
-        if not (long and (whole or moves)):
+        whole = last - first == len(time) - 1
+        if not (whole or moves):
             continue
         when = "throughout" if whole else f"from {time[first]:.6g} to {time[last]:.6g} s"
         warnings.append(
-            f"the gyro is stuck about {name}: {values[first] / DEGREE:.4g} °/s {when}; the attitude is not tracked then; check the sensor"
+            f"the gyro is stuck about {'xyz'[axis]}: {recording.rate[first, axis] / DEGREE:.4g} °/s {when}; the attitude is not tracked "
+            "then; check the sensor"
         )
     return warnings

@@ -1,0 +1,106 @@
+"""Statistics of a recording's samples (n, 3): means of blocks, runs of equal ones, extremes, bends, and changes of the field."""
+
+from __future__ import annotations
+
+import math
+
+from strapdown.kernels.algebra import combine, cross, dot, matrix_times_vector
+from strapdown.kernels.measurement import quaternion_at, vector_at
+from strapdown.kernels.rotation import rotation_matrix
+from strapdown.kernels.state import store_row
+
+
+def block_statistics(samples, length, mean, square):
+    """Write the mean (k, 3) of each block of that many samples, and the sum of the squared deviations from it (k,)."""
+    for k in range(len(mean)):
+        total = (0.0, 0.0, 0.0)
+        for i in range(length * k, length * (k + 1)):
+            total = combine(1.0, total, 1.0, vector_at(samples, i))
+        middle = (total[0] / length, total[1] / length, total[2] / length)
+        store_row(mean, k, middle)
+        square[k] = 0.0
+        for i in range(length * k, length * (k + 1)):
+            off = combine(1.0, vector_at(samples, i), -1.0, middle)
+            square[k] += dot(off, off)
+
+
+def halves(samples, sums, number):
+    """Write the sums of the first and of the second half of the samples of each span (k, 2, 3), and their number (k,).
+
+    ``samples``: (k, length, 3), not finite if missing. Of an odd number the first half has one more.
+    """
+    for k in range(len(samples)):
+        count = 0
+        for i in range(samples.shape[1]):
+            if is_finite(vector_at(samples[k], i)):
+                count += 1
+        number[k] = count
+        seen = 0
+        for half in range(2):
+            for c in range(3):
+                sums[k, half, c] = 0.0
+        for i in range(samples.shape[1]):
+            if is_finite(vector_at(samples[k], i)):
+                seen += 1
+                half = 0 if 2 * seen <= count + 1 else 1
+                for c in range(3):
+                    sums[k, half, c] += samples[k, i, c]
+
+
+def is_finite(v):
+    """Return whether all components are finite."""
+    return math.isfinite(v[0] + v[1] + v[2])
+
+
+def longest_runs(samples, run):
+    """Write the first and the last row of the longest run of equal samples about each axis (3, 2); of several the first one."""
+    for c in range(3):
+        first = 0
+        run[c, 0], run[c, 1] = 0, 0
+        for i in range(1, len(samples)):
+            if samples[i, c] != samples[i - 1, c]:
+                first = i
+            elif i - first > run[c, 1] - run[c, 0]:
+                run[c, 0], run[c, 1] = first, i
+
+
+def extremes(samples, ends):
+    """Write the largest and the smallest sample of each axis, and the number of samples equal to it (3, 2, 2); NaN is missing."""
+    for c in range(3):
+        high, low, at_high, at_low = -math.inf, math.inf, 0.0, 0.0
+        for i in range(len(samples)):
+            x = samples[i, c]
+            at_high = 0.0 if x > high else at_high
+            at_low = 0.0 if x < low else at_low
+            high = x if x > high else high
+            low = x if x < low else low
+            at_high += 1.0 if x == high else 0.0
+            at_low += 1.0 if x == low else 0.0
+        ends[c, 0, 0], ends[c, 0, 1], ends[c, 1, 0], ends[c, 1, 1] = high, at_high, low, at_low
+
+
+def bends(samples, bend):
+    """Write the largest second difference about any axis at each sample between two (n − 2,)."""
+    for i in range(len(bend)):
+        largest = 0.0
+        for c in range(3):
+            largest = max(largest, abs((samples[i + 2, c] - samples[i + 1, c]) - (samples[i + 1, c] - samples[i, c])))
+        bend[i] = largest
+
+
+def field_changes(rate, field, turned, stride, lag, still, late, products):
+    """Write c·w, w·w and c·c (k, 3) of the changes c of the field, and w of that by a unit delay; NaN where a sample is missing (NaN or 0).
+
+    Each is over ``lag`` times ``stride`` samples, in the frame fixed by the gyro; ``still`` and ``late`` (k + lag, 3) are scratch.
+    """
+    for k in range(len(still)):
+        i = stride * k
+        m, R = vector_at(field, i), rotation_matrix(quaternion_at(turned, i))
+        if m[0] == 0.0 and m[1] == 0.0 and m[2] == 0.0:
+            m = (math.nan, math.nan, math.nan)
+        store_row(still, k, matrix_times_vector(R, m))
+        store_row(late, k, matrix_times_vector(R, cross(vector_at(rate, i), m)))
+        if k >= lag:
+            c = combine(1.0, vector_at(still, k), -1.0, vector_at(still, k - lag))
+            w = combine(1.0, vector_at(late, k), -1.0, vector_at(late, k - lag))
+            store_row(products, k - lag, (dot(c, w), dot(w, w), dot(c, c)))
