@@ -169,7 +169,6 @@ def test_coning_studies_algorithms_of_ones_own(coning):
     predicted = rows["miller-3"]["predicted_deg_per_hour"]
     assert rows["miller-3"]["drift_deg_per_hour"] == pytest.approx(predicted, rel=0.02)
     assert predicted == pytest.approx(rows["three-sample"]["predicted_deg_per_hour"], rel=0.2)
-    assert (out / "algorithms.png").stat().st_size > 10_000
 
 
 def test_coning_json_holds_sound_values(coning):
