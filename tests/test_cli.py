@@ -161,7 +161,7 @@ def test_coning_json_has_the_keys_that_others_read(coning):
 
 
 def test_coning_studies_algorithms_of_ones_own(coning):
-    out, study, said = coning
+    _, study, said = coning
     said = " ".join(said.split())
     assert "0.003571 = 1/280" in said
     assert "the drift of rounded is of order (ωh)^2" in said
@@ -169,7 +169,6 @@ def test_coning_studies_algorithms_of_ones_own(coning):
     predicted = rows["miller-3"]["predicted_deg_per_hour"]
     assert rows["miller-3"]["drift_deg_per_hour"] == pytest.approx(predicted, rel=0.02)
     assert predicted == pytest.approx(rows["three-sample"]["predicted_deg_per_hour"], rel=0.2)
-    assert (out / "algorithms.png").stat().st_size > 10_000
 
 
 def test_coning_json_holds_sound_values(coning):

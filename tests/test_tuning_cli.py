@@ -110,32 +110,16 @@ def test_tune_against_the_truth_and_with_a_prior(succeeds, tmp_path, record, wro
     assert setup.read_setup(out).process_noise.rate_random_walk == pytest.approx(2.1e-6, rel=0.05)  # 2.5e-6 without
 
 
-def test_tune_by_the_size_of_the_error(succeeds, tmp_path, record, wrong):
-    out = tmp_path / "tuned.toml"
-    options = ("--filter", wrong, "--rmse", "--free", "gyro.arw,gyro.rrw", "--starts", 1, "--holdout", 0.4)
-    said = succeeds("tune", record, *options, "-o", out)
-    found = json.loads(out.with_suffix(".json").read_text())
-    before, after = np.degrees(found["objective"]["attitude_rms_rad"])
-    assert f"RMS attitude error: {before:.4g}° before, {after:.4g}° after." in said
-    assert after < before
-    held = found["held_out"]
-    assert held["after"]["attitude_rms_rad"] < held["before"]["attitude_rms_rad"]
-    assert setup.read_setup(out).measurement_sigma_factor != 1.0
-    values = {one["name"]: one["value"] for one in found["parameters"]}
-    assert setup.read_setup(out).process_noise.angle_random_walk == pytest.approx(values["gyro.arw"])
-
-
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
         (("--free", "gyro.awr"), "did you mean 'gyro.arw'"),
         (("--holdout", "1.5"), "between 0 and 1"),
-        (("--holdout", "0.3", "--holdout-by", "week"), "holdout by 'week'"),
         (("--out", "filter.json"), ".toml"),
         (("--truth", "--spacing", "1"), "leave it out"),
         (("--prior", "no-such-gyro"), "no-such-gyro"),
         (("--free", " , "), "names no parameter"),
-        (("--truth", "--rmse"), "give one of them"),
+        (("--gate", "--truth"), "likelihood of all innovations"),
     ],
 )
 def test_mistakes_are_reported_in_one_line(refusal, tmp_path, record, arguments, complaint):
@@ -161,7 +145,7 @@ def scaled(tmp_path):
     return path
 
 
-@pytest.mark.parametrize("options", [(), ("--rmse",), ("--spacing", 2.0)], ids=["likelihood", "rmse", "spacing"])
+@pytest.mark.parametrize("options", [(), ("--spacing", 2.0)], ids=["likelihood", "spacing"])
 def test_tune_gives_the_filter_states_for_what_the_record_specifies(run, tmp_path, scaled, options):
     out = tmp_path / "states.toml"
     status, said, complaint = run(

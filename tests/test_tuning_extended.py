@@ -8,7 +8,6 @@ import two_stars
 from measured import FIELD
 from measured import HAND as SWAY
 from measured import errors as errors_of
-from scipy import optimize
 from two_stars import drawn_case as case_of
 
 from strapdown import coning, consistency, estimation, gyro, motion, quaternion, records, scenarios, tuning, vectors
@@ -366,51 +365,6 @@ def test_hard_iron_is_tuned_from_several_records():
     one = found["mag.bias_sigma"]
     assert 0.1 < one.standard_error < 0.25
     assert abs(np.log(one.value / sigma)) < 2.6 * one.standard_error
-
-
-def attitude_rms(cases, chosen: setup.FilterSetup) -> float:
-    """RMS attitude error of one axis by ordinary runs of the filter, at every edge."""
-    squares = []
-    for one in cases:
-        initial = setup.initial_state(chosen, one.initial.attitude, one.initial.bias)
-        estimate, truth = setup.run(one.record, chosen, initial), one.record.truth
-        error = errors_of(estimate, truth)
-        squares.append(np.mean(error[:, :3] ** 2))
-    return float(np.sqrt(np.mean(squares)))
-
-
-@pytest.mark.slow
-def test_the_smallest_error_of_a_filter_with_states_then_the_scale_of_its_innovations():
-    """The least of the RMS error by a search over ordinary runs; the scale by the closed form, the root of the mean of e²/s."""
-    scenario = swaying(15.0)
-    chosen = filter_setup(scenario)
-    cases = [case_of(scenario, chosen, 5, run) for run in range(2)]
-    off = wrong(chosen, {"acc.correlated_sigma": 3.0})
-    names = ["acc.correlated_sigma", "acc.correlation_time"]
-    found, objective, _ = tuning.tune(cases, off, names, rmse=True, starts=1)
-    assert objective.composite
-
-    def at(logs: np.ndarray) -> setup.FilterSetup:
-        return tuning.with_values(off, dict(zip(names, np.exp(logs), strict=True)))
-
-    least = optimize.minimize(
-        lambda logs: attitude_rms(cases, at(logs)),
-        objective.start,
-        method="Nelder-Mead",
-        options={"xatol": 1e-4, "fatol": 1e-12},
-    )
-    assert least.fun < 0.7 * attitude_rms(cases, off)
-    np.testing.assert_allclose(found.optima[0], least.x, atol=1e-3)
-    scale = found.setup.measurement_sigma_factor
-    used = at(found.point - np.log([scale, 1.0]))  # a time is not scaled
-    np.testing.assert_allclose(found.point - np.log([scale, 1.0]), least.x, atol=0.01)
-    innovations = [i for one in cases for i in setup.run(one.record, used, one.initial).innovations.values()]
-    nis = sum(i.nis.sum() for i in innovations) / sum(i.innovation.size for i in innovations)
-    assert scale == pytest.approx(np.sqrt(nis), rel=1e-5)
-    assert scale > 1.1
-    # It leaves the estimates, and so their errors, as they are.
-    assert attitude_rms(cases, found.setup) == pytest.approx(attitude_rms(cases, used), rel=1e-9)
-    assert list(tuning.values_of(found.setup, names, []).values()) == pytest.approx([found[n].value for n in names])
 
 
 # ------------------------------------------------------------------------------------------------------------------------- held out

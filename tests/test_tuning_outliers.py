@@ -410,11 +410,3 @@ def test_tune_with_a_gate_writes_it_into_the_filter(succeeds, tmp_path):
     one = case(1, 300.0)
     estimate = setup.run(one.record, found, one.initial)
     assert all(innovation.refused > 5 for innovation in estimate.innovations.values())
-
-
-@pytest.mark.parametrize("other", ["--truth", "--rmse"])
-def test_a_gate_needs_all_innovations(refusal, tmp_path, other):
-    path = tmp_path / "sat.h5"
-    recordfiles.write_record(path, scenarios.simulate(scenario(60.0), 1))
-    complaint = refusal("tune", path, "--gate", other, "-o", tmp_path / "f.toml")
-    assert "likelihood of all innovations" in complaint.replace("\n", " ")

@@ -36,7 +36,7 @@ def coning(
     own = tuple(one for path in algorithm or () for one in sd.coning.read_algorithms(path))
     motion = {"angle": angle * DEGREE, "frequency": frequency, "rate": rate, "duration": duration}
     parameters = coning_study.ConingParameters(**motion, runs=runs, seed=seed, own=own)  # type: ignore[arg-type]
-    names = ("drift", "errors", "consistency", *(["algorithms"] if own else []))
+    names = ("drift", "errors", "consistency")
     ui.check_files(out / "coning.json", *(out / f"{name}.{form}" for name in names), tables=tables)
     if own:
         ui.show(coning_study.own_table(own))

@@ -31,7 +31,7 @@ class _Filter:
         None,
         help="Parameters to tune, separated by commas or repeated: gyro.arw, gyro.rrw, SENSOR.sigma[.x, .y, .z], initial.attitude, "
         "initial.bias, gate.probability; or only filter.scale. Default: the two of the gyro and the sigma of every sensor; for a recording "
-        "without --truth or --rmse only filter.scale is allowed.",
+        "without --truth only filter.scale is allowed.",
     )
     filter_file: Path | None = ui.FILTER
     states: bool = Option(
@@ -66,11 +66,11 @@ class _Objective:
     """Objective, by default the likelihood of all innovations."""
 
     truth: bool = Option(False, "--truth", help="Tune by the likelihood of the errors relative to the truth.")
-    rmse: bool = Option(False, "--rmse", help="Tune by the RMS attitude error against the truth; then scale all σ.")
     gate: bool = Option(False, "--gate", help="Also model outliers, and set the filter's gate.")
     spacing: float = Option(0.0, help="Interval of the samples used, s, with the weight of all.")
-    holdout: float | None = Option(None, help="Fraction of the data held out, to compare the filter before and after.")
-    holdout_by: str = Option("time", help="Hold out the end of each record (time), or complete records (record).")
+    holdout: float | None = Option(
+        None, help="Fraction of each record, its end, held out to compare the filter before and after."
+    )
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from strapdown.estimation.states import ProcessNoise
 from strapdown.gyro import GyroSpec
 from strapdown.montecarlo import FilterSetup, Statistics
 from strapdown.montecarlo.statistics import SUBSETS
-from strapdown.motion import Coning, Harmonic, HarmonicRates, Motion, SpinRock, TorqueFree
+from strapdown.motion import Coning
 from strapdown.results import Column, Table
 from strapdown.scenarios import Scenario
 from strapdown.units import (
@@ -428,52 +428,6 @@ def measured_drift(motion: Coning, rate: float, algorithm: coning.Algorithm) -> 
     estimate = coning.integrate(motion.increments(edges), algorithm, motion.attitude(0.0))[-1]
     error_f = quaternion.log(quaternion.multiply(estimate, quaternion.conjugate(motion.attitude(edges[-1]))))
     return float(error_f[2] / edges[-1])
-
-
-def step_drift(motion: Coning, rate: float, algorithm: coning.Algorithm) -> float:
-    """Return the drift of noise-free integration at any coning frequency, rad/s along the cone's axis: estimated minus true.
-
-    One step in axes that rotate with the coning, ``F = δq ⊗ R_z(ωT)``, is the same for all steps, so the error over many follows from its
-    angle, ωT for the truth. No averaging over a run is needed, and the periodic error does not enter.
-    """
-    n, h = algorithm.samples, 1.0 / rate
-    # A step whose window lies inside the record, in a record long enough not to be treated as short.
-    place = -(-algorithm.window // n)
-    steps = 2 * place + 1
-    edges = np.arange(steps * n + 1) * h
-    attitude = coning.integrate(motion.increments(edges), algorithm)
-    omega = 2.0 * np.pi * motion.frequency
-    turned = quaternion.exp(np.array([0.0, 0.0, omega * place * n * h]))
-    step = quaternion.multiply(quaternion.conjugate(attitude[place]), attitude[place + 1])
-    fixed = quaternion.multiply(quaternion.multiply(quaternion.conjugate(turned), step), turned)
-    angle = omega * n * h
-    w, x, y, z = quaternion.multiply(fixed, quaternion.exp(np.array([0.0, 0.0, angle])))
-    found = 2.0 * math.atan2(math.copysign(math.sqrt(x * x + y * y + z * z), z), w)  # about an axis near z
-    return math.remainder(found - angle, 2.0 * np.pi) / (n * h)
-
-
-MANOEUVRES: dict[str, Motion] = {
-    "spin 60 rpm, rocking": SpinRock(rock_angle=10.0 * DEGREE, rock_frequency=1.0, spin_rate=2.0 * np.pi),
-    "three axes at once": HarmonicRates(
-        mean=(0.0, 0.0, 0.2),
-        harmonics=(
-            Harmonic(amplitude=(2.0, 0.0, 0.0), frequency=0.8),
-            Harmonic(amplitude=(0.0, 1.5, 0.0), frequency=1.3, phase=1.0),
-            Harmonic(amplitude=(0.0, 0.0, 1.0), frequency=2.1, phase=2.0),
-        ),
-    ),
-    "tumble free of torque": TorqueFree(inertia=(1.0, 2.0, 2.5), initial_rate=(1.0, 2.0, 0.5)),
-}
-"""Motions other than coning with integration errors, 2 s of each (:func:`manoeuvre_error`)."""
-MANOEUVRE_SECONDS = 2.0
-
-
-def manoeuvre_error(motion: Motion, rate: float, algorithm: coning.Algorithm) -> float:
-    """Return the largest attitude error of noise-free integration over :data:`MANOEUVRE_SECONDS` of a motion, rad."""
-    steps = max(1, int(MANOEUVRE_SECONDS * rate) // algorithm.samples)
-    edges = np.arange(steps * algorithm.samples + 1) / rate
-    estimate = coning.integrate(motion.increments(edges), algorithm, motion.attitude(0.0))
-    return float(quaternion.angle_between(motion.attitude(edges[:: algorithm.samples]), estimate).max())
 
 
 def run(parameters: ConingParameters, *, progress: Callable[[int], None] | None = None) -> ConingStudy:

@@ -10,20 +10,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from strapdown.montecarlo.coning_study import (
-    MANOEUVRE_SECONDS,
-    MANOEUVRES,
-    ConingStudy,
-    Drift,
-    FilterOutcome,
-    manoeuvre_error,
-    step_drift,
-)
-from strapdown.motion import Coning
+from strapdown.montecarlo.coning_study import ConingStudy, Drift, FilterOutcome
 from strapdown.plots.estimates import errors_in_envelope
 from strapdown.plots.statistics import nees_over_time, nis_over_time
 from strapdown.plots.style import (
-    CYCLE,
     SKY,
     axes_or_new,
     ink,
@@ -142,38 +132,6 @@ def coning_consistency(outcomes: Sequence[FilterOutcome]) -> Figure:
     return figure
 
 
-FREQUENCIES = 60
-"""Number of coning frequencies at which drift is drawn, evenly spaced on a log axis from 0.01 to 0.4 of the sample rate."""
-
-
-def algorithms_compared(study: ConingStudy) -> Figure:
-    """Draw the drift of each algorithm over the coning frequency, and its maximum error over manoeuvres; the user's algorithms are bold."""
-    figure, (left, right) = new_figure(1, 2, size=(10.5, 4.8))
-    p = study.parameters
-    frequencies = np.geomspace(0.01, 0.4, FREQUENCIES) * p.rate
-    for k, algorithm in enumerate(p.algorithms):
-        own = algorithm in p.own
-        style = {"color": CYCLE[k % len(CYCLE)], "linestyle": "-" if own else "--", "zorder": 2 if own else 3}
-        drift = np.abs([step_drift(Coning(angle=p.angle, frequency=f), p.rate, algorithm) for f in frequencies])
-        drift = np.where(drift > _ROUNDING * DEGREE_PER_HOUR, drift, np.nan)
-        width = 2.4 if own else 1.2
-        left.plot(frequencies, drift / DEGREE_PER_HOUR, label=algorithm.name, linewidth=width, **style)  # type: ignore[arg-type]
-        errors = np.array([manoeuvre_error(motion, p.rate, algorithm) for motion in MANOEUVRES.values()]) / ARCSECOND
-        place = np.arange(len(errors)) + 0.7 * ((k + 0.5) / len(p.algorithms) - 0.5)
-        size = 9 if own else 6
-        right.plot(place, np.maximum(errors, 1e-9), "D" if own else "o", markersize=size, color=style["color"])
-    left.set(xscale="log", yscale="log", xlabel="coning frequency, Hz", ylabel="drift, °/h")
-    left.axvline(p.frequency, color=ink(), linewidth=0.8, linestyle=":")
-    left.set_title(f"Coning of {p.angle / DEGREE:g}°, gyro at {p.rate:g} Hz")
-    right.set_yscale("log")
-    right.set_xticks(range(len(MANOEUVRES)), [name.replace(", ", ",\n") for name in MANOEUVRES])
-    right.grid(visible=False, axis="x")
-    right.set_ylabel("maximum attitude error, arcsec")
-    right.set_title(f"Manoeuvres of {MANOEUVRE_SECONDS:g} s, gyro at {p.rate:g} Hz")
-    figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=6, frameon=False)
-    return figure
-
-
 def _leaves(outcome: FilterOutcome, subset: str, bounds: tuple[float, float]) -> bool:
     """Return whether the ANEES of a subset is outside its bounds at any epoch, tested or not."""
     value = outcome.statistics.anees[:, ("state", "attitude", "bias").index(subset)]
@@ -194,6 +152,4 @@ def draw_coning_study(study: ConingStudy, folder: str | os.PathLike[str], form: 
         target / "errors": coning_errors(study.outcomes),
         target / "consistency": coning_consistency(study.outcomes),
     }
-    if p.own:
-        figures[target / "algorithms"] = algorithms_compared(study)
     return save_as(figures, form)

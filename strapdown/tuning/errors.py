@@ -1,4 +1,4 @@
-"""Tuning against a truth: the likelihood of the state errors under the filter's covariance, or the size of the attitude error.
+"""Tuning against a truth: the likelihood of the state errors under the filter's covariance.
 
 The likelihood is that of the filter with its error states, gate and robust weights. Without these two, eight points are computed at once.
 
@@ -10,18 +10,17 @@ sandwich.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, Literal, NamedTuple
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from strapdown import consistency
-from strapdown.checks import Array, InputError, one_of
+from strapdown.checks import Array, InputError
 from strapdown.estimation.setup import FilterSetup
 from strapdown.tuning.innovations import Likelihood, construct, with_engine
 from strapdown.tuning.objective import STEP, Case, Derivatives, Objective, make_problem
 
-Measure = Literal["likelihood", "rmse"]
 MAX_EPOCHS = 1000
 """Maximum number of epochs per record."""
 
@@ -32,7 +31,6 @@ class ErrorObjective(Objective):
 
     base: Likelihood
     """The filter whose errors are judged."""
-    measure: Measure
     references: tuple[Reference, ...] = field(repr=False)
     """Truth of each record at the judged edges."""
     composite: ClassVar[bool] = True
@@ -43,23 +41,6 @@ class ErrorObjective(Objective):
         found = self.each(self.errors_of, [(number, rows) for number in range(len(self.references))])
         error = np.concatenate([e for e, _ in found])
         P = np.concatenate([covariance for _, covariance in found])
-        return self._squares(error) if self.measure == "rmse" else self._likelihood(error, P)
-
-    def rms(self, points: Array) -> Array:
-        """Return the RMS attitude error, all axes together, at points (k, p), rad (k,), where that is the measure."""
-        number = 3 * sum(len(one.epochs) for one in self.references)
-        return np.asarray(np.sqrt(3.0) * np.exp(self.minus_log(points) / number))
-
-    def errors_of(self, number: int, rows: Array) -> tuple[Array, Array]:
-        """Return errors (m, lanes, n) and covariances (m, lanes, n, n) of one record; n is 3 if the true bias is unknown."""
-        truth = self.references[number]
-        attitude, bias, P = self.base.estimates(number, rows, truth.epochs)
-        true_bias = bias if truth.bias is None else truth.bias[:, None]
-        error = consistency.errors(attitude, bias, truth.attitude[:, None], true_bias)
-        n = 3 if truth.bias is None or self.measure == "rmse" else 6
-        return error[..., :n], P[..., :n, :n]
-
-    def _likelihood(self, error: Array, P: Array) -> Derivatives:
         scale = np.sqrt(np.einsum("mii->mi", P[:, 0]))  # attitude in rad, bias in rad/s
         error, P = error / scale[:, None], P / (scale[:, None, :, None] * scale[:, None, None, :])
         inverse = np.linalg.inv(P[:, 0])
@@ -71,24 +52,22 @@ class ErrorObjective(Objective):
         information = np.einsum("mja,mab,mkb->jk", change_e, inverse, change_e) + 0.5 * np.einsum(
             "mjab,mkba->jk", turned, turned
         )
-        whole = value[:, 0] + np.log(scale).sum(axis=1)
-        return self._by_part(whole, score, information)
-
-    def _squares(self, error: Array) -> Derivatives:
-        # ½ N log Σ e²: the log likelihood of errors with a free σ, so that the value has its scale.
-        total, number = float(np.sum(error[:, 0] ** 2)), error[:, 0].size
-        change = (error[:, 1:] - error[:, :1]) / STEP
-        score = number / total * np.einsum("ma,mja->mj", error[:, 0], change)
-        information = number / total * np.einsum("mja,mka->jk", change, change)
-        value = np.full(len(error), 0.5 * number / len(error) * np.log(total / number))
-        return self._by_part(value, score, information)
-
-    def _by_part(self, value: Array, score: Array, information: Array) -> Derivatives:
         place = np.arange(len(value)) * self.parts // len(value)
-        sums = np.zeros((self.parts, score.shape[1]))
+        sums = np.zeros((self.parts, len(point)))
         np.add.at(sums, place, score)
-        summed = np.bincount(place, value, self.parts).astype(np.float64)
-        return Derivatives(value=summed, score=sums, information=information)
+        whole = value[:, 0] + np.log(scale).sum(axis=1)
+        return Derivatives(
+            value=np.bincount(place, whole, self.parts).astype(np.float64), score=sums, information=information
+        )
+
+    def errors_of(self, number: int, rows: Array) -> tuple[Array, Array]:
+        """Return errors (m, lanes, n) and covariances (m, lanes, n, n) of one record; n is 3 if the true bias is unknown."""
+        truth = self.references[number]
+        attitude, bias, P = self.base.estimates(number, rows, truth.epochs)
+        true_bias = bias if truth.bias is None else truth.bias[:, None]
+        error = consistency.errors(attitude, bias, truth.attitude[:, None], true_bias)
+        n = 3 if truth.bias is None else 6
+        return error[..., :n], P[..., :n, :n]
 
 
 def error_objective(
@@ -96,21 +75,16 @@ def error_objective(
     chosen: FilterSetup,
     free: Sequence[str],
     *,
-    measure: Measure = "likelihood",
     threads: int = 1,
 ) -> ErrorObjective:
     """Return the objective that judges the filter by its errors on records with a truth, or with a reference attitude (attitude only).
 
-    The likelihood of the errors under the filter's covariance requires small errors and a matching covariance. The RMS attitude error
-    requires only small errors, and does not determine a common scale of all σ; it is that of the filter without gate and robust weights.
+    The likelihood of the errors under the filter's covariance requires small errors.
     """
-    one_of("measure", measure, ("likelihood", "rmse"))
-    applied = replace(chosen, gate=None, robust=None) if measure == "rmse" else chosen
-    problem = make_problem(cases, applied, free, threads=threads)
+    problem = make_problem(cases, chosen, free, threads=threads)
     base = with_engine(problem)
-    references = tuple(_spread(base, number, measure) for number in range(len(base.cases)))
-    objective = construct(ErrorObjective, problem, base=base, measure=measure, references=references)
-    return replace(objective, chosen=replace(problem.chosen, gate=chosen.gate, robust=chosen.robust))
+    references = tuple(_spread(base, number) for number in range(len(base.cases)))
+    return construct(ErrorObjective, problem, base=base, references=references)
 
 
 class Reference(NamedTuple):
@@ -146,13 +120,13 @@ def reference(case: Case, edges: np.ndarray) -> Reference:
     return Reference(np.flatnonzero(judged), attitude[rows], None if truth is None else truth.bias[rows])
 
 
-def _spread(base: Likelihood, number: int, measure: Measure) -> Reference:
+def _spread(base: Likelihood, number: int) -> Reference:
     """Return the truth of a record at edges spaced by the correlation time of the attitude error at the starting point."""
     case = base.cases[number]
     known = reference(case, np.arange(0, len(case.record.time), base.chosen.integration.samples))
     picked = known.at(slice(None, None, max(1, len(known.epochs) // MAX_EPOCHS)))
     m = len(picked.epochs)
-    if measure == "rmse" or m < 100:
+    if m < 100:
         return picked
     attitude, _, P = base.estimates(number, base.start[None], picked.epochs)
     none = np.zeros((m, 3))

@@ -16,12 +16,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from strapdown.checks import Array, Hint, InputError, count, known_keys, positive
+from strapdown.checks import Array, Hint, InputError, count, known_keys
 from strapdown.estimation.setup import FilterSetup
 from strapdown.files import plain
 from strapdown.results import Column, Listed, Table, figure
 from strapdown.tuning.objective import REACH, Derivatives, Objective
-from strapdown.tuning.parameters import RRW, SCALE, Prior, Unit, with_values
+from strapdown.tuning.parameters import RRW, SCALE, Prior, Unit
 
 if TYPE_CHECKING:  # the steps after a search, which import this module
     from strapdown.tuning.outliers import TunedGate
@@ -207,18 +207,14 @@ class Tuning(Listed):
         Number of searches that ended within 0.001 of the best log likelihood.
     composite : bool, default False
         Whether the objective is no full likelihood, so that intervals come from the scatter of its gradient (sandwich).
-    scale : ndarray (p,) or float, default 1.0
-        Factor applied to the parameters after the minimisation (:func:`rescaled`).
     measure : str, default "likelihood"
-        What was minimised: "likelihood", "likelihood of the errors" or "rmse".
+        What was maximised: "likelihood" or "likelihood of the errors".
     gate : TunedGate, optional
         The gate, if outliers were modelled.
     comparison : Comparison, optional
         The filter before and after on held-out data.
     unmodelled : tuple of Unmodelled
         Tests of records for errors that the tuned filter does not model.
-    attitude_rms : tuple of float, optional
-        RMS attitude error before and after, rad, if it was minimised.
     """
 
     parameters: tuple[Estimated, ...]
@@ -232,12 +228,10 @@ class Tuning(Listed):
     misfit: bool
     agreeing: int
     composite: bool = False
-    scale: Array | float = 1.0
     measure: str = "likelihood"
     gate: TunedGate | None = None
     comparison: Comparison | None = None
     unmodelled: tuple[Unmodelled, ...] = ()
-    attitude_rms: tuple[float, float] | None = None
 
     def summary(self) -> dict[str, Any]:
         """Return everything as plain values for JSON, in SI units.
@@ -254,12 +248,7 @@ class Tuning(Listed):
                 for one in self.parameters
             ],
             "units": "SI: rad, s, and the units of whole vectors; divide by si_per_unit for the unit of a parameter",
-            "objective": {
-                "name": self.measure,
-                "before": self.before,
-                "after": self.after,
-                "attitude_rms_rad": self.attitude_rms,
-            },
+            "objective": {"name": self.measure, "before": self.before, "after": self.after},
             "searches": {"number": len(self.starts), "at_the_best_point": self.agreeing},
             "innovations_fit": not self.misfit,
             "unmodelled": [one.summary() for one in self.unmodelled],
@@ -277,15 +266,9 @@ class Tuning(Listed):
 
     @property
     def words(self) -> tuple[str, ...]:
-        """Sentences on what the parameters do not say: the RMS error minimised, the gate, errors that the filter does not model."""
-        found = []
-        if self.attitude_rms is not None:
-            before, after = np.degrees(self.attitude_rms)
-            found.append(f"RMS attitude error: {before:.4g}° before, {after:.4g}° after.")
-        if self.gate is not None:
-            found.append(self.gate.words)
+        """Sentences on what the parameters do not say: the gate, errors that the filter does not model."""
         worst = max(self.unmodelled, key=lambda one: one.severity, default=None)
-        return (*found, *(() if worst is None else worst.words))
+        return (*(() if self.gate is None else (self.gate.words,)), *(() if worst is None else worst.words))
 
     @property
     def tables(self) -> list[Table]:
@@ -312,7 +295,7 @@ class Tuning(Listed):
                 "A common scale leaves the estimates unchanged; it makes σ correct on average, not at each time."
                 if self.parameters[0].name == SCALE
                 else "The maximum-likelihood filter may follow them and estimate worse. Tune only filter.scale, or against a truth "
-                f"({Hint('truth', True)}, {Hint('rmse', True)}), or try {Hint('spacing')}."
+                f"({Hint('truth', True)}), or try {Hint('spacing')}."
             )
             notes.append(
                 "The innovations contradict any filter of this model: disturbances last over many samples, or vary. "
@@ -556,23 +539,6 @@ def _errors(objective: Objective, best: Optimum) -> _Errors:
     return _Errors(covariance, swollen * curvature, swollen, misfit)
 
 
-def rescaled(tuning: Tuning, factor: float) -> Tuning:
-    """Return a tuning with all σ of its filter scaled, because the RMS attitude error does not determine a common scale."""
-    positive("factor", factor)
-    names = ("value", "most_likely", "lower", "upper")
-    own = [1.0 if one.name.endswith("_time") else factor for one in tuning.parameters]
-    return replace(
-        tuning,
-        parameters=tuple(
-            replace(one, **{name: by * getattr(one, name) for name in names})
-            for one, by in zip(tuning.parameters, own, strict=True)
-        ),
-        setup=with_values(tuning.setup, {SCALE: factor}),
-        point=tuning.point + np.log(own),
-        scale=tuning.scale * np.array(own),
-    )
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Slices:
     """The likelihood along each parameter, with the others at their most likely values."""
@@ -604,7 +570,7 @@ def slices(objective: Objective, tuning: Tuning, *, number: int = 25) -> Slices:
         ends += np.array([-0.3, 0.3]) * max(float(np.ptp(ends)), 1e-3)
         points = np.tile(tuning.point, (number, 1))
         points[:, j] += np.where(grid < 0.0, tuning.point[j] - ends[0], ends[1] - tuning.point[j]) * grid
-        found = objective.minus_log(points - np.log(tuning.scale))
+        found = objective.minus_log(points)
         values.append(np.exp(points[:, j]))
         fallen.append(2.0 * (found - found.min()))
     return Slices(names=objective.names, values=np.array(values), fallen=np.array(fallen))

@@ -72,7 +72,7 @@ def by_innovations(names: Sequence[str] | None, spacing: float = 0.0, **more: An
     if wanted:
         raise InputError(
             f"{wanted[0]} cannot be tuned by the innovations of a recording: its disturbances last, so a filter of larger likelihood is "
-            f"usually worse. Tune only {SCALE}, the default, or by the errors (truth, rmse) if there is a reference"
+            f"usually worse. Tune only {SCALE}, the default, or by the errors (truth) if there is a reference"
         )
     return (SCALE,) if names is None else names, spacing or INDEPENDENT
 

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
-
-import numpy as np
+from typing import NamedTuple
 
 from strapdown.checks import InputError
 from strapdown.estimation.setup import FilterSetup
 from strapdown.tuning.errors import error_objective
-from strapdown.tuning.fitting import Tuning, fit, rescaled
+from strapdown.tuning.fitting import Tuning, fit
 from strapdown.tuning.innovations import Likelihood, likelihood
 from strapdown.tuning.objective import OUTLIERS, Case, Objective
 from strapdown.tuning.outliers import TunedGate, contaminated_likelihood, log_likelihood, tuned_gate
@@ -39,28 +37,24 @@ def objective_for(
     names: Sequence[str],
     *,
     truth: bool = False,
-    rmse: bool = False,
     gate: bool = False,
     spacing: float = 0.0,
     threads: int = 1,
 ) -> Objective:
     """Return the objective of a tuning, for :func:`fit`: by default the likelihood of the innovations.
 
-    ``truth``: likelihood of the errors against the truth, of the filter as used, including its gate; ``rmse``: RMS attitude error.
-    Innovations are those of the filter without its gate, because the likelihood of accepted ones increases as the gate becomes narrower;
-    ``gate``: model outliers. ``spacing``: minimum time between the samples of a sensor that are used, s.
+    ``truth``: likelihood of the errors against the truth, of the filter as used, including its gate. Innovations are those of the filter
+    without its gate, because the likelihood of accepted ones increases as the gate becomes narrower; ``gate``: model outliers. ``spacing``:
+    minimum time between the samples of a sensor that are used, s.
     """
-    if rmse and truth:
-        raise InputError("rmse and truth both say which errors against the truth count; give one of them")
-    other = truth or rmse
-    if spacing > 0.0 and other:
+    if spacing > 0.0 and truth:
         raise InputError(
             "spacing thins the innovations of the likelihood; against a truth there are none to thin: leave it out"
         )
-    if gate and (other or spacing > 0.0):
-        raise InputError("gate needs the likelihood of all innovations: leave truth, rmse and spacing out")
-    if other:
-        return error_objective(cases, setup, names, measure="rmse" if rmse else "likelihood", threads=threads)
+    if gate and (truth or spacing > 0.0):
+        raise InputError("gate needs the likelihood of all innovations: leave truth and spacing out")
+    if truth:
+        return error_objective(cases, setup, names, threads=threads)
     made = (
         contaminated_likelihood(cases, setup, names, threads=threads)
         if gate
@@ -83,9 +77,10 @@ def tune(
     progress: Callable[[str], None] | None = None,
     gate: bool = False,
     held: Sequence[Case] = (),
-    **objective: Any,
+    truth: bool = False,
+    spacing: float = 0.0,
 ) -> Tuned:
-    """Tune a filter: the objective, the search, and with ``rmse`` the common scale of all σ, with ``gate`` the filter's gate.
+    """Tune a filter: the objective, the search, and with ``gate`` the filter's gate.
 
     Parameters
     ----------
@@ -101,8 +96,8 @@ def tune(
         Model outliers, and set the gate where an outlier is more likely.
     held : sequence of Case, optional
         Held-out data (:func:`split`), on which the filter before and after tuning are compared.
-    **objective
-        ``truth``, ``rmse``, ``spacing`` of :func:`objective_for`.
+    truth, spacing : optional
+        As for :func:`objective_for`.
 
     Returns
     -------
@@ -116,7 +111,7 @@ def tune(
     """
     gate = gate or any(name in GATED for name in names or ())
     wanted = [name for name in names or () if name not in GATED] or list(default_names([case.record for case in cases]))
-    made = objective_for(cases, setup, wanted, gate=gate, threads=threads, **objective)
+    made = objective_for(cases, setup, wanted, truth=truth, gate=gate, spacing=spacing, threads=threads)
     result = fit(
         made,
         priors=priors,
@@ -126,18 +121,12 @@ def tune(
         threads=threads if isinstance(made, Likelihood) or (made.composite and len(cases) == 1) else 1,
         progress=progress,
     )
-    if objective.get("rmse"):
-        # The RMS error does not determine a common scale of all σ; the innovations do.
-        scale = likelihood(cases, result.setup, ["filter.scale"])
-        scaled = fit(
-            scale, starts=2, threads=threads, progress=progress and (lambda now: progress(f"scale of all σ, {now}"))
-        )
-        result = rescaled(result, scaled["filter.scale"].value)
     found = tuned_gate(made, result) if isinstance(made, Likelihood) and made.mixed else None
     if found is not None and found.gate is not None:
         result = dataclasses.replace(result, setup=dataclasses.replace(result.setup, gate=found.gate))
     result = dataclasses.replace(result, gate=found, comparison=_compared(held, setup, result, made, threads))
-    return Tuned(_examined(cases, setup, result, made, **objective), made, found)
+    result = dataclasses.replace(result, measure="likelihood" + " of the errors" * truth)
+    return Tuned(_examined(cases, setup, result), made, found)
 
 
 def _compared(
@@ -153,22 +142,9 @@ def _compared(
     return comparison
 
 
-def _examined(
-    cases: Sequence[Case],
-    before: FilterSetup,
-    result: Tuning,
-    made: Any,
-    *,
-    truth: bool = False,
-    rmse: bool = False,
-    **_: Any,
-) -> Tuning:
-    """Return the tuning with tests for errors that it does not model, and what was minimised."""
+def _examined(cases: Sequence[Case], before: FilterSetup, result: Tuning) -> Tuning:
+    """Return the tuning with tests for errors that it does not model."""
     tested = examined(cases, before, result)
     for one in sorted(tested, key=lambda one: one.severity)[-1:]:
         result = with_misfit_flag(result, one)
-    rms = None
-    if rmse:
-        rms = tuple(made.rms(np.stack([made.start, result.point - np.log(result.scale)])).tolist())
-    measure = ("rmse" if rmse else "likelihood") + (" of the errors" if truth else "")
-    return dataclasses.replace(result, measure=measure, unmodelled=tested, attitude_rms=rms)
+    return dataclasses.replace(result, unmodelled=tested)

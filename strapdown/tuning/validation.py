@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from strapdown import consistency
-from strapdown.checks import Array, InputError, fraction, one_of
+from strapdown.checks import Array, fraction
 from strapdown.consistency import Judgement, mean_bounds
 from strapdown.estimation import setup
 from strapdown.estimation.schedule import selected
@@ -20,15 +20,14 @@ from strapdown.results import Column, Listed, Table, figure
 from strapdown.tuning.objective import Case, of_sensors
 from strapdown.units import DEGREE
 
-By = Literal["time", "record"]
 MAX_ROWS = 20_000
 """Maximum number of states of a record that are judged."""
 MIN_ERRORS = 100
 """Minimum number of errors against a truth for their NEES over time to be reported."""
 
 
-def split(cases: Sequence[Case], share: float, by: By = "time") -> tuple[tuple[Case, ...], tuple[Case, ...]]:
-    """Divide cases into tuning data and held-out data.
+def split(cases: Sequence[Case], share: float) -> tuple[tuple[Case, ...], tuple[Case, ...]]:
+    """Divide cases into tuning data and held-out data, the end of every record, which the filter reaches from its beginning.
 
     Parameters
     ----------
@@ -36,23 +35,13 @@ def split(cases: Sequence[Case], share: float, by: By = "time") -> tuple[tuple[C
         Records to divide.
     share : float
         Fraction of the data held out, between 0 and 1.
-    by : {"time", "record"}
-        Hold out the end of every record, which the filter reaches from its beginning; or the last records.
 
     Returns
     -------
     tuned, held : tuple of Case
-        Cases to tune on, and cases held out. By time both have the same records, with different ``first`` and ``last``.
+        Cases to tune on, and cases held out: the same records, with different ``first`` and ``last``.
     """
     fraction("holdout", share)
-    one_of("holdout by", by, ("time", "record"))
-    if by == "record":
-        held = max(1, round(share * len(cases)))
-        if held >= len(cases):
-            raise InputError(
-                f"holding out {share:g} of {len(cases)} record(s) leaves none to tune on; give more records, or split by time"
-            )
-        return tuple(cases[:-held]), tuple(cases[-held:])
     train, test = [], []
     for case in cases:
         first, last = case.span

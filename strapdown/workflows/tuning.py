@@ -29,11 +29,9 @@ def tune(
     states: bool | None = None,
     priors: Mapping[str, Prior] | GyroSpec | None = None,
     truth: bool = False,
-    rmse: bool = False,
     gate: bool = False,
     spacing: float = 0.0,
     holdout: float | None = None,
-    holdout_by: str = "time",
     starts: int = 4,
     seed: int = 0,
     threads: int | None = None,
@@ -48,23 +46,19 @@ def tune(
         Initial filter. Default: matched to the first record, or that of recordings.
     free : sequence of str, optional
         Parameters to tune: ``"gyro.arw"``, ``"gyro.rrw"``, ``"SENSOR.sigma"``, …. Default: the two of the gyro and the σ of every sensor;
-        for recordings without ``truth`` or ``rmse`` only ``"filter.scale"``.
+        for recordings without ``truth`` only ``"filter.scale"``.
     states : bool, optional
         Whether the matched filter has an error state for each error that the record specifies. Default: if there are such errors.
     priors : mapping of str to Prior, or GyroSpec, optional
         Prior distributions of parameters, by name; or a gyro, for weak priors of its noise.
     truth : bool, default False
         Whether to tune by the likelihood of the errors relative to the truth, in place of that of the innovations.
-    rmse : bool, default False
-        Whether to tune by the RMS attitude error against the truth, and then to scale all σ by the innovations.
     gate : bool, default False
         Whether to model the fraction and scale of outliers too, for the filter's gate.
     spacing : float, default 0.0
         Interval between the samples of a sensor that are used, with the weight of all, s: for correlated disturbances.
     holdout : float, optional
-        Fraction of the data held out, for comparing the filter before and after tuning (``Tuning.comparison``).
-    holdout_by : {"time", "record"}, default "time"
-        Whether the end of each record is held out, or complete records.
+        Fraction of each record, its end, held out for comparing the filter before and after tuning (``Tuning.comparison``).
     starts : int, default 4
         Number of searches: one from the initial filter, the others from random initial values.
     seed : int, default 0
@@ -101,7 +95,6 @@ def tuned(
     states: bool | None = None,
     priors: Mapping[str, Prior] | GyroSpec | None = None,
     holdout: float | None = None,
-    holdout_by: str = "time",
     threads: int | None = None,
     **options: Any,
 ) -> Tuned:
@@ -132,11 +125,11 @@ def tuned(
             setup = setup or tuning.recording_setup()
             cases.append(tuning.recording_case(one))
     assert setup is not None
-    if not (options.get("truth") or options.get("rmse") or all(isinstance(one, ImuRecord) for one in sources)):
+    if not (options.get("truth") or all(isinstance(one, ImuRecord) for one in sources)):
         free, options["spacing"] = tuning.by_innovations(
             free, options.get("spacing", 0.0), gate=options.get("gate"), priors=priors
         )
-    train, held = (tuple(cases), ()) if holdout is None else tuning.split(cases, holdout, holdout_by)  # type: ignore[arg-type]
+    train, held = (tuple(cases), ()) if holdout is None else tuning.split(cases, holdout)
     wanted = [name for name in free or () if name not in tuning.GATED]
     wanted = wanted or list(tuning.default_names([case.record for case in cases]))
     if not own or any(name.startswith(("gyro.", "filter.")) for name in wanted):
