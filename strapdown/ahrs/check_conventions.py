@@ -27,13 +27,13 @@ import numpy as np
 
 from strapdown import coning, quaternion
 from strapdown.ahrs.starting import quiet_span
-from strapdown.checks import Array, Hint, InputError, lengths
+from strapdown.checks import Array, Hint, InputError, lengths, median
 from strapdown.files import plain
 from strapdown.kernels import recording_steps
 from strapdown.kernels.lane_values import WIDTH
 from strapdown.kernels.machine import compiled, read_only
 from strapdown.recordings.sensor_faults import stuck_words
-from strapdown.records.recording import Recording, increments
+from strapdown.records.recording import Recording
 from strapdown.results import Column, Table
 from strapdown.units import DEGREE, STANDARD_GRAVITY
 
@@ -448,7 +448,7 @@ _Sensors = Mapping[str, _Sensor]
 def _sensor(vectors: Array) -> _Sensor:
     size = lengths(vectors)
     size = size[np.isfinite(size)]
-    return _Sensor(vectors, size, float(np.median(size)))
+    return _Sensor(vectors, size, median(size))
 
 
 class _Windows(NamedTuple):
@@ -487,7 +487,7 @@ def _windows(recording: Recording, sensors: _Sensors, known: np.ndarray | bool =
         return None
     window = np.floor((time - time[0]) / SPAN).astype(int)
     turning = np.bincount(window, lengths(recording.rate[rows])) / np.bincount(window).clip(1)
-    least = 0.5 * max(1.0, SPAN / float(np.median(np.diff(time))))
+    least = 0.5 * max(1.0, SPAN / median(np.diff(time)))
     known = np.broadcast_to(known, recording.time.shape)[rows]
     side_by_side, used = np.zeros((len(time), WIDTH)), {}
     for name, (vectors, _, strength) in sensors.items():
@@ -499,7 +499,7 @@ def _windows(recording: Recording, sensors: _Sensors, known: np.ndarray | bool =
         if chosen.any():
             used[name] = seen & chosen[window]
             columns = slice(3 * len(used) - 3, 3 * len(used))
-            side_by_side[used[name], columns] = samples[used[name]] / strength
+            np.copyto(side_by_side[:, columns], samples / strength, where=used[name][:, None])
     if not used:
         return None
     evaluated = np.bincount(window[np.any([*used.values()], axis=0)], minlength=len(turning)) > 0
@@ -546,13 +546,19 @@ def _turns(recording: Recording, known: np.ndarray) -> tuple[np.ndarray, np.ndar
 
     ``known`` masks the samples at which a window may begin and end.
     """
-    total = np.concatenate([np.zeros((1, 3)), np.cumsum(increments(recording), axis=0)])
     step = max(1, round(REFERENCE_SPAN / recording.interval))
     first = np.arange(0, len(recording.time) - step, max(1, step // 2))
     first = first[known[first] & known[first + step]]
-    turn = total[first + step] - total[first]
+    turn = _turns_between(recording, first, first + step)
     chosen = np.sort(np.argsort(-lengths(turn))[:2000])
     return first[chosen], first[chosen] + step, turn[chosen]
+
+
+def _turns_between(recording: Recording, first: np.ndarray, last: np.ndarray) -> Array:
+    """Return the sums of the increments from some samples to others (m, 3)."""
+    turns = np.empty((len(first), 3))
+    compiled(recording_steps.turns_between)(*map(read_only, (recording.time, recording.rate, first, last)), turns)
+    return turns
 
 
 def _gyro_fits(turn: Array, reference: Array) -> Array:
@@ -646,13 +652,13 @@ def _without_reference(recording: Recording, sensors: _Sensors) -> _Explanations
     windows = _windows(recording, sensors)
     if windows is None:
         return None
-    # Only within each window: the turns from one to the next have no effect on the misfits.
+    # Only within each window: the attitude at its begin has no effect on the misfits.
     rows = windows.rows
-    turns = np.empty((len(rows) - 1, 3))
-    compiled(recording_steps.turns_between)(*map(read_only, (recording.time, recording.rate, rows)), turns)
-    attitudes = [coning.integrate(sign * factor * turns) for factor in GYRO_UNITS.values() for sign in (1.0, -1.0)]
+    factors = np.multiply.outer(list(GYRO_UNITS.values()), [1.0, -1.0]).reshape(-1, 1, 1)
+    turns = factors * _turns_between(recording, rows, np.append(rows[1:], rows[-1]))
+    attitudes = coning.integrate(turns.reshape(-1, 3))[:-1].reshape(len(factors), -1, 4)
     which, axes, changes = _one_wrong(tuple(windows.counts))
-    vectors = {name: _turned(one)[which, axes[name]] for name, one in windows.means(np.stack(attitudes)).items()}
+    vectors = {name: _turned(one)[which, axes[name]] for name, one in windows.means(attitudes).items()}
     number = np.array([len(one) for one in changes])
     misfit = _fixed_misfits(vectors)
     return _Explanations(misfit, number, changes.__getitem__, _floors(misfit, FLOORS["vectors"], sensors))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -141,7 +142,7 @@ class AhrsParameters:
             check = non_negative if name in may_be_zero else positive
             check(name, getattr(self, name))
 
-    @property
+    @functools.cached_property
     def setup(self) -> FilterSetup:
         """Setup of the filter with this model."""
         force: dict[str, Any] = {}

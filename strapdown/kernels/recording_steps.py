@@ -97,11 +97,11 @@ def turn_over(time, rate, late, sums, turn):
             turn[i, c] = sums[i, c] - (sums[k, c] + step)
 
 
-def turns_between(time, rate, rows, turns):
-    """Write the rotation vector (m − 1, 3) from each of the ``rows`` (m,) to the next, by the trapezoidal rule."""
+def turns_between(time, rate, first, last, turns):
+    """Write the rotation vectors (m, 3) from the samples ``first`` (m,) to the samples ``last``, by the trapezoidal rule."""
     for k in range(len(turns)):
         x, y, z = 0.0, 0.0, 0.0
-        for i in range(rows[k], rows[k + 1]):
+        for i in range(first[k], last[k]):
             half = 0.5 * (time[i + 1] - time[i])
             x += half * (rate[i, 0] + rate[i + 1, 0])
             y += half * (rate[i, 1] + rate[i + 1, 1])

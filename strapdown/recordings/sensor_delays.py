@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from strapdown.checks import Array, Hint, InputError, non_negative
+from strapdown.checks import Array, Hint, InputError, median, non_negative
 from strapdown.kernels import recording_samples, recording_steps
 from strapdown.kernels.machine import compiled, read_only
 from strapdown.records.recording import Recording
@@ -155,15 +155,14 @@ def _evidence(recording: Recording, turned: Array) -> tuple[Array, Array, Array,
 
 def _fitted(across: Array, along: Array, total: Array) -> tuple[float, float]:
     """Return the delay τ, s, of the fit c = τ w without outliers, and its σ, from c·w, w·w and c·c of each pair (m,)."""
-    kept, low, high = np.ones(len(total)), (len(total) - 1) // 2, len(total) // 2
+    kept = np.ones(len(total))
     for _ in range(4):
         information = float(along @ kept)
         if information == 0.0:
             return 0.0, np.inf
         delay = float(across @ kept) / information
         left = total - 2.0 * delay * across + delay**2 * along
-        ordered = np.partition(left, (low, high))
-        middle = 0.5 * float(ordered[low] + ordered[high])
+        middle = median(left)
         kept = (left <= 2.5**2 * middle).astype(np.float64)
     # The median norm of a normal residual with three components is 1.54 σ; the pairs of one span overlap and are not independent.
     return delay, float(np.sqrt(max(middle, 0.0) * PAIRS_IN_SPAN / information)) / 1.54

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from strapdown.checks import Array
+from strapdown.checks import Array, median
 from strapdown.kernels import recording_samples
 from strapdown.kernels.machine import compiled, read_only
 from strapdown.records.recording import Recording
@@ -72,17 +72,18 @@ def find(recording: Recording) -> Faults:
     """Return the faults of a recording's samples, with the corrected recording."""
     words = []
     changes: dict[str, Any] = {}
-    step = truncation_step(recording.rate)
+    measured = recording.rate
+    step = truncation_step(measured)
     if step is not None:
-        recording = replace(recording, rate=untruncated(recording.rate, step))
+        changes["rate"] = measured = untruncated(measured, step)
         words.append(
             f"The gyro's samples are multiples of {step / DEGREE:.3g} °/s truncated toward zero: half a step is added to each"
         )
-    rate, variance, clipped = restored(recording.time, recording.rate)
+    rate, variance, clipped = restored(recording.time, measured)
     if clipped.any():
         changes["rate"] = rate
         limits = ", ".join(
-            f"{axis} at {np.rad2deg(np.abs(recording.rate[clipped[:, k], k]).max()):.4g} °/s ({clipped[:, k].mean():.2%})"
+            f"{axis} at {np.rad2deg(np.abs(measured[clipped[:, k], k]).max()):.4g} °/s ({clipped[:, k].mean():.2%})"
             for k, axis in enumerate("xyz")
             if clipped[:, k].any()
         )
@@ -96,7 +97,7 @@ def find(recording: Recording) -> Faults:
         words.append(f"The accelerometer was clipped in {np.sum(lost)} samples ({lost.mean():.2%}), which are ignored")
     steps = np.diff(recording.time)
     usual = recording.interval
-    filled = interpolated(recording.rate)
+    filled = interpolated(measured)
     for first, last in filled:
         length = float(recording.time[last] - recording.time[first])
         turn = min(turn_variance_over(recording.time, rate, length, usual), UNKNOWN_TURN)
@@ -135,7 +136,7 @@ def interpolated(rate: Array) -> list[tuple[int, int]]:
     most = bend.max(initial=0.0)
     if most == 0.0 or not _runs(bend <= STRAIGHT * most):  # saves the median of nearly every recording
         return []
-    usual = np.median(bend[bend > 0.0])
+    usual = median(bend[bend > 0.0])
     runs = _runs(bend <= STRAIGHT * usual)
     return [(first, last) for first, last in runs if np.max(np.abs(rate[last] - rate[first])) > usual]
 

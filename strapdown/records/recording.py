@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from strapdown import quaternion
-from strapdown.checks import Array, InputError, array, increasing, one_of
+from strapdown.checks import Array, InputError, array, increasing, median, one_of
 from strapdown.results import Listed, Table
 from strapdown.units import DEGREE, STANDARD_GRAVITY
 
@@ -150,7 +150,7 @@ class Recording(Listed):
     @functools.cached_property
     def interval(self) -> float:
         """Median interval between the stamps, s."""
-        return float(np.median(np.diff(self.time)))
+        return median(np.diff(self.time))
 
     def since(self, first: int) -> Recording:
         """Return the recording from a given sample on.
@@ -329,8 +329,7 @@ def increments(recording: Recording) -> Array:
 
 def sampled(samples: Array) -> np.ndarray:
     """Return a mask (n,) of the rows (n, 3) of a sensor that are samples: neither NaN nor all 0."""
-    x, y, z = np.abs(samples).T
-    return np.asarray(x + y + z > 0.0)
+    return np.asarray(np.abs(samples) @ np.ones(3) > 0.0)
 
 
 def gaps(time: ArrayLike) -> list[tuple[float, float]]:
@@ -343,4 +342,5 @@ def gaps(time: ArrayLike) -> list[tuple[float, float]]:
     """
     stamps = np.asarray(time, np.float64)
     steps = np.diff(stamps)
-    return [(float(stamps[k]), float(steps[k])) for k in np.flatnonzero(steps > GAP * np.median(steps))]
+    usual = median(steps) if len(steps) else 0.0
+    return [(float(stamps[k]), float(steps[k])) for k in np.flatnonzero(steps > GAP * usual)]

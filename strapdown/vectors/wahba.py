@@ -67,8 +67,7 @@ def from_vertical_and_heading(up_b: ArrayLike, magnetic_b: ArrayLike) -> Array:
             f"{place('up_b', index)} and {place('magnetic_b', index)} are {angle[tuple(index)] / DEGREE:.6g}° apart, less than "
             f"{MIN_HORIZONTAL_ANGLE / DEGREE:.2g}° from one line: such a field gives no heading; check both"
         )
-    north_up = _frame(np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0]))
-    return quaternion.from_matrix(north_up @ np.swapaxes(_frame(up, field), -1, -2))
+    return quaternion.from_matrix(_NORTH_UP @ np.swapaxes(_frame(up, field), -1, -2))
 
 
 def _frame(first: Array, second: Array) -> Array:
@@ -76,6 +75,9 @@ def _frame(first: Array, second: Array) -> Array:
     normal = np.cross(first, second)
     normal = normal / np.linalg.norm(normal, axis=-1, keepdims=True)
     return np.stack(np.broadcast_arrays(first, np.cross(normal, first), normal), axis=-1)
+
+
+_NORTH_UP = _frame(np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0]))
 
 
 # ----------------------------------------------------------------------------------------------------------------------

@@ -290,17 +290,17 @@ def _run_recording(
         source, parameters = ahrs.without_temperature(source, parameters, temperature, walks=walks or smooth)
     reference = source.true_attitude
     if reference is not None and source.movement is not None:
-        judged = np.isfinite(reference).all(axis=1) & source.movement
+        judged = np.isfinite(reference @ np.ones(4)) & source.movement
         if not judged.any():
             raise InputError(
                 f"{source.source}: no sample to judge has a reference attitude; check its movement mask and its reference"
             )
     full = reference is not None if full_covariance is None else full_covariance
     result = ahrs.estimate(source, parameters, gate=gate, robust=robust, full_covariance=full, smooth=smooth, **options)
-    used = result.recording
+    used, parameters = result.recording, result.parameters
     estimate = dataclasses.replace(
         result.estimate,
-        setup=dataclasses.replace(result.parameters.setup, gate=gate, robust=robust),
+        setup=dataclasses.replace(parameters.setup, gate=gate, robust=robust),
         origin=Origin(source=used.source),
         truth=None if used.true_attitude is None else Truth.of_reference(used.true_attitude, used.movement),
         fixed_frame=fixed_frame(used),
@@ -308,12 +308,12 @@ def _run_recording(
         smoothed=smooth,
         remarks=(*remarks(result, motion), *notes),
         details={
-            **{f"parameter.{name}": value for name, value in vars(result.parameters).items()},
+            **{f"parameter.{one.name}": getattr(parameters, one.name) for one in dataclasses.fields(parameters)},
             "latency": result.delays.last_gyro,
             "magnetometer_latency": result.delays.last_field,
         },
     )
-    return Run(estimate, result.record, result.parameters.setup, result.initial, result.calibration)
+    return Run(estimate, result.record, parameters.setup, result.initial, result.calibration)
 
 
 def warn_about_conventions(source: Recording) -> None:
