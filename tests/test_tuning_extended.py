@@ -181,7 +181,7 @@ def test_it_is_that_of_ordinary_runs_and_score_and_curvature_are_its_derivatives
     one = case_of(scenario, chosen, 5)
     objective = tuning.likelihood([one], chosen, [*COLOURED, "gyro.arw"])
     point = objective.start + 0.2
-    points = np.stack([objective.start, point, objective.start + [0.5, -0.4, 0.3, -0.2]])
+    points = np.stack([objective.start, point, objective.start + np.array([0.5, -0.4, 0.3, -0.2])])
     runs = [setup.run(one.record, objective.setup(x), objective.initial(one, objective.setup(x))) for x in points]
     series = [run.innovations.values() for run in runs]
     expected = [0.5 * sum(np.sum(np.log(i.variance) + i.innovation**2 / i.variance) for i in s) for s in series]
