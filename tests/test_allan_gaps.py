@@ -58,11 +58,11 @@ def test_a_walk_with_single_samples_lost_is_nearly_unbiased():
 
 
 def over_records(kind: str, known: np.ndarray, m: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the mean Allan variance over 600 records, its standard error, and its expected value."""
-    records = noise(kind, (600, len(known)), 7)
+    """Return the mean Allan variance over 300 records, its standard error, and its expected value."""
+    records = noise(kind, (300, len(known)), 7)
     records[:, ~known] = np.nan
     found = np.array([allan.allan_deviation(one, 1.0, taus=m).deviation[0] ** 2 for one in records])
-    return np.nanmean(found, axis=0), np.nanstd(found, axis=0) / np.sqrt(600), true_variance(kind, m.astype(float))
+    return np.nanmean(found, axis=0), np.nanstd(found, axis=0) / np.sqrt(300), true_variance(kind, m.astype(float))
 
 
 def test_a_sample_lost_leaves_the_overlapping_estimator():

@@ -36,28 +36,20 @@ def test_what_is_put_in_comes_out():
 
 
 def test_its_intervals_cover_where_plain_least_squares_would_not():
-    """40 records of a bias that wanders: 95 % intervals hold 38, 33 is 3.6 σ below; those of white residuals hold fewer than half."""
-    samples, runs = 3000, 40
+    """20 records of a bias that wanders: 95 % intervals hold 19, 16 is 3.1 σ below; those of white residuals hold fewer than half."""
+    samples, runs = 3000, 20
     T = warm_up(samples)
     x = 1e-3 * (T - T.mean())[:, None] + records(samples, runs, 5)
     found = allan_temperature.fit_temperature(x, T, DT, order=1)
     inside = np.abs(found.polynomial.coefficients[1] - 1e-3) <= found.reach[1]
-    assert 33 <= inside.sum() <= 40
-    assert 0.7 < np.std(found.polynomial.coefficients[1]) / found.polynomial.sigma[1].mean() < 1.3  # of 40: ±11 %
+    assert 16 <= inside.sum() <= 20
+    assert 0.6 < np.std(found.polynomial.coefficients[1]) / found.polynomial.sigma[1].mean() < 1.4  # of 20: ±16 %
     A = np.stack([np.ones(samples), T - T.mean()], axis=1)
     plain, rest, *_ = np.linalg.lstsq(A, x, rcond=None)
     sigma = np.sqrt(rest / (samples - 2) / np.sum((T - T.mean()) ** 2))
     assert np.sum(np.abs(plain[1] - 1e-3) < 1.96 * sigma) < runs / 2
     # and it is nearer, for it knows where the noise is
     assert np.std(found.polynomial.coefficients[1]) < np.std(plain[1])
-
-
-def test_the_noise_that_the_polynomial_took_is_put_back():
-    """A short record and a cubic, which takes most of a wandering bias: of 40 intervals 38 would hold; 23 do where it is not put back."""
-    T = warm_up(1500)
-    x = 1e-3 * (T - T.mean())[:, None] + records(1500, 40, 5)
-    found = allan_temperature.fit_temperature(x, T, DT, order=3)
-    assert 33 <= np.sum(np.abs(found.polynomial.coefficients[1] - 1e-3) <= found.reach[1]) <= 40
 
 
 def three_hours(shape: str, K: float, runs: int):

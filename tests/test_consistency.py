@@ -221,21 +221,6 @@ def test_normality_sees_outliers():
         consistency.anderson_darling(np.ones(20))
 
 
-def test_quantile_pairs_are_order_statistics_in_their_band():
-    x = np.random.default_rng(13).standard_normal((5000, 2))
-    found = consistency.quantile_pairs(x)
-    assert len(found.observed) <= 2100
-    assert found.observed[0] == x.min()
-    assert found.observed[-1] == x.max()
-    inside = np.mean((found.observed >= found.low) & (found.observed <= found.high))
-    assert inside > 0.9
-    small = consistency.quantile_pairs(x[:20, 0])
-    for ends, share in ((small.low, 0.005), (small.high, 0.995)):
-        order = scipy.stats.beta.ppf(share, np.arange(1, 21), np.arange(20, 0, -1))
-        assert ends == pytest.approx(scipy.stats.norm.ppf(order))
-    assert small.theoretical[0] == pytest.approx(scipy.stats.norm.ppf(0.5 / 20))
-
-
 def test_mean_innovation_is_hotellings():
     z = np.random.default_rng(14).standard_normal((40, 1)) + 0.4
     mean, p = consistency.mean_innovation_p_value(z)

@@ -163,7 +163,6 @@ def test_every_function_draws_into_the_axes_it_is_given(run, statistics):
     size = np.linalg.norm(error[:, :3], axis=1)
     for draw in (
         lambda ax: plots.innovation_histogram(white, ax),
-        lambda ax: plots.innovation_quantiles(consistency.quantile_pairs(white), ax),
         lambda ax: plots.innovation_autocorrelation(consistency.autocorrelation(white), ax),
         lambda ax: plots.nis_over_record(innovations, consistency.mean_bounds(2, 1), ax),
         lambda ax: plots.error_distribution(size, ax),
@@ -450,11 +449,6 @@ def test_errors_of_a_recording_are_drawn_about_the_fixed_axes_with_sign_and_sigm
             assert np.nanmin(drawn) == pytest.approx(value)
             assert ax.collections[0].get_paths()[0].vertices[:, 1].max() == pytest.approx(3.0 * sigma)
             assert ax.get_ylim()[1] > abs(value)
-
-
-def test_a_distribution_of_errors_is_drawn():
-    ax = plots.error_distribution(units.DEGREE * np.arange(1.0, 101.0))
-    assert [line.get_xdata()[0] for line in ax.lines[1:]] == pytest.approx([50.0, 95.0])
 
 
 def test_the_errors_of_many_algorithms_go_into_rows(outcomes):

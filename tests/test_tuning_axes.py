@@ -100,6 +100,7 @@ def test_a_heading_has_one():
     assert not any(name.startswith("mag") for name in tuning.parameters.axis_names([record]))
 
 
+@pytest.mark.slow
 def test_the_monte_carlo_takes_a_sigma_for_each_axis_in_lanes():
     for scenario, sigma, rtol in (
         (tracked(20.0), {"star": (3e-5, 6e-5, 1.5e-4)}, 1e-3),

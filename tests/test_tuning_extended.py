@@ -89,14 +89,8 @@ EVERY_STATE = {
 }
 
 
-@pytest.mark.parametrize(
-    ("states", "sigma", "others"),
-    # The others take 10 s to compile.
-    [
-        pytest.param(*each, id=name, marks=pytest.mark.slow if name != "few" else [])
-        for name, each in EVERY_STATE.items()
-    ],
-)
+@pytest.mark.slow  # each takes 10 s to compile
+@pytest.mark.parametrize(("states", "sigma", "others"), EVERY_STATE.values(), ids=EVERY_STATE)
 def test_every_lane_is_the_filter_itself_with_every_state_and_kind_of_sensor(states, sigma, others):
     record = two_stars.every_kind(gaps=False)
     chosen = dataclasses.replace(two_stars.KINDS, states=states, sigma=sigma)
@@ -181,11 +175,17 @@ def test_of_a_bias_over_temperature_it_is_that_of_a_linear_filter():
     assert np.abs(bias[0, 0] - np.array([3e-5, -2e-5, 0.0]) * (T[1000] - T[0])).max() < 4.0 * np.sqrt(P[0, 0, 3, 3])
 
 
-def test_score_and_curvature_are_the_derivatives():
+def test_it_is_that_of_ordinary_runs_and_score_and_curvature_are_its_derivatives():
     scenario = swaying(20.0)
     chosen = filter_setup(scenario)
-    objective = tuning.likelihood([case_of(scenario, chosen, 5)], chosen, [*COLOURED, "gyro.arw"])
+    one = case_of(scenario, chosen, 5)
+    objective = tuning.likelihood([one], chosen, [*COLOURED, "gyro.arw"])
     point = objective.start + 0.2
+    points = np.stack([objective.start, point, objective.start + np.array([0.5, -0.4, 0.3, -0.2])])
+    runs = [setup.run(one.record, objective.setup(x), objective.initial(one, objective.setup(x))) for x in points]
+    series = [run.innovations.values() for run in runs]
+    expected = [0.5 * sum(np.sum(np.log(i.variance) + i.innovation**2 / i.variance) for i in s) for s in series]
+    np.testing.assert_allclose(objective.minus_log(points), expected, rtol=1e-9)
     found = objective.derivatives(point)
     h = 1e-3
     for j in range(len(point)):

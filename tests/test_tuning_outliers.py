@@ -183,7 +183,10 @@ GRADIENTS = {
 }
 
 
-@pytest.mark.parametrize(("states", "names"), GRADIENTS.values(), ids=GRADIENTS)
+@pytest.mark.parametrize(
+    ("states", "names"),
+    [pytest.param(*each, id=name, marks=pytest.mark.slow if each[0] else []) for name, each in GRADIENTS.items()],
+)
 def test_the_gradient_is_that_of_the_likelihood(states, names):
     one, chosen = every_kind(), dataclasses.replace(KINDS, states=states)
     objective = tuning.contaminated_likelihood([one, one], chosen, names, threads=2)

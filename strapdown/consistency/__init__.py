@@ -26,13 +26,11 @@ from strapdown.consistency.manifold import SUBSETS, errors, nees, whitened
 from strapdown.consistency.timeaverage import time_average
 from strapdown.consistency.whiteness import (
     Autocorrelation,
-    QuantilePairs,
     anderson_darling,
     autocorrelation,
     cross_correlation_p_value,
     ljung_box,
     mean_innovation_p_value,
-    quantile_pairs,
 )
 
 __all__ = [

@@ -125,41 +125,6 @@ def anderson_darling(whitened: ArrayLike) -> tuple[float, float]:
     return a, p
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class QuantilePairs:
-    """Sorted values and the quantiles of the standard normal: a Q–Q plot."""
-
-    theoretical: Array
-    observed: Array
-    """Sorted values of all components together."""
-    low: Array
-    """Lower limit of the pointwise band of each sorted value (from the beta distribution of order statistics)."""
-    high: Array
-    probability: float
-
-
-MAX_PAIRS = 2000
-
-
-def quantile_pairs(whitened: ArrayLike, probability: float = 0.99) -> QuantilePairs:
-    """Return the points of a Q–Q plot against the standard normal; for more than 2000 values both ends and evenly spread ranks."""
-    from scipy.special import betaincinv, ndtri
-
-    outside = tail(probability)
-    x = np.sort(_series(whitened).ravel())
-    n = len(x)
-    ends = np.concatenate([np.arange(min(n, 200)), np.arange(max(n - 200, 0), n)])
-    ranks = np.unique(np.concatenate([np.linspace(0, n - 1, min(n, MAX_PAIRS - 400)).round().astype(int), ends]))
-    k = ranks + 1.0
-    return QuantilePairs(
-        theoretical=np.asarray(ndtri((k - 0.5) / n)),
-        observed=x[ranks],
-        low=np.asarray(ndtri(betaincinv(k, n - k + 1.0, outside))),
-        high=np.asarray(ndtri(betaincinv(k, n - k + 1.0, 1.0 - outside))),
-        probability=probability,
-    )
-
-
 def mean_innovation_p_value(whitened: ArrayLike) -> tuple[Array, float]:
     """Return the mean of the whitened innovations (dof,) and the p-value that it is zero: Hotelling's T², exact for normal innovations."""
     from scipy.special import fdtrc

@@ -37,7 +37,6 @@ from strapdown.plots.innovations import (
     error_distribution,
     innovation_autocorrelation,
     innovation_histogram,
-    innovation_quantiles,
     nis_over_record,
 )
 from strapdown.plots.statistics import (

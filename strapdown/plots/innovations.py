@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
 from strapdown.checks import Array
-from strapdown.consistency import Autocorrelation, QuantilePairs
+from strapdown.consistency import Autocorrelation
 from strapdown.plots.decimation import decimated
 from strapdown.plots.style import AXES, BLUE, CYCLE, ORANGE, SKY, VERMILION, axes_or_new, ink, legend_above
 from strapdown.records import Innovations
@@ -40,27 +40,6 @@ def innovation_histogram(whitened: Array, ax: Axes | None = None) -> Axes:
         ax.plot([], [], " ", label=f"{beyond} beyond {HISTOGRAM_REACH:g} σ, in the outermost bins")
     ax.set_xlabel("innovation over its σ")
     ax.set_ylabel("density")
-    legend_above(ax)
-    return ax
-
-
-def innovation_quantiles(pairs: QuantilePairs, ax: Axes | None = None) -> Axes:
-    """Draw sorted whitened innovations over the quantiles of the standard normal distribution, with the bounds of each quantile."""
-    ax = axes_or_new(ax)
-    ax.fill_between(
-        pairs.theoretical,
-        pairs.low,
-        pairs.high,
-        color=ink(),
-        alpha=0.12,
-        linewidth=0,
-        label=f"{100 * pairs.probability:g} % bounds, each",
-    )
-    ends = np.array([pairs.theoretical[0], pairs.theoretical[-1]])
-    ax.plot(ends, ends, color=ink(), linewidth=0.8)
-    ax.plot(pairs.theoretical, pairs.observed, ".", color=BLUE, markersize=3, label="innovations")
-    ax.set_xlabel("quantile of the standard normal")
-    ax.set_ylabel("innovation over its σ")
     legend_above(ax)
     return ax
 

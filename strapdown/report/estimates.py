@@ -118,14 +118,13 @@ def _sensor(name: str, innovations: Innovations, confidence_level: float) -> str
     white = innovations.whitened
 
     def draw() -> Figure:
-        figure, axes = plots.new_figure(2, 2, size=(10.5, 7.0))
-        plots.innovation_histogram(white, axes[0, 0])
-        plots.innovation_quantiles(consistency.quantile_pairs(white, confidence_level), axes[0, 1])
-        plots.innovation_autocorrelation(consistency.autocorrelation(white, probability=confidence_level), axes[1, 0])
-        plots.nis_over_record(innovations, consistency.mean_bounds(white.shape[1], 1, 0.99), axes[1, 1])
+        figure, axes = plots.new_figure(3, 1, size=(9.0, 9.0))
+        plots.innovation_histogram(white, axes[0])
+        plots.innovation_autocorrelation(consistency.autocorrelation(white, probability=confidence_level), axes[1])
+        plots.nis_over_record(innovations, consistency.mean_bounds(white.shape[1], 1, 0.99), axes[2])
         return figure
 
-    caption = f"Innovations of {name} divided by their σ: distribution, quantiles, autocorrelation, NIS over time"
+    caption = f"Innovations of {name} divided by their σ: distribution, autocorrelation, NIS over time"
     return page.section(f"Innovations of {name}", page.figure(draw, caption))
 
 
