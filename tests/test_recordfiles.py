@@ -85,15 +85,10 @@ def test_a_bare_record_needs_no_extras(tmp_path):
     assert back.origin is None
 
 
-def foreign(**attributes):
-    """Return what makes an HDF5 file of another program."""
-
-    def write(path):
-        with h5py.File(path, "w") as file:
-            file["time"] = [1.0]
-            file.attrs.update(attributes)
-
-    return write
+def foreign(path):
+    """Make an HDF5 file of another program."""
+    with h5py.File(path, "w") as file:
+        file["time"] = [1.0]
 
 
 def edited(change):
@@ -117,8 +112,11 @@ def cut(share):
         (lambda path: path.unlink(), "does not exist"),
         *((cut(share), "cannot be read") for share in (0.0, 0.01, 0.3, 0.6, 0.9, 0.999)),
         (lambda path: path.write_text("time,x\n1,2\n"), "cannot be read"),
-        (foreign(), "HDF5 of another program"),
-        (foreign(kind="strapdown estimate"), "a strapdown estimate, not a strapdown record"),
+        (foreign, "HDF5 of another program"),
+        (
+            edited(lambda file: file.attrs.update(kind="strapdown estimate")),
+            "a strapdown estimate, not a strapdown record",
+        ),
         (edited(lambda file: file.attrs.update(format=2)), "layout 2"),
         (edited(lambda file: file.attrs.pop("format")), "cannot be read"),
         (edited(lambda file: file.pop("increments")), "increments is missing"),

@@ -13,8 +13,7 @@ SUBSETS: dict[str, tuple[int, ...]] = {
     "attitude": (0, 1, 2),
     "bias": (3, 4, 5),
 }
-"""Subsets of the error state by name; any other is a tuple of indices. For errors in the fixed frame (:func:`fixed_frame`) with a vertical
-z axis, 2 is the heading and (0, 1) the inclination."""
+"""Subsets of the error state by name; any other is a tuple of indices."""
 
 
 def errors(attitude: ArrayLike, bias: ArrayLike, true_attitude: ArrayLike, true_bias: ArrayLike) -> Array:

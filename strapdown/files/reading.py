@@ -56,10 +56,6 @@ BLOCK = 512
 """Size of the user block, bytes."""
 
 
-class NoDigestWarning(UserWarning):
-    """A file of this package has no digest, as files of earlier versions, so that damage to it may not be detected."""
-
-
 # ------------------------------------------------------------------------------------------------------------------ any file
 
 
@@ -322,9 +318,7 @@ def hdf5(path: Name) -> Iterator[Any]:
             _need_readable(path)
         with uninterrupted(), h5py.File(path, "r") as file:
             if not sealed and str(attributes(file).get("kind", "")).startswith("strapdown "):
-                if file.userblock_size:  # which files of earlier versions do not have
-                    raise InputError(f"{path} is damaged: its digest is missing; make it again, or restore a copy")
-                warnings.warn(NoDigestWarning(f"{path} has no digest; damage to it may not be detected"), stacklevel=1)
+                raise InputError(f"{path} is damaged: its digest is missing; make it again, or restore a copy")
             _need_plain(path, file)
             yield file
 

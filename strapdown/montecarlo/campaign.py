@@ -106,9 +106,9 @@ class Campaign(Listed):
     version : str, optional
         Version of this package that computed it. Default: the running one.
     sources : str, default ""
-        Digest of the sources of this package that computed it; empty for earlier versions.
+        Digest of the sources of this package that computed it.
     arithmetic : str, default ""
-        Processor features that the rounding depends on (:func:`strapdown.montecarlo.engine.arithmetic`); empty for earlier versions.
+        Processor features that the rounding depends on (:func:`strapdown.montecarlo.engine.arithmetic`).
     seconds : float, default 0.0
         Time spent computing, s, over all resumptions.
     """
@@ -422,8 +422,8 @@ def _stored(path: Path) -> tuple[Campaign, Statistics | None]:
             runs=count("runs", attributes["runs"]),
             statistics=_statistics_of(file["statistics"], plan) if "statistics" in file else None,
             version=str(attributes["version"]),
-            sources=str(attributes.get("sources", "")),
-            arithmetic=str(attributes.get("arithmetic", "")),
+            sources=str(attributes["sources"]),
+            arithmetic=str(attributes["arithmetic"]),
             seconds=finite("seconds", attributes["seconds"], unit="s"),
         )
         if "resume/whole" in file:

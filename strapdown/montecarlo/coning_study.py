@@ -355,24 +355,17 @@ def own_table(own: Sequence[coning.Algorithm]) -> Table:
         Column("optimum n", "best_drift_order"),
         Column("C for the same increments", "best_drift_constant"),
     )
-    rows, notes = [], []
+    rows = []
     for one in own:
-        row, constant = own_summary(one), one.drift_constant
+        constant = one.drift_constant
         exact = f" = {constant}" if constant.denominator < SHOWN_DENOMINATOR else ""
-        rows.append({**row, "samples": one.samples, "drift_constant": f"{float(constant):.4g}{exact}"})
-        if one.drift_order < row["best_drift_order"] and abs(constant) < ROUNDED:
-            notes.append(
-                f"Note: the drift of {one.name} is of order (ωh)^{one.drift_order} with a small constant, as with rounded coefficients. "
-                "If they are rounded, give them as fractions or with all digits."
-            )
+        rows.append({**own_summary(one), "samples": one.samples, "drift_constant": f"{float(constant):.4g}{exact}"})
     title = "Your own algorithms: drift under small coning is −C β² ω (ωh)^n, derived from the coefficients"
-    return _table(title, columns, rows, notes, name="own")
+    return _table(title, columns, rows, name="own")
 
 
 SHOWN_DENOMINATOR = 10**7
 """Drift constants with a smaller denominator are also shown as fractions."""
-ROUNDED = 1e-3
-"""A drift constant below this, in an order that the optimum coefficients cancel, is probably due to rounded coefficients."""
 
 
 def _table(
