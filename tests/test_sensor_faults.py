@@ -59,6 +59,13 @@ def test_samples_at_the_limit_are_recognised():
     np.testing.assert_array_equal(sensor_faults.clipped_samples(one_side, 1.0), plain >= 5.0)
 
 
+def test_a_quantised_sensor_that_repeats_samples_at_rest_may_be_clipped():
+    moving = np.round(swing().rate, 2)
+    plain = np.concatenate([np.zeros((4000, 3)), moving])
+    found = sensor_faults.clipped_samples(np.clip(plain, -5.0, 5.0), 1.0)
+    np.testing.assert_array_equal(found, np.abs(plain) >= 5.0)
+
+
 def test_rows_of_nan_or_of_zeros_are_no_samples():
     rows = np.array(
         [[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [2.0, 0.0, 0.0], [0.0, 0.0, 0.0], [1.0, np.nan, 1.0], [1.0, -1.0, 0.0]]

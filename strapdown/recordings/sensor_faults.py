@@ -205,7 +205,8 @@ def clipped_samples(samples: Array, least: float) -> np.ndarray:
         axis = samples[:, k].copy()
         extremes, repeated = [axis == end for end in ends[k, :, 0]], reached[k]
         same = np.append(False, axis[1:] == axis[:-1])
-        between = ~(extremes[0] | extremes[1])
+        # A quantised sensor repeats samples at rest; one that repeats them in motion too does not show by them that it is clipped.
+        between = ~(extremes[0] | extremes[1]) & (np.abs(axis) > least)
         if not between.any() or np.mean(same[between]) > MAX_REPEATS:
             continue
         for at, candidate in zip(extremes, repeated, strict=True):
