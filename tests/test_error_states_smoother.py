@@ -354,7 +354,6 @@ def swaying(duration=2.0, seed=1, start_error=(0.05, -0.02, 0.03)):
         series.append(series_of(name, "vector", at, z + sigma * rng.standard_normal(z.shape), reference, sigma))
     attitude = quaternion.multiply(BODY.attitude(np.array(0.0)), quaternion.exp(start_error))
     truth = records.Truth(attitude=BODY.attitude(time), bias=np.zeros((len(time), 3)))
-    # The magnetometer first, as in test_error_states_recovery.py: with its hard iron it is one structure to compile.
     record = ImuRecord(time=time, increments=turns, vectors=tuple(series[::-1]), truth=truth)
     return record, estimation.initial_state(attitude, attitude_sigma=0.05, bias_sigma=3e-3)
 
@@ -481,7 +480,7 @@ def jumped(lost: float, blocks) -> tuple[ImuRecord, estimation.State]:
 
 
 @pytest.mark.parametrize(
-    "blocks", [pytest.param((), marks=pytest.mark.slow), (WALKING, COLOURED)], ids=["none", "states"]
+    "blocks", [(), pytest.param((WALKING, COLOURED), marks=pytest.mark.slow)], ids=["none", "states"]
 )
 @pytest.mark.parametrize(("lost", "since"), [(0.0, 3), (0.5, 15)])
 def test_a_trajectory_begins_with_its_candidate(lost, since, blocks):

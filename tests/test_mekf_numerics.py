@@ -94,12 +94,20 @@ def test_positive_definite_over_twelve_decades_of_noise_over_the_prior(exponent,
         assert np.max(quaternion.angle_between(result.attitude, truth)) < 1e-6
 
 
-SCALE = (GyroScale(scale_sigma=1e-3, misalignment_sigma=1e-3),)
+MANY = (
+    GyroScale(scale_sigma=1e-2, misalignment_sigma=5e-3),
+    GyroGaussMarkov(bias_sigma=1e-3, correlation_time=5.0),
+    VectorBias(sensor="mag", bias_sigma=5e-6, unit="T"),
+    GaussMarkov(sensor="force", noise_sigma=0.02, correlation_time=0.7, frame="fixed"),
+)
 SILENT = tuple(
-    VectorMeasurements(sensor=kind, kind=kind, time=[], sigma=1.0, **value)
-    for kind, value in (
-        ("direction", {"vector_b": np.empty((0, 3)), "reference_f": STAR}),
-        ("attitude", {"attitude": np.empty((0, 4))}),
+    VectorMeasurements(sensor=sensor, kind=kind, time=[], sigma=1.0, **value)
+    for sensor, kind, value in (
+        *(
+            (name, kind, {"vector_b": np.empty((0, 3)), "reference_f": STAR})
+            for name, kind in (("mag", "vector"), ("force", "direction"), ("first", "direction"))
+        ),
+        ("attitude", "attitude", {"attitude": np.empty((0, 4))}),
     )
 )
 """Sensors without measurements, with which tests of one kind of sensor share their kernels."""
@@ -110,13 +118,13 @@ SILENT = tuple(
     [
         *((kind, None, ()) for kind in ("direction", "vector", "attitude")),
         ("direction", OPTIONS, ()),
-        ("direction", None, SCALE),
+        ("direction", None, MANY),
         *(
             pytest.param(kind, gate, states, marks=pytest.mark.slow)
             for kind, gate, states in (
                 *((kind, OPTIONS, ()) for kind in ("vector", "attitude")),
-                *((kind, None, SCALE) for kind in ("vector", "attitude")),
-                *((kind, OPTIONS, SCALE) for kind in ("direction", "vector", "attitude")),
+                *((kind, None, MANY) for kind in ("vector", "attitude")),
+                *((kind, OPTIONS, MANY) for kind in ("direction", "vector", "attitude")),
             )
         ),
     ],
@@ -321,7 +329,7 @@ def test_the_covariance_is_carried_through_large_corrections():
         assert np.allclose(np.diag(f.P), estimate.variance[k + 1], rtol=1e-5)
 
 
-@pytest.mark.parametrize("states", [(), SCALE], ids=["six", "more"])
+@pytest.mark.parametrize("states", [(), MANY], ids=["six", "more"])
 @pytest.mark.parametrize("angle", [0.3, 0.6, 0.95, 1.5])
 def test_a_large_correction_is_exact(states, angle):
     """P = σ²I and one measured attitude of variance r: the correction is φ σ²/(σ² + r), and P becomes σ² r/(σ² + r) J Jᵀ."""
@@ -351,7 +359,7 @@ def test_a_large_correction_is_exact(states, angle):
 def tracked(sigma, sharp=None, duration=6.0):
     """A record of a turning body with two stars, field and force, and perhaps one direction that is much sharper than all else."""
     record = record_of(duration=duration, rate=25.0)
-    series = [s for s in record.vectors if s.sensor in ("mag", "force")]
+    series = [*(s for s in record.vectors if s.sensor in ("mag", "force")), SILENT[-1]]
     random = np.random.default_rng(3)
     for name, at, r, noise in (
         ("first", np.arange(0.2, duration, 0.4), STAR, sigma),
@@ -362,14 +370,6 @@ def tracked(sigma, sharp=None, duration=6.0):
             vector = seen(SWAY.attitude(at), unit(r)) + noise * random.standard_normal((len(at), 3))
             series.append(series_of(name, "direction", at, unit(vector), unit(r), noise))
     return replace(record, vectors=tuple(series))
-
-
-MANY = (
-    GyroScale(scale_sigma=1e-2, misalignment_sigma=5e-3),
-    GyroGaussMarkov(bias_sigma=1e-3, correlation_time=5.0),
-    VectorBias(sensor="mag", bias_sigma=5e-6, unit="T"),
-    GaussMarkov(sensor="force", noise_sigma=0.02, correlation_time=0.7, frame="fixed"),
-)
 
 
 SHARP = {

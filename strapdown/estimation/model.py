@@ -173,7 +173,9 @@ def assemble(
         for k in np.flatnonzero(of_the_gyro).tolist()
     )
     sensors, vectors, varying = _on_sensors(blocks, kinds, numbers, isotropic=isotropic)
-    shapes = tuple(dict.fromkeys(sensors))
+    shapes = tuple(
+        sorted(set(sensors), key=repr)
+    )  # whatever the order of the sensors, for the kernels of one structure
     if not blocks:
         shapes = tuple(Sensor(code, isotropic, ()) for code in KIND_CODES.values())
     fastest = float(np.max(decay * np.where(entering, 5.0, 1.0), initial=0.0))
