@@ -78,7 +78,7 @@ LARGE_SIGMA = np.sqrt((LARGE[0] ** 2 + LARGE[0] * LARGE[1] + LARGE[1] ** 2) / 9.
 """RMS per axis of angles uniform between the two, about any axis, rad."""
 
 
-SMALL = {"runs": 6, "unscented_runs": 1, "duration": 20.0}
+SMALL = {"runs": 2, "unscented_runs": 1, "duration": 10.0}
 """Arguments of a quick test run."""
 
 COLOURS = {

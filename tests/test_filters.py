@@ -1,7 +1,6 @@
 """Filters of one interface, and the filters of ``sims/filter_family.py``: formulas, pairs that must agree, truth and χ²."""
 
 import dataclasses
-import json
 from functools import cache
 
 import mpmath
@@ -43,7 +42,7 @@ FORMS = ("scalar", "each sample", "axes", "axes of each sample", "covariance", "
 ONE_SIGMA = ("scalar", "each sample")
 CASES = [(kind, form) for kind in REFERENCES for form in FORMS if kind != "heading" or form in ONE_SIGMA]
 """Every kind of measurement with every form of noise that it has."""
-OWN_CASES = [(kind, form) for kind, form in CASES if kind in ("direction", "attitude")]
+OWN_CASES = [(kind, form) for kind in ("direction", "attitude") for form in ("scalar", "covariance of each sample")]
 SHARPEST = [(kind, "each sample" if kind == "heading" else "covariance of each sample") for kind in REFERENCES]
 """Each kind with the form of noise that needs most of the code."""
 UNEVEN = np.array([1.5, 0.4, 0.8])
@@ -545,80 +544,6 @@ def test_usque_equals_filterpy_step_by_step(kind, form):
         np.testing.assert_allclose(estimate.covariance[k], P, rtol=0.0, atol=1e-10)
 
 
-# ------------------------------------------------------------------------------------------------ equivariant
-
-
-def row_errors(midway, angle, n, r, q):
-    """Rows of a direction without noise and an attitude error of ``angle`` about n in fixed axes: H δθ and the innovation."""
-    z = seen(quaternion.multiply(quaternion.exp(angle * n), q), r)
-    series = series_of("sun", "direction", [0.0], z[None], r, 1.0)
-    H, y, _ = comparison.rows_of(series, 0, q, midway)
-    return H @ seen(q, angle * n), y
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_equivariant_rows_are_wrong_in_third_order_and_plain_ones_in_second(seed):
-    """Cayley: ``m − r = −2 tan(θ/2) n × ½ (m + r)`` exactly. Halving θ leaves an eighth of the error, of the plain row a quarter."""
-    rng = np.random.default_rng([50, seed])
-    n, r = rng.standard_normal((2, 3))
-    n, r = n / np.linalg.norm(n), r / np.linalg.norm(r)
-    q = quaternion.normalize(rng.standard_normal(4))
-    for angle in (1e-3, 0.3, 1.0, 2.5):
-        expected, y = row_errors(True, angle, n, r, q)
-        np.testing.assert_allclose(y, 2.0 * np.tan(0.5 * angle) / angle * expected, rtol=0.0, atol=2e-15)
-    for midway, order in ((True, 3), (False, 2)):
-        wrong = []
-        for angle in (0.04, 0.02, 0.01):
-            expected, y = row_errors(midway, angle, n, r, q)
-            wrong.append(np.linalg.norm(y - expected))
-        np.testing.assert_allclose(np.log2(np.divide(wrong[:-1], wrong[1:])), order, atol=0.05)
-
-
-@pytest.mark.parametrize("name", ["equivariant", "two-frame"])
-def test_the_equivariant_error_does_not_hang_on_the_trajectory(name):
-    """``Ė = −E [ε]``, ``ε̇ = [w_f] ε`` of ``E = R_true R_estᵀ``, ``ε = R_est (b_true − b_est)``: nothing of it but w_f.
-
-    Two attitudes and biases far apart, the same error and the same rate in fixed axes: the same error 100 steps later, and the same
-    covariance of it. Of the MEKF's error, seen from the body, neither holds.
-    """
-    rng = np.random.default_rng(51)
-    number, dt = 100, 0.1
-    time = dt * np.arange(number + 1)
-    rates_f = 2.0 * rng.standard_normal((number, 3))
-    E, epsilon = quaternion.exp([0.3, -0.2, 0.4]), np.array([0.02, -0.03, 0.01])
-    M = rng.standard_normal((6, 6)) * np.array([0.3] * 3 + [0.02] * 3)[:, None]
-    noise = estimation.ProcessNoise(angle_random_walk=0.01, rate_random_walk=0.002)
-    found = []
-    for _ in range(2):
-        q, b = quaternion.normalize(rng.standard_normal(4)), 0.5 * rng.standard_normal(3)
-        R = quaternion.to_matrix(q)
-        increments = np.empty((number, 3))
-        for k, rate in enumerate(rates_f):
-            body_rate = R.T @ rate
-            increments[k] = (body_rate + b) * dt
-            R = R @ expm(kinematics.skew(body_rate * dt))
-        to_body = np.kron(np.eye(2), quaternion.to_matrix(q).T)  # δθ = Rᵀ δφ, δb = Rᵀ β
-        true = estimation.State(attitude=quaternion.multiply(E, q), bias=b + seen(q, epsilon), covariance=np.eye(6))
-        own = estimation.State(attitude=q, bias=b, covariance=to_body @ M @ M.T @ to_body.T)
-        record = ImuRecord(time=time, increments=increments, vectors=())
-        truth, estimate = (own_filter(name, noise).run(record, one) for one in (true, own))
-        R = quaternion.to_matrix(estimate.attitude)
-        turned = np.zeros((number + 1, 6, 6))
-        turned[:, :3, :3] = turned[:, 3:, 3:] = R
-        error = quaternion.log(quaternion.multiply(truth.attitude, quaternion.conjugate(estimate.attitude)))
-        bias_f = np.einsum("kij,kj->ki", R, truth.bias - estimate.bias)
-        P = turned @ estimate.covariance @ np.swapaxes(turned, 1, 2)
-        body = turn_to(estimate.attitude, truth.attitude)
-        found.append((error, bias_f, P, body, estimate.covariance))
-    (one, other), scale = found, np.abs(found[0][2]).max()
-    assert np.ptp(one[0], axis=0).max() > 0.1  # it does change
-    np.testing.assert_allclose(one[0], other[0], rtol=0.0, atol=1e-12)
-    np.testing.assert_allclose(one[1], other[1], rtol=0.0, atol=1e-12)
-    np.testing.assert_allclose(one[2] / scale, other[2] / scale, rtol=0.0, atol=1e-12)
-    assert np.abs(one[3] - other[3]).max() > 0.1
-    assert np.abs(one[4] - other[4]).max() > 0.01 * scale
-
-
 # ------------------------------------------------------------------------------------------------- USQUE and complementary
 
 
@@ -820,14 +745,7 @@ EVERY_CASE = [(name, *case) for name in filters.FILTERS for case in CASES]
 EVERY_CASE += [(name, *case) for name in (*comparison.EXTENDED, "usque") for case in OWN_CASES]
 
 
-@pytest.mark.parametrize(
-    ("name", "kind", "form"),
-    [
-        pytest.param(*one, marks=[] if one[1:] in SHARPEST else pytest.mark.slow)
-        for one in EVERY_CASE
-        if one[1:] in SHARPEST or one[0] in comparison.EXTENDED[2:]
-    ],
-)
+@pytest.mark.parametrize(("name", "kind", "form"), [(name, *case) for name in filters.FILTERS for case in SHARPEST])
 def test_consistent_for_every_kind(name, kind, form):
     """ANEES inside its two-sided bounds (99.9 % each); above them when the noise is modelled at a third of what it is."""
     right, doubted = (anees(name, kind, form, 25, factor) for factor in (1.0, 1.0 / 3.0))
@@ -851,7 +769,9 @@ def test_consistent_for_every_kind_and_noise_in_many_runs(name, kind, form):
         assert np.min(high.mean) < 1.0
 
 
-@pytest.mark.parametrize("name", comparison.NAMES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[] if name in filters.FILTERS else pytest.mark.slow) for name in comparison.NAMES]
+)
 @pytest.mark.parametrize(("degrees", "left"), [(60.0, 0.5), (120.0, 3.0)])
 def test_converges_from_large_errors(name, degrees, left):
     rng = np.random.default_rng(20)
@@ -987,13 +907,6 @@ def test_every_filter_stays_finite_from_any_start(name, many):
         assert_sound(filters.run(name, record, BELIEF, initial, full_covariance=True))
 
 
-@pytest.mark.parametrize("name", comparison.EXTENDED)
-def test_own_filters_stay_finite_from_any_start(name):
-    for seed in range(4):
-        record, initial = wild(seed, 200, (("direction",), ("direction", "attitude"))[seed % 2])
-        assert_sound(own_filter(name, BELIEF).run(record, initial))
-
-
 @pytest.mark.parametrize(
     ("kind", "form"),
     [pytest.param(*one, marks=pytest.mark.slow if one[1] == "axes" and one[0] != "attitude" else []) for one in CASES],
@@ -1114,22 +1027,6 @@ def test_comparing_all_is_one_line_with_a_table():
     for names, message in (((), "^filters is empty; name at least one of mekf, mahony"), (["mefk"], "mean 'mekf'")):
         with pytest.raises(InputError, match=message):
             filters.compare(record, BELIEF, initial, filters=names)
-
-
-def test_study_runs_small_and_draws(tmp_path):
-    result = comparison.main(**comparison.SMALL, out=tmp_path)
-    assert [path.name for path in result.figures] == ["filter_family.png"]
-    assert (tmp_path / "filter_family.png").exists()
-    text = (tmp_path / "filter_family.txt").read_text(encoding="utf-8")
-    assert all(name in text for name in comparison.NAMES)
-    saved = json.loads((tmp_path / "filter_family.json").read_text(encoding="utf-8"))
-    assert len(saved["outcomes"]) == len(comparison.CASES) * len(comparison.NAMES)
-    for row in saved["outcomes"]:
-        outcome = result.outcome(row["case"], row["filter"])
-        assert row["final_rms_deg"] == outcome.final_rms / DEGREE
-        assert (row["convergence_time_s"] is None) == np.isnan(outcome.convergence_time)
-    assert [line.split(" (")[0] for line in saved["findings"]] == list(comparison.CASES)
-    assert all(line in text for line in saved["findings"])
 
 
 def test_findings_are_those_of_the_numbers():
