@@ -13,7 +13,6 @@ an arbitrary start would have converged to some attitude with a small σ.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,14 +21,13 @@ from strapdown import estimation, quaternion, records, vectors
 from strapdown.checks import Array, InputError, count
 from strapdown.estimation import forward
 from strapdown.estimation.forward import Problem
-from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.schedule import Schedule, innovations_by_sensor, joined
-from strapdown.estimation.states import ProcessNoise, State, check_arguments, initial_state
-from strapdown.kernels import gate_rules, measurement, structure
+from strapdown.estimation.states import ProcessNoise, State, initial_state
 from strapdown.kernels import hypotheses as kernel
+from strapdown.kernels import measurement, structure
 from strapdown.kernels.machine import compiled, read_only
 from strapdown.kernels.walk import walk
-from strapdown.records import Estimate, Event, ImuRecord
+from strapdown.records import Estimate, ImuRecord
 from strapdown.units import DEGREE, DEGREE_PER_HOUR
 
 __all__ = ["BankEstimate", "run"]
@@ -41,11 +39,6 @@ MIN_WEIGHT = 1e-6
 """Minimum weight of a hypothesis, relative to the largest; below it the hypothesis is dropped."""
 MAX_SHARE = 0.15
 """Maximum fraction of the mixture's covariance due to the distance of the hypotheses at which they are merged into one Gaussian."""
-MAX_FIRST_OUTLIERS = 3
-"""With a gate or robust updates: number of first directions that may all be outliers."""
-DOUBT = 1e-3
-"""Weight of a hypothesis that refuses a direction, relative to one that uses it, until the next direction decides: that of a measurement
-at the threshold of a gate that refuses correct measurements with this probability."""
 CONSTANT = 1.0 * DEGREE
 """Maximum rotation of the references over a record at which they count as constant, rad."""
 
@@ -64,7 +57,7 @@ class BankEstimate:
         ``record.truth.attitude[edges]``.
     angles : ndarray (h,)
         Initial position of the hypotheses on their circle, rad: the rotation about the first reference relative to the first of
-        them; with a gate or a robust update followed by those for each of the next directions.
+        them.
     weights : ndarray (k, h)
         Weights of the hypotheses at the first k rows, until they were merged into one.
     became_one : float
@@ -94,15 +87,11 @@ def run(
     bias_sigma: ArrayLike = 20.0 * DEGREE_PER_HOUR,
     bias: ArrayLike = (0.0, 0.0, 0.0),
     every: int = 1,
-    gate: Gate | None = None,
-    robust: Robust | None = None,
 ) -> BankEstimate:
     """Estimate attitude and gyro bias from an unknown initial attitude.
 
-    Measurements before the first direction (or vector, or attitude) are omitted and counted as skipped.
-
-    With a gate or a robust update the first direction may be an outlier: further sets of hypotheses omit it and start from the second,
-    third and fourth.
+    Measurements before the first direction (or vector, or attitude) are omitted and counted as skipped. Outliers are not expected: among
+    them the weights of the hypotheses become too certain.
 
     Parameters
     ----------
@@ -118,13 +107,6 @@ def run(
         Initial bias, rad/s, body axes.
     every : int, default 1
         Store every n-th edge; hypotheses are merged into one only at stored edges.
-    gate : Gate, optional
-        Each hypothesis refuses improbable measurements; a refused one reduces its weight like a measurement at the threshold. When most of
-        the hypotheses have refused ``recovery`` measurements in a row, they restart from the first of these, with three times the bias σ,
-        and an event reports it. After the merger it is the gate of :func:`strapdown.estimation.run`.
-    robust : Robust, optional
-        Each hypothesis weights measurements by their residuals, and hypotheses are weighted by likelihoods with heavier tails. Without a
-        gate the bank cannot recover if the first measurements are wrong.
 
     Returns
     -------
@@ -140,20 +122,16 @@ def run(
     ----------
     Y. Bar-Shalom, X. R. Li, T. Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, section 11.6 (multiple models).
     """
-    check_arguments(gate=gate, robust=robust)
     initial = initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=1.0, bias_sigma=bias_sigma, bias=bias)
     count("hypotheses", hypotheses, minimum=8)
     problem = forward.prepared(record, process_noise, initial, ())
-    merged = _Bank(problem, hypotheses, count("every", every), gate, robust).until_merged()
+    merged = _until_merged(problem, hypotheses, count("every", every))
     if merged.became_one >= record.time[-1]:
         return merged
     rest, state = _from_where_merged(record, merged)
-    if gate is not None and gate.restart_bias_sigma is None:
-        # A restart has the bank's initial σ of the bias, not the smaller one of the merged estimate.
-        gate = replace(gate, restart_bias_sigma=float(np.max(bias_sigma)))
-    after = estimation.run(rest, process_noise, state, every=every, full_covariance=True, gate=gate, robust=robust)
-    own = tuple(event for event in after.events if event.kind != "gap")  # gaps are already included
-    return replace(merged, estimate=joined([merged.estimate, replace(after, events=own)]))
+    after = estimation.run(rest, process_noise, state, every=every, full_covariance=True)
+    # Gaps are already included.
+    return replace(merged, estimate=joined([merged.estimate, replace(after, events=())]))
 
 
 def _from_where_merged(record: ImuRecord, merged: BankEstimate) -> tuple[ImuRecord, State]:
@@ -166,129 +144,69 @@ def _from_where_merged(record: ImuRecord, merged: BankEstimate) -> tuple[ImuReco
     return rest, State(attitude=last.attitude[-1], bias=last.bias[-1], covariance=last.covariance[-1])
 
 
-class _Walked(NamedTuple):
-    """Result of the bank from a given first direction on."""
-
-    estimate: Estimate
-    angles: Array
-    weights: Array
-    weight: Array
-    """Weights at the end."""
-    ended: int
-    """Why the walk ended, as in :mod:`strapdown.kernels.hypotheses`."""
-    used: int
-    """Number of events processed; if lost, index of the first of the refused ones."""
-
-
-class _Bank(NamedTuple):
-    """A record, prepared for the kernels, and the options of :func:`run`."""
-
-    problem: Problem
-    hypotheses: int
-    every: int
-    gate: Gate | None
-    robust: Robust | None
-
-    def directions(self, first: int) -> np.ndarray:
-        """Return the events from number ``first`` on that are not headings."""
-        kind = self.problem.events.kind[first:]
-        return np.asarray(first + np.flatnonzero(kind != measurement.HEADING))
-
-    def until_merged(self) -> BankEstimate:
-        """Return the bank's part of :func:`run`: until the hypotheses are merged, or to the end."""
-        record, events = self.problem.record, self.problem.events
-        stored = record.time[:: self.every]
-        recovery = 0 if self.gate is None else self.gate.recovery or 0
-        happened = forward.gaps(record)
-        failed = 0
-        directions = self.directions(0)
-        if len(directions) == 0:
-            raise InputError(
-                "the record has no direction, vector or attitude within its time to start from; add one: a heading is not enough"
-            )
-        first = int(directions[0])
-        while True:
-            if events.time[first] > stored[-1]:
-                raise InputError(
-                    f"the first direction comes at {events.time[first]:.6g} s, after the last stored edge; store more edges or give a "
-                    "longer record"
-                )
-            walked = self.walked(first, gate_rules.WIDENING ** (failed % (gate_rules.WIDEST + 1)), recovery)
-            if walked.ended != kernel.LOST:
-                break
-            # Earlier measurements may be wrong: start from the circle of the first refused direction.
-            again = self.directions(walked.used)
-            if len(again) == 0 or events.time[again[0]] > stored[-1]:
-                recovery = 0  # too late for another start
-                continue
-            failed += 1
-            start, end = events.time[[walked.used, walked.used + recovery - 1]]
-            sensor = events.sensors[events.sensor[walked.used]]
-            happened.append(Event(kind="recovery", start=start, end=end, sensor=sensor, value=float(recovery)))
-            first = int(again[0])
-        before = np.bincount(events.sensor[:first], minlength=len(events.sensors)).tolist()
-        skipped = {name: events.skipped[name] + number for name, number in zip(events.sensors, before, strict=True)}
-        estimate = replace(walked.estimate, skipped=skipped, events=forward.in_order(happened))
-        merged = walked.ended == kernel.MERGED
-        edges = np.arange(0, len(record.time), self.every)
-        return BankEstimate(
-            estimate=estimate,
-            edges=edges[stored >= events.time[first]],
-            angles=walked.angles,
-            weights=walked.weights,
-            became_one=float(estimate.time[-1]) if merged else np.inf,
-            reason="" if merged else _reason(record, events, walked.weight, estimate),
+def _until_merged(problem: Problem, hypotheses: int, every: int) -> BankEstimate:
+    """Return the bank's part of :func:`run`: until the hypotheses are merged, or to the end."""
+    record, events = problem.record, problem.events
+    directions = np.flatnonzero(events.kind != measurement.HEADING)
+    if len(directions) == 0:
+        raise InputError(
+            "the record has no direction, vector or attitude within its time to start from; add one: a heading is not enough"
         )
-
-    def walked(self, first: int, widening: float, recovery: int) -> _Walked:
-        """Run the bank with the hypotheses of the first direction and, if it may be an outlier, of the next ones."""
-        record, events, every = self.problem.record, self.problem.events, self.every
-        outliers = self.gate is not None or self.robust is not None  # whether the first directions may be outliers
-        later = self.directions(first + 1)[: MAX_FIRST_OUTLIERS if outliers else 0]
-        sets = [start(self.problem, int(event), self.hypotheses, widening) for event in (first, *later)]
-        x, P, angles = (np.concatenate(parts) for parts in zip(*sets, strict=True))
-        number = np.cumsum([len(of_set) for *_, of_set in sets])
-        # The walk begins at the last stored edge before the first direction, with empty intervals until the direction.
-        began = events.time[first]
-        k = int(np.searchsorted(record.time, began, side="right")) - 1
-        edge = k - k % every
-        edges, increments = record.time[edge:].copy(), record.increments[edge:].copy()
-        increments[k - edge] *= (edges[k - edge + 1] - began) / (edges[k - edge + 1] - edges[k - edge])
-        first_row = int(edges[0] < began)
-        np.maximum(edges, began, out=edges)
-        rows, weight = (len(edges) - 1) // every + 1, np.empty(len(x))
-        shapes = (rows, 7), (rows, 6, 6), (6, 6), (rows, len(x)), (len(events.time), 6), (len(events.time),)
-        out = kernel.Outputs._make(np.empty(shape) for shape in shapes)
-        body = kernel.Body(
-            form=filter_form(self.problem, x, P),
-            log_weight=np.where(np.arange(len(x)) < number[0], 0.0, -np.inf),
-            weight=weight,
-            later=later - (first + 1),
-            sets=number,
-            charge=-2.0 * np.log(DOUBT),
-            options=forward.gate_options(self.gate, self.robust)._replace(recovery=recovery),
-            min_weight=MIN_WEIGHT,
-            max_share=MAX_SHARE,
-            first_row=first_row,
+    first = int(directions[0])
+    began = events.time[first]
+    stored = record.time[::every]
+    if began > stored[-1]:
+        raise InputError(
+            f"the first direction comes at {began:.6g} s, after the last stored edge; store more edges or give a longer record"
         )
-        measured = forward.measurements_in_body_axes(events, first + 1)
-        kernels = forward.instance_of(forward.ANY_SENSOR)
-        rows, ended, used = compiled(walk, kernel, kernels)(
-            read_only(edges), read_only(increments), measured, every, body, out
-        )
-        used += first + 1
-        processed = np.zeros(len(events.time), bool)
-        processed[events.row[first + 1 : used + recovery if ended == kernel.LOST else used]] = True
-        x, P, weights = (values[first_row:rows] for values in (out.x, out.P, out.weights))
-        estimate = Estimate(
-            time=record.time[edge::every][first_row:rows],
-            attitude=x[:, :4],
-            bias=x[:, 4:],
-            variance=np.diagonal(P, axis1=1, axis2=2).copy(),
-            covariance=P,
-            innovations=innovations_by_sensor(events, out.innovation, out.share if outliers else None, processed),
-        )
-        return _Walked(estimate, angles, weights, weight, ended, used)
+    x, P, angles = start(problem, first, hypotheses)
+    # The walk begins at the last stored edge before the first direction, with empty intervals until the direction.
+    k = int(np.searchsorted(record.time, began, side="right")) - 1
+    edge = k - k % every
+    edges, increments = record.time[edge:].copy(), record.increments[edge:].copy()
+    increments[k - edge] *= (edges[k - edge + 1] - began) / (edges[k - edge + 1] - edges[k - edge])
+    first_row = int(edges[0] < began)
+    np.maximum(edges, began, out=edges)
+    rows, weight = (len(edges) - 1) // every + 1, np.empty(len(x))
+    shapes = (rows, 7), (rows, 6, 6), (6, 6), (rows, len(x)), (len(events.time), 6)
+    out = kernel.Outputs._make(np.empty(shape) for shape in shapes)
+    body = kernel.Body(
+        form=filter_form(problem, x, P),
+        log_weight=np.zeros(len(x)),
+        weight=weight,
+        options=forward.gate_options(None, None),
+        min_weight=MIN_WEIGHT,
+        max_share=MAX_SHARE,
+        first_row=first_row,
+    )
+    measured = forward.measurements_in_body_axes(events, first + 1)
+    kernels = forward.instance_of(forward.ANY_SENSOR)
+    rows, ended, used = compiled(walk, kernel, kernels)(
+        read_only(edges), read_only(increments), measured, every, body, out
+    )
+    processed = np.zeros(len(events.time), bool)
+    processed[events.row[first + 1 : first + 1 + used]] = True
+    before = np.bincount(events.sensor[:first], minlength=len(events.sensors)).tolist()
+    x, P, weights = (values[first_row:rows] for values in (out.x, out.P, out.weights))
+    estimate = Estimate(
+        time=record.time[edge::every][first_row:rows],
+        attitude=x[:, :4],
+        bias=x[:, 4:],
+        variance=np.diagonal(P, axis1=1, axis2=2).copy(),
+        covariance=P,
+        innovations=innovations_by_sensor(events, out.innovation, None, processed),
+        skipped={name: events.skipped[name] + number for name, number in zip(events.sensors, before, strict=True)},
+        events=forward.in_order(forward.gaps(record)),
+    )
+    merged = ended == kernel.MERGED
+    return BankEstimate(
+        estimate=estimate,
+        edges=np.arange(0, len(record.time), every)[stored >= began],
+        angles=angles,
+        weights=weights,
+        became_one=float(estimate.time[-1]) if merged else np.inf,
+        reason="" if merged else _reason(record, events, weight, estimate),
+    )
 
 
 def filter_form(problem: Problem, x: Array, P: Array) -> structure.Body:
@@ -299,12 +217,11 @@ def filter_form(problem: Problem, x: Array, P: Array) -> structure.Body:
     return form._replace(x=np.append(x, np.zeros((1, 7)), axis=0), P=padded.reshape(len(padded), -1))
 
 
-def start(problem: Problem, event: int, hypotheses: int, widening: float = 1.0) -> tuple[Array, Array, Array]:
+def start(problem: Problem, event: int, hypotheses: int) -> tuple[Array, Array, Array]:
     """Return hypotheses from a direction: attitudes and biases (h, 7), covariances (h, 6, 6), and angles on the circle (h,), rad.
 
     Across the direction each has the measurement's covariance; about it, a standard deviation of half the spacing, for which the sum of the
-    Gaussians is uniform over the circle to 1.5 %. A measured attitude gives a single hypothesis. The σ of the bias is multiplied by
-    ``widening``.
+    Gaussians is uniform over the circle to 1.5 %. A measured attitude gives a single hypothesis.
     """
     events, initial = problem.events, problem.initial
     z, frame = events.vector_b[event], events.triads[events.reference[event]]
@@ -322,7 +239,7 @@ def start(problem: Problem, event: int, hypotheses: int, widening: float = 1.0) 
         cross = np.cross(np.eye(3), z)
         noise = cross @ noise @ cross.T + (np.pi / hypotheses) ** 2 * np.outer(z, z)
     P = np.zeros((len(angles), 6, 6))
-    P[:, :3, :3], P[:, 3:, 3:] = noise, widening**2 * initial.covariance[3:, 3:]
+    P[:, :3, :3], P[:, 3:, 3:] = noise, initial.covariance[3:, 3:]
     x = np.concatenate([attitudes, np.broadcast_to(initial.bias, (len(angles), 3))], axis=1)
     return x, P, angles
 

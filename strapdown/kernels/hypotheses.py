@@ -15,8 +15,8 @@ from strapdown.kernels.algebra import add, combine, dot, factored, solved
 from strapdown.kernels.filter import WIDTH_OF_ROW, bias_at, load, propagate_row, turn_tangent
 from strapdown.kernels.gate import Options, iterated_update
 from strapdown.kernels.gate_rules import WIDE_PASSES
-from strapdown.kernels.iterated_update import HUBER, PASSED_OVER, REFUSED, STUDENT
-from strapdown.kernels.measurement import HEADING, KIND, VECTOR, degrees_of_freedom, store_innovations
+from strapdown.kernels.iterated_update import PASSED_OVER
+from strapdown.kernels.measurement import KIND, VECTOR, store_innovations
 from strapdown.kernels.rotation import inverse_right_jacobian, logarithm, moved, quaternion_multiply, unit
 from strapdown.kernels.structure import Body as Filter
 from strapdown.kernels.walk import step_within, turn_squared
@@ -26,31 +26,19 @@ CALLED = ("normalized_weights",)
 
 RUNNING = 0
 MERGED = 1
-LOST = 2
-"""Why the walk ended: not before the end of the record; merged into one Gaussian; successive measurements refused by more than half the
-weight."""
+"""Why the walk ended: not before the end of the record; merged into one Gaussian."""
 
 
 class Body(NamedTuple):
-    """Hypotheses and options.
-
-    Further sets of hypotheses, of zero weight at first, may start from the measurements ``later``, each from one of them, in case earlier
-    measurements are outliers. At its measurement, a set is given the weight that the earlier sets would have if they had refused all
-    directions until then at a NIS of ``charge``. Hypotheses are not merged before the first of these measurements.
-    """
+    """Hypotheses and options."""
 
     form: Filter
     """The hypotheses, and one more state, which is scratch."""
     log_weight: np.ndarray
     """(h,), as ``weight``; at return, the final values."""
     weight: np.ndarray
-    later: np.ndarray
-    """Measurements at which further sets start (k,), counted from the first of the walk."""
-    sets: np.ndarray
-    """First hypothesis of each further set, and the total number of hypotheses (k + 1,)."""
-    charge: float
     options: Options
-    """Gate and robust weights. ``recovery``: consecutive refusals by more than half the weight after which all are lost; 0: never."""
+    """A gate that accepts all."""
     min_weight: float
     """Minimum weight relative to the largest; hypotheses below it are dropped."""
     max_share: float
@@ -72,8 +60,6 @@ class Outputs(NamedTuple):
     """(rows, h)."""
     innovation: np.ndarray
     """Innovations of the hypothesis of the largest weight (events, 6)."""
-    share: np.ndarray
-    """Its weight of each measurement (events,)."""
 
 
 def heaviest(weight):
@@ -141,7 +127,7 @@ def share_between(P, between, k):
 
 
 def normalized_weights(log_weight, least, weight):
-    """Write normalised weights, permanently 0 below ``least``; return the value subtracted from each logarithm to make the largest 0."""
+    """Write normalised weights, permanently 0 below ``least``, relative to the largest."""
     best = -math.inf
     for i in range(len(log_weight)):
         best = max(best, log_weight[i])
@@ -154,27 +140,12 @@ def normalized_weights(log_weight, least, weight):
         total += weight[i]
     for i in range(len(log_weight)):
         weight[i] /= total
-    return best
-
-
-def heavy_tailed(robust, parameter, numerator, nis):
-    """Return the term that replaces the NIS in −2 log likelihood for a robust update: Huber's function, or that of Student's t."""
-    if robust == STUDENT:
-        return numerator * math.log(1.0 + nis / parameter)
-    if robust == HUBER and nis > parameter:
-        return 2.0 * math.sqrt(parameter * nis) - parameter
-    return nis
 
 
 def begin(body):
-    """Return number of sets started, log weight of refusing all, consecutive refusals, and why the walk ended."""
+    """Return why the walk ended: it is running."""
     normalized_weights(body.log_weight, body.min_weight, body.weight)
-    refused = 0.0
-    for i in range(len(body.weight)):
-        if body.weight[i] > 0.0:
-            refused += math.exp(body.log_weight[i])
-    none = 0 * len(body.weight)
-    return none, math.log(refused), none, none
+    return 0 * len(body.weight)
 
 
 def longest_step(state, part, dt, body):
@@ -196,48 +167,27 @@ def predict(state, part, dt, body, out):
 
 def update(state, e, now, measured, body, out):
     """Update every hypothesis with a measurement, and its weight by the likelihood."""
-    started, refused, streak, ended = state
-    options, weight, log_weight = body.options, body.weight, body.log_weight
+    weight, log_weight = body.weight, body.log_weight
     place, sensor = measured.place[e], measured.sensor[e]
     kind = measured.series[sensor, KIND]
-    degrees = degrees_of_freedom(kind)
-    parameter, numerator = options.parameters[degrees - 1, 0], options.parameters[degrees - 1, 1]
     leader = heaviest(weight)
-    refusing = 0.0
-    height = 0.0
     for i in range(len(weight)):
         if weight[i] > 0.0:
-            outcome, share, y, s, _ = iterated_update(body.form, i, e, measured, WIDE_PASSES, options)
-            if outcome == REFUSED:
-                refusing += weight[i]
-            spread = math.log(s[0]) + math.log(s[1]) + math.log(s[2])
+            outcome, _, y, s, _ = iterated_update(body.form, i, e, measured, WIDE_PASSES, body.options)
             if outcome != PASSED_OVER:
                 nis = y[0] * y[0] / s[0] + y[1] * y[1] / s[1]
                 if kind != VECTOR:  # its length has no information about the attitude
                     nis += y[2] * y[2] / s[2]
-                # A refused measurement counts as one at the threshold: otherwise no hypothesis would survive an outlier.
-                nis = min(heavy_tailed(options.robust, parameter, numerator, nis), options.thresholds[degrees - 1])
-                log_weight[i] -= 0.5 * (nis + spread)
+                log_weight[i] -= 0.5 * (nis + (math.log(s[0]) + math.log(s[1]) + math.log(s[2])))
             if i == leader:
-                height = spread
-                out.share[place] = share
                 store_innovations(out.innovation, place, y, s)
-    refused -= 0.5 * (height + (1.0 if kind == HEADING else body.charge))
-    if started < len(body.later) and e == body.later[started]:
-        members = body.sets[started + 1] - body.sets[started]
-        for i in range(body.sets[started], body.sets[started + 1]):
-            log_weight[i] = refused - math.log(members)
-        started += 1
-    refused -= normalized_weights(log_weight, body.min_weight, weight)
-    streak = streak + 1 if refusing > 0.5 else 0 * streak
-    if options.recovery > 0 and streak >= options.recovery:
-        ended = 0 * ended + LOST
-    return started, refused, streak, ended
+    normalized_weights(log_weight, body.min_weight, weight)
+    return state
 
 
 def keep(state, row, e, body, out):
     """Write the mixture at a stored edge, and check whether the hypotheses have converged."""
-    started, refused, streak, ended = state
+    ended = state
     if ended == RUNNING and row >= body.first_row:
         P, between = out.P[row], out.between
         moment_match(body.form, body.weight, out.x[row], P, between)
@@ -245,18 +195,16 @@ def keep(state, row, e, body, out):
         for i in range(len(body.weight)):
             out.weights[row, i] = body.weight[i]
             left += body.weight[i] > 0.0
-        apart = max(share_between(P, between, 0), share_between(P, between, 3))
-        if (started > 0 or len(body.later) == 0) and (left == 1 or apart < body.max_share):
+        if left == 1 or max(share_between(P, between, 0), share_between(P, between, 3)) < body.max_share:
             ended = 0 * ended + MERGED
-    return started, refused, streak, ended
+    return ended
 
 
 def stopped(state):
-    """Return whether the hypotheses are merged or lost."""
-    return state[3] != RUNNING
+    """Return whether the hypotheses are merged."""
+    return state != RUNNING
 
 
 def finish(state, row, e, body):
-    """Return the number of edges, why the walk ended, and the number of measurements processed; if lost, of those before the refusals."""
-    _, _, streak, ended = state
-    return row, ended, e - streak if ended == LOST else e
+    """Return the number of edges, why the walk ended, and the number of measurements processed."""
+    return row, state, e
