@@ -402,7 +402,6 @@ FACES = {
     "estimation.smooth": estimation.smooth,
     "StepFilter": lambda record, *given, **options: GatedStepFilter(*given, **options),
     "estimation.observability": estimation.observability,
-    "estimation.relinearized_start": estimation.relinearized_start,
     "multiple_model.run": lambda record, noise, initial, **options: multiple_model.run(record, noise, **options),
     "filters.run": lambda *given: filters.run("mahony", *given),
     "filters.compare": filters.compare,
@@ -413,7 +412,7 @@ WRONG_ARGUMENTS = {"record": None, "process_noise": 1e-4, "initial": None, "gate
 def wants(face, name):
     """Whether a face has an argument of that name."""
     if name in ("gate", "robust"):
-        return "filters" not in face and face not in ("estimation.observability", "estimation.relinearized_start")
+        return "filters" not in face and face not in ("estimation.observability", "multiple_model.run")
     return (face, name) not in {("multiple_model.run", "initial"), ("StepFilter", "record")}
 
 

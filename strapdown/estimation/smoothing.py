@@ -23,8 +23,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from strapdown import kinematics, quaternion
-from strapdown.checks import Array, InputError, count
+from strapdown.checks import Array, InputError
 from strapdown.estimation import forward, recovery_segments
 from strapdown.estimation import model as modelling
 from strapdown.estimation.error_states import ErrorStates
@@ -35,7 +34,6 @@ from strapdown.estimation.states import (
     GateMemory,
     ProcessNoise,
     State,
-    check_arguments,
     covariance_blocks,
     covariance_matrices,
 )
@@ -159,40 +157,6 @@ def _added_angle(problem: Problem) -> Array:
     angle, rate = problem.variances
     dt = np.append(problem.record.intervals, 0.0)
     return np.asarray(angle * dt + rate * dt**3 / 3.0)
-
-
-def relinearized_start(
-    record: ImuRecord,
-    process_noise: ProcessNoise,
-    initial: State,
-    error_states: Sequence[ErrorStates] = (),
-    *,
-    passes: int = 2,
-) -> State:
-    """Return the initial state with the smoother's estimate of its values and with its covariance unchanged.
-
-    If the initial state is in error by tenths of a radian, the first measurements are linearised at the wrong attitude, and the covariance
-    stays too small. A filter that starts from the result is linearised correctly. The record is used twice, for the point of linearisation
-    and for the estimate, so the prior has too little weight, by ``1/s²`` of its information, with s the singular value of
-    :func:`strapdown.estimation.observability`: suitable for records that determine the states much better than the prior.
-    """
-    check_arguments(record=record)
-    problem = forward.prepared(record, process_noise, initial, error_states)
-    state, model = problem.initial, problem.model
-    for _ in range(count("passes", passes)):
-        whole = smooth(record, process_noise, state, problem.error_states)
-        # The prior moves to the new tangent space: exp(a + ε) = exp(a) ⊗ exp(J_r(a) ε).
-        carry = model.turning_matrix(state.attitude, whole.attitude[0])
-        a = quaternion.log(quaternion.multiply(quaternion.conjugate(state.attitude), whole.attitude[0]))
-        carry[:3, :3] = kinematics.right_jacobian(a)
-        state = State(
-            attitude=whole.attitude[0],
-            bias=whole.bias[0],
-            values=np.concatenate([np.empty(0), *(one.values[0] for one in whole.error_states.values())]),
-            covariance=carry @ state.covariance @ carry.T,
-            unit_sigma=state.unit_sigma,
-        )
-    return state
 
 
 @dataclass(frozen=True, eq=False)
