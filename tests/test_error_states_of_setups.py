@@ -6,7 +6,7 @@ import in_steps
 import numpy as np
 import pytest
 from gated_steps import GatedStepFilter
-from measured import FIELD, drawn_start, resting, series_of, turn_to
+from measured import FIELD, drawn_start, resting, seen, series_of, turn_to, unit
 from measured import HAND as SWAY
 
 from strapdown import consistency, estimation, kinematics, motion, quaternion, records, scenarios, vectors
@@ -414,6 +414,33 @@ def test_the_noise_of_an_angular_acceleration_turns_with_the_arm():
     found = kernels.arm_noise(0, x, measured, tuple(C[upper]), model.numbers, 0.0)
     r = kinematics.skew(arm / length)
     np.testing.assert_allclose(found, (C + r @ np.diag(variance) @ r.T)[upper], rtol=1e-14)
+
+
+@pytest.mark.parametrize("kind", ["vector", "direction"])
+def test_an_accelerometer_at_an_arm_feels_the_turning_body(kind):
+    """``g + ẇ × r + w × (w × r)`` at rate w and angular acceleration ẇ leave no residual; the rows of the arm are its derivative."""
+    arm, bias, rate, turning = np.random.default_rng(1).standard_normal((4, 3))
+    q, up = quaternion.exp([0.3, -0.4, 1.2]), np.array([0.0, 0.0, 9.81])
+    strength = 1.0 if kind == "vector" else 9.81
+    model = assemble((error_states.LeverArm(sensor="acc", arm_sigma=0.3, strength=strength),), {"acc": kind})
+    kernels, length = forward.instance_of(model), 9.81 if kind == "vector" else 1.0
+
+    def felt(r):
+        return seen(q, up) + np.cross(turning, r) + np.cross(rate, np.cross(rate, r))
+
+    def residual(measured, r):
+        z = measured / 9.81 if kind == "vector" else unit(measured)
+        measured = structure.Measured(
+            tuple(z), tuple(vectors.triad(up).ravel()), (1.0,), length, (*rate + bias, *turning, 0.0, 0.0, 0.0)
+        )
+        rows, y, *_ = kernels.rows_and_axes(0, np.concatenate([q, bias, r]), measured, model.numbers, 0.0)
+        return np.array(rows, np.float64), np.array(y)
+
+    rows, zero = residual(felt(arm), arm)
+    np.testing.assert_allclose(zero, 0.0, atol=1e-14)
+    for k, h in enumerate(1e-5 * np.eye(3)):
+        ahead, back = (residual(felt(arm + sign * h), arm)[1] for sign in (1.0, -1.0))
+        np.testing.assert_allclose(rows[:, 6 + k], (ahead - back) / 2e-5, rtol=0, atol=1e-8)
 
 
 @pytest.mark.slow
