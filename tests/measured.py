@@ -5,6 +5,7 @@ from dataclasses import fields, is_dataclass, replace
 import numpy as np
 
 from strapdown import consistency, estimation, motion, quaternion
+from strapdown.estimation import error_states
 from strapdown.recordings import Recording
 from strapdown.records import ImuRecord
 from strapdown.vectors import VectorMeasurements
@@ -80,6 +81,15 @@ def record_of(body=SWAY, duration=4.0, rate=50.0, seed=1, anisotropic=False) -> 
     moving = np.stack([np.cos(t), np.sin(t), 0.5 + 0.1 * t], axis=-1)
     beacon = series_of("beacon", "vector", t, seen(body.attitude(t), moving), moving, 0.02)
     return ImuRecord(time=edges, increments=increments, vectors=(mag, force, compass, tracker, beacon))
+
+
+EVERY_KIND = (
+    error_states.VectorBias(sensor="mag", bias_sigma=5e-6, unit="T"),
+    error_states.GyroScale(scale_sigma=0.02, misalignment_sigma=0.01),
+    error_states.GaussMarkov(sensor="force", noise_sigma=0.1, correlation_time=0.7),
+    error_states.GyroGaussMarkov(bias_sigma=3e-3, correlation_time=20.0),
+)
+"""States of every kind for :func:`record_of` with ``anisotropic``: the largest filter of the default run, compiled once."""
 
 
 def turn_to(q, other):

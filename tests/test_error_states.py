@@ -9,7 +9,7 @@ import in_steps
 import mpmath
 import numpy as np
 import pytest
-from measured import FIELD, HAND, SWAY, UP, correlation, record_of, resting, seen, series_of, turn_to
+from measured import EVERY_KIND, FIELD, HAND, SWAY, UP, correlation, record_of, resting, seen, series_of, turn_to
 from plain_kernels import called
 
 from strapdown import estimation, kinematics, motion, quaternion, records
@@ -86,12 +86,7 @@ OPTIONS: dict[str, tuple[error_states.ErrorStates, ...]] = {
     "mounting of a direction": (
         error_states.SensorMounting(sensor="force", mounting_sigma=np.array([0.05, 0.03, 0.02])),
     ),
-    "all": (
-        error_states.VectorBias(sensor="mag", bias_sigma=5e-6, unit="T"),
-        error_states.GyroScale(scale_sigma=0.02, misalignment_sigma=0.01),
-        error_states.GaussMarkov(sensor="force", noise_sigma=0.1, correlation_time=0.7),
-        error_states.GyroGaussMarkov(bias_sigma=3e-3, correlation_time=20.0),
-    ),
+    "all": EVERY_KIND,
 }
 
 

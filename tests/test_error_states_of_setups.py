@@ -265,9 +265,7 @@ def test_the_whole_bias_is_that_of_all_states():
 def test_the_smoother_reports_the_whole_bias_too():
     """At the last edge it is the filter; there the kernels sum the parts."""
     record = simulated(markov_noise=1e-3, markov_correlation_time=8.0)
-    states = States(
-        gyro_scale_sigma=1e-3, gyro_drift_sigma=(2e-3, 1e-3), gyro_drift_time=(8.0, 1.5), gyro_fast_bias_sigma=1e-4
-    )
+    states = States(gyro_drift_sigma=(2e-3,), gyro_drift_time=(8.0,), gyro_fast_bias_sigma=1e-4)
     given = chosen(states)
     filtered = run(record, given, full_covariance=True)
     smoothed = setup.smooth(record, given, begun(record), full_covariance=True)
@@ -598,9 +596,9 @@ def test_chosen_states_are_those_named():
 def test_an_estimate_with_states_is_judged_like_any_other(tmp_path):
     from strapdown.estimation.setup import read_estimate, write_estimate
 
-    scenario = dataclasses.replace(scenarios.load_scenario("low-orbit"), duration=1200.0)
+    scenario = scenarios.load_scenario("low-orbit")
     filter_setup = setup.FilterSetup.for_scenario(scenario, states=True)
-    record = scenarios.simulate(scenarios.drawn(scenario, 2), 2)
+    record = scenarios.simulate(scenarios.drawn(dataclasses.replace(scenario, duration=1200.0), 2), 2)
     draw = generator(2, 0, "start").standard_normal(6)
     initial = drawn_start(record.truth, draw, filter_setup.attitude_sigma, filter_setup.bias_sigma)
     estimate = setup.run(record, filter_setup, initial, full_covariance=True)

@@ -9,14 +9,13 @@ import in_steps
 import mpmath
 import numpy as np
 import pytest
-from measured import STAR, SWAY, record_of, resting, seen, series_of, turn_to, unit
+from measured import EVERY_KIND, STAR, SWAY, record_of, resting, seen, series_of, turn_to, unit
 from plain_kernels import plain
 from scipy.spatial.transform import Rotation
 from square_root import SquareRootFilter
 
 from strapdown import estimation, kinematics, motion, quaternion, records
 from strapdown.checks import InputError
-from strapdown.estimation.error_states import GaussMarkov, GyroGaussMarkov, GyroScale, VectorBias
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.schedule import schedule
 from strapdown.estimation.states import GateMemory, ProcessNoise, covariance_matrices, initial_state, pack
@@ -94,22 +93,7 @@ def test_positive_definite_over_twelve_decades_of_noise_over_the_prior(exponent,
         assert np.max(quaternion.angle_between(result.attitude, truth)) < 1e-6
 
 
-MANY = (
-    GyroScale(scale_sigma=1e-2, misalignment_sigma=5e-3),
-    GyroGaussMarkov(bias_sigma=1e-3, correlation_time=5.0),
-    VectorBias(sensor="mag", bias_sigma=5e-6, unit="T"),
-    GaussMarkov(sensor="force", noise_sigma=0.02, correlation_time=0.7, frame="fixed"),
-)
-SILENT = tuple(
-    VectorMeasurements(sensor=sensor, kind=kind, time=[], sigma=1.0, **value)
-    for sensor, kind, value in (
-        *(
-            (name, kind, {"vector_b": np.empty((0, 3)), "reference_f": STAR})
-            for name, kind in (("mag", "vector"), ("force", "direction"), ("first", "direction"))
-        ),
-        ("attitude", "attitude", {"attitude": np.empty((0, 4))}),
-    )
-)
+SILENT = tuple(series.taken(slice(0)) for series in record_of(duration=1.0, anisotropic=True).vectors)
 """Sensors without measurements, with which tests of one kind of sensor share their kernels."""
 
 
@@ -118,13 +102,13 @@ SILENT = tuple(
     [
         *((kind, None, ()) for kind in ("direction", "vector", "attitude")),
         ("direction", OPTIONS, ()),
-        ("direction", None, MANY),
+        ("vector", None, EVERY_KIND),
         *(
             pytest.param(kind, gate, states, marks=pytest.mark.slow)
             for kind, gate, states in (
                 *((kind, OPTIONS, ()) for kind in ("vector", "attitude")),
-                *((kind, None, MANY) for kind in ("vector", "attitude")),
-                *((kind, OPTIONS, MANY) for kind in ("direction", "vector", "attitude")),
+                *((kind, None, EVERY_KIND) for kind in ("direction", "attitude")),
+                *((kind, OPTIONS, EVERY_KIND) for kind in ("direction", "vector", "attitude")),
             )
         ),
     ],
@@ -137,7 +121,7 @@ def test_what_needs_more_digits_than_a_covariance_has_is_refused(kind, gate, sta
         series |= (
             {"attitude": [quaternion.IDENTITY]} if kind == "attitude" else {"vector_b": [axis], "reference_f": axis}
         )
-        record = resting(*SILENT, VectorMeasurements(**series))
+        record = resting(*(SILENT if states else ()), VectorMeasurements(**series))
         start = initial_state(quaternion.IDENTITY, attitude_sigma=first, bias_sigma=0.1)
         if refused:
             with pytest.raises(InputError, match=REFUSED):
@@ -329,7 +313,7 @@ def test_the_covariance_is_carried_through_large_corrections():
         assert np.allclose(np.diag(f.P), estimate.variance[k + 1], rtol=1e-5)
 
 
-@pytest.mark.parametrize("states", [(), MANY], ids=["six", "more"])
+@pytest.mark.parametrize("states", [(), EVERY_KIND], ids=["six", "more"])
 @pytest.mark.parametrize("angle", [0.3, 0.6, 0.95, 1.5])
 def test_a_large_correction_is_exact(states, angle):
     """P = σ²I and one measured attitude of variance r: the correction is φ σ²/(σ² + r), and P becomes σ² r/(σ² + r) J Jᵀ."""
@@ -341,7 +325,8 @@ def test_a_large_correction_is_exact(states, angle):
         attitude=[Rotation.from_rotvec(angle * axis).as_quat(scalar_first=True)],
         sigma=np.sqrt(r),
     )
-    record = ImuRecord(time=[0.0, 0.01], increments=np.zeros((1, 3)), vectors=(*SILENT, measured))
+    others = tuple(series for series in SILENT if states and series.kind != "attitude")
+    record = ImuRecord(time=[0.0, 0.01], increments=np.zeros((1, 3)), vectors=(*others, measured))
     start = initial_state(quaternion.IDENTITY, attitude_sigma=sigma, bias_sigma=1e-6)
     found = estimation.run(record, NOISE, start, states, full_covariance=True)
     share = sigma**2 / (sigma**2 + r)
@@ -356,10 +341,11 @@ def test_a_large_correction_is_exact(states, angle):
 # ----------------------------------------------------------------------------------------------- against the square root of the covariance
 
 
-def tracked(sigma, sharp=None, duration=6.0):
+def tracked(sigma, sharp=None, duration=6.0, states=()):
     """A record of a turning body with two stars, field and force, and perhaps one direction that is much sharper than all else."""
-    record = record_of(duration=duration, rate=25.0)
-    series = [*(s for s in record.vectors if s.sensor in ("mag", "force")), SILENT[-1]]
+    record = record_of(duration=duration, rate=25.0, anisotropic=bool(states))
+    series = [s for s in record.vectors if s.sensor in ("mag", "force")]
+    series += SILENT[2:] if states else ()
     random = np.random.default_rng(3)
     for name, at, r, noise in (
         ("first", np.arange(0.2, duration, 0.4), STAR, sigma),
@@ -368,7 +354,8 @@ def tracked(sigma, sharp=None, duration=6.0):
     ):
         if noise:
             vector = seen(SWAY.attitude(at), unit(r)) + noise * random.standard_normal((len(at), 3))
-            series.append(series_of(name, "direction", at, unit(vector), unit(r), noise))
+            # With states as a whole vector, for the structure of other tests: its length says nothing.
+            series.append(series_of(name, "vector" if states else "direction", at, unit(vector), unit(r), noise))
     return replace(record, vectors=tuple(series))
 
 
@@ -394,13 +381,13 @@ WITH_STATES = ("1 mrad", "one of 1 arcsecond", "one of 1 nrad", "from 3 rad")
         pytest.param(
             *case, states, id=f"{name}-{many}", marks=[] if not states or name in WITH_STATES else pytest.mark.slow
         )
-        for many, states in (("six", ()), ("states", MANY))
+        for many, states in (("six", ()), ("states", EVERY_KIND))
         for name, case in SHARP.items()
     ],
 )
 def test_variances_are_those_of_the_square_root(sigma, sharp, start_sigma, bound, states):
     """Every variance at every edge; within 60° and from an arcsecond on the estimate too, to as much of its σ."""
-    record = tracked(sigma, sharp)
+    record = tracked(sigma, sharp, states=states)
     draw = start_sigma * np.array([0.4, -0.3, 0.5])
     first = initial_state(
         quaternion.multiply(SWAY.attitude(np.array(0.0)), quaternion.exp(draw)),
