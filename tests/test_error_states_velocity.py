@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import json
 from pathlib import Path
 
 import in_steps
@@ -15,7 +14,7 @@ from measured import UP, assert_inside, drawn_start, seen, series_of, unit, wave
 
 from benchmarks import recordings as leaderboard
 from sims import hand_held
-from strapdown import ahrs, consistency, estimation, kinematics, quaternion, scenarios
+from strapdown import ahrs, consistency, estimation, kinematics, quaternion
 from strapdown.checks import InputError
 from strapdown.consistency import reference_errors
 from strapdown.estimation import error_states, setup
@@ -674,26 +673,6 @@ def test_a_setup_runs_it():
     np.testing.assert_allclose(
         found.error_states["acc velocity"].values, same.error_states["acc velocity"].values, atol=1e-10
     )
-
-
-@pytest.mark.slow
-def test_the_command_line_takes_it_from_a_filter_file(succeeds):
-    """As a user would: a simulated record, a filter file whose accelerometer has the states."""
-    scenario = dataclasses.replace(scenarios.load_scenario("hand-held"), duration=8.0)
-    Path("hand.toml").write_text(scenarios.scenario_to_toml(scenario), encoding="utf-8")
-    succeeds("simulate", "hand.toml", "--out", "record.h5")
-    (acc,) = (sensor.name for sensor in scenario.sensors if "acc" in sensor.name)
-    chosen = setup.FilterSetup.for_scenario(scenario, states=True)
-    held = dataclasses.replace(chosen.states.sensors.get(acc, SensorStates()), **dataclasses.asdict(TOLD))
-    chosen = dataclasses.replace(chosen, states=dataclasses.replace(chosen.states, sensors={acc: held}))
-    Path("filter.toml").write_text(setup.to_toml(chosen), encoding="utf-8")
-    output = succeeds("estimate", "record.h5", "--filter", "filter.toml", "--out", "out")
-    assert f"{acc} velocity" in output
-    found = json.loads(Path("out/states.json").read_text(encoding="utf-8"))[f"{acc} velocity"]
-    assert found["components"][:2] == ["velocity x", "drive x"]
-    assert found["units"] == ["m/s", "m/s²"] * 3
-    # The point that the sensor is at does not move, and the filter sees it.
-    assert np.all(np.abs(found["values"]) < 4.0 * np.array(found["sigma"]))
 
 
 def test_what_no_state_covers_is_reported():

@@ -7,7 +7,6 @@ import mpmath
 import numpy as np
 import pytest
 from filterpy.common import van_loan_discretization
-from filterpy.kalman import JulierSigmaPoints, UnscentedKalmanFilter
 from measured import drawn_start, errors, resting, seen, series_of, turn_to
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm, solve_discrete_are
@@ -477,84 +476,7 @@ def test_extended_filters_equal_a_slow_reference(name, kind, form):
         )
 
 
-@pytest.mark.parametrize(("kind", "form"), OWN_CASES)
-def test_usque_equals_filterpy_step_by_step(kind, form):
-    """The same sigma points in filterpy's own UnscentedKalmanFilter, its state p about a quaternion that moves after every step."""
-    rng = np.random.default_rng([42, list(REFERENCES).index(kind)])
-    record = simulated(
-        rng, intervals=8, dt=0.4, kinds=(kind,), measurements=4, form=form, sigma=0.05, noise=(0.02, 0.01)
-    )
-    noise = estimation.ProcessNoise(angle_random_walk=0.02, rate_random_walk=0.01)
-    initial = started(record, rng, attitude_sigma=0.3, bias_sigma=0.05)
-    (series,) = record.vectors
-    to_q, to_p = comparison.to_quaternion, comparison.to_rodrigues
-    ukf = UnscentedKalmanFilter(6, 3, 1.0, hx=None, fx=None, points=JulierSigmaPoints(6, kappa=1.0))
-    q = initial.attitude
-    ukf.x, ukf.P = np.concatenate([np.zeros(3), initial.bias]), initial.covariance.copy()
-    now = record.time[0]
-    events = sorted([(t, k) for k, t in enumerate(series.time)] + [(t, -1) for t in record.time[1:]])
-    rows = []
-    for t, k in events:
-        j = int(np.searchsorted(record.time, t)) - 1
-        dt, begin = t - now, record.time[j : j + 2]
-        increment = record.increments[j] * dt / np.diff(begin)[0]
-        now = t
-        ukf.Q = 0.5 * dt * np.diag([0.02**2] * 3 + [0.01**2] * 3)
-        ukf.P = ukf.P + ukf.Q  # half before the step, as in the paper
-        # Every point is propagated about the central one, which filterpy hands over first.
-        centre = [None]
-
-        def propagated(x, dt, q=q, increment=increment, centre=centre):
-            end = quaternion.multiply(quaternion.multiply(q, to_q(x[:3])), quaternion.exp(increment - dt * x[3:]))
-            centre[0] = end if centre[0] is None else centre[0]
-            return np.concatenate([to_p(quaternion.multiply(quaternion.conjugate(centre[0]), end)), x[3:]])
-
-        ukf.predict(dt=dt, fx=propagated)
-        q = quaternion.multiply(centre[0], to_q(ukf.x[:3]))
-        ukf.x[:3] = 0.0
-        if k >= 0:
-            ukf.sigmas_f = ukf.points_fn.sigma_points(ukf.x, ukf.P)  # filterpy would reuse those before Q was added
-            r, N = series.references_f[k], series.covariances[k]
-
-            def measured(x, q=q, r=r, k=k):
-                R = quaternion.to_matrix(quaternion.multiply(q, to_q(x[:3])))
-                if kind == "attitude":
-                    return x[:3]
-                return R.T @ r / np.linalg.norm(r)
-
-            if kind == "attitude":
-                z = to_p(quaternion.multiply(quaternion.conjugate(q), series.attitude[k]))
-            else:
-                z, N = series.vector_b[k] / np.linalg.norm(r), N / (r @ r)
-            if kind == "direction":
-                rows3 = np.vstack([unit_vector_basis(measured(ukf.x)), measured(ukf.x)])
-                N = rows3 @ N @ rows3.T
-                N[2], N[:, 2] = 0.0, 0.0
-                N[2, 2] = 0.5 * (N[0, 0] + N[1, 1])
-                N = rows3.T @ N @ rows3
-            ukf.update(z, R=N, hx=measured)
-            q = quaternion.multiply(q, to_q(ukf.x[:3]))
-            ukf.x[:3] = 0.0
-        else:
-            rows.append((q, ukf.x[3:].copy(), ukf.P.copy()))
-    estimate = own_filter("usque", noise).run(record, initial)
-    for k, (attitude, bias, P) in enumerate(rows, start=1):
-        assert quaternion.angle_between(estimate.attitude[k], attitude) < 1e-10
-        np.testing.assert_allclose(estimate.bias[k], bias, rtol=0.0, atol=1e-10)
-        np.testing.assert_allclose(estimate.covariance[k], P, rtol=0.0, atol=1e-10)
-
-
 # ------------------------------------------------------------------------------------------------- USQUE and complementary
-
-
-@pytest.mark.parametrize("angle", [1e-12, 1e-6, 1e-2, 1.0, 2.5, 3.1])
-def test_rodrigues_parameters(angle):
-    """a = 1, f = 4: p = 4 tan(θ/4) n, four times the modified Rodrigues parameters of SciPy."""
-    n = np.array([0.6, -0.64, 0.48])
-    q = quaternion.exp(angle * n)
-    np.testing.assert_allclose(comparison.to_rodrigues(q), 4.0 * np.tan(angle / 4.0) * n, rtol=1e-12)
-    np.testing.assert_allclose(comparison.to_rodrigues(-q), 4.0 * Rotation.from_rotvec(angle * n).as_mrp(), rtol=1e-12)
-    np.testing.assert_allclose(comparison.to_quaternion(4.0 * np.tan(angle / 4.0) * n), q, atol=1e-15)
 
 
 @pytest.mark.parametrize(

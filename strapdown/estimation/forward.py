@@ -188,8 +188,7 @@ def run_part(
     """Run the filter and return the end state too, from which the next part of a record continues, bit for bit.
 
     The end state includes the gate's state: its counts, its candidate, and the σ of the next restart. A lock-out that continues is reported
-    by both parts, by the second as a whole. Where the blocks would lose their digits and the covariance is carried as its factor, parts
-    agree to its rounding.
+    by both parts, by the second as a whole.
 
     Effects that are constant in a sensor's own unit (``varying``) refer in all parts to the first part with the sensor: to the magnitude at
     the root mean square σ there (``unit_sigma`` of the state). A run over the whole record refers to that of the whole record, and so has
