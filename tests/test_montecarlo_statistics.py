@@ -261,7 +261,9 @@ def test_summary_bounds_are_those_that_decide():
     assert np.allclose(summary["nees"]["bias"]["bounds"], [low, high], rtol=1e-12)
     low, high = scipy.stats.chi2.ppf([0.5 * single, 1.0 - 0.5 * single], 6) / 6.0
     assert np.allclose(summary["nis"][1]["bounds"], [low, high], rtol=1e-12)
-    assert np.allclose(sums.nis_bounds(1.0 - single, "star"), [low, high], rtol=1e-12)
+    low, high = scipy.stats.chi2.ppf([0.5 * single, 1.0 - 0.5 * single], sums.sensor_degrees.sum())
+    bounds = np.array([low, high]) / sums.sensor_degrees.sum()
+    assert np.allclose(sums.nis_bounds(1.0 - single), bounds, rtol=1e-12)
 
 
 def test_the_mean_error_is_students_t_of_the_worst_epoch_and_state():

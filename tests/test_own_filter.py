@@ -104,7 +104,7 @@ def test_without_a_bias_the_attitude_alone_is_judged(own, tmp_path, capsys):
     assert {one.of for one in judgement.findings if "NEES" in one.name} == {"attitude"}
     assert list(montecarlo.summary(statistics)["nees"]) == ["attitude"]
     campaign.run(with_filter(attitude_only), tmp_path / "own.h5", runs=12)
-    page, numbers = campaigns.report(tmp_path / "own.h5", 0.99)
+    page, numbers = campaigns.report(tmp_path / "own.h5")
     assert list(numbers["anees"]) == ["attitude"]
     assert "bias x" not in page
     assert "nan" not in json.dumps(numbers).lower()
@@ -276,7 +276,7 @@ def test_a_campaign_goes_on_and_is_replayed(own, tmp_path):
     assert read.setup == plan.setup
     with pytest.raises(InputError, match="Wrapped is a filter of your own, whose code is not in the result file"):
         montecarlo.replay(read, 0)
-    assert "textbook" not in campaigns.report(path, 0.99)[0]
+    assert "textbook" not in campaigns.report(path)[0]
 
 
 def test_the_packages_other_filter_runs_in_a_monte_carlo_by_name():
@@ -456,7 +456,7 @@ def test_a_filter_that_leaves_measurements_out_stays_above_the_bound_by_just_tha
     np.testing.assert_allclose(said["attitude"], np.sqrt(np.mean(ratio[1:, :3] ** 2, axis=0)), rtol=1e-12)
     cli.app(["montecarlo", str(tmp_path / "half.h5")], standalone_mode=False)
     assert f"by axis: attitude {said['attitude'][0]:.3f}" in capsys.readouterr().out
-    page, numbers = campaigns.report(tmp_path / "half.h5", 0.99)
+    page, numbers = campaigns.report(tmp_path / "half.h5")
     np.testing.assert_allclose(numbers["rms_over_root_cramer_rao_bound"], ratio, rtol=1e-12)
     assert "Cramér–Rao" in page
     assert verdicts.bound_of(replace(plan, setup=base)) is None  # of the package's own filter its σ says it

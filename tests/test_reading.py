@@ -290,7 +290,7 @@ def test_a_report_does_not_show_what_a_link_beside_the_result_leads_to(known, tm
     (tmp_path / "filter.json").write_bytes(known["tuning.json"].content)
     beside = tmp_path / name
     beside.write_bytes((tmp_path / "secret").read_bytes() if name.endswith("png") else b"[filter]\n")
-    show = lambda: (tunings.report(tmp_path / "filter.json", 0.99), page.stored_figure(tmp_path / "errors", "errors"))  # noqa: E731
+    show = lambda: (tunings.report(tmp_path / "filter.json"), page.stored_figure(tmp_path / "errors", "errors"))  # noqa: E731
     assert show()
     beside.unlink()
     beside.symlink_to(tmp_path / "secret")

@@ -408,7 +408,7 @@ def test_tune_with_a_gate_writes_it_into_the_filter(succeeds, tmp_path):
     assert found.gate.probability == pytest.approx(content["gate"]["probability"])
     assert content["gate"]["lower"] < content["gate"]["probability"] < content["gate"]["upper"]
     assert set(content["gate"]["thresholds"]) == {"star 1", "star 2"}
-    page, _ = tunings.report(out.with_suffix(".json"), 0.99)
+    page, _ = tunings.report(out.with_suffix(".json"))
     assert "A measurement with a NIS above" in page
     one = case(1, 300.0)
     estimate = setup.run(one.record, found, one.initial)

@@ -225,7 +225,7 @@ def test_the_command_reports_it_and_refuses_two_kinds(succeeds, refusal, tmp_pat
     (finding,) = json.loads(out.with_suffix(".json").read_text())["unmodelled"]
     assert finding["moves_with_the_rate"]
     np.testing.assert_allclose(finding["scale_factor"]["value"][:2], 1e-3, atol=1e-3)
-    page, _ = tunings.report(out.with_suffix(".json"), 0.99)
+    page, _ = tunings.report(out.with_suffix(".json"))
     assert "A scale factor of the gyro" in page
     other = dataclasses.replace(chosen.gyro, angle_random_walk=6e-5)
     brief = dataclasses.replace(chosen, gyro=other, duration=60.0)

@@ -356,23 +356,20 @@ class Statistics(ByValue, Listed):
         """NIS per degree of freedom of each sensor over the whole time and all runs (s,)."""
         return _divided(self.sensor_nis_sum.sum(axis=1), self.sensor_degrees.sum(axis=1))
 
-    def nis_bounds(self, probability: float = 0.99, sensor: str | None = None) -> tuple[float, float]:
-        """Return two-sided bounds of the mean NIS per degree of freedom of a consistent filter.
+    def nis_bounds(self, probability: float = 0.99) -> tuple[float, float]:
+        """Return two-sided bounds of :attr:`mean_nis` of a consistent filter.
 
         Parameters
         ----------
         probability : float, default 0.99
             Probability that a consistent filter lies inside the bounds.
-        sensor : str, optional
-            Name of a sensor. Default: all sensors together (:attr:`mean_nis`).
 
         Returns
         -------
         low, high : float
             Bounds per degree of freedom; a mean outside them rejects the filter.
         """
-        rows = slice(None) if sensor is None else self.sensors.index(sensor)
-        return consistency.mean_bounds(1, int(self.sensor_degrees[rows].sum()), probability)
+        return consistency.mean_bounds(1, int(self.sensor_degrees.sum()), probability)
 
     def verdict(self, epochs: NDArray[Any], subset: str = "state", probability: float = 0.99) -> Verdict:
         """Return the two-sided χ² test of the ANEES at given epochs.

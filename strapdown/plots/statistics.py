@@ -116,13 +116,13 @@ STATES = tuple(f"{what} {axis}" for what in ("attitude", "bias") for axis in AXE
 """Names of the six states of the error (δθ, δb)."""
 
 
-def runs_overview(statistics: Statistics, probability: float = 0.99) -> Figure:
+def runs_overview(statistics: Statistics) -> Figure:
     """Draw ANEES of attitude and bias, and the NIS, over time, with the bounds of a consistent filter; dots are the tested epochs."""
     figure, axes = new_figure(1, 3, size=(10.5, 4.2))
     axes[1].set_visible(statistics.has_bias)
-    findings = statistics.judge(confidence_level=probability).findings
+    findings = statistics.judge().findings
     judged = judged_epochs(len(statistics.time) - 1)
-    label = f"{100 * probability:g} % bounds, all tests together"
+    label = "99 % bounds, all tests together"
     low, high = np.nanmin(statistics.anees), np.nanmax(statistics.anees)
     for ax, subset in zip(axes, ("attitude", "bias") if statistics.has_bias else ("attitude",), strict=False):
         bounds = next((one.low, one.high) for one in findings if (one.name, one.of) == ("ANEES", subset))
@@ -131,12 +131,7 @@ def runs_overview(statistics: Statistics, probability: float = 0.99) -> Figure:
         ax.plot(statistics.time[judged], anees, ".", color=CYCLE[0], label="epochs judged")
         ax.set_ylim(min(0.5, 0.8 * float(low)), max(2.0, 1.3 * float(high)))
     if statistics.sensor_degrees.sum() > 0:
-        nis_over_time(
-            [("all runs", statistics)],
-            axes[2],
-            probability=probability,
-            label=f"{100 * probability:g} % bounds, each interval",
-        )
+        nis_over_time([("all runs", statistics)], axes[2])
     else:
         axes[2].set_visible(False)
     legend_below(figure, [one for one in axes if one.get_visible()], ncols=4)

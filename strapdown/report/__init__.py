@@ -25,7 +25,7 @@ from strapdown.report import campaigns, comparisons, conings, estimates, tunings
 
 __all__ = ["write"]
 
-_WRITERS: dict[str, Callable[[Path, float], tuple[str, dict[str, Any]]]] = {
+_WRITERS: dict[str, Callable[[Path], tuple[str, dict[str, Any]]]] = {
     "strapdown estimate": estimates.report,
     "strapdown montecarlo": campaigns.report,
     "strapdown tuning": tunings.report,
@@ -48,7 +48,6 @@ def write(
     out: str | os.PathLike[str] | None = None,
     *,
     other: str | os.PathLike[str] | None = None,
-    confidence_level: float = 0.99,
 ) -> Report:
     """Write the report of a result file, and its statistics as JSON beside it, atomically.
 
@@ -60,8 +59,6 @@ def write(
         The page. Default: ``result`` with the suffix .html.
     other : path, optional
         A second estimate of the same motion: the page has both, and their difference.
-    confidence_level : float
-        Probability that no test rejects a consistent filter.
 
     Returns
     -------
@@ -79,7 +76,7 @@ def write(
         raise InputError(f"{source} holds: {kind.removeprefix('strapdown ')}; reports are available for: {known}")
     with from_file(source):  # errors while drawing invalid numbers name the file
         if other is None:
-            content, statistics = _WRITERS[kind](source, confidence_level)
+            content, statistics = _WRITERS[kind](source)
         else:
             existing_file(Path(other))
             if {kind, _kind(Path(other))} != {"strapdown estimate"}:

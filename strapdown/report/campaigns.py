@@ -17,16 +17,16 @@ from strapdown.plots.statistics import STATES, state_unit
 from strapdown.report import findings, page
 
 
-def report(path: Path, confidence_level: float) -> tuple[str, dict[str, Any]]:
+def report(path: Path) -> tuple[str, dict[str, Any]]:
     """Return the page and the statistics for a campaign file."""
     attributes = records.read_attributes(path)
     held = campaign.read(path)
     statistics = held.statistics
     if statistics is None:
         raise InputError(f"{path} has no completed run yet; continue the campaign first, {Hint('resume', True)}")
-    judgement = workflows.check(held, confidence_level=confidence_level)
+    judgement = workflows.check(held)
     bound = verdicts.bound_of(held.plan)
-    numbers = verdicts.summary(statistics, confidence_level=confidence_level, bound=bound)
+    numbers = verdicts.summary(statistics, bound=bound)
     many = f"{statistics.failed} runs failed: their error or covariance was not finite at some epoch."
     parts = [
         part for one in verdicts.tables(numbers) for part in (page.paragraph(f"{one.title}:"), *findings.tabled(one))
@@ -41,7 +41,7 @@ def report(path: Path, confidence_level: float) -> tuple[str, dict[str, Any]]:
         findings.verdict(judgement),
         page.section("Key numbers", *parts, *failed),
         findings.evidence(judgement),
-        page.section("Over time", *_over_time(statistics, judgement, confidence_level)),
+        page.section("Over time", *_over_time(statistics, judgement)),
         page.section(
             "At the end",
             page.figure(
@@ -81,7 +81,7 @@ def _over_bound(statistics: Statistics, bound: Array) -> Array:
     return verdicts.efficiency(statistics, bound)[:, : len(_estimated(statistics))]
 
 
-def _over_time(statistics: Statistics, judgement: consistency.Judgement, probability: float) -> list[str]:
+def _over_time(statistics: Statistics, judgement: consistency.Judgement) -> list[str]:
     """Return charts of ANEES and NIS with their bounds, and of the quantiles of the errors with those that the filter predicts."""
     charts = []
     for one in judgement.findings:
@@ -92,7 +92,7 @@ def _over_time(statistics: Statistics, judgement: consistency.Judgement, probabi
     if known.any():
         samples = round(float(np.median(statistics.nis_degrees[known]) * statistics.runs))
         lines = (page.Series(label="NIS, all runs", value=np.where(known, statistics.nis, np.nan), colour="--b"),)
-        bounds = consistency.mean_bounds(1, samples, probability)
+        bounds = consistency.mean_bounds(1, samples)
         charts.append(_bounded("NIS in each interval", statistics.nis_time, lines, bounds))
     settled = slice(len(statistics.time) // 20, None)
     for k, name in enumerate(_estimated(statistics)):

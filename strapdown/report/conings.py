@@ -13,8 +13,8 @@ from strapdown.montecarlo import coning_study
 from strapdown.report import findings, page
 
 
-def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
-    """Return the page and the statistics for the JSON of a coning study; the bounds are those of the study, not of ``probability``."""
+def report(path: Path) -> tuple[str, dict[str, Any]]:
+    """Return the page and the statistics for the JSON of a coning study."""
     study = reading.json_file(path)
     try:
         return _page(path, study)

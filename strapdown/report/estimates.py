@@ -21,7 +21,7 @@ from strapdown.units import DEGREE, angle_unit, rate_unit
 _COLOURS = ("--a", "--b", "--c")
 
 
-def report(path: Path, confidence_level: float) -> tuple[str, dict[str, Any]]:
+def report(path: Path) -> tuple[str, dict[str, Any]]:
     """Return the page and the statistics for an estimate file."""
     attributes = records.read_attributes(path)
     estimate = setup.read_estimate(path)
@@ -33,7 +33,7 @@ def report(path: Path, confidence_level: float) -> tuple[str, dict[str, Any]]:
         error[known] = consistency.errors(
             estimate.attitude[known], estimate.bias[known], truth.attitude[known], truth.bias[known]
         )
-    judgement = workflows.check(estimate, confidence_level=confidence_level)
+    judgement = workflows.check(estimate)
     table = None if truth is None else workflows.accuracy(estimate)
     span = estimate.time[-1] - estimate.time[0]
     used = sum(len(one.time) for one in estimate.innovations.values())
@@ -49,7 +49,7 @@ def report(path: Path, confidence_level: float) -> tuple[str, dict[str, Any]]:
         *([] if table is None else [findings.listed(table.listing())]),
         findings.evidence(judgement),
         _over_time(estimate, truth, error),
-        *[_sensor(name, one, confidence_level) for name, one in estimate.innovations.items()],
+        *[_sensor(name, one) for name, one in estimate.innovations.items()],
         *_distribution(estimate, truth),
         page.section(
             "Provenance",
@@ -110,7 +110,7 @@ def _over_time(estimate: Estimate, truth: Truth | None, error: Array | None) -> 
     return page.section("Over time", page.beside_body(charts, estimate.time, estimate.attitude))
 
 
-def _sensor(name: str, innovations: Innovations, confidence_level: float) -> str:
+def _sensor(name: str, innovations: Innovations) -> str:
     if len(innovations.time) < 8:
         return page.section(
             f"Innovations of {name}", page.paragraph(f"{len(innovations.time)} measurements are too few to draw.")
@@ -120,7 +120,7 @@ def _sensor(name: str, innovations: Innovations, confidence_level: float) -> str
     def draw() -> Figure:
         figure, axes = plots.new_figure(3, 1, size=(9.0, 9.0))
         plots.innovation_histogram(white, axes[0])
-        plots.innovation_autocorrelation(consistency.autocorrelation(white, probability=confidence_level), axes[1])
+        plots.innovation_autocorrelation(consistency.autocorrelation(white), axes[1])
         plots.nis_over_record(innovations, consistency.mean_bounds(white.shape[1], 1, 0.99), axes[2])
         return figure
 

@@ -15,8 +15,8 @@ from strapdown.results import Table
 from strapdown.tuning.fitting import VERDICTS
 
 
-def report(path: Path, confidence_level: float) -> tuple[str, dict[str, Any]]:
-    """Return the page and the statistics for the JSON of a tuning; ``confidence_level`` is not used, since the verdict is in the JSON."""
+def report(path: Path) -> tuple[str, dict[str, Any]]:
+    """Return the page and the statistics for the JSON of a tuning, with its verdict."""
     content, listed, charts = read(path)
     shown, toml = content["report"], path.with_suffix(".toml")
     parts = [

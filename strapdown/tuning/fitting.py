@@ -555,20 +555,23 @@ class Slices:
         return plain([{"name": name, "values": x, "fallen": y} for name, x, y in rows])  # type: ignore[no-any-return]
 
 
-def slices(objective: Objective, tuning: Tuning, *, number: int = 25) -> Slices:
+SLICE_POINTS = 25
+"""Number of points of a slice, odd, so that the tuned one is the middle."""
+
+
+def slices(objective: Objective, tuning: Tuning) -> Slices:
     """Return slices of the objective through the tuned point, somewhat wider than each interval, without priors.
 
-    The points, an odd number, are densest about the tuned point, which is the middle one: a slice may be much narrower than the interval,
-    for which the other parameters vary too.
+    The points are densest about the tuned one: a slice may be much narrower than the interval, for which the other parameters vary too.
     """
-    grid = np.linspace(-1.0, 1.0, number) ** 3
+    grid = np.linspace(-1.0, 1.0, SLICE_POINTS) ** 3
     values, fallen = [], []
     for j, one in enumerate(tuning.parameters):
         width = 2.5 * min(max(one.standard_error, 1e-3), 1.0)
         top = one.upper if np.isfinite(one.upper) else one.value * np.exp(width)
         ends = np.log([max(min(one.lower, one.value), one.value * np.exp(-2.0 * width), 1e-300), max(top, one.value)])
         ends += np.array([-0.3, 0.3]) * max(float(np.ptp(ends)), 1e-3)
-        points = np.tile(tuning.point, (number, 1))
+        points = np.tile(tuning.point, (SLICE_POINTS, 1))
         points[:, j] += np.where(grid < 0.0, tuning.point[j] - ends[0], ends[1] - tuning.point[j]) * grid
         found = objective.minus_log(points)
         values.append(np.exp(points[:, j]))

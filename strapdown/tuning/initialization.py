@@ -19,12 +19,12 @@ from strapdown.tuning.objective import Case
 from strapdown.tuning.parameters import SCALE
 
 
-def recording_setup(parameters: AhrsParameters | None = None) -> FilterSetup:
-    """Return the setup of the filter that :func:`strapdown.ahrs.estimate` runs. Default: that of ``AhrsParameters()``."""
-    return (parameters or AhrsParameters()).setup
+def recording_setup() -> FilterSetup:
+    """Return the setup of the filter that :func:`strapdown.ahrs.estimate` runs."""
+    return AhrsParameters().setup
 
 
-def recording_case(recording: Recording, parameters: AhrsParameters | None = None) -> Case:
+def recording_case(recording: Recording) -> Case:
     """Return a recording as filtered by :func:`strapdown.ahrs.estimate`: with its reference.
 
     Delays between sensors are not compensated.
@@ -33,8 +33,6 @@ def recording_case(recording: Recording, parameters: AhrsParameters | None = Non
     ----------
     recording : Recording
         Recording with an accelerometer.
-    parameters : AhrsParameters, optional
-        Default: ``AhrsParameters()``.
 
     Returns
     -------
@@ -47,7 +45,7 @@ def recording_case(recording: Recording, parameters: AhrsParameters | None = Non
         If there is no accelerometer, or the recording is too short.
     """
     ahrs.need_accelerometer(recording)
-    prepared = ahrs.prepare(recording, parameters or AhrsParameters())
+    prepared = ahrs.prepare(recording, AhrsParameters())
     return Case(
         record=prepared.record,
         initial=prepared.initial,

@@ -35,6 +35,8 @@ SHARE, SCALE = 0.02, 5.0
 """Initial share and scale of the search."""
 MAX_REFUSED = 0.25
 """Maximum share of outliers; above it they are a second noise level, and no gate is set."""
+DRAWS = 2000
+"""Number of draws of share and scale for the interval of the probability."""
 MIN_REFUSED = 1e-9
 """Minimum share of valid measurements that a gate refuses."""
 
@@ -86,7 +88,7 @@ class TunedGate:
         )
 
 
-def tuned_gate(objective: Likelihood, tuning: Tuning, *, draws: int = 2000) -> TunedGate:
+def tuned_gate(objective: Likelihood, tuning: Tuning) -> TunedGate:
     """Return the gate at the Bayes threshold, with its interval from those of share and scale."""
     share, scale = tuning[OUTLIER_SHARE], tuning[OUTLIER_SCALE]
     seen = _seen(objective, tuning.point[:-2])
@@ -99,7 +101,7 @@ def tuned_gate(objective: Likelihood, tuning: Tuning, *, draws: int = 2000) -> T
     # Standard errors by the sandwich if the tuning used it.
     swollen = np.array([one.standard_error for one in (share, scale)]) / np.sqrt(np.diag(tuning.covariance)[-2:])
     covariance = tuning.covariance[-2:, -2:] * swollen[:, None] * swollen
-    normal = np.random.default_rng(0).standard_normal((draws, 2)) @ np.linalg.cholesky(covariance).T
+    normal = np.random.default_rng(0).standard_normal((DRAWS, 2)) @ np.linalg.cholesky(covariance).T
     tried = np.exp(np.log([share.value, scale.value]) + normal)
     tried = np.column_stack([np.minimum(tried[:, 0], SHARES[1]), np.maximum(tried[:, 1], 1.01)])
     lower, upper = np.quantile(_probability(seen, tried)[0], [0.025, 0.975])

@@ -22,7 +22,6 @@ import numpy as np
 from strapdown import estimation
 from strapdown.checks import Hint
 from strapdown.consistency import Judgement
-from strapdown.consistency.bounds import tail
 from strapdown.consistency.judgement import concluded
 from strapdown.estimation import setup
 from strapdown.estimation.setup import FilterSetup
@@ -40,6 +39,8 @@ from strapdown.tuning.objective import Case, of_sensors
 from strapdown.tuning.parameters import RRW
 from strapdown.tuning.validation import performance
 
+PROBABILITY = 0.99
+"""Probability that a filter that models all errors passes all tests."""
 LEVELS = (1.0, 0.2, 0.04)
 """Multiples of the tuned random walk of the bias with which a scale factor is tested."""
 MAX_REPORTED = 2
@@ -62,13 +63,12 @@ class Unmodelled:
     """Likely causes, if a test in :data:`SHAPES` fails."""
     missing: tuple[str, ...] = ()
     """Errors that the record specifies and the filter has no state for."""
-    probability: float
 
     @property
     def moves_with_the_rate(self) -> bool:
         """Whether a scale factor explains the innovations better than the noise of the gyro and than any other cause."""
         other = max((cause.gain for cause in self.causes), default=0.0)
-        return self.scale_factor.finding.p_value < 1.0 - self.probability and self.scale_factor.gain > other
+        return self.scale_factor.finding.p_value < 1.0 - PROBABILITY and self.scale_factor.gain > other
 
     @property
     def failed(self) -> tuple[str, ...]:
@@ -133,9 +133,8 @@ class Unmodelled:
         }
 
 
-def unmodelled(case: Case, chosen: FilterSetup, *, probability: float = 0.99) -> Unmodelled:
+def unmodelled(case: Case, chosen: FilterSetup) -> Unmodelled:
     """Return the evidence against a tuned filter in the part of a record that it was tuned on."""
-    tail(probability)
     judgement = performance([case], chosen).judgements[0]
     record = record_for_tuning(case)
     used = of_sensors(chosen, record)
@@ -143,18 +142,17 @@ def unmodelled(case: Case, chosen: FilterSetup, *, probability: float = 0.99) ->
     if used.gate is not None:
         # A gate removes the tails of the innovations and passes small outliers: NIS and normality are not evidence then.
         kept = tuple(one for one in judgement.findings if one.name not in ("NIS", "normality"))
-        judgement = concluded(kept, judgement.limits, probability, parts={})
+        judgement = concluded(kept, judgement.limits, PROBABILITY, parts={})
         record = accepted(record, setup.run(record, used, initial, every=len(record.increments)))
     causes: tuple[Cause, ...] = ()
     if any(finding.rejected and finding.name in SHAPES for finding in judgement.findings):
-        causes = diagnosis.diagnose(record, used, initial, probability=probability).causes
+        causes = diagnosis.diagnose(record, used, initial, probability=PROBABILITY).causes
     return Unmodelled(
         record=case.name,
         judgement=judgement,
         scale_factor=scale_factor(setup.modelled_record(record, used), used.process_noise, initial),
         causes=causes,
         missing=unmodelled_errors(record.origin, chosen),
-        probability=probability,
     )
 
 

@@ -20,6 +20,8 @@ from strapdown.results import Column, Listed, Table, figure
 from strapdown.tuning.objective import Case, of_sensors
 from strapdown.units import DEGREE
 
+BINS = 40
+"""Number of time bins of the averaged NIS and NEES."""
 MAX_ROWS = 20_000
 """Maximum number of states of a record that are judged."""
 MIN_ERRORS = 100
@@ -177,9 +179,7 @@ class Comparison(Listed):
         return self.after.log_likelihood > self.before.log_likelihood
 
 
-def compare(
-    cases: Sequence[Case], before: FilterSetup, after: FilterSetup, *, threads: int = 1, bins: int = 40
-) -> Comparison:
+def compare(cases: Sequence[Case], before: FilterSetup, after: FilterSetup, *, threads: int = 1) -> Comparison:
     """Return the performance of two filters on held-out data.
 
     Parameters
@@ -192,8 +192,6 @@ def compare(
         The tuned filter.
     threads : int, default 1
         Number of cases filtered in parallel.
-    bins : int, default 40
-        Number of time bins of the averaged NIS and NEES.
 
     Returns
     -------
@@ -201,11 +199,11 @@ def compare(
         Log likelihood, NIS, NEES and RMS attitude error (rad) of each filter; NaN where the truth needed is unknown.
     """
     with ThreadPoolExecutor(threads) as pool:
-        results = list(pool.map(lambda chosen: performance(cases, chosen, bins=bins), (before, after)))
+        results = list(pool.map(lambda chosen: performance(cases, chosen), (before, after)))
     return Comparison(before=results[0], after=results[1])
 
 
-def performance(cases: Sequence[Case], chosen: FilterSetup, *, bins: int = 40) -> Performance:
+def performance(cases: Sequence[Case], chosen: FilterSetup) -> Performance:
     """Return the performance of a filter on the judged part of these cases."""
     judged = [_judged(case, chosen) for case in cases]
     total, number, squares = 0.0, 0, 0.0
@@ -224,7 +222,7 @@ def performance(cases: Sequence[Case], chosen: FilterSetup, *, bins: int = 40) -
         elif truth is not None:
             found = consistency.reference_errors(estimate.attitude, truth.attitude).total
             error_squares.append(found[np.isfinite(found)] ** 2)
-    time, course, degrees = _nis_course(list(judged[0][0].innovations.values()), bins)
+    time, course, degrees = _nis_course(list(judged[0][0].innovations.values()))
     return Performance(
         log_likelihood=total / number,
         nis=squares / number,
@@ -237,7 +235,7 @@ def performance(cases: Sequence[Case], chosen: FilterSetup, *, bins: int = 40) -
         nis_time=time,
         nis_course=course,
         nis_degrees=degrees,
-        nees=_nees_courses(*judged[0], bins),
+        nees=_nees_courses(*judged[0]),
     )
 
 
@@ -272,26 +270,26 @@ def _judged(case: Case, chosen: FilterSetup) -> tuple[Estimate, Truth | None]:
     return replace(estimate, innovations=innovations, **part), truth
 
 
-def _spans(time: Array, first: float, last: float, bins: int) -> tuple[Array, np.ndarray]:
-    """Return the midpoints of equal time bins (bins,), and the bin of each time."""
-    edges = np.linspace(first, last + 1e-9, bins + 1)
-    place = np.clip(np.searchsorted(edges, time, side="right") - 1, 0, bins - 1)
+def _spans(time: Array, first: float, last: float) -> tuple[Array, np.ndarray]:
+    """Return the midpoints of equal time bins (BINS,), and the bin of each time."""
+    edges = np.linspace(first, last + 1e-9, BINS + 1)
+    place = np.clip(np.searchsorted(edges, time, side="right") - 1, 0, BINS - 1)
     return 0.5 * (edges[1:] + edges[:-1]), place
 
 
-def _nis_course(innovations: Sequence[Innovations], bins: int) -> tuple[Array, Array, Array]:
+def _nis_course(innovations: Sequence[Innovations]) -> tuple[Array, Array, Array]:
     time = np.concatenate([one.time[one.used] for one in innovations])
-    middles, places = _spans(time, time.min(), time.max(), bins)
-    sums, degrees = np.zeros(bins), np.zeros(bins)
+    middles, places = _spans(time, time.min(), time.max())
+    sums, degrees = np.zeros(BINS), np.zeros(BINS)
     for one in innovations:
         place, places = places[: one.used.sum()], places[one.used.sum() :]
-        sums += np.bincount(place, one.nis[one.used], bins)
-        degrees += np.bincount(place, minlength=bins) * float(one.innovation.shape[1])
+        sums += np.bincount(place, one.nis[one.used], BINS)
+        degrees += np.bincount(place, minlength=BINS) * float(one.innovation.shape[1])
     with np.errstate(invalid="ignore", divide="ignore"):
         return middles, sums / degrees, degrees
 
 
-def _nees_courses(estimate: Estimate, truth: Truth | None, bins: int) -> tuple[NeesCourse, ...]:
+def _nees_courses(estimate: Estimate, truth: Truth | None) -> tuple[NeesCourse, ...]:
     known = None if truth is None else np.isfinite(truth.attitude).all(axis=1)
     if truth is None or known is None or int(known.sum()) < MIN_ERRORS:
         return ()
@@ -300,8 +298,8 @@ def _nees_courses(estimate: Estimate, truth: Truth | None, bins: int) -> tuple[N
     bias = truth.bias if whole else estimate.bias
     error = consistency.errors(estimate.attitude[known], estimate.bias[known], truth.attitude[known], bias[known])
     time, P = estimate.time[known], estimate.covariance[known]
-    middles, place = _spans(time, time[0], time[-1], bins)
-    number = np.bincount(place, minlength=bins)
+    middles, place = _spans(time, time[0], time[-1])
+    number = np.bincount(place, minlength=BINS)
     found = []
     for name in ("attitude", "bias") if whole else ("attitude",):
         states = consistency.SUBSETS[name]
@@ -312,6 +310,6 @@ def _nees_courses(estimate: Estimate, truth: Truth | None, bins: int) -> tuple[N
             else consistency.time_average(error[:, :3], P[:, :3, :3])
         )
         with np.errstate(invalid="ignore", divide="ignore"):
-            mean = np.bincount(place, consistency.nees(error, P, states), bins) / (len(states) * number)
-        found.append(NeesCourse(of=name, time=middles, mean=mean, effective=average.effective / bins))
+            mean = np.bincount(place, consistency.nees(error, P, states), BINS) / (len(states) * number)
+        found.append(NeesCourse(of=name, time=middles, mean=mean, effective=average.effective / BINS))
     return tuple(found)

@@ -90,7 +90,7 @@ def targets(folder: Path) -> list[Target]:
         target("gyro.toml", gyro.read_spec, damage.TEXT, 0.05),
         target("dispersions.toml", montecarlo.read_dispersions, damage.TEXT, 0.05),
         target("vibration.csv", coning.read_vibration, damage.TEXT, 0.11),
-        target("tuning.json", lambda path: tunings.report(path, 0.99), (*damage.TEXT, damage.replace_node, damage.replace_node), 0.12),
+        target("tuning.json", tunings.report, (*damage.TEXT, damage.replace_node, damage.replace_node), 0.12),
         *foreign(folder),
     ]  # fmt: skip
 
