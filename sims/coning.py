@@ -78,7 +78,7 @@ def main(*, runs: int = 100, duration: float = 240.0, seed: int = 1, out: Path |
 
     # 6. The verdict: NEES and NIS at 20 epochs, with two-sided 99 % bounds.
     outcomes = tuple(
-        FilterOutcome(integration=a.name, statistics=s, probability=0.99, epochs=np.arange(5, 101, 5))
+        FilterOutcome(integration=a.name, statistics=s, epochs=np.arange(5, 101, 5))
         for a, s in zip(algorithms, statistics, strict=True)
     )
 

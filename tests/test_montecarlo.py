@@ -12,20 +12,20 @@ from sims import campaign as sim
 from strapdown import coning, estimation, montecarlo, motion
 from strapdown.checks import InputError
 from strapdown.estimation.states import ProcessNoise
-from strapdown.montecarlo import FilterSetup
+from strapdown.montecarlo import FilterSetup, coning_study
 from strapdown.montecarlo.coning_study import ConingParameters
 
 PARAMETERS = ConingParameters(duration=60.0)
 SCENARIO = PARAMETERS.scenario
-NOISE = ProcessNoise(angle_random_walk=PARAMETERS.angle_random_walk, rate_random_walk=PARAMETERS.rate_random_walk)
+NOISE = ProcessNoise(angle_random_walk=coning_study.ANGLE_RANDOM_WALK, rate_random_walk=coning_study.RATE_RANDOM_WALK)
 EPOCHS = np.arange(5, 101, 5)
 
 
 def setup(algorithm="matched-4-11", noise=NOISE, **changes):
     return FilterSetup(
         process_noise=noise,
-        attitude_sigma=PARAMETERS.attitude_sigma,
-        bias_sigma=PARAMETERS.bias_sigma,
+        attitude_sigma=coning_study.ATTITUDE_SIGMA,
+        bias_sigma=coning_study.BIAS_SIGMA,
         integration=coning.ALGORITHMS[algorithm],
         **changes,
     )
@@ -133,8 +133,8 @@ def test_the_start_is_drawn_from_the_prior():
     draws = []
     for run in range(400):
         state = montecarlo.start(record, setup(), 1, run)
-        delta = turn_to(state.attitude, record.truth.attitude[0]) / PARAMETERS.attitude_sigma
-        draws.append(np.concatenate([delta, (record.truth.bias[0] - state.bias) / PARAMETERS.bias_sigma]))
+        delta = turn_to(state.attitude, record.truth.attitude[0]) / coning_study.ATTITUDE_SIGMA
+        draws.append(np.concatenate([delta, (record.truth.bias[0] - state.bias) / coning_study.BIAS_SIGMA]))
     assert np.all(np.abs(np.mean(draws, axis=0)) < 4.0 / 20.0)
     assert np.all(np.abs(np.var(draws, axis=0) - 1.0) < 4.0 * np.sqrt(2.0 / 400.0))
 

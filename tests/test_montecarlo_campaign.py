@@ -380,9 +380,9 @@ def test_the_command_resumes_extends_and_shows(command):
 
 
 def test_the_command_gives_the_filter_states_where_asked(command, tmp_path):
-    status, said, error = command("short.toml", "--runs", 2, "--states")
+    status, said, error = command("short.toml", "--runs", 2, "--states", *SCALAR)
     assert status == 3, error
-    assert "short: 2 runs, seed 1, machine: lanes." in said
+    assert "short: 2 runs, seed 1, machine: scalar." in said
     held = campaign.read(tmp_path / "short-montecarlo.h5")
     assert held.plan.individuals
     assert held.plan.setup.states is not None
@@ -395,7 +395,7 @@ def test_the_command_gives_the_filter_states_where_asked(command, tmp_path):
 
 def test_each_run_draws_its_own_gyro_where_the_filter_has_states_for_its_errors(command):
     """Scale factors over the runs: independent standard normals times that of the specification, whatever the chunks."""
-    command("short.toml", "--runs", 4)
+    command("short.toml", "--runs", 4, *SCALAR)
     plan = campaign.read("short-montecarlo.h5").plan
     assert plan.individuals
     known = replace(SCENARIO.gyro, scale_factor=np.zeros(3))

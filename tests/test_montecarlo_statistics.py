@@ -319,7 +319,7 @@ def test_the_summary_has_the_last_epoch_each_sensor_and_the_bound():
 
 def test_the_numbers_of_the_coning_study_are_means_over_the_judged_epochs():
     sums, epochs = scalar.run_chunk(PLAN, 0, 8), np.array([2, 4, 6])
-    found = FilterOutcome(integration="a", statistics=sums, probability=0.95, epochs=epochs).summary()
+    found = FilterOutcome(integration="a", statistics=sums, epochs=epochs).summary()
     error, P = sums.example_error[:, epochs], sums.covariance_sum[epochs] / 8.0
     turn = np.pi / 648000.0  # an arcsecond, and a degree per hour
     for name, part in (("attitude_{}_arcsec", slice(3)), ("bias_{}_deg_per_hour", slice(3, 6))):
@@ -331,7 +331,7 @@ def test_the_numbers_of_the_coning_study_are_means_over_the_judged_epochs():
     totals |= {"nis": (sums.sensor_degrees.sum(), sums.sensor_nis_sum.sum())}
     for name, (degrees, total) in totals.items():
         assert found[name] == pytest.approx(np.mean(total) / degrees)
-        ends = scipy.stats.chi2.ppf([0.025, 0.975], degrees) / degrees
+        ends = scipy.stats.chi2.ppf([0.005, 0.995], degrees) / degrees
         np.testing.assert_allclose(found[f"{name}_bounds"], ends)
 
 

@@ -477,9 +477,7 @@ def test_error_states_are_drawn_with_three_sigma(run):
 @pytest.fixture(scope="module")
 def outcomes(statistics):
     epochs = np.array([10, 20])
-    return [
-        FilterOutcome(integration=name, statistics=statistics, probability=0.99, epochs=epochs) for name in ("a", "b")
-    ]
+    return [FilterOutcome(integration=name, statistics=statistics, epochs=epochs) for name in ("a", "b")]
 
 
 def test_no_legend_covers_a_curve_and_ticks_are_plain(run, statistics, outcomes):

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from strapdown import coning, montecarlo, quaternion
-from strapdown.checks import Array, InputError, count, non_negative, positive
+from strapdown.checks import Array, InputError, count, positive
 from strapdown.consistency import Verdict
 from strapdown.estimation.states import ProcessNoise
 from strapdown.gyro import GyroSpec
@@ -54,11 +54,19 @@ MAX_STEPS = 60_000
 """Maximum number of steps of a run in which a drift is measured."""
 EPOCHS = 100
 VERDICT_EPOCHS = 20
+ANGLE_RANDOM_WALK, RATE_RANDOM_WALK = 0.08 * DEGREE_PER_ROOT_HOUR, 1.0 * DEGREE_PER_HOUR_PER_ROOT_HOUR
+"""Noise of the gyro."""
+DIRECTION_SIGMA = 20.0 * ARCSECOND
+"""σ of each component of two measured directions, about once per second."""
+ATTITUDE_SIGMA, BIAS_SIGMA = 200.0 * ARCSECOND, 20.0 * DEGREE_PER_HOUR
+"""σ of the initial errors, each body axis."""
+PROBABILITY = 0.99
+"""Probability of all bounds for a consistent filter, the default of :class:`Statistics`."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ConingParameters:
-    """Parameters of the study, SI and radians. By default the gyro is sampled only ten times per coning cycle.
+    """Cone and Monte Carlo of the study, SI and radians. By default the gyro is sampled only ten times per coning cycle.
 
     Parameters
     ----------
@@ -74,18 +82,6 @@ class ConingParameters:
         Number of Monte Carlo runs.
     seed : int, default 1
         Seed of the Monte Carlo.
-    angle_random_walk : float, default 0.08 °/√h
-        Angle random walk σ_v of the gyro, rad/√s.
-    rate_random_walk : float, default 1 °/h/√h
-        Rate random walk σ_u of the gyro, rad/s/√s.
-    direction_sigma : float, default 20″
-        σ of each component of two measured directions, rad, about once per second.
-    attitude_sigma : float, default 200″
-        σ of the initial attitude error, each body axis, rad.
-    bias_sigma : float, default 20 °/h
-        σ of the initial bias error, each body axis, rad/s.
-    probability : float, default 0.99
-        Probability of all bounds for a consistent filter.
     own : tuple of Algorithm, default ()
         User-defined algorithms, compared with those of the package.
     """
@@ -96,12 +92,6 @@ class ConingParameters:
     duration: float = 240.0
     runs: int = 100
     seed: int = 1
-    angle_random_walk: float = 0.08 * DEGREE_PER_ROOT_HOUR
-    rate_random_walk: float = 1.0 * DEGREE_PER_HOUR_PER_ROOT_HOUR
-    direction_sigma: float = 20.0 * ARCSECOND
-    attitude_sigma: float = 200.0 * ARCSECOND
-    bias_sigma: float = 20.0 * DEGREE_PER_HOUR
-    probability: float = 0.99
     own: tuple[coning.Algorithm, ...] = ()
 
     def __post_init__(self) -> None:
@@ -109,17 +99,8 @@ class ConingParameters:
         angle = positive("angle", self.angle / DEGREE, unit="degrees")
         if angle >= 90.0:
             raise InputError(f"angle is {angle:g} degrees; the half-angle of a cone must be below 90 degrees")
-        for name in (
-            "frequency",
-            "rate",
-            "duration",
-            "angle_random_walk",
-            "direction_sigma",
-            "attitude_sigma",
-            "bias_sigma",
-        ):
+        for name in ("frequency", "rate", "duration"):
             positive(name, getattr(self, name))
-        non_negative("rate_random_walk", self.rate_random_walk)
         if self.rate / self.frequency < MIN_SAMPLES_A_CYCLE:
             raise InputError(
                 f"rate is {self.rate:g} Hz, {self.rate / self.frequency:.3g} samples per cone cycle at {self.frequency:g} Hz, too few for "
@@ -127,8 +108,6 @@ class ConingParameters:
             )
         count("runs", self.runs)
         count("seed", self.seed, minimum=0)
-        if not 0.0 < self.probability < 1.0:
-            raise InputError(f"probability is {self.probability}; it must lie between 0 and 1")
         names = [one.name for one in self.algorithms]
         if len(set(names)) < len(names):
             raise InputError(
@@ -162,9 +141,9 @@ class ConingParameters:
         references = {"direction x": np.array([1.0, 0.0, 0.0]), "direction yz": np.array([0.0, 1.0, 1.0])}
         return Scenario(
             motion=Coning(angle=self.angle, frequency=self.frequency),
-            gyro=GyroSpec(angle_random_walk=self.angle_random_walk, rate_random_walk=self.rate_random_walk),
+            gyro=GyroSpec(angle_random_walk=ANGLE_RANDOM_WALK, rate_random_walk=RATE_RANDOM_WALK),
             sensors=tuple(
-                VectorSensor(name=name, reference_f=r, sigma=self.direction_sigma, rate=1.0 / self.measurement_interval)
+                VectorSensor(name=name, reference_f=r, sigma=DIRECTION_SIGMA, rate=1.0 / self.measurement_interval)
                 for name, r in references.items()
             ),
             rate=self.rate,
@@ -190,19 +169,18 @@ class FilterOutcome:
 
     integration: str
     statistics: Statistics
-    probability: float
     epochs: Array = field(repr=False)
     """Indices of the epochs judged."""
 
     @property
     def verdicts(self) -> dict[str, Verdict]:
         """Test of the NEES at the judged epochs, by subset of the states."""
-        return {subset: self.statistics.verdict(self.epochs, subset, self.probability) for subset in SUBSETS}
+        return {subset: self.statistics.verdict(self.epochs, subset) for subset in SUBSETS}
 
     @property
     def consistent(self) -> bool:
         """Whether NEES of the state, of the attitude and of the bias and the NIS all lie inside their bounds."""
-        low, high = self.statistics.nis_bounds(self.probability)
+        low, high = self.statistics.nis_bounds()
         nees = all(one.consistent for one in self.verdicts.values())
         return nees and low <= self.statistics.mean_nis <= high
 
@@ -231,7 +209,7 @@ class FilterOutcome:
             "epochs": len(self.epochs),
             "epochs_outside": {subset: verdict.outside for subset, verdict in verdicts.items()},
             "nis": statistics.mean_nis,
-            "nis_bounds": list(statistics.nis_bounds(self.probability)),
+            "nis_bounds": list(statistics.nis_bounds()),
             "consistent": self.consistent,
         }
 
@@ -273,11 +251,11 @@ class ConingStudy:
                 "duration_s": p.samples / p.rate,
                 "runs": p.runs,
                 "seed": p.seed,
-                "angle_random_walk_deg_per_root_hour": p.angle_random_walk / DEGREE_PER_ROOT_HOUR,
-                "rate_random_walk_deg_per_hour_per_root_hour": p.rate_random_walk / DEGREE_PER_HOUR_PER_ROOT_HOUR,
-                "direction_sigma_arcsec": p.direction_sigma / ARCSECOND,
+                "angle_random_walk_deg_per_root_hour": ANGLE_RANDOM_WALK / DEGREE_PER_ROOT_HOUR,
+                "rate_random_walk_deg_per_hour_per_root_hour": RATE_RANDOM_WALK / DEGREE_PER_HOUR_PER_ROOT_HOUR,
+                "direction_sigma_arcsec": DIRECTION_SIGMA / ARCSECOND,
                 "direction_interval_s": p.measurement_interval,
-                "bounds_probability": p.probability,
+                "bounds_probability": PROBABILITY,
             },
             "integration": [
                 {
@@ -455,12 +433,12 @@ def run(parameters: ConingParameters, *, progress: Callable[[int], None] | None 
         )
         for algorithm in algorithms
     )
-    noise = ProcessNoise(angle_random_walk=parameters.angle_random_walk, rate_random_walk=parameters.rate_random_walk)
+    noise = ProcessNoise(angle_random_walk=ANGLE_RANDOM_WALK, rate_random_walk=RATE_RANDOM_WALK)
     setups = tuple(
         FilterSetup(
             process_noise=noise,
-            attitude_sigma=parameters.attitude_sigma,
-            bias_sigma=parameters.bias_sigma,
+            attitude_sigma=ATTITUDE_SIGMA,
+            bias_sigma=BIAS_SIGMA,
             integration=algorithm,
         )
         for algorithm in algorithms
@@ -471,7 +449,7 @@ def run(parameters: ConingParameters, *, progress: Callable[[int], None] | None 
     # The first judged epoch is late enough for the bias to have been observed.
     epochs = np.linspace(EPOCHS // VERDICT_EPOCHS, EPOCHS, VERDICT_EPOCHS).astype(int)
     outcomes = tuple(
-        FilterOutcome(integration=algorithm.name, statistics=part, probability=parameters.probability, epochs=epochs)
+        FilterOutcome(integration=algorithm.name, statistics=part, epochs=epochs)
         for algorithm, part in zip(algorithms, statistics, strict=True)
     )
     return ConingStudy(parameters=parameters, drifts=drifts, outcomes=outcomes)

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from strapdown.montecarlo.coning_study import ConingStudy, Drift, FilterOutcome
+from strapdown.montecarlo.coning_study import PROBABILITY, ConingStudy, Drift, FilterOutcome
 from strapdown.plots.estimates import errors_in_envelope
 from strapdown.plots.statistics import nees_over_time, nis_over_time
 from strapdown.plots.style import (
@@ -100,7 +100,7 @@ def coning_consistency(outcomes: Sequence[FilterOutcome]) -> Figure:
     figure, axes = new_figure(1, 3, size=(10.5, 4.6))
     named = [(outcome.integration, outcome.statistics) for outcome in outcomes]
     first = outcomes[0]
-    percent = f"{100 * first.probability:g} %"
+    percent = f"{100 * PROBABILITY:g} %"
     for ax, subset in zip(axes[:2], ("attitude", "bias"), strict=True):
         verdicts = [one.verdicts[subset] for one in outcomes]
         bounds = verdicts[0].simultaneous_bounds
@@ -121,11 +121,9 @@ def coning_consistency(outcomes: Sequence[FilterOutcome]) -> Figure:
         ax.set_title(title, loc="left")
     low, high = axes[0].get_ylim()
     axes[0].set_ylim(min(0.3, low), max(3.0, min(high, 30.0)))
-    nis_over_time(named, axes[2], probability=first.probability, label=f"NIS: {percent} bounds, each interval")
+    nis_over_time(named, axes[2], label=f"NIS: {percent} bounds, each interval")
     passing = [
-        low <= one.statistics.mean_nis <= high
-        for one in outcomes
-        for low, high in [one.statistics.nis_bounds(one.probability)]
+        low <= one.statistics.mean_nis <= high for one in outcomes for low, high in [one.statistics.nis_bounds()]
     ]
     axes[2].set_title(f"NIS: {sum(passing)} of {len(outcomes)} pass\nTest of the mean over all time", loc="left")
     legend_below(figure, list(axes))
