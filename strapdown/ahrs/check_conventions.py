@@ -229,17 +229,14 @@ def examine(recording: Recording) -> Examination:
     found = (_without_reference if recording.true_attitude is None else _with_reference)(recording, sensors)
     notes = _unseen(recording)
     if found is None:
-        return Examination(
-            source=recording.source,
-            verdict="cannot tell",
-            reason="the recording has hardly any rotation, or too few samples",
-            candidates=(),
-            notes=tuple(notes),
-            doubts=tuple(upright + unsaid + doubts),
+        reason = "the recording has hardly any rotation, or too few samples"
+        result = Examination(
+            source=recording.source, verdict="cannot tell", reason=reason, candidates=(), notes=tuple(notes)
         )
-    result = _concluded(recording.source, found, unit_changes, notes)
-    if stuck:
-        result = replace(result, verdict="cannot tell", reason="a gyro axis is stuck; see the warning")
+    else:
+        result = _concluded(recording.source, found, unit_changes, notes)
+        if stuck:
+            result = replace(result, verdict="cannot tell", reason="a gyro axis is stuck; see the warning")
     if upright and result.verdict == "as declared":
         result = replace(
             result, verdict="cannot tell", reason="the sensors agree with each other; see the warning on their sign"

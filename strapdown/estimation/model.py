@@ -120,11 +120,11 @@ class _Numbers:
 
     def entries(self, numbers: Array) -> tuple[int | tuple[int], ...]:
         """Return the entry of each number."""
-        return tuple(self._entry(x) for x in np.ravel(numbers).tolist())
+        return tuple(self._entry(x) if x else 0 for x in np.ravel(numbers).tolist())
 
     def _entry(self, x: float) -> int | tuple[int]:
-        if x == 0.0 or (x == 1.0 and not self.generic):
-            return int(x)
+        if x == 1.0 and not self.generic:
+            return 1
         if self.generic or x not in self.places:
             self.places[x] = len(self.values)
             self.values.append(x)
@@ -247,11 +247,9 @@ def _on_sensors(
                     vectors[(k, k + third, k + 2 * third)] = None
             for k, row in enumerate(_numbers(block, effect)):
                 if np.any(row):
-                    offset, fixed, scale = (
-                        numbers.entries(row[part]) for part in (slice(3), slice(3, 6), slice(6, 15))
-                    )
+                    entries, lever = numbers.entries(row), effect.lever is not None
                     states[sensor].append(
-                        SensorState(6 + own.start + k, offset, effect.lever is not None, fixed, carried, scale)
+                        SensorState(6 + own.start + k, entries[:3], lever, entries[3:6], carried, entries[6:])
                     )
             if effect.varying and kinds[sensor] in ("direction", "heading"):
                 varying.add(sensor)

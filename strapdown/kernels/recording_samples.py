@@ -32,7 +32,7 @@ def halves(samples, sums, number):
     for k in range(len(samples)):
         count = 0
         for i in range(samples.shape[1]):
-            if is_finite(vector_at(samples[k], i)):
+            if math.isfinite(samples[k, i, 0] + samples[k, i, 1] + samples[k, i, 2]):
                 count += 1
         number[k] = count
         seen = 0
@@ -40,16 +40,11 @@ def halves(samples, sums, number):
             for c in range(3):
                 sums[k, half, c] = 0.0
         for i in range(samples.shape[1]):
-            if is_finite(vector_at(samples[k], i)):
+            if math.isfinite(samples[k, i, 0] + samples[k, i, 1] + samples[k, i, 2]):
                 seen += 1
                 half = 0 if 2 * seen <= count + 1 else 1
                 for c in range(3):
                     sums[k, half, c] += samples[k, i, c]
-
-
-def is_finite(v):
-    """Return whether all components are finite."""
-    return math.isfinite(v[0] + v[1] + v[2])
 
 
 def longest_runs(samples, run):
