@@ -77,7 +77,7 @@ class Steps(NamedTuple):
     time: np.ndarray
     """Time of the end, s (k,)."""
     turn_variance: np.ndarray
-    """Variance of the rotation by the gyro over the step in addition to its noise, rad² per axis: gaps, clipping (k,)."""
+    """Largest variance of the rotation by the gyro about an axis over the step in addition to its noise, rad²: gaps, clipping (k,)."""
 
 
 class Memory(NamedTuple):
