@@ -177,6 +177,8 @@ def look_at_field(constants, steps, memory, found, k, known):
             memory.ring[i, 7] = 0.0
     memory.counted[2] += 1
     share = max(constants.vertical_share, 1.0 / memory.counted[2])
+    if share > constants.vertical_share:  # the mean field starts with the average of that time too, not with one sample
+        forgotten = max(forgotten, share)
     low_passed(share, memory.vertical, 0, vector_at(memory.held, 1), memory.counted[1])
     low_passed(share, memory.vertical, 1, vector_at(memory.vertical, 0), memory.counted[1])
     up = vector_at(memory.vertical, 1)
