@@ -289,6 +289,18 @@ def test_the_smoother_recovers_the_attitude_of_a_start_in_motion(monkeypatch):
     assert largest[1] > 10.0
 
 
+def test_a_wrong_field_at_the_very_start_is_no_disturbance_later():
+    """The mean from which the field deviates begins with the average of a second, in which one step of 0.03 s has little weight."""
+    plain = recording(20.0)
+    up = quaternion.rotate(quaternion.conjugate(plain.true_attitude), [0.0, 0.0, 1.0])
+    first = plain.time < plain.time[0] + 0.03
+    wrong = Rotation.from_rotvec(0.5 * up[first]).apply(plain.magnetic_field[first])
+    broken = dataclasses.replace(plain, magnetic_field=np.concatenate([wrong, plain.magnetic_field[~first]]))
+    vectors = [ahrs.prepare(one, ahrs.HAND_HELD).record.vectors[1] for one in (plain, broken)]
+    after = vectors[0].time > plain.time[0] + 3.0
+    assert np.median(vectors[1].sigma[after][:12] / vectors[0].sigma[after][:12]) < 1.1
+
+
 def test_the_steeper_the_field_the_less_it_says():
     """The same disturbance of a field of dip 63° turns the heading by as much more as its level part is less."""
     flat = recording(20.0)

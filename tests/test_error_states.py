@@ -444,7 +444,7 @@ def test_a_split_run_is_the_whole_run_to_the_bit(option):
     ("option", "gate"), [("all", None), ("none", None), ("none", Gate())], ids=["states", "registers", "gate"]
 )
 def test_a_run_in_spans_is_that_of_its_parts_to_the_bit(option, gate):
-    """Each part from the end of the one before, changed, and with its own noise; a common edge has the row before the change.
+    """Each part from the end of the one before, changed; a common edge has the row before the change.
 
     At both edges there are measurements.
     """
@@ -455,12 +455,11 @@ def test_a_run_in_spans_is_that_of_its_parts_to_the_bit(option, gate):
         return dataclasses.replace(state, bias=state.bias + 1e-4, covariance=2.0 * state.covariance)
 
     n = len(record.increments)
-    spans = [forward.Span(24, 1e-3, wider), forward.Span(55, 5e-3), forward.Span(n, 2e-3, wider)]
+    spans = [forward.Span(24, wider), forward.Span(55), forward.Span(n, wider)]
     whole = forward.run_spans(record, NOISE, start(), blocks, spans, gate=gate)
     state, first, parts = start(), 0, []
-    for last, walk_, change in spans:
-        noise = dataclasses.replace(NOISE, angle_random_walk=walk_)
-        part, end = estimation.run_part(records.cut(record, first, last), noise, state, blocks, **options)
+    for last, change in spans:
+        part, end = estimation.run_part(records.cut(record, first, last), NOISE, state, blocks, **options)
         state, first = change(end) if change else end, last
         parts.append(part)
     for name in ("attitude", "bias", "variance", "covariance"):

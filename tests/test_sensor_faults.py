@@ -8,7 +8,7 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation
 
 from strapdown import ahrs, quaternion
-from strapdown.ahrs import check_conventions
+from strapdown.ahrs import check_conventions, estimating
 from strapdown.recordings import Recording, sensor_faults
 from strapdown.records.recording import sampled
 from strapdown.units import DEGREE
@@ -94,7 +94,7 @@ def test_a_clipped_rate_is_restored_to_within_its_sigma(limit):
         np.array([np.sum((plain.rate - rate)[first : first + 40, 0] * at[first : first + 40, 0]) for first in starts])
         / RATE
     )
-    sigma = np.array([np.sqrt(np.sum(variance[first : first + 30])) for first in starts])
+    sigma = np.array([np.sqrt(np.sum(variance[first : first + 30, 0])) for first in starts])
     off = np.sqrt(np.mean(runs**2))
     beyond = (
         np.sqrt(np.mean([np.sum((plain.rate - clipped.rate)[f : f + 40, 0] * at[f : f + 40, 0]) ** 2 for f in starts]))
@@ -109,20 +109,43 @@ def test_a_clipped_rate_is_restored_to_within_its_sigma(limit):
 
 
 def test_the_variance_of_a_restored_turn_is_spread_over_its_intervals():
-    """σ of the turn beyond the limit is half of it, whatever the number of intervals from the sample before the run to that after it."""
+    """σ of the turn beyond the limit is half of it, whatever the number of intervals from the sample before the run to that after it.
+
+    The turns about the other axes are known.
+    """
     plain = swing()
     only_x = dataclasses.replace(plain, rate=plain.rate * [1.0, 0.0, 0.0])
     rate, variance, at = sensor_faults.restored(plain.time, with_rate(only_x, 5.0).rate)
-    expected = np.zeros(len(variance))
+    expected = np.zeros(variance.shape)
     for first, stop in np.flatnonzero(np.diff(at[:, 0].astype(int))).reshape(-1, 2) + 1:
         turn = np.sum(np.abs(rate[first:stop, 0]) - 5.0) / RATE
         slopes = RATE * np.diff(only_x.rate[[first - 2, first - 1, stop, stop + 1], 0])[[0, 2]]
         ends = [first - 1, stop]
         cubic = CubicHermiteSpline(plain.time[ends], only_x.rate[ends, 0], slopes)(plain.time[first:stop])
         np.testing.assert_allclose(np.abs(rate[first:stop, 0]), np.maximum(np.abs(cubic), 5.0), rtol=1e-9)
-        expected[first - 1 : stop] += (0.5 * turn) ** 2 / (stop - first + 1)
+        expected[first - 1 : stop, 0] += (0.5 * turn) ** 2 / (stop - first + 1)
     np.testing.assert_allclose(variance, expected, rtol=1e-9, atol=1e-18)
-    assert np.count_nonzero(variance) > 1000
+    assert np.count_nonzero(variance[:, 0]) > 1000
+
+
+def test_only_the_turn_about_the_clipped_axis_is_uncertain():
+    """σ about the other axes is that without clipping, to the tenth, while that about x grows by the turn that is missed."""
+    plain = swing()
+    sigma = []
+    for recording in (plain, with_rate(plain, 5.0)):
+        found = ahrs.estimate(recording, latency=0.0)
+        sigma.append(np.sqrt(found.estimate.variance[:, :3]))
+    run = np.flatnonzero(found.faults.turn_variance[:, 0])
+    ratio = (sigma[1] / sigma[0])[run[run > 5.0 * RATE] + 1]
+    assert np.median(ratio[:, 0]) > 1.5
+    assert np.all(np.abs(np.median(ratio[:, 1:], axis=0) - 1.0) < 0.1)
+
+
+def test_an_uncertain_turn_is_added_before_its_step_and_a_small_one_with_those_that_follow():
+    small = estimating.SMALL_TURN**2
+    steps = small * np.array([[0.0, 0.0, 0.0], [0.4, 0.1, 0.0], [0.7, 0.0, 0.0], [9.0, 3.0, 0.0], [0.0, 0.0, 0.0]])
+    expected = small * np.array([[0.0] * 3] * 2 + [[1.1, 0.1, 0.0], [9.0, 3.0, 0.0]] + [[0.0] * 3] * 2)
+    np.testing.assert_allclose(estimating.uncertain_turns(steps), expected, rtol=1e-12, atol=1e-18)
 
 
 def test_the_turn_over_a_gap_is_that_of_a_brownian_bridge():
@@ -131,9 +154,9 @@ def test_the_turn_over_a_gap_is_that_of_a_brownian_bridge():
     time = np.arange(400_000) * dt
     rate = np.cumsum(np.sqrt(density * dt) * random.standard_normal((len(time), 3)), axis=0)
     length = 0.05
-    assert sensor_faults.turn_variance_over(time, rate, length, dt) == pytest.approx(
-        density * length**3 / 12.0, rel=0.05
-    )
+    lengths = length * np.array([1.0, 2.0, 1.0])
+    variance = sensor_faults.turn_variance_over(rate, lengths, dt)
+    np.testing.assert_allclose(variance, density * lengths**3 / 12.0, rtol=0.05)
 
 
 def off_by(recording: Recording, **options: bool) -> tuple[np.ndarray, np.ndarray, ahrs.AhrsEstimate]:
@@ -244,7 +267,7 @@ def test_a_gap_filled_by_interpolation_is_a_gap(smooth):
 def test_the_turn_over_a_long_gap_has_a_variance_of_one():
     """No more is known of it than that it is a turn."""
     variance = sensor_faults.find(filled(swing(80.0), (5.0, 35.0))).turn_variance
-    assert variance.sum() == pytest.approx(1.0, rel=1e-9)
+    np.testing.assert_allclose(variance.sum(axis=0), 1.0, rtol=1e-9)
 
 
 def test_straight_lines_of_a_still_or_noisy_gyro_are_no_gaps():

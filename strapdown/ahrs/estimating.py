@@ -43,6 +43,8 @@ FAR_START = 20.0 * DEGREE
 """Rotation by which the smoother corrects the attitude at the start, rad, above which it is linearised about the corrected one again."""
 MAX_STARTS = 3
 """Maximum number of such starts."""
+SMALL_TURN = 0.5 * DEGREE
+"""σ of an uncertain rotation, rad, below which it is added to the attitude's with those that follow."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -195,53 +197,63 @@ def _run(
 ) -> tuple[Estimate, float | None]:
     """Return the filter's or the smoother's estimate at the steps, and the smoother's disagreement with its filter.
 
-    If the rotation over some sample intervals is uncertain (``turn_variance`` (n,), rad², is positive), the record is run in parts. The
-    angle random walk of each part is that of the gyro plus that variance spread over the part. Each part is smoothed separately, because
-    samples after an interval of unknown rotation have little information about the attitude before it. The filter's bias is corrected after
-    each span at rest; the smoother's initial state includes all of them.
+    The record is run in parts. Before each uncertain rotation (:func:`uncertain_turns`) its variance is added to that of the attitude; the
+    parts between are smoothed separately, because samples after an unknown rotation have little information about the attitude before it.
+    The filter's bias is corrected after each span at rest; the smoother's initial state includes all of them.
     """
     record, own, smooth = prepared.record, parameters.setup, options.smooth
     kinds = {series.sensor: series.kind for series in record.vectors}
     blocks = () if own.states is None else own.states.blocks(kinds)
-    extra = over_steps(turn_variance, prepared.edge)
+    added = uncertain_turns(over_steps(turn_variance, prepared.edge))
     rested = np.searchsorted(prepared.edge, [] if smooth else at_rest.last)
-    bounds = np.unique([0, *(np.flatnonzero(np.diff(extra > 0.0)) + 1), *rested, len(extra)]).tolist()
-    spans = []
-    for first, last in itertools.pairwise(bounds):
-        walk = parameters.angle_random_walk**2 + float(np.sum(extra[first:last])) / (
-            record.time[last] - record.time[first]
-        )
-        rates = [(at_rest.rate[k], float(at_rest.sigma[k])) for k in np.flatnonzero(rested == last)]
-        change = functools.partial(functools.reduce, _with_rate, rates) if rates else None
-        spans.append(estimation.Span(last, float(np.sqrt(walk)), change))
+
+    def changed(state: estimation.State, edge: int) -> estimation.State:
+        for k in np.flatnonzero(rested == edge):
+            state = with_rate_at_rest(state, at_rest.rate[k], float(at_rest.sigma[k]))
+        if added[edge].any():
+            P = np.array(state.covariance)
+            P[:3, :3] += np.diag(added[edge])
+            state = replace(state, covariance=P)
+        return state
+
+    bounds = np.unique([0, *np.flatnonzero(added.any(axis=1)), *rested, len(record.increments)]).tolist()
+    state = changed(prepared.initial, 0)
     judged: dict[str, Any] = {"gate": options.gate, "robust": options.robust}
     if not smooth:
-        found = estimation.run_spans(record, own.process_noise, prepared.initial, blocks, spans, **judged)
+        spans = [estimation.Span(last, functools.partial(changed, edge=last)) for last in bounds[1:]]
+        found = estimation.run_spans(record, own.process_noise, state, blocks, spans, **judged)
         # Gaps are among the faults of the recording: the rotation over them is uncertain by more than the event says.
         return replace(found, events=tuple(one for one in found.events if one.kind != "gap")), None
     shared = Options(full_covariance=True, error_state_covariance=False, **judged)
-    state = prepared.initial
     parts: list[Estimate] = []
     forward: list[Array] = []
-    for (first, last), span in zip(itertools.pairwise(bounds), spans, strict=True):
-        part = record if len(spans) == 1 else cut(record, first, last)
-        noise = replace(own.process_noise, angle_random_walk=span.angle_random_walk)
+    for first, last in itertools.pairwise(bounds):
+        part = record if len(bounds) == 2 else cut(record, first, last)
         for _ in range(MAX_STARTS):
-            smoothed, filtered = estimation.smoothed_and_filtered(part, noise, state, blocks, shared)
+            smoothed, filtered = estimation.smoothed_and_filtered(part, own.process_noise, state, blocks, shared)
             if quaternion.angle_between(smoothed.attitude[0], state.attitude) < FAR_START:
                 break
             state = replace(state, attitude=smoothed.attitude[0])
         parts.append(smoothed)
         forward.append(filtered if not forward else filtered[1:])
-        if last < len(extra):
-            _, state = estimation.run_part(part, noise, state, blocks, **judged)
+        if last < bounds[-1]:
+            _, state = estimation.run_part(part, own.process_noise, state, blocks, **judged)
+            state = changed(state, last)
     whole = joined(parts)
     return whole, regions.disagreement(whole.attitude, np.concatenate(forward))
 
 
-def _with_rate(state: estimation.State, measured: tuple[Array, float]) -> estimation.State:
-    """Return the state corrected by a mean rate at rest and its σ."""
-    return with_rate_at_rest(state, *measured)
+def uncertain_turns(variance: Array) -> Array:
+    """Return the variance that is added to that of the attitude at each edge of the steps (k + 1, 3), from that of each step (k, 3), rad².
+
+    It is added before the step, a smaller one than :data:`SMALL_TURN` squared with that of the next steps.
+    """
+    total = np.cumsum(variance, axis=0)
+    level = np.floor(total.max(axis=1, initial=0.0) / SMALL_TURN**2)
+    due = np.flatnonzero(np.diff(level, prepend=0.0) > 0.0)
+    added = np.zeros((len(variance) + 1, 3))
+    added[due] = np.diff(total[due], axis=0, prepend=0.0)
+    return added
 
 
 def _at_stamps(
@@ -261,7 +273,8 @@ def _at_stamps(
     late = np.broadcast_to(delays.gyro, used.time.shape)
     ahead = -sensor_delays.turn_over(used, -late) if options.smooth else used.rate * late[:, None]
     interval = max(parameters.step, used.interval)
-    level = regions.acceleration_level(filtered, over_steps(turn_variance, edge) > 0.0, interval)
+    uncertain = np.asarray(over_steps(turn_variance, edge).any(axis=1))
+    level = regions.acceleration_level(filtered, uncertain, interval)
     assert filtered.covariance is not None
     iron = np.zeros(len(edge))
     if prepared.field is not None:

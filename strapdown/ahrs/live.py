@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import Any, NoReturn
 
 import numpy as np
@@ -88,8 +87,6 @@ class LiveAhrs:
         self.parameters = parameters or of_motion("hand", magnetometer=magnetometer)
         late = 0.5 * self.interval if latency is None else non_negative("latency", latency, unit="s")
         setup = self.parameters.setup
-        # The record's parts have this noise.
-        walk = float(np.sqrt(setup.process_noise.angle_random_walk**2))
         kinds: list[tuple[str, Any, Array]] = [
             ("accelerometer", "vector", GRAVITY),
             ("magnetometer", "heading", headings.NORTH),
@@ -106,7 +103,7 @@ class LiveAhrs:
             for sensor, kind, reference in kinds
         ]
         self._filter = estimation.LiveFilter(
-            replace(setup.process_noise, angle_random_walk=walk),
+            setup.process_noise,
             estimation.initial_state([1.0, 0.0, 0.0, 0.0], attitude_sigma=1.0, bias_sigma=1.0),
             () if setup.states is None else setup.states.blocks({one.sensor: one.kind for one in self._sensors}),
             sensors=self._sensors,

@@ -51,8 +51,8 @@ def prepare(
 
     ``field_delay`` is that of the magnetometer relative to the gyro, s, one number or one per sample; each sample is rotated forward
     by the gyro. ``causal``: a heading's noise depends only on the samples up to it, and on ``turn_variance``, the variance of the rotation
-    over each sample interval in addition to the gyro's noise, rad², one number or (n − 1,). ``turned`` (n, 4): attitude from the gyro only,
-    if already computed.
+    about each body axis over each sample interval in addition to the gyro's noise, rad², one number or (n − 1, 3). ``turned`` (n, 4):
+    attitude from the gyro only, if already computed.
     """
     if turned is None:
         turned = sensor_delays.gyro_attitude(recording)
@@ -85,7 +85,7 @@ def prepare(
         field, seen = sums(recording.magnetic_field, frame, edge)
         middle = frame[(edge[:-1] + edge[1:] + 1) // 2]
         if causal:
-            variance = over_steps(np.broadcast_to(turn_variance, len(turned) - 1), edge)
+            variance = over_steps(np.broadcast_to(turn_variance, (len(turned) - 1, 3)), edge).max(axis=1)
             variance[1:] += variance[:-1]  # most of a step's samples may precede the uncertain rotation
             rows = kernel.Steps(
                 field, seen, seen * interval, middle, total, number, turned[edge[1:]], time[1:], variance
@@ -133,8 +133,8 @@ def edges(time: Array, step: float, interval: float) -> np.ndarray:
 
 
 def over_steps(variance: Array, edge: np.ndarray) -> Array:
-    """Return the sum over each step (k,) of a variance of each sample interval (n − 1,)."""
-    return np.asarray(np.add.reduceat(variance, edge[:-1].astype(np.intp)))
+    """Return the sum over each step (k, 3) of a variance of each sample interval (n − 1, 3)."""
+    return np.asarray(np.add.reduceat(variance, edge[:-1].astype(np.intp), axis=0))
 
 
 def sums(samples: Array, frame: Array, edge: Array) -> tuple[Array, Array]:

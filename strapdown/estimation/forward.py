@@ -72,11 +72,10 @@ class Options:
 
 
 class Span(NamedTuple):
-    """A part of a record with its own noise."""
+    """A part of a record."""
 
     last: int
     """Last edge."""
-    angle_random_walk: float
     change: Callable[[State], State] | None = None
     """Returns the state from which the next span starts; None: the state at the end of this one."""
 
@@ -218,7 +217,7 @@ def run_spans(
     gate: Gate | None = None,
     robust: Robust | None = None,
 ) -> Estimate:
-    """Run the filter over a record in spans, between which the noise or the state changes.
+    """Run the filter over a record in spans, between which the state changes.
 
     The row of a common edge is that before the change. Whole covariances are those of attitude and bias only.
     """
@@ -290,11 +289,10 @@ def _over_temperature(problem: Problem, options: Options, slopes: slice) -> Pass
     parts: list[Estimate] = []
     before, begin = float(T[0]), 0
     for span in _spans_of(problem):
-        noise = replace(problem.process_noise, angle_random_walk=span.angle_random_walk)
         for first, last, mean in temperature.stretches(cut(record, begin, span.last), options.every):
             state = temperature.shifted(state, slopes, mean - before)
             part, off = temperature.at_mean(cut(record, begin + first, begin + last), mean, state.values[slopes])
-            passed = _run(prepared(part, noise, state, problem.error_states, driven=True), options)
+            passed = _run(prepared(part, problem.process_noise, state, problem.error_states, driven=True), options)
             parts.append(temperature.at_edges(passed.estimate, slopes, off[:: options.every]))
             state, before = passed.end, mean
         if span.change is not None:
@@ -326,27 +324,26 @@ def in_order(events: Sequence[Event]) -> tuple[Event, ...]:
 
 def _spans_of(problem: Problem) -> tuple[Span, ...]:
     """Return the spans of a record; without any, the whole as one."""
-    whole = Span(len(problem.record.increments), problem.process_noise.angle_random_walk)
-    return problem.spans or (whole,)
+    return problem.spans or (Span(len(problem.record.increments)),)
 
 
 def _in_spans(
     problem: Problem, rows: Sequence[Array], read: Callable[[], State], write: Callable[[State], None]
-) -> Iterator[tuple[float, slice, tuple[Any, ...], list[Array]]]:
-    """Yield σ_v², the events, the kernel's first arguments and the rows to write for each span; then change the state.
+) -> Iterator[tuple[slice, tuple[Any, ...], list[Array]]]:
+    """Yield the events, the kernel's first arguments and the rows to write for each span; then change the state.
 
     ``rows``: arrays of the outputs with a row for each edge, ``read`` and ``write``: access to the state in the kernel's arrays.
     """
     edges, increments = problem.gyro
     measured = problem.events.measurements
     first = before = 0
-    for last, walk_, change in _spans_of(problem):
+    for last, change in _spans_of(problem):
         after = int(np.searchsorted(measured.time, edges[last], side="right"))
         events = slice(before, after)
         columns = {name: getattr(measured, name)[events] for name in ("time", "place", "sensor")}
         at_first = [row[first : first + 1].copy() for row in rows]
         arguments = edges[first : last + 1], increments[first:last], measured._replace(**columns)
-        yield walk_**2, events, arguments, [row[first:] for row in rows]
+        yield events, arguments, [row[first:] for row in rows]
         if first:
             for row, kept in zip(rows, at_first, strict=True):
                 row[first : first + 1] = kept
@@ -375,9 +372,9 @@ def _in_registers(problem: Problem, options: Options) -> Passed:
     body = body_in_registers(problem)
     state, number = body.state, 0
     read, write = functools.partial(state_of_numbers, state), functools.partial(put_state, body)
-    for variance, _, arguments, part in _in_spans(problem, out[:-2], read, write):
+    for _, arguments, part in _in_spans(problem, out[:-2], read, write):
         out_of_part = six_states.Outputs._make((*part, *out[-2:]))
-        number = compiled(walk, six_states)(*arguments, every, body._replace(angle_variance=variance), out_of_part)
+        number = compiled(walk, six_states)(*arguments, every, body, out_of_part)
         if number < 0:
             raise TooPreciseError()
     if options.segments:
@@ -631,10 +628,8 @@ def _run(problem: Problem, options: Options) -> Passed:
         judged = judge.outputs(out)
         weight = judged.weight
     read, write = functools.partial(state_of, body, model, None, units), functools.partial(put_state, body)
-    for variance, at, arguments, part in _in_spans(problem, out[:-2], read, write):
-        form = body._replace(
-            model=body.model._replace(angle_variance=variance), length=body.length[at], turning=body.turning[at]
-        )
+    for at, arguments, part in _in_spans(problem, out[:-2], read, write):
+        form = body._replace(length=body.length[at], turning=body.turning[at])
         out_of_part = structure.Outputs._make((*part, *out[-2:]))
         if options.judged:
             outputs, judge.counters[:, gate_rules.REPORTED] = judged._replace(form=out_of_part), -1.0

@@ -77,7 +77,7 @@ class Steps(NamedTuple):
     time: np.ndarray
     """Time of the end, s (k,)."""
     turn_variance: np.ndarray
-    """Variance of the rotation by the gyro over the step in addition to its noise, rad² per axis: gaps, clipping (k,)."""
+    """Largest variance of the rotation by the gyro about an axis over the step in addition to its noise, rad²: gaps, clipping (k,)."""
 
 
 class Memory(NamedTuple):
@@ -177,6 +177,8 @@ def look_at_field(constants, steps, memory, found, k, known):
             memory.ring[i, 7] = 0.0
     memory.counted[2] += 1
     share = max(constants.vertical_share, 1.0 / memory.counted[2])
+    if share > constants.vertical_share:  # the mean field starts with the average of that time too, not with one sample
+        forgotten = max(forgotten, share)
     low_passed(share, memory.vertical, 0, vector_at(memory.held, 1), memory.counted[1])
     low_passed(share, memory.vertical, 1, vector_at(memory.vertical, 0), memory.counted[1])
     up = vector_at(memory.vertical, 1)

@@ -4,8 +4,8 @@ If the samples of a gyro are multiples of a step, truncated toward zero, every r
 rest differs from that in motion: half a step is added (:func:`truncation_step`).
 
 A clipped gyro sample is a lower bound of the rate. The rate of a run of clipped samples is restored by a cubic between the samples before
-and after (:func:`restored`). Its error is represented by a variance of the rotation, which the filter adds to that of the gyro's noise, as
-it does for the rotation over a gap. A clipped sample of the accelerometer has a wrong direction and is left out.
+and after (:func:`restored`). Its error is represented by a variance of the rotation about the clipped axis, which the filter adds to its
+own, as it does for the rotation over a gap. A clipped sample of the accelerometer has a wrong direction and is left out.
 
 Where a recording was resampled, a gap of its sensors can be filled by a straight line, which is no measurement: the rotation over it is as
 uncertain as over a gap, and the other sensors' samples there are left out (:func:`interpolated`).
@@ -63,7 +63,7 @@ class Faults:
     recording: Recording
     """Recording with clipped gyro samples restored and clipped accelerometer samples replaced by NaN."""
     turn_variance: Array
-    """Variance (n − 1,) of the rotation over each interval in addition to the gyro's noise, rad² per axis; mostly 0."""
+    """Variance (n − 1, 3) of the rotation about each body axis over each interval in addition to the gyro's noise, rad²; mostly 0."""
     words: tuple[str, ...]
     """Description of the faults."""
 
@@ -98,25 +98,26 @@ def find(recording: Recording) -> Faults:
     steps = np.diff(recording.time)
     usual = recording.interval
     filled = interpolated(measured)
-    for first, last in filled:
-        length = float(recording.time[last] - recording.time[first])
-        turn = min(turn_variance_over(recording.time, rate, length, usual), UNKNOWN_TURN)
-        variance[first:last] += turn / (last - first)
     if filled:
+        lengths = np.array([recording.time[last] - recording.time[first] for first, last in filled])
+        turns = np.minimum(turn_variance_over(rate, lengths, usual), UNKNOWN_TURN)
+        for (first, last), turn in zip(filled, turns, strict=True):
+            # σ grows at nine times and not at each sample, because the filter starts anew at each.
+            variance[np.linspace(first, last, MIN_STRAIGHT - 1, endpoint=False).astype(int)] += turn / (
+                MIN_STRAIGHT - 1
+            )
         inside = np.concatenate([np.arange(first + 1, last) for first, last in filled])
         for name in ("specific_force", "magnetic_field"):
             samples = changes.get(name, getattr(recording, name))
             if samples is not None:
                 changes[name] = samples.copy()
                 changes[name][inside] = np.nan
-        longest = max(recording.time[last] - recording.time[first] for first, last in filled)
         words.append(
-            f"Gaps filled by interpolation: {len(filled)}, up to {longest:.3g} s; samples there are ignored, and σ grows over each"
+            f"Gaps filled by interpolation: {len(filled)}, up to {lengths.max():.3g} s; samples there are ignored, and σ grows over each"
         )
     long = np.flatnonzero(steps > LONG_INTERVAL * usual)
-    for k in long:
-        variance[k] += turn_variance_over(recording.time, rate, float(steps[k]), usual)
     if len(long):
+        variance[long] += turn_variance_over(rate, steps[long], usual)[:, None]
         words.append(
             f"Intervals between stamps longer than {LONG_INTERVAL:g} median ones: {len(long)}, up to {steps.max():.3g} s; σ grows over "
             "each according to the change of the rate in that time"
@@ -216,13 +217,13 @@ def clipped_samples(samples: Array, least: float) -> np.ndarray:
 
 
 def restored(time: Array, rate: Array) -> tuple[Array, Array, np.ndarray]:
-    """Return rates (n, 3) with clipped runs restored, the variance of the rotation over each interval (n − 1,), and the mask of clipping.
+    """Return rates (n, 3) with clipped runs restored, the variance of the rotation over each interval (n − 1, 3), and the mask of clipping.
 
     A run is replaced by the cubic with the values and slopes at its ends, but not below the limit. The rotation beyond the limit over a
     run has a relative σ of :data:`RESTORED_ERROR`; its variance is distributed equally over the intervals of the run.
     """
     clipped = clipped_samples(rate, MIN_CLIPPED_RATE)
-    variance = np.zeros(len(time) - 1)
+    variance = np.zeros((len(time) - 1, 3))
     if not clipped.any():
         return rate, variance, clipped
     result = rate.copy()
@@ -231,7 +232,7 @@ def restored(time: Array, rate: Array) -> tuple[Array, Array, np.ndarray]:
         for first, stop in edges.reshape(-1, 2):
             limit = rate[first, k]
             if first < 2 or stop + 1 >= len(time):
-                variance[max(first - 1, 0) : stop] += (RESTORED_ERROR * limit * (time[1] - time[0])) ** 2
+                variance[max(first - 1, 0) : stop, k] += (RESTORED_ERROR * limit * (time[1] - time[0])) ** 2
                 continue
             t0, t1 = time[first - 1], time[stop]
             u = (time[first:stop] - t0) / (t1 - t0)
@@ -245,18 +246,19 @@ def restored(time: Array, rate: Array) -> tuple[Array, Array, np.ndarray]:
             beyond = np.maximum(np.sign(limit) * (cubic - limit), 0.0)
             result[first:stop, k] = limit + np.sign(limit) * beyond
             turn = float(np.sum(beyond)) * (t1 - t0) / (stop - first + 1)
-            variance[first - 1 : stop] += (RESTORED_ERROR * turn) ** 2 / (stop - first + 1)
+            variance[first - 1 : stop, k] += (RESTORED_ERROR * turn) ** 2 / (stop - first + 1)
     return result, variance, clipped
 
 
-def turn_variance_over(time: Array, rate: Array, length: float, usual: float) -> float:
-    """Return the variance, rad² per axis, of a rotation computed from the rates at the ends of an interval of duration T, s.
+def turn_variance_over(rate: Array, length: Array, usual: float) -> Array:
+    """Return the variance (m,), rad² per axis, of rotations computed from the rates at the ends of intervals of duration T, s (m,).
 
     With D the mean square change of the rate over T in the rest of the recording, and the rate between both ends modelled as a Brownian
     bridge, the variance is ``T² D/12``.
     """
-    lag = min(max(1, round(length / usual)), len(time) - 1)
-    return length**2 / 12.0 * float(np.mean((rate[lag:] - rate[:-lag]) ** 2))
+    lags, place = np.unique(np.clip(np.rint(length / usual).astype(int), 1, len(rate) - 1), return_inverse=True)
+    change = np.array([np.mean((rate[lag:] - rate[:-lag]) ** 2) for lag in lags])
+    return np.asarray(length**2 / 12.0 * change[place])
 
 
 STUCK_TIME = 2.0
