@@ -76,11 +76,17 @@ def test_the_file_describes_itself(tmp_path):
 
 @pytest.mark.parametrize("end", [8, 13])
 def test_a_campaign_can_be_extended_to_the_same_bits(tmp_path, end):
-    """From ends on whole chunks and on short ones."""
-    path = tmp_path / "c.h5"
+    """From ends on whole chunks and on short ones, of which only the short one is computed again."""
+    path, computed = tmp_path / "c.h5", []
+
+    def noting(work, chunks):
+        computed.extend(chunks)
+        return engine.in_threads(1)(work, computed)
+
     go(path, 5)
     go(path, end, resume=True, chunk=None)
-    result = go(path, 30, resume=True)
+    result = go(path, 30, resume=True, workers=noting)
+    assert computed == list(engine.chunks_of(30, CHUNK))[1:]
     assert_same(result.statistics, straight(30))
     assert_same(campaign.read(path).statistics, straight(30))
 
