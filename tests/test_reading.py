@@ -579,7 +579,7 @@ def test_a_campaign_goes_on_only_on_a_processor_that_rounds_alike(known, tmp_pat
     campaign._write(
         path,
         dataclasses.replace(held, **engine.identity()._asdict()),
-        held.statistics,
+        campaign._Progress(held.statistics, {}, 4),
         plan.to_table(),
     )
     assert campaign.read(path).arithmetic == engine.arithmetic()

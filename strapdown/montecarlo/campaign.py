@@ -3,9 +3,9 @@
 The file is HDF5 and always complete: each version is written to a temporary file and renamed. A reader, during the campaign or after it was
 killed, finds the statistics of the runs finished until then. The file holds sums, not runs, so its size does not depend on their number.
 
-The statistics are a left fold over chunks in the order of their runs, which depends only on plan, machine and chunk. If the last chunk is
-short, the group ``resume/whole`` holds the fold without it, so that an extended campaign is bitwise identical to one that was as long from
-the start.
+The statistics are a left fold over whole chunks in the order of their runs, which depends only on plan, machine and chunk. The group
+``resume`` holds what is needed to continue: chunks finished before earlier ones, ``resume/<first run>``, and, if the last chunk is short,
+the fold without it, ``resume/whole``. So an extended campaign is bitwise identical to one that was as long from the start.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from strapdown.checks import Hint, InputError, count, finite, one_of
 from strapdown.estimation import setup
 from strapdown.estimation.filters.own import Own
 from strapdown.files import atomic_write, locked, reading, set_attributes, whole_hdf5
-from strapdown.montecarlo.engine import MACHINES, Identity, Work, Workers, choose, chunks_of, identity, in_threads
+from strapdown.montecarlo.engine import MACHINES, Chunks, Identity, Work, Workers, choose, identity, in_threads
 from strapdown.montecarlo.plan import Plan, from_table
 from strapdown.montecarlo.statistics import BINS, Statistics, merge
 from strapdown.records import CONVENTIONS, put
@@ -165,6 +165,43 @@ def with_filter(held: Campaign, own: Own, path: Path) -> Campaign:
     return replace(held, plan=replace(held.plan, setup=replace(setup, estimator=own)))
 
 
+@dataclass
+class _Progress:
+    """Finished chunks: the fold over whole chunks from the first, and chunks finished before earlier ones, by first run."""
+
+    whole: Statistics | None
+    early: dict[int, Statistics]
+    chunk: int
+
+    @property
+    def merged(self) -> int:
+        """Number of runs in the fold."""
+        return 0 if self.whole is None else self.whole.runs
+
+    def take(self, first_run: int, part: Statistics) -> None:
+        """Add a finished chunk."""
+        self.early[first_run] = part
+        while self.merged in self.early and self.early[self.merged].runs == self.chunk:
+            first = self.merged
+            self.whole = self.early[first] if self.whole is None else merge(self.whole, self.early[first])
+            del self.early[first]
+
+    @property
+    def statistics(self) -> Statistics | None:
+        """Statistics of all runs from the first without a gap, a short last chunk included."""
+        last = self.early.get(self.merged)
+        if last is None:
+            return self.whole
+        return last if self.whole is None else merge(self.whole, last)
+
+    def missing(self, runs: int) -> Chunks:
+        """Return the chunks left to compute; a short last chunk is dropped if it is to be longer now."""
+        for first in [first for first, part in self.early.items() if part.runs != min(self.chunk, runs - first)]:
+            del self.early[first]
+        left = range(self.merged, runs, self.chunk)
+        return Chunks([first for first in left if first not in self.early] if self.early else left, runs, self.chunk)
+
+
 def run(
     plan: Plan,
     path: str | os.PathLike[str],
@@ -221,49 +258,58 @@ def run(
         held = _stored(target) if resume and target.exists() else None
         if held is None:
             size = MACHINES[chosen.machine].CHUNK if chunk is None else count("chunk", chunk)
-            stored, whole, before = None, None, 0.0
+            state, before = _Progress(None, {}, size), 0.0
         else:
-            stored, whole = held
+            stored, state = held
             size, before = stored.chunk, stored.seconds
             _need_same(target, stored, plan, chosen.machine, size if chunk is None else count("chunk", chunk), runs)
         begun = time.perf_counter()
 
-        def write(total: Statistics | None, whole: Statistics | None) -> Campaign:
+        def write() -> Campaign:
             now = Campaign(
                 plan=plan,
                 machine=chosen.machine,
                 reason=chosen.reason,
                 chunk=size,
                 runs=runs,
-                statistics=None if total is None else replace(total, plan=plan),
+                statistics=None if state.statistics is None else replace(state.statistics, plan=plan),
                 **identity()._asdict(),
                 seconds=before + time.perf_counter() - begun,
             )
-            _write(target, now, whole, table)
+            _write(target, now, state, table)
             return now
 
-        total = None if stored is None else stored.statistics
-        if total is not None and total.runs < runs:  # a short last chunk is computed again, with more runs
-            total = whole
-        done = 0 if total is None else total.runs
-        if progress is not None and done:
-            progress(done)
-        written, due, unwritten = write(total, whole), 0.0, False  # fails at once if the file cannot be written
-        crew = in_threads(threads) if workers is None else workers
-        try:
-            for (part,) in crew(Work(plans=(plan,), machine=chosen.machine), chunks_of(runs, size, done)):
-                total = part if whole is None else merge(whole, part)
-                whole = total if part.runs == size else whole
-                unwritten = True
-                if progress is not None:
-                    progress(part.runs)
-                if (now := time.perf_counter()) >= due:
-                    written, unwritten = write(total, whole), False
-                    due = time.perf_counter() + (time.perf_counter() - now) * (1.0 / SHARE - 1.0)
-        finally:
-            if unwritten:
-                written = write(total, whole)
-        return written
+        work = Work(plans=(plan,), machine=chosen.machine)
+        return _compute(work, state, runs, in_threads(threads) if workers is None else workers, write, progress)
+
+
+def _compute(
+    work: Work,
+    state: _Progress,
+    runs: int,
+    workers: Workers,
+    write: Callable[[], Campaign],
+    progress: Callable[[int], None] | None,
+) -> Campaign:
+    """Compute the missing chunks; write at once, at intervals, and at the end or an exception; return the last written state."""
+    missing = state.missing(runs)
+    if progress is not None and (done := runs - sum(n for _, n in missing)):
+        progress(done)
+    written = write()  # fails before anything is computed if the file cannot be written
+    due, unwritten = 0.0, False
+    try:
+        for place, (part,) in workers(work, missing):
+            state.take(missing[place][0], part)
+            unwritten = True
+            if progress is not None:
+                progress(missing[place][1])
+            if (now := time.perf_counter()) >= due:
+                written, unwritten = write(), False
+                due = time.perf_counter() + (time.perf_counter() - now) * (1.0 / SHARE - 1.0)
+    finally:
+        if unwritten:
+            written = write()
+    return written
 
 
 def _need_same(target: Path, held: Campaign, plan: Plan, machine: str, chunk: int, runs: int) -> None:
@@ -302,7 +348,7 @@ def _flat(table: Mapping[str, Any], place: str = "") -> dict[str, Any]:
 # -------------------------------------------------------------------------------------------------------------------------- file
 
 
-def _write(path: Path, campaign: Campaign, whole: Statistics | None, table: Mapping[str, Any]) -> None:
+def _write(path: Path, campaign: Campaign, state: _Progress, table: Mapping[str, Any]) -> None:
     import h5py
     import numba
 
@@ -338,8 +384,11 @@ def _write(path: Path, campaign: Campaign, whole: Statistics | None, table: Mapp
         set_attributes(file, attributes)
         if campaign.statistics is not None:
             _put_statistics(file.create_group("statistics"), campaign.statistics)
-            if whole is not None and whole.runs < campaign.statistics.runs:
-                _put_statistics(file.create_group("resume/whole"), whole)
+        folded = campaign.statistics is not None and campaign.statistics.runs == state.merged
+        if state.early and state.whole is not None and not folded:
+            _put_statistics(file.create_group("resume/whole"), state.whole)
+        for first_run, part in sorted(state.early.items()):
+            _put_statistics(file.create_group(f"resume/{first_run}"), part)
 
 
 def _put_statistics(group: Any, statistics: Statistics) -> None:
@@ -401,8 +450,7 @@ def read(path: str | os.PathLike[str]) -> Campaign:
     return _stored(Path(path))[0]
 
 
-def _stored(path: Path) -> tuple[Campaign, Statistics | None]:
-    """Return the campaign of a file, and the fold over its whole chunks."""
+def _stored(path: Path) -> tuple[Campaign, _Progress]:
     with reading.hdf5(path) as file:
         attributes = reading.attributes(file)
         if attributes.get("kind") != KIND:
@@ -426,7 +474,16 @@ def _stored(path: Path) -> tuple[Campaign, Statistics | None]:
             arithmetic=str(attributes["arithmetic"]),
             seconds=finite("seconds", attributes["seconds"], unit="s"),
         )
-        if "resume/whole" in file:
-            return campaign, _statistics_of(file["resume/whole"], plan)
-        whole = campaign.statistics is not None and campaign.statistics.runs % campaign.chunk == 0
-        return campaign, campaign.statistics if whole else None
+        early = file.get("resume", {})
+        return campaign, _Progress(
+            _statistics_of(early["whole"], plan) if "whole" in early else _whole(campaign, early),
+            {int(name): _statistics_of(group, plan) for name, group in early.items() if name != "whole"},
+            campaign.chunk,
+        )
+
+
+def _whole(campaign: Campaign, early: Mapping[str, Any]) -> Statistics | None:
+    """Return the fold over whole chunks if the file has no ``resume/whole``: the statistics, unless they are one short chunk."""
+    if campaign.statistics is None or "0" in early:
+        return None
+    return campaign.statistics

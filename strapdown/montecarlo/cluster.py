@@ -14,14 +14,15 @@ from __future__ import annotations
 import contextlib
 import functools
 import pickle
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import CancelledError
+from queue import Empty, SimpleQueue
 from typing import Any
 
 import strapdown
 from strapdown.checks import InputError, count
 from strapdown.files.extras import library
-from strapdown.montecarlo.engine import Identity, Parts, Work, Workers, identity, in_order
+from strapdown.montecarlo.engine import Chunks, Identity, Parts, Window, Work, Workers, identity
 
 __all__ = [
     "dask_client",
@@ -103,15 +104,30 @@ def on_dask(client: Any) -> Workers:
     """
     distributed = library("distributed", "a cluster of workers", "cluster")
 
-    def work_through(work: Work, chunks: Iterable[tuple[int, int]]) -> Iterator[Parts]:
+    def work_through(work: Work, chunks: Chunks) -> Iterator[tuple[int, Parts]]:
         payload = distributed.protocol.pickle.dumps(work)  # the user's classes and functions are pickled by value
         _need_workers(client, distributed)
-
-        def submit(first_run: int, runs: int) -> Any:
-            return client.submit(_chunk, payload, first_run, runs, identity(), pure=False)
-
-        for future in in_order(chunks, submit, max(1, sum(client.nthreads().values()))):
-            yield _result(distributed, client, future)
+        window = Window(len(chunks), 2 * max(1, sum(client.nthreads().values())))
+        places: dict[Any, int] = {}
+        finished: SimpleQueue[Any] = SimpleQueue()
+        try:
+            while window.open:
+                while (place := window.begin()) is not None:
+                    future = client.submit(_chunk, payload, *chunks[place], identity(), pure=False)
+                    places[future] = place
+                    future.add_done_callback(finished.put)
+                try:
+                    future = finished.get(timeout=WORKERS_SECONDS)
+                except Empty:
+                    _need_workers(client, distributed)
+                    continue
+                place = places.pop(future)
+                parts = _result(distributed, client, future, chunks[place])
+                window.finish(place)
+                yield place, parts
+        finally:
+            with contextlib.suppress(distributed.comm.CommClosedError):
+                client.cancel(list(places))
 
     return work_through
 
@@ -136,24 +152,21 @@ def _lost(client: Any, error: object) -> InputError:
     )
 
 
-def _result(distributed: Any, client: Any, future: Any) -> Parts:
+def _result(distributed: Any, client: Any, future: Any, chunk: tuple[int, int]) -> Parts:
     """Return what a worker computed, if it is of the same identity."""
-    while True:
-        try:
-            there, parts = future.result(timeout=WORKERS_SECONDS)
-            break
-        except TimeoutError:
-            _need_workers(client, distributed)
-        except distributed.KilledWorker:
-            raise InputError(
-                "every worker that computed a chunk of runs died; check the workers' logs and memory"
-            ) from None
-        except ModuleNotFoundError as error:
-            raise InputError(
-                f"a worker cannot compute runs ({error}); install strapdown {strapdown.__version__} there"
-            ) from None
-        except (CancelledError, distributed.comm.CommClosedError) as error:
-            raise _lost(client, error) from None
+    runs = f"runs {chunk[0]} to {sum(chunk) - 1}"
+    try:
+        there, parts = future.result()
+    except distributed.KilledWorker:
+        raise InputError(
+            f"{runs} were lost because every worker that computed them died; check the workers' logs and memory"
+        ) from None
+    except ModuleNotFoundError as error:
+        raise InputError(
+            f"a worker cannot compute {runs} ({error}); install strapdown {strapdown.__version__} there"
+        ) from None
+    except (CancelledError, distributed.comm.CommClosedError) as error:
+        raise _lost(client, error) from None
     here = identity()
     if there.version != here.version:
         raise InputError(

@@ -6,9 +6,7 @@ import functools
 import hashlib
 import json
 import os
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Future
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from queue import SimpleQueue
@@ -32,8 +30,8 @@ Parts = tuple[Statistics, ...]
 MACHINES: dict[str, Any] = {lanes.NAME: lanes, scalar.NAME: scalar}
 """Machines by name, the fast one first: modules as described in :mod:`strapdown.montecarlo.statistics`."""
 
-AHEAD = 2
-"""Maximum number of chunks per worker that are submitted and not yet merged; bounds the memory."""
+AHEAD = 4
+"""Maximum number of chunks per worker ahead of the first unfinished one; bounds the memory."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,9 +137,30 @@ def replay(plan: Plan, run: int, *, machine: str = "auto") -> Replay:
     return replace(found, record=replace(record, origin=origin), estimate=estimate)
 
 
-def chunks_of(runs: int, chunk: int, first: int = 0) -> Iterator[tuple[int, int]]:
-    """Yield the chunks of the runs ``first`` to ``runs`` − 1 as (first run, number of runs)."""
-    return ((k, min(chunk, runs - k)) for k in range(first, runs, chunk))
+@dataclass(frozen=True)
+class Chunks:
+    """Chunks as (first run, runs), computed on access, because a list would grow with the number of runs."""
+
+    firsts: Sequence[int]
+    """First run of each chunk."""
+    runs: int
+    """Total number of runs."""
+    chunk: int
+
+    def __len__(self) -> int:
+        return len(self.firsts)
+
+    def __getitem__(self, place: int) -> tuple[int, int]:
+        first = self.firsts[place]
+        return first, min(self.chunk, self.runs - first)
+
+    def __iter__(self) -> Iterator[tuple[int, int]]:
+        return (self[place] for place in range(len(self)))
+
+
+def chunks_of(runs: int, chunk: int) -> Chunks:
+    """Return the chunks of ``runs`` runs."""
+    return Chunks(range(0, runs, chunk), runs, chunk)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -159,56 +178,85 @@ class Work:
         return tuple(MACHINES[self.machine].run_chunk(plan, first_run, runs) for plan in self.plans)
 
 
-Workers = Callable[[Work, Iterable[tuple[int, int]]], Iterator[Parts]]
-"""Function that computes chunks and yields their results in the order of the chunks."""
+Workers = Callable[[Work, Chunks], Iterator[tuple[int, Parts]]]
+"""Function that computes chunks and yields (index, result) in the order in which they finish, at most :data:`AHEAD` chunks per worker
+ahead of the first unfinished one."""
 
 
-def in_order(chunks: Iterable[tuple[int, int]], submit: Callable[[int, int], Any], workers: int) -> Iterator[Any]:
-    """Yield the futures of the chunks in their order, with at most :data:`AHEAD` chunks per worker submitted."""
-    waiting: deque[Any] = deque()
-    try:
-        for chunk in chunks:
-            waiting.append(submit(*chunk))
-            if len(waiting) == AHEAD * workers:
-                yield waiting.popleft()
-        while waiting:
-            yield waiting.popleft()
-    finally:
-        for future in waiting:
-            future.cancel()
+class Window:
+    """Order in which chunks are started, with a limited number ahead of the first unfinished one."""
+
+    def __init__(self, chunks: int, workers: int) -> None:
+        self._next, self._end, self._ahead = 0, chunks, AHEAD * workers
+        self._running: set[int] = set()
+        self._most = workers
+
+    def begin(self) -> int | None:
+        """Return the index of the next chunk to start; None if there is none now."""
+        first = min(self._running, default=self._next)
+        if self._next >= self._end or len(self._running) >= self._most or self._next >= first + self._ahead:
+            return None
+        self._running.add(self._next)
+        self._next += 1
+        return self._next - 1
+
+    def finish(self, place: int) -> None:
+        """Mark a chunk as finished."""
+        self._running.remove(place)
+
+    @property
+    def open(self) -> bool:
+        """Whether any chunk is unfinished."""
+        return bool(self._running) or self._next < self._end
 
 
 def in_threads(threads: int | None = None) -> Workers:
     """Return workers that are threads of this process. Default: one per core."""
     number = os.cpu_count() or 1 if threads is None else count("threads", threads)
 
-    def work_through(work: Work, chunks: Iterable[tuple[int, int]]) -> Iterator[Parts]:
-        tasks: SimpleQueue[tuple[Future[Parts], int, int] | None] = SimpleQueue()
+    def work_through(work: Work, chunks: Chunks) -> Iterator[tuple[int, Parts]]:
+        tasks: SimpleQueue[int | None] = SimpleQueue()
+        results: SimpleQueue[tuple[int, Parts | BaseException]] = SimpleQueue()
 
         def worker_loop() -> None:
-            while (task := tasks.get()) is not None:
-                future, *chunk = task
-                if future.set_running_or_notify_cancel():
-                    try:
-                        future.set_result(work(*chunk))
-                    except BaseException as error:
-                        future.set_exception(error)
+            while (place := tasks.get()) is not None:
+                try:
+                    results.put((place, work(*chunks[place])))
+                except BaseException as error:
+                    results.put((place, error))
 
-        def submit(first_run: int, runs: int) -> Future[Parts]:
-            future: Future[Parts] = Future()
-            tasks.put((future, first_run, runs))
-            return future
-
-        for _ in range(number):  # the threads of an executor would be waited for after an interruption
-            Thread(target=worker_loop, daemon=True).start()
+        workers = [Thread(target=worker_loop, daemon=True) for _ in range(min(number, len(chunks)))]
+        for thread in workers:
+            thread.start()
+        window = Window(len(chunks), len(workers))
         try:
-            for future in in_order(chunks, submit, number):
-                yield future.result()
+            while window.open:
+                while (place := window.begin()) is not None:
+                    tasks.put(place)
+                done, result = results.get()
+                if isinstance(result, BaseException):
+                    raise result
+                window.finish(done)
+                yield done, result
         finally:
-            for _ in range(number):
+            for _ in workers:
                 tasks.put(None)
 
     return work_through
+
+
+def merged_in_order(finished: Iterator[tuple[int, Parts]]) -> Parts:
+    """Return the statistics of all chunks, which come in any order, merged in the order of their indices."""
+    early: dict[int, Parts] = {}
+    total: Parts = ()
+    place = 0
+    for number, parts in finished:
+        early[number] = parts
+        while place in early:
+            following = early.pop(place)
+            total = tuple(merge(a, b) for a, b in zip(total, following, strict=True)) if total else following
+            place += 1
+    return total
 
 
 def run_plan(
@@ -299,9 +347,13 @@ def run(
 
 
 def _run(work: Work, runs: int, chunk: int, workers: Workers, progress: Callable[[int], None] | None) -> Parts:
-    total: Parts = ()
-    for parts in workers(work, chunks_of(runs, chunk)):
-        total = tuple(merge(a, b) for a, b in zip(total, parts, strict=True)) if total else parts
-        if progress is not None:
-            progress(parts[0].runs)
-    return tuple(replace(part, plan=plan) for part, plan in zip(total, work.plans, strict=True))
+    chunks = chunks_of(runs, chunk)
+
+    def counted() -> Iterator[tuple[int, Parts]]:
+        for place, parts in workers(work, chunks):
+            if progress is not None:
+                progress(chunks[place][1])
+            yield place, parts
+
+    parts = merged_in_order(counted())
+    return tuple(replace(part, plan=plan) for part, plan in zip(parts, work.plans, strict=True))

@@ -199,7 +199,7 @@ def _write_campaign(path: Path, scenario: scenarios.Scenario) -> None:
         **{name: np.zeros(shape, np.int64) for name, shape in counts.items()},
     )
     held = campaign.Campaign(plan=plan, machine="lanes", reason="", chunk=4, runs=8, statistics=found)
-    campaign._write(path, held, found, plan.to_table())
+    campaign._write(path, held, campaign._Progress(found, {}, 4), plan.to_table())
 
 
 _TRACKER = """[[sensors]]
