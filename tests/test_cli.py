@@ -161,7 +161,7 @@ def test_coning_json_has_the_keys_that_others_read(coning):
 
 
 def test_coning_studies_algorithms_of_ones_own(coning):
-    out, study, said = coning
+    _, study, said = coning
     said = " ".join(said.split())
     assert "0.003571 = 1/280" in said
     rows = {row["algorithm"]: row for row in study["integration"]}

@@ -1,6 +1,7 @@
 """Clipped samples and gaps: recognised, restored as far as can be, and uncertain by as much as they are off."""
 
 import dataclasses
+import itertools
 
 import numpy as np
 import pytest
@@ -9,6 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from strapdown import ahrs, quaternion
 from strapdown.ahrs import check_conventions, estimating
+from strapdown.kernels import recording_samples
+from strapdown.kernels.machine import compiled, read_only
 from strapdown.recordings import Recording, sensor_faults
 from strapdown.records.recording import sampled
 from strapdown.units import DEGREE
@@ -327,3 +330,33 @@ def test_a_coarse_gyro_at_rest_is_not_stuck():
     rate = np.random.default_rng(1).normal(0.0, 1e-3, (1000, 3))
     rate[100:900, 2] = 0.0  # below its resolution
     assert not sensor_faults.stuck_words(Recording(source="a", time=0.01 * np.arange(1000), rate=rate))
+
+
+def test_the_compiled_statistics_are_those_of_numpy():
+    samples = np.rint(np.random.default_rng(2).normal(0.0, 2.0, (600, 3)))
+    mean, square = np.empty((30, 3)), np.empty(30)
+    compiled(recording_samples.block_statistics)(read_only(samples), 20, mean, square)
+    blocks = samples.reshape(30, 20, 3)
+    np.testing.assert_allclose(mean, blocks.mean(axis=1), rtol=0, atol=1e-15)
+    np.testing.assert_allclose(square, 20.0 * blocks.var(axis=1).sum(axis=1), rtol=1e-14)
+    bend = np.empty(598)
+    compiled(recording_samples.bends)(read_only(samples), bend)
+    np.testing.assert_array_equal(bend, np.abs(np.diff(samples, n=2, axis=0)).max(axis=1))
+    run = np.empty((3, 2), np.int64)
+    compiled(recording_samples.longest_runs)(read_only(samples), run)
+    for column, (first, last) in zip(samples.T, run, strict=True):
+        runs = [len(list(equal)) for _, equal in itertools.groupby(column)]
+        k = int(np.argmax(runs))
+        assert (first, last) == (sum(runs[:k]), sum(runs[: k + 1]) - 1)
+    samples[np.random.default_rng(3).random(600) < 0.2] = np.nan
+    ends, sums, number = np.empty((3, 2, 2)), np.empty((30, 2, 3)), np.empty(30)
+    compiled(recording_samples.extremes)(read_only(samples), ends)
+    for column, found in zip(samples.T, ends, strict=True):
+        extremes = [np.nanmax(column), np.nanmin(column)]
+        assert found.tolist() == [[end, np.sum(column == end)] for end in extremes]
+    compiled(recording_samples.halves)(read_only(samples.reshape(30, 20, 3)), sums, number)
+    for block, found, count in zip(samples.reshape(30, 20, 3), sums, number, strict=True):
+        known = block[np.isfinite(block).all(axis=1)]
+        assert count == len(known)
+        middle = (len(known) + 1) // 2
+        np.testing.assert_array_equal(found, [known[:middle].sum(axis=0), known[middle:].sum(axis=0)])
