@@ -10,7 +10,7 @@ from strapdown import estimation, recordings
 from strapdown.checks import InputError
 from strapdown.cli import app
 from strapdown.recordings import Recording, read, recordfiles, samples
-from strapdown.records import ImuRecord
+from strapdown.records import ImuRecord, result_file
 from strapdown.records.recording import at_nearest, gaps
 
 HEADER = "time,gx [rad/s],gy,gz,ax [m/s2],ay,az"
@@ -247,8 +247,8 @@ def test_a_sensor_of_zeros_is_reported(csv, columns, name):
 
 
 def test_a_result_or_a_folder_is_no_recording(tmp_path):
-    with h5py.File(tmp_path / "estimate.h5", "w") as file:
-        file.attrs["kind"] = "strapdown estimate"
+    with result_file(tmp_path / "estimate.h5", "estimate", {}):
+        pass
     refused(
         tmp_path / "estimate.h5", "is a strapdown estimate, a result, not a recording; give the recording that it was"
     )
