@@ -106,8 +106,8 @@ def from_datasheet(**quantities: str) -> GyroSpec:
 
     Examples
     --------
-    >>> from_datasheet(arw="60 deg/sqrt(h)").angle_random_walk == from_datasheet(arw="1 deg/s/sqrt(Hz)").angle_random_walk
-    True
+    >>> [f"{from_datasheet(arw=arw).angle_random_walk:.6g}" for arw in ("60 deg/sqrt(h)", "1 deg/s/sqrt(Hz)")]
+    ['0.0174533', '0.0174533']
     """
     known_keys("from_datasheet", quantities, _QUANTITIES)
     if "quantization" in quantities and "angle_resolution" in quantities:
