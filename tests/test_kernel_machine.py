@@ -404,7 +404,8 @@ def _answer(pipe: Connection, root: Path, code: str, arguments: tuple[str, ...])
     for name in [name for name in sys.modules if name.partition(".")[0] == "strapdown"]:
         del sys.modules[name]
     sys.path.insert(0, str(root))
-    sys.dont_write_bytecode = True  # Python would use it for a source of the same length that is written in the same second
+    # Python would use the bytecode for a source of the same length that is written in the same second.
+    sys.dont_write_bytecode = True
     numba.config.CACHE_DIR = str(root / "cache")
     names = {"arguments": arguments}
     exec(code, names)
