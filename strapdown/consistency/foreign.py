@@ -31,7 +31,7 @@ from strapdown.consistency.alignment import (
     turns,
 )
 from strapdown.consistency.bounds import mean_p_value
-from strapdown.consistency.judgement import DETECTABLE, WITHOUT_TRUTH, Judgement, judge
+from strapdown.consistency.judgement import DETECTABLE, Judgement, judge
 from strapdown.consistency.manifold import whitened
 from strapdown.consistency.timeaverage import MIN_ROWS, effective_samples, time_average
 from strapdown.records import Estimate, Innovations, Truth
@@ -225,8 +225,7 @@ def _checked(
     aligned = in_truth_frames(own.attitude, alignment)
     if own.covariance is None:
         estimate = without_truth(own.time, aligned, innovations)
-        judged = judge(estimate, **how)
-        judgement = replace(judged, limits=tuple(limit for limit in judged.limits if limit != WITHOUT_TRUTH))
+        judgement = judge(estimate, truth, **how)
         chosen, found, explained = "", dict[str, float](), tuple[Explanation, ...]()
     else:
         readings = {name: read_as(name, own.covariance, own.attitude) for name in ERROR_FRAMES}

@@ -173,9 +173,8 @@ def assemble(
         for k in np.flatnonzero(of_the_gyro).tolist()
     )
     sensors, vectors, varying = _on_sensors(blocks, kinds, numbers, isotropic=isotropic)
-    shapes = tuple(
-        sorted(set(sensors), key=repr)
-    )  # whatever the order of the sensors, for the kernels of one structure
+    # Sorted, so that the order of the sensors makes no other structure, whose kernels would be compiled again.
+    shapes = tuple(sorted(set(sensors), key=repr))
     if not blocks:
         shapes = tuple(Sensor(code, isotropic, ()) for code in KIND_CODES.values())
     fastest = float(np.max(decay * np.where(entering, 5.0, 1.0), initial=0.0))

@@ -54,11 +54,9 @@ def write_estimate(path: str | os.PathLike[str], estimate: Estimate) -> None:
         size = 6 if estimate.has_bias else 3
         known = np.isfinite(estimate.variance).any()  # an estimate of another program may be without
         for name, unit in _VALUES.items():
-            if name in ("variance", "covariance") and not known:
-                continue
             value = getattr(estimate, name)
             if name in ("variance", "covariance") and value is not None:
-                value = value[:, :size] if name == "variance" else value[:, :size, :size]
+                value = (value[:, :size] if name == "variance" else value[:, :size, :size]) if known else None
             if value is not None and (name != "bias" or estimate.has_bias):
                 put(file, name, value, unit)
         if truth is not None:
